@@ -1,0 +1,1 @@
+"""The truth: wake flows, aerosol extinction, sub-grid texture and scattering matrices."""

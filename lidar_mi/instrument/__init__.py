@@ -1,0 +1,1 @@
+"""The sensor: laser, telescope, scan geometry and range gates."""

@@ -1,0 +1,1 @@
+"""The picture: Mitsuba scenes, running them, EXR files in and out."""
