@@ -1,0 +1,88 @@
+"""Stokes vectors and Mueller matrices of single scattering, in Mitsuba's conventions.
+
+A Stokes vector (I, Q, U, V) belongs to a propagation direction k and a reference axis
+perpendicular to it; Q > 0 is linear polarisation along that axis. A phase function returns the
+Mueller matrix from the axis ``mi.mueller.stokes_basis(k)`` of the incident light to
+``mi.mueller.stokes_basis(k')`` of the scattered light, both in world coordinates.
+"""
+
+import drjit as dr
+import mitsuba as mi
+
+
+def horizontal_axis(direction):
+    """Horizontal unit vector perpendicular to ``direction``: the axis e_h of lidar Stokes vectors.
+
+    For light straight up or down, where every perpendicular axis is horizontal, it is the y axis.
+    """
+    length = dr.hypot(direction.x, direction.y)
+    vertical = length < 1e-6
+    scale = dr.rcp(dr.select(vertical, 1, length))
+    return dr.select(
+        vertical,
+        mi.Vector3f(0, 1, 0),
+        mi.Vector3f(-direction.y * scale, direction.x * scale, 0),
+    )
+
+
+def transverse(axis, direction):
+    """Unit vector along the part of ``axis`` that is perpendicular to ``direction``."""
+    return dr.normalize(axis - direction * dr.dot(axis, direction))
+
+
+def scattering_angle(incident, scattered):
+    """Angle between two unit vectors, in radians, exact to rounding near 0 and 180 degrees."""
+    return dr.atan2(dr.norm(dr.cross(incident, scattered)), dr.dot(incident, scattered))
+
+
+def rotate_from_scattering_plane(incident, scattered, elements):
+    """Mueller matrix between the Stokes bases of two directions from scattering-plane elements.
+
+    Parameters
+    ----------
+    incident, scattered : mi.Vector3f
+        Unit propagation directions k and k'.
+    elements : tuple
+        (a1, a2, a3, a4, b1, b2) of the matrix with rows (a1, b1, 0, 0), (b1, a2, 0, 0),
+        (0, 0, a3, b2), (0, 0, -b2, a4), referred to the scattering plane (Hansen & Travis 1974,
+        Space Sci. Rev. 16, eq. 2.23 ff.; Q > 0 is polarisation parallel to the plane).
+
+    Notes
+    -----
+    At exactly 0 and 180 degrees the scattering plane is undefined; any plane through k then gives
+    the same matrix, provided b1 = b2 = 0, a2 = +-a3 there, which every macroscopically isotropic
+    and mirror-symmetric medium obeys.
+    """
+    a1, a2, a3, a4, b1, b2 = elements
+    normal = dr.cross(incident, scattered)
+    length = dr.norm(normal)
+    defined = length > 1e-6
+    normal = dr.select(
+        defined,
+        normal * dr.rcp(dr.select(defined, length, 1)),
+        mi.coordinate_system(incident)[0],
+    )
+    plane = mi.Spectrum(0)
+    plane[0, 0], plane[0, 1] = a1, b1
+    plane[1, 0], plane[1, 1] = b1, a2
+    plane[2, 2], plane[2, 3] = a3, b2
+    plane[3, 2], plane[3, 3] = -b2, a4
+    # (axis, normal, direction) is right-handed for both, as (e_h, e_v, direction) is.
+    return mi.mueller.rotate_mueller_basis(
+        plane,
+        in_forward=incident,
+        in_basis_current=dr.cross(normal, incident),
+        in_basis_target=mi.mueller.stokes_basis(incident),
+        out_forward=scattered,
+        out_basis_current=dr.cross(normal, scattered),
+        out_basis_target=mi.mueller.stokes_basis(scattered),
+    )
+
+
+def rotate_stokes(stokes, direction, current_axis, target_axis):
+    """Stokes vector (4 arrays) of light along ``direction``, referred to another axis."""
+    cosine = dr.dot(current_axis, target_axis)
+    sine = dr.dot(dr.cross(current_axis, target_axis), direction)
+    cos2, sin2 = cosine * cosine - sine * sine, 2 * cosine * sine
+    i, q, u, v = stokes
+    return i, cos2 * q + sin2 * u, cos2 * u - sin2 * q, v
