@@ -1,0 +1,203 @@
+"""What a displacement vector is worth: flags, the texture of its window, the median test."""
+
+import enum
+
+import torch
+from kornia.filters import spatial_gradient
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.windows import Windows, working
+
+
+class Flag(enum.IntFlag):
+    """Why a vector is rejected, one bit a reason; 0 is a good vector.
+
+    Names and values become the CF attributes `flag_meanings` and `flag_masks`.
+    """
+
+    PEAK_ON_RIM = 1
+    """Best match on the rim of the search range: the true one may lie outside. No displacement."""
+    LOW_CORRELATION = 2
+    """Correlation at the peak below the threshold (cross-correlation only)."""
+    LOW_TEXTURE = 4
+    """The template has too little structure in at least one direction (aperture problem)."""
+    MEDIAN_OUTLIER = 8
+    """Fails the normalised median test against its neighbours."""
+    NO_SUBPIXEL_FIT = 16
+    """A neighbour of the peak is not positive: the displacement is the integer one there."""
+    NON_FINITE_INPUT = 32
+    """NaN or infinity in the search region of one of the images. No displacement."""
+    NO_MATCH = 64
+    """No candidate could be compared (no contrast, no positive weight). No displacement."""
+
+
+# A Sobel derivative, scaled to give the slope of a ramp, passes 3/16 of the variance of white
+# noise: (1/2) from the difference times (1 + 4 + 1) / 16 from the smoothing across it.
+_SOBEL_NOISE = 3 / 16
+
+
+def texture(image: torch.Tensor, windows: Windows) -> tuple[torch.Tensor, torch.Tensor]:
+    """Texture of every template, and its mean value.
+
+    The texture is the square root of the smaller eigenvalue of the gradient matrix (structure
+    tensor), averaged over the template, divided by the template's mean: the rms slope of the
+    image in the direction where it is weakest, as contrast relative to the local mean per pixel
+    (px^-1). It limits every method: with white noise of standard deviation s, the variance of
+    the displacement in that direction is at least 2 s^2 / (n^2 lambda) (Cramer-Rao, both images
+    noisy). Gradients are Sobel's (kornia), reaching one pixel beyond the template.
+
+    Parameters
+    ----------
+    image : torch.Tensor, shape (z, y)
+    windows : Windows
+
+    Returns
+    -------
+    texture, mean : torch.Tensor, shape windows.count
+        px^-1 and the image's unit. Zero texture where the template is wholly zero.
+    """
+    image = working(image)
+    gradient = spatial_gradient(image[None, None], mode="sobel")[0, 0]
+    along_y, along_z = windows.of_templates(gradient.square())
+    across = windows.of_templates(gradient[0] * gradient[1])
+    half_trace = (along_y + along_z) / 2
+    radius = torch.hypot((along_y - along_z) / 2, across)
+    mean = windows.of_templates(image)
+    slope = (half_trace - radius).clamp(min=0).sqrt()
+    return torch.where(slope > 0, slope / mean.abs(), 0.0), mean
+
+
+def low_texture(
+    image: torch.Tensor, windows: Windows, minimum: float, noise: float | torch.Tensor = 0.0
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Texture of every template, and where it is too low to say anything.
+
+    Too low is: not above `minimum`, or a squared slope below twice what the noise alone would
+    give (3/16 of its variance after the Sobel filter), i.e. the image's own structure is weaker
+    than the noise. At that limit an 8 x 8 template cannot do better than 0.4 px.
+
+    Parameters
+    ----------
+    image : torch.Tensor, shape (z, y)
+    windows : Windows
+    minimum : float
+        px^-1, relative to the local mean.
+    noise : float or torch.Tensor of the image's shape
+        Standard deviation of the noise of each pixel, in the image's unit.
+
+    Returns
+    -------
+    texture : torch.Tensor, shape windows.count
+    low : torch.Tensor of bool, shape windows.count
+    """
+    image = working(image)
+    value, mean = texture(image, windows)
+    sigma = torch.as_tensor(noise, dtype=image.dtype, device=image.device)
+    if sigma.ndim and sigma.shape != image.shape:
+        raise InputError(
+            f"noise: shape {tuple(sigma.shape)} is neither one number nor the image's "
+            f"{tuple(image.shape)}"
+        )
+    if not bool((sigma >= 0).all()):
+        raise InputError("noise: not a standard deviation >= 0 everywhere")
+    variance = windows.of_templates((sigma**2).expand_as(image))
+    slope = value * mean.abs()
+    return value, (value <= minimum) | (slope**2 < 2 * _SOBEL_NOISE * variance)
+
+
+def non_finite(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:
+    """Windows with a NaN or an infinity anywhere in the search region of either image."""
+    bad = working(~(torch.isfinite(image1) & torch.isfinite(image2)))
+    return windows.of_regions(bad) > 0
+
+
+def filled(image: torch.Tensor) -> torch.Tensor:
+    """The image with its mean in place of non-finite pixels, so that sums stay finite.
+
+    Windows that hold such a pixel are flagged by `non_finite`; the others never see it.
+    """
+    finite = torch.isfinite(image)
+    if bool(finite.all()):
+        return image
+    return torch.where(finite, image, image[finite].mean() if bool(finite.any()) else 0.0)
+
+
+def median_outliers(
+    dz: torch.Tensor,
+    dy: torch.Tensor,
+    size: int = 3,
+    spacing: int = 1,
+    threshold: float = 2.0,
+    epsilon: float = 0.1,
+) -> torch.Tensor:
+    """Normalised median test of Westerweel & Scarano (2005, Exp. Fluids 39, 1096-1100).
+
+    A vector's difference to the median of its neighbours, over the median of the neighbours' own
+    differences plus `epsilon`; both components together must not exceed `threshold`.
+
+    Parameters
+    ----------
+    dz, dy : torch.Tensor, shape (rows, columns)
+        Displacements in pixels; NaN where there is none.
+    size : int
+        Neighbourhood of size x size vectors, 3 or 5.
+    spacing : int
+        Vectors from one neighbour to the next. Vectors whose windows nearly coincide share their
+        errors and cannot judge each other: the test expects windows to overlap by half or less.
+    threshold : float
+        2 in the paper.
+    epsilon : float
+        Expected noise of a displacement, px.
+
+    Returns
+    -------
+    torch.Tensor of bool
+        False also where the vector or all but two of its neighbours are missing.
+
+    Raises
+    ------
+    InputError
+        size not 3 or 5; spacing below 1; threshold or epsilon not positive.
+    """
+    if size not in (3, 5):
+        raise InputError(f"median_size: {size!r} is not 3 or 5")
+    if spacing < 1:
+        raise InputError(f"spacing: {spacing!r} is not an integer >= 1")
+    for name, value in (("median_threshold", threshold), ("median_epsilon", epsilon)):
+        if not value > 0:
+            raise InputError(f"{name}: {value!r} is not > 0")
+    squared = 0.0
+    for component in (dz, dy):
+        around = _neighbours(component, size // 2, spacing)
+        middle = _median(around)
+        spread = _median((around - middle).abs())
+        squared = squared + ((component - middle) / (spread + epsilon)) ** 2
+        enough = (~torch.isnan(around)).sum(0) > 2
+    return enough & (squared > threshold**2)
+
+
+def _neighbours(values: torch.Tensor, reach: int, spacing: int) -> torch.Tensor:
+    """All neighbours of each value, NaN beyond the edge, shape (neighbours, rows, columns)."""
+    rim = reach * spacing
+    padded = torch.nn.functional.pad(values, (rim, rim, rim, rim), value=float("nan"))
+    rows, columns = values.shape
+    steps = range(0, 2 * rim + 1, spacing)
+    return torch.stack(
+        [
+            padded[i : i + rows, j : j + columns]
+            for i in steps
+            for j in steps
+            if (i, j) != (rim, rim)
+        ]
+    )
+
+
+def _median(values: torch.Tensor) -> torch.Tensor:
+    """Median over the first axis without NaN; the mean of the middle two of an even number.
+
+    (torch.nanmedian takes the lower of the two, which biases a test with 8 neighbours.)
+    """
+    ranked = values.sort(dim=0).values  # NaN last
+    number = (~torch.isnan(values)).sum(0, keepdim=True)
+    middle = torch.cat([(number - 1).clamp(min=0) // 2, number // 2])
+    return ranked.gather(0, middle.clamp(max=len(values) - 1)).mean(0)

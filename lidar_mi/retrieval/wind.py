@@ -1,0 +1,253 @@
+"""From two images to the wind: one call, CF data set out."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.correlation import cross_correlation
+from lidar_mi.retrieval.displacement import Displacement
+from lidar_mi.retrieval.quality import Flag, low_texture, median_outliers
+from lidar_mi.retrieval.weight_shift import weight_shift
+from lidar_mi.retrieval.windows import Windows
+
+METHODS: Mapping[str, Callable[..., Displacement]] = {
+    "cc": cross_correlation,
+    "ws": weight_shift,
+}
+"""Methods by name: (image1, image2, template, search, stride, **options) -> Displacement."""
+
+_METRES = ("m", "metre", "metres", "meter", "meters")
+
+
+def retrieve_wind(
+    image1: xr.DataArray,
+    image2: xr.DataArray,
+    dt: float,
+    method: str = "cc",
+    template: int = 8,
+    search: int = 16,
+    stride: int = 1,
+    device: str | torch.device = "cpu",
+    *,
+    min_correlation: float = 0.5,
+    min_texture: float = 0.005,
+    noise: float | xr.DataArray = 0.0,
+    median_size: int = 3,
+    median_threshold: float = 2.0,
+    median_epsilon: float = 0.1,
+) -> xr.Dataset:
+    """Wind in the image plane from two images of the same air, dt apart.
+
+    Parameters
+    ----------
+    image1, image2 : xr.DataArray, dims (z, y)
+        On one grid: coordinates z and y in metres (`units` attribute), ascending and uniform;
+        the spacings may differ between z and y.
+    dt : float
+        Time from image 1 to image 2, s.
+    method : {"cc", "ws"}
+        Cross-correlation or weight shift, see `METHODS`.
+    template, search, stride : int
+        Pixels: template n >= 2, search region >= n + 2, step from window to window >= 1. Winds
+        beyond ((search - template) // 2 - 1/2) spacing / dt cannot be seen (17.5 m/s for 8 in 16
+        at 0.5 m and 0.1 s).
+    device : str or torch.device
+        Where to compute.
+    min_correlation : float
+        Flag vectors with a lower peak ("cc" only).
+    min_texture : float
+        Flag vectors whose template of image 1 has an rms slope, in its weakest direction and
+        relative to its mean, not above this; px^-1. See `quality.texture`.
+    noise : float or xr.DataArray
+        Standard deviation of image 1's noise, in its unit; a template with less structure than
+        noise is flagged as without texture.
+    median_size, median_threshold, median_epsilon
+        Normalised median test, see `quality.median_outliers`. Neighbours are taken half a
+        template apart (or a stride, if that is more): closer ones share their pixels.
+
+    Returns
+    -------
+    xr.Dataset, dims (z, y)
+        At the template centres (an even template's lies between pixels): `v`, `w` (m s-1),
+        `displacement_y`, `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1),
+        `flag` (bits of `quality.Flag`, 0 = good). The auxiliary coordinates `y_vector`,
+        `z_vector` are where the vector belongs, at mid-time: the centre and half the
+        displacement. Rejected vectors keep their value (or NaN if there is none); nothing is
+        replaced.
+
+    Raises
+    ------
+    InputError
+        Images on different or unsuitable grids, or a parameter out of its range.
+    """
+    if method not in METHODS:
+        raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
+    dt = _positive("dt", dt)
+    if not min_texture >= 0:
+        raise InputError(f"min_texture: {min_texture!r} px^-1 is not >= 0")
+    image1, image2 = _checked("image1", image1), _checked("image2", image2)
+    _same_grid(image1, image2)
+    windows = Windows(image1.shape, template, search, stride)
+    pixels1, pixels2 = (_tensor(image, device) for image in (image1, image2))
+    if isinstance(noise, xr.DataArray):
+        noise = _checked("noise", noise)
+        _same_grid(image1, noise, "noise")
+        noise = _tensor(noise, device)
+
+    options = {"min_correlation": min_correlation} if method == "cc" else {}
+    found = METHODS[method](pixels1, pixels2, template, search, stride, **options)
+    texture, low = low_texture(pixels1, windows, min_texture, noise)
+    spacing = max(1, round(template / 2 / stride))
+    outlier = median_outliers(
+        found.dz, found.dy, median_size, spacing, median_threshold, median_epsilon
+    )
+    flag = found.flag | (
+        Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier
+    ).to(torch.uint8)
+    attributes = {
+        "method": method,
+        "template": template,
+        "search": search,
+        "stride": stride,
+        "dt": dt,
+        "min_texture": min_texture,
+        "median_size": median_size,
+        "median_threshold": median_threshold,
+        "median_epsilon": median_epsilon,
+        **options,
+    }
+    return _dataset(image1, windows, found._replace(flag=flag), texture, attributes)
+
+
+def _dataset(
+    image: xr.DataArray,
+    windows: Windows,
+    found: Displacement,
+    texture: torch.Tensor,
+    attributes: dict,
+) -> xr.Dataset:
+    centre, spacing = {}, {}
+    for axis, name in enumerate(("z", "y")):
+        pixel = image[name].values.astype(float)
+        start = np.asarray(windows.starts(axis))
+        centre[name] = (pixel[start] + pixel[start + windows.template - 1]) / 2
+        spacing[name] = (pixel[-1] - pixel[0]) / (len(pixel) - 1)
+    moved = {
+        "z": found.dz.cpu().numpy() * spacing["z"],
+        "y": found.dy.cpu().numpy() * spacing["y"],
+    }
+    vector = {
+        "z": centre["z"][:, None] + moved["z"] / 2,
+        "y": centre["y"][None, :] + moved["y"] / 2,
+    }
+    dt = attributes["dt"]
+    score, score_name = {
+        "cc": ("correlation", "normalised cross-correlation at the peak"),
+        "ws": ("mismatch", "misfit of weight and centre of mass over their spread"),
+    }[attributes["method"]]
+
+    def field(values: np.ndarray | torch.Tensor, long_name: str, units: str, **more: str):
+        values = values.cpu().numpy() if isinstance(values, torch.Tensor) else values
+        attrs = {"long_name": long_name, "units": units, **more}
+        return ("z", "y"), values.astype(np.float32), attrs
+
+    dataset = xr.Dataset(
+        {
+            "v": field(moved["y"] / dt, "wind along y", "m s-1", standard_name="y_wind"),
+            "w": field(
+                moved["z"] / dt, "wind along z", "m s-1", standard_name="upward_air_velocity"
+            ),
+            "displacement_y": field(moved["y"], "displacement along y", "m"),
+            "displacement_z": field(moved["z"], "displacement along z", "m"),
+            score: field(found.score, score_name, "1"),
+            "texture": field(texture, "smallest rms slope relative to the mean, per pixel", "1"),
+            "flag": (
+                ("z", "y"),
+                found.flag.cpu().numpy(),
+                {
+                    "long_name": "reasons to reject the vector, 0 = good",
+                    "standard_name": "quality_flag",
+                    "flag_masks": np.array([bit.value for bit in Flag], dtype=np.uint8),
+                    "flag_meanings": " ".join(bit.name.lower() for bit in Flag),
+                },
+            ),
+        },
+        coords={
+            "z": ("z", centre["z"], {"long_name": "template centre, up", "units": "m"}),
+            "y": ("y", centre["y"], {"long_name": "template centre, left", "units": "m"}),
+            "z_vector": field(vector["z"], "z of the vector at mid-time", "m"),
+            "y_vector": field(vector["y"], "y of the vector at mid-time", "m"),
+        },
+        attrs={
+            "Conventions": "CF-1.11",
+            "title": "Wind in the image plane from an image pair",
+            **attributes,
+            "dt_units": "s",
+        },
+    )
+    dataset["z"].attrs |= {"axis": "Z", "positive": "up"}
+    dataset["y"].attrs |= {"axis": "Y"}
+    for name in ("z", "y"):
+        dataset[name].encoding["_FillValue"] = None
+    return dataset
+
+
+def _tensor(image: xr.DataArray, device: str | torch.device) -> torch.Tensor:
+    try:
+        target = torch.device(device)
+        return torch.as_tensor(np.ascontiguousarray(image.values), device=target)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"device: {str(device)!r} cannot be used here ({reason})") from error
+
+
+def _positive(name: str, value: float) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = np.nan
+    if not (number > 0 and np.isfinite(number)):
+        raise InputError(f"{name}: {value!r} s is not a number > 0")
+    return number
+
+
+def _checked(name: str, image: xr.DataArray) -> xr.DataArray:
+    """The image as (z, y), its grid known to be in metres, ascending and uniform."""
+    if not isinstance(image, xr.DataArray):
+        raise InputError(f"{name}: {type(image).__name__} is not an xarray.DataArray")
+    if set(image.dims) != {"z", "y"} or image.ndim != 2:
+        raise InputError(f"{name}: dims {tuple(image.dims)} are not ('z', 'y')")
+    if image.dtype.kind not in "fiu":
+        raise InputError(f"{name}: values of type {image.dtype} are not real numbers")
+    for axis in ("z", "y"):
+        if axis not in image.coords:
+            raise InputError(f"{name}.{axis}: coordinate missing; give it in m")
+        coordinate = image[axis]
+        units = coordinate.attrs.get("units")
+        if units not in _METRES:
+            raise InputError(f"{name}.{axis}: units {units!r} are not 'm'")
+        steps = np.diff(coordinate.values.astype(float))
+        if not steps.size or not np.isfinite(steps).all() or steps.min() <= 0:
+            raise InputError(f"{name}.{axis}: not at least two finite, ascending values")
+        if np.ptp(steps) > 1e-3 * steps.mean():
+            raise InputError(
+                f"{name}.{axis}: spacing from {steps.min():g} to {steps.max():g} m is not "
+                "uniform (to 0.1 %)"
+            )
+    return image.transpose("z", "y")
+
+
+def _same_grid(image1: xr.DataArray, image2: xr.DataArray, name: str = "image2") -> None:
+    if image1.shape != image2.shape:
+        sizes = " and ".join(f"{z} x {y}" for z, y in (image1.shape, image2.shape))
+        raise InputError(f"{name}: sizes {sizes} px (z x y) differ; both must have one grid")
+    for axis in ("z", "y"):
+        first, second = (image[axis].values.astype(float) for image in (image1, image2))
+        off = np.abs(first - second).max()
+        if off > 1e-3 * np.diff(first).mean():
+            raise InputError(
+                f"{name}.{axis}: up to {off:g} m off image1's; resample both onto one grid"
+            )
