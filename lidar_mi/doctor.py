@@ -97,10 +97,9 @@ def examine() -> list[Check]:
         _check_plugins,
         _check_torch,
     ]
+    checks = [_check_python(), *_check_dependencies(), _check_llvm()]
     with ThreadPoolExecutor(max_workers=_cores()) as pool:
-        pending = [pool.submit(trial) for trial in trials]
-        checks = [_check_python(), *_check_dependencies(), _check_llvm()]
-        checks += [trial.result() for trial in pending]
+        checks += pool.map(lambda trial: trial(), trials)
     return [*checks, _check_cores(), _check_memory(), _check_disk(), _check_exr_tools()]
 
 
@@ -167,21 +166,26 @@ def _check_dependency(requirement: Requirement) -> Check:
 
 
 def _check_llvm() -> Check:
-    set_before = os.environ.get(llvm.VARIABLE, "")
+    name = "LLVM library"
     chosen = llvm.select_llvm()
     if problem := llvm.check_llvm():
-        return Check("LLVM library", False, problem, _install_llvm())
-    newest = {str(path): version for path, version in llvm.find_llvm()}
+        return Check(name, False, problem, _install_llvm())
     if chosen is None:
-        return Check("LLVM library", True, "left to Dr.Jit on this system")
-    version = newest.get(os.path.realpath(chosen)) or llvm.version_of(chosen) or "unknown"
-    why = f"set by {llvm.VARIABLE}" if set_before else "the newest of"
-    others = "" if set_before else f" {', '.join(map(str, sorted(newest.values())))}"
-    return Check("LLVM library", True, f"{chosen}, version {version}, {why}{others}")
+        return Check(name, True, "left to Dr.Jit on this system")
+    if _newest_is(chosen):
+        versions = ", ".join(str(version) for _, version in llvm.find_llvm())
+        return Check(name, True, f"{chosen}, the newest (LLVM {versions} found)")
+    return Check(name, True, f"{chosen}, as {llvm.VARIABLE} says")
+
+
+def _newest_is(chosen: str) -> bool:
+    found = llvm.find_llvm()
+    return bool(found) and os.path.realpath(chosen) == str(found[0][0])
 
 
 def _install_llvm() -> str:
-    if os.environ.get(llvm.VARIABLE, "") not in ("", llvm.NOT_FOUND):
+    chosen = os.environ.get(llvm.VARIABLE, "")
+    if chosen not in ("", llvm.NOT_FOUND) and not _newest_is(chosen):
         return f"unset {llvm.VARIABLE}"
     for tool, command in (
         ("apt-get", "sudo apt install libllvm19"),
@@ -199,7 +203,12 @@ def _attempt(code: str, *arguments: str, timeout: float = 180.0) -> tuple[bool, 
     command = [sys.executable, "-P", "-c", code, *arguments]
     try:
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=timeout
+            command,
+            check=False,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=timeout,
         )
     except subprocess.TimeoutExpired:
         return False, f"no answer within {timeout:.0f} s"
@@ -269,24 +278,25 @@ def _check_cores() -> Check:
 
 def _check_memory() -> Check:
     total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    free = total
-    limits = []
-    try:
-        lines = Path("/proc/meminfo").read_text().splitlines()
-        free = next(int(line.split()[1]) * 1024 for line in lines if "MemAvailable" in line)
-    except (OSError, StopIteration):
-        pass  # not Linux: the total is all we know
-    for folder in ("/sys/fs/cgroup/memory.{}", "/sys/fs/cgroup/memory/memory.{}_in_bytes"):
-        try:
-            limit = int(Path(folder.format("max" if "{}_" not in folder else "limit")).read_text())
-            used_name = "current" if "{}_" not in folder else "usage"
-            limits.append(limit - int(Path(folder.format(used_name)).read_text()))
-        except (OSError, ValueError):
-            continue  # no such control group, or "max": unlimited
-    free = min([free, *limits])
+    free = min([total, *_memory_bounds()])
     ok = free >= MEMORY_NEEDED
     detail = f"{free / GIB:.1f} GiB free of {total / GIB:.1f} GiB (needs {MEMORY_NEEDED // GIB})"
-    return Check("memory", ok, detail, "" if ok else "ps aux --sort=-rss | head   (end what is big)")
+    remedy = "" if ok else "ps aux --sort=-rss | head   (shows what to end)"
+    return Check("memory", ok, detail, remedy)
+
+
+def _memory_bounds() -> list[int]:
+    """What the kernel calls available and what a container is limited to, where they say so."""
+    bounds = []
+    meminfo = Path("/proc/meminfo")
+    if meminfo.is_file():
+        lines = meminfo.read_text().splitlines()
+        bounds = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable")]
+    for file in ("memory.max", "memory/memory.limit_in_bytes"):
+        limit = Path("/sys/fs/cgroup", file)
+        if limit.is_file() and (text := limit.read_text().strip()).isdigit():
+            bounds.append(int(text))
+    return bounds
 
 
 def _check_disk() -> Check:

@@ -5,8 +5,8 @@ which Python cannot catch. Dr.Jit opens its LLVM while ``drjit`` is imported, so
 made on ``import lidar_mi``, through ``DRJIT_LIBLLVM_PATH``.
 
 The module needs the standard library only and is also a script: ``python3 -P lidar_mi/llvm.py``
-prints the chosen library (exit code 0), or what to install (1), or what is wrong with the
-``DRJIT_LIBLLVM_PATH`` that the user has set (2). On systems other than Linux and macOS the search
+prints the chosen library (exit code 0), or what to install (3), or what is wrong with the
+``DRJIT_LIBLLVM_PATH`` that the user has set (4). On systems other than Linux and macOS the search
 is left to Dr.Jit.
 """
 
@@ -133,9 +133,9 @@ def check_llvm(
 
     The library is opened and asked for its version, so a file whose name lies is found out.
     """
-    choice = environ.get(VARIABLE, "")
+    choice = select_llvm(folders, dict(environ))  # a copy: judging changes nothing
     if not choice:
-        return None if sys.platform not in ("linux", "darwin") else _nothing_suitable(folders)
+        return None
     if choice == NOT_FOUND:
         return _nothing_suitable(folders)
     advice = f"it must name libLLVM {MINIMUM_VERSION} or newer, or be unset"
@@ -219,5 +219,5 @@ if __name__ == "__main__":
     select_llvm(folders)
     if message := check_llvm(folders):
         print(message)
-        sys.exit(1 if own_choice else 2)
+        sys.exit(3 if own_choice else 4)
     print(os.environ.get(VARIABLE, "left to Dr.Jit"))

@@ -1,0 +1,37 @@
+# Everything runs from .venv, which the first target that needs it sets up.
+# ARGS goes to the command behind a target: make test ARGS="tests/test_llvm.py -x"
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test test-all bench lint clean
+
+PYTHON_ENV := .venv/bin/python
+EXPERIMENT := wake_backscatter
+
+help: ## show this list
+	@echo "make demo or make test on a fresh machine do everything by themselves."
+	@sed -n 's/^\([a-z-]*\):[^#]*## \(.*\)/  make \1|\2/p' Makefile | awk -F'|' '{printf "%-18s%s\n", $$1, $$2}'
+
+setup: ## make .venv, install the package and an LLVM for it (nothing to do: does nothing)
+	@scripts/setup.sh
+
+demo: setup ## run the main experiment on the embedded wake
+	.venv/bin/lidar-mi run scenes/$(EXPERIMENT).yaml -o outputs/$(EXPERIMENT) $(ARGS)
+
+test: setup ## run the tests, without those marked slow
+	$(PYTHON_ENV) -m pytest -m "not slow" $(ARGS)
+
+test-all: setup ## run all tests
+	$(PYTHON_ENV) -m pytest -m "slow or not slow" $(ARGS)
+
+bench: setup ## compare with other programs, side by side
+	@$(PYTHON_ENV) -c "from importlib.util import find_spec as f; exit(not (f('mitransient') and f('openpiv')))" \
+		|| $(PYTHON_ENV) -m pip install -q -e ".[bench]"
+	$(PYTHON_ENV) -m benchmarks $(ARGS)
+
+lint: setup ## check the style of the code
+	@$(PYTHON_ENV) -c "import ruff" 2>/dev/null || $(PYTHON_ENV) -m pip install -q ruff
+	$(PYTHON_ENV) -m ruff check $(if $(ARGS),$(ARGS),.)
+
+clean: ## remove caches and build leftovers; .venv and outputs stay
+	rm -rf build dist .pytest_cache .ruff_cache *.egg-info
+	find . -name .venv -prune -o -name outputs -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
