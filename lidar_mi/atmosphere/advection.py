@@ -1,0 +1,127 @@
+"""Carry a field with the flow: the image at t2 from the image at t1."""
+
+import numpy as np
+import xarray as xr
+from scipy.ndimage import map_coordinates, spline_filter
+
+from lidar_mi.errors import InputError
+
+# Cells of edge values put around a plane, so that the spline's response to the edge (it falls
+# by 0.27 a cell) and air that blows in find the edge value.
+_MARGIN = 12
+
+
+def _axis(field, name):
+    values = field[name].values.astype(float)
+    steps = np.diff(values)
+    if values.size < 4 or steps[0] <= 0 or np.ptp(steps) > 1e-3 * abs(steps[0]):
+        raise InputError(
+            f"advection.{name}: axis of {values.size} nodes is not usable; allowed: "
+            "4 nodes or more, ascending, equally spaced"
+        )
+    return values, (values[-1] - values[0]) / (values.size - 1)
+
+
+def _sampler(plane):
+    """Cubic B-spline through the nodes of a plane; call it with fractional node indices.
+
+    Outside the plane the value at the nearest edge holds.
+    """
+    coefficients = spline_filter(np.pad(plane, _MARGIN, mode="edge"), order=3, mode="mirror")
+
+    def sample(indices):
+        return map_coordinates(
+            coefficients, indices + _MARGIN, order=3, mode="nearest", prefilter=False
+        )
+
+    return sample
+
+
+def _departures(v, w, dt, steps):
+    """Node indices from which the air at the nodes came; v, w in nodes per second."""
+    nodes = np.indices(v.shape, dtype=float)
+    sample_v, sample_w = _sampler(v), _sampler(w)
+    h = dt / steps
+    place = nodes
+    for _ in range(steps):
+        half = place - 0.5 * h * np.stack([sample_v(place), sample_w(place)])
+        place = place - h * np.stack([sample_v(half), sample_w(half)])
+    return place
+
+
+def advect(
+    field: xr.DataArray, v: xr.DataArray, w: xr.DataArray, dt: float, steps: int = 4
+) -> xr.DataArray:
+    """The field after dt in the frozen cross flow (v, w): Df/Dt = 0, semi-Lagrangian.
+
+    Every node is followed back along its trajectory in `steps` midpoint steps (second order:
+    in solid rotation the departure point is off by r (omega dt)^3/(6 steps^2), which for
+    omega = 5 s^-1 and dt = 0.1 s is 2 % of r in one step and 0.13 % in four), and the field
+    there is read from the cubic B-spline through its nodes (Staniforth and Cote,
+    Mon. Wea. Rev. 119, 1991). The
+    spline keeps waves of 4 cells and longer; a wave of 2 cells is lost at half-cell shifts, as
+    it must be on this grid. Along x nothing moves. Air that enters through an edge carries
+    the edge's value, so a strip of width speed*dt along inflow edges is not meaningful. A field
+    that is nowhere negative stays so: the spline's undershoots at sharp edges are set to zero.
+
+    Parameters
+    ----------
+    field : xarray.DataArray
+        Any scalar, dims (y, z) or (x, y, z) in any order, y and z equally spaced, metres.
+    v, w : xarray.DataArray
+        Velocity along y and z, m s^-1, same dims and coordinates as `field`.
+    dt : float
+        s; negative goes back in time.
+    steps : int
+        Trajectory steps in dt, >= 1.
+
+    Returns
+    -------
+    xarray.DataArray
+        float64, dims, coordinates and attributes of `field`.
+
+    Raises
+    ------
+    InputError
+        Other dims, unequal grids, uneven axes, values or dt not finite.
+    """
+    if not np.isfinite(dt):
+        raise InputError(f"advection.dt: {dt} s is not allowed; any finite time is")
+    if steps != int(steps) or steps < 1:
+        raise InputError(f"advection.steps: {steps} is not allowed; a whole number >= 1 is")
+    dims = set(field.dims)
+    if dims not in ({"y", "z"}, {"x", "y", "z"}) or len(field.dims) != len(dims):
+        raise InputError(
+            f"advection.field: dims {tuple(field.dims)} are not allowed; (y, z) or (x, y, z) are"
+        )
+    (_, dy), (_, dz) = _axis(field, "y"), _axis(field, "z")
+    for name, component in (("field", field), ("v", v), ("w", w)):
+        if set(component.dims) != dims or any(
+            component.sizes[d] != field.sizes[d]
+            or not np.allclose(component[d], field[d], rtol=0, atol=1e-3 * min(dy, dz))
+            for d in dims
+        ):
+            raise InputError(
+                f"advection.{name}: grid {dict(component.sizes)} differs from the field's "
+                f"{dict(field.sizes)}; it must be the same nodes"
+            )
+        bad = int((~np.isfinite(component)).sum())
+        if bad:
+            raise InputError(f"advection.{name}: {bad} values are not finite; none may be")
+
+    order = [d for d in ("x", "y", "z") if d in dims]
+    shape = (-1, field.sizes["y"], field.sizes["z"])
+    planes, vs, ws = (
+        a.transpose(*order).values.astype(float).reshape(shape) for a in (field, v, w)
+    )
+    moved = np.stack(
+        [
+            _sampler(plane)(_departures(pv / dy, pw / dz, dt, int(steps)))
+            for plane, pv, pw in zip(planes, vs, ws)
+        ]
+    )
+    if planes.min() >= 0:
+        moved = np.maximum(moved, 0.0)
+    result = field.transpose(*order).astype(float)
+    result = result.copy(data=moved.reshape(result.shape))
+    return result.transpose(*field.dims)

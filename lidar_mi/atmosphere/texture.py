@@ -1,0 +1,149 @@
+"""Sub-grid aerosol texture: what a simulation on a metre grid has lost and a lidar would see."""
+
+import numpy as np
+import xarray as xr
+from scipy.fft import fftfreq, irfftn, next_fast_len, rfftfreq, rfftn
+
+from lidar_mi.errors import InputError
+
+# 8 bytes each for the noise and its spectrum: half a gigabyte in all.
+_LARGEST_GRID = 30_000_000
+
+
+def _spacing(name, values):
+    values = np.asarray(values, dtype=float)
+    steps = np.diff(values)
+    if (
+        values.ndim != 1
+        or values.size < 2
+        or steps[0] <= 0
+        or np.ptp(steps) > 1e-3 * steps[0]
+    ):
+        raise InputError(
+            f"texture.{name}: axis of shape {values.shape} is not usable; allowed: 1-D, "
+            "ascending, equally spaced, 2 nodes or more"
+        )
+    return (values[-1] - values[0]) / (values.size - 1)
+
+
+def gaussian_field(
+    shape: tuple[int, ...], spacing: tuple[float, ...], outer_scale: float, seed: int
+) -> np.ndarray:
+    """Periodic Gaussian random field, isotropic, with -5/3 line spectra.
+
+    The spectral density is (k^2 + k0^2)^(-(5/3 + d - 1)/2) in d dimensions, k0 = 2 pi/L: its
+    integral over the d - 1 other wavenumbers, the line spectrum, is (k^2 + k0^2)^(-5/6) (von
+    Karman's form of the Corrsin-Obukhov spectrum; Monin and Yaglom, Statistical Fluid
+    Mechanics 2, 1975, section 21). Waves up to the grid's shortest along each axis are filled;
+    those it cannot hold are missing from a line spectrum, which for d = 2 (3) lies below the law
+    by 5 (8) % at a quarter of the largest wavenumber, 15 (23) % at half, 35 (51) % at the end.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Nodes of the period.
+    spacing : tuple of float
+        m.
+    outer_scale : float
+        L, m.
+    seed : int
+
+    Returns
+    -------
+    ndarray
+        Zero mean, not normalised.
+    """
+    d = len(shape)
+    noise = np.random.Generator(np.random.PCG64(seed)).standard_normal(shape)
+    spectrum = rfftn(noise, overwrite_x=True)
+    frequencies = [fftfreq(n, s) for n, s in zip(shape[:-1], spacing[:-1])]
+    frequencies.append(rfftfreq(shape[-1], spacing[-1]))
+    k2 = sum(f**2 for f in np.meshgrid(*frequencies, indexing="ij", sparse=True))
+    # Frequencies in cycles per metre: the common 2 pi drops out of the shape.
+    spectrum *= (k2 + outer_scale**-2) ** (-(5 / 3 + d - 1) / 4)
+    spectrum.flat[0] = 0
+    return irfftn(spectrum, s=shape, overwrite_x=True)
+
+
+def corrsin_obukhov(y, z, rms: float, outer_scale: float, seed: int, x=None) -> xr.DataArray:
+    """Random factor with which small-scale mixing modulates the aerosol.
+
+    Log-normal, exp(g - s^2/2) with s^2 = ln(1 + rms^2), so it is positive with mean 1 and
+    relative rms `rms`. g is a piece cut from a `gaussian_field` that is longer than the image by
+    `outer_scale` in every direction (there the correlation has fallen to about 1e-3), so opposite
+    edges know nothing of each other; its mean and standard deviation *over the image* are set to
+    0 and s. The factor's own mean and rms therefore scatter only by what the tails do: some
+    per cent of the rms in an image of ten outer scales.
+
+    Parameters
+    ----------
+    y, z : array_like
+        Node positions, m, equally spaced, ascending.
+    rms : float
+        Relative, >= 0; 0 gives ones.
+    outer_scale : float
+        m, at least two cells.
+    seed : int
+        >= 0.
+    x : array_like, optional
+        Gives dims (x, y, z); one node is a slice of the two-dimensional field, more a
+        three-dimensional field.
+
+    Returns
+    -------
+    xarray.DataArray
+        Factor, dimensionless, dims (y, z) or (x, y, z).
+
+    Raises
+    ------
+    InputError
+        Values out of range, uneven axes, a field too large for memory.
+    """
+    if not (np.isfinite(rms) and rms >= 0):
+        raise InputError(f"texture.rms: {rms} is not allowed; it must be >= 0")
+    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
+        raise InputError(f"texture.seed: {seed!r} is not allowed; a whole number >= 0 is")
+    axes = {"y": np.asarray(y, dtype=float), "z": np.asarray(z, dtype=float)}
+    if x is not None:
+        axes = {"x": np.atleast_1d(np.asarray(x, dtype=float)), **axes}
+    spacing = {
+        name: _spacing(name, values)
+        for name, values in axes.items()
+        if name != "x" or values.size > 1
+    }
+    if not (np.isfinite(outer_scale) and outer_scale >= 2 * max(spacing.values())):
+        raise InputError(
+            f"texture.outer_scale: {outer_scale} m is not allowed; it must be at least two "
+            f"cells, {2 * max(spacing.values()):g} m"
+        )
+    sizes = [values.size for values in axes.values()]
+    period = tuple(
+        next_fast_len(int(np.ceil(axes[name].size + outer_scale / step)), real=True)
+        for name, step in spacing.items()
+    )
+    if np.prod(period, dtype=float) > _LARGEST_GRID:
+        raise InputError(
+            f"texture.outer_scale: {outer_scale} m with {' x '.join(map(str, sizes))} nodes "
+            f"needs a grid of {' x '.join(map(str, period))}; allowed: {_LARGEST_GRID} nodes"
+        )
+    if rms == 0:
+        factor = np.ones(sizes)
+    else:
+        g = gaussian_field(period, tuple(spacing.values()), outer_scale, seed)
+        g = g[tuple(slice(axes[name].size) for name in spacing)]
+        s = np.sqrt(np.log1p(rms**2))
+        g = (g - g.mean()) * (s / g.std())
+        factor = np.exp(g - s**2 / 2).reshape(sizes)
+    return xr.DataArray(
+        factor,
+        coords={name: (name, values, {"units": "m"}) for name, values in axes.items()},
+        dims=tuple(axes),
+        name="texture",
+        attrs={
+            "units": "1",
+            "long_name": "aerosol texture factor",
+            "rms": rms,
+            "outer_scale": outer_scale,
+            "seed": int(seed),
+        },
+    )

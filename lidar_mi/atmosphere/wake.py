@@ -1,0 +1,421 @@
+"""Wake flows from files: read, check, refine, and put into the lidar's frame."""
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pint
+import xarray as xr
+from scipy.interpolate import CubicSpline
+
+from lidar_mi.errors import InputError
+
+_UNITS = pint.get_application_registry()
+
+_DIMENSIONS = ("time", "x", "y", "z")
+_VARIABLES = {
+    "u": ("m s-1", "velocity along the flight path"),
+    "v": ("m s-1", "velocity across the flight path, positive to port"),
+    "w": ("m s-1", "vertical velocity, positive upwards"),
+    "tracer": ("1", "exhaust tracer"),
+    "aerosol": ("1", "background aerosol relative to its mean"),
+}
+_REQUIRED = ("v", "w")
+
+# What the format libraries raise on damaged files.
+_FORMAT_ERRORS = (OSError, ValueError, TypeError, LookupError, RuntimeError, AttributeError)
+
+# Largest deviation of a step from the mean step, in steps: float32 axes a few kilometres from
+# their origin reach 5e-4.
+_UNEVEN = 1e-3
+
+
+def parse_units(text: str) -> pint.Quantity:
+    """A CF units string as a pint quantity: 'm s-1', 'km/h', 'kg m-3', '1', '%'.
+
+    CF (UDUNITS) writes powers as digits behind a unit and products as a dot, pint does not.
+
+    Raises
+    ------
+    ValueError
+        If it is not a unit.
+    """
+    text = str(text).strip()
+    products = re.sub(r"(?<=[^\W_])\.(?=[^\W\d_])", "*", text)
+    powers = re.sub(r"(?<![\w.])([^\W\d_]+)\^?(-?\d+)(?!\w)", r"\1**\2", products)
+    try:
+        return 1.0 * _UNITS.parse_expression(powers or "1") * _UNITS.dimensionless
+    except Exception as error:  # pint lets its tokenizer's own exceptions through
+        raise ValueError(f"{text!r} is not a unit") from error
+
+
+def _scale_to(variable: xr.DataArray, target: str, name: str, path: Path) -> float:
+    """Factor from the variable's units to `target`."""
+    text = variable.attrs.get("units")
+    allowed = f"allowed: {target} or a unit that converts to it"
+    if text is None and target == "1":
+        return 1.0  # CF section 3.1: no units attribute means dimensionless
+    if text is None:
+        raise InputError(f"{path}: {name} has no units attribute; {allowed}")
+    try:
+        return float(parse_units(text).to(parse_units(target).units).magnitude)
+    except (ValueError, pint.PintError):
+        raise InputError(f"{path}: {name} has the unit {text!r}; {allowed}") from None
+
+
+def _open(path: Path) -> xr.Dataset:
+    try:
+        with path.open("rb") as file:
+            magic = file.read(8)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); allowed: a NetCDF file"
+        ) from None
+    if magic == b"\x89HDF\r\n\x1a\n":
+        engine = "h5netcdf"
+    elif magic[:4] in (b"CDF\x01", b"CDF\x02"):
+        engine = "scipy"
+    else:
+        raise InputError(f"{path}: is not NetCDF; allowed: NetCDF-4 (HDF5) or NetCDF-3 classic")
+    try:
+        return xr.open_dataset(path, engine=engine, decode_times=False)
+    except _FORMAT_ERRORS as error:
+        raise _damaged(path, error) from None
+
+
+def _damaged(path, error):
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return InputError(f"{path}: is damaged ({reason}); allowed: a whole NetCDF file")
+
+
+def _file_names(names, path):
+    """Our name -> the file's, for all dimensions and variables."""
+    known = (*_DIMENSIONS, *_VARIABLES)
+    names = dict(names or {})
+    for ours, theirs in names.items():
+        if ours not in known:
+            raise InputError(f"wake.names: {ours!r} is not known; allowed: {', '.join(known)}")
+        if not isinstance(theirs, str):
+            raise InputError(f"wake.names.{ours}: {theirs!r} is not allowed; a text is")
+    table = {ours: names.get(ours, ours) for ours in known}
+    doubled = {t for t in table.values() if list(table.values()).count(t) > 1}
+    if doubled:
+        raise InputError(
+            f"wake.names: {', '.join(sorted(doubled))} of {path} stands for more than one thing; "
+            "allowed: one each"
+        )
+    return table
+
+
+def _pick_time(data, name, time, path):
+    """The data set at one time, without the dimension, and that time in s (None: unknown)."""
+    if name not in data.dims and name not in data.variables:
+        if time is None:
+            return data, None
+        raise InputError(
+            f"{path}: time {time:g} s is asked for, but there is no {name!r}; it has the "
+            f"dimensions {', '.join(map(str, data.dims))}"
+        )
+    if name not in data.variables:
+        if time is None and data.sizes[name] == 1:
+            return data.isel({name: 0}), None
+        raise InputError(
+            f"{path}: dimension {name!r} has no values; allowed: a coordinate variable {name!r}"
+        )
+    coordinate = data[name]
+    if coordinate.ndim > 1:
+        raise InputError(f"{path}: {name!r} has dims {coordinate.dims}; allowed: one at most")
+    # "seconds since 2000-01-01" counts in seconds; the date itself is of no use here.
+    plain = coordinate.copy()
+    if "units" in plain.attrs:
+        plain.attrs["units"] = str(plain.attrs["units"]).split(" since ")[0]
+    times = np.atleast_1d(coordinate.values.astype(float)) * _scale_to(plain, "s", name, path)
+    listing = ", ".join(f"{t:.10g}" for t in times[:20]) + (" ..." if times.size > 20 else "")
+    if time is None:
+        if times.size > 1:
+            raise InputError(f"{path}: time is not given; allowed: one of {listing} s")
+        index = 0
+    else:
+        if not np.isfinite(time):
+            raise InputError(f"wake.time: {time} s is not allowed; any finite time is")
+        index = int(np.argmin(np.abs(times - time)))
+        if not abs(times[index] - time) <= 1e-6 * max(abs(time), abs(times[index])):
+            raise InputError(f"{path}: time {time:.10g} s is not there; allowed: {listing} s")
+    return data.isel({name: index}) if name in data.dims else data, float(times[index])
+
+
+def _axis(data, name, ours, path):
+    """The axis in metres, ascending and exact, and whether the file's runs the other way."""
+    if name not in data.variables:
+        raise InputError(
+            f"{path}: dimension {name!r} ({ours}) has no values; allowed: a coordinate "
+            f"variable {name!r} in m"
+        )
+    variable = data[name]
+    values = variable.values.astype(float) * _scale_to(variable, "m", name, path)
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        raise InputError(
+            f"{path}: axis {name!r} has {bad.size} values that are not finite, the first at "
+            f"index {bad[0]}; allowed: finite numbers"
+        )
+    if values.size == 1:
+        return values, False
+    exact = np.linspace(values[0], values[-1], values.size)
+    step = exact[1] - exact[0]
+    off = np.abs(np.diff(values) - step)
+    if step == 0 or off.max() > _UNEVEN * abs(step):
+        worst = int(off.argmax())
+        raise InputError(
+            f"{path}: axis {name!r} is not uniform, the step after index {worst} is "
+            f"{values[worst + 1] - values[worst]:g} m, the mean {step:g} m; allowed: equal steps"
+        )
+    return (exact[::-1], True) if step < 0 else (exact, False)
+
+
+def _plane_index(axis, x, path, name):
+    """Index of the plane nearest to x, which must lie in one of the planes' cells."""
+    half = (axis[1] - axis[0]) / 2 if axis.size > 1 else 0.0
+    slack = half + 1e-6 * max(1.0, abs(x))
+    if not axis[0] - slack <= x <= axis[-1] + slack:
+        raise InputError(
+            f"{path}: {name} = {x:g} m is outside; allowed: {axis[0] - half:g} to "
+            f"{axis[-1] + half:g} m"
+        )
+    return int(np.argmin(np.abs(axis - x)))
+
+
+def _check_finite(values, axes, name, path):
+    bad = ~np.isfinite(values)
+    count = int(bad.sum())
+    if count:
+        first = np.unravel_index(int(bad.argmax()), bad.shape)
+        place = ", ".join(f"{d} = {axes[d][i]:g} m" for d, i in zip("xyz", first))
+        raise InputError(
+            f"{path}: variable {name!r} has {count} values that are not finite, the first at "
+            f"{place}; allowed: none"
+        )
+
+
+def read_wake(
+    path: str | Path,
+    time: float | None = None,
+    names: Mapping[str, str] | None = None,
+    x: float | None = None,
+    require: Iterable[str] = (),
+) -> xr.Dataset:
+    """One instant of a simulated wake from a NetCDF file with CF units.
+
+    The file's variables lie on (time, x, y, z) in any order; time and x may be missing (a slab
+    gets one x plane, at its scalar coordinate or at 0). Descending axes are turned round, units
+    are converted; nothing is interpolated.
+
+    Parameters
+    ----------
+    path : str or Path
+        NetCDF-4 or NetCDF-3 classic.
+    time : float, optional
+        s; the file must hold it to 1e-6 relative. May be left out where there is one time only.
+        In "seconds since ..." axes the count is meant.
+    names : mapping, optional
+        Our name to the file's, for time, x, y, z, u, v, w, tracer, aerosol, where they differ:
+        {"v": "V_wind", "y": "lateral"}. A variable named here must exist.
+    x : float, optional
+        m; keeps the one plane nearest to it. Default: all planes.
+    require : iterable of str
+        Variables that must be there beside v and w, out of u, tracer, aerosol.
+
+    Returns
+    -------
+    xarray.Dataset
+        float64 on dims (x, y, z), ascending, metres: u, v, w in m s^-1, tracer and aerosol
+        dimensionless, as far as the file has them. Scalar coordinate `time` in s if known.
+
+    Raises
+    ------
+    InputError
+        Naming file and variable: unreadable, missing, wrong dims or units, values that are not
+        finite, axes that are not uniform, a time or plane that is not there.
+    """
+    path = Path(path)
+    table = _file_names(names, path)
+    for name in require:
+        if name not in _VARIABLES:
+            raise InputError(
+                f"wake: variable {name!r} is not known; allowed: {', '.join(_VARIABLES)}"
+            )
+    asked = {*_REQUIRED, *require, *(n for n in (names or {}) if n in _VARIABLES)}
+    with _open(path) as data:
+        return _read(data, table, asked, time, x, path)
+
+
+def _read(data, table, asked, time, x, path):
+    for name in _VARIABLES:
+        if name in asked and table[name] not in data.data_vars:
+            raise InputError(
+                f"{path}: variable {table[name]!r} ({name}) is missing; it has "
+                f"{', '.join(map(str, data.data_vars)) or 'none'}"
+            )
+    for name in ("y", "z"):
+        if table[name] not in data.dims:
+            raise InputError(
+                f"{path}: dimension {table[name]!r} ({name}) is missing; it has "
+                f"{', '.join(map(str, data.dims)) or 'none'}"
+            )
+    present = [name for name in _VARIABLES if table[name] in data.data_vars]
+    spatial = {table[d]: d for d in ("x", "y", "z") if table[d] in data.dims}
+    for name in present:
+        dims = set(data[table[name]].dims)
+        if not dims - {table["time"]} == set(spatial):
+            raise InputError(
+                f"{path}: variable {table[name]!r} has the dimensions "
+                f"({', '.join(map(str, data[table[name]].dims))}); allowed: "
+                f"{', '.join(spatial)} and, at choice, {table['time']}, in any order"
+            )
+
+    data, seconds = _pick_time(data, table["time"], time, path)
+    axes, reverse = {}, []
+    for theirs, ours in spatial.items():
+        axes[ours], turned = _axis(data, theirs, ours, path)
+        if turned:
+            reverse.append(theirs)
+    data = data.isel({theirs: slice(None, None, -1) for theirs in reverse})
+    if "x" not in axes:
+        theirs = table["x"]
+        place = 0.0
+        if theirs in data.variables and data[theirs].ndim == 0:
+            place = float(data[theirs]) * _scale_to(data[theirs], "m", theirs, path)
+        elif x is not None:
+            raise InputError(
+                f"{path}: x = {x:g} m is asked for, but there is no {theirs!r}; it has the "
+                f"dimensions {', '.join(map(str, data.dims))}"
+            )
+        axes = {"x": np.array([place]), **axes}
+    if x is not None:
+        index = _plane_index(axes["x"], x, path, table["x"])
+        axes["x"] = axes["x"][index : index + 1]
+        if table["x"] in data.dims:
+            data = data.isel({table["x"]: slice(index, index + 1)})
+
+    wake = xr.Dataset(
+        coords={d: (d, axes[d], {"units": "m"}) for d in ("x", "y", "z")},
+        attrs={"source": path.name},
+    )
+    for name in present:
+        variable = data[table[name]]
+        unit, long_name = _VARIABLES[name]
+        scale = _scale_to(variable, unit, f"variable {table[name]!r}", path)
+        try:
+            variable = variable.load()
+        except _FORMAT_ERRORS as error:
+            raise _damaged(path, error) from None
+        if variable.dtype.kind not in "iuf":
+            raise InputError(
+                f"{path}: variable {table[name]!r} is of type {variable.dtype}; allowed: numbers"
+            )
+        variable = variable.transpose(*(table[d] for d in "xyz" if table[d] in variable.dims))
+        values = variable.values.astype(float).reshape([axes[d].size for d in "xyz"]) * scale
+        _check_finite(values, axes, table[name], path)
+        wake[name] = ("x", "y", "z"), values, {"units": unit, "long_name": long_name}
+    if seconds is not None:
+        wake = wake.assign_coords(time=((), seconds, {"units": "s"}))
+    return wake
+
+
+def resample(wake: xr.Dataset, spacing: float) -> xr.Dataset:
+    """Finer nodes in y and z by cubic splines; x stays as it is.
+
+    Splines (not-a-knot) in y, then in z, through the nodes; exact for cubic polynomials. The
+    end nodes are kept: 110 x 70 nodes of 1 m become 219 x 139 of 0.5 m. tracer and aerosol are
+    clipped to the range of their data, which a spline leaves at sharp edges (a tracer would go
+    negative there).
+
+    Parameters
+    ----------
+    wake : xarray.Dataset
+        Variables on (x, y, z), from `read_wake`.
+    spacing : float
+        m; it must divide the extent of y and of z.
+
+    Returns
+    -------
+    xarray.Dataset
+
+    Raises
+    ------
+    InputError
+        A spacing that is not positive or does not divide an extent, fewer than 4 nodes.
+    """
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise InputError(f"wake.spacing: {spacing} m is not allowed; it must be > 0 m")
+    nodes = {}
+    for name in ("y", "z"):
+        axis = wake[name].values.astype(float)
+        if axis.size < 4:
+            raise InputError(
+                f"wake.{name}: {axis.size} nodes are too few to interpolate; allowed: 4 or more"
+            )
+        extent = axis[-1] - axis[0]
+        cells = round(extent / spacing)
+        if cells < 1 or abs(cells * spacing - extent) > _UNEVEN * spacing:
+            raise InputError(
+                f"wake.spacing: {spacing:g} m does not divide the extent of {name}, "
+                f"{extent:g} m; allowed: {extent:g} m over a whole number"
+            )
+        nodes[name] = np.linspace(axis[0], axis[-1], cells + 1)
+
+    fine = wake.drop_vars([*wake.data_vars, "y", "z"]).assign_coords(
+        {name: (name, values, {"units": "m"}) for name, values in nodes.items()}
+    )
+    for name, variable in wake.data_vars.items():
+        values = variable.transpose("x", "y", "z").values.astype(float)
+        low, high = values.min(), values.max()
+        for number, axis in ((1, "y"), (2, "z")):
+            values = CubicSpline(wake[axis].values, values, axis=number)(nodes[axis])
+        if name in ("tracer", "aerosol"):
+            values = values.clip(low, high)
+        fine[name] = ("x", "y", "z"), values, variable.attrs
+    return fine
+
+
+def centre(
+    wake: xr.Dataset,
+    y: float | None = None,
+    z: float | None = None,
+    about: tuple[float, float] = (0.0, 0.0),
+) -> xr.Dataset:
+    """Put the wake's point (y, z) at `about` in the lidar frame, by default on the beam axis.
+
+    Parameters
+    ----------
+    wake : xarray.Dataset
+    y, z : float, optional
+        m, in the wake's own frame and inside it; default: the middle of the domain.
+    about : (float, float)
+        y and z in the lidar frame, m.
+
+    Returns
+    -------
+    xarray.Dataset
+        The same values on shifted axes.
+
+    Raises
+    ------
+    InputError
+        A centre outside the wake.
+    """
+    shifted = wake
+    for name, place, target in (("y", y, about[0]), ("z", z, about[1])):
+        axis = wake[name]
+        first, last = float(axis[0]), float(axis[-1])
+        if place is None:
+            place = (first + last) / 2
+        elif not first <= place <= last:
+            raise InputError(
+                f"wake.centre.{name}: {place:g} m is outside the wake; allowed: "
+                f"{first:g} to {last:g} m"
+            )
+        moved = axis.values - place + target
+        shifted = shifted.assign_coords({name: (name, moved, axis.attrs)})
+    return shifted

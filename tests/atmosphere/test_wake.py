@@ -1,0 +1,321 @@
+"""The reader against files written by hand: detects any lost sign, axis or unit, and any bad
+file that does not end in one line naming file, variable and what is allowed."""
+
+from importlib.resources import files
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidar_mi.atmosphere.wake import centre, parse_units, read_wake, resample
+from lidar_mi.errors import InputError
+
+SLAB = files("lidar_mi.scenes") / "wake_slab_40s.nc"
+T, X, Y, Z = (np.array([1.0, 1.1]), np.arange(3) + 0.5, np.arange(6) - 2.5, np.arange(5) * 2.0)
+
+
+def field(t, x, y, z):
+    """Differs along every axis."""
+    return 1000 * t + 100 * x + 10 * y + z
+
+
+def example() -> xr.Dataset:
+    values = field(*np.meshgrid(T, X, Y, Z, indexing="ij"))
+    dims = ("time", "x", "y", "z")
+    return xr.Dataset(
+        {
+            "v": (dims, values, {"units": "m s-1"}),
+            "w": (dims, -values, {"units": "m s-1"}),
+            "tracer": (dims, values / 2e4 + 0.1, {"units": "1"}),
+        },
+        coords={
+            "time": ("time", T, {"units": "s"}),
+            "x": ("x", X, {"units": "m"}),
+            "y": ("y", Y, {"units": "m"}),
+            "z": ("z", Z, {"units": "m"}),
+        },
+    )
+
+
+@pytest.fixture
+def write(tmp_path):
+    def write(data, engine="h5netcdf", name="les.nc"):
+        path = tmp_path / name
+        data.to_netcdf(path, engine=engine)
+        return path
+
+    return write
+
+
+def fails(path, *words, **arguments):
+    """One line, with the file and all the words in it."""
+    with pytest.raises(InputError) as caught:
+        read_wake(path, **arguments)
+    message = str(caught.value)
+    assert "\n" not in message
+    for word in (str(path), *words):
+        assert word in message, message
+
+
+def expected(t, x=X, y=Y, z=Z):
+    return field(t, *np.meshgrid(x, y, z, indexing="ij"))
+
+
+@pytest.mark.parametrize("engine", ["h5netcdf", "scipy"])
+def test_values_land_where_they_belong(write, engine):
+    wake = read_wake(write(example(), engine), time=1.1)
+    assert wake.v.dims == ("x", "y", "z") and wake.v.dtype == np.float64
+    np.testing.assert_allclose(wake.v, expected(1.1), rtol=1e-12)
+    np.testing.assert_allclose(wake.w, -expected(1.1), rtol=1e-12)
+    assert set(wake.data_vars) == {"v", "w", "tracer"}
+    assert float(wake.time) == pytest.approx(1.1)
+    assert wake.v.attrs["units"] == "m s-1"
+
+
+def test_any_order_of_dimensions_and_descending_axes(write):
+    data = example().transpose("z", "time", "y", "x").isel(y=slice(None, None, -1))
+    data = data.isel(z=slice(None, None, -1))
+    wake = read_wake(write(data), time=1.0)
+    np.testing.assert_allclose(wake.y, Y)
+    np.testing.assert_allclose(wake.z, Z)
+    np.testing.assert_allclose(wake.v, expected(1.0), rtol=1e-12)
+
+
+def test_names_are_mapped(write):
+    data = example().rename(v="V_wind", y="lateral", time="age")
+    wake = read_wake(
+        write(data), time=1.0, names={"v": "V_wind", "y": "lateral", "time": "age"}
+    )
+    np.testing.assert_allclose(wake.v, expected(1.0), rtol=1e-12)
+
+
+def test_units_are_converted(write):
+    data = example()
+    data["v"] = data.v * 3.6
+    data.v.attrs["units"] = "km/h"
+    data["y"] = ("y", Y / 1000, {"units": "km"})
+    data["time"] = ("time", T / 60, {"units": "minutes since 2000-01-01"})
+    wake = read_wake(write(data), time=1.1)
+    np.testing.assert_allclose(wake.v, expected(1.1), rtol=1e-12)
+    np.testing.assert_allclose(wake.y, Y, atol=1e-12)
+
+
+def test_packed_integers_are_unpacked(tmp_path):
+    data = example()
+    path = tmp_path / "packed.nc"
+    packing = {"dtype": "int32", "scale_factor": 1e-3, "_FillValue": -(2**31)}
+    data.to_netcdf(path, engine="h5netcdf", encoding={"v": packing})
+    np.testing.assert_allclose(read_wake(path, time=1.0).v, expected(1.0), atol=1e-3)
+
+
+def test_one_plane_by_value(write):
+    path = write(example())
+    wake = read_wake(path, time=1.0, x=1.6)
+    assert wake.x.values.tolist() == [1.5]
+    np.testing.assert_allclose(wake.v, expected(1.0, x=[1.5]), rtol=1e-12)
+    assert read_wake(path, time=1.0, x=3.0).x.values.tolist() == [2.5]  # the last cell's face
+    fails(path, "x = 3.1 m", "0 to 3 m", time=1.0, x=3.1)
+
+
+def test_slab_without_x_or_time(write):
+    data = example().isel(time=0, x=1, drop=True)
+    wake = read_wake(write(data))
+    assert wake.v.shape == (1, 6, 5) and wake.x.values.tolist() == [0.0]
+    assert "time" not in wake.coords
+    np.testing.assert_allclose(wake.v[0], expected(1.0, x=[1.5])[0], rtol=1e-12)
+    fails(write(data), "no 'x'", x=0.5)
+    fails(write(data), "no 'time'", time=1.0)
+    kept = example().isel(time=0, x=1)  # as scalar coordinates
+    wake = read_wake(write(kept), time=1.0)
+    assert wake.x.values.tolist() == [1.5] and float(wake.time) == 1.0
+
+
+def test_time_is_picked_by_value(write):
+    path = write(example())
+    assert float(read_wake(path, time=1.1 * (1 + 5e-7)).time) == pytest.approx(1.1)
+    fails(path, "1.05", "1, 1.1 s", time=1.05)
+    fails(path, "time is not given", "1, 1.1 s")
+    assert float(read_wake(write(example().isel(time=[1]))).time) == pytest.approx(1.1)
+
+
+def test_float32_time_is_found(write):
+    data = example()
+    data["time"] = ("time", T.astype("float32"), {"units": "s"})
+    assert float(read_wake(write(data), time=1.1).time) == pytest.approx(1.1)
+
+
+@pytest.mark.filterwarnings("ignore:Cannot close a netcdf_file:RuntimeWarning")
+def test_files_that_are_not_netcdf(tmp_path, write):
+    fails(tmp_path / "absent.nc", "cannot be read", "No such file")
+    fails(tmp_path, "cannot be read")
+    text = tmp_path / "text.nc"
+    text.write_text("v w\n1 2\n")
+    fails(text, "not NetCDF")
+    empty = tmp_path / "empty.nc"
+    empty.touch()
+    fails(empty, "not NetCDF")
+    for engine in ("h5netcdf", "scipy"):
+        whole = write(example(), engine, "whole.nc").read_bytes()
+        cut = tmp_path / f"cut_{engine}.nc"
+        cut.write_bytes(whole[: len(whole) // 2])
+        fails(cut, "damaged", time=1.0)
+
+
+def test_missing_variables_and_dimensions(write):
+    fails(write(example().drop_vars("w")), "'w'", "missing", "v, tracer", time=1.0)
+    fails(write(example()), "'aerosol'", "missing", time=1.0, require=["aerosol"])
+    fails(write(example()), "'smoke'", "missing", time=1.0, names={"tracer": "smoke"})
+    fails(write(example().rename(y="lateral")), "'y'", "missing", "lateral", time=1.0)
+    fails(write(example().drop_vars("y")), "'y'", "no values", time=1.0)
+    data = example()
+    data["w"] = data.w.isel(x=0, drop=True)
+    fails(write(data), "'w'", "(time, y, z)", "x, y, z", time=1.0)
+
+
+def test_bad_names():
+    for names, word in (({"V": "v"}, "'V'"), ({"v": "w"}, "more than one"), ({"v": 3}, "3")):
+        with pytest.raises(InputError, match=word):
+            read_wake(SLAB, names=names)
+    with pytest.raises(InputError, match="'smoke'"):
+        read_wake(SLAB, require=["smoke"])
+
+
+def test_values_that_are_not_finite(write):
+    data = example()
+    data.v[1, 2, 3, 4] = np.nan
+    data.v[1, 2, 4, 0] = np.inf
+    fails(
+        write(data), "'v'", "2 values", "x = 2.5 m, y = 0.5 m, z = 8 m", "allowed: none", time=1.1
+    )
+    np.testing.assert_allclose(read_wake(write(data), time=1.0).v, expected(1.0), rtol=1e-12)
+    data = example()
+    data["y"] = ("y", np.where(Y == 0.5, np.nan, Y), {"units": "m"})
+    fails(write(data), "'y'", "index 3", time=1.0)
+
+
+def test_uneven_axes(write):
+    data = example()
+    stretched = Y.copy()
+    stretched[3] += 0.01
+    data["y"] = ("y", stretched, {"units": "m"})
+    fails(write(data), "'y'", "not uniform", "equal steps", time=1.0)
+    data["y"] = ("y", np.zeros(6), {"units": "m"})
+    fails(write(data), "'y'", "not uniform", time=1.0)
+    data["y"] = ("y", (Y + 5000).astype("float32"), {"units": "m"})
+    np.testing.assert_array_equal(read_wake(write(data), time=1.0).y, Y + 5000)
+
+
+def test_wrong_units(write):
+    for name, units in (("v", "K"), ("v", "banana"), ("y", "s"), ("time", "m"), ("tracer", "m")):
+        data = example()
+        data[name].attrs["units"] = units
+        fails(write(data), f"{name}", f"'{units}'", "allowed:", time=1.0)
+    data = example()
+    del data.v.attrs["units"]
+    fails(write(data), "'v'", "no units", "m s-1", time=1.0)
+    data = example()
+    del data.tracer.attrs["units"]  # CF: dimensionless
+    assert "tracer" in read_wake(write(data), time=1.0)
+
+
+def test_text_is_not_a_velocity(write):
+    data = example().isel(time=[0], x=[0])
+    data["v"] = (data.v.dims, np.full(data.v.shape, "fast"), {"units": "m s-1"})
+    fails(write(data), "'v'", "allowed: numbers")
+
+
+@pytest.mark.parametrize(
+    "text, si",
+    [
+        ("m s-1", 1.0),
+        ("m.s-1", 1.0),
+        ("m s^-1", 1.0),
+        ("m/s", 1.0),
+        ("km/h", 1 / 3.6),
+        ("cm s-1", 0.01),
+        ("knot", 1852 / 3600),
+    ],
+)
+def test_speeds_in_cf_writing(text, si):
+    assert parse_units(text).to("m/s").magnitude == pytest.approx(si, rel=1e-12)
+
+
+@pytest.mark.parametrize("text, si", [("1", 1), ("", 1), ("%", 0.01), ("1e-3", 1e-3)])
+def test_pure_numbers_in_cf_writing(text, si):
+    assert parse_units(text).to("").magnitude == pytest.approx(si, rel=1e-12)
+
+
+def test_powers_in_cf_writing():
+    assert parse_units("kg m-3").to("g/cm**3").magnitude == pytest.approx(1e-3)
+    assert parse_units("m2 s-2").to("km**2/s**2").magnitude == pytest.approx(1e-6)
+    for text in ("banana", "m s-", "-"):
+        with pytest.raises(ValueError, match="is not a unit"):
+            parse_units(text)
+
+
+def test_sample_has_the_published_ranges():
+    wake = read_wake(SLAB, time=40.0)
+    assert wake.v.shape == (1, 110, 70)
+    assert (float(wake.y[0]), float(wake.z[0])) == (-54.5, -94.5)
+    assert 0.62 <= float(wake.aerosol.min()) and float(wake.aerosol.max()) <= 1.31
+    assert -13.1 <= float(wake.w.min()) and float(wake.v.max()) <= 11.4
+
+
+def test_resample_has_the_papers_219_by_139_nodes_and_keeps_the_old_ones():
+    wake = read_wake(SLAB, time=40.0)
+    fine = resample(wake, 0.5)
+    assert fine.v.shape == (1, 219, 139) and fine.v.dims == ("x", "y", "z")
+    assert (float(fine.y[0]), float(fine.y[-1])) == (-54.5, 54.5)
+    for name in wake.data_vars:
+        np.testing.assert_allclose(fine[name][:, ::2, ::2], wake[name], atol=1e-12)
+    assert float(fine.tracer.min()) >= 0
+    assert float(fine.tracer.max()) <= float(wake.tracer.max())
+
+
+def test_resample_is_exact_for_cubics():
+    y, z = np.arange(8.0), np.arange(7.0) * 2
+    polynomial = np.poly1d([0.3, -2, 1, 5])
+
+    def plane(y, z):
+        return polynomial(y)[:, None] * polynomial(z / 3)[None, :]
+
+    wake = xr.Dataset({"v": (("x", "y", "z"), plane(y, z)[None])}, {"x": [0.0], "y": y, "z": z})
+    fine = resample(wake, 0.25)
+    np.testing.assert_allclose(fine.v[0], plane(fine.y.values, fine.z.values), rtol=1e-9, atol=1e-9)
+
+
+def test_resample_keeps_a_sharp_tracer_positive():
+    y = np.arange(10.0)
+    step = np.where(y < 5, 0.0, 1.0)[:, None] * np.ones(6)
+    dims = ("x", "y", "z")
+    wake = xr.Dataset(
+        {"tracer": (dims, step[None]), "v": (dims, step[None])},
+        {"x": [0.0], "y": y, "z": np.arange(6.0)},
+    )
+    fine = resample(wake, 0.5)
+    assert float(fine.v.min()) < -0.01  # the spline does swing
+    assert float(fine.tracer.min()) == 0 and float(fine.tracer.max()) == 1
+
+
+@pytest.mark.parametrize("spacing", [0.0, -1.0, np.nan, 0.4, 200.0])
+def test_resample_bad_spacing(spacing):
+    with pytest.raises(InputError, match="wake.spacing"):
+        resample(read_wake(SLAB, time=40.0), spacing)
+
+
+def test_resample_needs_four_nodes():
+    wake = read_wake(SLAB, time=40.0).isel(y=slice(0, 3))
+    with pytest.raises(InputError, match="wake.y: 3 nodes"):
+        resample(wake, 0.5)
+
+
+def test_centre():
+    wake = read_wake(SLAB, time=40.0)
+    middle = centre(wake)
+    assert float(middle.z[0]) == -34.5 and float(middle.z[-1]) == 34.5
+    shifted = centre(wake, y=-1.0, z=-60.0, about=(0.0, 5.0))
+    assert float(shifted.y[0]) == -53.5 and float(shifted.z[0]) == -94.5 + 65
+    xr.testing.assert_equal(shifted.v.variable, wake.v.variable)
+    assert shifted.y.attrs["units"] == "m"
+    with pytest.raises(InputError, match="centre.z"):
+        centre(wake, z=0.0)
