@@ -172,21 +172,26 @@ def _check_llvm() -> Check:
         return Check(name, False, problem, _install_llvm())
     if chosen is None:
         return Check(name, True, "left to Dr.Jit on this system")
-    if _newest_is(chosen):
+    if os.path.realpath(chosen) == _best_llvm():
         versions = ", ".join(str(version) for _, version in llvm.find_llvm())
         return Check(name, True, f"{chosen}, the newest (LLVM {versions} found)")
     return Check(name, True, f"{chosen}, as {llvm.VARIABLE} says")
 
 
-def _newest_is(chosen: str) -> bool:
-    found = llvm.find_llvm()
-    return bool(found) and os.path.realpath(chosen) == str(found[0][0])
+def _best_llvm() -> str | None:
+    """The library that lidar-mi takes when the user has set none."""
+    chosen = llvm.select_llvm(environ={})
+    return None if chosen == llvm.NOT_FOUND else chosen
 
 
 def _install_llvm() -> str:
-    chosen = os.environ.get(llvm.VARIABLE, "")
-    if chosen not in ("", llvm.NOT_FOUND) and not _newest_is(chosen):
-        return f"unset {llvm.VARIABLE}"
+    chosen, best = os.environ.get(llvm.VARIABLE, ""), _best_llvm()
+    if chosen in ("", llvm.NOT_FOUND) or os.path.realpath(chosen) == best:
+        return _install_command()
+    return f"unset {llvm.VARIABLE}" + ("" if best else f"; {_install_command()}")
+
+
+def _install_command() -> str:
     for tool, command in (
         ("apt-get", "sudo apt install libllvm19"),
         ("dnf", "sudo dnf install llvm-libs"),
