@@ -74,6 +74,16 @@ assert torch.fft.irfft2(torch.fft.rfft2(torch.ones(8, 8))).sum().item() == 64
 print(f'{build} build, {torch.get_num_threads()} threads{devices}')
 """
 
+# The embedded sample through h5netcdf, which installs without the HDF5 reader that it needs.
+_TRY_NETCDF = """
+from importlib import resources
+import xarray
+with resources.as_file(resources.files('lidar_mi.scenes') / 'wake_slab_40s.nc') as path:
+    with xarray.open_dataset(path, engine='h5netcdf') as wake:
+        shape = wake.v.load().shape
+print(f'the embedded wake reads: v is {shape}')
+"""
+
 
 @dataclass(frozen=True)
 class Check:
@@ -95,6 +105,7 @@ def examine() -> list[Check]:
         *(partial(_check_variant, variant) for variant in LLVM_VARIANTS),
         _check_cuda,
         _check_plugins,
+        _check_netcdf,
         _check_torch,
     ]
     checks = [_check_python(), *_check_dependencies(), _check_llvm()]
@@ -269,6 +280,12 @@ def _reinstall(*packages: str) -> str:
 def _check_torch() -> Check:
     ok, said = _attempt(_TRY_TORCH)
     return Check("torch computes", ok, said, "" if ok else _reinstall("torch"))
+
+
+def _check_netcdf() -> Check:
+    ok, said = _attempt(_TRY_NETCDF)
+    remedy = "" if ok else f"{sys.executable} -m pip install h5py h5netcdf"
+    return Check("NetCDF files", ok, said, remedy)
 
 
 def _cores() -> int:
