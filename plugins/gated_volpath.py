@@ -162,7 +162,7 @@ def define():
             out, medium = photon.transmittance(distance, active)
             position = photon.origin + photon.direction * distance
             mei = interaction(medium, position, photon.direction, photon.wavelengths)
-            active &= medium != None  # noqa: E711
+            active &= medium != None
             scattering, _ = coefficients(medium, mei, photon.channel, active)
             back = photon.aperture - position
             # d(distance) / d(range)

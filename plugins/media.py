@@ -63,7 +63,7 @@ def transmittance(scene, medium, origin, direction, distance, channel, wavelengt
         end, hit, passes, behind, skip = _next_surface(
             scene, origin, direction, travelled, skip, distance, medium, active
         )
-        inside = active & (medium != None)  # noqa: E711
+        inside = active & (medium != None)
         homogeneous = inside & medium.is_homogeneous()
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths)
         majorant = medium.get_majorant(mei, inside)[channel]
@@ -97,7 +97,7 @@ def collision(scene, medium, origin, direction, distance, channel, wavelengths, 
         end, hit, passes, behind, skip = _next_surface(
             scene, origin, direction, travelled, skip, distance, medium, active
         )
-        inside = active & (medium != None)  # noqa: E711
+        inside = active & (medium != None)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths)
         majorant = medium.get_majorant(mei, inside)[channel]
         tracking = inside & (majorant > 0)

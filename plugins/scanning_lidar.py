@@ -35,8 +35,8 @@ normalised. One column (row) lies at the middle of its angles. The laser's local
 beam's axis and its local +x on the horizontal axis e_h.
 
 A photon's range is half its optical path. A ``planar`` gate between x = X0 and X1 means ranges
-from X0 to X1 over the cosine between beam axis and x. Directions, gates, aperture and field of
-view can be changed through ``mi.traverse`` without compiling anything again.
+from X0 to X1 over the cosine between beam axis and x. Directions, gates, aperture and pose can
+be changed through ``mi.traverse`` without compiling anything again.
 """
 
 from pathlib import Path
@@ -79,6 +79,8 @@ def define():
                     _angles(props, "azimuth", width), _angles(props, "elevation", height)
                 )
             self.m_directions = mi.Float(directions.ravel())
+            self.m_pose = mi.Transform4f(props.get("to_world", mi.ScalarTransform4f()))
+            dr.make_opaque(self.m_pose)
             self._check()
 
         @property
@@ -119,6 +121,9 @@ def define():
         def _beams(self):
             return dr.arange(mi.UInt32, self.beam_count)
 
+        def world_transform(self):
+            return self.m_pose
+
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             """The axis of the beam at a film position: lets any integrator look along the scan."""
             width, height = self.film().size()
@@ -141,9 +146,10 @@ def define():
             callback.put("gate_start", self.m_gate_start, kind)
             callback.put("gate_stop", self.m_gate_stop, kind)
             callback.put("aperture_radius", self.m_aperture, kind)
+            callback.put("to_world", self.m_pose, kind)
 
         def parameters_changed(self, keys=()):
-            dr.make_opaque(self.m_gate_start, self.m_gate_stop, self.m_aperture)
+            dr.make_opaque(self.m_gate_start, self.m_gate_stop, self.m_aperture, self.m_pose)
             self._check()
 
         def _check(self):
@@ -152,8 +158,11 @@ def define():
                 fail(NAME, "gate_start", start, "a range above 0 m")
             if not start < stop < np.inf:
                 fail(NAME, "gate_stop", stop, f"a range beyond gate_start = {start:g} m")
-            forward = np.array(self.m_directions).reshape(-1, 3)[:, 0]
-            if self.gate_kind == "planar" and forward.min() <= 0:
+            directions = read_directions(
+                np.array(self.m_directions).reshape(-1, 3), self.beam_count
+            )
+            self.m_directions = mi.Float(directions.ravel())
+            if self.gate_kind == "planar" and directions[:, 0].min() <= 0:
                 fail(NAME, "gate_kind", "planar", "'spherical' when a beam does not point forward")
 
         def bbox(self):

@@ -1,0 +1,238 @@
+"""What an experiment file may say: every key, its unit, its default and its limits."""
+
+import difflib
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+from .errors import InputError
+from .instrument.lidar import BackscatterLidar
+from .instrument.scan import Scan
+from .rendering.settings import RenderSettings
+from .units import Extinction, Length, Number, Speed, Time, to_si
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class VortexPair(_Section):
+    """An analytic vortex pair in place of a simulation."""
+
+    model: Literal["lamb_oseen", "burnham_hallock"] = "lamb_oseen"
+    circulation: Number = Field(458.0, gt=0, description="m2/s")
+    separation: Length = Field(47.1, gt=0)
+    core_radius: Length = Field(3.0, gt=0)
+    width: Length = Field(109.0, gt=0, description="extent of the domain in y")
+    height: Length = Field(69.0, gt=0, description="extent of the domain in z")
+
+
+class ExtinctionMapping(_Section):
+    """From tracers (or from the wind's speed) to the extinction coefficient."""
+
+    source: Literal["tracer", "speed"] = "tracer"
+    tracer: str | None = Field("tracer", description="exhaust tracer, or null for none")
+    aerosol: str | None = Field("aerosol", description="background aerosol, or null for a flat one")
+    background: Extinction = Field("0.1 / km", ge=0, description="also of the environment")
+    maximum: Extinction = Field("1.8 / km", gt=0)
+    stretch: Number = Field(2.0, ge=1, description="contrast of thin tracer; 1 = linear")
+
+
+class Texture(_Section):
+    """Sub-grid aerosol texture that a simulation's grid has lost; rms 0 switches it off."""
+
+    rms: Number = Field(0.1, ge=0, le=2)
+    outer_scale: Length = Field(10.0, gt=0)
+
+
+class Wake(_Section):
+    """The flow and what drifts in it."""
+
+    file: str | None = Field(None, description="NetCDF file; beside the experiment or shipped")
+    vortex_pair: VortexPair | None = None
+    time: Time | None = Field(None, description="needed when the file holds several")
+    second: Literal["advect"] | Time = Field("advect", description="t2: advected, or a time")
+    x: Length | None = Field(None, description="plane put in the middle of the gates")
+    depth: Literal["plane", "volume"] = Field(
+        "plane", description="one plane extruded over the gates, or all planes of the file"
+    )
+    centre: tuple[Length, Length] | None = Field(
+        None, description="(y, z) of the wake put on the beam axis; default: the domain's middle"
+    )
+    spacing: Length = Field(0.5, gt=0)
+    names: dict[str, str] = Field({}, description="our dimension or variable names: the file's")
+    extinction: ExtinctionMapping = ExtinctionMapping()
+    texture: Texture = Texture()
+
+    @field_validator("second", mode="before")
+    @classmethod
+    def _advect_or_time(cls, value):
+        if value == "advect":
+            return value
+        try:
+            return to_si(value, "s", "40.1 s")
+        except ValueError:
+            raise ValueError(
+                f"{value!r} is not allowed; expected advect or a time such as '40.1 s'"
+            ) from None
+
+    @model_validator(mode="after")
+    def _one_source(self):
+        if (self.file is None) == (self.vortex_pair is None):
+            raise ValueError("expected either file or vortex_pair")
+        if self.vortex_pair and self.second != "advect":
+            raise ValueError(f"second: {self.second!r} is not allowed with vortex_pair")
+        if self.vortex_pair and self.depth == "volume":
+            raise ValueError("depth: 'volume' is not allowed with vortex_pair")
+        return self
+
+
+class Platform(_Section):
+    """The aircraft that carries the lidar towards the wake."""
+
+    speed: Speed = Field(150.0, ge=0)
+    dt: Time = Field(0.1, gt=0)
+
+
+class Scattering(_Section):
+    """How the air scatters, in the slab and around it."""
+
+    phase: Literal["rayleigh", "isotropic", "henyey_greenstein", "table"] = "rayleigh"
+    depolarization: Number = Field(0.0, ge=0, lt=0.5, description="of Rayleigh, natural light")
+    asymmetry: Number = Field(0.0, gt=-1, lt=1, description="of Henyey-Greenstein")
+    table: str | None = Field(None, description="scattering-matrix file, see the mueller plugin")
+    albedo: Number = Field(1.0, ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _table_given(self):
+        if (self.phase == "table") != (self.table is not None):
+            raise ValueError(f"table: {self.table!r} is not allowed with phase {self.phase}")
+        return self
+
+
+class Retrieval(_Section):
+    """How winds are found in the image pair."""
+
+    methods: tuple[Literal["cc", "ws"], ...] = Field(("cc", "ws"), min_length=1)
+    template: int = Field(8, ge=2)
+    search: int = Field(16, ge=4)
+    stride: int = Field(1, ge=1)
+    min_correlation: Number = Field(0.5, ge=-1, le=1)
+    min_texture: Number = Field(0.01, ge=0)
+    min_isotropy: Number = Field(0.2, ge=0, le=1)
+
+    @model_validator(mode="after")
+    def _region_holds_template(self):
+        if self.search < self.template + 2:
+            raise ValueError(
+                f"search: {self.search} is not allowed; expected at least template + 2 = "
+                f"{self.template + 2}"
+            )
+        return self
+
+
+class Experiment(_Section):
+    """One experiment, start to end."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    seed: int = Field(1, ge=0, lt=2**31)
+    wake: Wake
+    platform: Platform = Platform()
+    lidar: BackscatterLidar = BackscatterLidar()
+    scan: Scan = Scan()
+    scattering: Scattering = Scattering()
+    render: RenderSettings = RenderSettings()
+    retrieval: Retrieval = Retrieval()
+
+    @model_validator(mode="after")
+    def _telescope_stays_before_the_slab(self):
+        flown = self.platform.speed * self.platform.dt
+        if flown >= self.scan.range:
+            raise ValueError(
+                f"scan.range: {self.scan.range:g} m is not allowed; expected more than the "
+                f"{flown:g} m flown in platform.dt"
+            )
+        return self
+
+
+def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
+    """Read an experiment file; ``overrides`` are texts such as ``"wake.texture.rms=0.2"``.
+
+    Raises
+    ------
+    InputError
+        Unreadable file, unknown key, wrong unit, value out of range: the first fault is named.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; expected an experiment file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; expected an experiment in YAML") from None
+    try:
+        data = yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" line {mark.line + 1}" if mark else ""
+        raise InputError(f"{path}:{line} not valid YAML ({getattr(error, 'problem', error)})")
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: holds no keys; expected name, wake, ...")
+    for override in overrides or []:
+        _override(data, override)
+    return check(data, str(path))
+
+
+def check(data: dict, origin: str) -> Experiment:
+    """An experiment from a nested dictionary; see `load` for the errors."""
+    try:
+        return Experiment.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{origin}: {_first_fault(error)}") from None
+
+
+def dump(experiment: Experiment) -> str:
+    """The resolved experiment as YAML, quantities with their SI units; `load` reads it again."""
+    return yaml.safe_dump(experiment.model_dump(mode="json"), sort_keys=False)
+
+
+def _override(data: dict, text: str) -> None:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise InputError(f"--set {text}: expected KEY=VALUE, such as wake.texture.rms=0.2")
+    *parents, last = key.strip().split(".")
+    for parent in parents:
+        data = data.setdefault(parent, {})
+        if not isinstance(data, dict):
+            raise InputError(f"--set {text}: {parent} is a value, not a section")
+    try:
+        data[last] = yaml.safe_load(value)
+    except yaml.YAMLError:
+        raise InputError(f"--set {text}: {value!r} is not a YAML value") from None
+
+
+def _first_fault(error: ValidationError) -> str:
+    fault = error.errors()[0]
+    where = [str(p) for p in fault["loc"] if p not in ("float", "literal['advect']")]
+    field = ".".join(where)
+    message = fault["msg"].removeprefix("Value error, ")
+    if fault["type"] == "extra_forbidden":
+        allowed = _keys_at(fault["loc"][:-1])
+        close = difflib.get_close_matches(where[-1], allowed, 1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        return f"{field}: unknown key{hint} (allowed: {', '.join(allowed)})"
+    if fault["type"] == "missing":
+        return f"{field}: missing"
+    shown = f"{fault['input']!r}: " if fault["type"] != "value_error" else ""
+    return f"{field}: {shown}{message}" if field else message
+
+
+def _keys_at(location: tuple) -> list[str]:
+    model: Any = Experiment
+    for part in location:
+        annotation = model.model_fields[part].annotation
+        options = getattr(annotation, "__args__", (annotation,))
+        model = next(o for o in options if isinstance(o, type) and issubclass(o, BaseModel))
+    return list(model.model_fields)

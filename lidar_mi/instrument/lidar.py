@@ -1,0 +1,40 @@
+"""The backscatter lidar: what its laser sends and its telescope receives."""
+
+import math
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+from ..units import Angle, Energy, Length, Time
+
+
+class BackscatterLidar(BaseModel):
+    """A monostatic pulsed lidar; defaults are the paper's.
+
+    Lengths in m, angles in rad, energy in J, time in s; text with units is read as such.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    wavelength: Length = Field(532e-9, gt=0, description="vacuum wavelength of the laser")
+    beam_radius: Length = Field(0.1, gt=0, description="1/e^2 radius of the beam at the aperture")
+    beam_cut: Length = Field(0.1, gt=0, description="outer radius of the emitted beam")
+    divergence_full: Angle = Field("2 mrad", ge=0, lt=0.5, description="1/e^2 divergence, full angle")
+    stokes: tuple[float, float, float, float] = Field(
+        (1.0, 1.0, 0.0, 0.0), description="Stokes vector (I, Q, U, V) about the horizontal axis"
+    )
+    pulse_energy: Energy = Field(1e-3, gt=0, description="energy of a pulse in one beam")
+    pulse_duration: Time = Field(0.0, ge=0, description="full width at half maximum of the pulse")
+    aperture_radius: Length = Field(0.5, gt=0, description="radius of the telescope")
+    fov_half: Angle = Field("5 mrad", gt=0, lt=0.5, description="field of view, half angle")
+
+    @field_validator("stokes")
+    @classmethod
+    def _physical(cls, value):
+        if value[0] != 1 or math.hypot(*value[1:]) > 1 + 1e-6:
+            raise ValueError(f"{value} is not allowed; expected I = 1 and Q^2 + U^2 + V^2 <= 1")
+        return value
+
+    @property
+    def aperture_area(self) -> float:
+        """Area of the telescope, m^2."""
+        return math.pi * self.aperture_radius**2

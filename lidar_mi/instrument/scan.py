@@ -1,0 +1,129 @@
+"""Scan geometry: where the beams of a scan go and which ranges are recorded."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from ..units import Angle, Length
+
+
+class Scan(BaseModel):
+    """How the beams are aimed and gated; defaults are the paper's slab at 500 m.
+
+    ``aim: grid`` sends every beam to a node of the wake's (y, z) grid in the middle of the gates,
+    at both times to the same nodes. ``aim: angles`` takes equidistant angles (paper): columns in
+    +-azimuth_half by rows in +-elevation_half, given for t1 and t2.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    aim: Literal["grid", "angles"] = "grid"
+    range: Length = Field(500.0, gt=0, description="distance of the first gate's start at t1")
+    thickness: Length = Field(2.5, gt=0, description="depth of all gates together")
+    gates: Literal["planar", "spherical"] = "planar"
+    gate_count: int = Field(1, ge=1, le=10_000)
+    columns: int = Field(219, ge=1, description="beams across, with aim: angles")
+    rows: int = Field(139, ge=1, description="beams up, with aim: angles")
+    azimuth_half: tuple[Angle, Angle] = ("6.2 deg", "6.4 deg")
+    elevation_half: tuple[Angle, Angle] = ("3.9 deg", "4.1 deg")
+
+
+@dataclass(frozen=True)
+class ScanPlan:
+    """One scan, ready to be rendered. All lengths in m, in the lidar's frame.
+
+    Attributes
+    ----------
+    y, z : (columns,), (rows,) arrays
+        Where the beams hit the plane in the middle of the gates, ascending.
+    gate_start, gate_stop : float
+        The gates together: distances along x (planar) or ranges (spherical).
+    gate_kind : "planar" or "spherical"
+    gate_count : int
+    position : float
+        How far the telescope has come along x since the first scan.
+    """
+
+    y: np.ndarray
+    z: np.ndarray
+    gate_start: float
+    gate_stop: float
+    gate_kind: str
+    gate_count: int
+    position: float
+
+    @property
+    def centre(self) -> float:
+        """Distance of the middle of the gates, m."""
+        return (self.gate_start + self.gate_stop) / 2
+
+    def directions(self) -> np.ndarray:
+        """Unit vectors of the beams, (rows * columns, 3), as a pilot reads a page: top left first."""
+        vertical, lateral = np.meshgrid(self.z[::-1], self.y[::-1], indexing="ij")
+        beams = np.stack([np.full_like(lateral, self.centre), lateral, vertical], -1)
+        beams = beams.reshape(-1, 3)
+        return beams / np.linalg.norm(beams, axis=1, keepdims=True)
+
+    def obliquity(self) -> np.ndarray:
+        """1 / cos of the angle between beam and x axis, (rows, columns), y and z ascending."""
+        return np.sqrt(
+            1 + (self.y[None, :] / self.centre) ** 2 + (self.z[:, None] / self.centre) ** 2
+        )
+
+    def ranges(self) -> np.ndarray:
+        """Middle of every gate along every beam, m, (gates, rows, columns)."""
+        edges = np.linspace(self.gate_start, self.gate_stop, self.gate_count + 1)
+        middle = (edges[1:] + edges[:-1])[:, None, None] / 2
+        return middle * self._along_beam()
+
+    def gate_length(self) -> np.ndarray:
+        """Length of one gate along every beam, m, (rows, columns)."""
+        return (self.gate_stop - self.gate_start) / self.gate_count * self._along_beam()
+
+    def _along_beam(self) -> np.ndarray:
+        oblique = self.obliquity()
+        return oblique if self.gate_kind == "planar" else np.ones_like(oblique)
+
+
+def plan_scans(scan: Scan, y, z, travelled) -> list[ScanPlan]:
+    """The scans of one slab of air from a moving telescope.
+
+    Parameters
+    ----------
+    scan : Scan
+    y, z : arrays
+        Nodes of the wake's grid (used with ``aim: grid``), m, ascending.
+    travelled : sequence of float
+        How far the telescope has come along x at each scan, m; the gates stay with the air, so
+        they come nearer by as much.
+
+    Raises
+    ------
+    ValueError
+        The telescope would reach the slab.
+    """
+    plans = []
+    for index, position in enumerate(travelled):
+        start = scan.range - position
+        if start <= 0:
+            raise ValueError(
+                f"scan.range: {scan.range:g} m is not allowed; expected more than the "
+                f"{position:g} m flown until the last scan"
+            )
+        stop = start + scan.thickness
+        nodes_y, nodes_z = np.asarray(y, float), np.asarray(z, float)
+        if scan.aim == "angles":
+            middle = (start + stop) / 2
+            half = min(index, 1)
+            nodes_y = middle * np.tan(_angles(scan.azimuth_half[half], scan.columns))
+            nodes_z = middle * np.tan(_angles(scan.elevation_half[half], scan.rows))
+        plans.append(
+            ScanPlan(nodes_y, nodes_z, start, stop, scan.gates, scan.gate_count, float(position))
+        )
+    return plans
+
+
+def _angles(half: float, count: int) -> np.ndarray:
+    return np.linspace(-half, half, count) if count > 1 else np.zeros(1)

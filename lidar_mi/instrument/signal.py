@@ -1,0 +1,26 @@
+"""From received energy to what the atmosphere scattered back."""
+
+import numpy as np
+
+from .scan import ScanPlan
+
+
+def apparent_backscatter(s0, plan: ScanPlan, aperture_area: float, environment: float):
+    """Apparent backscatter coefficient, m^-1 sr^-1: S0 r^2 / (A dr T^2).
+
+    The single-scattering lidar equation solved for the backscatter coefficient, with the
+    environment's two-way transmittance to the middle of the gate. A homogeneous slab gives a flat
+    image. Attenuation by the slab itself is left in (0.5 % for 2.5 m at 1 / km).
+
+    Parameters
+    ----------
+    s0 : (gates, rows, columns) array
+        Received energy over emitted pulse energy.
+    aperture_area : float
+        m^2.
+    environment : float
+        Extinction coefficient on the way, m^-1.
+    """
+    r = plan.ranges()
+    transmittance = np.exp(-2 * environment * r)
+    return s0 * r**2 / (aperture_area * plan.gate_length() * transmittance)

@@ -1,0 +1,233 @@
+"""The backscatter lidar's picture: an extinction field and a scan become a Mitsuba scene."""
+
+from collections.abc import Callable, Sequence
+
+import mitsuba as mi
+import numpy as np
+import xarray as xr
+
+from .. import __version__
+from ..instrument.lidar import BackscatterLidar
+from ..instrument.scan import ScanPlan
+from ..instrument.signal import apparent_backscatter
+from .exr import QUANTITIES, label_scan
+from .settings import RenderSettings
+
+
+def extrude(plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar) -> xr.DataArray:
+    """A plane of air (z, y) made as deep as every beam of the scan needs it, (x, y, z).
+
+    Beams are wide and oblique: at the slab's faces and rims some of their light crosses outside
+    the gate's planes and the outermost nodes. The plane is extended by that much (the outermost
+    values repeated), so that the whole gate is filled with it.
+    """
+    reach = lidar.beam_cut if np.isfinite(lidar.beam_cut) else 3 * lidar.beam_radius
+    # the Gaussian divergence exceeds 2.2 times its 1/e^2 angle once in 16 000 photons
+    reach += 2.2 * lidar.divergence_full / 2 * plan.gate_stop
+    slope = np.hypot(np.abs(plan.y).max(), np.abs(plan.z).max()) / plan.centre
+    # spherical gates bulge: their rim lies nearer by the beam's obliquity
+    bulge = (plan.obliquity().max() - 1) * plan.gate_stop if plan.gate_kind == "spherical" else 0
+    margin = reach * slope + bulge
+    pad = {axis: int(np.ceil(reach / _spacing(plane, axis))) for axis in ("y", "z")}
+    padded = plane.pad({axis: (n, n) for axis, n in pad.items()}, mode="edge")
+    for axis, n in pad.items():
+        start = float(plane[axis][0]) - n * _spacing(plane, axis)
+        padded[axis] = start + _spacing(plane, axis) * np.arange(padded.sizes[axis])
+    thickness = plan.gate_stop - plan.gate_start + 2 * margin
+    solid = padded.expand_dims(x=[plan.centre + plan.position]).transpose("x", "y", "z")
+    solid["x"].attrs["cell_width"] = thickness
+    return solid
+
+
+def render_scans(
+    extinctions: Sequence[xr.DataArray],
+    plans: Sequence[ScanPlan],
+    lidar: BackscatterLidar,
+    environment: float,
+    phase: dict,
+    albedo: float,
+    settings: RenderSettings,
+    seed: int,
+    progress: Callable[[int, int, int], None] | None = None,
+) -> list[xr.Dataset]:
+    """Render one scan after the other in one scene; only the first compiles anything.
+
+    Parameters
+    ----------
+    extinctions : sequence of (x, y, z) arrays
+        Extinction coefficient (m^-1) at cell centres, x from the telescope's place at the first
+        scan, all on one grid; a single x plane says its depth in ``x.attrs["cell_width"]``.
+    environment : float
+        Extinction coefficient around the slab and on the way, m^-1.
+    phase : dict
+        Mitsuba phase function of slab and environment.
+    albedo : float
+        Single-scattering albedo of slab and environment.
+    seed : int
+        Scan k uses seed + k * 2^16, far apart for neighbouring experiments.
+    progress : callable, optional
+        Called with (scan, photons done, photons in all).
+
+    Returns
+    -------
+    list of xr.Dataset
+        S0 ... S3, S0_stderr (gate, z, y), Y (z, y); y and z ascending.
+    """
+    scene = mi.load_dict(
+        scene_dict(extinctions[0], plans[0], lidar, environment, phase, albedo, settings)
+    )
+    parameters = mi.traverse(scene)
+    scans = []
+    for index, (extinction, plan) in enumerate(zip(extinctions, plans, strict=True)):
+        if index:
+            _move(parameters, extinction, plan)
+        if progress:
+            scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
+        image = mi.render(scene, seed=(seed + (index << 16)) % 2**32)
+        scans.append(_as_dataset(np.array(image), plan, lidar, environment, settings, seed))
+    return scans
+
+
+def scene_dict(
+    extinction: xr.DataArray,
+    plan: ScanPlan,
+    lidar: BackscatterLidar,
+    environment: float,
+    phase: dict,
+    albedo: float,
+    settings: RenderSettings,
+) -> dict:
+    """The Mitsuba scene of one scan as a dictionary for ``mi.load_dict``."""
+    low, high = _box(extinction)
+    place = mi.ScalarTransform4f().translate(low).scale(high - low)
+    medium = {"albedo": albedo, "phase": phase}
+    return {
+        "type": "scene",
+        "integrator": {
+            "type": "gated_volpath",
+            "max_order": settings.max_order,
+            "estimator": settings.estimator,
+            "samples_per_pass": settings.samples_per_pass,
+        },
+        "environment": {"type": "homogeneous", "sigma_t": environment, **medium},
+        "sensor": {
+            "type": "scanning_lidar",
+            "aperture_radius": lidar.aperture_radius,
+            "fov_half_mrad": lidar.fov_half * 1e3,
+            "gate_kind": plan.gate_kind,
+            "gate_start": plan.gate_start,
+            "gate_stop": plan.gate_stop,
+            "gate_count": plan.gate_count,
+            "directions": mi.TensorXf(plan.directions()),
+            "to_world": mi.ScalarTransform4f().translate([plan.position, 0, 0]),
+            "laser": {
+                "type": "laser",
+                "beam_radius": lidar.beam_radius,
+                "beam_cut": lidar.beam_cut,
+                "divergence_full_mrad": lidar.divergence_full * 1e3,
+                "stokes": ", ".join(map(repr, lidar.stokes)),
+                "wavelength": lidar.wavelength,
+                "pulse_energy": lidar.pulse_energy,
+                "pulse_duration": lidar.pulse_duration,
+            },
+            "film": {
+                "type": "hdrfilm",
+                "width": len(plan.y),
+                "height": len(plan.z),
+                "pixel_format": "luminance",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "independent", "sample_count": settings.samples_per_beam},
+            "medium": {"type": "ref", "id": "environment"},
+        },
+        "slab": {
+            "type": "cube",
+            "to_world": place @ mi.ScalarTransform4f().translate(0.5).scale(0.5),
+            "bsdf": {"type": "null"},
+            "interior": {
+                "type": "heterogeneous",
+                "sigma_t": {
+                    "type": "gridvolume",
+                    "grid": mi.VolumeGrid(_voxels(extinction)),
+                    "to_world": place,
+                    "accel": False,
+                },
+                **medium,
+            },
+            "exterior": {"type": "ref", "id": "environment"},
+        },
+    }
+
+
+def _move(parameters, extinction: xr.DataArray, plan: ScanPlan) -> None:
+    """Put the telescope, its beams and the air in the slab where they are at a later scan."""
+    parameters["sensor.to_world"] = mi.Transform4f().translate([plan.position, 0, 0])
+    parameters["sensor.directions"] = mi.Float(plan.directions().ravel())
+    parameters["sensor.gate_start"] = plan.gate_start
+    parameters["sensor.gate_stop"] = plan.gate_stop
+    parameters["slab.interior_medium.sigma_t.data"] = mi.TensorXf(_voxels(extinction))
+    parameters.update()
+
+
+def _voxels(extinction: xr.DataArray) -> np.ndarray:
+    """Values in the order of a Mitsuba volume grid: z, y, x, channel."""
+    return extinction.transpose("z", "y", "x").values[..., None].astype(np.float32)
+
+
+def _spacing(field: xr.DataArray, axis: str) -> float:
+    return float(field[axis][1] - field[axis][0])
+
+
+def _box(extinction: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of the grid; values sit at cell centres, so it ends half a cell beyond them."""
+    low, high = [], []
+    for axis in ("x", "y", "z"):
+        nodes = extinction[axis]
+        half = (nodes.attrs["cell_width"] if len(nodes) == 1 else _spacing(extinction, axis)) / 2
+        low.append(float(nodes[0]) - half)
+        high.append(float(nodes[-1]) + half)
+    return np.array(low), np.array(high)
+
+
+def _as_dataset(image, plan, lidar, environment, settings, seed) -> xr.Dataset:
+    """The rendered tensor (rows from the top, y falling) as a labelled dataset."""
+    rows, columns, _ = image.shape
+    values = image.reshape(rows, columns, plan.gate_count, len(QUANTITIES))[::-1, ::-1]
+    variables = {
+        name: (("gate", "z", "y"), values[..., k].transpose(2, 0, 1))
+        for k, name in enumerate(QUANTITIES)
+    }
+    y = apparent_backscatter(variables["S0"][1], plan, lidar.aperture_area, environment)
+    variables["Y"] = (("z", "y"), y[0].astype(np.float32))
+    attributes = {
+        "software": f"lidar-mi {__version__}",
+        "units": "Stokes: received over emitted energy; Y: m-1 sr-1; lengths: m; angles: rad",
+        "variant": settings.variant,
+        "polarized": int(mi.is_polarized),
+        "seed": int(seed),
+        "samples_per_beam": settings.samples_per_beam,
+        "max_order": settings.max_order,
+        "estimator": settings.estimator,
+        "gate_kind": plan.gate_kind,
+        "gate_count": plan.gate_count,
+        "gate_start": float(plan.gate_start),
+        "gate_stop": float(plan.gate_stop),
+        "telescope_position": float(plan.position),
+        "environment_extinction": float(environment),
+        "wavelength": lidar.wavelength,
+        "beam_radius": lidar.beam_radius,
+        "beam_cut": lidar.beam_cut,
+        "divergence_full": lidar.divergence_full,
+        "pulse_energy": lidar.pulse_energy,
+        "pulse_duration": lidar.pulse_duration,
+        "stokes_emitted": list(lidar.stokes),
+        "aperture_radius": lidar.aperture_radius,
+        "fov_half": lidar.fov_half,
+    }
+    return label_scan(
+        xr.Dataset(
+            variables,
+            coords={"gate": np.arange(plan.gate_count), "y": plan.y, "z": plan.z},
+            attrs=attributes,
+        )
+    )

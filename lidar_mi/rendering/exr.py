@@ -1,0 +1,133 @@
+"""Scans as OpenEXR files: one file a scan, one layer a gate and Stokes component.
+
+A file shows what the pilot sees: top row = largest z, left column = largest y. Layers are
+``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate, and ``Y``, the apparent
+backscatter of the first gate, so that any viewer shows something at once. Everything else
+(beam positions, gates, instrument, units, seed, version) is in typed header attributes.
+"""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import xarray as xr
+
+from ..errors import InputError
+
+QUANTITIES = ("S0", "S1", "S2", "S3", "S0_stderr")
+_LAYER = re.compile(r"gate(\d+)\.(\w+)$")
+# header entries that describe the file, not the scan
+_STRUCTURE = {
+    "channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio",
+    "screenWindowCenter", "screenWindowWidth", "type", "tiles", "name", "version", "chunkCount",
+}  # fmt: skip
+
+
+def write_scan(path: str | Path, scan: xr.Dataset) -> None:
+    """Write a scan: S0 ... S3, S0_stderr with dims (gate, z, y), and Y with dims (z, y).
+
+    The file is written under a temporary name and renamed, so that no broken file is left. Values
+    are float32. Attributes of the dataset become header attributes: float, int, text, and lists of
+    floats keep their type.
+    """
+    path = Path(path)
+    pilot = scan.transpose("gate", "z", "y").sortby(["z", "y"], ascending=False)
+    channels = {"Y": pilot["Y"].values}
+    for gate in range(pilot.sizes["gate"]):
+        for quantity in QUANTITIES:
+            channels[f"gate{gate:03d}.{quantity}"] = pilot[quantity].values[gate]
+    header = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "y": scan["y"].values.astype(np.float32),
+        "z": scan["z"].values.astype(np.float32),
+    }
+    for key, value in scan.attrs.items():
+        header[key] = value.astype(np.float32) if isinstance(value, np.ndarray) else value
+    channels = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in channels.items()}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        OpenEXR.File(header, channels).write(str(temporary))
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
+    """Header attributes and all layers of any EXR file, rows from the top.
+
+    Raises
+    ------
+    InputError
+        There is no such file, or it is no readable EXR.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected an OpenEXR image")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            header = {k: v for k, v in file.header().items() if k not in _STRUCTURE}
+            layers = {k: np.array(c.pixels) for k, c in file.channels().items()}
+    except RuntimeError:
+        raise InputError(f"{path}: not a readable OpenEXR image") from None
+    return header, layers
+
+
+def read_scan(path: str | Path) -> xr.Dataset:
+    """Read a scan written by `write_scan`, y and z ascending; the round trip is exact in float32.
+
+    Raises
+    ------
+    InputError
+        Not an EXR file, or one without our layers or axes.
+    """
+    header, layers = read_layers(path)
+    gates: dict[int, dict[str, np.ndarray]] = {}
+    for name, pixels in layers.items():
+        if match := _LAYER.match(name):
+            gates.setdefault(int(match[1]), {})[match[2]] = pixels
+    complete = gates and all(set(QUANTITIES) <= set(layer) for layer in gates.values())
+    if not complete or "Y" not in layers or not {"y", "z"} <= set(header):
+        raise InputError(
+            f"{path}: layers {', '.join(sorted(layers)) or 'none'} are not a lidar scan; expected "
+            "Y and gate000.S0 ... gate000.S3, gate000.S0_stderr, with header attributes y and z"
+        )
+    y, z = (np.asarray(header.pop(axis), float) for axis in ("y", "z"))
+    rows, columns = layers["Y"].shape
+    if (len(z), len(y)) != (rows, columns):
+        raise InputError(
+            f"{path}: header axes of {len(y)} x {len(z)} values do not fit the image of "
+            f"{columns} x {rows} pixels"
+        )
+    variables = {
+        quantity: (
+            ("gate", "z", "y"),
+            np.stack([gates[g][quantity][::-1, ::-1] for g in sorted(gates)]),
+        )
+        for quantity in QUANTITIES
+    }
+    variables["Y"] = (("z", "y"), layers["Y"][::-1, ::-1])
+    return label_scan(
+        xr.Dataset(variables, coords={"gate": sorted(gates), "y": y, "z": z}, attrs=header)
+    )
+
+
+def label_scan(scan: xr.Dataset) -> xr.Dataset:
+    """The same scan with CF names and units on its variables."""
+    meaning = {
+        "S0": "received energy over emitted pulse energy",
+        "S1": "Stokes Q about the horizontal axis, over emitted pulse energy",
+        "S2": "Stokes U about the horizontal axis, over emitted pulse energy",
+        "S3": "Stokes V, over emitted pulse energy",
+        "S0_stderr": "Monte Carlo standard error of S0",
+    }
+    for name, text in meaning.items():
+        scan[name].attrs = {"long_name": text, "units": "1"}
+    scan["Y"].attrs = {"long_name": "apparent backscatter of the first gate", "units": "m-1 sr-1"}
+    scan["y"].attrs = {"long_name": "distance to port", "units": "m", "axis": "Y"}
+    scan["z"].attrs = {
+        "long_name": "height above the beam axis", "units": "m", "axis": "Z", "positive": "up",
+    }  # fmt: skip
+    return scan
