@@ -1,0 +1,461 @@
+"""One experiment, start to end: truth, sensor, picture, estimate, verdict.
+
+A run lives in one folder. Pictures are kept as soon as they are there; a run that was stopped
+goes on with those, and everything after them is made again.
+"""
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+import yaml
+from scipy import ndimage
+
+from . import __version__, config
+from .assessment import figures, report
+from .assessment.cores import Core, find_cores
+from .assessment.errors import truth_at_vectors, wind_metrics
+from .atmosphere.advection import advect
+from .atmosphere.extinction import extinction_from_speed, extinction_from_tracer
+from .atmosphere.texture import corrsin_obukhov
+from .atmosphere.vortex import pair_wake, vortex_pair
+from .atmosphere.wake import centre, read_wake, resample
+from .config import Experiment
+from .errors import InputError
+from .instrument.scan import ScanPlan, plan_scans
+from .rendering import exr
+from .rendering.phase import phase_function
+from .rendering.variant import use_variant
+from .retrieval.images import resample_pair
+from .retrieval.wind import retrieve_wind
+
+IMAGES = ("image_t1.exr", "image_t2.exr")
+# what winds are retrieved from; see `winds`
+SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
+
+Notice = Callable[[str, float | None], None]
+"""Called with what is running and how far it is (0 to 1, None: unknown)."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the lidar looks at, in the lidar's frame at t1 (metres, m^-1, m s^-1).
+
+    ``extinction`` and ``smooth`` (without sub-grid texture) hold the fields at t1 and t2, dims
+    (x, y, z); ``wind`` has v, w on (z, y), averaged over the gates' depth.
+    """
+
+    extinction: tuple[xr.DataArray, xr.DataArray]
+    smooth: tuple[xr.DataArray, xr.DataArray]
+    wind: xr.Dataset
+
+    def image(self, which: int, smooth: bool = False) -> xr.DataArray:
+        """Extinction averaged over depth as an image (z, y): what an ideal lidar would see."""
+        field = (self.smooth if smooth else self.extinction)[which]
+        return _slab_mean(field, self.wind.attrs["gates"])
+
+
+def run(
+    experiment: Experiment,
+    folder: str | Path,
+    beside: str | Path = ".",
+    overwrite: bool = False,
+    notice: Notice = lambda text, share: None,
+) -> dict[str, float]:
+    """Run an experiment into a folder and return its metrics.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    folder : path
+        Made if missing. If it holds a run of the same experiment, its pictures are used again.
+    beside : path
+        Folder in which files named by the experiment are looked for first.
+    overwrite : bool
+        Replace a run of a different experiment instead of refusing.
+    notice : callable
+        Told what is running.
+
+    Raises
+    ------
+    InputError
+        Bad input, or the folder holds another experiment.
+    """
+    folder = Path(folder)
+    timing = {}
+    use_variant(experiment.render.variant)
+    with _timed(timing, "truth"):
+        notice("reading the wake", None)
+        truth = make_truth(experiment, beside)
+        plans = _plans(experiment, truth)
+    _claim(folder, experiment, overwrite)
+    log = _Log(folder / "log.txt", notice)
+    log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")
+    with _timed(timing, "render"):
+        scans = pictures(experiment, truth, plans, folder, beside, log)
+    with _timed(timing, "retrieve"):
+        log("retrieving winds")
+        cores = find_cores(truth.wind)
+        found = winds(experiment, truth, plans, scans, log)
+        _write(folder / "wind.nc", lambda path: found.to_netcdf(path, engine="h5netcdf"))
+    metrics = verdict(found, scans, cores)
+    with _timed(timing, "figures"):
+        log("drawing figures")
+        drawn = figures.draw_all(folder / "figures", truth, scans, found, cores, log)
+    metrics |= {f"timing.{k}_s": round(v, 3) for k, v in timing.items()}
+    _write(
+        folder / "metrics.json",
+        lambda path: path.write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n"),
+    )
+    page = report.page(experiment, config.dump(experiment), metrics, cores, drawn)
+    _write(folder / "report.html", lambda path: path.write_text(page))
+    log("done")
+    return metrics
+
+
+def make_truth(experiment: Experiment, beside: str | Path = ".") -> Truth:
+    """The flow and the extinction at both times, on the scan's grid, in the lidar's frame."""
+    first, second = _flows(experiment, beside)
+    mapping, dt = experiment.wake.extinction, experiment.platform.dt
+    smooth1 = _extinction(first, mapping, first, second)
+    if second is None:
+        flow = first
+        smooth2 = advect(smooth1, flow["v"], flow["w"], dt)
+    else:
+        flow = (first + second) / 2
+        smooth2 = _extinction(second, mapping, first, second)
+    texture = experiment.wake.texture
+    if texture.rms > 0:
+        x = first["x"].values if first.sizes["x"] > 1 else None
+        factor = corrsin_obukhov(
+            first["y"].values, first["z"].values, texture.rms, texture.outer_scale,
+            experiment.seed, x=x,
+        )  # fmt: skip
+        if x is None:
+            factor = factor.expand_dims(x=first["x"].values)
+        factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
+        if second is None:
+            rough1 = smooth1 * factor
+            rough2 = advect(rough1, flow["v"], flow["w"], dt)
+        else:
+            rough1 = smooth1 * factor
+            rough2 = smooth2 * advect(factor, flow["v"], flow["w"], dt)
+    else:
+        rough1, rough2 = smooth1, smooth2
+    gates = (experiment.scan.range, experiment.scan.range + experiment.scan.thickness)
+    wind = xr.Dataset({name: _slab_mean(flow[name], gates) for name in ("v", "w")})
+    wind.attrs["gates"] = gates
+    return Truth((rough1, rough2), (smooth1, smooth2), wind)
+
+
+def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dataset]:
+    """The two scans, from the folder if they are there, else rendered and written to it."""
+    from .rendering.backscatter import extrude, render_scans
+
+    paths = [folder / name for name in IMAGES]
+    if all(path.is_file() for path in paths):
+        log("using the pictures of the last run")
+        return [exr.read_scan(path) for path in paths]
+    fields = truth.extinction
+    if fields[0].sizes["x"] == 1:
+        reach = max(plans, key=lambda plan: plan.gate_stop)
+        fields = [
+            extrude(field.isel(x=0).transpose("z", "y"), reach, experiment.lidar)
+            for field in fields
+        ]
+
+    def progress(scan: int, done: int, total: int) -> None:
+        log.bar(f"rendering scan {scan + 1} of {len(plans)}", done / total)
+
+    log(f"rendering {len(plans)} scans of {len(plans[0].y)} x {len(plans[0].z)} beams")
+    scans = render_scans(
+        fields,
+        plans,
+        experiment.lidar,
+        experiment.wake.extinction.background,
+        phase_function(experiment.scattering, beside),
+        experiment.scattering.albedo,
+        experiment.render,
+        experiment.seed,
+        progress,
+    )
+    for path, scan in zip(paths, scans):
+        exr.write_scan(path, scan)
+    return scans
+
+
+def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset:
+    """Winds by every method from every image pair, with the truth at their places.
+
+    Returns a data set with dims (source, method, z, y). Sources: the extinction itself, the same
+    without sub-grid texture, the extinction blurred by the beam's width (what a noise-free lidar
+    would see), and the rendered backscatter.
+    """
+    settings, lidar = experiment.retrieval, experiment.lidar
+    images = {
+        "extinction": [truth.image(k) for k in (0, 1)],
+        "extinction_without_texture": [truth.image(k, smooth=True) for k in (0, 1)],
+        "extinction_blurred": [
+            blur_by_beam(truth.image(k), lidar, plans[k].centre) for k in (0, 1)
+        ],
+        "backscatter": [scan["Y"] for scan in scans],
+    }
+    noise = {"backscatter": apparent_noise(scans[0])}
+    if experiment.scan.aim == "angles":
+        # the noise has no structure to interpolate: its level goes along
+        noise["backscatter"] = float(noise["backscatter"].median())
+        grid = resample_pair(*images["backscatter"], experiment.wake.spacing)
+        images["backscatter"] = grid
+        images = {
+            name: [image.interp(y=grid[0]["y"], z=grid[0]["z"]) for image in pair]
+            if name != "backscatter" else pair
+            for name, pair in images.items()
+        }  # fmt: skip
+    sources = []
+    for source in SOURCES:
+        log.bar(f"retrieving winds from {source.replace('_', ' ')}", SOURCES.index(source) / 4)
+        methods = []
+        for method in settings.methods:
+            wind = retrieve_wind(
+                *images[source],
+                dt=experiment.platform.dt,
+                method=method,
+                template=settings.template,
+                search=settings.search,
+                stride=settings.stride,
+                min_correlation=settings.min_correlation,
+                min_texture=settings.min_texture,
+                min_isotropy=settings.min_isotropy,
+                noise=noise.get(source, 0.0),
+            )
+            true = truth_at_vectors(wind, truth.wind)
+            wind = wind.assign(v_true=true["v"], w_true=true["w"])
+            wind = wind.rename({"correlation" if method == "cc" else "mismatch": "score"})
+            methods.append(wind.reset_coords(["y_vector", "z_vector"]))
+        sources.append(xr.concat(methods, "method", combine_attrs="drop_conflicts"))
+    found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
+    found = found.assign_coords(source=list(SOURCES), method=list(settings.methods))
+    found["score"].attrs = {
+        "long_name": "cc: correlation at the peak; ws: misfit of weight and centre of mass",
+        "units": "1",
+    }
+    found.attrs["title"] = f"Cross-flow wind of the experiment {experiment.name}"
+    found.attrs["source"] = f"lidar-mi {__version__}"
+    return found
+
+
+def apparent_noise(scan: xr.Dataset) -> xr.DataArray:
+    """Standard error of the apparent backscatter Y, same unit."""
+    first = scan.isel(gate=0)
+    lit = first["S0"] > 0
+    return (scan["Y"] * first["S0_stderr"] / first["S0"].where(lit)).fillna(0.0)
+
+
+def blur_by_beam(image: xr.DataArray, lidar, distance: float) -> xr.DataArray:
+    """An image seen by beams of finite width: Gaussian of the beam's variance at a distance.
+
+    The variance per axis is that of the truncated Gaussian aperture plus the Gaussian divergence;
+    taking their sum as Gaussian is exact to a fraction of the aperture's share, 2 % here.
+    """
+    w, cut = lidar.beam_radius, lidar.beam_cut
+    edge = 2 * (cut / w) ** 2
+    lost = edge / np.expm1(edge) if edge < 500 else 0.0
+    aperture = w**2 / 4 * (1 - lost)
+    sigma = np.sqrt(aperture + (lidar.divergence_full / 2 * distance) ** 2 / 4)
+    step = [float(image[axis][1] - image[axis][0]) for axis in image.dims]
+    values = ndimage.gaussian_filter(image.values, [sigma / s for s in step], mode="nearest")
+    return image.copy(data=values)
+
+
+def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
+    """All metrics of a run: ``source.method.quantity``."""
+    metrics = {}
+    for source in found["source"].values:
+        for method in found["method"].values:
+            wind = found.sel(source=source, method=method)
+            true = wind[["v_true", "w_true"]].rename(v_true="v", w_true="w")
+            for key, value in wind_metrics(wind, true, cores).items():
+                metrics[f"{source}.{method}.{key}"] = value
+    first = scans[0].isel(gate=0)
+    lit = first["S0"].where(first["S0"] > 0)
+    metrics["backscatter.mc_relative_error"] = float((first["S0_stderr"] / lit).median())
+    for core, side in zip(cores, ("first", "second")):
+        for key in ("y", "z", "radius", "circulation"):
+            metrics[f"wake.{side}_core.{key}"] = getattr(core, key)
+    return metrics
+
+
+def _flows(experiment: Experiment, beside) -> tuple[xr.Dataset, xr.Dataset | None]:
+    """The flow at t1 and, if it is a state of its own, at t2, centred and refined."""
+    wake = experiment.wake
+    gate_middle = experiment.scan.range + experiment.scan.thickness / 2
+    if wake.vortex_pair:
+        pair = wake.vortex_pair
+        axes = [
+            np.linspace(-extent / 2, extent / 2, _cells(extent, wake.spacing, name) + 1)
+            for name, extent in (("width", pair.width), ("height", pair.height))
+        ]
+        vortices = vortex_pair(
+            pair.circulation, pair.separation, pair.core_radius, model=pair.model
+        )
+        return pair_wake(vortices, *axes, x=gate_middle), None
+    mapping = wake.extinction
+    needed = [
+        name
+        for name, used in (("tracer", mapping.tracer), ("aerosol", mapping.aerosol))
+        if used and mapping.source == "tracer"
+    ]
+    path = find_file(wake.file, beside, "wake.file")
+    flows = []
+    for when in (wake.time, None if wake.second == "advect" else wake.second):
+        if flows and when is None:
+            return flows[0], None
+        plane = wake.x if wake.depth == "plane" else None
+        flow = read_wake(path, when, wake.names, plane, require=needed)
+        if wake.depth == "plane" and flow.sizes["x"] > 1:
+            places = flow["x"].values
+            raise InputError(
+                f"wake.x: missing; {path.name} has {len(places)} planes, expected one of "
+                f"{places[0]:g} to {places[-1]:g} m (or wake.depth: volume)"
+            )
+        y, z = wake.centre or (None, None)
+        flow = centre(resample(flow, wake.spacing), y, z).drop_vars("time", errors="ignore")
+        middle = wake.x if wake.x is not None else float(flow["x"].mean())
+        flows.append(flow.assign_coords(x=flow["x"] - middle + gate_middle))
+    return flows[0], flows[1]
+
+
+def _cells(extent: float, spacing: float, name: str) -> int:
+    cells = round(extent / spacing)
+    if cells < 1 or abs(cells * spacing - extent) > 1e-6 * extent:
+        raise InputError(
+            f"wake.vortex_pair.{name}: {extent:g} m is not allowed; expected a multiple of "
+            f"wake.spacing = {spacing:g} m"
+        )
+    return cells
+
+
+def _extinction(flow, mapping, first, second) -> xr.DataArray:
+    """Extinction of one state, scaled by the largest value of both."""
+    limits = {"background": mapping.background, "maximum": mapping.maximum}
+    states = [s for s in (first, second) if s is not None]
+    if mapping.source == "speed":
+        fastest = max(float(np.hypot(s["v"], s["w"]).max()) for s in states)
+        field = extinction_from_speed(flow, **limits, stretch=mapping.stretch, reference=fastest)
+    else:
+        tracer = mapping.tracer if mapping.tracer in flow else None
+        aerosol = mapping.aerosol if mapping.aerosol in flow else None
+        densest = max(float(s[tracer].max()) for s in states) if tracer else None
+        field = extinction_from_tracer(
+            flow, **limits, stretch=mapping.stretch, tracer=tracer, aerosol=aerosol,
+            reference=densest,
+        )  # fmt: skip
+    return field.transpose("x", "y", "z")
+
+
+def _slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
+    """Mean over the planes inside the gates, (z, y)."""
+    if field.sizes["x"] > 1:
+        field = field.sel(x=slice(*gates))
+        if not field.sizes["x"]:
+            raise InputError(
+                f"scan.thickness: no plane of the wake lies in the gates, "
+                f"{gates[0]:g} to {gates[1]:g} m; expected at least the planes' spacing"
+            )
+    image = field.mean("x").transpose("z", "y")
+    for axis in ("y", "z"):
+        image[axis].attrs["units"] = "m"
+    return image
+
+
+def _plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
+    flown = experiment.platform.speed * experiment.platform.dt
+    return plan_scans(
+        experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown)
+    )
+
+
+def find_file(name: str, beside: str | Path, field: str) -> Path:
+    """A file named by an experiment: as given, beside the experiment, or shipped."""
+    shipped = Path(str(files("lidar_mi.scenes")))
+    for candidate in (Path(beside) / name, shipped / name):
+        if candidate.is_file():
+            return candidate
+    raise InputError(
+        f"{field}: {name} not found; looked in {Path(beside).resolve()} and the shipped samples "
+        f"({', '.join(sorted(p.name for p in shipped.glob('*.nc')))})"
+    )
+
+
+def _claim(folder: Path, experiment: Experiment, overwrite: bool) -> None:
+    """Make the folder this experiment's, keeping pictures of the very same one."""
+    marker = folder / "experiment.yaml"
+    resolved = config.dump(experiment)
+    if marker.is_file():
+        before = yaml.safe_load(marker.read_text()) or {}
+        if before.get("experiment") != yaml.safe_load(resolved):
+            if not overwrite:
+                raise InputError(
+                    f"{folder}: holds a run of another experiment; expected an empty folder "
+                    "(-o DIR), or --overwrite to replace it"
+                )
+            for name in IMAGES:
+                (folder / name).unlink(missing_ok=True)
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: is no run folder; expected an empty or a new one (-o DIR)")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
+    libraries = ("mitsuba", "drjit", "numpy", "scipy", "torch", "kornia", "OpenEXR", "xarray")
+    record = {
+        "experiment": yaml.safe_load(resolved),
+        "versions": {
+            "lidar-mi": __version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in libraries},
+        },
+    }
+    _write(marker, lambda path: path.write_text(yaml.safe_dump(record, sort_keys=False)))
+
+
+def _write(path: Path, write: Callable[[Path], object]) -> None:
+    """Write under a temporary name, then rename: never half a file."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def _timed(timing: dict[str, float], name: str):
+    start = time.perf_counter()
+    yield
+    timing[name] = time.perf_counter() - start
+
+
+class _Log:
+    """Lines for the log file and the person in front of the screen."""
+
+    def __init__(self, path: Path, notice: Notice):
+        self.path, self.notice = path, notice
+
+    def __call__(self, text: str) -> None:
+        with self.path.open("a") as file:
+            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
+        self.notice(text, None)
+
+    def bar(self, text: str, share: float) -> None:
+        """Progress within a step: shown, not logged."""
+        self.notice(text, share)

@@ -1,0 +1,31 @@
+"""Setting Mitsuba's variant, with a clear word where it cannot be set."""
+
+import mitsuba as mi
+
+from ..errors import InputError
+from ..llvm import require_llvm
+from .settings import VARIANTS
+
+
+def use_variant(name: str) -> None:
+    """Set the Mitsuba variant ``name``.
+
+    Raises
+    ------
+    InputError
+        Not one of `VARIANTS`, no suitable LLVM, or no CUDA device.
+    """
+    if name not in VARIANTS:
+        raise InputError(f"variant: {name!r} is not allowed; expected one of {', '.join(VARIANTS)}")
+    if name.startswith("llvm"):
+        require_llvm()
+    try:
+        mi.set_variant(name)
+    except ImportError as error:
+        raise InputError(f"variant: {name} cannot run here ({_first_line(error)})") from None
+    # Mitsuba's hint that a monochrome film is monochrome is of no use to anyone here
+    mi.set_log_level(mi.LogLevel.Error)
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().splitlines()[0]
