@@ -37,8 +37,8 @@ def resample(image: xr.DataArray, y: np.ndarray, z: np.ndarray) -> xr.DataArray:
     """
     if image.ndim != 2:
         raise InputError(f"image: dims {tuple(image.dims)} are not two")
-    dim_z, axis_z = _axis(image, "z", 0)
-    dim_y, axis_y = _axis(image, "y", 1)
+    dim_z, axis_z = _axis(image, "z")
+    dim_y, axis_y = _axis(image, "y")
     if dim_z == dim_y:
         raise InputError(f"image: y and z both run along dim {dim_y!r}")
     values = image.transpose(dim_z, dim_y).values.astype(float)
@@ -82,8 +82,8 @@ def resample_pair(
     if not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"spacing: {spacing!r} m is not a number > 0")
     nodes = {}
-    for place, name in enumerate(("z", "y")):
-        axes = [_axis(image, name, place)[1] for image in (image1, image2)]
+    for name in ("z", "y"):
+        axes = [_axis(image, name)[1] for image in (image1, image2)]
         # a hair of tolerance: an edge that is a multiple but for rounding is still a node
         low = np.ceil(max(axis[0] for axis in axes) / spacing - 1e-6)
         high = np.floor(min(axis[-1] for axis in axes) / spacing + 1e-6)
@@ -97,7 +97,7 @@ def resample_pair(
     return first, second
 
 
-def _axis(image: xr.DataArray, name: str, place: int) -> tuple[str, np.ndarray]:
+def _axis(image: xr.DataArray, name: str) -> tuple[str, np.ndarray]:
     """The dim that coordinate `name` runs along, and its values there, ascending, in m."""
     if name not in image.coords:
         raise InputError(f"image.{name}: coordinate missing; give it in m")
@@ -105,14 +105,15 @@ def _axis(image: xr.DataArray, name: str, place: int) -> tuple[str, np.ndarray]:
     if coordinate.ndim == 1:
         dim, values = coordinate.dims[0], coordinate.values.astype(float)
     elif coordinate.ndim == 2:
-        dim = image.dims[place]
-        grid = coordinate.transpose(dim, ...).values.astype(float)
-        values = grid.mean(axis=1)
-        step = np.abs(np.diff(values)).mean()
-        if not np.ptp(grid, axis=1).max() <= 1e-3 * step:
+        grid = coordinate.values.astype(float)
+        spans = [np.ptp(grid, axis=axis).max() for axis in (0, 1)]
+        along = int(spans[1] > spans[0])
+        dim, other = coordinate.dims[along], coordinate.dims[1 - along]
+        values = grid.mean(axis=1 - along)
+        if not spans[1 - along] <= 1e-3 * spans[along] / max(len(values) - 1, 1):
             raise InputError(
                 f"image.{name}: varies along both dims; only separable grids can be resampled "
-                f"({name} constant along {image.dims[1 - place]!r} to 0.1 % of the spacing)"
+                f"({name} constant along {other!r} to 0.1 % of the spacing)"
             )
     else:
         raise InputError(f"image.{name}: {coordinate.ndim} dims; one or two are allowed")

@@ -9,7 +9,7 @@ import xarray as xr
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.correlation import cross_correlation
 from lidar_mi.retrieval.displacement import Displacement
-from lidar_mi.retrieval.quality import Flag, low_texture, median_outliers
+from lidar_mi.retrieval.quality import Flag, Texture, low_texture, median_outliers
 from lidar_mi.retrieval.weight_shift import weight_shift
 from lidar_mi.retrieval.windows import Windows
 
@@ -18,6 +18,12 @@ METHODS: Mapping[str, Callable[..., Displacement]] = {
     "ws": weight_shift,
 }
 """Methods by name: (image1, image2, template, search, stride, **options) -> Displacement."""
+
+SCORES = {
+    "cc": ("correlation", "normalised cross-correlation at the peak"),
+    "ws": ("mismatch", "misfit of weight and centre of mass over their spread"),
+}
+"""What a method's `Displacement.score` is: name in the data set, meaning."""
 
 _METRES = ("m", "metre", "metres", "meter", "meters")
 
@@ -33,7 +39,8 @@ def retrieve_wind(
     device: str | torch.device = "cpu",
     *,
     min_correlation: float = 0.5,
-    min_texture: float = 0.005,
+    min_texture: float = 0.01,
+    min_isotropy: float = 0.2,
     noise: float | xr.DataArray = 0.0,
     median_size: int = 3,
     median_threshold: float = 2.0,
@@ -58,9 +65,10 @@ def retrieve_wind(
         Where to compute.
     min_correlation : float
         Flag vectors with a lower peak ("cc" only).
-    min_texture : float
+    min_texture, min_isotropy : float
         Flag vectors whose template of image 1 has an rms slope, in its weakest direction and
-        relative to its mean, not above this; px^-1. See `quality.texture`.
+        relative to its mean, not above this (px^-1), or below this fraction of the slope in its
+        strongest direction. See `quality.texture`.
     noise : float or xr.DataArray
         Standard deviation of image 1's noise, in its unit; a template with less structure than
         noise is flagged as without texture.
@@ -73,7 +81,7 @@ def retrieve_wind(
     xr.Dataset, dims (z, y)
         At the template centres (an even template's lies between pixels): `v`, `w` (m s-1),
         `displacement_y`, `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1),
-        `flag` (bits of `quality.Flag`, 0 = good). The auxiliary coordinates `y_vector`,
+        `isotropy`, `flag` (bits of `quality.Flag`, 0 = good). The auxiliary coordinates `y_vector`,
         `z_vector` are where the vector belongs, at mid-time: the centre and half the
         displacement. Rejected vectors keep their value (or NaN if there is none); nothing is
         replaced.
@@ -86,8 +94,6 @@ def retrieve_wind(
     if method not in METHODS:
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
     dt = _positive("dt", dt)
-    if not min_texture >= 0:
-        raise InputError(f"min_texture: {min_texture!r} px^-1 is not >= 0")
     image1, image2 = _checked("image1", image1), _checked("image2", image2)
     _same_grid(image1, image2)
     windows = Windows(image1.shape, template, search, stride)
@@ -99,7 +105,7 @@ def retrieve_wind(
 
     options = {"min_correlation": min_correlation} if method == "cc" else {}
     found = METHODS[method](pixels1, pixels2, template, search, stride, **options)
-    texture, low = low_texture(pixels1, windows, min_texture, noise)
+    texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, noise)
     spacing = max(1, round(template / 2 / stride))
     outlier = median_outliers(
         found.dz, found.dy, median_size, spacing, median_threshold, median_epsilon
@@ -114,6 +120,7 @@ def retrieve_wind(
         "stride": stride,
         "dt": dt,
         "min_texture": min_texture,
+        "min_isotropy": min_isotropy,
         "median_size": median_size,
         "median_threshold": median_threshold,
         "median_epsilon": median_epsilon,
@@ -126,7 +133,7 @@ def _dataset(
     image: xr.DataArray,
     windows: Windows,
     found: Displacement,
-    texture: torch.Tensor,
+    texture: Texture,
     attributes: dict,
 ) -> xr.Dataset:
     centre, spacing = {}, {}
@@ -144,10 +151,7 @@ def _dataset(
         "y": centre["y"][None, :] + moved["y"] / 2,
     }
     dt = attributes["dt"]
-    score, score_name = {
-        "cc": ("correlation", "normalised cross-correlation at the peak"),
-        "ws": ("mismatch", "misfit of weight and centre of mass over their spread"),
-    }[attributes["method"]]
+    score, score_name = SCORES[attributes["method"]]
 
     def field(values: np.ndarray | torch.Tensor, long_name: str, units: str, **more: str):
         values = values.cpu().numpy() if isinstance(values, torch.Tensor) else values
@@ -163,7 +167,10 @@ def _dataset(
             "displacement_y": field(moved["y"], "displacement along y", "m"),
             "displacement_z": field(moved["z"], "displacement along z", "m"),
             score: field(found.score, score_name, "1"),
-            "texture": field(texture, "smallest rms slope relative to the mean, per pixel", "1"),
+            "texture": field(
+                texture.slope, "weakest rms slope relative to the mean, per pixel", "1"
+            ),
+            "isotropy": field(texture.isotropy, "weakest over strongest rms slope", "1"),
             "flag": (
                 ("z", "y"),
                 found.flag.cpu().numpy(),
