@@ -68,8 +68,8 @@ def texture(image: torch.Tensor, windows: Windows) -> Texture:
       against the noise, and is given as contrast relative to the local mean, per pixel.
     - Where the air in a window is also deformed, the strong direction spoils the weak one even
       without noise; the error then follows the ratio of the eigenvalues, not their size. (CC 8
-      in 16 on a simulated wake, no noise: 0.8 m/s where the isotropy is above 0.6, 4 m/s below
-      0.13.) So the ratio of the slopes counts too.
+      in 16 on a simulated wake with 5 % of texture, no noise, rms of the vector's error: 0.9 m/s
+      where the isotropy is above 0.5, 4 m/s below 0.13.) So the ratio of the slopes counts too.
 
     Parameters
     ----------
