@@ -106,7 +106,7 @@ def run(
         log("retrieving winds")
         cores = find_cores(truth.wind)
         found = winds(experiment, truth, plans, scans, log)
-        _write(folder / "wind.nc", lambda path: found.to_netcdf(path, engine="h5netcdf"))
+        write_netcdf(found, folder / "wind.nc")
     metrics = verdict(found, scans, cores)
     with _timed(timing, "figures"):
         log("drawing figures")
@@ -196,7 +196,7 @@ def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dat
 def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset:
     """Winds by every method from every image pair, with the truth at their places.
 
-    Returns a data set with dims (source, method, z, y). Sources: the extinction itself, the same
+    Returns a data set with dims (source, algorithm, z, y). Sources: the extinction itself, the same
     without sub-grid texture, the extinction blurred by the beam's width (what a noise-free lidar
     would see), and the rendered backscatter.
     """
@@ -241,9 +241,9 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
             wind = wind.assign(v_true=true["v"], w_true=true["w"])
             wind = wind.rename({"correlation" if method == "cc" else "mismatch": "score"})
             methods.append(wind.reset_coords(["y_vector", "z_vector"]))
-        sources.append(xr.concat(methods, "method", combine_attrs="drop_conflicts"))
+        sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
     found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
-    found = found.assign_coords(source=list(SOURCES), method=list(settings.methods))
+    found = found.assign_coords(source=list(SOURCES), algorithm=list(settings.methods))
     found["score"].attrs = {
         "long_name": "cc: correlation at the peak; ws: misfit of weight and centre of mass",
         "units": "1",
@@ -280,8 +280,8 @@ def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
     """All metrics of a run: ``source.method.quantity``."""
     metrics = {}
     for source in found["source"].values:
-        for method in found["method"].values:
-            wind = found.sel(source=source, method=method)
+        for method in found["algorithm"].values:
+            wind = found.sel(source=source, algorithm=method)
             true = wind[["v_true", "w_true"]].rename(v_true="v", w_true="w")
             for key, value in wind_metrics(wind, true, cores).items():
                 metrics[f"{source}.{method}.{key}"] = value
@@ -426,6 +426,15 @@ def _claim(folder: Path, experiment: Experiment, overwrite: bool) -> None:
         },
     }
     _write(marker, lambda path: path.write_text(yaml.safe_dump(record, sort_keys=False)))
+
+
+def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
+    """Write a data set as NetCDF-4 under a temporary name, then rename."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
+    packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
+    _write(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=packed))
 
 
 def _write(path: Path, write: Callable[[Path], object]) -> None:

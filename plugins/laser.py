@@ -41,7 +41,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from .parameters import at_least, fail, positive
+from .parameters import at_least, fail, pose, positive
 from .polarization import rotate_stokes, transverse
 
 NAME, KIND = "laser", "emitter"
@@ -58,7 +58,8 @@ def define():
             self.pulse_energy = positive(props, NAME, "pulse_energy", 1.0)
             self.pulse_duration = at_least(props, NAME, "pulse_duration", 0.0, 0.0)
             self.stokes = _stokes(props.get("stokes", "1, 1, 0, 0"))
-            self.m_to_world = props.get("to_world", mi.ScalarTransform4f())
+            self.m_pose = pose(props)
+            dr.make_opaque(self.m_pose)
             self.m_radius = dr.opaque(mi.Float, radius)
             # share of an uncut beam inside the aperture; radii are drawn from that share
             self.m_inside = dr.opaque(mi.Float, -math.expm1(-2 * (cut / radius) ** 2))
@@ -79,7 +80,7 @@ def define():
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             """A photon of the beam; the weight's first column is its Stokes vector, in joules."""
             origin, local = self.sample_local(sample2, sample3)
-            to_world = mi.Transform4f(self.m_to_world)
+            to_world = self.m_pose
             direction = dr.normalize(to_world @ local)
             axis = transverse(to_world @ mi.Vector3f(1, 0, 0), direction)
             ray = mi.Ray3f(to_world @ origin, direction, time, self.wavelengths())
@@ -104,7 +105,7 @@ def define():
             return mi.Spectrum(0)
 
         def bbox(self):
-            return mi.ScalarBoundingBox3f(self.m_to_world @ mi.ScalarPoint3f(0))
+            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
 
         def to_string(self):
             return (

@@ -2,6 +2,9 @@
 
 import math
 
+import mitsuba as mi
+import numpy as np
+
 
 def fail(plugin: str, field: str, value, allowed: str):
     """Raise ValueError: ``plugin.field: value is not allowed; expected ...``."""
@@ -38,3 +41,10 @@ def choice(props, plugin: str, field: str, default: str, allowed: tuple[str, ...
     if value not in allowed:
         fail(plugin, field, value, "one of " + ", ".join(allowed))
     return value
+
+
+def pose(props, field: str = "to_world"):
+    """The transform parameter ``field`` in the variant's precision; Mitsuba reads doubles."""
+    if not props.has_property(field):
+        return mi.Transform4f()
+    return mi.Transform4f(np.array(props[field].matrix, dtype=np.float32))

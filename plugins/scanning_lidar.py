@@ -45,7 +45,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .parameters import choice, fail, positive, whole
+from .parameters import choice, fail, pose, positive, whole
 from .polarization import horizontal_axis
 
 NAME, KIND = "scanning_lidar", "sensor"
@@ -79,7 +79,7 @@ def define():
                     _angles(props, "azimuth", width), _angles(props, "elevation", height)
                 )
             self.m_directions = mi.Float(directions.ravel())
-            self.m_pose = mi.Transform4f(props.get("to_world", mi.ScalarTransform4f()))
+            self.m_pose = pose(props)
             dr.make_opaque(self.m_pose)
             self._check()
 

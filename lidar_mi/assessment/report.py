@@ -1,0 +1,69 @@
+"""The report of a run: one HTML file that needs nothing else."""
+
+import base64
+from collections.abc import Sequence
+from importlib.resources import files
+
+import jinja2
+
+from .. import __version__
+from .cores import Core
+from .figures import METHOD_NAMES, Drawn
+
+# rows of the table of results: key, name, unit
+_ROWS = (
+    ("rmse_v", "rms error of v", "m/s"),
+    ("rmse_w", "rms error of w", "m/s"),
+    ("bias_v", "bias of v", "m/s"),
+    ("bias_w", "bias of w", "m/s"),
+    ("rmse_speed", "rms error of speed", "m/s"),
+    ("p50_direction", "median error of direction", "rad"),
+    ("outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
+    ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
+    ("all.rmse_v", "rms error of v, flagged vectors too", "m/s"),
+    ("all.rmse_w", "rms error of w, flagged vectors too", "m/s"),
+    ("valid_fraction", "share of valid vectors", ""),
+)
+
+
+def page(
+    experiment, resolved: str, metrics: dict[str, float], cores: Sequence[Core],
+    drawn: Sequence[Drawn],
+) -> str:  # fmt: skip
+    """The report as HTML, pictures embedded, everything named by the user escaped.
+
+    Parameters
+    ----------
+    experiment : lidar_mi.config.Experiment
+    resolved : str
+        The experiment with all defaults, as YAML.
+    metrics : dict
+        From `lidar_mi.experiment.verdict`.
+    """
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    template = environment.from_string(
+        files("lidar_mi.assessment").joinpath("report.html").read_text()
+    )
+    return template.render(
+        name=experiment.name,
+        version=__version__,
+        resolved=resolved,
+        metrics=metrics,
+        cores=cores,
+        tables=list(_tables(experiment, metrics)),
+        pictures=[
+            (d.title, d.caption, base64.b64encode(d.path.read_bytes()).decode()) for d in drawn
+        ],
+    )
+
+
+def _tables(experiment, metrics):
+    sources = ("backscatter", "extinction", "extinction_blurred", "extinction_without_texture")
+    for method in experiment.retrieval.methods:
+        rows = []
+        for key, label, unit in _ROWS:
+            values = [metrics.get(f"{source}.{method}.{key}") for source in sources]
+            shown = ["-" if value is None else f"{value:.3g}" for value in values]
+            rows.append((label, unit, shown))
+        heads = [source.replace("_", " ") for source in sources]
+        yield METHOD_NAMES[method], heads, rows

@@ -1,0 +1,332 @@
+"""The command line: ``lidar-mi run | render | retrieve | info | doctor``."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+from .errors import InputError
+
+app = typer.Typer(
+    name="lidar-mi",
+    help="Virtual lidars that look at wake vortices: from a simulated wake to retrieved winds.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+)
+
+_out = Console()
+_err = Console(stderr=True)
+
+Variant = Annotated[str | None, typer.Option("-m", "--variant", help="Mitsuba variant.")]
+
+
+@app.callback(invoke_without_command=True)
+def _top(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        from . import __version__
+
+        print(f"lidar-mi {__version__}")
+        raise typer.Exit
+
+
+@app.command(
+    epilog="Examples: `lidar-mi run wake_backscatter.yaml` (a shipped experiment) - "
+    "`lidar-mi run my.yaml -o outputs/calm --set wake.texture.rms=0 --set seed=7`"
+)
+def run(
+    experiment: Annotated[str, typer.Argument(help="Experiment file, or the name of a shipped one.")],
+    variant: Variant = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Run folder. Default: outputs/NAME.")
+    ] = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the file, as often as "
+                     "needed: --set scan.range='400 m'."),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a run of a different experiment.")
+    ] = False,
+) -> None:  # fmt: skip
+    """Run an experiment, start to end.
+
+    Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
+    A run that was stopped goes on with the images it has.
+    """
+    from . import config
+    from . import experiment as chain
+
+    path = _experiment_file(experiment)
+    overrides = list(set_ or []) + ([f"render.variant={variant}"] if variant else [])
+    loaded = config.load(path, overrides)
+    folder = out or Path("outputs") / loaded.name
+    with _progress() as notice:
+        metrics = chain.run(loaded, folder, path.parent, overwrite, notice)
+    _print_metrics(metrics)
+    _out.print(f"report   {folder / 'report.html'}")
+    _out.print(f"figures  {folder / 'figures'}")
+    _out.print(f"winds    {folder / 'wind.nc'}")
+
+
+@app.command(epilog="Example: `lidar-mi render slab.xml -s 256 -D range=485 -o slab.exr`")
+def render(
+    scene: Annotated[Path, typer.Argument(help="Mitsuba scene (XML).")],
+    variant: Variant = None,
+    samples: Annotated[
+        int, typer.Option("-s", "--spp", min=0, help="Photons a beam; 0 = as the scene says.")
+    ] = 0,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="EXR file. Default: beside the scene.")
+    ] = None,
+    define: Annotated[
+        list[str] | None,
+        typer.Option("-D", "--define", metavar="KEY=VALUE", help="Fill in $KEY in the scene."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
+) -> None:
+    """Render a Mitsuba scene with the project's plugins, like the `mitsuba` command."""
+    from .rendering.scene import render_file
+
+    path = out or scene.with_suffix(".exr")
+    with _progress() as notice:
+        render_file(
+            scene, path, variant or "llvm_ad_mono_polarized", samples, seed,
+            _definitions(define or []), lambda share: notice(f"rendering {scene.name}", share),
+        )  # fmt: skip
+    _out.print(f"image    {path}")
+
+
+@app.command(
+    epilog="Example: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc`"
+)
+def retrieve(
+    first: Annotated[Path, typer.Argument(help="EXR image at t1.")],
+    second: Annotated[Path, typer.Argument(help="EXR image at t2.")],
+    dt: Annotated[float, typer.Option(help="Time between the images, s.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="NetCDF file.")] = Path("wind.nc"),
+    method: Annotated[str, typer.Option(help="cc (cross-correlation) or ws (weight shift).")] = "cc",
+    template: Annotated[int, typer.Option(help="Template size, pixels.")] = 8,
+    search: Annotated[int, typer.Option(help="Search region, pixels.")] = 16,
+    stride: Annotated[int, typer.Option(help="Step between vectors, pixels.")] = 1,
+    layer: Annotated[str, typer.Option(help="Layer of the EXR files.")] = "Y",
+    spacing: Annotated[
+        float | None, typer.Option(help="Pixel spacing in m, for files without axes.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
+) -> None:
+    """Find the cross-flow wind (v, w) in any two EXR images of the same air."""
+    from .experiment import write_netcdf
+    from .rendering.scene import read_image
+    from .retrieval.images import on_one_grid
+    from .retrieval.wind import retrieve_wind
+
+    images = [read_image(path, layer, spacing) for path in (first, second)]
+    pair = on_one_grid(*images)
+    wind = retrieve_wind(
+        *pair, dt=dt, method=method, template=template, search=search, stride=stride,
+        device=device,
+    )  # fmt: skip
+    write_netcdf(wind, out)
+    valid = float((wind["flag"] == 0).mean())
+    _out.print(f"{wind.sizes['y']} x {wind.sizes['z']} vectors, {valid:.1%} valid")
+    _out.print(f"winds    {out}")
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(help="EXR file, NetCDF file or run folder.")],
+) -> None:
+    """Say what an EXR file, a NetCDF file or a run folder holds."""
+    from .rendering import exr
+
+    if path.is_dir():
+        _info_folder(path)
+    elif path.suffix == ".exr":
+        header, layers = exr.read_layers(path)
+        _info_table(f"{path}: {len(layers)} layers", _layer_rows(layers))
+        _info_table("header", [(k, _short(v)) for k, v in sorted(header.items())])
+    elif path.suffix in (".nc", ".nc4", ".cdf"):
+        _info_netcdf(path)
+    else:
+        raise InputError(f"{path}: unknown kind of file; expected .exr, .nc or a run folder")
+
+
+@app.command()
+def doctor() -> None:
+    """Explain what this machine can run, and what to install for the rest."""
+    from .doctor import print_report
+
+    raise typer.Exit(print_report())
+
+
+def main() -> None:
+    """Entry point: bad input is one line and exit code 2."""
+    try:
+        app()
+    except InputError as error:
+        _fail(str(error))
+    except KeyboardInterrupt:
+        _fail("stopped; start the same command again to go on", code=130)
+    except Exception as error:
+        message = _plugin_message(error)
+        if message is None:
+            raise
+        _fail(message)
+
+
+def _fail(message: str, code: int = 2) -> None:
+    _err.print(f"lidar-mi: {message}", style="red", markup=False, highlight=False, soft_wrap=True)
+    sys.exit(code)
+
+
+def _plugin_message(error: BaseException | None) -> str | None:
+    """The one line a plugin said about a wrong parameter, from under the layers above it."""
+    while error is not None:
+        for line in str(error).splitlines():
+            if " is not allowed; expected " in line:
+                return line.split("ValueError: ")[-1].strip()
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def _experiment_file(name: str) -> Path:
+    from importlib.resources import files
+
+    path = Path(name)
+    if path.is_file():
+        return path
+    shipped = Path(str(files("lidar_mi.scenes")))
+    candidate = shipped / (name if name.endswith(".yaml") else f"{name}.yaml")
+    if path.parent == Path() and candidate.is_file():
+        return candidate
+    raise InputError(
+        f"{name}: no such file; expected an experiment file or one of "
+        + ", ".join(sorted(p.stem for p in shipped.glob("*.yaml")))
+    )
+
+
+def _definitions(texts: list[str]) -> dict[str, str]:
+    pairs = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise InputError(f"-D {text}: expected KEY=VALUE")
+        pairs[key] = value
+    return pairs
+
+
+class _progress:
+    """A progress bar that says what is running; plain lines where there is no terminal."""
+
+    def __enter__(self):
+        self.bars = Progress(
+            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
+            console=_err, transient=True, disable=not _err.is_terminal,
+        )  # fmt: skip
+        self.bars.start()
+        self.task = self.bars.add_task("starting", total=None)
+        self.last = None
+        return self._notice
+
+    def _notice(self, text: str, share: float | None) -> None:
+        self.bars.update(
+            self.task, description=text, total=None if share is None else 1.0,
+            completed=share or 0.0,
+        )  # fmt: skip
+        if not _err.is_terminal and text != self.last:
+            _err.print(text, markup=False, highlight=False)
+        self.last = text
+
+    def __exit__(self, *_):
+        self.bars.stop()
+
+
+def _print_metrics(metrics: dict[str, float]) -> None:
+    """The few numbers people ask for first."""
+    table = Table(title="rms error of the wind, valid vectors", title_justify="left")
+    for head in ("winds from", "method", "v / m/s", "w / m/s", "beyond cores v", "w", "valid"):
+        table.add_column(head, justify="left" if head in ("winds from", "method") else "right")
+    names = sorted({tuple(key.split(".")[:2]) for key in metrics if key.endswith(".rmse_v")})
+    for source, method in names:
+        keys = ("rmse_v", "rmse_w", "outside_cores.rmse_v", "outside_cores.rmse_w")
+        values = [metrics.get(f"{source}.{method}.{key}") for key in keys]
+        shown = ["-" if value is None else f"{value:.2f}" for value in values]
+        valid = f"{metrics[f'{source}.{method}.valid_fraction']:.0%}"
+        table.add_row(source.replace("_", " "), method, *shown, valid)
+    _out.print(table)
+
+
+def _info_folder(folder: Path) -> None:
+    import json
+
+    import yaml
+
+    marker = folder / "experiment.yaml"
+    if not marker.is_file():
+        raise InputError(f"{folder}: no experiment.yaml in it; expected a run folder")
+    record = yaml.safe_load(marker.read_text())
+    rows = [(name, str(number)) for name, number in record["versions"].items()]
+    _info_table(f"{folder}: experiment {record['experiment']['name']}", rows)
+    _info_table(
+        "files",
+        [(str(p.relative_to(folder)), f"{p.stat().st_size / 1e6:.2f} MB")
+         for p in sorted(folder.rglob("*")) if p.is_file()],
+    )  # fmt: skip
+    if (folder / "metrics.json").is_file():
+        _print_metrics(json.loads((folder / "metrics.json").read_text()))
+    else:
+        _out.print("unfinished: no metrics.json yet; run it again to go on")
+
+
+def _info_netcdf(path: Path) -> None:
+    import xarray as xr
+
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected a NetCDF file")
+    try:
+        data = xr.open_dataset(path, engine="h5netcdf", decode_times=False)
+    except Exception:  # noqa: BLE001 - whatever the format library says, it is unreadable
+        raise InputError(f"{path}: not a readable NetCDF-4 file") from None
+    with data:
+        rows = []
+        for name, variable in data.variables.items():
+            shape = " x ".join(f"{d} {n}" for d, n in variable.sizes.items())
+            span = ""
+            if variable.dtype.kind in "fiu" and variable.size:
+                span = f"{float(variable.min()):.4g} ... {float(variable.max()):.4g}"
+            rows.append((str(name), shape, span, str(variable.attrs.get("units", ""))))
+        _info_table(str(path), rows)
+        _info_table("attributes", [(k, _short(v)) for k, v in data.attrs.items()])
+
+
+def _layer_rows(layers):
+    import numpy as np
+
+    for name, pixels in sorted(layers.items()):
+        rows, columns = pixels.shape
+        span = f"{np.nanmin(pixels):.4g} ... {np.nanmax(pixels):.4g}"
+        yield name, f"{columns} x {rows}", str(pixels.dtype), span
+
+
+def _info_table(title: str, rows) -> None:
+    table = Table(title=title, title_justify="left", show_header=False)
+    for row in rows:
+        table.add_row(*row)
+    _out.print(table)
+
+
+def _short(value) -> str:
+    text = " ".join(str(value).split())
+    return text if len(text) <= 70 else f"{text[:67]}..."
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,159 @@
+"""Mitsuba scene files with our plugins, and images from any EXR file."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+import xarray as xr
+
+from .. import __version__
+from ..errors import InputError
+from .exr import QUANTITIES, label_scan, read_layers, write_scan
+from .variant import use_variant
+
+
+def render_file(
+    scene_path: str | Path,
+    out: str | Path,
+    variant: str = "llvm_ad_mono_polarized",
+    samples: int = 0,
+    seed: int = 0,
+    definitions: dict[str, str] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> xr.Dataset:
+    """Render an XML scene with a `scanning_lidar` and write its scan as EXR.
+
+    ``Y`` in the file is the apparent backscatter of the first gate, S0 r^2 / (A dr), with the
+    transmittance left in: a scene says nothing about which of its media are "the environment".
+
+    Parameters
+    ----------
+    samples : int
+        Photons a beam; 0: as the scene says.
+    definitions : dict
+        Values for ``$name`` in the scene.
+
+    Raises
+    ------
+    InputError
+        Missing or broken scene, or one without a `scanning_lidar` and a `gated_volpath`.
+    """
+    scene_path, out = Path(scene_path), Path(out)
+    if not scene_path.is_file():
+        raise InputError(f"{scene_path}: no such file; expected a Mitsuba scene (XML)")
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: {out.parent} is no folder; expected one that exists")
+    use_variant(variant)
+    try:
+        scene = mi.load_file(str(scene_path), **(definitions or {}))
+    except RuntimeError as error:
+        if " is not allowed; expected " in str(error):
+            raise
+        raise InputError(f"{scene_path}: {_reason(error)}") from None
+    sensors = scene.sensors()
+    if not sensors or not hasattr(sensors[0], "beam_frame"):
+        raise InputError(f"{scene_path}: its first sensor is no 'scanning_lidar'; expected one")
+    integrator = scene.integrator()
+    if not hasattr(integrator, "estimator"):
+        raise InputError(f"{scene_path}: its integrator is no 'gated_volpath'; expected one")
+    if progress:
+        integrator.progress = lambda done, total: progress(done / total)
+    sensor = sensors[0]
+    image = np.array(mi.render(scene, spp=samples, seed=seed))
+    scan = _as_dataset(image, sensor)
+    scan.attrs |= {
+        "software": f"lidar-mi {__version__}",
+        "scene": scene_path.name,
+        "variant": variant,
+        "polarized": int(mi.is_polarized),
+        "seed": seed,
+        "samples_per_beam": samples or sensor.sampler().sample_count(),
+        "max_order": integrator.max_order,
+        "estimator": integrator.estimator,
+        "units": "Stokes: received over emitted energy; Y: m-1 sr-1; lengths: m; angles: rad",
+    }
+    write_scan(out, scan)
+    return scan
+
+
+def _as_dataset(image: np.ndarray, sensor) -> xr.Dataset:
+    """The rendered tensor with the beams' places in the middle of the gates as axes.
+
+    A direction table need not form a grid; then pixel numbers serve as axes (``grid`` = 0).
+    """
+    rows, columns, _ = image.shape
+    gates = sensor.gate_count
+    start, stop = sensor.m_gate_start[0], sensor.m_gate_stop[0]
+    beams = np.array(sensor.m_directions, float).reshape(rows, columns, 3)[::-1, ::-1]
+    slope_y, slope_z = beams[..., 1] / beams[..., 0], beams[..., 2] / beams[..., 0]
+    grid = np.ptp(slope_y, 0).max() < 1e-6 and np.ptp(slope_z, 1).max() < 1e-6
+    if grid:
+        y, z = (start + stop) / 2 * slope_y[0], (start + stop) / 2 * slope_z[:, 0]
+    else:
+        y, z = np.arange(columns, dtype=float), np.arange(rows, dtype=float)
+    values = image.reshape(rows, columns, gates, len(QUANTITIES))[::-1, ::-1]
+    variables = {
+        name: (("gate", "z", "y"), values[..., k].transpose(2, 0, 1))
+        for k, name in enumerate(QUANTITIES)
+    }
+    oblique = 1 / beams[..., 0] if sensor.gate_kind == "planar" else 1.0
+    length = (stop - start) / gates * oblique
+    middle = (start + (stop - start) / gates / 2) * oblique
+    area = np.pi * sensor.m_aperture[0] ** 2
+    variables["Y"] = (("z", "y"), variables["S0"][1][0] * middle**2 / (area * length))
+    attributes = {
+        "grid": int(grid),
+        "gate_kind": sensor.gate_kind,
+        "gate_count": gates,
+        "gate_start": start,
+        "gate_stop": stop,
+        "wavelength": sensor.laser.wavelength,
+        "pulse_energy": sensor.laser.pulse_energy,
+        "stokes_emitted": list(sensor.laser.stokes),
+    }
+    return label_scan(
+        xr.Dataset(
+            variables, coords={"gate": np.arange(gates), "y": y, "z": z}, attrs=attributes
+        )
+    )
+
+
+def read_image(path: str | Path, layer: str = "Y", spacing: float | None = None) -> xr.DataArray:
+    """One layer of any EXR file as an image (z, y), ascending, in metres.
+
+    Axes come from the header attributes ``y`` and ``z`` that our scans carry; for other files
+    ``spacing`` (m) puts the image's middle at zero.
+
+    Raises
+    ------
+    InputError
+        Unreadable file, no such layer, or no axes and no spacing.
+    """
+    header, layers = read_layers(path)
+    if layer not in layers:
+        raise InputError(
+            f"{path}: layer {layer!r} is not there; expected one of {', '.join(sorted(layers))}"
+        )
+    pixels = layers[layer][::-1, ::-1].astype(np.float64)
+    rows, columns = pixels.shape
+    if spacing is not None:
+        if not spacing > 0:
+            raise InputError(f"spacing: {spacing} m is not allowed; expected a number above 0")
+        y, z = ((np.arange(n) - (n - 1) / 2) * spacing for n in (columns, rows))
+    elif {"y", "z"} <= set(header) and len(header["y"]) == columns and len(header["z"]) == rows:
+        y, z = np.asarray(header["y"], float), np.asarray(header["z"], float)
+    else:
+        raise InputError(
+            f"{path}: header has no axes y and z for {columns} x {rows} pixels; "
+            "expected them, or --spacing in m"
+        )
+    metres = {"units": "m"}
+    return xr.DataArray(
+        pixels, {"z": ("z", z, metres), "y": ("y", y, metres)}, ("z", "y"), layer
+    )
+
+
+def _reason(error: Exception) -> str:
+    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
+    return " ".join(lines)[:300]
