@@ -254,13 +254,16 @@ def _print_metrics(metrics: dict[str, float]) -> None:
     table = Table(title="rms error of the wind, valid vectors", title_justify="left")
     for head in ("winds from", "method", "v / m/s", "w / m/s", "beyond cores v", "w", "valid"):
         table.add_column(head, justify="left" if head in ("winds from", "method") else "right")
-    names = sorted({tuple(key.split(".")[:2]) for key in metrics if key.endswith(".rmse_v")})
+    names = [
+        tuple(key.split(".")[:2]) for key in metrics
+        if key.endswith(".valid_fraction") and not key.startswith("texture_sweep.")
+    ]  # fmt: skip
     for source, method in names:
         keys = ("rmse_v", "rmse_w", "outside_cores.rmse_v", "outside_cores.rmse_w")
         values = [metrics.get(f"{source}.{method}.{key}") for key in keys]
         shown = ["-" if value is None else f"{value:.2f}" for value in values]
         valid = f"{metrics[f'{source}.{method}.valid_fraction']:.0%}"
-        table.add_row(source.replace("_", " "), method, *shown, valid)
+        table.add_row(source.replace("_", " ").replace("extinction ", ""), method, *shown, valid)
     _out.print(table)
 
 

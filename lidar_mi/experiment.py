@@ -33,6 +33,7 @@ from .config import Experiment
 from .errors import InputError
 from .instrument.scan import ScanPlan, plan_scans
 from .rendering import exr
+from .rendering.backscatter import extrude, render_scans
 from .rendering.phase import phase_function
 from .rendering.variant import use_variant
 from .retrieval.images import resample_pair
@@ -41,6 +42,9 @@ from .retrieval.wind import retrieve_wind
 IMAGES = ("image_t1.exr", "image_t2.exr")
 # what winds are retrieved from; see `winds`
 SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
+
+# relative rms of the sub-grid texture for which `texture_sweep` says how good winds get
+TEXTURE_SWEEP = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 
 Notice = Callable[[str, float | None], None]
 """Called with what is running and how far it is (0 to 1, None: unknown)."""
@@ -107,10 +111,11 @@ def run(
         cores = find_cores(truth.wind)
         found = winds(experiment, truth, plans, scans, log)
         write_netcdf(found, folder / "wind.nc")
-    metrics = verdict(found, scans, cores)
+        sweep = texture_sweep(experiment, beside, log)
+    metrics = verdict(found, scans, cores) | sweep
     with _timed(timing, "figures"):
         log("drawing figures")
-        drawn = figures.draw_all(folder / "figures", truth, scans, found, cores, log)
+        drawn = figures.draw_all(folder / "figures", truth, scans, found, cores, sweep, log)
     metrics |= {f"timing.{k}_s": round(v, 3) for k, v in timing.items()}
     _write(
         folder / "metrics.json",
@@ -159,8 +164,6 @@ def make_truth(experiment: Experiment, beside: str | Path = ".") -> Truth:
 
 def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dataset]:
     """The two scans, from the folder if they are there, else rendered and written to it."""
-    from .rendering.backscatter import extrude, render_scans
-
     paths = [folder / name for name in IMAGES]
     if all(path.is_file() for path in paths):
         log("using the pictures of the last run")
@@ -251,6 +254,31 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
     found.attrs["title"] = f"Cross-flow wind of the experiment {experiment.name}"
     found.attrs["source"] = f"lidar-mi {__version__}"
     return found
+
+
+def texture_sweep(experiment: Experiment, beside, log) -> dict[str, float]:
+    """How well CC does on extinction pairs of more and less sub-grid texture, all vectors.
+
+    Keys ``texture_sweep.10_percent.rmse_v`` and ``.rmse_w`` (m/s, every vector with a displacement) and
+    ``.valid_fraction``.
+    """
+    settings = experiment.retrieval
+    metrics = {}
+    for index, rms in enumerate(TEXTURE_SWEEP):
+        log.bar(f"retrieving winds at {rms:.0%} texture", index / len(TEXTURE_SWEEP))
+        texture = experiment.wake.texture.model_copy(update={"rms": rms})
+        wake = experiment.wake.model_copy(update={"texture": texture})
+        truth = make_truth(experiment.model_copy(update={"wake": wake}), beside)
+        wind = retrieve_wind(
+            truth.image(0), truth.image(1), dt=experiment.platform.dt, method="cc",
+            template=settings.template, search=settings.search, stride=settings.stride,
+        )  # fmt: skip
+        found = wind_metrics(wind, truth_at_vectors(wind, truth.wind), [])
+        for key in ("all.rmse_v", "all.rmse_w", "valid_fraction"):
+            if key in found:
+                name = key.removeprefix("all.")
+                metrics[f"texture_sweep.{round(100 * rms)}_percent.{name}"] = found[key]
+    return metrics
 
 
 def apparent_noise(scan: xr.Dataset) -> xr.DataArray:
@@ -352,8 +380,13 @@ def _extinction(flow, mapping, first, second) -> xr.DataArray:
         fastest = max(float(np.hypot(s["v"], s["w"]).max()) for s in states)
         field = extinction_from_speed(flow, **limits, stretch=mapping.stretch, reference=fastest)
     else:
+        # an analytic flow carries neither: then the background is all there is
         tracer = mapping.tracer if mapping.tracer in flow else None
         aerosol = mapping.aerosol if mapping.aerosol in flow else None
+        if tracer is None and aerosol is None:
+            field = xr.full_like(flow["v"], mapping.background)
+            field.attrs = {"long_name": "extinction coefficient", "units": "m-1"}
+            return field.transpose("x", "y", "z")
         densest = max(float(s[tracer].max()) for s in states) if tracer else None
         field = extinction_from_tracer(
             flow, **limits, stretch=mapping.stretch, tracer=tracer, aerosol=aerosol,

@@ -99,7 +99,8 @@ def define():
 
         def wavelengths(self):
             """The laser's wavelength in nm, as a ray carries it (empty outside spectral variants)."""
-            return mi.Color0f() if not mi.is_spectral else mi.Wavelength(self.wavelength * 1e9)
+            kind = type(mi.Ray3f().wavelengths)
+            return kind(self.wavelength * 1e9) if mi.is_spectral else kind()
 
         def eval(self, si, active=True):
             return mi.Spectrum(0)

@@ -30,7 +30,8 @@ class Drawn:
 
 
 def draw_all(
-    folder: Path, truth, scans, found: xr.Dataset, cores: list[Core], log: Callable
+    folder: Path, truth, scans, found: xr.Dataset, cores: list[Core], sweep: dict[str, float],
+    log: Callable,
 ) -> list[Drawn]:
     """Draw every figure of a backscatter run as PNG into ``folder``.
 
@@ -39,6 +40,7 @@ def draw_all(
     truth : lidar_mi.experiment.Truth
     scans : the two rendered scans
     found : winds with dims (source, algorithm, z, y), from `lidar_mi.experiment.winds`
+    sweep : metrics from `lidar_mi.experiment.texture_sweep`
     """
     folder.mkdir(exist_ok=True)
     plates = (
@@ -52,9 +54,9 @@ def draw_all(
          _picture_differences(truth, scans)),
         ("fig10_wind_from_backscatter", "Wind from the backscatter pair",
          _retrieved(found, "backscatter", cores)),
-        ("fig11_deviation_from_extinction_winds", "Winds from backscatter against those from "
-         "extinction", _deviation_maps(found, "backscatter", "extinction")),
-        ("fig12_error_by_texture", "Error and local texture", _error_by_texture(found)),
+        ("fig11_deviation_from_extinction_winds", "What the instrument changes in the winds",
+         _deviation_maps(found, "backscatter", "extinction")),
+        ("fig12_error_by_texture", "Error and texture", _error_by_texture(found, sweep)),
     )  # fmt: skip
     drawn = []
     for index, (name, title, (figure, caption)) in enumerate(plates):
@@ -68,7 +70,7 @@ def draw_all(
 
 
 def _sheet(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
-    figure = Figure(figsize=(6.6 * columns, 4.4 * rows), layout="constrained")
+    figure = Figure(figsize=(6.8 * columns, 4.3 * rows), layout="compressed")
     return figure, figure.subplots(rows, columns, squeeze=False)
 
 
@@ -85,7 +87,7 @@ def _image(axes, field: xr.DataArray, title: str, label: str, **style) -> None:
         y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
     )
     _frame(axes, y, z, title)
-    axes.figure.colorbar(mesh, ax=axes, label=label, shrink=0.85)
+    axes.figure.colorbar(mesh, ax=axes, label=label, pad=0.02)
 
 
 def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, every: int) -> None:
@@ -105,7 +107,7 @@ def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, every: int) -
     for core in cores:
         axes.plot(core.y, core.z, "+", color="crimson", ms=9)
     _frame(axes, wind["y"], wind["z"], title)
-    axes.figure.colorbar(arrows, ax=axes, label="speed / m s$^{-1}$", shrink=0.85)
+    axes.figure.colorbar(arrows, ax=axes, label="speed / m s$^{-1}$", pad=0.02)
 
 
 def _truth_vectors(wind: xr.Dataset) -> xr.Dataset:
@@ -212,26 +214,37 @@ def _picture_differences(truth, scans):
     )
 
 
-def _error_by_texture(found):
-    figure = Figure(figsize=(7.2, 4.6), layout="constrained")
-    axes = figure.subplots()
+def _error_by_texture(found, sweep):
+    figure = Figure(figsize=(13, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    levels = sorted({int(key.split(".")[1].removesuffix("_percent")) for key in sweep})
+    for name, marker in (("v", "o"), ("w", "s")):
+        errors = [sweep[f"texture_sweep.{level}_percent.rmse_{name}"] for level in levels]
+        left.plot(levels, errors, marker=marker, label=name)
+    left.set(
+        xlabel="sub-grid texture, rms / %", ylabel="rms error / m s$^{-1}$", yscale="log",
+        title="cross-correlation from extinction, all vectors",
+    )  # fmt: skip
     for source, marker in (("extinction", "o"), ("backscatter", "s"),
                            ("extinction_without_texture", "^")):  # fmt: skip
         for method in found["algorithm"].values:
             wind = found.sel(source=source, algorithm=method)
             groups = error_by_texture(wind, _truth_vectors(wind))
-            axes.plot(
+            right.plot(
                 groups["texture"], groups["rmse"], marker=marker, ms=5,
                 ls="-" if method == "cc" else ":",
                 label=f"{method} from {source.replace('_', ' ')}",
             )  # fmt: skip
-    axes.set(
-        xlabel="local texture: rms slope in its weakest direction, relative, per pixel",
+    right.set(
+        xlabel="local texture: weakest rms slope in a window, relative, per pixel",
         ylabel="rms error of v and w / m s$^{-1}$", xscale="log", yscale="log",
+        title="all vectors, in groups by their local texture",
     )  # fmt: skip
-    axes.legend(fontsize=8)
-    axes.grid(alpha=0.3, which="both")
+    for axes in (left, right):
+        axes.legend(fontsize=8)
+        axes.grid(alpha=0.3, which="both")
     return figure, (
-        "How the error depends on what a window has to hold on to: all vectors in groups of "
-        "equal number by local texture. Without texture an image cannot tell (aperture problem)."
+        "Winds can only be as good as the structure that moves with them. Left: the extinction "
+        "pair with more and less sub-grid texture. Right: this run's vectors, grouped by what "
+        "their windows have to hold on to. A smooth image cannot tell (aperture problem)."
     )

@@ -97,6 +97,30 @@ def resample_pair(
     return first, second
 
 
+def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
+    """The pair as it is if both images share one uniform grid, else resampled onto one.
+
+    The common grid has the coarser image's mean spacing along y, see `resample_pair`.
+
+    Raises
+    ------
+    InputError
+        Images of different size, or as `resample_pair`.
+    """
+    if image1.shape != image2.shape:
+        sizes = " and ".join(f"{i.sizes['y']} x {i.sizes['z']}" for i in (image1, image2))
+        raise InputError(f"image2: sizes {sizes} px (y x z) differ; expected two of one size")
+    steps = [float(image["y"][-1] - image["y"][0]) / (image.sizes["y"] - 1)
+             for image in (image1, image2)]  # fmt: skip
+    tolerance = 1e-3 * min(steps)
+    shared = all(
+        np.abs(np.diff(image1[a].values, 2)).max(initial=0) < tolerance
+        and np.abs(image1[a].values - image2[a].values).max() < tolerance
+        for a in ("y", "z")
+    )
+    return (image1, image2) if shared else resample_pair(image1, image2, max(steps))
+
+
 def _axis(image: xr.DataArray, name: str) -> tuple[str, np.ndarray]:
     """The dim that coordinate `name` runs along, and its values there, ascending, in m."""
     if name not in image.coords:
