@@ -104,8 +104,8 @@ def run(
     _claim(folder, experiment, overwrite)
     log = _Log(folder / "log.txt", notice)
     log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")
-    with _timed(timing, "render"):
-        scans = pictures(experiment, truth, plans, folder, beside, log)
+    scans = pictures(experiment, truth, plans, folder, beside, log)
+    timing["render"] = sum(scan.attrs["render_seconds"] for scan in scans)
     with _timed(timing, "retrieve"):
         log("retrieving winds")
         cores = find_cores(truth.wind)
@@ -163,11 +163,11 @@ def make_truth(experiment: Experiment, beside: str | Path = ".") -> Truth:
 
 
 def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dataset]:
-    """The two scans, from the folder if they are there, else rendered and written to it."""
+    """The two scans: those in the folder, and the missing ones rendered and written to it."""
     paths = [folder / name for name in IMAGES]
-    if all(path.is_file() for path in paths):
-        log("using the pictures of the last run")
-        return [exr.read_scan(path) for path in paths]
+    missing = [index for index, path in enumerate(paths) if not path.is_file()]
+    if len(missing) < len(paths):
+        log(f"using {len(paths) - len(missing)} of {len(paths)} pictures from an earlier run")
     fields = truth.extinction
     if fields[0].sizes["x"] == 1:
         reach = max(plans, key=lambda plan: plan.gate_stop)
@@ -179,8 +179,9 @@ def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dat
     def progress(scan: int, done: int, total: int) -> None:
         log.bar(f"rendering scan {scan + 1} of {len(plans)}", done / total)
 
-    log(f"rendering {len(plans)} scans of {len(plans[0].y)} x {len(plans[0].z)} beams")
-    scans = render_scans(
+    if missing:
+        log(f"rendering {len(missing)} scans of {len(plans[0].y)} x {len(plans[0].z)} beams")
+    rendered = render_scans(
         fields,
         plans,
         experiment.lidar,
@@ -190,10 +191,12 @@ def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dat
         experiment.render,
         experiment.seed,
         progress,
+        missing,
     )
-    for path, scan in zip(paths, scans):
-        exr.write_scan(path, scan)
-    return scans
+    for index, scan in zip(missing, rendered):
+        exr.write_scan(paths[index], scan)
+    # read back, so that a resumed run and one that was not see the same float32 values
+    return [exr.read_scan(path) for path in paths]
 
 
 def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset:

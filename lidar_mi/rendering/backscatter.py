@@ -1,6 +1,7 @@
 """The backscatter lidar's picture: an extinction field and a scan become a Mitsuba scene."""
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 
 import mitsuba as mi
 import numpy as np
@@ -49,7 +50,8 @@ def render_scans(
     settings: RenderSettings,
     seed: int,
     progress: Callable[[int, int, int], None] | None = None,
-) -> list[xr.Dataset]:
+    scans: Sequence[int] | None = None,
+) -> Iterator[xr.Dataset]:
     """Render one scan after the other in one scene; only the first compiles anything.
 
     Parameters
@@ -67,25 +69,35 @@ def render_scans(
         Scan k uses seed + k * 2^16, far apart for neighbouring experiments.
     progress : callable, optional
         Called with (scan, photons done, photons in all).
+    scans : sequence of int, optional
+        Which of the scans to render; default: all.
 
-    Returns
-    -------
-    list of xr.Dataset
-        S0 ... S3, S0_stderr (gate, z, y), Y (z, y); y and z ascending.
+    Yields
+    ------
+    xr.Dataset
+        S0 ... S3, S0_stderr (gate, z, y), Y (z, y); y and z ascending. One scan at a time, as
+        soon as it is rendered.
     """
+    chosen = list(range(len(plans)) if scans is None else scans)
+    if not chosen:
+        return
     scene = mi.load_dict(
-        scene_dict(extinctions[0], plans[0], lidar, environment, phase, albedo, settings)
+        scene_dict(
+            extinctions[chosen[0]], plans[chosen[0]], lidar, environment, phase, albedo, settings
+        )
     )
     parameters = mi.traverse(scene)
-    scans = []
-    for index, (extinction, plan) in enumerate(zip(extinctions, plans, strict=True)):
-        if index:
-            _move(parameters, extinction, plan)
+    for index in chosen:
+        plan = plans[index]
+        if index != chosen[0]:
+            _move(parameters, extinctions[index], plan)
         if progress:
             scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
-        image = mi.render(scene, seed=(seed + (index << 16)) % 2**32)
-        scans.append(_as_dataset(np.array(image), plan, lidar, environment, settings, seed))
-    return scans
+        start = time.perf_counter()
+        image = np.array(mi.render(scene, seed=(seed + (index << 16)) % 2**32))
+        scan = _as_dataset(image, plan, lidar, environment, settings, seed)
+        scan.attrs["render_seconds"] = time.perf_counter() - start
+        yield scan
 
 
 def scene_dict(
