@@ -30,13 +30,12 @@ over the sphere (values are then per steradian); all elements share that factor.
     {"type": "mueller", "table": mi.TensorXf(table)}
 """
 
-from pathlib import Path
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from .parameters import fail
+from .parameters import table as read_table
 from .polarization import rotate_from_scattering_plane, scattering_angle
 
 NAME, KIND = "mueller", "phase"
@@ -46,12 +45,16 @@ def define():
     class Mueller(mi.PhaseFunction):
         def __init__(self, props):
             super().__init__(props)
-            table = check_table(_read(props.get("table", None)))
+            if "table" not in props:
+                fail(NAME, "table", None, "a tensor of N x 7 numbers or a file name")
+            table = check_table(read_table(NAME, "table", props["table"], 7))
             self.m_angle = mi.Float(np.radians(table[:, 0]))
             self.m_elements = [mi.Float(column) for column in table[:, 1:].T]
             cosine, first = np.unique(np.cos(np.radians(table[:, 0])).astype(np.float32), True)
-            self.m_cosine = mi.IrregularContinuousDistribution(
-                mi.Float(cosine), mi.Float(np.maximum(table[first, 1], 1e-6 * table[:, 1].max()))
+            density = np.maximum(table[first, 1], 1e-6 * table[:, 1].max()).astype(np.float32)
+            self.m_cosine = mi.IrregularContinuousDistribution(mi.Float(cosine), mi.Float(density))
+            self.m_cell = mi.DiscreteDistribution(
+                mi.Float(np.diff(cosine) * (density[1:] + density[:-1]))
             )
             self.m_flags = +mi.PhaseFunctionFlags.Isotropic
 
@@ -74,6 +77,18 @@ def define():
                 for column in (self.m_elements if mi.is_polarized else self.m_elements[:1])
             ]
 
+        def sample_cosine(self, sample, active=True):
+            """Cosines distributed as ``m_cosine``, whose own inversion cancels where a1 is flat."""
+            cell, sample = self.m_cell.sample_reuse(sample, active)
+            low, high = (
+                dr.gather(mi.Float, self.m_cosine.pdf, cell + end, active) for end in (0, 1)
+            )
+            root = dr.sqrt(dr.lerp(low * low, high * high, sample))
+            first, last = (
+                dr.gather(mi.Float, self.m_cosine.nodes, cell + end, active) for end in (0, 1)
+            )
+            return dr.lerp(first, last, sample * (low + high) / (low + root))
+
         def eval_pdf(self, ctx, mei, wo, active=True):
             incident = -mei.wi
             elements = self.elements(scattering_angle(incident, wo), active)
@@ -84,7 +99,7 @@ def define():
             return rotate_from_scattering_plane(incident, wo, elements), pdf
 
         def sample(self, ctx, mei, sample1, sample2, active=True):
-            cosine = self.m_cosine.sample(sample2.x, active)
+            cosine = self.sample_cosine(sample2.x, active)
             sine = dr.safe_sqrt(1 - cosine * cosine)
             sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample2.y)
             wo = mi.Frame3f(-mei.wi).to_world(
@@ -126,17 +141,3 @@ def check_table(table: np.ndarray) -> np.ndarray:
     integral += (slope * np.diff(np.sin(theta))).sum()
     table[:, 1:] /= 2 * np.pi * integral
     return table
-
-
-def _read(source) -> np.ndarray:
-    if source is None:
-        fail(NAME, "table", None, "a tensor of N x 7 numbers or a file name")
-    if not isinstance(source, str):
-        return np.array(source)
-    path = Path(str(mi.file_resolver().resolve(source)))
-    if not path.is_file():
-        fail(NAME, "table", source, "a readable file")
-    try:
-        return np.load(path) if path.suffix == ".npy" else np.loadtxt(path)
-    except ValueError as error:
-        fail(NAME, "table", source, f"N lines of 7 numbers ({error})")

@@ -1,6 +1,7 @@
 """Reading plugin parameters: a wrong value is named with its plugin, field and what is allowed."""
 
 import math
+from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
@@ -11,17 +12,26 @@ def fail(plugin: str, field: str, value, allowed: str):
     raise ValueError(f"{plugin}.{field}: {value!r} is not allowed; expected {allowed}")
 
 
+def number(props, plugin: str, field: str, default: float) -> float:
+    """The float parameter ``field``."""
+    value = props.get(field, default)
+    try:
+        return float(value)
+    except (TypeError, ValueError):
+        fail(plugin, field, value, "a number")
+
+
 def positive(props, plugin: str, field: str, default: float) -> float:
-    """The float parameter ``field``, greater than zero."""
-    value = float(props.get(field, default))
-    if not value > 0:
-        fail(plugin, field, value, "a number above 0")
+    """The float parameter ``field``, greater than zero; infinite only where the default is."""
+    value = number(props, plugin, field, default)
+    if not value > 0 or (math.isinf(value) and not math.isinf(default)):
+        fail(plugin, field, value, "a finite number above 0")
     return value
 
 
 def at_least(props, plugin: str, field: str, default: float, least: float) -> float:
     """The finite float parameter ``field``, no smaller than ``least``."""
-    value = float(props.get(field, default))
+    value = number(props, plugin, field, default)
     if not (value >= least and math.isfinite(value)):
         fail(plugin, field, value, f"a finite number of at least {least:g}")
     return value
@@ -45,6 +55,21 @@ def choice(props, plugin: str, field: str, default: str, allowed: tuple[str, ...
 
 def pose(props, field: str = "to_world"):
     """The transform parameter ``field`` in the variant's precision; Mitsuba reads doubles."""
-    if not props.has_property(field):
+    if field not in props:
         return mi.Transform4f()
     return mi.Transform4f(np.array(props[field].matrix, dtype=np.float32))
+
+
+def table(plugin: str, field: str, source, columns: int) -> np.ndarray:
+    """Numbers given as a tensor, or by the name of a ``.npy`` or text file (``#`` comments)."""
+    if not isinstance(source, str):
+        return np.array(source)
+    path = Path(str(mi.file_resolver().resolve(source)))
+    if not path.is_file():
+        fail(plugin, field, source, "a readable file")
+    try:
+        if path.suffix == ".npy":
+            return np.asarray(np.load(path), float)
+        return np.loadtxt(path, ndmin=2)
+    except (ValueError, EOFError) as error:
+        fail(plugin, field, source, f"N lines of {columns} numbers ({error})")

@@ -26,7 +26,7 @@ integrate to one over the sphere.
 import drjit as dr
 import mitsuba as mi
 
-from .parameters import fail
+from .parameters import fail, number
 from .polarization import rotate_from_scattering_plane
 
 NAME, KIND = "rayleigh_polarized", "phase"
@@ -36,7 +36,7 @@ def define():
     class RayleighPolarized(mi.PhaseFunction):
         def __init__(self, props):
             super().__init__(props)
-            depolarization = float(props.get("depolarization", 0.0))
+            depolarization = number(props, NAME, "depolarization", 0.0)
             if not 0 <= depolarization < 0.5:
                 fail(NAME, "depolarization", depolarization, "0 <= value < 0.5")
             self.depolarization = depolarization

@@ -39,13 +39,12 @@ from X0 to X1 over the cosine between beam axis and x. Directions, gates, apertu
 be changed through ``mi.traverse`` without compiling anything again.
 """
 
-from pathlib import Path
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .parameters import choice, fail, pose, positive, whole
+from .parameters import choice, fail, number, pose, positive, whole
+from .parameters import table as read_table
 from .polarization import horizontal_axis
 
 NAME, KIND = "scanning_lidar", "sensor"
@@ -68,11 +67,11 @@ def define():
                 fail(NAME, "fov_half_mrad", fov * 1e3, "less than a half space, 1570.8 mrad")
             self.m_fov_tan = dr.opaque(mi.Float, np.tan(fov))
             for field in ("gate_start", "gate_stop"):
-                if not props.has_property(field):
+                if field not in props:
                     fail(NAME, field, "nothing", "a range in m")
-            self.m_gate_start = dr.opaque(mi.Float, float(props["gate_start"]))
-            self.m_gate_stop = dr.opaque(mi.Float, float(props["gate_stop"]))
-            if props.has_property("directions"):
+            self.m_gate_start = dr.opaque(mi.Float, number(props, NAME, "gate_start", 0.0))
+            self.m_gate_stop = dr.opaque(mi.Float, number(props, NAME, "gate_stop", 0.0))
+            if "directions" in props:
                 directions = read_directions(props["directions"], width * height)
             else:
                 directions = angle_directions(
@@ -191,13 +190,7 @@ def angle_directions(azimuth: np.ndarray, elevation: np.ndarray) -> np.ndarray:
 
 def read_directions(source, count: int) -> np.ndarray:
     """A table of beam directions (tensor or file name), checked and normalised, (count, 3)."""
-    if isinstance(source, str):
-        path = Path(str(mi.file_resolver().resolve(source)))
-        if not path.is_file():
-            fail(NAME, "directions", source, "a readable file of N x 3 numbers")
-        table = np.load(path) if path.suffix == ".npy" else np.loadtxt(path, ndmin=2)
-    else:
-        table = np.array(source)
+    table = read_table(NAME, "directions", source, 3)
     if table.shape != (count, 3):
         fail(NAME, "directions", f"shape {table.shape}", f"({count}, 3), one beam a film pixel")
     length = np.linalg.norm(table.astype(float), axis=1, keepdims=True)
@@ -207,8 +200,8 @@ def read_directions(source, count: int) -> np.ndarray:
 
 
 def _angles(props, name: str, count: int) -> np.ndarray:
-    low = float(props.get(f"{name}_min_deg", 0.0))
-    high = float(props.get(f"{name}_max_deg", 0.0))
+    low = number(props, NAME, f"{name}_min_deg", 0.0)
+    high = number(props, NAME, f"{name}_max_deg", 0.0)
     if not (-90 < low <= high < 90):
         fail(NAME, f"{name}_min_deg, {name}_max_deg", (low, high), "-90 < min <= max < 90")
     if count == 1:
