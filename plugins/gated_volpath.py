@@ -340,14 +340,15 @@ def _check_gate_meets_medium(scene, sensor):
     if sensor.get_medium() is not None:
         return
     near, far = sensor.nearest_and_farthest()
-    position = sensor.world_transform() @ mi.ScalarPoint3f(0)
+    origin = sensor.world_transform() @ mi.Point3f(0)
+    position = mi.ScalarPoint3f(origin.x[0], origin.y[0], origin.z[0])
     spans = []
     for shape in scene.shapes():
         if shape.interior_medium() is None and shape.exterior_medium() is None:
             continue
         box = shape.bbox()
         corners = [dr.norm(box.corner(i) - position) for i in range(8)]
-        spans.append((float(box.distance(position)), float(max(c[0] for c in corners))))
+        spans.append((float(box.distance(position)), float(max(corners))))
     if not any(first <= far and last >= near for first, last in spans):
         where = ", ".join(f"{a:g} to {b:g} m" for a, b in spans) or "nowhere"
         fail(NAME, "gates", f"{near:g} to {far:g} m", f"ranges with a medium (there is one: {where})")
