@@ -126,6 +126,6 @@ def _stokes(text) -> tuple[float, float, float, float]:
     if len(values) != 4:
         fail(NAME, "stokes", text, "four numbers I, Q, U, V, for example '1, 1, 0, 0'")
     degree = math.hypot(*values[1:])
-    if values[0] != 1 or degree > 1 + 1e-6:
+    if values[0] != 1 or not degree <= 1 + 1e-6:
         fail(NAME, "stokes", text, "I = 1 and Q^2 + U^2 + V^2 <= 1")
     return tuple(values)

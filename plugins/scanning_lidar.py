@@ -157,8 +157,9 @@ def define():
                 fail(NAME, "gate_start", start, "a range above 0 m")
             if not start < stop < np.inf:
                 fail(NAME, "gate_stop", stop, f"a range beyond gate_start = {start:g} m")
+            flat = np.array(self.m_directions)
             directions = read_directions(
-                np.array(self.m_directions).reshape(-1, 3), self.beam_count
+                flat.reshape(-1, 3) if flat.size % 3 == 0 else flat, self.beam_count
             )
             self.m_directions = mi.Float(directions.ravel())
             if self.gate_kind == "planar" and directions[:, 0].min() <= 0:

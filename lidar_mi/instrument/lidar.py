@@ -30,7 +30,7 @@ class BackscatterLidar(BaseModel):
     @field_validator("stokes")
     @classmethod
     def _physical(cls, value):
-        if value[0] != 1 or math.hypot(*value[1:]) > 1 + 1e-6:
+        if value[0] != 1 or not math.hypot(*value[1:]) <= 1 + 1e-6:
             raise ValueError(f"{value} is not allowed; expected I = 1 and Q^2 + U^2 + V^2 <= 1")
         return value
 

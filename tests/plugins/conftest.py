@@ -45,7 +45,7 @@ def grid(values, low, high, phase="rayleigh_polarized", albedo=1.0):
 
 
 def lidar(size, gate, laser=None, environment=None, samples=64, **parameters):
-    """A scanning lidar of ``size`` = (width, height) beams that records ``gate`` = (start, stop)."""
+    """A scanning lidar of (width, height) beams that records the gate (start, stop)."""
     sensor = {
         "type": "scanning_lidar",
         "gate_start": gate[0],
