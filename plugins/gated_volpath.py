@@ -25,7 +25,8 @@ and carry the transmittance of all media on the way; they have the same expectat
 
 ``mi.render(scene)`` returns a tensor (height, width, 5 x gates) with the channels
 ``gateNNN.S0`` ... ``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the
-scan. The Stokes vector refers to the horizontal axis e_h of the returning light. Unpolarised
+scan. The Stokes vector refers to the beam's horizontal axis e_h, as the emitted one does: to its
+part across the returning light, as seen by an analyser fixed to the telescope. Unpolarised
 variants carry intensity only: S1 to S3 are 0 there. In RGB variants the colour channel nearest to
 the laser's wavelength is used.
 
@@ -45,7 +46,7 @@ import mitsuba as mi
 
 from .media import coefficients, collision, interaction, transmittance
 from .parameters import choice, fail, whole
-from .polarization import horizontal_axis, rotate_stokes, transverse
+from .polarization import rotate_stokes, transverse
 
 NAME, KIND = "gated_volpath", "integrator"
 
@@ -287,7 +288,7 @@ class _Photon:
         depolarises &= matrix[3][3] == scalar
         scattered[1:] = [dr.select(depolarises, 0, s) for s in scattered[1:]]
         return rotate_stokes(
-            scattered, wo, mi.mueller.stokes_basis(wo), transverse(horizontal_axis(wo), wo)
+            scattered, wo, mi.mueller.stokes_basis(wo), transverse(self.axes.s, wo)
         )
 
 
