@@ -125,8 +125,9 @@ def define():
                         dr.eval(total[1:])
                         dr.sync_thread()
                         self.progress(done, beams * photons)
-                number, means, squares = total
-                cell = dr.arange(mi.UInt32, count * gates) + first * gates
+                _, means, squares = total
+                number = _opaque(total[0])
+                cell = dr.arange(mi.UInt32, count * gates) + dr.opaque(mi.UInt32, first * gates)
                 error = dr.sqrt(squares / (number * (number - 1.0)))
                 for index, values in enumerate((*means, error)):
                     dr.scatter(image, values, cell * quantities + index)
@@ -306,34 +307,40 @@ def _channel(wavelength: float) -> int:
     return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0
 
 
+def _opaque(number: float):
+    """A number that changes from scan to scan without being compiled into a kernel."""
+    return dr.opaque(mi.Float, number)
+
+
 def _moments_by_block(stokes, count: int):
     """Means, and S0's sum of squared deviations, over runs of ``count`` photons."""
     dr.eval(stokes)
-    means = [dr.block_sum(s, count) / count for s in stokes]
-    deviation = stokes[0] - dr.repeat(means[0], count)
+    means = [dr.block_sum(s, count) / _opaque(count) for s in stokes]
+    run = dr.arange(mi.UInt32, dr.width(stokes[0])) // dr.opaque(mi.UInt32, count)
+    deviation = stokes[0] - dr.gather(mi.Float, means[0], run)
     return means, dr.block_sum(deviation * deviation, count)
 
 
 def _moments_by_scatter(stokes, cell, cells: int, count: int):
     """The same where a photon may fall into any cell; photons elsewhere count as zeros."""
-    means = []
-    for value in stokes:
-        total = dr.zeros(mi.Float, cells)
-        dr.scatter_reduce(dr.ReduceOp.Add, total, value, cell, value != 0)
-        means.append(total / count)
-    squares = dr.zeros(mi.Float, cells)
-    dr.scatter_reduce(dr.ReduceOp.Add, squares, stokes[0] * stokes[0], cell, stokes[0] != 0)
-    return means, dr.maximum(squares - count * means[0] * means[0], 0)
+    # all sums before any is read: reading one makes Dr.Jit run the kernel so far
+    *sums, squares = (dr.zeros(mi.Float, cells) for _ in range(len(STOKES) + 1))
+    for total, value in zip((*sums, squares), (*stokes, stokes[0] * stokes[0])):
+        # the default mode would compile the number of cells into the kernel
+        dr.scatter_reduce(dr.ReduceOp.Add, total, value, cell, value != 0, mode=dr.ReduceMode.Local)
+    number = _opaque(count)
+    means = [total / number for total in sums]
+    return means, dr.maximum(squares - number * means[0] * means[0], 0)
 
 
 def _merge(first, second):
     """Moments of two sets of photons together (Chan, Golub & LeVeque 1983)."""
     n1, means1, squares1 = first
     n2, means2, squares2 = second
-    share = n2 / (n1 + n2)
+    share, weight = _opaque(n2 / (n1 + n2)), _opaque(n1 * n2 / (n1 + n2))
     means = [a + (b - a) * share for a, b in zip(means1, means2)]
     difference = means2[0] - means1[0]
-    return n1 + n2, means, squares1 + squares2 + difference * difference * (n1 * share)
+    return n1 + n2, means, squares1 + squares2 + difference * difference * weight
 
 
 def _check_gate_meets_medium(scene, sensor):
