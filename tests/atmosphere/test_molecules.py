@@ -1,0 +1,137 @@
+"""Molecular scattering against published numbers: detects 0.05 % in the cross-section, 1e-5 in the
+King factor, 1 % in depolarisation, and any mix-up of Cabannes line and whole Rayleigh band."""
+
+import math
+
+import numpy as np
+import pytest
+
+from lidar_mi.atmosphere import molecules
+from lidar_mi.errors import InputError
+
+
+@pytest.mark.parametrize(
+    "wavelength, square_centimetres, king",
+    [
+        (355e-9, 2.759e-26, 1.05289),
+        (532e-9, 5.167e-27, 1.04899),
+        (1064e-9, 3.127e-28, 1.04721),
+    ],
+)
+def test_laser_wavelengths(wavelength, square_centimetres, king):
+    assert molecules.cross_section(wavelength) * 1e4 == pytest.approx(square_centimetres, rel=2e-4)
+    assert molecules.king_factor(wavelength) == pytest.approx(king, abs=0.6e-5)
+
+
+@pytest.mark.parametrize("micrometres", [0.25, 0.30, 0.40, 0.55, 0.70, 0.85])
+def test_published_fit_of_the_cross_section(micrometres):
+    """Bodhaine et al., eq. 29: within 0.01 % of their own numbers from 0.25 to 0.85 um."""
+    square = micrometres**2
+    fit = 1.0455996 - 341.29061 / square - 0.90230850 * square
+    fit /= 1 + 0.0027059889 / square - 85.968563 * square
+    assert molecules.cross_section(micrometres * 1e-6) == pytest.approx(fit * 1e-32, rel=2e-4)
+
+
+def test_refractive_index_of_standard_air():
+    """Peck & Reeder's own value at 632.8 nm: n - 1 = 2.7652e-4 at 15 degrees C, 330 ppm CO2."""
+    assert molecules.refractive_index(632.8e-9, 330e-6) - 1 == pytest.approx(2.7652e-4, abs=3e-8)
+    # CO2 raises the refractivity by 54 % of its share
+    ratio = (molecules.refractive_index(532e-9, 0.01) - 1) / (
+        molecules.refractive_index(532e-9, 0.0) - 1
+    )
+    assert ratio == pytest.approx((1 + 0.54 * 0.0097) / (1 - 0.54 * 0.0003), rel=1e-12)
+
+
+def test_king_factor_is_that_of_the_depolarisation_factor():
+    """(6 + 3 d)/(6 - 7 d), the definition, for the whole band."""
+    king = molecules.king_factor(532e-9)
+    d = molecules.depolarization_factor(king, "rayleigh")
+    assert (6 + 3 * d) / (6 - 7 * d) == pytest.approx(king, rel=1e-12)
+    # Hansen & Travis 1974 use 0.031 in the ultraviolet to visible, Young 1980 gives 0.0279
+    assert 0.0275 < d < 0.0310
+
+
+def test_depolarisation_of_the_cabannes_line_and_of_the_whole_band():
+    """532 nm: 0.0036 and 0.0143 (Behrendt & Nakamura 2002), from their anisotropy, 1.5 % lower."""
+    narrow = molecules.molecular_scattering(532e-9, band="cabannes")
+    wide = molecules.molecular_scattering(532e-9, band="rayleigh")
+    assert narrow.depolarization_ratio == pytest.approx(0.0036, rel=0.02)
+    assert wide.depolarization_ratio == pytest.approx(0.0143, rel=0.02)
+    for air in (narrow, wide):
+        d = air.depolarization
+        assert air.depolarization_ratio == pytest.approx(d / (2 - d), rel=1e-12)
+
+
+def test_lidar_ratio():
+    """Isotropic molecules: 8 pi/3; air a little more, most of it in the Cabannes line."""
+    narrow = molecules.molecular_scattering(532e-9, band="cabannes")
+    wide = molecules.molecular_scattering(532e-9, band="rayleigh")
+    for air in (narrow, wide):
+        assert air.lidar_ratio == pytest.approx(air.extinction / air.backscatter, rel=1e-12)
+    # Chandrasekhar's phase function with gamma = d/(2 - d)
+    gamma = wide.depolarization / (2 - wide.depolarization)
+    assert wide.lidar_ratio == pytest.approx(
+        8 * math.pi / 3 * (1 + 2 * gamma) / (1 + gamma), rel=1e-12
+    )
+    # She 2001: the Cabannes line holds about 97.5 % of the backscatter of the whole band
+    assert narrow.backscatter / wide.backscatter == pytest.approx(0.975, abs=0.002)
+
+
+def test_sum_over_lines_is_the_whole_band():
+    """Cabannes + Raman = whole: the Raman part is pure anisotropic scattering, three quarters."""
+    king = molecules.king_factor(532e-9)
+    whole = molecules.anisotropy(king, "rayleigh")
+    narrow = molecules.molecular_scattering(532e-9, band="cabannes")
+    raman = 7.5 * whole / (45 + 10 * whole)
+    assert narrow.albedo + raman == pytest.approx(1, rel=1e-12)
+
+
+def test_table_agrees_with_the_coefficients():
+    for band in molecules.BANDS:
+        air = molecules.molecular_scattering(355e-9, 26500.0, 223.25, band)
+        table = molecules.molecular_table(355e-9, 26500.0, 223.25, band)
+        assert table.extinction == pytest.approx(air.extinction, rel=1e-12)
+        assert table.backscatter == pytest.approx(air.backscatter, rel=1e-12)
+        assert table.lidar_ratio == pytest.approx(air.lidar_ratio, rel=1e-12)
+        assert table.depolarization_ratio == pytest.approx(air.depolarization_ratio, rel=1e-12)
+        assert table.albedo == air.albedo
+
+
+def test_number_density_and_extinction_at_sea_level():
+    """Loschmidt's constant, and Bodhaine's standard air, to their rounding."""
+    assert molecules.number_density(101325.0, 273.15) == pytest.approx(2.686780e25, rel=1e-6)
+    air = molecules.molecular_scattering(532e-9)
+    assert air.number_density == pytest.approx(2.546899e25, rel=2e-5)
+    assert air.extinction == pytest.approx(air.number_density * air.cross_section, rel=1e-12)
+    # 1.32e-2 / km, the sea-level textbook value at 532 nm
+    assert air.extinction == pytest.approx(1.316e-5, rel=1e-3)
+
+
+def test_standard_atmosphere():
+    """ICAO standard atmosphere at sea level, 8.5 km and the tropopause."""
+    pytest.importorskip("ambiance", reason="ambiance (standard atmosphere) is not installed")
+    pressure, temperature = molecules.standard_atmosphere(0)
+    assert (pressure, temperature) == pytest.approx((101325.0, 288.15), rel=1e-9)
+    # ICAO Doc 7488: 8500 m geometric: 232.974 K, 331.54 hPa
+    pressure, temperature = molecules.standard_atmosphere(8500)
+    assert (pressure, temperature) == pytest.approx((33154, 232.974), rel=1e-5)
+    assert molecules.standard_atmosphere(15000)[1] == pytest.approx(216.65)
+    with pytest.raises(InputError, match="altitude: 90000.*-5004 to 81020"):
+        molecules.standard_atmosphere(90000)
+    with pytest.raises(InputError, match="altitude"):
+        molecules.standard_atmosphere(np.nan)
+
+
+@pytest.mark.parametrize(
+    "call, words",
+    [
+        (lambda: molecules.cross_section(532.0), "wavelength: 532.0 m"),
+        (lambda: molecules.cross_section(532e-9, co2=360), "co2: 360"),
+        (lambda: molecules.number_density(-1.0, 300.0), "pressure: -1.0"),
+        (lambda: molecules.number_density(1e5, float("nan")), "temperature: nan"),
+        (lambda: molecules.molecular_scattering(532e-9, band="raman"), "band: 'raman'.*cabannes"),
+    ],
+)
+def test_bad_input(call, words):
+    with pytest.raises(InputError, match=words):
+        call()
