@@ -12,6 +12,7 @@ The average over sizes is ours: equal steps in the logarithm of the radius.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from scipy.integrate import quad
 
 from lidar_mi.errors import InputError
 
-from .scattering import ScatteringTable, write_table
+from .scattering import ScatteringTable, read_table, write_table
 
 # Nodes of the size average. Backscatter converges last: 64 is within 1 % for spheroids (their
 # orientation average smooths the ripple in size); spheres, whose ripple is narrow, need thousands.
@@ -256,10 +257,35 @@ def aerosol(name: str) -> Aerosol:
     return AEROSOLS[name]
 
 
+def aerosol_table(name: str, wavelength: float) -> ScatteringTable:
+    """The table of a named aerosol: the one that ships, or else a new one from `make_table`.
+
+    Parameters
+    ----------
+    name : str
+        A name in `AEROSOLS`.
+    wavelength : float
+        m, in vacuum.
+
+    Raises
+    ------
+    InputError
+        As `make_table`; ``scatrs`` is needed only where no table ships (all do at 532 nm).
+    """
+    shipped = (
+        files("lidar_mi.scenes") / f"aerosol_{aerosol(name).name}_{wavelength * 1e9:.0f}nm.txt"
+    )
+    if shipped.is_file():
+        table = read_table(str(shipped))
+        if math.isclose(table.wavelength, wavelength, rel_tol=1e-6):
+            return table
+    return make_table(name, wavelength)
+
+
 def table_angles() -> np.ndarray:
     """361 angles in degrees, steps from 0.05 near 0 and 180 to just under 1 between.
 
-    Resolves the forward peak and the glory up to size parameters of about 300.
+    Fine enough for cloud droplets: linear interpolation of a1 then integrates to 0.05 % of one.
     """
     # the step grows linearly away from both ends
     fine = np.linspace(0, 180, 180001)

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 from lidar_mi.atmosphere import particles
+from lidar_mi.atmosphere.molecules import molecular_table
 from lidar_mi.atmosphere.particles import AEROSOLS, Aerosol, LogNormal, ModifiedGamma, make_table
-from lidar_mi.atmosphere.scattering import read_table
+from lidar_mi.atmosphere.scattering import mix, read_table
 from lidar_mi.errors import InputError
 
 GREEN = 532e-9
@@ -384,6 +385,33 @@ def test_shipped_spheroids_can_be_made_again(scatrs, name):
     assert again.lidar_ratio == pytest.approx(table.lidar_ratio, rel=0.02)
     assert again.depolarization_ratio == pytest.approx(table.depolarization_ratio, rel=0.02)
     assert again.extinction_cross_section == pytest.approx(table.extinction_cross_section, rel=5e-3)
+
+
+def test_named_aerosol_comes_from_the_shipped_table_only_at_its_wavelength(monkeypatch):
+    made = []
+    monkeypatch.setattr(particles, "make_table", lambda *arguments: made.append(arguments))
+    assert particles.aerosol_table("dust", GREEN).name == "dust" and not made
+    particles.aerosol_table("dust", 532.4e-9)
+    particles.aerosol_table("dust", 1064e-9)
+    assert made == [("dust", 532.4e-9), ("dust", 1064e-9)]
+    with pytest.raises(InputError, match="'smoke'"):
+        particles.aerosol_table("smoke", GREEN)
+
+
+def test_aerosol_in_air():
+    """A tenth per kilometre of spheroids in sea-level air: coefficients add, and depolarised and
+    polarised backscatter each add too (Tesche et al. 2009, eq. 4)."""
+    aerosol = particles.aerosol_table("spheroids", GREEN).with_extinction(1e-4)
+    air = molecular_table(GREEN)
+    both = mix([aerosol, air], [aerosol.extinction, air.extinction])
+    assert both.extinction == pytest.approx(1e-4 + 1.316e-5, rel=1e-4)
+    assert both.backscatter == pytest.approx(aerosol.backscatter + air.backscatter, rel=1e-9)
+
+    def crossed(table):
+        ratio = table.depolarization_ratio
+        return table.backscatter * ratio / (1 + ratio)
+
+    assert crossed(both) == pytest.approx(crossed(aerosol) + crossed(air), rel=1e-9)
 
 
 # --- bad input ------------------------------------------------------------------------------------
