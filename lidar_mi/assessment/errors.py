@@ -2,7 +2,7 @@
 
 import numpy as np
 import xarray as xr
-from scipy.interpolate import RegularGridInterpolator
+from scipy.interpolate import RectBivariateSpline
 
 from .cores import Core, outside_cores
 
@@ -17,17 +17,16 @@ def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
     truth : xr.Dataset
         v, w (m s^-1) on (z, y); its flow is taken to stand still over dt. Cubic interpolation.
     """
-    points = np.stack([wind["z_vector"].values, wind["y_vector"].values], -1)
-    axes = (truth["z"].values, truth["y"].values)
+    axes = {name: truth[name].values for name in ("z", "y")}
+    places = {name: wind[f"{name}_vector"].values for name in axes}
+    known = np.ones(wind["v"].shape, bool)
+    for name, axis in axes.items():
+        known &= (places[name] >= axis[0]) & (places[name] <= axis[-1])
     found = {}
     for name in ("v", "w"):
-        field = truth[name].transpose("z", "y").values
-        interpolate = RegularGridInterpolator(
-            axes, field, method="cubic", bounds_error=False, fill_value=np.nan
-        )
-        values = np.full(points.shape[:-1], np.nan)
-        known = np.isfinite(points).all(-1)
-        values[known] = interpolate(points[known])
+        spline = RectBivariateSpline(*axes.values(), truth[name].transpose("z", "y").values, s=0)
+        values = np.full(known.shape, np.nan)
+        values[known] = spline.ev(places["z"][known], places["y"][known])
         found[name] = (wind["v"].dims, values, wind[name].attrs)
     return xr.Dataset(found)
 
