@@ -15,7 +15,9 @@ from .units import Extinction, Length, Number, Speed, Time, to_si
 
 
 class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+    )
 
 
 class VortexPair(_Section):
@@ -177,7 +179,8 @@ def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f" line {mark.line + 1}" if mark else ""
-        raise InputError(f"{path}:{line} not valid YAML ({getattr(error, 'problem', error)})")
+        reason = " ".join(str(getattr(error, "problem", error)).split())
+        raise InputError(f"{path}:{line} not valid YAML ({reason})") from None
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds no keys; expected name, wake, ...")
     for override in overrides or []:

@@ -5,12 +5,21 @@ Each type here is a ``float`` for pydantic models that also reads text with a un
 except angles, which must say their unit (degrees and radians are too easily confused).
 """
 
+import re
+import tokenize
 from typing import Annotated
 
 import pint
 from pydantic import BeforeValidator, PlainSerializer
 
-_UNITS = pint.UnitRegistry(autoconvert_offset_to_baseunit=True)
+_UNITS = pint.UnitRegistry()
+# one number, then a unit: pint alone reads "0,1 m" as 1 m and "500 m 3" as 1500 m
+_TEXT = re.compile(r"""([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan))\s*([^\n,;#"']*)""")
+# what pint raises, and what reaches us through it from Python's tokenizer and arithmetic
+_BAD_UNIT = (
+    pint.PintError, tokenize.TokenError, ArithmeticError, AssertionError, AttributeError,
+    SyntaxError, TypeError, ValueError,
+)  # fmt: skip
 
 
 def to_si(value, unit: str, example: str) -> float:
@@ -27,16 +36,21 @@ def to_si(value, unit: str, example: str) -> float:
         if unit == "rad" and value != 0:
             raise ValueError(f"{value!r} has no unit; expected an angle such as '{example}'")
         return float(value)
-    try:
-        quantity = _UNITS.Quantity(value)
-        if quantity.unitless and unit not in ("", "rad"):
-            return float(quantity.magnitude)
-        if quantity.unitless and unit == "rad" and quantity.magnitude != 0:
+    kind = f"a quantity in {unit}" if unit else "a number"
+    wrong = ValueError(f"{value!r} is not allowed; expected {kind}, such as '{example}'")
+    match = _TEXT.fullmatch(value.strip())
+    if not match:
+        raise wrong
+    number, text = float(match[1]), match[2]
+    if not text:
+        if unit == "rad" and number != 0:
             raise ValueError(f"{value!r} has no unit; expected an angle such as '{example}'")
-        return float(quantity.to(unit or "dimensionless").magnitude)
-    except (pint.PintError, AttributeError, TypeError, SyntaxError, AssertionError):
-        kind = f"a quantity in {unit}" if unit else "a number"
-        raise ValueError(f"{value!r} is not allowed; expected {kind}, such as '{example}'") from None
+        return number
+    try:
+        given = _UNITS.parse_units("1" + text if text.startswith("/") else text)
+        return float(_UNITS.Quantity(number, given).to(unit or "dimensionless").magnitude)
+    except _BAD_UNIT:
+        raise wrong from None
 
 
 def _quantity(unit: str, example: str):

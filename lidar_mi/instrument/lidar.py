@@ -13,12 +13,18 @@ class BackscatterLidar(BaseModel):
     Lengths in m, angles in rad, energy in J, time in s; text with units is read as such.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+    )
 
     wavelength: Length = Field(532e-9, gt=0, description="vacuum wavelength of the laser")
     beam_radius: Length = Field(0.1, gt=0, description="1/e^2 radius of the beam at the aperture")
-    beam_cut: Length = Field(0.1, gt=0, description="outer radius of the emitted beam")
-    divergence_full: Angle = Field("2 mrad", ge=0, lt=0.5, description="1/e^2 divergence, full angle")
+    beam_cut: Length = Field(
+        0.1, gt=0, allow_inf_nan=True, description="outer radius of the emitted beam; inf: uncut"
+    )
+    divergence_full: Angle = Field(
+        "2 mrad", ge=0, lt=0.5, description="1/e^2 divergence, full angle"
+    )
     stokes: tuple[float, float, float, float] = Field(
         (1.0, 1.0, 0.0, 0.0), description="Stokes vector (I, Q, U, V) about the horizontal axis"
     )

@@ -1,12 +1,15 @@
 """Scan geometry: where the beams of a scan go and which ranges are recorded."""
 
+import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from ..units import Angle, Length
+
+HalfAngle = Annotated[Angle, Field(gt=0, lt=math.pi / 2)]
 
 
 class Scan(BaseModel):
@@ -17,7 +20,9 @@ class Scan(BaseModel):
     +-azimuth_half by rows in +-elevation_half, given for t1 and t2.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+    )
 
     aim: Literal["grid", "angles"] = "grid"
     range: Length = Field(500.0, gt=0, description="distance of the first gate's start at t1")
@@ -26,8 +31,8 @@ class Scan(BaseModel):
     gate_count: int = Field(1, ge=1, le=10_000)
     columns: int = Field(219, ge=1, description="beams across, with aim: angles")
     rows: int = Field(139, ge=1, description="beams up, with aim: angles")
-    azimuth_half: tuple[Angle, Angle] = ("6.2 deg", "6.4 deg")
-    elevation_half: tuple[Angle, Angle] = ("3.9 deg", "4.1 deg")
+    azimuth_half: tuple[HalfAngle, HalfAngle] = ("6.2 deg", "6.4 deg")
+    elevation_half: tuple[HalfAngle, HalfAngle] = ("3.9 deg", "4.1 deg")
 
 
 @dataclass(frozen=True)

@@ -267,7 +267,6 @@ class TestKernels:
         assert kernels(parameters.update) & first == set()  # the update's own, small ones
         assert kernels(lambda: dr.eval(mi.render(scene, seed=4, spp=64))) <= first
 
-
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
     def test_photons_are_traced_once(self, world, estimator):
         """One large kernel a pass: statistics must not make Dr.Jit trace them again."""

@@ -1,0 +1,138 @@
+"""Quantities with units. Detects a wrong factor, and text that is silently misread."""
+
+import math
+
+import pytest
+from pydantic import BaseModel, ValidationError
+
+from lidar_mi.units import Angle, Energy, Extinction, Length, Number, Speed, Time
+
+
+class Quantities(BaseModel):
+    length: Length = 0
+    angle: Angle = 0
+    speed: Speed = 0
+    time: Time = 0
+    energy: Energy = 0
+    extinction: Extinction = 0
+    number: Number = 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "expected"),
+    [
+        ("length", "500 m", 500),
+        ("length", "532 nm", 532e-9),
+        ("length", "0.5 um", 5e-7),
+        ("length", "0.5 µm", 5e-7),
+        ("length", "8.5km", 8500),
+        ("length", " 12 cm ", 0.12),
+        ("length", "1e3 mm", 1),
+        ("length", "-3 m", -3),
+        ("length", ".5 m", 0.5),
+        ("length", "5. m", 5),
+        ("length", "1 ft", 0.3048),
+        ("length", "inf m", math.inf),
+        ("length", "500", 500),
+        ("length", 500, 500),
+        ("length", 0.25, 0.25),
+        ("angle", "2 mrad", 2e-3),
+        ("angle", "6.2 deg", math.radians(6.2)),
+        ("angle", "180 degree", math.pi),
+        ("angle", "3 arcmin", math.radians(0.05)),
+        ("angle", "1 rad", 1),
+        ("angle", 0, 0),
+        ("angle", "0", 0),
+        ("speed", "150 m/s", 150),
+        ("speed", "540 km/h", 150),
+        ("speed", "100 knot", 51.4444),
+        ("speed", "150 m s^-1", 150),
+        ("time", "0.1 s", 0.1),
+        ("time", "10 ns", 1e-8),
+        ("time", "2 min", 120),
+        ("energy", "70 mJ", 0.07),
+        ("extinction", "1.8 / km", 1.8e-3),
+        ("extinction", "0.1/km", 1e-4),
+        ("extinction", "0.1 1/km", 1e-4),
+        ("extinction", "0.1 km^-1", 1e-4),
+        ("extinction", "0.1 km**-1", 1e-4),
+        ("extinction", 2.7e-5, 2.7e-5),
+        ("number", 0.5, 0.5),
+        ("number", "0.5", 0.5),
+        ("number", "10 %", 0.1),
+        ("number", "1e-2", 0.01),
+    ],
+)
+def test_quantities_become_si(kind, text, expected):
+    assert getattr(Quantities(**{kind: text}), kind) == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("kind", "text"),
+    [
+        # another kind of quantity
+        ("length", "500 s"),
+        ("length", "2 mrad"),
+        ("length", "5 %"),
+        ("length", "5 km/m"),
+        ("length", "5 m m"),
+        ("length", "20 degC"),
+        ("angle", "2 m"),
+        ("angle", "2 Hz"),
+        ("speed", "150 m"),
+        ("time", "0.1 1/s"),
+        ("energy", "1 W"),
+        ("extinction", "1.8 km"),
+        ("extinction", "1.8 / km^2"),
+        ("number", "5 m"),
+        # no quantity
+        ("length", ""),
+        ("length", "  "),
+        ("length", "m"),
+        ("length", "wide"),
+        ("number", "half"),
+        ("length", "5 furlongitudes"),
+        ("length", "'5' m"),
+        ("length", "[5] m"),
+        ("length", True),
+        ("length", None),
+        ("length", [5]),
+        ("length", {"m": 5}),
+        # what a lenient reader takes for something else
+        ("length", "0,1 m"),
+        ("length", "500 m 3"),
+        ("length", "5 m + 3 cm"),
+        ("length", "1_000 m"),
+        ("length", "0x10 m"),
+        ("length", "1 m\n2"),
+        ("length", "5 m # or 6"),
+        ("length", "(3 m"),
+        ("length", "3 (m"),
+        ("length", "1/0 m"),
+        ("length", "5 m/0"),
+        ("length", "10**10**3 m"),
+        ("length", "__import__('os')"),
+    ],
+)
+def test_anything_else_is_named_with_an_example(kind, text):
+    with pytest.raises(ValidationError) as error:
+        Quantities(**{kind: text})
+    fault = error.value.errors()[0]
+    assert fault["loc"] == (kind,)
+    assert repr(text) in fault["msg"] and "expected a" in fault["msg"]
+
+
+@pytest.mark.parametrize("text", [2, 2.0, "2", "-0.1"])
+def test_an_angle_must_say_its_unit(text):
+    with pytest.raises(ValidationError, match="has no unit; expected an angle such as '2 mrad'"):
+        Quantities(angle=text)
+
+
+def test_written_quantities_are_read_again_exactly():
+    one = Quantities(
+        length=0.1 + 0.2, angle="6.2 deg", speed=1 / 3, time=1e-9, energy="0.07 J",
+        extinction="1.8 / km", number=1e-30,
+    )  # fmt: skip
+    text = one.model_dump(mode="json")
+    assert text["angle"].endswith(" rad") and text["extinction"].endswith(" 1/m")
+    assert Quantities(**text) == one
