@@ -54,12 +54,13 @@ def test_king_factor_is_that_of_the_depolarisation_factor():
     king = molecules.king_factor(532e-9)
     d = molecules.depolarization_factor(king, "rayleigh")
     assert (6 + 3 * d) / (6 - 7 * d) == pytest.approx(king, rel=1e-12)
-    # Hansen & Travis 1974 use 0.031 in the ultraviolet to visible, Young 1980 gives 0.0279
+    # air in the visible: 0.0279 (Young 1980) to 0.031 (Hansen & Travis 1974)
     assert 0.0275 < d < 0.0310
 
 
 def test_depolarisation_of_the_cabannes_line_and_of_the_whole_band():
-    """532 nm: 0.0036 and 0.0143 (Behrendt & Nakamura 2002), from their anisotropy, 1.5 % lower."""
+    """532 nm: 0.0036 and 0.0143 (Behrendt & Nakamura 2002, Opt. Express 10, 805), to 2 %, for
+    their King factor is not quite this one."""
     narrow = molecules.molecular_scattering(532e-9, band="cabannes")
     wide = molecules.molecular_scattering(532e-9, band="rayleigh")
     assert narrow.depolarization_ratio == pytest.approx(0.0036, rel=0.02)
