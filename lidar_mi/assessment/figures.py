@@ -63,8 +63,11 @@ def draw_all(
         log.bar(f"drawing {title.lower()}", index / len(plates))
         path = folder / f"{name}.png"
         temporary = path.with_name(f".{path.name}")
-        figure.savefig(temporary, dpi=110, format="png")
-        temporary.replace(path)
+        try:
+            figure.savefig(temporary, dpi=110, format="png")
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
         drawn.append(Drawn(path, title, caption))
     return drawn
 
@@ -219,7 +222,9 @@ def _error_by_texture(found, sweep):
     left, right = figure.subplots(1, 2)
     levels = sorted({int(key.split(".")[1].removesuffix("_percent")) for key in sweep})
     for name, marker in (("v", "o"), ("w", "s")):
-        errors = [sweep[f"texture_sweep.{level}_percent.rmse_{name}"] for level in levels]
+        # air without any structure gives no displacement, hence no error either
+        errors = [sweep.get(f"texture_sweep.{level}_percent.rmse_{name}") for level in levels]
+        errors = [np.nan if error is None else error for error in errors]
         left.plot(levels, errors, marker=marker, label=name)
     left.set(
         xlabel="sub-grid texture, rms / %", ylabel="rms error / m s$^{-1}$", yscale="log",
