@@ -1,0 +1,13 @@
+"""lidar-mi side by side with other ways to the same result, measured in one run.
+
+``make bench`` (or ``python -m benchmarks``) prints one table a comparison and writes
+``outputs/benchmarks.json``. What counts are the ratios: both sides take turns, and a ratio is the
+median over the turns, because machines are noisy and differ.
+
+estimators   the gated estimator against the analog one
+transient    the renderer against mitransient's volumetric integrator
+velocimetry  cross-correlation against OpenPIV
+renderer     speed and memory of the renderer alone
+"""
+
+import lidar_mi  # noqa: F401  chooses the LLVM before any of the modules here imports drjit

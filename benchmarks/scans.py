@@ -1,0 +1,82 @@
+"""The scan that is measured: the paper's, over the wake that ships with the project."""
+
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import mitsuba as mi
+import xarray as xr
+
+from lidar_mi.config import Experiment, load
+from lidar_mi.experiment import make_truth
+from lidar_mi.instrument.scan import ScanPlan, plan_scans
+from lidar_mi.rendering.backscatter import extrude, render_scans, scene_dict
+from lidar_mi.rendering.phase import phase_function
+from lidar_mi.rendering.variant import use_variant
+
+
+@dataclass(frozen=True)
+class PaperScan:
+    """The demo experiment up to the picture: extinction (x, y, z) and scan geometry at t1, t2."""
+
+    experiment: Experiment
+    fields: tuple[xr.DataArray, ...]
+    plans: tuple[ScanPlan, ...]
+
+    @property
+    def thickness(self) -> float:
+        """Depth of the gate, m."""
+        return self.plans[0].gate_stop - self.plans[0].gate_start
+
+    def air(self) -> tuple:
+        """Environment extinction (m^-1), phase function and albedo."""
+        scattering = self.experiment.scattering
+        background = self.experiment.wake.extinction.background
+        return background, phase_function(scattering), scattering.albedo
+
+    def scene(self):
+        """The scan at t1 as a Mitsuba scene, in the experiment's variant."""
+        use_variant(self.experiment.render.variant)
+        experiment = self.experiment
+        return mi.load_dict(
+            scene_dict(
+                self.fields[0], self.plans[0], experiment.lidar, *self.air(), experiment.render
+            )
+        )
+
+    def render(self, photons: int, seed: int):
+        """Both scans as an experiment renders them, one after the other."""
+        use_variant(self.experiment.render.variant)
+        settings = self.experiment.render.model_copy(update={"samples_per_beam": photons})
+        return render_scans(
+            self.fields, self.plans, self.experiment.lidar, *self.air(), settings, seed
+        )
+
+
+def paper_scan(columns: int = 219, rows: int = 139) -> PaperScan:
+    """The demo experiment; fewer columns and rows: the middle of its grid."""
+    experiment = load(Path(str(files("lidar_mi.scenes"))) / "wake_backscatter.yaml")
+    truth = make_truth(experiment)
+    y, z = (_middle(truth.wind[axis], count) for axis, count in (("y", columns), ("z", rows)))
+    flown = experiment.platform.speed * experiment.platform.dt
+    plans = plan_scans(experiment.scan, y.values, z.values, (0.0, flown))
+    fields = [
+        extrude(
+            field.isel(x=0).sel(y=y, z=z).transpose("z", "y"), plans[0], experiment.lidar
+        )
+        for field in truth.extinction
+    ]
+    return PaperScan(experiment, tuple(fields), tuple(plans))
+
+
+def set_extinction(scene, field: xr.DataArray) -> None:
+    """Put another extinction on the same grid into a scene of `PaperScan.scene`."""
+    parameters = mi.traverse(scene)
+    voxels = field.transpose("z", "y", "x").values[..., None]
+    parameters["slab.interior_medium.sigma_t.data"] = mi.TensorXf(voxels.astype("float32"))
+    parameters.update()
+
+
+def _middle(axis: xr.DataArray, count: int) -> xr.DataArray:
+    start = (len(axis) - count) // 2
+    return axis[start : start + count]

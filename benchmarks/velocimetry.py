@@ -1,0 +1,261 @@
+"""Cross-correlation against OpenPIV on one image pair with exactly known wind.
+
+Two Lamb-Oseen vortices carry a band-limited texture, a sum of plane waves that is evaluated where
+the air of every pixel came from: no interpolation, no noise, so all error is the method's. Vectors
+are compared at the same places, and every vector with the wind where it belongs: a template of the
+first image belongs half its displacement further on, a vector from windows in both images (or from
+images deformed symmetrically) to the windows' centre. OpenPIV's own coordinates lie half a pixel
+beyond that centre; it is not charged for this.
+"""
+
+import contextlib
+import io
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.atmosphere.vortex import Vortex, velocity, vortex_pair
+from lidar_mi.retrieval.wind import retrieve_wind
+
+from .measure import in_turns
+from .report import Comparison, missing, row
+
+SPACING, DT = 0.5, 0.1
+CIRCULATION, SEPARATION, CORE_RADIUS = 400.0, 47.1, 3.0
+CORRELATION_LENGTH, CONTRAST, WAVES = 3.0, 0.2, 600
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two images (z, y) dt apart and the flow between them."""
+
+    first: xr.DataArray
+    second: xr.DataArray
+    vortices: tuple[Vortex, ...]
+
+
+@dataclass(frozen=True)
+class Field:
+    """Displacements (px) of windows that lie one pixel apart.
+
+    ``start`` is where the first window's centre lies in the image (px along z and y), ``moved``
+    says which part of its displacement a vector belongs further on.
+    """
+
+    dz: np.ndarray
+    dy: np.ndarray
+    start: float
+    moved: float
+
+
+def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison:
+    """Errors and times for windows of 8 and 16 pixels, one pass and iterated deformation.
+
+    Calls are short, so there are twice as many turns as ``repeats``.
+    """
+    title = f"Wind from an image pair of {columns} x {rows} px against OpenPIV"
+    sides = ("lidar-mi cc", "OpenPIV")
+    if reason := missing("openpiv"):
+        return Comparison(title, *sides, reason=reason)
+    pair = vortex_images(columns, rows)
+    cases = {
+        # of its four correlations the one with the smallest error each
+        "8 px windows: cc 8 in 16 | extended search 8 in 16": (
+            (8, 16), lambda: extended_search(pair, 8, 16, "linear")),
+        "8 px windows: cc 8 in 16 | window deformation 32, 16, 8, 8": (
+            (8, 16), lambda: window_deformation(pair, (32, 16, 8, 8), (8, 4, 2, 1))),
+        "16 px windows: cc 16 in 24 | one pass 16": (
+            (16, 24), lambda: extended_search(pair, 16, 16, "circular")),
+        "16 px windows: cc 16 in 24 | window deformation 32, 16, 16, 16, 16": (
+            (16, 24),
+            lambda: window_deformation(pair, (32, 16, 16, 16, 16), (16, 8, 4, 2, 1))),
+    }  # fmt: skip
+    lines = []
+    for case, (windows, theirs) in cases.items():
+        found = in_turns(
+            {
+                "ours": lambda _, windows=windows: cross_correlation(pair, *windows),
+                "theirs": lambda _, theirs=theirs: theirs(),
+            },
+            2 * repeats,
+        )
+        ours, other = (found[side][0].result for side in ("ours", "theirs"))
+        errors, vectors = wind_errors(pair, ours, other)
+        share = f"{vectors} vectors both have"
+        for (where, component), (left, right) in errors.items():
+            lines.append(
+                row(case, f"rms error of {component}, {where}", "m/s", [left], [right], "lower",
+                    share)
+            )  # fmt: skip
+            share = ""
+        per_vector = [
+            [1e6 * seconds / field.dz.size for seconds, field in found[side]]
+            for side in ("ours", "theirs")
+        ]
+        lines.append(row(case, "time of one vector", "us", *per_vector, "lower"))
+        fastest = [[min(times)] for times in per_vector]
+        lines.append(row(case, "time of one vector, fastest turn", "us", *fastest, "lower"))
+    return Comparison(
+        title,
+        *sides,
+        tuple(lines),
+        (
+            (
+                f"Vortex pair of {CIRCULATION:g} m2/s, {SEPARATION:g} m apart, core radius "
+                f"{CORE_RADIUS:g} m; {SPACING:g} m pixels, {DT:g} s; texture with {CORRELATION_LENGTH:g} "
+                f"px correlation length and {CONTRAST:.0%} contrast, no noise; one vector a pixel."
+            ),
+            (
+                "lidar-mi's time includes its quality flags, which OpenPIV's one-pass times do not; it "
+                "computes on all cores, OpenPIV on one."
+            ),
+            "Flagged vectors take part: rms over all that both sides return.",
+            (
+                "extended search and one pass: extended_search_area_piv with normalised correlation, "
+                "Gaussian sub-pixel fit, vectorised. Window deformation: windef.simple_multipass, "
+                "default correlation, windows as named, the last at one vector a pixel."
+            ),
+        ),
+    )
+
+
+def vortex_images(columns: int, rows: int, seed: int = 1) -> Pair:
+    """The pair: image 2 shows at every pixel the texture the air there had at time 0."""
+    y, z = ((np.arange(n) - (n - 1) / 2) * SPACING for n in (columns, rows))
+    vertical, lateral = np.meshgrid(z, y, indexing="ij")
+    vortices = vortex_pair(CIRCULATION, SEPARATION, CORE_RADIUS)
+    waves = _waves(seed)
+    return Pair(
+        _image(_texture(waves, lateral, vertical), y, z),
+        _image(_texture(waves, *origin(vortices, lateral, vertical, DT)), y, z),
+        vortices,
+    )
+
+
+def origin(vortices, y: np.ndarray, z: np.ndarray, dt: float, steps: int = 8) -> np.ndarray:
+    """Where air now at (y, z) was dt ago (Runge-Kutta, 4th order)."""
+    here = np.array([y, z], float)
+    h = -dt / steps
+
+    def wind(place):
+        return np.array(velocity(vortices, *place))
+
+    for _ in range(steps):
+        k1 = wind(here)
+        k2 = wind(here + h / 2 * k1)
+        k3 = wind(here + h / 2 * k2)
+        k4 = wind(here + h * k3)
+        here = here + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+    return here
+
+
+def cross_correlation(pair: Pair, template: int, search: int) -> Field:
+    wind = retrieve_wind(pair.first, pair.second, DT, "cc", template, search, stride=1)
+    moved = [wind[f"displacement_{axis}"].values / SPACING for axis in ("z", "y")]
+    return Field(*moved, start=(search - template) // 2 + (template - 1) / 2, moved=0.5)
+
+
+def extended_search(pair: Pair, window: int, search: int, correlation: str) -> Field:
+    from openpiv.pyprocess import extended_search_area_piv
+
+    with _quiet():
+        dy, dz, _ = extended_search_area_piv(
+            pair.first.values,
+            pair.second.values,
+            window_size=window,
+            search_area_size=search,
+            overlap=search - 1,
+            correlation_method=correlation,
+            normalized_correlation=True,
+            subpixel_method="gaussian",
+            sig2noise_method=None,
+            use_vectorized=True,
+        )
+    # windows of one size see the same air in both images: the vector belongs to their centre
+    return Field(dz, dy, start=(search - 1) / 2, moved=0.5 if window < search else 0.0)
+
+
+def window_deformation(pair: Pair, windows: tuple[int, ...], steps: tuple[int, ...]) -> Field:
+    from openpiv.settings import PIVSettings
+    from openpiv.windef import simple_multipass
+
+    settings = PIVSettings(
+        windowsizes=windows,
+        overlap=tuple(w - s for w, s in zip(windows, steps, strict=True)),
+        num_iterations=len(windows),
+        subpixel_method="gaussian",
+        deformation_method="symmetric",
+        sig2noise_method=None,
+        sig2noise_validate=False,
+    )
+    with _quiet():
+        _, _, dy, up, _ = simple_multipass(pair.first.values, pair.second.values, settings)
+    # rows are z, ascending; OpenPIV takes them for a picture's, descending, and turns the sign
+    return Field(-up, dy, start=(windows[-1] - 1) / 2, moved=0.0)
+
+
+def wind_errors(pair: Pair, ours: Field, other: Field) -> tuple[dict, int]:
+    """Rms errors of both, m/s, over the vectors that both have.
+
+    Returns ``{(where, component): (ours, other)}`` for everywhere and beyond two core radii, and
+    the number of vectors.
+    """
+    first = max(ours.start, other.start)
+    size = [
+        min(int(f.start - first) + f.dz.shape[axis] for f in (ours, other)) for axis in (0, 1)
+    ]
+    place = [
+        float(pair.first[name][0]) + (first + np.arange(n)) * SPACING
+        for name, n in zip(("z", "y"), size)
+    ]
+    z, y = np.meshgrid(*place, indexing="ij")
+    errors = []
+    for field in (ours, other):
+        skip = int(first - field.start)
+        part = slice(skip, skip + size[0]), slice(skip, skip + size[1])
+        dz, dy = field.dz[part] * SPACING, field.dy[part] * SPACING
+        v, w = velocity(pair.vortices, y + field.moved * dy, z + field.moved * dz)
+        errors.append({"v": dy / DT - v, "w": dz / DT - w})
+    both = np.all([np.isfinite(e[c]) for e in errors for c in "vw"], axis=0)
+    distance = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0)
+    regions = {"everywhere": both, "beyond 2 core radii": both & (distance > 2 * CORE_RADIUS)}
+    found = {
+        (where, component): tuple(
+            float(np.sqrt(np.mean(e[component][chosen] ** 2))) for e in errors
+        )
+        for where, chosen in regions.items()
+        for component in "vw"
+    }
+    return found, int(both.sum())
+
+
+def _waves(seed: int):
+    """Plane waves of a texture with the autocorrelation exp(-(r / length)^2), length in px."""
+    random = np.random.default_rng(seed)
+    vectors = random.standard_normal((WAVES, 2)) * np.sqrt(2) / CORRELATION_LENGTH
+    phases = random.uniform(0, 2 * np.pi, WAVES)
+    seen = np.hypot(*vectors.T) < np.pi  # the image can hold no wave shorter than 2 px
+    return vectors[seen] / SPACING, phases[seen]
+
+
+def _texture(waves, y: np.ndarray, z: np.ndarray) -> np.ndarray:
+    vectors, phases = waves
+    total = np.zeros(np.shape(y))
+    for (a, b), phase in zip(vectors, phases):
+        total += np.cos(a * y + b * z + phase)
+    return 1 + CONTRAST * np.sqrt(2 / len(phases)) * total
+
+
+def _image(values: np.ndarray, y: np.ndarray, z: np.ndarray) -> xr.DataArray:
+    coordinates = {"z": ("z", z, {"units": "m"}), "y": ("y", y, {"units": "m"})}
+    return xr.DataArray(values, coordinates, ("z", "y"))
+
+
+@contextlib.contextmanager
+def _quiet():
+    """OpenPIV prints and warns about every peak it cannot fit."""
+    with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        yield
