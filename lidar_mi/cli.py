@@ -1,6 +1,7 @@
 """The command line: ``lidar-mi run | render | retrieve | info | doctor``."""
 
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -23,7 +24,8 @@ app = typer.Typer(
 _out = Console()
 _err = Console(stderr=True)
 
-Variant = Annotated[str | None, typer.Option("-m", "--variant", help="Mitsuba variant.")]
+_VARIANT_HELP = "Mitsuba variant, such as llvm_ad_mono_polarized or cuda_ad_mono."
+Variant = Annotated[str | None, typer.Option("-m", "--variant", help=_VARIANT_HELP)]
 
 
 @app.callback(invoke_without_command=True)
@@ -140,13 +142,17 @@ def retrieve(
     _out.print(f"winds    {out}")
 
 
-@app.command()
+@app.command(
+    epilog="Examples: `lidar-mi info outputs/wake_backscatter` - `lidar-mi info image_t1.exr`"
+)
 def info(
     path: Annotated[Path, typer.Argument(help="EXR file, NetCDF file or run folder.")],
 ) -> None:
     """Say what an EXR file, a NetCDF file or a run folder holds."""
     from .rendering import exr
 
+    if not path.exists():
+        raise InputError(f"{path}: no such file; expected .exr, .nc or a run folder")
     if path.is_dir():
         _info_folder(path)
     elif path.suffix == ".exr":
@@ -159,7 +165,7 @@ def info(
         raise InputError(f"{path}: unknown kind of file; expected .exr, .nc or a run folder")
 
 
-@app.command()
+@app.command(epilog="Example: `lidar-mi doctor` (exit code 0: everything that is needed is there)")
 def doctor() -> None:
     """Explain what this machine can run, and what to install for the rest."""
     from .doctor import print_report
@@ -173,9 +179,10 @@ def main() -> None:
         app()
     except InputError as error:
         _fail(str(error))
-    except KeyboardInterrupt:
-        _fail("stopped; start the same command again to go on", code=130)
-    except Exception as error:
+    except BaseException as error:
+        # Mitsuba and the command parser each put their own exception in an interrupt's place
+        if any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):
+            _fail("stopped; a run goes on when started again", code=130)
         message = _plugin_message(error)
         if message is None:
             raise
@@ -187,13 +194,19 @@ def _fail(message: str, code: int = 2) -> None:
     sys.exit(code)
 
 
-def _plugin_message(error: BaseException | None) -> str | None:
-    """The one line a plugin said about a wrong parameter, from under the layers above it."""
+def _causes(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception, the one it came from, and so on."""
     while error is not None:
-        for line in str(error).splitlines():
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _plugin_message(error: BaseException) -> str | None:
+    """The one line a plugin said about a wrong parameter, from under the layers above it."""
+    for cause in _causes(error):
+        for line in str(cause).splitlines():
             if " is not allowed; expected " in line:
                 return line.split("ValueError: ")[-1].strip()
-        error = error.__cause__ or error.__context__
     return None
 
 
@@ -270,14 +283,11 @@ def _print_metrics(metrics: dict[str, float]) -> None:
 def _info_folder(folder: Path) -> None:
     import json
 
-    import yaml
+    from .experiment import read_record
 
-    marker = folder / "experiment.yaml"
-    if not marker.is_file():
-        raise InputError(f"{folder}: no experiment.yaml in it; expected a run folder")
-    record = yaml.safe_load(marker.read_text())
+    record = read_record(folder)
     rows = [(name, str(number)) for name, number in record["versions"].items()]
-    _info_table(f"{folder}: experiment {record['experiment']['name']}", rows)
+    _info_table(f"{folder}: experiment {record['experiment'].get('name')}", rows)
     _info_table(
         "files",
         [(str(p.relative_to(folder)), f"{p.stat().st_size / 1e6:.2f} MB")
@@ -292,8 +302,6 @@ def _info_folder(folder: Path) -> None:
 def _info_netcdf(path: Path) -> None:
     import xarray as xr
 
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a NetCDF file")
     try:
         data = xr.open_dataset(path, engine="h5netcdf", decode_times=False)
     except Exception:  # noqa: BLE001 - whatever the format library says, it is unreadable

@@ -474,7 +474,7 @@ def _claim(folder: Path, experiment: Experiment, beside: str | Path, overwrite: 
     }
     if marker.is_file():
         before = read_record(folder)
-        if any(before[key] != record[key] for key in ("experiment", "files")):
+        if any(before.get(key) != record[key] for key in ("experiment", "files")):
             pictures = [folder / name for name in IMAGES if (folder / name).is_file()]
             if pictures and not overwrite:
                 raise InputError(
@@ -520,7 +520,7 @@ def read_record(folder: str | Path) -> dict:
     except (yaml.YAMLError, UnicodeDecodeError):
         record = None
     if not isinstance(record, dict) or not all(
-        isinstance(record.get(key), dict) for key in ("experiment", "files", "versions")
+        isinstance(record.get(key), dict) for key in ("experiment", "versions")
     ):
         raise InputError(f"{marker}: not written by a run; expected a run folder")
     return record

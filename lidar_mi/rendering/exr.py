@@ -70,7 +70,7 @@ def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             header = {k: v for k, v in file.header().items() if k not in _STRUCTURE}
             layers = {k: np.array(c.pixels) for k, c in file.channels().items()}
-    except RuntimeError:
+    except (RuntimeError, ValueError):  # no OpenEXR file; one that is cut off
         raise InputError(f"{path}: not a readable OpenEXR image") from None
     return header, layers
 

@@ -1,5 +1,6 @@
 """Mitsuba scene files with our plugins, and images from any EXR file."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -155,5 +156,7 @@ def read_image(path: str | Path, layer: str = "Y", spacing: float | None = None)
 
 
 def _reason(error: Exception) -> str:
-    lines = [line.strip() for line in str(error).splitlines() if line.strip()]
-    return " ".join(lines)[:300]
+    """Mitsuba's message in one line; of a plugin's traceback only what it ends with."""
+    text = re.sub(r"Traceback \(most recent call last\):\n(  .*\n)+", "", str(error))
+    text = re.sub(r"^\[[\w.]+:\d+\] ", "", text)
+    return " ".join(text.split())[:300]
