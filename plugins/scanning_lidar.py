@@ -59,6 +59,8 @@ def define():
                 fail(NAME, "emitter", len(lasers), "exactly one nested emitter of type 'laser'")
             self.laser = lasers[0]
             width, height = self.film().size()
+            if min(width, height) < 1:
+                fail(NAME, "film", f"{width} x {height}", "at least 1 x 1 beams")
             self.gate_kind = choice(props, NAME, "gate_kind", "planar", ("planar", "spherical"))
             self.gate_count = whole(props, NAME, "gate_count", 1, 1)
             self.m_aperture = dr.opaque(mi.Float, positive(props, NAME, "aperture_radius", 0.5))
