@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 import yaml
-from scipy import ndimage, stats
+from scipy import integrate, ndimage, stats
 
 from . import __version__, config
 from .assessment import figures, report
@@ -426,15 +426,22 @@ def _extinction(flow, mapping, first, second) -> xr.DataArray:
 
 
 def _slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
-    """Mean over the planes inside the gates, (z, y)."""
-    if field.sizes["x"] > 1:
-        field = field.sel(x=slice(*gates))
-        if not field.sizes["x"]:
+    """Mean over the depth of planar gates, (z, y); linear between planes, as the renderer's grid."""
+    x = field["x"].values
+    weights = np.ones(1)
+    if len(x) > 1:
+        half = (x[1] - x[0]) / 2
+        first, last = x[0] - half, x[-1] + half
+        if gates[0] < first - 1e-6 or gates[1] > last + 1e-6:
             raise InputError(
-                f"scan.thickness: no plane of the wake lies in the gates, "
-                f"{gates[0]:g} to {gates[1]:g} m; expected at least the planes' spacing"
+                f"scan.thickness: gates from {gates[0]:g} to {gates[1]:g} m reach beyond the wake, "
+                f"whose planes fill {first:g} to {last:g} m; expected gates inside"
             )
-    image = field.mean("x").transpose("z", "y")
+        nodes = np.unique([*gates, *x[(x > gates[0]) & (x < gates[1])]])
+        hats = [np.interp(nodes, x, plane) for plane in np.eye(len(x))]
+        weights = integrate.trapezoid(hats, nodes) / (gates[1] - gates[0])
+    image = (field * xr.DataArray(weights, dims="x")).sum("x").transpose("z", "y")
+    image.attrs = field.attrs
     for axis in ("y", "z"):
         image[axis].attrs["units"] = "m"
     return image
