@@ -11,24 +11,28 @@ energy*, and the standard error of its first component.
 ============================ ======= ======================================================= =======
 Parameter                    Type    Meaning                                                 Default
 ============================ ======= ======================================================= =======
-``max_order``                int     highest scattering order; only 1, single scattering,    1
-                                     is available
-``estimator``                string  ``gated``: the collision is forced into the gate;       gated
+``max_order``                int     highest scattering order that is followed               1
+``estimator``                string  ``gated``: the last collision is forced into the gate;  gated
                                      ``analog``: free flights as nature draws them, most
                                      photons miss the gate (for validation)
+``orders``                   bool    also give S0 of every order by itself                   false
 ``samples_per_pass``         int     photons in flight at once; bounds the memory, does not  4194304
                                      change the result
 ============================ ======= ======================================================= =======
 
-Both estimators connect the collision to a sampled point of the telescope, check the field of view
-and carry the transmittance of all media on the way; they have the same expectation.
+Both estimators connect every collision to a sampled point of the telescope, check the field of
+view and carry the transmittance of all media on the way; they have the same expectation. In the
+gated one every photon belongs to a gate and has a range R in it. Of each scattering order the last
+vertex is placed so that the whole path is 2 R long: on the ellipsoid whose foci are the last but
+one vertex and the telescope point. It is looked for from both foci, along the photon's flight and
+along a direction of the field of view, and both are weighted by the balance heuristic (Veach 1997).
 
-``mi.render(scene)`` returns a tensor (height, width, 5 x gates) with the channels
-``gateNNN.S0`` ... ``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the
-scan. The Stokes vector refers to the beam's horizontal axis e_h, as the emitted one does: to its
-part across the returning light, as seen by an analyser fixed to the telescope. Unpolarised
-variants carry intensity only: S1 to S3 are 0 there. In RGB variants the colour channel nearest to
-the laser's wavelength is used.
+``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
+``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
+each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... behind these. The Stokes vector
+refers to the beam's horizontal axis e_h, as the emitted one does: to its part across the returning
+light, as seen by an analyser fixed to the telescope. Unpolarised variants carry intensity only: S1
+to S3 are 0 there. In RGB variants the colour channel nearest to the laser's wavelength is used.
 
 ``sample_count`` of the sensor's sampler (or ``spp``) is the number of photons a beam. The gated
 estimator spreads them evenly over the gates and rounds up, so that every gate gets the same
@@ -38,21 +42,18 @@ depolarise completely.
 
 .. code-block:: xml
 
-    <integrator type="gated_volpath"> <string name="estimator" value="gated"/> </integrator>
+    <integrator type="gated_volpath"> <integer name="max_order" value="4"/> </integrator>
 """
 
 import drjit as dr
 import mitsuba as mi
 
-from .media import coefficients, collision, interaction, transmittance
 from .parameters import choice, fail, whole
-from .polarization import rotate_stokes, transverse
+from .paths import Lidar
 
 NAME, KIND = "gated_volpath", "integrator"
 
-SPEED_OF_LIGHT = 299_792_458.0
 STOKES = ("S0", "S1", "S2", "S3")
-FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
 
 
 def define():
@@ -60,9 +61,8 @@ def define():
         def __init__(self, props):
             super().__init__(props)
             self.max_order = whole(props, NAME, "max_order", 1, 1)
-            if self.max_order > 1:
-                fail(NAME, "max_order", self.max_order, "1 (single scattering)")
             self.estimator = choice(props, NAME, "estimator", "gated", ("gated", "analog"))
+            self.orders = bool(props.get("orders", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
             # called with (photons done, photons in all) after every pass, when set
             self.progress = None
@@ -70,77 +70,132 @@ def define():
         def aov_names(self):
             return []
 
+        def quantities(self) -> list[str]:
+            """What is rendered of every gate."""
+            orders = range(1, self.max_order + 1) if self.orders else ()
+            return [*STOKES, "S0_stderr", *(f"order{order}.S0" for order in orders)]
+
         def channel_names(self, sensor) -> list[str]:
             """Names of the last axis of the rendered tensor."""
             return [
                 f"gate{gate:03d}.{quantity}"
                 for gate in range(sensor.gate_count)
-                for quantity in (*STOKES, "S0_stderr")
+                for quantity in self.quantities()
             ]
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            sensor, seed, photons = self._prepare(scene, sensor, seed, spp)
+            gates, beams = sensor.gate_count, sensor.beam_count
+            quantities = len(self.quantities())
+            image = dr.zeros(mi.Float, beams * gates * quantities)
+            trace = self._gated if self.estimator == "gated" else self._analog
+            done, total = 0, None
+            with dr.suspend_grad():
+                for first, count, start, now, complete in self._passes(sensor, photons):
+                    part = trace(scene, sensor, seed, first, count, start, now)
+                    total = part if total is None else _merge(total, part)
+                    done += count * now * self._unit(sensor)
+                    if self.progress:
+                        dr.eval(total[1:])
+                        dr.sync_thread()
+                        self.progress(done, beams * photons)
+                    if not complete:
+                        continue
+                    _, means, squares = total
+                    number = _opaque(total[0])
+                    error = dr.sqrt(squares / (number * (number - 1.0)))
+                    values = [*means[: len(STOKES)], error, *means[len(STOKES) :]]
+                    for value, place in zip(values, self._places(first * gates, count * gates)):
+                        dr.scatter(image, value, place)
+                    dr.eval(image)
+                    total = None
+            width, height = sensor.film().size()
+            return mi.TensorXf(image, (height, width, gates * quantities))
+
+        def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+            """Gradients of the scene from those of the image (of S0 to S3; S0_stderr has none)."""
+            for means, places in self._differentiable(scene, sensor, seed, spp):
+                grads = [dr.gather(mi.Float, grad_in.array, place) for place in places]
+                dr.backward(sum(dr.sum(m * g) for m, g in zip(means, grads)))
+
+        def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+            """Gradients of the image (of S0 to S3) from those of the scene."""
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            width, height = sensor.film().size()
+            shape = (height, width, sensor.gate_count * len(self.quantities()))
+            image = dr.zeros(mi.Float, shape[0] * shape[1] * shape[2])
+            for means, places in self._differentiable(scene, sensor, seed, spp):
+                dr.forward_to(means)
+                for mean, place in zip(means, places):
+                    dr.scatter_reduce(dr.ReduceOp.Add, image, dr.grad(mean), place)
+            return mi.TensorXf(image, shape)
+
+        def _differentiable(self, scene, sensor, seed, spp):
+            """Means of passes, attached to the scene's parameters, and their places in the image."""
+            if self.estimator != "gated" or self.max_order > 1:
+                fail(
+                    NAME, "gradients", f"{self.estimator}, max_order {self.max_order}",
+                    "the gated estimator with max_order 1",
+                )  # fmt: skip
+            sensor, seed, photons = self._prepare(scene, sensor, seed, spp)
+            gates = sensor.gate_count
+            for first, count, start, now, _ in self._passes(sensor, photons):
+                with dr.resume_grad():
+                    _, means, _ = self._gated(
+                        scene, sensor, seed, first, count, start, now, differentiable=True
+                    )
+                    share = now * gates / photons
+                    means = [m * share for m in means[: len(STOKES)]]
+                    yield means, self._places(first * gates, count * gates)[: len(STOKES)]
+
+        def _prepare(self, scene, sensor, seed, spp):
+            """The sensor, an opaque seed, and the number of photons a beam, all checked."""
             if isinstance(sensor, int):
                 sensor = scene.sensors()[sensor]
             if not hasattr(sensor, "beam_frame"):
                 fail(NAME, "sensor", type(sensor).__name__, "a sensor of type 'scanning_lidar'")
             _check_gate_meets_medium(scene, sensor)
             photons = int(spp) or sensor.sampler().sample_count()
-            gates = sensor.gate_count
             if self.estimator == "gated":
-                photons = gates * max(2, -(-photons // gates))
+                photons = sensor.gate_count * max(2, -(-photons // sensor.gate_count))
             elif photons < 2:
                 fail(NAME, "sample_count", photons, "at least 2, for a standard error")
             seed = mi.UInt32(seed)
             dr.make_opaque(seed)  # a new seed compiles nothing
-            with dr.suspend_grad():
-                image = self._render_passes(scene, sensor, seed, photons)
-            width, height = sensor.film().size()
-            return mi.TensorXf(image, (height, width, gates * (len(STOKES) + 1)))
+            return sensor, seed, photons
 
-        def _render_passes(self, scene, sensor, seed, photons):
-            """All beams, a few at a time; a beam's photons in several passes if they are many."""
-            gates, beams = sensor.gate_count, sensor.beam_count
-            # gated photons come in rounds of one photon a gate
-            unit = gates if self.estimator == "gated" else 1
+        def _unit(self, sensor) -> int:
+            """Gated photons come in rounds of one photon a gate."""
+            return sensor.gate_count if self.estimator == "gated" else 1
+
+        def _passes(self, sensor, photons):
+            """All beams, a few at a time; a beam's photons in several passes if they are many.
+
+            Yields first beam, number of beams, first round, number of rounds, and whether these
+            beams are then complete.
+            """
+            beams, unit = sensor.beam_count, self._unit(sensor)
             rounds = photons // unit
             rounds_at_once = min(rounds, max(2, self.samples_per_pass // unit))
             beams_at_once = max(1, self.samples_per_pass // (rounds_at_once * unit))
-            trace = self._gated if self.estimator == "gated" else self._analog
-            quantities = len(STOKES) + 1
-            image = dr.zeros(mi.Float, beams * gates * quantities)
-            done = 0
             for first in range(0, beams, beams_at_once):
-                count = min(beams_at_once, beams - first)
-                total = None
                 start = 0
                 while start < rounds:
                     now = min(rounds_at_once, rounds - start)
                     if rounds - start - now == 1:
                         now += 1  # a pass of one photon has no variance
-                    part = trace(scene, sensor, seed, first, count, start, now)
-                    total = part if total is None else _merge(total, part)
+                    last = start + now == rounds
+                    yield first, min(beams_at_once, beams - first), start, now, last
                     start += now
-                    done += count * now * unit
-                    if self.progress:
-                        dr.eval(total[1:])
-                        dr.sync_thread()
-                        self.progress(done, beams * photons)
-                _, means, squares = total
-                number = _opaque(total[0])
-                cell = dr.arange(mi.UInt32, count * gates) + dr.opaque(mi.UInt32, first * gates)
-                error = dr.sqrt(squares / (number * (number - 1.0)))
-                for index, values in enumerate((*means, error)):
-                    dr.scatter(image, values, cell * quantities + index)
-                dr.eval(image)
-            return image
 
-        def _gated(self, scene, sensor, seed, first, count, start, rounds):
-            """Mean Stokes vector and sum of squared deviations, collisions forced into the gates.
+        def _places(self, first: int, cells: int):
+            """Where each quantity of a run of cells (beam by beam, gate by gate) is in the image."""
+            quantities = len(self.quantities())
+            cell = (dr.arange(mi.UInt32, cells) + dr.opaque(mi.UInt32, first)) * quantities
+            return [cell + index for index in range(quantities)]
 
-            A photon belongs to one gate; its range is uniform in the gate. The point of the
-            laser's ray that closes the path laser - collision - telescope on twice that range is
-            t = (4 R^2 - m^2) / (4 R + 2 m.d), with m from the telescope point to the ray's origin.
-            """
+        def _gated(self, scene, sensor, seed, first, count, start, rounds, differentiable=False):
+            """Means, and S0's sum of squared deviations, last collisions forced into the gates."""
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * gates * rounds)
             # opaque, so that neither the number of photons nor the pass is baked into the kernel
@@ -149,56 +204,51 @@ def define():
             beam, gate = cell // gates, cell % gates
             number = (lane - cell * rounds_ + dr.opaque(mi.UInt32, start)) * gates + gate
             beam += dr.opaque(mi.UInt32, first)
-            photon = _Photon(scene, sensor, seed, beam, number)
+            lidar = Lidar(scene, sensor, differentiable)
+            photon = lidar.emit(seed, beam, number)
 
             low, high = sensor.ranges(photon.frame.n)
-            width = (high - low) / gates
-            range_ = low + width * (gate + photon.random())
-            half_path = range_ - photon.delay
-            offset = photon.origin - photon.aperture
-            along = dr.dot(offset, photon.direction)
-            distance = (4 * half_path * half_path - dr.squared_norm(offset)) / (
-                4 * half_path + 2 * along
+            width = 2 * (high - low) / gates
+            near = 2 * (low - photon.delay) + width * gate
+            where = photon.rng.next_float32()
+            by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
+            stokes = lidar.forced(
+                photon, near, near + width, where, self.max_order, self.orders, by_order, cell
             )
-            active = (half_path > 0) & (distance > 0)
-            out, medium = photon.transmittance(distance, active)
-            position = photon.origin + photon.direction * distance
-            mei = interaction(medium, position, photon.direction, photon.wavelengths)
-            active &= medium != None
-            scattering, _ = coefficients(medium, mei, photon.channel, active)
-            back = photon.aperture - position
-            # d(distance) / d(range)
-            jacobian = 2 * dr.rcp(1 - dr.dot(photon.direction, dr.normalize(back)))
-            weight = out * scattering * jacobian * width
-            stokes = photon.connect(medium, mei, weight, active)
-            return rounds, *_moments_by_block(stokes, rounds)
+            dr.eval(stokes, by_order)
+            means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
+            deviation = stokes[0] - dr.gather(mi.Float, means[0], cell)
+            means += self._per_order(by_order, rounds)
+            return rounds, means, dr.block_sum(deviation * deviation, rounds)
 
         def _analog(self, scene, sensor, seed, first, count, start, rounds):
             """The same, free flights as nature draws them."""
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * rounds)
             rounds_ = dr.opaque(mi.UInt32, rounds)
-            local = lane // rounds_
-            number = lane - local * rounds_ + dr.opaque(mi.UInt32, start)
-            photon = _Photon(scene, sensor, seed, local + dr.opaque(mi.UInt32, first), number)
+            beam = lane // rounds_
+            number = lane - beam * rounds_ + dr.opaque(mi.UInt32, start)
+            lidar = Lidar(scene, sensor)
+            photon = lidar.emit(seed, beam + dr.opaque(mi.UInt32, first), number)
 
-            low, high = sensor.ranges(photon.frame.n)
-            distance, medium, found = photon.collision(2 * high)
-            position = photon.origin + photon.direction * distance
-            mei = interaction(medium, position, photon.direction, photon.wavelengths)
-            back = dr.norm(photon.aperture - position)
-            share = (0.5 * (distance + back) + photon.delay - low) / (high - low)
-            gate = mi.UInt32(dr.clip(share * gates, 0, gates - 1))
-            found &= (share >= 0) & (share < 1)
-            scattering, extinction = coefficients(medium, mei, photon.channel, found)
-            stokes = photon.connect(medium, mei, scattering / extinction, found)
-            return rounds, *_moments_by_scatter(stokes, local * gates + gate, count * gates, rounds)
+            by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
+            sums = [dr.zeros(mi.Float, count * gates) for _ in STOKES]
+            squares = dr.zeros(mi.Float, count * gates)
+            lidar.analog(photon, self.max_order, beam * gates, gates, sums, squares, self.orders, by_order)
+            dr.eval(sums, squares, by_order)
+            number = _opaque(rounds)
+            means = [s / number for s in sums]
+            spread = dr.maximum(squares - number * means[0] * means[0], 0)
+            return rounds, means + self._per_order(by_order, rounds), spread
 
-        def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
-            fail(NAME, "gradients", "requested", "rendering without gradients")
-
-        def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
-            fail(NAME, "gradients", "requested", "rendering without gradients")
+        def _per_order(self, by_order, rounds):
+            if not self.orders:
+                return []
+            cells = dr.arange(mi.UInt32, dr.width(by_order) // self.max_order)
+            return [
+                dr.gather(mi.Float, by_order, cells * self.max_order + order) / _opaque(rounds)
+                for order in range(self.max_order)
+            ]
 
         def to_string(self):
             return f"GatedVolpath[max_order={self.max_order}, estimator={self.estimator}]"
@@ -206,131 +256,9 @@ def define():
     return GatedVolpath
 
 
-class _Photon:
-    """The photons of a wavefront: emitted into their beams, each with its point of the telescope.
-
-    Positions and directions are in world coordinates. ``delay`` is half the light path (m) by
-    which the photon left after the middle of the pulse.
-    """
-
-    def __init__(self, scene, sensor, seed, beam, number):
-        self.scene, self.sensor = scene, sensor
-        self.rng = _generator(seed, beam, number)
-        laser = sensor.laser
-        self.wavelengths = laser.wavelengths()
-        self.channel = _channel(laser.wavelength)
-        to_world = sensor.world_transform()
-        self.frame = sensor.beam_frame(beam)
-        origin, direction = laser.sample_local(self._pair(), self._pair())
-        self.origin = to_world @ mi.Point3f(self.frame.to_world(mi.Vector3f(origin)))
-        self.direction = dr.normalize(to_world @ self.frame.to_world(direction))
-        self.aperture = to_world @ sensor.sample_aperture(self.frame, self._pair())
-        self.axes = mi.Frame3f(
-            *(to_world @ axis for axis in (self.frame.s, self.frame.t, self.frame.n))
-        )
-        self.delay = mi.Float(0)
-        if laser.pulse_duration > 0:
-            sigma = FWHM_TO_SIGMA * laser.pulse_duration * SPEED_OF_LIGHT / 2
-            self.delay = sigma * mi.warp.square_to_std_normal(self._pair()).x
-
-    def random(self):
-        return self.rng.next_float32()
-
-    def _pair(self):
-        return mi.Point2f(self.random(), self.random())
-
-    def transmittance(self, distance, active):
-        """Along the photon's way out: transmittance, and the medium at its end."""
-        return transmittance(
-            self.scene, self.sensor.get_medium(), self.origin, self.direction, distance,
-            self.channel, self.wavelengths, self.rng, active,
-        )  # fmt: skip
-
-    def collision(self, distance):
-        return collision(
-            self.scene, self.sensor.get_medium(), self.origin, self.direction, distance,
-            self.channel, self.wavelengths, self.rng, mi.Bool(True),
-        )  # fmt: skip
-
-    def connect(self, medium, mei, weight, active):
-        """Next-event estimation: the Stokes vector that reaches the telescope point, about e_h."""
-        back = self.aperture - mei.p
-        distance = dr.norm(back)
-        wo = back / distance
-        active = active & self.sensor.in_field_of_view(self.axes, -back)
-        home, _ = transmittance(
-            self.scene, medium, mei.p, wo, distance,
-            self.channel, self.wavelengths, self.rng, active,
-        )  # fmt: skip
-        weight = weight * home * self.sensor.aperture_area()
-        weight *= -dr.dot(wo, self.axes.n) / (distance * distance)
-        phase = medium.phase_function()
-        value, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, wo, active)
-        if mi.is_polarized:
-            stokes = self._scatter(value, wo)
-        else:
-            stokes = (value[self.channel], mi.Float(0), mi.Float(0), mi.Float(0))
-        return [dr.select(active, s * weight, 0) for s in stokes]
-
-    def _scatter(self, value, wo):
-        """Mueller matrix of a phase function times the laser's Stokes vector."""
-        matrix = [[value[row, column][self.channel] for column in range(4)] for row in range(4)]
-        emitted = rotate_stokes(
-            [mi.Float(s) for s in self.sensor.laser.stokes],
-            self.direction,
-            transverse(self.axes.s, self.direction),
-            mi.mueller.stokes_basis(self.direction),
-        )
-        scattered = [sum(m * s for m, s in zip(row, emitted)) for row in matrix]
-        # scalar phase functions answer with a multiple of the unit matrix in *any* pair of axes
-        scalar = matrix[0][0]
-        depolarises = (matrix[0][1] == 0) & (matrix[1][0] == 0)
-        depolarises &= (matrix[1][1] == scalar) & (matrix[2][2] == scalar)
-        depolarises &= matrix[3][3] == scalar
-        scattered[1:] = [dr.select(depolarises, 0, s) for s in scattered[1:]]
-        return rotate_stokes(
-            scattered, wo, mi.mueller.stokes_basis(wo), transverse(self.axes.s, wo)
-        )
-
-
-def _generator(seed, beam, number):
-    """Independent random numbers for every seed, beam and photon number."""
-    key, counter = mi.sample_tea_32(seed, beam)
-    state, stream = mi.sample_tea_32(key, counter + number)
-    rng = mi.PCG32()
-    rng.seed(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
-    return rng
-
-
-def _channel(wavelength: float) -> int:
-    """Index of the spectrum's entry that stands for the laser."""
-    return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0
-
-
 def _opaque(number: float):
     """A number that changes from scan to scan without being compiled into a kernel."""
     return dr.opaque(mi.Float, number)
-
-
-def _moments_by_block(stokes, count: int):
-    """Means, and S0's sum of squared deviations, over runs of ``count`` photons."""
-    dr.eval(stokes)
-    means = [dr.block_sum(s, count) / _opaque(count) for s in stokes]
-    run = dr.arange(mi.UInt32, dr.width(stokes[0])) // dr.opaque(mi.UInt32, count)
-    deviation = stokes[0] - dr.gather(mi.Float, means[0], run)
-    return means, dr.block_sum(deviation * deviation, count)
-
-
-def _moments_by_scatter(stokes, cell, cells: int, count: int):
-    """The same where a photon may fall into any cell; photons elsewhere count as zeros."""
-    # all sums before any is read: reading one makes Dr.Jit run the kernel so far
-    *sums, squares = (dr.zeros(mi.Float, cells) for _ in range(len(STOKES) + 1))
-    for total, value in zip((*sums, squares), (*stokes, stokes[0] * stokes[0])):
-        # the default mode would compile the number of cells into the kernel
-        dr.scatter_reduce(dr.ReduceOp.Add, total, value, cell, value != 0, mode=dr.ReduceMode.Local)
-    number = _opaque(count)
-    means = [total / number for total in sums]
-    return means, dr.maximum(squares - number * means[0] * means[0], 0)
 
 
 def _merge(first, second):

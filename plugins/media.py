@@ -49,38 +49,66 @@ def _next_surface(scene, origin, direction, travelled, skip, distance, medium, a
     return end, hit, passes, dr.select(hit, behind, medium), SURFACE_SKIP * size
 
 
-@dr.syntax
-def transmittance(scene, medium, origin, direction, distance, channel, wavelengths, rng, active):
+def transmittance(
+    scene, medium, origin, direction, distance, channel, wavelengths, rng, active,
+    differentiable=False,
+):  # fmt: skip
     """Unbiased estimate of the transmittance along a straight line, and the medium at its end.
 
-    Homogeneous media in closed form; others by ratio tracking (Novak et al. 2014, ACM TOG 33(6)),
-    unbiased for any majorant that bounds the extinction coefficient.
+    Homogeneous media in closed form; others by residual ratio tracking (Novak et al. 2014, ACM TOG
+    33(6)), unbiased for any majorant that bounds the extinction coefficient.
+
+    With ``differentiable``, gradients are unbiased too: d ln T, the integral of -d(extinction), is
+    estimated at one uniform place of the line, independent of the estimate of T.
     """
+    where = rng.next_float32(active) * distance if differentiable else mi.Float(-1)
+    with dr.suspend_grad():
+        value, end, between = _walk(
+            scene, medium, dr.detach(origin), dr.detach(direction), dr.detach(distance), where,
+            channel, wavelengths, rng, active,
+        )  # fmt: skip
+    if differentiable:
+        mei = interaction(between, origin + direction * where, direction, wavelengths)
+        inside = active & (between != None)
+        _, extinction = coefficients(between, mei, channel, inside)
+        depth = dr.select(inside, extinction * distance, 0)
+        value *= dr.exp(dr.detach(depth) - depth)
+    return value, end
+
+
+@dr.syntax
+def _walk(scene, medium, origin, direction, distance, where, channel, wavelengths, rng, active):
+    """Transmittance, medium at the end, and medium at the distance ``where``."""
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
     travelled, skip, value = mi.Float(0), mi.Float(0), mi.Float(1)
+    between = mi.MediumPtr(medium)
     while dr.hint(active, label="transmittance"):
         end, hit, passes, behind, skip = _next_surface(
             scene, origin, direction, travelled, skip, distance, medium, active
         )
         inside = active & (medium != None)
-        homogeneous = inside & medium.is_homogeneous()
-        mei = interaction(medium, origin + direction * travelled, direction, wavelengths)
+        # the extinction in the middle of the segment stands for all of it, the rest is tracked
+        middle = origin + direction * (0.5 * (travelled + end))
+        mei = interaction(medium, middle, direction, wavelengths)
+        _, control = coefficients(medium, mei, channel, inside)
+        value = dr.select(inside, value * dr.exp(-control * (end - travelled)), value)
         majorant = medium.get_majorant(mei, inside)[channel]
-        value = dr.select(homogeneous, value * dr.exp(-majorant * (end - travelled)), value)
-        tracking = inside & ~homogeneous & (majorant > 0)
+        tracking = inside & ~medium.is_homogeneous() & (majorant > 0)
         position = mi.Float(travelled)
         while dr.hint(tracking, label="ratio tracking"):
             position -= dr.log(1 - rng.next_float32(tracking)) / majorant
             tracking &= position < end
             mei = interaction(medium, origin + direction * position, direction, wavelengths)
             _, extinction = coefficients(medium, mei, channel, tracking)
-            value = dr.select(tracking, value * (1 - extinction / majorant), value)
+            excess = (extinction - control) / majorant
+            value = dr.select(tracking, value * (1 - excess), value)
         value = dr.select(hit & ~passes, 0, value)
         medium = dr.select(hit, behind, medium)
+        between = dr.select(hit & (end <= where), behind, between)
         travelled = end
         active &= hit & (value > 0)
-    return value, medium
+    return value, medium, between
 
 
 @dr.syntax

@@ -11,7 +11,7 @@ from .. import __version__
 from ..instrument.lidar import BackscatterLidar
 from ..instrument.scan import ScanPlan
 from ..instrument.signal import apparent_backscatter
-from .exr import QUANTITIES, label_scan
+from .exr import label_scan
 from .settings import RenderSettings
 
 
@@ -75,8 +75,8 @@ def render_scans(
     Yields
     ------
     xr.Dataset
-        S0 ... S3, S0_stderr (gate, z, y), Y (z, y); y and z ascending. One scan at a time, as
-        soon as it is rendered.
+        S0 ... S3, S0_stderr and, with more than one order, each order's S0 as ``orderK.S0``, dims
+        (gate, z, y); Y (z, y); y and z ascending. One scan at a time, as soon as it is rendered.
     """
     chosen = list(range(len(plans)) if scans is None else scans)
     if not chosen:
@@ -94,8 +94,10 @@ def render_scans(
         if progress:
             scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
         start = time.perf_counter()
-        image = np.array(mi.render(scene, seed=(seed + (index << 16)) % 2**32))
-        scan = _as_dataset(image, plan, lidar, environment, settings, seed)
+        seed_here = (seed + (index << 16)) % 2**32
+        image = np.array(mi.render(scene, seed=seed_here))
+        names = scene.integrator().quantities()
+        scan = _as_dataset(image, names, plan, lidar, environment, settings, seed_here)
         scan.attrs["render_seconds"] = time.perf_counter() - start
         yield scan
 
@@ -118,6 +120,7 @@ def scene_dict(
         "integrator": {
             "type": "gated_volpath",
             "max_order": settings.max_order,
+            "orders": settings.max_order > 1,
             "estimator": settings.estimator,
             "samples_per_pass": settings.samples_per_pass,
         },
@@ -201,13 +204,13 @@ def _box(extinction: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
     return np.array(low), np.array(high)
 
 
-def _as_dataset(image, plan, lidar, environment, settings, seed) -> xr.Dataset:
+def _as_dataset(image, names, plan, lidar, environment, settings, seed) -> xr.Dataset:
     """The rendered tensor (rows from the top, y falling) as a labelled dataset."""
     rows, columns, _ = image.shape
-    values = image.reshape(rows, columns, plan.gate_count, len(QUANTITIES))[::-1, ::-1]
+    values = image.reshape(rows, columns, plan.gate_count, len(names))[::-1, ::-1]
     variables = {
         name: (("gate", "z", "y"), values[..., k].transpose(2, 0, 1))
-        for k, name in enumerate(QUANTITIES)
+        for k, name in enumerate(names)
     }
     y = apparent_backscatter(variables["S0"][1], plan, lidar.aperture_area, environment)
     variables["Y"] = (("z", "y"), y[0].astype(np.float32))

@@ -1,7 +1,8 @@
 """Scans as OpenEXR files: one file a scan, one layer a gate and Stokes component.
 
 A file shows what the pilot sees: top row = largest z, left column = largest y. Layers are
-``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate, and ``Y``, the apparent
+``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate (and
+``gate000.order1.S0``, ... where orders of scattering were told apart), and ``Y``, the apparent
 backscatter of the first gate, so that any viewer shows something at once. Everything else
 (beam positions, gates, instrument, units, seed, version) is in typed header attributes.
 """
@@ -17,7 +18,7 @@ import xarray as xr
 from ..errors import InputError
 
 QUANTITIES = ("S0", "S1", "S2", "S3", "S0_stderr")
-_LAYER = re.compile(r"gate(\d+)\.(\w+)$")
+_LAYER = re.compile(r"gate(\d+)\.(.+)$")
 # header entries that describe the file, not the scan
 _STRUCTURE = {
     "channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio",
@@ -36,7 +37,7 @@ def write_scan(path: str | Path, scan: xr.Dataset) -> None:
     pilot = scan.transpose("gate", "z", "y").sortby(["z", "y"], ascending=False)
     channels = {"Y": pilot["Y"].values}
     for gate in range(pilot.sizes["gate"]):
-        for quantity in QUANTITIES:
+        for quantity in _quantities(pilot):
             channels[f"gate{gate:03d}.{quantity}"] = pilot[quantity].values[gate]
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
@@ -106,12 +107,17 @@ def read_scan(path: str | Path) -> xr.Dataset:
             ("gate", "z", "y"),
             np.stack([gates[g][quantity][::-1, ::-1] for g in sorted(gates)]),
         )
-        for quantity in QUANTITIES
+        for quantity in gates[min(gates)]
     }
     variables["Y"] = (("z", "y"), layers["Y"][::-1, ::-1])
     return label_scan(
         xr.Dataset(variables, coords={"gate": sorted(gates), "y": y, "z": z}, attrs=header)
     )
+
+
+def _quantities(scan: xr.Dataset) -> list[str]:
+    """What a scan holds of every gate."""
+    return [name for name, variable in scan.data_vars.items() if "gate" in variable.dims]
 
 
 def label_scan(scan: xr.Dataset) -> xr.Dataset:
@@ -123,7 +129,9 @@ def label_scan(scan: xr.Dataset) -> xr.Dataset:
         "S3": "Stokes V, over emitted pulse energy",
         "S0_stderr": "Monte Carlo standard error of S0",
     }
-    for name, text in meaning.items():
+    for name in _quantities(scan):
+        order = name.removeprefix("order").removesuffix(".S0")
+        text = meaning.get(name, f"S0 of scattering order {order}")
         scan[name].attrs = {"long_name": text, "units": "1"}
     scan["Y"].attrs = {"long_name": "apparent backscatter of the first gate", "units": "m-1 sr-1"}
     scan["y"].attrs = {"long_name": "distance to port", "units": "m", "axis": "Y"}

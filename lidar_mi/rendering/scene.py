@@ -10,7 +10,7 @@ import xarray as xr
 
 from .. import __version__
 from ..errors import InputError
-from .exr import QUANTITIES, label_scan, read_layers, write_scan
+from .exr import label_scan, read_layers, write_scan
 from .variant import use_variant
 
 
@@ -62,7 +62,7 @@ def render_file(
         integrator.progress = lambda done, total: progress(done / total)
     sensor = sensors[0]
     image = np.array(mi.render(scene, spp=samples, seed=seed))
-    scan = _as_dataset(image, sensor)
+    scan = _as_dataset(image, integrator.quantities(), sensor)
     scan.attrs |= {
         "software": f"lidar-mi {__version__}",
         "scene": scene_path.name,
@@ -78,7 +78,7 @@ def render_file(
     return scan
 
 
-def _as_dataset(image: np.ndarray, sensor) -> xr.Dataset:
+def _as_dataset(image: np.ndarray, names: list[str], sensor) -> xr.Dataset:
     """The rendered tensor with the beams' places in the middle of the gates as axes.
 
     A direction table need not form a grid; then pixel numbers serve as axes (``grid`` = 0).
@@ -93,10 +93,10 @@ def _as_dataset(image: np.ndarray, sensor) -> xr.Dataset:
         y, z = (start + stop) / 2 * slope_y[0], (start + stop) / 2 * slope_z[:, 0]
     else:
         y, z = np.arange(columns, dtype=float), np.arange(rows, dtype=float)
-    values = image.reshape(rows, columns, gates, len(QUANTITIES))[::-1, ::-1]
+    values = image.reshape(rows, columns, gates, len(names))[::-1, ::-1]
     variables = {
         name: (("gate", "z", "y"), values[..., k].transpose(2, 0, 1))
-        for k, name in enumerate(QUANTITIES)
+        for k, name in enumerate(names)
     }
     oblique = 1 / beams[..., 0] if sensor.gate_kind == "planar" else 1.0
     length = (stop - start) / gates * oblique
@@ -111,7 +111,12 @@ def _as_dataset(image: np.ndarray, sensor) -> xr.Dataset:
         "gate_stop": stop,
         "wavelength": sensor.laser.wavelength,
         "pulse_energy": sensor.laser.pulse_energy,
+        "pulse_duration": sensor.laser.pulse_duration,
         "stokes_emitted": list(sensor.laser.stokes),
+        "beam_radius": sensor.laser.m_radius[0],
+        "divergence_full": 2 * sensor.laser.m_divergence_half[0],
+        "aperture_radius": sensor.m_aperture[0],
+        "fov_half": float(np.arctan(sensor.m_fov_tan[0])),
     }
     return label_scan(
         xr.Dataset(

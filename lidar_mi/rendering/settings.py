@@ -18,6 +18,6 @@ class RenderSettings(BaseModel):
 
     variant: Literal[VARIANTS] = "llvm_ad_mono_polarized"
     samples_per_beam: int = Field(64, ge=2, lt=2**31)
-    max_order: int = Field(1, ge=1, le=1, description="scattering orders; 1 = single scattering")
+    max_order: int = Field(4, ge=1, le=64, description="scattering orders; 1 = single scattering")
     estimator: Literal["gated", "analog"] = "gated"
     samples_per_pass: int = Field(1 << 22, ge=1024, description="photons in flight: the memory")

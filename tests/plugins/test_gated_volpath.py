@@ -359,7 +359,6 @@ class TestErrors:
     @pytest.mark.parametrize(
         ("parameters", "message"),
         [
-            ({"max_order": 2}, "gated_volpath.max_order: 2 is not allowed; expected 1"),
             ({"max_order": 0}, "gated_volpath.max_order: 0 is not allowed; expected"),
             ({"estimator": "magic"}, "gated_volpath.estimator: 'magic' is not allowed; expected"),
             ({"samples_per_pass": 0}, "gated_volpath.samples_per_pass: 0 is not allowed"),
@@ -428,8 +427,9 @@ class TestErrors:
             "gated_volpath.sample_count: 1 is not allowed; expected at least 2"
         )
 
-    def test_gradients_are_refused(self, world):
-        scene = scan(world, (2, 2))
+    @pytest.mark.parametrize("integrator", [{"estimator": "analog"}, {"max_order": 2}])
+    def test_gradients_are_refused_where_there_are_none(self, world, integrator):
+        scene = scan(world, (2, 2), integrator=integrator)
         with pytest.raises(ValueError, match=r"gated_volpath\.gradients"):
             scene.integrator().render_forward(scene, None)
         with pytest.raises(ValueError, match=r"gated_volpath\.gradients"):

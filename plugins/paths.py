@@ -1,0 +1,386 @@
+"""Light paths of a lidar: from the laser over the air's vertices to a point of the telescope.
+
+`Lidar.forced` finds paths that end in a gate, `Lidar.analog` lets photons fly as nature draws them
+and sees whether they do. Both bring back Stokes vectors about the instrument's horizontal axis.
+"""
+
+import drjit as dr
+import mitsuba as mi
+
+from .media import coefficients, collision, interaction, transmittance
+from .polarization import rotate_stokes, transverse
+
+SPEED_OF_LIGHT = 299_792_458.0
+FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
+
+# Share of photons whose first vertex is looked for near the gate when more orders follow.
+NEAR_SHARE = 0.5
+# Shortest distance from the gate that this search resolves, in radii of the field of view there.
+NEAR_SCALE = 0.02
+
+
+class Photon:
+    """Photons as they leave the laser, each with the telescope point it will be connected to.
+
+    World coordinates. ``frame`` holds the beam's axes in the lidar's own frame, ``axes`` in the
+    world. ``delay`` is half the light path (m) by which the photon left after the middle of the
+    pulse. ``stokes`` refers to ``mi.mueller.stokes_basis(direction)``.
+    """
+
+    def __init__(self, rng, frame, axes, origin, direction, aperture, delay, stokes):
+        self.rng, self.frame, self.axes = rng, frame, axes
+        self.origin, self.direction, self.aperture = origin, direction, aperture
+        self.delay, self.stokes = delay, stokes
+
+
+class Lidar:
+    """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
+
+    def __init__(self, scene, sensor, differentiable=False):
+        self.scene, self.sensor, self.differentiable = scene, sensor, differentiable
+        self.wavelengths = sensor.laser.wavelengths()
+        self.channel = _channel(sensor.laser.wavelength)
+        self.area = sensor.aperture_area()
+        self.context = mi.PhaseFunctionContext()
+
+    def emit(self, seed, beam, number) -> Photon:
+        rng = _generator(seed, beam, number)
+        sensor, laser = self.sensor, self.sensor.laser
+        to_world = sensor.world_transform()
+        frame = sensor.beam_frame(beam)
+        origin, direction = laser.sample_local(_pair(rng), _pair(rng))
+        origin = to_world @ mi.Point3f(frame.to_world(mi.Vector3f(origin)))
+        direction = dr.normalize(to_world @ frame.to_world(direction))
+        aperture = to_world @ sensor.sample_aperture(frame, _pair(rng))
+        axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
+        delay = mi.Float(0)
+        if laser.pulse_duration > 0:
+            sigma = FWHM_TO_SIGMA * laser.pulse_duration * SPEED_OF_LIGHT / 2
+            delay = sigma * mi.warp.square_to_std_normal(_pair(rng)).x
+        stokes = [mi.Float(1)]
+        if mi.is_polarized:
+            stokes = rotate_stokes(
+                [mi.Float(s) for s in laser.stokes],
+                direction,
+                transverse(axes.s, direction),
+                mi.mueller.stokes_basis(direction),
+            )
+        return Photon(rng, frame, axes, origin, direction, aperture, delay, list(stokes))
+
+    def forced(self, photon, low, high, share, max_order, split, by_order, cell):
+        """Stokes vector (about e_h) a photon brings back from its gate.
+
+        ``low`` and ``high`` are twice the gate's ranges less the photon's delay, ``share`` (0 to
+        1) says where between them this photon's whole path is. The sum of all orders up to
+        ``max_order``; with ``split`` each order's S0 is also added to ``by_order``.
+        """
+        medium = mi.MediumPtr(self.sensor.get_medium())
+        offset = photon.origin - photon.aperture
+        path = dr.lerp(low, high, share)
+        closure = _closing(offset, photon.direction, path)
+        total = self._connect(
+            photon, photon.rng, photon.origin, photon.direction, closure, medium, photon.stokes,
+            high - low, (path > 0) & (closure > 0),
+        )  # fmt: skip
+        if split:
+            _add(by_order, total[0], cell * max_order)
+        if max_order == 1:
+            return total
+        further = self._forced_further(
+            photon, photon.rng, photon.origin, photon.direction, photon.stokes, medium, low, high,
+            path, mi.UInt32(max_order), split, by_order, cell, max_order,
+        )  # fmt: skip
+        return _sum(total, further)
+
+    @dr.syntax
+    def _forced_further(
+        self, photon, rng, position, direction, stokes, medium, low, high, path, last, split,
+        by_order, cell, max_order,
+    ):  # fmt: skip
+        """Orders from two on.
+
+        Three ways lead to a path's last vertex: along the photon's flight to where the path closes
+        (``ahead``); from the telescope, along a direction of the field of view, to where it closes
+        (``back``); and a free flight that happens to end in the gate (``free``), which covers
+        vertices of small scattering angle, where a range says little about a place.
+        """
+        aperture, axes = photon.aperture, photon.axes
+        width = high - low
+        total, order = _copied([0, 0, 0, 0]), mi.UInt32(1)
+        position, direction = mi.Point3f(position), mi.Vector3f(direction)
+        stokes, medium = _copied(stokes), mi.MediumPtr(medium)
+        low, high, path = mi.Float(low), mi.Float(high), mi.Float(path)
+        density = mi.Float(0)  # of the flight's direction; 0: the laser's
+        active = high > 0
+        while dr.hint(active, label="scattering orders"):
+            # the next vertex: no later than the far end of the gate
+            reach = _closing(position - aperture, direction, high)
+            active &= reach > 0
+            near = active & (order == 1) & (rng.next_float32(active) < NEAR_SHARE)
+            flight, behind, found = collision(
+                self.scene, medium, position, direction, reach, self.channel, self.wavelengths,
+                rng, active & ~near,
+            )  # fmt: skip
+            footprint = NEAR_SCALE * 0.5 * path * self.sensor.m_fov_tan
+            spread = dr.log((reach + footprint) / footprint)
+            left = footprint * (dr.exp(spread * rng.next_float32(active)) - 1)
+            flight = dr.select(near, reach - left, flight)
+            near &= flight > 0
+            survived, arrived = transmittance(
+                self.scene, medium, position, direction, flight, self.channel, self.wavelengths,
+                rng, near,
+            )  # fmt: skip
+            medium = dr.select(near, arrived, behind)
+            active &= (near & (medium != None)) | found
+            vertex = mi.Point3f(position + direction * flight)
+            mei = interaction(medium, vertex, direction, self.wavelengths)
+            scattering, extinction = coefficients(medium, mei, self.channel, active)
+            # two ways of finding the first vertex; any partition of one keeps the mean
+            drawn = dr.rcp((reach - flight + footprint) * spread)
+            part = NEAR_SHARE * drawn / (NEAR_SHARE * drawn + (1 - NEAR_SHARE) * extinction)
+            weight = dr.select(
+                near,
+                survived * scattering / drawn * part / NEAR_SHARE,
+                scattering / extinction * dr.select(order == 1, (1 - part) / (1 - NEAR_SHARE), 1),
+            )  # fmt: skip
+            stokes = _scaled(stokes, dr.select(active, weight, 0))
+            active &= stokes[0] > 0
+            low, high, path = low - flight, high - flight, path - flight
+
+            # free: this vertex may be the last one
+            home = aperture - vertex
+            outside = dr.norm(home)
+            in_gate = active & (order > 1) & (outside >= low) & (outside < high)
+            slope = 1 - dr.dot(direction, home / outside)
+            chance = extinction * dr.exp(-extinction * flight) * width
+            aimed = self._aimed(axes, home, outside, flight)
+            share = chance / (chance + slope * (1 + aimed / density))
+            gain = self._receive(photon, rng, medium, mei, stokes, in_gate, share)
+            total = _sum(total, gain)
+            if dr.hint(split, mode="scalar"):
+                _add(by_order, gain[0], cell * max_order + order - 1, in_gate)
+            order += 1
+            active &= order <= last
+
+            # back: the last vertex looked for from the telescope
+            inward = self._in_field(axes, rng)
+            outside = _closing(aperture - vertex, inward, path)
+            end = aperture + inward * outside
+            leg = dr.norm(end - vertex)
+            outward = (end - vertex) / leg
+            seen = active & (outside > 0) & (leg > 0)
+            bent, density = self._scatter(medium, mei, stokes, outward, seen)
+            aimed = dr.square(leg / outside) / self._field_solid_angle()
+            gain = self._connect(
+                photon, rng, vertex, outward, leg, medium, _scaled(bent, dr.rcp(aimed)), width,
+                seen, (aimed, density, aimed),
+            )  # fmt: skip
+
+            # ahead: along the photon's next flight
+            onward, value, density = medium.phase_function().sample(
+                self.context, mei, rng.next_float32(active), _pair(rng), active
+            )
+            stokes = _apply(value, stokes, self.channel)
+            active &= density > 0
+            closure = _closing(vertex - aperture, onward, path)
+            home = aperture - (vertex + onward * closure)
+            aimed = self._aimed(axes, home, dr.norm(home), closure)
+            gain = _sum(gain, self._connect(
+                photon, rng, vertex, onward, closure, medium, stokes, width,
+                active & (closure > 0), (density, density, aimed),
+            ))  # fmt: skip
+            total = _sum(total, gain)
+            if dr.hint(split, mode="scalar"):
+                _add(by_order, gain[0], cell * max_order + order - 1, active)
+            position, direction = mi.Point3f(vertex), mi.Vector3f(onward)
+        return total
+
+    def _aimed(self, axes, home, outside, leg):
+        """Density, per solid angle of the flight, of finding its end from the telescope.
+
+        Flight and return meet an ellipsoid under the same angle, so the solid angles of a piece
+        of it, seen from its foci, are as one over the distances squared.
+        """
+        visible = self.sensor.in_field_of_view(axes, -home)
+        return dr.select(visible, dr.square(leg / outside) / self._field_solid_angle(), 0)
+
+    def _connect(
+        self, photon, rng, position, direction, distance, medium, stokes, width, active,
+        densities=None,
+    ):  # fmt: skip
+        """Scatter at ``distance`` along a flight, where the path closes: Stokes vector about e_h.
+
+        ``width`` (of the gate, as whole path) times d(distance)/d(path) makes a path length a
+        volume. ``densities`` of the direction, for the balance heuristic: as it was drawn here, by
+        the phase function, and from the telescope; without them this is the only way here.
+        """
+        out, medium = transmittance(
+            self.scene, medium, position, direction, distance, self.channel, self.wavelengths,
+            rng, active, self.differentiable,
+        )  # fmt: skip
+        vertex = position + direction * distance
+        mei = interaction(medium, vertex, direction, self.wavelengths)
+        active = active & (medium != None)
+        scattering, extinction = coefficients(medium, mei, self.channel, active)
+        slope = 1 - dr.dot(direction, dr.normalize(photon.aperture - vertex))
+        volume = width / slope
+        weight = out * scattering * volume
+        if densities:
+            own, density, aimed = densities
+            free = density * extinction * dr.exp(-extinction * distance) * volume
+            weight *= own / (density + aimed + free)
+        return self._receive(photon, rng, medium, mei, stokes, active, weight)
+
+    def _receive(self, photon, rng, medium, mei, stokes, active, weight):
+        """Next-event estimation from an interaction to the telescope point."""
+        back = photon.aperture - mei.p
+        distance = dr.norm(back)
+        wo = back / distance
+        active = active & self.sensor.in_field_of_view(photon.axes, -back)
+        home, _ = transmittance(
+            self.scene, medium, mei.p, wo, distance, self.channel, self.wavelengths, rng, active,
+            self.differentiable,
+        )  # fmt: skip
+        weight = weight * home * self.area * -dr.dot(wo, photon.axes.n) / (distance * distance)
+        received, _ = self._scatter(medium, mei, stokes, wo, active)
+        if not mi.is_polarized:
+            received = [*received, mi.Float(0), mi.Float(0), mi.Float(0)]
+        else:
+            received = rotate_stokes(
+                received, wo, mi.mueller.stokes_basis(wo), transverse(photon.axes.s, wo)
+            )
+        return [dr.select(active, r * weight, 0) for r in received]
+
+    def _scatter(self, medium, mei, stokes, wo, active):
+        """Stokes vector after scattering into a direction (per steradian), and its pdf."""
+        value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
+        return _apply(value, stokes, self.channel), pdf
+
+    def _field_solid_angle(self):
+        cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
+        return dr.two_pi * dr.square(self.sensor.m_fov_tan * cosine) / (1 + cosine)
+
+    def _in_field(self, axes, rng):
+        """A direction of the field of view, uniform in solid angle."""
+        sample = _pair(rng)
+        # 1 - cos, kept apart from 1: fields of view are milliradians
+        below = sample.x * self._field_solid_angle() * dr.inv_two_pi
+        sine = dr.safe_sqrt(below * (2 - below))
+        sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
+        return axes.to_world(mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - below))
+
+    @dr.syntax
+    def analog(self, photon, max_order, base, gates, sums, squares, split, by_order):
+        """Free flights as nature draws them; every collision is connected to the telescope.
+
+        A photon's apparent range never falls from one order to the next (triangle inequality), so
+        what it brings to a gate is complete when a later gate is reached: only then is it squared.
+        """
+        rng, aperture = photon.rng, photon.aperture
+        low, high = self.sensor.ranges(photon.frame.n)
+        position, direction = mi.Point3f(photon.origin), mi.Vector3f(photon.direction)
+        stokes = _copied(photon.stokes)
+        medium = mi.MediumPtr(self.sensor.get_medium())
+        travelled, order = mi.Float(2 * photon.delay), mi.UInt32(1)
+        gate, held = mi.UInt32(0), _copied([0, 0, 0, 0])
+        active = mi.Bool(True)
+        while dr.hint(active, label="scattering orders"):
+            began = mi.Bool(active)
+            flight, medium, active = collision(
+                self.scene, medium, position, direction, 2 * high - travelled, self.channel,
+                self.wavelengths, rng, active,
+            )  # fmt: skip
+            position = mi.Point3f(position + direction * flight)
+            travelled += flight
+            mei = interaction(medium, position, direction, self.wavelengths)
+            scattering, extinction = coefficients(medium, mei, self.channel, active)
+            albedo = dr.select(active, scattering / extinction, 0)
+            stokes = _scaled(stokes, albedo)
+            range_ = 0.5 * (travelled + dr.norm(aperture - position))
+            share = (range_ - low) / (high - low)
+            counts = active & (share >= 0) & (share < 1)
+            gain = self._receive(photon, rng, medium, mei, stokes, counts, mi.Float(1))
+            now = dr.select(counts, mi.UInt32(dr.clip(share * gates, 0, gates - 1)), gate)
+            done = now != gate
+            _deposit(sums, squares, base + gate, held, done)
+            held = _sum(_scaled(held, dr.select(done, 0, 1)), gain)
+            gate = now
+            if dr.hint(split, mode="scalar"):
+                _add(by_order, gain[0], (base + gate) * max_order + order - 1, counts)
+            order += 1
+            active &= (order <= max_order) & (range_ < high)
+            onward, value, density = medium.phase_function().sample(
+                self.context, mei, rng.next_float32(active), _pair(rng), active
+            )
+            stokes = _apply(value, stokes, self.channel)
+            direction = mi.Vector3f(onward)
+            active &= (density > 0) & (stokes[0] > 0)
+            _deposit(sums, squares, base + gate, held, began & ~active)
+
+
+def _add(total, value, cell, active=True):
+    # the default mode would compile the number of cells into the kernel
+    dr.scatter_reduce(dr.ReduceOp.Add, total, value, cell, active, mode=dr.ReduceMode.Local)
+
+
+def _deposit(sums, squares, cell, held, active):
+    """Add what photons have brought to their gates, and its square."""
+    active = active & (held[0] != 0)
+    for total, value in zip(sums, held):
+        _add(total, value, cell, active)
+    _add(squares, held[0] * held[0], cell, active)
+
+
+def _closing(offset, direction, path):
+    """Where a flight must end for the rest of its path to be ``path`` long.
+
+    From ``offset`` (start minus goal) along ``direction`` to t, and from there to the goal:
+    t + |offset + t direction| = path, t = (path^2 - |offset|^2) / (2 (path + offset.direction)).
+    -1 where the path is shorter than the straight line.
+    """
+    length = dr.norm(offset)
+    end = (path - length) * (path + length) / (2 * (path + dr.dot(offset, direction)))
+    return dr.select(path > length, end, -1)
+
+
+def _apply(value, stokes, channel):
+    """A phase function's value (Mueller matrix or number) times a Stokes vector."""
+    if not mi.is_polarized:
+        return [value[channel] * stokes[0]]
+    matrix = [[value[row, column][channel] for column in range(4)] for row in range(4)]
+    scattered = [sum(m * s for m, s in zip(row, stokes)) for row in matrix]
+    # scalar phase functions answer with a multiple of the unit matrix in *any* pair of axes
+    scalar = matrix[0][0]
+    depolarises = (matrix[0][1] == 0) & (matrix[1][0] == 0)
+    depolarises &= (matrix[1][1] == scalar) & (matrix[2][2] == scalar) & (matrix[3][3] == scalar)
+    return [scattered[0], *(dr.select(depolarises, 0, s) for s in scattered[1:])]
+
+
+def _copied(stokes):
+    return [mi.Float(s) for s in stokes]
+
+
+def _sum(first, second):
+    return [a + b for a, b in zip(first, second, strict=True)]
+
+
+def _scaled(stokes, factor):
+    return [s * factor for s in stokes]
+
+
+def _pair(rng):
+    return mi.Point2f(rng.next_float32(), rng.next_float32())
+
+
+def _generator(seed, beam, number):
+    """Independent random numbers for every seed, beam and photon number."""
+    key, counter = mi.sample_tea_32(seed, beam)
+    state, stream = mi.sample_tea_32(key, counter + number)
+    rng = mi.PCG32()
+    rng.seed(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
+    return rng
+
+
+def _channel(wavelength: float) -> int:
+    """Index of the spectrum's entry that stands for the laser."""
+    return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0
