@@ -42,8 +42,9 @@ def write_scan(path: str | Path, scan: xr.Dataset) -> None:
     header = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        "y": scan["y"].values.astype(np.float32),
-        "z": scan["z"].values.astype(np.float32),
+        # ascending, whatever the order in the dataset
+        "y": pilot["y"].values[::-1].astype(np.float32),
+        "z": pilot["z"].values[::-1].astype(np.float32),
     }
     for key, value in scan.attrs.items():
         header[key] = value.astype(np.float32) if isinstance(value, np.ndarray) else value

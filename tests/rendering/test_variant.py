@@ -1,0 +1,38 @@
+"""Choosing Mitsuba's variant. Detects an error that is no single clear line."""
+
+import mitsuba as mi
+import pytest
+
+from lidar_mi.errors import InputError
+from lidar_mi.rendering.settings import VARIANTS
+from lidar_mi.rendering.variant import use_variant
+
+
+@pytest.mark.parametrize("name", [v for v in VARIANTS if v.startswith("llvm")])
+def test_every_llvm_variant_can_be_set(variant, name):
+    use_variant(name)
+    assert mi.variant() == name
+    assert mi.load_dict({"type": "rayleigh_polarized"}) is not None
+
+
+@pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_magic", "", "LLVM_AD_RGB"])
+def test_others_are_refused(variant, name):
+    with pytest.raises(InputError) as error:
+        use_variant(name)
+    assert str(error.value).startswith(
+        f"variant: {name!r} is not allowed; expected one of llvm_ad_"
+    )
+    assert "\n" not in str(error.value)
+    assert mi.variant() == variant
+
+
+def test_a_variant_that_cannot_run_here_says_so(variant):
+    """Where there is a CUDA device it can, and is set."""
+    try:
+        use_variant("cuda_ad_mono_polarized")
+    except InputError as error:
+        assert str(error).startswith("variant: cuda_ad_mono_polarized cannot run here (")
+        assert "\n" not in str(error)
+        assert mi.variant() == variant
+    else:
+        assert mi.variant() == "cuda_ad_mono_polarized"
