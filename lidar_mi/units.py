@@ -31,7 +31,7 @@ def to_si(value, unit: str, example: str) -> float:
         The text is no quantity, or its unit is no multiple of ``unit``.
     """
     if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise ValueError(f"{value!r} is not allowed; expected a quantity such as '{example}'")
+        raise ValueError(f"{value!r} is not allowed; expected a quantity such as '{example}'")  # noqa: TRY004
     if not isinstance(value, str):
         if unit == "rad" and value != 0:
             raise ValueError(f"{value!r} has no unit; expected an angle such as '{example}'")
@@ -67,4 +67,7 @@ Speed = _quantity("m/s", "150 m/s")
 Time = _quantity("s", "0.1 s")
 Energy = _quantity("J", "1 mJ")
 Extinction = _quantity("1/m", "1.8 / km")
+Frequency = _quantity("Hz", "1 kHz")
+SpectralRadiance = _quantity("W/m^3/sr", "0.3 W/m^2/sr/nm")
+Circulation = _quantity("m^2/s", "458 m^2/s")
 Number = _quantity("", "0.5")

@@ -1,0 +1,153 @@
+"""What else a scan tells: linear depolarisation ratio, share of multiple scattering."""
+
+import numpy as np
+import xarray as xr
+
+from ..errors import InputError
+
+
+def linear_depolarization(s0, s1):
+    """Linear depolarisation ratio delta = (S0 - S1) / (S0 + S1), cross over co-polarised light.
+
+    For emission polarised along e_h, the axis that S1 refers to. NaN where no co-polarised light
+    came back.
+    """
+    s0, s1 = np.asarray(s0, float), np.asarray(s1, float)
+    parallel = s0 + s1
+    return np.divide(s0 - s1, parallel, out=np.full(parallel.shape, np.nan), where=parallel > 0)
+
+
+def depolarization_stderr(s0, s1, s0_stderr, s1_stderr, correlation):
+    """Standard error of `linear_depolarization` by linear error propagation.
+
+    Parameters
+    ----------
+    s0, s1 : array
+    s0_stderr, s1_stderr : array
+        Standard errors of S0 and S1.
+    correlation : array
+        Correlation coefficient of the estimates of S0 and S1. It is near +-1, as both come from
+        the same photons: taking it as 0 makes the error many times too large.
+    """
+    s0, s1 = np.asarray(s0, float), np.asarray(s1, float)
+    first, second = s1 * s0_stderr, s0 * s1_stderr
+    # written as a sum of squares, because its terms nearly cancel where all photons agree
+    correlation = np.clip(correlation, -1, 1)
+    root = 2 * np.sqrt((first - correlation * second) ** 2 + (1 - correlation**2) * second**2)
+    total = s0 + s1
+    return np.divide(root, total**2, out=np.full(root.shape, np.nan), where=total > 0)
+
+
+def depolarization_stderr_bound(s0, s1, s0_stderr, photons: int):
+    """The largest standard error the depolarisation ratio can have, from that of S0 alone.
+
+    A photon of weight s brings x cross- and s - x co-polarised light, 0 <= x <= s. The error of
+    the ratio delta of their sums is that of the mean of (1 + delta) x - delta s, over the mean
+    co-polarised light; it lies between -delta s and s, whatever the photon did. So for n
+    independent photons
+
+        stderr(delta) <= max(1, delta) (1 + delta) sqrt(<s^2> / n) / <s>,
+        <s^2> / n = stderr(S0)^2 + S0^2 / n.
+
+    Nothing smaller is certain: it would be reached if few photons brought all the depolarisation.
+    Single scattering, where all photons of a beam are nearly alike, lies orders of magnitude below.
+
+    Parameters
+    ----------
+    photons : int
+        Number n of independent photons of a pixel and gate.
+    """
+    s0 = np.asarray(s0, float)
+    ratio = linear_depolarization(s0, s1)
+    relative = np.divide(s0_stderr, s0, out=np.full(s0.shape, np.nan), where=s0 > 0)
+    return np.maximum(1, ratio) * (1 + ratio) * np.sqrt(relative**2 + 1 / photons)
+
+
+def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
+    """Linear depolarisation ratio of a scan, ``depolarization`` and ``depolarization_stderr``.
+
+    The standard error follows from ``S0_stderr``, ``S1_stderr`` and ``S0_S1_correlation`` if the
+    scan has them; from ``S0_stderr`` alone it is `depolarization_stderr_bound`, an upper bound.
+    Attribute ``stderr_is_bound`` of ``depolarization_stderr`` says which.
+
+    Raises
+    ------
+    InputError
+        The scan was rendered without polarisation, or its light was not emitted along e_h.
+    """
+    emitted = scan.attrs.get("stokes_emitted")
+    if emitted is None or not np.allclose(emitted, (1, 1, 0, 0), rtol=0, atol=1e-6):
+        raise InputError(
+            f"stokes_emitted: {emitted} is not allowed for the linear depolarisation ratio; "
+            "expected (1, 1, 0, 0), light polarised along the horizontal axis"
+        )
+    if not scan.attrs.get("polarized"):
+        raise InputError("polarized: 0 is not allowed; expected a scan of a polarised variant")
+    names = ("S0", "S1", "S0_stderr", "S1_stderr", "S0_S1_correlation")
+    dims = ("gate", "z", "y")
+    known = [scan[n].transpose(*dims).values.astype(float) for n in names if n in scan]
+    bound = len(known) < len(names)
+    if bound:
+        stderr = depolarization_stderr_bound(*known[:3], _photons(scan))
+    else:
+        stderr = depolarization_stderr(*known)
+    ratio = linear_depolarization(*known[:2])
+    text = "standard error of the linear depolarisation ratio"
+    coords = {name: scan.coords[name] for name in dims if name in scan.coords}
+    return xr.Dataset(
+        {
+            "depolarization": (
+                dims, ratio, {"long_name": "linear depolarisation ratio", "units": "1"}
+            ),
+            "depolarization_stderr": (
+                dims,
+                stderr,
+                {
+                    "long_name": f"upper bound of the {text}" if bound else text,
+                    "units": "1",
+                    "stderr_is_bound": int(bound),
+                },
+            ),
+        },
+        coords=coords,
+    )  # fmt: skip
+
+
+def multiple_scattering_fraction(
+    single, multiple, single_stderr=0.0, multiple_stderr=0.0, correlation=0.0
+):
+    """Share of the received light that was scattered more than once, and its standard error.
+
+    Parameters
+    ----------
+    single, multiple : array
+        S0 of scattering order one, and of all orders above it together.
+    single_stderr, multiple_stderr : array
+        Their standard errors.
+    correlation : array
+        Correlation coefficient of the two estimates; 0 when the orders were sampled by photons of
+        their own, -1 for an upper bound of the error.
+
+    Returns
+    -------
+    fraction, stderr : arrays
+        multiple / (single + multiple); NaN where no light came back.
+    """
+    single, multiple = np.asarray(single, float), np.asarray(multiple, float)
+    total = single + multiple
+    fraction = np.divide(multiple, total, out=np.full(total.shape, np.nan), where=total > 0)
+    first, second = multiple * single_stderr, single * multiple_stderr
+    correlation = np.clip(correlation, -1, 1)
+    root = np.sqrt((first - correlation * second) ** 2 + (1 - correlation**2) * second**2)
+    root, total = np.broadcast_arrays(root, total)
+    stderr = np.divide(root, total**2, out=np.full(root.shape, np.nan), where=total > 0)
+    return fraction, stderr
+
+
+def _photons(scan: xr.Dataset) -> int:
+    """Independent photons of a pixel and gate: the gated estimator spreads a beam's over gates."""
+    for name in ("samples_per_beam", "estimator", "gate_count"):
+        if name not in scan.attrs:
+            raise InputError(f"scan: attribute {name} is missing; expected a scan rendered here")
+    photons, gates = scan.attrs["samples_per_beam"], scan.attrs["gate_count"]
+    return max(2, -(-photons // gates)) if scan.attrs["estimator"] == "gated" else photons
