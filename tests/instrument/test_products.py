@@ -32,9 +32,9 @@ def photons(kind, seed=1):
     if kind == "mixed":
         weight = random.gamma(4, 0.25, shape)
         return weight, weight * random.beta(1, 4, shape)
-    # one photon in 50 is 10 times as heavy, and of the other kind than all the rest
-    rare = random.uniform(size=shape) < 0.02
-    weight = np.where(rare, 10.0, 1.0)
+    # one photon in 5 is twice as heavy, and polarised across the rest
+    rare = random.uniform(size=shape) < 0.2
+    weight = np.where(rare, 2.0, 1.0)
     return weight, np.where(rare == (kind == "rare cross"), weight, 0.0)
 
 
