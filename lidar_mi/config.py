@@ -11,7 +11,7 @@ from .errors import InputError
 from .instrument.lidar import BackscatterLidar
 from .instrument.scan import Scan
 from .rendering.settings import RenderSettings
-from .units import Extinction, Length, Number, Speed, Time, to_si
+from .units import Circulation, Extinction, Length, Number, Speed, Time, to_si
 
 
 class _Section(BaseModel):
@@ -24,7 +24,7 @@ class VortexPair(_Section):
     """An analytic vortex pair in place of a simulation."""
 
     model: Literal["lamb_oseen", "burnham_hallock"] = "lamb_oseen"
-    circulation: Number = Field(458.0, gt=0, description="m2/s")
+    circulation: Circulation = Field(458.0, gt=0)
     separation: Length = Field(47.1, gt=0)
     core_radius: Length = Field(3.0, gt=0)
     width: Length = Field(109.0, gt=0, description="extent of the domain in y")
@@ -88,6 +88,9 @@ class Wake(_Section):
             raise ValueError(f"second: {self.second!r} is not allowed with vortex_pair")
         if self.vortex_pair and self.depth == "volume":
             raise ValueError("depth: 'volume' is not allowed with vortex_pair")
+        for key in ("time", "x", "centre", "names"):
+            if self.vortex_pair and getattr(self, key):
+                raise ValueError(f"{key}: {getattr(self, key)!r} is not allowed with vortex_pair")
         return self
 
 
@@ -101,16 +104,21 @@ class Platform(_Section):
 class Scattering(_Section):
     """How the air scatters, in the slab and around it."""
 
-    phase: Literal["rayleigh", "isotropic", "henyey_greenstein", "table"] = "rayleigh"
+    phase: Literal["rayleigh", "isotropic", "henyey_greenstein", "aerosol", "table"] = "rayleigh"
+    aerosol: str | None = Field(None, description="name of an aerosol, with phase: aerosol")
     depolarization: Number = Field(0.0, ge=0, lt=0.5, description="of Rayleigh, natural light")
     asymmetry: Number = Field(0.0, gt=-1, lt=1, description="of Henyey-Greenstein")
     table: str | None = Field(None, description="scattering-matrix file, see the mueller plugin")
-    albedo: Number = Field(1.0, ge=0, le=1)
+    albedo: Number | None = Field(
+        None, ge=0, le=1, description="scattered share of the extinction; default: the aerosol's, or 1"
+    )
 
     @model_validator(mode="after")
     def _table_given(self):
         if (self.phase == "table") != (self.table is not None):
             raise ValueError(f"table: {self.table!r} is not allowed with phase {self.phase}")
+        if (self.phase == "aerosol") != (self.aerosol is not None):
+            raise ValueError(f"aerosol: {self.aerosol!r} is not allowed with phase {self.phase}")
         return self
 
 
@@ -183,6 +191,8 @@ def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
         raise InputError(f"{path}:{line} not valid YAML ({reason})") from None
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds no keys; expected name, wake, ...")
+    if isinstance(data.get("experiment"), dict) and "versions" in data:
+        data = data["experiment"]  # the record in a run folder can be run again
     for override in overrides or []:
         _override(data, override)
     return check(data, str(path))

@@ -35,7 +35,7 @@ from .errors import InputError
 from .instrument.scan import ScanPlan, plan_scans
 from .rendering import exr
 from .rendering.backscatter import extrude, render_scans
-from .rendering.phase import phase_function
+from .rendering.phase import albedo, phase_function
 from .rendering.variant import use_variant
 from .retrieval.images import resample_pair
 from .retrieval.wind import retrieve_wind
@@ -57,7 +57,7 @@ class Truth:
     """What the lidar looks at, in the lidar's frame at t1 (metres, m^-1, m s^-1).
 
     ``extinction`` and ``smooth`` (without sub-grid texture) hold the fields at t1 and t2, dims
-    (x, y, z); ``wind`` has v, w on (z, y), averaged over the gates' depth.
+    (x, y, z); ``wind`` has v, w on (z, y), averaged over the depth of the first gate.
     """
 
     extinction: tuple[xr.DataArray, xr.DataArray]
@@ -132,7 +132,7 @@ def run(
 
 def _check_ahead(experiment, truth, plans, beside) -> None:
     """What would only fail later is said before anything is written."""
-    phase_function(experiment.scattering, beside)
+    phase_function(experiment.scattering, beside, experiment.lidar.wavelength)
     settings, image = experiment.retrieval, (len(plans[0].z), len(plans[0].y))
     Windows(image, settings.template, settings.search, settings.stride)
     if not max(float(field.max()) for field in truth.extinction) > 0:
@@ -140,7 +140,7 @@ def _check_ahead(experiment, truth, plans, beside) -> None:
             "wake.extinction: 0 everywhere is not allowed; expected air that scatters, by its "
             "background, tracer or aerosol"
         )
-    if not experiment.scattering.albedo > 0:
+    if not albedo(experiment.scattering, experiment.lidar.wavelength) > 0:
         raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
 
 
@@ -173,7 +173,9 @@ def make_truth(experiment: Experiment, beside: str | Path = ".") -> Truth:
             rough2 = smooth2 * advect(factor, flow["v"], flow["w"], dt)
     else:
         rough1, rough2 = smooth1, smooth2
-    gates = (experiment.scan.range, experiment.scan.range + experiment.scan.thickness)
+    # winds are retrieved from the first gate
+    depth = experiment.scan.thickness / experiment.scan.gate_count
+    gates = (experiment.scan.range, experiment.scan.range + depth)
     wind = xr.Dataset({name: _slab_mean(flow[name], gates) for name in ("v", "w")})
     wind.attrs["gates"] = gates
     return Truth((rough1, rough2), (smooth1, smooth2), wind)
@@ -203,8 +205,8 @@ def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dat
         plans,
         experiment.lidar,
         experiment.wake.extinction.background,
-        phase_function(experiment.scattering, beside),
-        experiment.scattering.albedo,
+        phase_function(experiment.scattering, beside, experiment.lidar.wavelength),
+        albedo(experiment.scattering, experiment.lidar.wavelength),
         experiment.render,
         experiment.seed,
         progress,
@@ -252,12 +254,7 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
                 *images[source],
                 dt=experiment.platform.dt,
                 method=method,
-                template=settings.template,
-                search=settings.search,
-                stride=settings.stride,
-                min_correlation=settings.min_correlation,
-                min_texture=settings.min_texture,
-                min_isotropy=settings.min_isotropy,
+                **_windows(settings),
                 noise=noise.get(source, 0.0),
             )
             true = truth_at_vectors(wind, truth.wind)
@@ -276,11 +273,16 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
     return found
 
 
-def texture_sweep(experiment: Experiment, beside, log) -> dict[str, float]:
-    """How well CC does on extinction pairs of more and less sub-grid texture, all vectors.
+def _windows(settings) -> dict:
+    """Window sizes and thresholds, as `retrieve_wind` takes them."""
+    return settings.model_dump(exclude={"methods"})
 
-    Keys ``texture_sweep.10_percent.rmse_v`` and ``.rmse_w`` (m/s, every vector with a displacement) and
-    ``.valid_fraction``.
+
+def texture_sweep(experiment: Experiment, beside, log) -> dict[str, float]:
+    """How well CC does on extinction pairs of more and less sub-grid texture.
+
+    Keys ``texture_sweep.10_percent.rmse_v`` and ``.rmse_w`` (m/s, every vector with a
+    displacement) and ``.valid_fraction``.
     """
     settings = experiment.retrieval
     metrics = {}
@@ -291,7 +293,7 @@ def texture_sweep(experiment: Experiment, beside, log) -> dict[str, float]:
         truth = make_truth(experiment.model_copy(update={"wake": wake}), beside)
         wind = retrieve_wind(
             truth.image(0), truth.image(1), dt=experiment.platform.dt, method="cc",
-            template=settings.template, search=settings.search, stride=settings.stride,
+            **_windows(settings),
         )  # fmt: skip
         found = wind_metrics(wind, truth_at_vectors(wind, truth.wind), [])
         for key in ("all.rmse_v", "all.rmse_w", "valid_fraction"):
@@ -314,8 +316,8 @@ def blur_by_beam(image: xr.DataArray, lidar, distance: float) -> xr.DataArray:
     Between nodes the air varies linearly, as the renderer's grid does. A beam is a Gaussian with
     the variance per axis of its truncated aperture plus its divergence, so a node k spacings away
     weighs g(k+1) - 2 g(k) + g(k-1), where g(x) is the mean of max(0, x + sigma X) for normal X.
-    For 0.5 m spacing and the paper's beam this blurs nearly twice as much as the Gaussian alone
-    (variance sigma^2 + 1/6 px^2). What is left out costs less than 0.1 % of a pixel on textured
+    The spacing adds 1/6 px^2 to the Gaussian's variance: for 0.5 m and the paper's beam, two
+    thirds more. What is left out costs less than 0.1 % of a pixel on textured
     air: the aperture's truncation beyond its variance, and the smear of oblique beams over the
     gate's depth.
     """
@@ -346,6 +348,10 @@ def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
     first = scans[0].isel(gate=0)
     lit = first["S0"].where(first["S0"] > 0)
     metrics["backscatter.mc_relative_error"] = float((first["S0_stderr"] / lit).median())
+    if "order1.S0" in first:
+        total = float(first["S0"].sum(dtype=float))
+        single = float(first["order1.S0"].sum(dtype=float))
+        metrics["backscatter.multiple_scattering_fraction"] = 1 - single / total
     for core, side in zip(cores, ("first", "second")):
         for key in ("y", "z", "radius", "circulation"):
             metrics[f"wake.{side}_core.{key}"] = getattr(core, key)
@@ -367,18 +373,24 @@ def _flows(experiment: Experiment, beside) -> tuple[xr.Dataset, xr.Dataset | Non
         )
         return pair_wake(vortices, *axes, x=gate_middle), None
     mapping = wake.extinction
-    needed = [
-        name
-        for name, used in (("tracer", mapping.tracer), ("aerosol", mapping.aerosol))
-        if used and mapping.source == "tracer"
-    ]
+    # what the extinction is made from goes by our names from here on, and must be in the file
+    needed = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
+    needed = {n: t for n, t in needed.items() if t and mapping.source == "tracer"}
+    names = wake.names | {n: t for n, t in needed.items() if t != n}
     path = find_file(wake.file, beside, "wake.file")
+    if wake.second != "advect" and wake.time is not None:
+        passed = wake.second - wake.time
+        if abs(passed - experiment.platform.dt) > 1e-3 * experiment.platform.dt:
+            raise InputError(
+                f"wake.second: {wake.second:g} s is not allowed; expected platform.dt = "
+                f"{experiment.platform.dt:g} s after wake.time = {wake.time:g} s"
+            )
     flows = []
     for when in (wake.time, None if wake.second == "advect" else wake.second):
         if flows and when is None:
             return flows[0], None
         plane = wake.x if wake.depth == "plane" else None
-        flow = read_wake(path, when, wake.names, plane, require=needed)
+        flow = read_wake(path, when, names, plane, require=needed)
         if wake.depth == "plane" and flow.sizes["x"] > 1:
             places = flow["x"].values
             raise InputError(
@@ -411,8 +423,8 @@ def _extinction(flow, mapping, first, second) -> xr.DataArray:
         field = extinction_from_speed(flow, **limits, stretch=mapping.stretch, reference=fastest)
     else:
         # an analytic flow carries neither: then the background is all there is
-        tracer = mapping.tracer if mapping.tracer in flow else None
-        aerosol = mapping.aerosol if mapping.aerosol in flow else None
+        tracer = "tracer" if mapping.tracer and "tracer" in flow else None
+        aerosol = "aerosol" if mapping.aerosol and "aerosol" in flow else None
         if tracer is None and aerosol is None:
             field = xr.full_like(flow["v"], mapping.background)
             field.attrs = {"long_name": "extinction coefficient", "units": "m-1"}

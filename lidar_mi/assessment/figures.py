@@ -17,7 +17,7 @@ from .errors import deviations, error_by_texture
 
 METHOD_NAMES = {"cc": "cross-correlation", "ws": "weight shift"}
 ARROW = 0.35  # metres drawn for 1 m/s
-SPEED_LIMIT = 18.0  # m/s, as far as 8 in 16 pixels can see
+SPEED_LIMIT = 18.0  # m/s, the end of the colour scale
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,11 @@ class Scan(BaseModel):
     ``aim: grid`` sends every beam to a node of the wake's (y, z) grid in the middle of the gates,
     at both times to the same nodes. ``aim: angles`` takes equidistant angles (paper): columns in
     +-azimuth_half by rows in +-elevation_half, given for t1 and t2.
+
+    Pixels are placed in the plane x = middle of the gates. With ``gates: spherical`` the light of
+    an oblique beam comes from nearer than that: at 6 degrees off axis the place is wrong by 0.3 m,
+    and by a little more from 485 m than from 500 m, which looks like an outward wind of up to
+    0.3 m/s at the image's corners.
     """
 
     model_config = ConfigDict(

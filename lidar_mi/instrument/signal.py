@@ -10,7 +10,7 @@ def apparent_backscatter(s0, plan: ScanPlan, aperture_area: float, environment: 
 
     The single-scattering lidar equation solved for the backscatter coefficient, with the
     environment's two-way transmittance to the middle of the gate. A homogeneous slab gives a flat
-    image. Attenuation by the slab itself is left in (0.5 % for 2.5 m at 1 / km).
+    image. Attenuation by the slab itself is left in (0.25 % to the middle of 2.5 m at 1 / km).
 
     Parameters
     ----------
