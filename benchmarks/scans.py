@@ -11,7 +11,7 @@ from lidar_mi.config import Experiment, load
 from lidar_mi.experiment import make_truth
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans, scene_dict
-from lidar_mi.rendering.phase import phase_function
+from lidar_mi.rendering.phase import albedo, phase_function
 from lidar_mi.rendering.variant import use_variant
 
 
@@ -32,7 +32,7 @@ class PaperScan:
         """Environment extinction (m^-1), phase function and albedo."""
         scattering = self.experiment.scattering
         background = self.experiment.wake.extinction.background
-        return background, phase_function(scattering), scattering.albedo
+        return background, phase_function(scattering), albedo(scattering)
 
     def scene(self):
         """The scan at t1 as a Mitsuba scene, in the experiment's variant."""
@@ -54,8 +54,9 @@ class PaperScan:
 
 
 def paper_scan(columns: int = 219, rows: int = 139) -> PaperScan:
-    """The demo experiment; fewer columns and rows: the middle of its grid."""
-    experiment = load(Path(str(files("lidar_mi.scenes"))) / "wake_backscatter.yaml")
+    """The demo experiment in single scattering; fewer columns and rows: the middle of its grid."""
+    path = Path(str(files("lidar_mi.scenes"))) / "wake_backscatter.yaml"
+    experiment = load(path, ["render.max_order=1"])
     truth = make_truth(experiment)
     y, z = (_middle(truth.wind[axis], count) for axis, count in (("y", columns), ("z", rows)))
     flown = experiment.platform.speed * experiment.platform.dt
