@@ -56,9 +56,7 @@ def _histories(case, count, max_order, rng):
     position = np.stack([np.zeros(count), radius * np.cos(turn), radius * np.sin(turn)], 1)
     tangent = case.divergence_half * np.sqrt(-0.5 * np.log(1 - rng.random(count)))
     turn = 2 * np.pi * rng.random(count)
-    direction = _unit(
-        np.stack([np.ones(count), tangent * np.cos(turn), tangent * np.sin(turn)], 1)
-    )
+    direction = _unit(np.stack([np.ones(count), tangent * np.cos(turn), tangent * np.sin(turn)], 1))
     axis = _across(np.broadcast_to([0.0, 1.0, 0.0], direction.shape), direction)
     stokes = np.zeros((count, 4))
     stokes[:, :2] = 1.0
