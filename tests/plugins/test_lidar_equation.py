@@ -199,10 +199,13 @@ class TestMajorants:
 
 
 def test_varying_grid(world, statistics):
-    """A ramp of extinction along x: linear between cell centres, so known in closed form."""
+    """A valley of extinction along x: linear between cell centres, so known in closed form.
+
+    Strongly curved, so that no mean or middle value stands for the way through it.
+    """
     photons = 4000
     centres = 400 + 10 * (np.arange(20) + 0.5)
-    values = 1e-3 * (1 + (centres - 400) / 50)
+    values = 1e-3 * (1 + np.abs(centres - 465) / 10)
     slab = world.grid(np.broadcast_to(values, (2, 2, 20)), [400, -90, -90], [600, 90, 90])
     scene = world.scene(
         world.lidar((25, 20), (500.0, 540.0), gate_count=4, **SCAN),
@@ -212,12 +215,11 @@ def test_varying_grid(world, statistics):
     secant = secants(scene, (20, 25))
 
     def extinction(r):
-        # beyond the outermost centres the grid is constant
-        return 1e-3 * (1 + np.maximum(r / secant - 405, 0) / 50 + 0.1)
+        return 1e-3 * (1 + (r / secant - 465) / 10)
 
     def depth(r):
-        x = r / secant
-        return secant * 1e-3 * (1.1 * (x - 400) + np.maximum(x - 405, 0) ** 2 / 100)
+        # 7e-3 in the outermost half cell, then down to 1e-3 at 465 m and up again
+        return secant * 1e-3 * (5 * 7 + 60 * 4 + (x := r / secant - 465) + x**2 / 20)
 
     truth = lidar_equation(np.linspace(500, 540, 5)[:, None, None] * secant, extinction, depth)
     for gate in range(4):

@@ -41,6 +41,8 @@ CASES = {
     # parallax of up to 10 degrees: gates are ellipsoids, dipoles are seen from aside
     "near and wide": Case((20.0, 25.0), 3.0, 120.0, 60.0, 0.5, 0.8, 2e-2),
     "near, wide, cut by the view": Case((8.0, 9.0), 3.0, 250.0, 200.0, 1.0, 2.0, 5e-2),
+    # parallax of up to 45 degrees: obliquity and the path's Jacobian far from those of backscatter
+    "nearer than wide": Case((3.0, 4.0), 3.0, 1200.0, 100.0, 0.3, 0.6, 5e-2),
     "near, wide, long pulse": Case((20.0, 25.0), 3.0, 120.0, 60.0, 0.5, 0.8, 2e-2, 30e-9),
 }
 
