@@ -352,7 +352,8 @@ def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
         total = float(first["S0"].sum(dtype=float))
         single = float(first["order1.S0"].sum(dtype=float))
         metrics["backscatter.multiple_scattering_fraction"] = 1 - single / total
-    for core, side in zip(cores, ("first", "second")):
+    for core in cores:
+        side = "port" if core.circulation > 0 else "starboard"
         for key in ("y", "z", "radius", "circulation"):
             metrics[f"wake.{side}_core.{key}"] = getattr(core, key)
     return metrics

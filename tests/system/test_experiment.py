@@ -168,7 +168,7 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
         )
     }  # fmt: skip
     expected |= {"backscatter.mc_relative_error", "backscatter.multiple_scattering_fraction"}
-    expected |= {f"wake.{side}_core.{q}" for side in ("first", "second")
+    expected |= {f"wake.{side}_core.{q}" for side in ("port", "starboard")
                  for q in ("y", "z", "radius", "circulation")}  # fmt: skip
     expected |= {f"texture_sweep.{level}_percent.{q}" for level in (0, 2, 5, 10, 20, 40)
                  for q in ("rmse_v", "rmse_w", "valid_fraction")}  # fmt: skip
@@ -753,8 +753,8 @@ def test_whole_simulation_as_a_volume(tmp_path, quick):
     for name in ("v", "w"):
         assert metrics[f"extinction.cc.rmse_{name}"] < 0.8
         assert metrics[f"backscatter.cc.rmse_{name}"] < 1.0
-    assert metrics["wake.first_core.y"] == pytest.approx(23.4, abs=0.5)
-    assert metrics["wake.second_core.y"] == pytest.approx(-23.4, abs=0.5)
+    assert metrics["wake.port_core.y"] == pytest.approx(23.4, abs=0.5)
+    assert metrics["wake.starboard_core.y"] == pytest.approx(-23.4, abs=0.5)
 
 
 # ---------------------------------------------------------------- going on, and repeating
