@@ -94,7 +94,7 @@ def render_scans(
         if progress:
             scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
         start = time.perf_counter()
-        seed_here = (seed + (index << 16)) % 2**32
+        seed_here = (seed + (index << 16)) % 2**31  # a header holds 32 bits with a sign
         image = np.array(mi.render(scene, seed=seed_here))
         names = scene.integrator().quantities()
         scan = _as_dataset(image, names, plan, lidar, environment, settings, seed_here)

@@ -275,6 +275,17 @@ class TestScans:
         z = (one["S0"] - two["S0"]) / np.hypot(one["S0_stderr"], two["S0_stderr"])
         assert float(np.abs(z).max()) < 5
 
+    def test_the_largest_seed_is_told_as_it_was_used(self, tmp_path):
+        """In the file too, whose whole numbers have 32 bits with a sign."""
+        plans = self.plans()
+        fields = list(self.fields(plans))
+        scans = render(fields, plans, seed=2**31 - 1)
+        for scan in scans:
+            write_scan(tmp_path / "scan.exr", scan)
+            assert read_scan(tmp_path / "scan.exr").attrs["seed"] == scan.attrs["seed"] >= 0
+        (again,) = render(fields[1:], plans[1:], seed=scans[1].attrs["seed"])
+        assert np.array_equal(again["S0"], scans[1]["S0"])
+
     def test_seed_and_albedo(self):
         plans = self.plans()[:1]
         fields = list(self.fields(plans))
