@@ -371,7 +371,7 @@ def test_multiple_scattering_is_a_small_share(demo):
 
 def test_the_cores_are_those_of_the_wake(demo):
     """y = +-23.4 m at z = -60.4 m, which lies 0.4 m below the domain's middle."""
-    for side, sign in (("first", 1), ("second", -1)):
+    for side, sign in (("port", 1), ("starboard", -1)):
         core = {q: demo.metrics[f"wake.{side}_core.{q}"] for q in ("y", "z", "circulation")}
         assert core["y"] == pytest.approx(sign * 23.4, abs=0.5)
         assert core["z"] == pytest.approx(-0.4, abs=0.5)
@@ -640,7 +640,7 @@ def test_vortex_pair(tmp_path):
     drawn = {path.stem for path in (tmp_path / "run" / "figures").iterdir()}
     assert drawn == FIGURES
     # Lamb-Oseen: 1 - e^-1.2564 of 150 m^2/s at the core radius of 2 m
-    for side, sign in (("first", 1), ("second", -1)):
+    for side, sign in (("port", 1), ("starboard", -1)):
         assert metrics[f"wake.{side}_core.y"] == pytest.approx(8 * sign, abs=0.1)
         assert metrics[f"wake.{side}_core.radius"] == pytest.approx(2, abs=0.13)
         assert metrics[f"wake.{side}_core.circulation"] == pytest.approx(
