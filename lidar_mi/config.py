@@ -8,6 +8,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from .errors import InputError
+from .instrument.detector import Detector
 from .instrument.lidar import BackscatterLidar
 from .instrument.scan import Scan
 from .rendering.settings import RenderSettings
@@ -151,6 +152,7 @@ class Experiment(_Section):
     wake: Wake
     platform: Platform = Platform()
     lidar: BackscatterLidar = BackscatterLidar()
+    detector: Detector | None = Field(None, description="adds a noisy picture and its winds")
     scan: Scan = Scan()
     scattering: Scattering = Scattering()
     render: RenderSettings = RenderSettings()

@@ -32,6 +32,7 @@ from .atmosphere.vortex import pair_wake, vortex_pair
 from .atmosphere.wake import centre, read_wake, resample
 from .config import Experiment
 from .errors import InputError
+from .instrument.detector import noise_budget, noisy_scan
 from .instrument.scan import ScanPlan, plan_scans
 from .rendering import exr
 from .rendering.backscatter import extrude, render_scans
@@ -42,8 +43,8 @@ from .retrieval.wind import retrieve_wind
 from .retrieval.windows import Windows
 
 IMAGES = ("image_t1.exr", "image_t2.exr")
-# what winds are retrieved from; see `winds`
-SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
+# what winds are retrieved from behind a detector, beside the noise-free picture
+NOISY = "backscatter_noisy"
 
 # relative rms of the sub-grid texture for which `texture_sweep` says how good winds get
 TEXTURE_SWEEP = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
@@ -116,6 +117,9 @@ def run(
         write_netcdf(found, folder / "wind.nc")
         sweep = texture_sweep(experiment, beside, log)
     metrics = verdict(found, scans, cores) | sweep
+    if experiment.detector:
+        budget = noise_budget(scans[0], experiment.lidar, experiment.detector)
+        metrics |= {f"detector.{key}": value for key, value in budget.items()}
     with _timed(timing, "figures"):
         log("drawing figures")
         drawn = figures.draw_all(folder / "figures", truth, scans, found, cores, sweep, log)
@@ -213,6 +217,10 @@ def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dat
         missing,
     )
     for index, scan in zip(missing, rendered):
+        if experiment.detector:
+            # numbers of their own, apart from those of the light transport
+            seed = [experiment.seed, index, 1]
+            scan = noisy_scan(scan, experiment.lidar, experiment.detector, seed)
         exr.write_scan(paths[index], scan)
     # read back, so that a resumed run and one that was not see the same float32 values
     return [exr.read_scan(path) for path in paths]
@@ -223,7 +231,7 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
 
     Returns a data set with dims (source, algorithm, z, y). Sources: the extinction itself, the same
     without sub-grid texture, the extinction blurred by the beam's width (what a noise-free lidar
-    would see), and the rendered backscatter.
+    would see), the rendered backscatter and, with a detector, the same with its noise.
     """
     settings, lidar = experiment.retrieval, experiment.lidar
     images = {
@@ -235,19 +243,23 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
         "backscatter": [scan["Y"] for scan in scans],
     }
     noise = {"backscatter": apparent_noise(scans[0])}
+    if experiment.detector:
+        images[NOISY] = [scan["Y_noisy"] for scan in scans]
+        noise[NOISY] = np.hypot(noise["backscatter"], scans[0]["Y_noise_std"])
     if experiment.scan.aim == "angles":
         # the noise has no structure to interpolate: its level goes along
-        noise["backscatter"] = float(noise["backscatter"].median())
-        grid = resample_pair(*images["backscatter"], experiment.wake.spacing)
-        images["backscatter"] = grid
+        noise = {name: float(level.median()) for name, level in noise.items()}
+        rendered = {
+            name: resample_pair(*images[name], experiment.wake.spacing) for name in noise
+        }
+        grid = rendered["backscatter"][0]
         images = {
-            name: [image.interp(y=grid[0]["y"], z=grid[0]["z"]) for image in pair]
-            if name != "backscatter" else pair
-            for name, pair in images.items()
-        }  # fmt: skip
+            name: [image.interp(y=grid["y"], z=grid["z"]) for image in pair]
+            for name, pair in images.items() if name not in rendered
+        } | rendered  # fmt: skip
     sources = []
-    for source in SOURCES:
-        log.bar(f"retrieving winds from {source.replace('_', ' ')}", SOURCES.index(source) / 4)
+    for index, source in enumerate(images):
+        log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(images))
         methods = []
         for method in settings.methods:
             wind = retrieve_wind(
@@ -263,7 +275,7 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
             methods.append(wind.reset_coords(["y_vector", "z_vector"]))
         sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
     found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
-    found = found.assign_coords(source=list(SOURCES), algorithm=list(settings.methods))
+    found = found.assign_coords(source=list(images), algorithm=list(settings.methods))
     found["score"].attrs = {
         "long_name": "cc: correlation at the peak; ws: misfit of weight and centre of mass",
         "units": "1",

@@ -88,6 +88,7 @@ def _unit(field):
         for kind, unit in (
             (units.Length, "m"), (units.Angle, "rad"), (units.Speed, "m/s"), (units.Time, "s"),
             (units.Energy, "J"), (units.Extinction, "1/m"), (units.Circulation, "m²/s"),
+            (units.Frequency, "Hz"), (units.SpectralRadiance, "W/m³/sr"),
             (units.Number, None),
         )
     }  # fmt: skip

@@ -58,6 +58,8 @@ def draw_all(
          _deviation_maps(found, "backscatter", "extinction")),
         ("fig12_error_by_texture", "Error and texture", _error_by_texture(found, sweep)),
     )  # fmt: skip
+    if "Y_noisy" in scans[0]:
+        plates += (("fig13_detector", "What the detector reads", _detected(scans, found, cores)),)
     drawn = []
     for index, (name, title, (figure, caption)) in enumerate(plates):
         log.bar(f"drawing {title.lower()}", index / len(plates))
@@ -198,6 +200,19 @@ def _backscatter(scans):
     return figure, (
         "Rendered backscatter, normalised for range, gate length and the environment's "
         "transmittance."
+    )
+
+
+def _detected(scans, found, cores):
+    figure, axes = _sheet(1, 2)
+    _image(axes[0, 0], scans[0]["Y_noisy"] * 1e6, "$t_1$ with the detector's noise",
+           "apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$", cmap="cividis")  # fmt: skip
+    wind = found.sel(source="backscatter_noisy").isel(algorithm=0)
+    name = METHOD_NAMES[str(wind["algorithm"].values)]
+    _arrows(axes[0, 1], wind, cores, f"{name}, with noise", _step(wind))
+    return figure, (
+        "The backscatter picture with photon, sky, dark and speckle noise of one pulse a beam, and "
+        "the wind found in two of them."
     )
 
 

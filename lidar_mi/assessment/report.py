@@ -58,7 +58,9 @@ def page(
 
 
 def _tables(experiment, metrics):
-    sources = ("backscatter", "extinction", "extinction_blurred", "extinction_without_texture")
+    sources = ["backscatter", "extinction", "extinction_blurred", "extinction_without_texture"]
+    if experiment.detector:
+        sources.insert(0, "backscatter_noisy")
     for method in experiment.retrieval.methods:
         rows = []
         for key, label, unit in _ROWS:

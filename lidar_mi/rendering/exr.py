@@ -3,7 +3,8 @@
 A file shows what the pilot sees: top row = largest z, left column = largest y. Layers are
 ``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate (and
 ``gate000.order1.S0``, ... where orders of scattering were told apart), and ``Y``, the apparent
-backscatter of the first gate, so that any viewer shows something at once. Everything else
+backscatter of the first gate, so that any viewer shows something at once. With a detector, ``gate000.S0_noisy``,
+``gate000.S0_noise_std``, ``Y_noisy`` and ``Y_noise_std`` stand beside them. Everything else
 (beam positions, gates, instrument, units, seed, version) is in typed header attributes.
 """
 
@@ -35,7 +36,7 @@ def write_scan(path: str | Path, scan: xr.Dataset) -> None:
     """
     path = Path(path)
     pilot = scan.transpose("gate", "z", "y").sortby(["z", "y"], ascending=False)
-    channels = {"Y": pilot["Y"].values}
+    channels = {name: pilot[name].transpose("z", "y").values for name in _pictures(pilot)}
     for gate in range(pilot.sizes["gate"]):
         for quantity in _quantities(pilot):
             channels[f"gate{gate:03d}.{quantity}"] = pilot[quantity].values[gate]
@@ -110,7 +111,9 @@ def read_scan(path: str | Path) -> xr.Dataset:
         )
         for quantity in gates[min(gates)]
     }
-    variables["Y"] = (("z", "y"), layers["Y"][::-1, ::-1])
+    for name, pixels in layers.items():
+        if not _LAYER.match(name):
+            variables[name] = (("z", "y"), pixels[::-1, ::-1])
     return label_scan(
         xr.Dataset(variables, coords={"gate": sorted(gates), "y": y, "z": z}, attrs=header)
     )
@@ -121,6 +124,11 @@ def _quantities(scan: xr.Dataset) -> list[str]:
     return [name for name, variable in scan.data_vars.items() if "gate" in variable.dims]
 
 
+def _pictures(scan: xr.Dataset) -> list[str]:
+    """What a scan holds once: Y, and Y_noisy with its standard deviation behind a detector."""
+    return [name for name, variable in scan.data_vars.items() if set(variable.dims) == {"z", "y"}]
+
+
 def label_scan(scan: xr.Dataset) -> xr.Dataset:
     """The same scan with CF names and units on its variables."""
     meaning = {
@@ -129,12 +137,20 @@ def label_scan(scan: xr.Dataset) -> xr.Dataset:
         "S2": "Stokes U about the horizontal axis, over emitted pulse energy",
         "S3": "Stokes V, over emitted pulse energy",
         "S0_stderr": "Monte Carlo standard error of S0",
+        "S0_noisy": "S0 with the detector's noise",
+        "S0_noise_std": "standard deviation of the noise of S0_noisy",
     }
     for name in _quantities(scan):
         order = name.removeprefix("order").removesuffix(".S0")
         text = meaning.get(name, f"S0 of scattering order {order}")
         scan[name].attrs = {"long_name": text, "units": "1"}
-    scan["Y"].attrs = {"long_name": "apparent backscatter of the first gate", "units": "m-1 sr-1"}
+    once = {
+        "Y": "apparent backscatter of the first gate",
+        "Y_noisy": "apparent backscatter with the detector's noise",
+        "Y_noise_std": "standard deviation of the noise of Y_noisy",
+    }
+    for name in _pictures(scan):
+        scan[name].attrs = {"long_name": once.get(name, name), "units": "m-1 sr-1"}
     scan["y"].attrs = {"long_name": "distance to port", "units": "m", "axis": "Y"}
     scan["z"].attrs = {
         "long_name": "height above the beam axis", "units": "m", "axis": "Z", "positive": "up",

@@ -26,7 +26,7 @@ from scipy.stats import norm, qmc
 
 from lidar_mi import config, experiment
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import IMAGES, SOURCES, blur_by_beam, make_truth, run
+from lidar_mi.experiment import IMAGES, blur_by_beam, make_truth, run
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans
@@ -36,6 +36,7 @@ from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.images import on_one_grid
 from lidar_mi.retrieval.wind import retrieve_wind
 
+SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
 SCENES = Path(str(files("lidar_mi.scenes")))
 
 FIGURES = {
@@ -615,6 +616,35 @@ def test_second_snapshot_agrees_with_advection(plain, variation):
     for name in ("v", "w"):
         key = f"backscatter.cc.rmse_{name}"
         assert metrics[key] == pytest.approx(plain[1][key], rel=0.1)
+
+
+def test_detector_adds_a_noisy_picture_and_its_winds(variation):
+    """Weak pulses by day: noise of the stated size in the pictures, worse winds, and a wide
+    field of view lets in more sky than signal; strong pulses give the noise-free winds back."""
+    weak = ["detector={}", "lidar.pulse_energy=1 mJ", "render.samples_per_beam=256"]
+    folder, metrics = variation(*weak)
+    for index in (0, 1):
+        scan = read_scan(folder / IMAGES[index])
+        z = (scan["S0_noisy"] - scan["S0"]) / scan["S0_noise_std"]
+        # variance of 30 441 standard normal numbers: 1 +- 0.008
+        assert float(z.var()) == pytest.approx(1, abs=0.04)
+        assert abs(float(z.mean())) < 4 / np.sqrt(z.size)
+        np.testing.assert_allclose(
+            scan["Y_noisy"] / scan["Y"], (scan["S0_noisy"] / scan["S0"])[0], rtol=1e-4
+        )
+    assert metrics["detector.noise.all"] > 0.005
+    for name in ("v", "w"):
+        key = f"cc.rmse_{name}"
+        assert metrics[f"backscatter_noisy.{key}"] > 1.02 * metrics[f"backscatter.{key}"]
+    strong, again = variation("detector={}", "lidar.pulse_energy=1 J", "scan.aim=angles")
+    assert again["detector.noise.all"] < 1e-3
+    for name in ("v", "w"):
+        key = f"cc.rmse_{name}"
+        assert again[f"backscatter_noisy.{key}"] == pytest.approx(
+            again[f"backscatter.{key}"], rel=0.01
+        )
+    with xr.open_dataset(strong / "wind.nc", engine="h5netcdf") as wind:
+        assert wind["source"].values.tolist() == [*SOURCES, "backscatter_noisy"]
 
 
 def test_aiming_by_angles_is_as_good(plain, variation):
