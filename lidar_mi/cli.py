@@ -125,10 +125,10 @@ def retrieve(
     device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
 ) -> None:
     """Find the cross-flow wind (v, w) in any two EXR images of the same air."""
-    from .experiment import write_netcdf
     from .rendering.scene import read_image
     from .retrieval.images import on_one_grid
     from .retrieval.wind import retrieve_wind
+    from .run_folder import write_netcdf
 
     images = [read_image(path, layer, spacing) for path in (first, second)]
     pair = on_one_grid(*images)
@@ -283,7 +283,7 @@ def _print_metrics(metrics: dict[str, float]) -> None:
 def _info_folder(folder: Path) -> None:
     import json
 
-    from .experiment import read_record
+    from .run_folder import read_record
 
     record = read_record(folder)
     rows = [(name, str(number)) for name, number in record["versions"].items()]

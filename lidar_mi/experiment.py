@@ -4,32 +4,18 @@ A run lives in one folder. Pictures are kept as soon as they are there; a run th
 goes on with those, and everything after them is made again.
 """
 
-import hashlib
 import json
-import os
-import platform
 import time
-from collections.abc import Callable
 from contextlib import contextmanager
-from dataclasses import dataclass
-from importlib.metadata import version
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
-import yaml
-from scipy import integrate, ndimage, stats
 
 from . import __version__, config
 from .assessment import figures, report
 from .assessment.cores import Core, find_cores
 from .assessment.errors import truth_at_vectors, wind_metrics
-from .atmosphere.advection import advect
-from .atmosphere.extinction import extinction_from_speed, extinction_from_tracer
-from .atmosphere.texture import corrsin_obukhov
-from .atmosphere.vortex import pair_wake, vortex_pair
-from .atmosphere.wake import centre, read_wake, resample
 from .config import Experiment
 from .errors import InputError
 from .instrument.detector import noise_budget, noisy_scan
@@ -41,34 +27,14 @@ from .rendering.variant import use_variant
 from .retrieval.images import resample_pair
 from .retrieval.wind import retrieve_wind
 from .retrieval.windows import Windows
+from .run_folder import IMAGES, Log, Notice, claim, write, write_netcdf
+from .truth import Truth, blur_by_beam, make_truth
 
-IMAGES = ("image_t1.exr", "image_t2.exr")
 # what winds are retrieved from behind a detector, beside the noise-free picture
 NOISY = "backscatter_noisy"
 
 # relative rms of the sub-grid texture for which `texture_sweep` says how good winds get
 TEXTURE_SWEEP = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
-
-Notice = Callable[[str, float | None], None]
-"""Called with what is running and how far it is (0 to 1, None: unknown)."""
-
-
-@dataclass(frozen=True)
-class Truth:
-    """What the lidar looks at, in the lidar's frame at t1 (metres, m^-1, m s^-1).
-
-    ``extinction`` and ``smooth`` (without sub-grid texture) hold the fields at t1 and t2, dims
-    (x, y, z); ``wind`` has v, w on (z, y), averaged over the depth of the first gate.
-    """
-
-    extinction: tuple[xr.DataArray, xr.DataArray]
-    smooth: tuple[xr.DataArray, xr.DataArray]
-    wind: xr.Dataset
-
-    def image(self, which: int, smooth: bool = False) -> xr.DataArray:
-        """Extinction averaged over depth as an image (z, y): what an ideal lidar would see."""
-        field = (self.smooth if smooth else self.extinction)[which]
-        return _slab_mean(field, self.wind.attrs["gates"])
 
 
 def run(
@@ -105,8 +71,8 @@ def run(
         truth = make_truth(experiment, beside)
         plans = _plans(experiment, truth)
     _check_ahead(experiment, truth, plans, beside)
-    _claim(folder, experiment, beside, overwrite)
-    log = _Log(folder / "log.txt", notice)
+    claim(folder, experiment, beside, overwrite)
+    log = Log(folder / "log.txt", notice)
     log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")
     scans = pictures(experiment, truth, plans, folder, beside, log)
     timing["render"] = sum(scan.attrs["render_seconds"] for scan in scans)
@@ -124,12 +90,12 @@ def run(
         log("drawing figures")
         drawn = figures.draw_all(folder / "figures", truth, scans, found, cores, sweep, log)
     metrics |= {f"timing.{k}_s": round(v, 3) for k, v in timing.items()}
-    _write(
+    write(
         folder / "metrics.json",
         lambda path: path.write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n"),
     )
     page = report.page(experiment, config.dump(experiment), metrics, cores, drawn)
-    _write(folder / "report.html", lambda path: path.write_text(page))
+    write(folder / "report.html", lambda path: path.write_text(page))
     log("done")
     return metrics
 
@@ -146,43 +112,6 @@ def _check_ahead(experiment, truth, plans, beside) -> None:
         )
     if not albedo(experiment.scattering, experiment.lidar.wavelength) > 0:
         raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
-
-
-def make_truth(experiment: Experiment, beside: str | Path = ".") -> Truth:
-    """The flow and the extinction at both times, on the scan's grid, in the lidar's frame."""
-    first, second = _flows(experiment, beside)
-    mapping, dt = experiment.wake.extinction, experiment.platform.dt
-    smooth1 = _extinction(first, mapping, first, second)
-    if second is None:
-        flow = first
-        smooth2 = advect(smooth1, flow["v"], flow["w"], dt)
-    else:
-        flow = (first + second) / 2
-        smooth2 = _extinction(second, mapping, first, second)
-    texture = experiment.wake.texture
-    if texture.rms > 0:
-        x = first["x"].values if first.sizes["x"] > 1 else None
-        factor = corrsin_obukhov(
-            first["y"].values, first["z"].values, texture.rms, texture.outer_scale,
-            experiment.seed, x=x,
-        )  # fmt: skip
-        if x is None:
-            factor = factor.expand_dims(x=first["x"].values)
-        factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
-        if second is None:
-            rough1 = smooth1 * factor
-            rough2 = advect(rough1, flow["v"], flow["w"], dt)
-        else:
-            rough1 = smooth1 * factor
-            rough2 = smooth2 * advect(factor, flow["v"], flow["w"], dt)
-    else:
-        rough1, rough2 = smooth1, smooth2
-    # winds are retrieved from the first gate
-    depth = experiment.scan.thickness / experiment.scan.gate_count
-    gates = (experiment.scan.range, experiment.scan.range + depth)
-    wind = xr.Dataset({name: _slab_mean(flow[name], gates) for name in ("v", "w")})
-    wind.attrs["gates"] = gates
-    return Truth((rough1, rough2), (smooth1, smooth2), wind)
 
 
 def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dataset]:
@@ -322,32 +251,6 @@ def apparent_noise(scan: xr.Dataset) -> xr.DataArray:
     return (scan["Y"] * first["S0_stderr"] / first["S0"].where(lit)).fillna(0.0)
 
 
-def blur_by_beam(image: xr.DataArray, lidar, distance: float) -> xr.DataArray:
-    """An image seen by beams of finite width, aimed at its nodes, at a distance.
-
-    Between nodes the air varies linearly, as the renderer's grid does. A beam is a Gaussian with
-    the variance per axis of its truncated aperture plus its divergence, so a node k spacings away
-    weighs g(k+1) - 2 g(k) + g(k-1), where g(x) is the mean of max(0, x + sigma X) for normal X.
-    The spacing adds 1/6 px^2 to the Gaussian's variance: for 0.5 m and the paper's beam, two
-    thirds more. What is left out costs less than 0.1 % of a pixel on textured
-    air: the aperture's truncation beyond its variance, and the smear of oblique beams over the
-    gate's depth.
-    """
-    w, cut = lidar.beam_radius, lidar.beam_cut
-    edge = 2 * (cut / w) ** 2
-    lost = edge / np.expm1(edge) if edge < 500 else 0.0
-    aperture = w**2 / 4 * (1 - lost)
-    metres = np.sqrt(aperture + (lidar.divergence_full / 2 * distance) ** 2 / 4)
-    values = image.values
-    for axis, name in enumerate(image.dims):
-        sigma = metres / float(image[name][1] - image[name][0])
-        reach = int(np.ceil(6 * sigma)) + 1
-        x = np.arange(-reach - 1, reach + 2)
-        g = x * stats.norm.cdf(x / sigma) + sigma * stats.norm.pdf(x / sigma)
-        values = ndimage.correlate1d(values, np.diff(g, 2), axis, mode="nearest")
-    return image.copy(data=values)
-
-
 def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
     """All metrics of a run: ``source.method.quantity``."""
     metrics = {}
@@ -371,210 +274,11 @@ def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
     return metrics
 
 
-def _flows(experiment: Experiment, beside) -> tuple[xr.Dataset, xr.Dataset | None]:
-    """The flow at t1 and, if it is a state of its own, at t2, centred and refined."""
-    wake = experiment.wake
-    gate_middle = experiment.scan.range + experiment.scan.thickness / 2
-    if wake.vortex_pair:
-        pair = wake.vortex_pair
-        axes = [
-            np.linspace(-extent / 2, extent / 2, _cells(extent, wake.spacing, name) + 1)
-            for name, extent in (("width", pair.width), ("height", pair.height))
-        ]
-        vortices = vortex_pair(
-            pair.circulation, pair.separation, pair.core_radius, model=pair.model
-        )
-        return pair_wake(vortices, *axes, x=gate_middle), None
-    mapping = wake.extinction
-    # what the extinction is made from goes by our names from here on, and must be in the file
-    needed = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
-    needed = {n: t for n, t in needed.items() if t and mapping.source == "tracer"}
-    names = wake.names | {n: t for n, t in needed.items() if t != n}
-    path = find_file(wake.file, beside, "wake.file")
-    if wake.second != "advect" and wake.time is not None:
-        passed = wake.second - wake.time
-        if abs(passed - experiment.platform.dt) > 1e-3 * experiment.platform.dt:
-            raise InputError(
-                f"wake.second: {wake.second:g} s is not allowed; expected platform.dt = "
-                f"{experiment.platform.dt:g} s after wake.time = {wake.time:g} s"
-            )
-    flows = []
-    for when in (wake.time, None if wake.second == "advect" else wake.second):
-        if flows and when is None:
-            return flows[0], None
-        plane = wake.x if wake.depth == "plane" else None
-        flow = read_wake(path, when, names, plane, require=needed)
-        if wake.depth == "plane" and flow.sizes["x"] > 1:
-            places = flow["x"].values
-            raise InputError(
-                f"wake.x: missing; {path.name} has {len(places)} planes, expected one of "
-                f"{places[0]:g} to {places[-1]:g} m (or wake.depth: volume)"
-            )
-        y, z = wake.centre or (None, None)
-        flow = centre(resample(flow, wake.spacing), y, z).drop_vars("time", errors="ignore")
-        middle = wake.x if wake.x is not None else float(flow["x"].mean())
-        flows.append(flow.assign_coords(x=flow["x"] - middle + gate_middle))
-    return flows[0], flows[1]
-
-
-def _cells(extent: float, spacing: float, name: str) -> int:
-    cells = round(extent / spacing)
-    if cells < 1 or abs(cells * spacing - extent) > 1e-6 * extent:
-        raise InputError(
-            f"wake.vortex_pair.{name}: {extent:g} m is not allowed; expected a multiple of "
-            f"wake.spacing = {spacing:g} m"
-        )
-    return cells
-
-
-def _extinction(flow, mapping, first, second) -> xr.DataArray:
-    """Extinction of one state, scaled by the largest value of both."""
-    limits = {"background": mapping.background, "maximum": mapping.maximum}
-    states = [s for s in (first, second) if s is not None]
-    if mapping.source == "speed":
-        fastest = max(float(np.hypot(s["v"], s["w"]).max()) for s in states)
-        field = extinction_from_speed(flow, **limits, stretch=mapping.stretch, reference=fastest)
-    else:
-        # an analytic flow carries neither: then the background is all there is
-        tracer = "tracer" if mapping.tracer and "tracer" in flow else None
-        aerosol = "aerosol" if mapping.aerosol and "aerosol" in flow else None
-        if tracer is None and aerosol is None:
-            field = xr.full_like(flow["v"], mapping.background)
-            field.attrs = {"long_name": "extinction coefficient", "units": "m-1"}
-            return field.transpose("x", "y", "z")
-        densest = max(float(s[tracer].max()) for s in states) if tracer else None
-        field = extinction_from_tracer(
-            flow, **limits, stretch=mapping.stretch, tracer=tracer, aerosol=aerosol,
-            reference=densest,
-        )  # fmt: skip
-    return field.transpose("x", "y", "z")
-
-
-def _slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
-    """Mean over the depth of planar gates, (z, y); linear between planes, as the renderer's grid."""
-    x = field["x"].values
-    weights = np.ones(1)
-    if len(x) > 1:
-        half = (x[1] - x[0]) / 2
-        first, last = x[0] - half, x[-1] + half
-        if gates[0] < first - 1e-6 or gates[1] > last + 1e-6:
-            raise InputError(
-                f"scan.thickness: gates from {gates[0]:g} to {gates[1]:g} m reach beyond the wake, "
-                f"whose planes fill {first:g} to {last:g} m; expected gates inside"
-            )
-        nodes = np.unique([*gates, *x[(x > gates[0]) & (x < gates[1])]])
-        hats = [np.interp(nodes, x, plane) for plane in np.eye(len(x))]
-        weights = integrate.trapezoid(hats, nodes) / (gates[1] - gates[0])
-    image = (field * xr.DataArray(weights, dims="x")).sum("x").transpose("z", "y")
-    image.attrs = field.attrs
-    for axis in ("y", "z"):
-        image[axis].attrs["units"] = "m"
-    return image
-
-
 def _plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
     flown = experiment.platform.speed * experiment.platform.dt
     return plan_scans(
         experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown)
     )
-
-
-def find_file(name: str, beside: str | Path, field: str) -> Path:
-    """A file named by an experiment: as given, beside the experiment, or shipped."""
-    shipped = Path(str(files("lidar_mi.scenes")))
-    for candidate in (Path(beside) / name, shipped / name):
-        if candidate.is_file():
-            return candidate
-    raise InputError(
-        f"{field}: {name} not found; looked in {Path(beside).resolve()} and the shipped samples "
-        f"({', '.join(sorted(p.name for p in shipped.glob('*.nc')))})"
-    )
-
-
-def _claim(folder: Path, experiment: Experiment, beside: str | Path, overwrite: bool) -> None:
-    """Make the folder this experiment's, keeping pictures of the very same one."""
-    marker = folder / "experiment.yaml"
-    libraries = ("mitsuba", "drjit", "numpy", "scipy", "torch", "kornia", "OpenEXR", "xarray")
-    record = {
-        "experiment": yaml.safe_load(config.dump(experiment)),
-        "files": _checksums(experiment, beside),
-        "versions": {
-            "lidar-mi": __version__,
-            "python": platform.python_version(),
-            **{name: version(name) for name in libraries},
-        },
-    }
-    if marker.is_file():
-        before = read_record(folder)
-        if any(before.get(key) != record[key] for key in ("experiment", "files")):
-            pictures = [folder / name for name in IMAGES if (folder / name).is_file()]
-            if pictures and not overwrite:
-                raise InputError(
-                    f"{folder}: holds a run of another experiment; expected an empty folder "
-                    "(-o DIR), or --overwrite to replace it"
-                )
-            # nothing of the other experiment may be taken for a result of this one
-            old = [folder / name for name in ("wind.nc", "metrics.json", "report.html", "log.txt")]
-            for path in (*pictures, *old, *(folder / "figures").glob("*.png")):
-                path.unlink(missing_ok=True)
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise InputError(f"{folder}: is no run folder; expected an empty or a new one (-o DIR)")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
-    _write(marker, lambda path: path.write_text(yaml.safe_dump(record, sort_keys=False)))
-
-
-def _checksums(experiment: Experiment, beside: str | Path) -> dict[str, str]:
-    """SHA-256 of the files an experiment names: a changed file is another experiment."""
-    paths = {}
-    if experiment.wake.file:
-        paths["wake.file"] = find_file(experiment.wake.file, beside, "wake.file")
-    if experiment.scattering.table:
-        paths["scattering.table"] = Path(phase_function(experiment.scattering, beside)["table"])
-    return {field: hashlib.sha256(path.read_bytes()).hexdigest() for field, path in paths.items()}
-
-
-def read_record(folder: str | Path) -> dict:
-    """What a run folder says it holds: ``experiment`` (resolved), ``files`` (checksums), ``versions``.
-
-    Raises
-    ------
-    InputError
-        The folder's experiment.yaml is missing or was not written by a run.
-    """
-    marker = Path(folder) / "experiment.yaml"
-    try:
-        record = yaml.safe_load(marker.read_text())
-    except OSError:
-        raise InputError(f"{folder}: no experiment.yaml in it; expected a run folder") from None
-    except (yaml.YAMLError, UnicodeDecodeError):
-        record = None
-    if not isinstance(record, dict) or not all(
-        isinstance(record.get(key), dict) for key in ("experiment", "versions")
-    ):
-        raise InputError(f"{marker}: not written by a run; expected a run folder")
-    return record
-
-
-def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
-    """Write a data set as NetCDF-4 under a temporary name, then rename."""
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
-    packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
-    _write(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=packed))
-
-
-def _write(path: Path, write: Callable[[Path], object]) -> None:
-    """Write under a temporary name, then rename: never half a file."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        write(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -583,18 +287,3 @@ def _timed(timing: dict[str, float], name: str):
     yield
     timing[name] = time.perf_counter() - start
 
-
-class _Log:
-    """Lines for the log file and the person in front of the screen."""
-
-    def __init__(self, path: Path, notice: Notice):
-        self.path, self.notice = path, notice
-
-    def __call__(self, text: str) -> None:
-        with self.path.open("a") as file:
-            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
-        self.notice(text, None)
-
-    def bar(self, text: str, share: float) -> None:
-        """Progress within a step: shown, not logged."""
-        self.notice(text, share)

@@ -22,7 +22,7 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from lidar_mi import cli, config, experiment, units
+from lidar_mi import cli, config, truth, units
 from lidar_mi.rendering.phase import phase_function
 
 ROOT = Path(__file__).parents[1]
@@ -261,7 +261,7 @@ def check_yaml(block):
     data = yaml.safe_load(block.text)
     if block.file:
         Path(block.file).write_text(block.text)
-        experiment.make_truth(config.load(block.file))
+        truth.make_truth(config.load(block.file))
         return
     loaded = config.check({**BASE, **data}, block.place)
     phase_function(loaded.scattering)  # finds the table

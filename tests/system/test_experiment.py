@@ -24,9 +24,9 @@ from scipy import ndimage
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import norm, qmc
 
-from lidar_mi import config, experiment
+from lidar_mi import config, experiment, run_folder
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import IMAGES, blur_by_beam, make_truth, run
+from lidar_mi.experiment import run
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans
@@ -35,6 +35,8 @@ from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.images import on_one_grid
 from lidar_mi.retrieval.wind import retrieve_wind
+from lidar_mi.run_folder import IMAGES
+from lidar_mi.truth import blur_by_beam, make_truth
 
 SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
 SCENES = Path(str(files("lidar_mi.scenes")))
@@ -912,7 +914,7 @@ def test_stopped_anywhere_it_goes_on(tmp_path, quick, step):
 
 def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
     data = xr.Dataset({"v": ("y", [1.0, 2.0])})
-    experiment.write_netcdf(data, tmp_path / "wind.nc")
+    run_folder.write_netcdf(data, tmp_path / "wind.nc")
 
     def half(self, path, **_):
         path.write_bytes(b"half a fi")
@@ -920,7 +922,7 @@ def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
 
     monkeypatch.setattr(xr.Dataset, "to_netcdf", half)
     with pytest.raises(KeyboardInterrupt):
-        experiment.write_netcdf(data * 2, tmp_path / "wind.nc")
+        run_folder.write_netcdf(data * 2, tmp_path / "wind.nc")
     monkeypatch.undo()
     assert [p.name for p in tmp_path.iterdir()] == ["wind.nc"]
     with xr.open_dataset(tmp_path / "wind.nc") as kept:

@@ -1,0 +1,125 @@
+"""The folder of a run: whose it is, what was run in it, and files that are never half written."""
+
+import hashlib
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from pathlib import Path
+
+import xarray as xr
+import yaml
+
+from . import __version__, config
+from .config import Experiment
+from .errors import InputError
+from .rendering.phase import phase_function
+from .truth import find_file
+
+IMAGES = ("image_t1.exr", "image_t2.exr")
+
+Notice = Callable[[str, float | None], None]
+"""Called with what is running and how far it is (0 to 1, None: unknown)."""
+
+
+def claim(folder: Path, experiment: Experiment, beside: str | Path, overwrite: bool) -> None:
+    """Make the folder this experiment's, keeping pictures of the very same one."""
+    marker = folder / "experiment.yaml"
+    libraries = ("mitsuba", "drjit", "numpy", "scipy", "torch", "kornia", "OpenEXR", "xarray")
+    record = {
+        "experiment": yaml.safe_load(config.dump(experiment)),
+        "files": _checksums(experiment, beside),
+        "versions": {
+            "lidar-mi": __version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in libraries},
+        },
+    }
+    if marker.is_file():
+        before = read_record(folder)
+        if any(before.get(key) != record[key] for key in ("experiment", "files")):
+            pictures = [folder / name for name in IMAGES if (folder / name).is_file()]
+            if pictures and not overwrite:
+                raise InputError(
+                    f"{folder}: holds a run of another experiment; expected an empty folder "
+                    "(-o DIR), or --overwrite to replace it"
+                )
+            # nothing of the other experiment may be taken for a result of this one
+            old = [folder / name for name in ("wind.nc", "metrics.json", "report.html", "log.txt")]
+            for path in (*pictures, *old, *(folder / "figures").glob("*.png")):
+                path.unlink(missing_ok=True)
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise InputError(f"{folder}: is no run folder; expected an empty or a new one (-o DIR)")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
+    write(marker, lambda path: path.write_text(yaml.safe_dump(record, sort_keys=False)))
+
+
+def _checksums(experiment: Experiment, beside: str | Path) -> dict[str, str]:
+    """SHA-256 of the files an experiment names: a changed file is another experiment."""
+    paths = {}
+    if experiment.wake.file:
+        paths["wake.file"] = find_file(experiment.wake.file, beside, "wake.file")
+    if experiment.scattering.table:
+        paths["scattering.table"] = Path(phase_function(experiment.scattering, beside)["table"])
+    return {field: hashlib.sha256(path.read_bytes()).hexdigest() for field, path in paths.items()}
+
+
+def read_record(folder: str | Path) -> dict:
+    """What a run folder says it holds: ``experiment`` (resolved), ``files`` (checksums), ``versions``.
+
+    Raises
+    ------
+    InputError
+        The folder's experiment.yaml is missing or was not written by a run.
+    """
+    marker = Path(folder) / "experiment.yaml"
+    try:
+        record = yaml.safe_load(marker.read_text())
+    except OSError:
+        raise InputError(f"{folder}: no experiment.yaml in it; expected a run folder") from None
+    except (yaml.YAMLError, UnicodeDecodeError):
+        record = None
+    if not isinstance(record, dict) or not all(
+        isinstance(record.get(key), dict) for key in ("experiment", "versions")
+    ):
+        raise InputError(f"{marker}: not written by a run; expected a run folder")
+    return record
+
+
+def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
+    """Write a data set as NetCDF-4 under a temporary name, then rename."""
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
+    packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
+    write(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=packed))
+
+
+def write(path: Path, write: Callable[[Path], object]) -> None:
+    """Write under a temporary name, then rename: never half a file."""
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+class Log:
+    """Lines for the log file and the person in front of the screen."""
+
+    def __init__(self, path: Path, notice: Notice):
+        self.path, self.notice = path, notice
+
+    def __call__(self, text: str) -> None:
+        with self.path.open("a") as file:
+            file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
+        self.notice(text, None)
+
+    def bar(self, text: str, share: float) -> None:
+        """Progress within a step: shown, not logged."""
+        self.notice(text, share)
