@@ -196,11 +196,7 @@ def blur_by_beam(image: xr.DataArray, lidar, distance: float) -> xr.DataArray:
     air: the aperture's truncation beyond its variance, and the smear of oblique beams over the
     gate's depth.
     """
-    w, cut = lidar.beam_radius, lidar.beam_cut
-    edge = 2 * (cut / w) ** 2
-    lost = edge / np.expm1(edge) if edge < 500 else 0.0
-    aperture = w**2 / 4 * (1 - lost)
-    metres = np.sqrt(aperture + (lidar.divergence_full / 2 * distance) ** 2 / 4)
+    metres = lidar.radius_at(distance) / 2
     values = image.values
     for axis, name in enumerate(image.dims):
         sigma = metres / float(image[name][1] - image[name][0])

@@ -138,13 +138,11 @@ def footprint_radius(lidar: BackscatterLidar, distance):
     A Gaussian with the variance of the truncated aperture plus the divergence. Area pi w^2 is
     (integral of I)^2 / integral of I^2; it is exact for an uncut beam and for one cut far inside
     its 1/e^2 radius, 10 % too small for a collimated one cut there (divergence hides that: the
-    paper's is 2 % too small at 100 m, 0.01 % at 500 m). The field of view is a disc with a sharp edge: there the area is
-    pi w^2 tanh(R^2 / w^2) for radius R, exact for a Gaussian.
+    paper's is 2 % too small at 100 m, 0.01 % at 500 m). The field of view is a disc with a sharp
+    edge: there the area is pi w^2 tanh(R^2 / w^2) for radius R, exact for a Gaussian.
     """
     distance = np.asarray(distance, float)
-    edge = 2 * (lidar.beam_cut / lidar.beam_radius) ** 2
-    lost = edge / np.expm1(edge) if edge < 500 else 0.0
-    squared = lidar.beam_radius**2 * (1 - lost) + (lidar.divergence_full / 2 * distance) ** 2
+    squared = lidar.radius_at(distance) ** 2
     return np.sqrt(squared * np.tanh((distance * lidar.fov_half) ** 2 / squared))
 
 

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from ..units import Angle, Energy, Length, Time
@@ -44,3 +45,13 @@ class BackscatterLidar(BaseModel):
     def aperture_area(self) -> float:
         """Area of the telescope, m^2."""
         return math.pi * self.aperture_radius**2
+
+    def radius_at(self, distance):
+        """1/e^2 radius of the Gaussian with the beam's variance at a distance (m), m.
+
+        Variance of the truncated aperture plus that of the divergence.
+        """
+        edge = 2 * (self.beam_cut / self.beam_radius) ** 2
+        lost = edge / math.expm1(edge) if edge < 500 else 0.0
+        spread = self.divergence_full / 2 * np.asarray(distance, float)
+        return np.sqrt(self.beam_radius**2 * (1 - lost) + spread**2)

@@ -11,7 +11,7 @@ from .. import __version__
 from ..instrument.lidar import BackscatterLidar
 from ..instrument.scan import ScanPlan
 from ..instrument.signal import apparent_backscatter
-from .exr import label_scan
+from .exr import label_scan, unpack
 from .settings import RenderSettings
 
 
@@ -206,12 +206,7 @@ def _box(extinction: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
 
 def _as_dataset(image, names, plan, lidar, environment, settings, seed) -> xr.Dataset:
     """The rendered tensor (rows from the top, y falling) as a labelled dataset."""
-    rows, columns, _ = image.shape
-    values = image.reshape(rows, columns, plan.gate_count, len(names))[::-1, ::-1]
-    variables = {
-        name: (("gate", "z", "y"), values[..., k].transpose(2, 0, 1))
-        for k, name in enumerate(names)
-    }
+    variables = unpack(image, names, plan.gate_count)
     y = apparent_backscatter(variables["S0"][1], plan, lidar.aperture_area, environment)
     variables["Y"] = (("z", "y"), y[0].astype(np.float32))
     attributes = {

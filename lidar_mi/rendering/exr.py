@@ -129,6 +129,16 @@ def _pictures(scan: xr.Dataset) -> list[str]:
     return [name for name, variable in scan.data_vars.items() if set(variable.dims) == {"z", "y"}]
 
 
+def unpack(image: np.ndarray, names: list[str], gates: int) -> dict[str, tuple]:
+    """A rendered tensor (rows from the top, y falling) as variables on (gate, z, y), ascending."""
+    rows, columns, _ = image.shape
+    values = image.reshape(rows, columns, gates, len(names))[::-1, ::-1]
+    return {
+        name: (("gate", "z", "y"), values[..., k].transpose(2, 0, 1))
+        for k, name in enumerate(names)
+    }
+
+
 def label_scan(scan: xr.Dataset) -> xr.Dataset:
     """The same scan with CF names and units on its variables."""
     meaning = {

@@ -10,7 +10,7 @@ import xarray as xr
 
 from .. import __version__
 from ..errors import InputError
-from .exr import label_scan, read_layers, write_scan
+from .exr import label_scan, read_layers, unpack, write_scan
 from .variant import use_variant
 
 
@@ -93,11 +93,7 @@ def _as_dataset(image: np.ndarray, names: list[str], sensor) -> xr.Dataset:
         y, z = (start + stop) / 2 * slope_y[0], (start + stop) / 2 * slope_z[:, 0]
     else:
         y, z = np.arange(columns, dtype=float), np.arange(rows, dtype=float)
-    values = image.reshape(rows, columns, gates, len(names))[::-1, ::-1]
-    variables = {
-        name: (("gate", "z", "y"), values[..., k].transpose(2, 0, 1))
-        for k, name in enumerate(names)
-    }
+    variables = unpack(image, names, gates)
     oblique = 1 / beams[..., 0] if sensor.gate_kind == "planar" else 1.0
     length = (stop - start) / gates * oblique
     middle = (start + (stop - start) / gates / 2) * oblique
