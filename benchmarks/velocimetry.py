@@ -14,26 +14,23 @@ import warnings
 from dataclasses import dataclass
 
 import numpy as np
-import xarray as xr
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity, vortex_pair
+from lidar_mi.atmosphere.vortex import velocity
 from lidar_mi.retrieval.wind import retrieve_wind
 
+from .cases import (
+    CIRCULATION,
+    CONTRAST,
+    CORE_RADIUS,
+    CORRELATION_LENGTH,
+    DT,
+    SEPARATION,
+    SPACING,
+    Pair,
+    vortex_pair_images,
+)
 from .measure import in_turns
 from .report import Comparison, missing, row
-
-SPACING, DT = 0.5, 0.1
-CIRCULATION, SEPARATION, CORE_RADIUS = 400.0, 47.1, 3.0
-CORRELATION_LENGTH, CONTRAST, WAVES = 3.0, 0.2, 600
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Two images (z, y) dt apart and the flow between them."""
-
-    first: xr.DataArray
-    second: xr.DataArray
-    vortices: tuple[Vortex, ...]
 
 
 @dataclass(frozen=True)
@@ -59,7 +56,7 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
     sides = ("lidar-mi cc", "OpenPIV")
     if reason := missing("openpiv"):
         return Comparison(title, *sides, reason=reason)
-    pair = vortex_images(columns, rows)
+    pair = vortex_pair_images(columns=columns, rows=rows)
     cases = {
         # of its four correlations the one with the smallest error each
         "8 px windows: cc 8 in 16 | extended search 8 in 16": (
@@ -119,36 +116,6 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
             ),
         ),
     )
-
-
-def vortex_images(columns: int, rows: int, seed: int = 1) -> Pair:
-    """The pair: image 2 shows at every pixel the texture the air there had at time 0."""
-    y, z = ((np.arange(n) - (n - 1) / 2) * SPACING for n in (columns, rows))
-    vertical, lateral = np.meshgrid(z, y, indexing="ij")
-    vortices = vortex_pair(CIRCULATION, SEPARATION, CORE_RADIUS)
-    waves = _waves(seed)
-    return Pair(
-        _image(_texture(waves, lateral, vertical), y, z),
-        _image(_texture(waves, *origin(vortices, lateral, vertical, DT)), y, z),
-        vortices,
-    )
-
-
-def origin(vortices, y: np.ndarray, z: np.ndarray, dt: float, steps: int = 8) -> np.ndarray:
-    """Where air now at (y, z) was dt ago (Runge-Kutta, 4th order)."""
-    here = np.array([y, z], float)
-    h = -dt / steps
-
-    def wind(place):
-        return np.array(velocity(vortices, *place))
-
-    for _ in range(steps):
-        k1 = wind(here)
-        k2 = wind(here + h / 2 * k1)
-        k3 = wind(here + h / 2 * k2)
-        k4 = wind(here + h * k3)
-        here = here + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return here
 
 
 def cross_correlation(pair: Pair, template: int, search: int) -> Field:
@@ -229,28 +196,6 @@ def wind_errors(pair: Pair, ours: Field, other: Field) -> tuple[dict, int]:
         for component in "vw"
     }
     return found, int(both.sum())
-
-
-def _waves(seed: int):
-    """Plane waves of a texture with the autocorrelation exp(-(r / length)^2), length in px."""
-    random = np.random.default_rng(seed)
-    vectors = random.standard_normal((WAVES, 2)) * np.sqrt(2) / CORRELATION_LENGTH
-    phases = random.uniform(0, 2 * np.pi, WAVES)
-    seen = np.hypot(*vectors.T) < np.pi  # the image can hold no wave shorter than 2 px
-    return vectors[seen] / SPACING, phases[seen]
-
-
-def _texture(waves, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    vectors, phases = waves
-    total = np.zeros(np.shape(y))
-    for (a, b), phase in zip(vectors, phases):
-        total += np.cos(a * y + b * z + phase)
-    return 1 + CONTRAST * np.sqrt(2 / len(phases)) * total
-
-
-def _image(values: np.ndarray, y: np.ndarray, z: np.ndarray) -> xr.DataArray:
-    coordinates = {"z": ("z", z, {"units": "m"}), "y": ("y", y, {"units": "m"})}
-    return xr.DataArray(values, coordinates, ("z", "y"))
 
 
 @contextlib.contextmanager

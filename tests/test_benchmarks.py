@@ -27,7 +27,7 @@ if not (ROOT / "benchmarks").is_dir():
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import __main__ as command
-from benchmarks import estimators, measure, renderer, report, transient, velocimetry
+from benchmarks import cases, estimators, measure, renderer, report, transient, velocimetry
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 
 
@@ -226,7 +226,7 @@ def test_mitransient_renders_the_same_signal(variant, monkeypatch):
 def test_air_turns_around_a_single_vortex():
     vortex = Vortex(400.0, 3.0, 1.0, -2.0)
     y, z = np.array([2.0, 4.0, -9.0]), np.array([-2.5, 1.0, 7.0])
-    before = velocimetry.origin((vortex,), y, z, 0.1)
+    before = cases.origin((vortex,), y, z, 0.1)
     now, then = (a + 1j * b for a, b in ((y - 1, z + 2), (before[0] - 1, before[1] + 2)))
     r = np.abs(now)
     swirl = 400 / (2 * np.pi * r) * (1 - np.exp(-1.2564 * r**2 / 9))
@@ -234,7 +234,7 @@ def test_air_turns_around_a_single_vortex():
 
 
 def test_errors_are_zero_for_the_true_wind_wherever_the_grids_begin():
-    pair = velocimetry.vortex_images(60, 40)
+    pair = cases.vortex_pair_images(columns=60, rows=40)
 
     def field(start, rows, columns, extra=0.0):
         z = float(pair.first.z[0]) + 0.5 * (start + np.arange(rows))

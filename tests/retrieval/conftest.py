@@ -1,10 +1,16 @@
 """Images with exactly known motion: sums of plane waves, evaluated wherever the flow comes from."""
 
+import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import xarray as xr
+
+# benchmarks.cases makes the image pairs that errors are quoted for; last, so that an installed
+# lidar_mi is the one that is tested
+sys.path.append(str(Path(__file__).resolve().parents[2]))
 
 
 def waves(seed, length, number=600):
