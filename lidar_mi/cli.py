@@ -1,4 +1,4 @@
-"""The command line: ``lidar-mi run | render | retrieve | info | doctor``."""
+"""The command line: ``lidar-mi run | render | retrieve | info | aerosol | doctor``."""
 
 import sys
 from collections.abc import Iterator
@@ -143,26 +143,103 @@ def retrieve(
 
 
 @app.command(
-    epilog="Examples: `lidar-mi info outputs/wake_backscatter` - `lidar-mi info image_t1.exr`"
+    epilog="Examples: `lidar-mi info outputs/wake_backscatter` - `lidar-mi info image_t1.exr` - "
+    "`lidar-mi info spheroids` - `lidar-mi info molecules --wavelength '355 nm' "
+    "--altitude '8500 m'`"
 )
 def info(
-    path: Annotated[Path, typer.Argument(help="EXR file, NetCDF file or run folder.")],
-) -> None:
-    """Say what an EXR file, a NetCDF file or a run folder holds."""
-    from .rendering import exr
+    what: Annotated[str, typer.Argument(
+        help="EXR, NetCDF or scattering-table file (.txt), run folder, or a name: molecules, "
+             "spheroids, spheres, continental, sea_salt, dust, droplets, soot.")],
+    wavelength: Annotated[str | None, typer.Option(
+        help="Of a named scatterer. Default: 532 nm.")] = None,
+    altitude: Annotated[str | None, typer.Option(
+        help="Of molecules, in the standard atmosphere. Default: 0 m.")] = None,
+) -> None:  # fmt: skip
+    """Say what a file or a run folder holds, or how an aerosol or air scatters.
 
-    if not path.exists():
-        raise InputError(f"{path}: no such file; expected .exr, .nc or a run folder")
-    if path.is_dir():
-        _info_folder(path)
-    elif path.suffix == ".exr":
-        header, layers = exr.read_layers(path)
-        _info_table(f"{path}: {len(layers)} layers", _layer_rows(layers))
-        _info_table("header", [(k, _short(v)) for k, v in sorted(header.items())])
-    elif path.suffix in (".nc", ".nc4", ".cdf"):
-        _info_netcdf(path)
-    else:
-        raise InputError(f"{path}: unknown kind of file; expected .exr, .nc or a run folder")
+    Of scatterers: extinction and backscatter coefficient and the number of particles they go with,
+    single-scattering albedo, lidar ratio, depolarisation ratio.
+    """
+    import json
+
+    from .info import sections
+
+    with _progress() as notice:
+        found = list(
+            sections(
+                what, _quantity("--wavelength", wavelength, "m", "532 nm"),
+                _quantity("--altitude", altitude, "m", "8500 m"), notice,
+            )
+        )  # fmt: skip
+    for title, rows in found:
+        _print_rows(title, rows)
+    if Path(what).is_dir():
+        if (Path(what) / "metrics.json").is_file():
+            _print_metrics(json.loads((Path(what) / "metrics.json").read_text()))
+        else:
+            _out.print("unfinished: no metrics.json yet; run it again to go on")
+
+
+@app.command(
+    epilog="Examples: `lidar-mi aerosol dust --wavelength '1064 nm'` - "
+    "`lidar-mi aerosol spheres --name smoke --index 1.6+0.02i --radius '0.1 um' --sigma 1.6 "
+    "-o smoke.txt`. In an experiment: `scattering: {phase: table, table: smoke.txt}`"
+)
+def aerosol(
+    start: Annotated[str, typer.Argument(
+        metavar="AEROSOL", help="The aerosol to start from: spheroids, spheres, continental, "
+        "sea_salt, dust, droplets, soot.")],
+    wavelength: Annotated[str, typer.Option(help="Vacuum wavelength.")] = "532 nm",
+    out: Annotated[Path | None, typer.Option(
+        "-o", "--out", help="Table to write. Default: aerosol_NAME_NNNnm.txt.")] = None,
+    name: Annotated[str | None, typer.Option(
+        help="Name of the new aerosol; needed when something below is changed.")] = None,
+    index: Annotated[str | None, typer.Option(
+        help="Refractive index, such as 1.53+0.008i; the imaginary part absorbs.")] = None,
+    elongation: Annotated[float | None, typer.Option(
+        help="Length over width of prolate spheroids in random orientation; 1 = spheres.")] = None,
+    radius: Annotated[str | None, typer.Option(
+        help="Median radius of a log-normal, mode of a modified gamma distribution; of the "
+        "sphere of equal volume, such as '0.2 um'.")] = None,
+    sigma: Annotated[float | None, typer.Option(
+        help="Geometric standard deviation of a log-normal distribution, above 1.")] = None,
+    smallest: Annotated[str | None, typer.Option(help="Smallest radius.")] = None,
+    largest: Annotated[str | None, typer.Option(
+        help="Largest radius. Time and memory grow steeply with it for spheroids; beyond a size "
+        "parameter (circumference over wavelength) of about 24 they are refused.")] = None,
+    number_density: Annotated[str | None, typer.Option(
+        help="Particles that go with the table, such as '2e8 / m^3'.")] = None,
+    nodes: Annotated[int | None, typer.Option(
+        min=2, help="Sizes to average over. Default: 128 (spheroids), 10000 (spheres).")] = None,
+) -> None:  # fmt: skip
+    """Make the scattering table of an aerosol: a named one, or one changed to taste.
+
+    The table holds the six elements of the scattering matrix over angle (T-matrix method for
+    spheroids, Lorenz-Mie theory for spheres), averaged over sizes and orientations, and the
+    extinction cross-section and albedo. A table of spheroids takes half a minute, of spheres a
+    few seconds. Needs the library scatrs: `pip install 'lidar-mi[particles]'`.
+    """
+    from .atmosphere.particles import changed, make_table
+    from .atmosphere.scattering import describe, write_table
+    from .run_folder import write
+
+    metres = _quantity("--wavelength", wavelength, "m", "532 nm")
+    particles = changed(
+        start, metres, name, index=_index(index), elongation=elongation, sigma=sigma,
+        radius=_quantity("--radius", radius, "m", "0.2 um"),
+        smallest=_quantity("--smallest", smallest, "m", "0.03 um"),
+        largest=_quantity("--largest", largest, "m", "1.5 um"),
+        number_density=_quantity("--number-density", number_density, "1/m^3", "2e8 / m^3"),
+    )  # fmt: skip
+    path = out or Path(f"aerosol_{particles.name}_{metres * 1e9:.0f}nm.txt")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
+    with _progress() as notice:
+        table = make_table(particles, metres, nodes, notice)
+    write(path, lambda part: write_table(table, part))
+    _print_rows(particles.name, list(describe(table).items()))
+    _out.print(f"table    {path}")
 
 
 @app.command(epilog="Example: `lidar-mi doctor` (exit code 0: everything that is needed is there)")
@@ -226,6 +303,28 @@ def _experiment_file(name: str) -> Path:
     )
 
 
+def _quantity(option: str, text: str | None, unit: str, example: str) -> float | None:
+    """An option's value in SI; None where it is not given."""
+    from .units import to_si
+
+    if text is None:
+        return None
+    try:
+        return to_si(text, unit, example)
+    except ValueError as error:
+        raise InputError(f"{option}: {error}") from None
+
+
+def _index(text: str | None) -> complex | None:
+    """A refractive index, its imaginary unit written as i or j."""
+    try:
+        return None if text is None else complex(text.replace(" ", "").replace("i", "j"))
+    except ValueError:
+        raise InputError(
+            f"--index: {text!r} is not allowed; expected a number such as 1.53+0.008i"
+        ) from None
+
+
 def _definitions(texts: list[str]) -> dict[str, str]:
     pairs = {}
     for text in texts:
@@ -280,63 +379,11 @@ def _print_metrics(metrics: dict[str, float]) -> None:
     _out.print(table)
 
 
-def _info_folder(folder: Path) -> None:
-    import json
-
-    from .run_folder import read_record
-
-    record = read_record(folder)
-    rows = [(name, str(number)) for name, number in record["versions"].items()]
-    _info_table(f"{folder}: experiment {record['experiment'].get('name')}", rows)
-    _info_table(
-        "files",
-        [(str(p.relative_to(folder)), f"{p.stat().st_size / 1e6:.2f} MB")
-         for p in sorted(folder.rglob("*")) if p.is_file()],
-    )  # fmt: skip
-    if (folder / "metrics.json").is_file():
-        _print_metrics(json.loads((folder / "metrics.json").read_text()))
-    else:
-        _out.print("unfinished: no metrics.json yet; run it again to go on")
-
-
-def _info_netcdf(path: Path) -> None:
-    import xarray as xr
-
-    try:
-        data = xr.open_dataset(path, engine="h5netcdf", decode_times=False)
-    except Exception:  # noqa: BLE001 - whatever the format library says, it is unreadable
-        raise InputError(f"{path}: not a readable NetCDF-4 file") from None
-    with data:
-        rows = []
-        for name, variable in data.variables.items():
-            shape = " x ".join(f"{d} {n}" for d, n in variable.sizes.items())
-            span = ""
-            if variable.dtype.kind in "fiu" and variable.size:
-                span = f"{float(variable.min()):.4g} ... {float(variable.max()):.4g}"
-            rows.append((str(name), shape, span, str(variable.attrs.get("units", ""))))
-        _info_table(str(path), rows)
-        _info_table("attributes", [(k, _short(v)) for k, v in data.attrs.items()])
-
-
-def _layer_rows(layers):
-    import numpy as np
-
-    for name, pixels in sorted(layers.items()):
-        rows, columns = pixels.shape
-        span = f"{np.nanmin(pixels):.4g} ... {np.nanmax(pixels):.4g}"
-        yield name, f"{columns} x {rows}", str(pixels.dtype), span
-
-
-def _info_table(title: str, rows) -> None:
+def _print_rows(title: str, rows) -> None:
     table = Table(title=title, title_justify="left", show_header=False)
     for row in rows:
         table.add_row(*row)
     _out.print(table)
-
-
-def _short(value) -> str:
-    text = " ".join(str(value).split())
-    return text if len(text) <= 70 else f"{text[:67]}..."
 
 
 if __name__ == "__main__":

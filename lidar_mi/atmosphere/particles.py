@@ -2,7 +2,7 @@
 
 The tables that ship with the package were made by this module, one command each::
 
-    python -m lidar_mi.atmosphere.particles spheroids --wavelength '532 nm' -o FILE
+    lidar-mi aerosol spheroids --wavelength '532 nm' -o FILE
 
 Matrices come from ``scatrs`` (an optional library): T-matrix with analytic average over random
 orientation for spheroids (Mishchenko 1991, J. Opt. Soc. Am. A 8, 871), Lorenz-Mie for spheres.
@@ -11,16 +11,18 @@ The average over sizes is ours: equal steps in the logarithm of the radius.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 from scipy.integrate import quad
 
 from lidar_mi.errors import InputError
 
-from .scattering import ScatteringTable, read_table, write_table
+from .scattering import ScatteringTable, read_table
+
+Notice = Callable[[str, float | None], None]
+"""Called with what is done and the share that is finished."""
 
 # Sizes to average over. Backscatter converges last. Spheroids: 48, 64, 96 sizes give lidar ratios
 # within 0.7 % of each other (the orientation average smooths the ripple in size); spheres, whose
@@ -258,7 +260,61 @@ def aerosol(name: str) -> Aerosol:
     return AEROSOLS[name]
 
 
-def aerosol_table(name: str, wavelength: float) -> ScatteringTable:
+def changed(
+    name: str, wavelength: float, new_name: str | None = None, *, index: complex | None = None,
+    elongation: float | None = None, number_density: float | None = None, **sizes: float | None,
+) -> Aerosol:  # fmt: skip
+    """A named aerosol with some of its numbers changed; what is None stays.
+
+    Parameters
+    ----------
+    name : str
+        A name in `AEROSOLS`.
+    wavelength : float
+        m, at which ``index`` holds.
+    new_name : str, optional
+        Needed when something is changed.
+    index, elongation, number_density
+        As in `Aerosol`; the index at one wavelength.
+    **sizes
+        ``radius`` (median of a log-normal, mode of a modified gamma distribution), ``smallest``,
+        ``largest`` in m; ``sigma`` of a log-normal one.
+
+    Raises
+    ------
+    InputError
+        Unknown name, a number out of range, or a change without a new name.
+    """
+    particles = aerosol(name)
+    changes = {"elongation": elongation, "number_density": number_density}
+    changes = {key: value for key, value in changes.items() if value is not None}
+    if index is not None:
+        changes["index"] = ((wavelength, index),)
+    given = {key: value for key, value in sizes.items() if value is not None}
+    if "radius" in given:
+        of = "median" if isinstance(particles.sizes, LogNormal) else "mode"
+        given[of] = given.pop("radius")
+    for key, value in given.items():
+        if not hasattr(particles.sizes, key):
+            raise InputError(
+                f"{key}: {value:g} is not allowed; the sizes of {name!r} have no {key}, "
+                f"expected one of {', '.join(vars(particles.sizes))}"
+            )
+    if given:
+        changes["sizes"] = replace(particles.sizes, **given)
+    if not changes:
+        return particles if new_name is None else replace(particles, name=new_name)
+    if new_name is None or new_name in AEROSOLS:
+        raise InputError(
+            f"name: {new_name} is not allowed for a changed {name!r}; expected a name of its own"
+        )
+    return replace(particles, name=new_name, source=f"made from {name!r} by changing "
+                   f"{', '.join(changes)}", **changes)  # fmt: skip
+
+
+def aerosol_table(
+    name: str, wavelength: float, notice: Notice = lambda text, share: None
+) -> ScatteringTable:
     """The table of a named aerosol: the one that ships, or else a new one from `make_table`.
 
     Parameters
@@ -267,6 +323,8 @@ def aerosol_table(name: str, wavelength: float) -> ScatteringTable:
         A name in `AEROSOLS`.
     wavelength : float
         m, in vacuum.
+    notice : callable, optional
+        As in `make_table`.
 
     Raises
     ------
@@ -280,7 +338,7 @@ def aerosol_table(name: str, wavelength: float) -> ScatteringTable:
         table = read_table(str(shipped))
         if math.isclose(table.wavelength, wavelength, rel_tol=1e-6):
             return table
-    return make_table(name, wavelength)
+    return make_table(name, wavelength, notice=notice)
 
 
 def table_angles() -> np.ndarray:
@@ -302,7 +360,7 @@ def make_table(
     particles: Aerosol | str,
     wavelength: float,
     nodes: int | None = None,
-    notice: Callable[[str, float | None], None] = lambda text, share: None,
+    notice: Notice = lambda text, share: None,
 ) -> ScatteringTable:
     """The scattering table of an aerosol: averages over sizes and, for spheroids, orientations.
 
@@ -431,45 +489,3 @@ def _spheroid(x, m, elongation, cosine):
     q = t.efficiencies()
     f = t.phase_matrix(cosine)
     return q.q_ext, q.q_sca, np.stack([f.f11, f.f22, f.f33, f.f44, f.f12, f.f34], axis=1)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """``python -m lidar_mi.atmosphere.particles NAME --wavelength '532 nm' -o FILE``."""
-    import argparse
-    import sys
-
-    from lidar_mi.units import to_si
-
-    from .scattering import describe
-
-    parser = argparse.ArgumentParser(
-        prog="python -m lidar_mi.atmosphere.particles",
-        description="Make the scattering table of a named aerosol.",
-    )
-    parser.add_argument("name", help=", ".join(AEROSOLS))
-    parser.add_argument("--wavelength", default="532 nm", help="default: 532 nm")
-    parser.add_argument("--nodes", type=int, help="sizes to average over")
-    parser.add_argument("-o", "--out", type=Path, help="default: aerosol_NAME_NNNnm.txt")
-    options = parser.parse_args(arguments)
-    try:
-        try:
-            wavelength = to_si(options.wavelength, "m", "532 nm")
-        except ValueError as error:
-            raise InputError(f"wavelength: {error}") from None
-        table = make_table(
-            options.name, wavelength, options.nodes,
-            lambda text, share: print(f"\r{text} {share:.0%}", end="", file=sys.stderr),
-        )  # fmt: skip
-    except InputError as error:
-        print(f"lidar-mi: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    print(file=sys.stderr)
-    out = options.out or Path(f"aerosol_{table.name}_{wavelength * 1e9:.0f}nm.txt")
-    write_table(table, out)
-    for key, value in describe(table).items():
-        print(f"{key:42s} {value}")
-    print(f"{'file':42s} {out}")
-
-
-if __name__ == "__main__":
-    main()

@@ -407,7 +407,7 @@ def describe(table: ScatteringTable) -> dict[str, str]:
         "lidar ratio": f"{table.lidar_ratio:.4g} sr",
         "linear depolarisation ratio at 180 degrees": f"{table.depolarization_ratio:.4g}",
         "asymmetry parameter": f"{table.asymmetry:.4g}",
-        "number density": f"{table.number_density:.4g} m^-3",
+        "at a number density of": f"{table.number_density:.4g} m^-3",
         "extinction coefficient": f"{table.extinction:.4g} m^-1",
         "backscatter coefficient": f"{table.backscatter:.4g} m^-1 sr^-1",
         "angles": f"{len(table.angle)}, smallest step {np.diff(table.angle).min():.3g} degrees",

@@ -390,7 +390,7 @@ def test_shipped_spheroids_can_be_made_again(scatrs, name):
 
 def test_named_aerosol_comes_from_the_shipped_table_only_at_its_wavelength(monkeypatch):
     made = []
-    monkeypatch.setattr(particles, "make_table", lambda *arguments: made.append(arguments))
+    monkeypatch.setattr(particles, "make_table", lambda *given, **_: made.append(given))
     assert particles.aerosol_table("dust", GREEN).name == "dust" and not made
     particles.aerosol_table("dust", 532.4e-9)
     particles.aerosol_table("dust", 1064e-9)
@@ -454,14 +454,29 @@ def test_missing_library_is_answered_with_the_line_to_type(monkeypatch):
         make_table("spheres", GREEN)
 
 
-def test_command_writes_a_table_that_reads_back(scatrs, tmp_path, capsys):
-    path = tmp_path / "soot.txt"
-    particles.main(["soot", "--wavelength", "355 nm", "--nodes", "300", "-o", str(path)])
-    table = read_table(path)
-    assert table.wavelength == pytest.approx(355e-9) and table.name == "soot"
-    assert f"{table.lidar_ratio:.4g} sr" in capsys.readouterr().out
-    for wrong in (["smog"], ["soot", "--wavelength", "green"], ["soot", "--wavelength", "5 um"]):
-        with pytest.raises(SystemExit) as stop:
-            particles.main([*wrong, "-o", str(path)])
-        assert stop.value.code == 2
-        assert len(capsys.readouterr().err.strip().splitlines()) == 1
+def test_a_changed_aerosol_keeps_the_rest():
+    one = particles.changed("dust", GREEN, "ash", index=1.6 + 0.01j, sigma=1.5, largest=1e-6)
+    dust = AEROSOLS["dust"]
+    assert one.refractive_index(GREEN) == 1.6 + 0.01j
+    assert (one.sizes.median, one.sizes.sigma, one.sizes.largest) == (0.3e-6, 1.5, 1e-6)
+    assert (one.elongation, one.number_density) == (dust.elongation, dust.number_density)
+    assert particles.changed("dust", GREEN) is dust
+    gamma = particles.changed("droplets", GREEN, "fog", radius=2e-6)
+    assert gamma.sizes == replace(AEROSOLS["droplets"].sizes, mode=2e-6)
+
+
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"sigma": 2.0}, "name: None is not allowed for a changed 'droplets'|sigma"),
+        ({"new_name": "fog", "sigma": 2.0}, "sigma: 2 is not allowed; the sizes of 'droplets'"),
+        ({"new_name": "dust", "radius": 1e-6}, "name: dust is not allowed"),
+        ({"radius": 1e-6}, "name: None is not allowed"),
+        ({"new_name": "fog", "radius": -1.0}, "mode: -1.0 is not allowed"),
+        ({"new_name": "fog", "elongation": 9.0}, "elongation: 9.0 is not allowed"),
+        ({"new_name": "fog", "index": 0.0}, "index: 0.0 is not allowed"),
+    ],
+)
+def test_a_change_that_makes_no_aerosol_is_refused(changes, words):
+    with pytest.raises(InputError, match=words):
+        particles.changed("droplets", GREEN, **changes)

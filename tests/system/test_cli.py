@@ -19,6 +19,7 @@ import pytest
 import xarray as xr
 
 from lidar_mi import cli, experiment
+from lidar_mi.atmosphere.scattering import read_table
 from lidar_mi.rendering.exr import read_layers, read_scan
 
 SCENES = Path(str(files("lidar_mi.scenes")))
@@ -110,11 +111,11 @@ def test_version_in_a_fresh_process():
 def test_help_names_every_command(lidar_mi):
     code, out, _ = lidar_mi("--help")
     assert code == 0
-    for command in ("run", "render", "retrieve", "info", "doctor"):
+    for command in ("run", "render", "retrieve", "info", "aerosol", "doctor"):
         assert re.search(rf"^│ {command} ", out, re.MULTILINE)
 
 
-@pytest.mark.parametrize("command", ["run", "render", "retrieve", "info", "doctor"])
+@pytest.mark.parametrize("command", ["run", "render", "retrieve", "info", "aerosol", "doctor"])
 def test_help_teaches_by_example(lidar_mi, command):
     code, out, _ = lidar_mi(command, "--help")
     assert code == 0
@@ -188,6 +189,51 @@ def test_info_on_a_run_that_was_stopped(there, lidar_mi, quick):
     (there / "run" / "metrics.json").unlink()
     code, out, _ = lidar_mi("info", "run")
     assert code == 0 and "unfinished" in out
+
+
+def test_info_on_named_scatterers(lidar_mi):
+    """The aerosol of the paper as its table says, by name and by file; molecules as published
+    (Bodhaine et al. 1999: 5.167e-27 cm2 and King factor 1.04899 at 532 nm, 2.759e-26 and 1.05289
+    at 355 nm)."""
+    table = read_table(SCENES / "aerosol_spheroids_532nm.txt")
+    for name in ("spheroids", SCENES / "aerosol_spheroids_532nm.txt"):
+        code, out, _ = lidar_mi("info", name)
+        assert code == 0
+        for shown in (
+            "532 nm", f"{table.extinction:.4g} m^-1", f"{table.backscatter:.4g} m^-1 sr^-1",
+            f"{table.lidar_ratio:.4g} sr", f"{table.albedo:.5g}", "2e+08 m^-3",
+            f"{table.depolarization_ratio:.4g}",
+        ):  # fmt: skip
+            assert shown in out
+    code, out, _ = lidar_mi("info", "molecules")
+    assert code == 0 and "1.049 " in out and "5.1673e-31" in out and "1013.2 hPa" in out
+    _, out, _ = lidar_mi("info", "molecules", "--wavelength", "355 nm", "--altitude", "8500 m")
+    assert "1.0529 " in out and "2.7589e-30" in out and "331.5" in out
+
+
+def test_aerosol_writes_a_table_that_info_reads(there, lidar_mi):
+    pytest.importorskip("scatrs", reason="scatrs (extra 'particles') is not installed")
+    code, out, _ = lidar_mi("aerosol", "soot", "--wavelength", "355 nm", "--nodes", 300)
+    assert code == 0 and "aerosol_soot_355nm.txt" in out
+    table = read_table("aerosol_soot_355nm.txt")
+    assert (table.name, table.wavelength) == ("soot", pytest.approx(355e-9))
+    assert f"{table.lidar_ratio:.4g} sr" in out and "300 sizes" in words_of(out)
+    code, out, _ = lidar_mi(
+        "aerosol", "spheres", "--name", "smoke", "--index", "1.6+0.02i", "--radius", "0.1 um",
+        "--sigma", 1.6, "--number-density", "1e9 / m^3", "--nodes", 200, "-o", "smoke.txt",
+    )  # fmt: skip
+    assert code == 0
+    smoke = read_table("smoke.txt")
+    assert (smoke.name, smoke.number_density) == ("smoke", 1e9)
+    assert "m = 1.6 + 0.02i, log-normal r 0.1 um sigma 1.6" in smoke.provenance
+    assert lidar_mi("info", "smoke.txt")[1].count("smoke") >= 2
+
+
+def test_a_missing_library_is_answered_with_the_line_to_type(there, lidar_mi, monkeypatch):
+    monkeypatch.setitem(sys.modules, "scatrs.mie", None)
+    code, _, err = lidar_mi("aerosol", "soot", "--wavelength", "355 nm")
+    assert code == 2 and "pip install 'lidar-mi[particles]'" in err.splitlines()[-1]
+    assert not list(there.glob("aerosol_*"))
 
 
 def test_doctor_ends_as_its_findings_say(lidar_mi):
@@ -343,7 +389,20 @@ def bad(*arguments, says):
         bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0.1", "--layer", "G", "--spacing", "1",
             "-o", "none/w.nc", says=["none/w.nc", "none is no folder"]),
         bad("info", "none", says=["none", "no such file"]),
-        bad("info", "tiny.yaml", says=["tiny.yaml", "expected .exr, .nc or a run folder"]),
+        bad("info", "tiny.yaml", says=["tiny.yaml", "expected .exr, .nc, .txt", "run folder"]),
+        bad("info", "smog", says=["smog", "no such file", "molecules", "spheroids"]),
+        bad("info", "tiny.yaml", "--wavelength", "532 nm", says=["--wavelength", "tiny.yaml"]),
+        bad("info", "dust", "--altitude", "1 km", says=["--altitude", "dust", "molecules"]),
+        bad("info", "dust", "--wavelength", "green", says=["--wavelength", "'green'", "532 nm"]),
+        bad("info", "dust", "--wavelength", "355 nm", says=["355 nm", "'dust'", "532 to 1064"]),
+        bad("info", "molecules", "--altitude", "99 km", says=["altitude", "99000", "81020"]),
+        bad("info", "numbers.txt", says=["numbers.txt", "# name"]),
+        bad("aerosol", "smog", says=["aerosol", "'smog'", "spheroids"]),
+        bad("aerosol", "soot", "--wavelength", "5 um", says=["wavelength", "5000 nm", "'soot'"]),
+        bad("aerosol", "soot", "--sigma", "1.5", says=["name", "'soot'", "of its own"]),
+        bad("aerosol", "soot", "--name", "x", "--index", "black", says=["--index", "'black'"]),
+        bad("aerosol", "soot", "--name", "x", "--radius", "2 kg", says=["--radius", "'2 kg'"]),
+        bad("aerosol", "soot", "-o", "none/a.txt", says=["none/a.txt", "none is no folder"]),
         bad("info", "text.nc", says=["text.nc", "NetCDF"]),
         bad("info", "text.exr", says=["text.exr", "OpenEXR"]),
         bad("info", ".", says=["no experiment.yaml", "run folder"]),
@@ -356,6 +415,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(there, lidar_mi, arguments, sa
     (there / "wake.yaml").write_text("name: wake\nwake: {file: text.nc}\n")
     (there / "cut.yaml").write_text("name: cut\nwake: {file: cut.nc, time: 40 s}\n")
     (there / "cut.nc").write_bytes((SCENES / "wake_slab_40s.nc").read_bytes()[:20_000])
+    (there / "numbers.txt").write_text("0 1 1 1 1 0 0\n90 1 1 1 1 0 0\n180 1 1 1 1 0 0\n")
     write_exr("rgb.exr")
     write_exr("wide.exr", shape=(17, 31))
     (there / "cut.exr").write_bytes((there / "rgb.exr").read_bytes()[:400])

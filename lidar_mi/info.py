@@ -1,0 +1,147 @@
+"""What a file, a run folder or a named scatterer holds, as titled tables of text."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from .atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphere
+from .atmosphere.particles import AEROSOLS, Notice, aerosol_table
+from .atmosphere.scattering import describe, read_table
+from .errors import InputError
+
+MOLECULES = "molecules"
+
+Section = tuple[str, list[tuple[str, ...]]]
+"""A title and rows of equal length."""
+
+
+def sections(
+    what: str, wavelength: float | None = None, altitude: float | None = None,
+    notice: Notice = lambda text, share: None,
+) -> Iterator[Section]:  # fmt: skip
+    """Describe a file, a run folder, a named aerosol or the molecules of air.
+
+    Parameters
+    ----------
+    what : str
+        Path of an EXR or NetCDF file, a scattering table or a run folder; or a name.
+    wavelength : float, optional
+        m, of a named scatterer; default 532 nm.
+    altitude : float, optional
+        m in the standard atmosphere, of molecules; default 0.
+
+    Raises
+    ------
+    InputError
+        Nothing of this name, not readable, or an option that does not apply to it.
+    """
+    path = Path(what)
+    named = not path.exists() and (what in AEROSOLS or what == MOLECULES)
+    if wavelength is not None and not named:
+        raise InputError(f"--wavelength: not allowed with {what}; expected a named scatterer")
+    if altitude is not None and (not named or what != MOLECULES):
+        raise InputError(f"--altitude: not allowed with {what}; expected {MOLECULES}")
+    kinds = {
+        ".exr": _picture, ".nc": _netcdf, ".nc4": _netcdf, ".cdf": _netcdf, ".txt": _table_file,
+    }  # fmt: skip
+    if named:
+        wavelength = wavelength or 532e-9
+        if what == MOLECULES:
+            yield from _molecules(wavelength, altitude or 0.0)
+        else:
+            yield _scatterer(what, aerosol_table(what, wavelength, notice))
+    elif not path.exists():
+        raise InputError(
+            f"{what}: no such file; expected .exr, .nc, .txt, a run folder, {MOLECULES} or one "
+            f"of the aerosols {', '.join(AEROSOLS)}"
+        )
+    elif path.is_dir():
+        yield from _run_folder(path)
+    elif path.suffix in kinds:
+        yield from kinds[path.suffix](path)
+    else:
+        raise InputError(
+            f"{path}: unknown kind of file; expected .exr, .nc, .txt (scattering table) or a run "
+            "folder"
+        )
+
+
+def _scatterer(title: str, table) -> Section:
+    return title, list(describe(table).items())
+
+
+def _table_file(path: Path) -> Iterator[Section]:
+    yield _scatterer(str(path), read_table(path))
+
+
+def _molecules(wavelength: float, altitude: float) -> Iterator[Section]:
+    """The whole band of Rayleigh scattering beside the line that a narrow receiver sees."""
+    pressure, temperature = standard_atmosphere(altitude)
+    bands = [molecular_scattering(wavelength, pressure, temperature, band) for band in BANDS]
+    rows = [("", *(f"{band} {kind}" for band, kind in zip(BANDS, ("line", "band"))))]
+    for label, name, unit in (
+        ("extinction coefficient", "extinction", "m^-1"),
+        ("single-scattering albedo", "albedo", ""),
+        ("backscatter coefficient", "backscatter", "m^-1 sr^-1"),
+        ("lidar ratio", "lidar_ratio", "sr"),
+        ("linear depolarisation ratio at 180 degrees", "depolarization_ratio", ""),
+        ("depolarisation of natural light at 90 degrees", "depolarization", ""),
+        ("extinction cross-section", "cross_section", "m^2 per molecule"),
+        ("King factor", "king_factor", ""),
+        ("number density", "number_density", "m^-3"),
+    ):
+        rows.append((label, *(f"{getattr(band, name):.5g} {unit}".strip() for band in bands)))
+    title = (
+        f"dry air at {wavelength * 1e9:g} nm, {altitude:g} m: {pressure / 100:.5g} hPa, "
+        f"{temperature:.5g} K"
+    )
+    yield title, rows
+
+
+def _picture(path: Path) -> Iterator[Section]:
+    from .rendering import exr
+
+    header, layers = exr.read_layers(path)
+    rows = []
+    for name, pixels in sorted(layers.items()):
+        span = f"{np.nanmin(pixels):.4g} ... {np.nanmax(pixels):.4g}"
+        rows.append((name, f"{pixels.shape[1]} x {pixels.shape[0]}", str(pixels.dtype), span))
+    yield f"{path}: {len(layers)} layers", rows
+    yield "header", [(key, _short(value)) for key, value in sorted(header.items())]
+
+
+def _netcdf(path: Path) -> Iterator[Section]:
+    import xarray as xr
+
+    try:
+        data = xr.open_dataset(path, engine="h5netcdf", decode_times=False)
+    except Exception:  # noqa: BLE001 - whatever the format library says, it is unreadable
+        raise InputError(f"{path}: not a readable NetCDF-4 file") from None
+    with data:
+        rows = []
+        for name, variable in data.variables.items():
+            shape = " x ".join(f"{d} {n}" for d, n in variable.sizes.items())
+            span = ""
+            if variable.dtype.kind in "fiu" and variable.size:
+                span = f"{float(variable.min()):.4g} ... {float(variable.max()):.4g}"
+            rows.append((str(name), shape, span, str(variable.attrs.get("units", ""))))
+        yield str(path), rows
+        yield "attributes", [(key, _short(value)) for key, value in data.attrs.items()]
+
+
+def _run_folder(folder: Path) -> Iterator[Section]:
+    from .run_folder import read_record
+
+    record = read_record(folder)
+    rows = [(name, str(number)) for name, number in record["versions"].items()]
+    yield f"{folder}: experiment {record['experiment'].get('name')}", rows
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    yield "files", [
+        (str(path.relative_to(folder)), f"{path.stat().st_size / 1e6:.2f} MB") for path in files
+    ]
+
+
+def _short(value) -> str:
+    text = " ".join(str(value).split())
+    return text if len(text) <= 70 else f"{text[:67]}..."
