@@ -1,0 +1,230 @@
+"""The backscattered line: what the air's motion, temperature and pressure do to a laser's line.
+
+Every line here is a sum of Gaussians, so that its Fourier transform, which an etalon's series
+needs, is a closed form. Widths are full widths at half maximum, sigmas are standard deviations;
+frequencies are offsets from the laser's, in Hz.
+
+Signs: an approaching scatterer (v_LOS > 0) raises the frequency, by 2 v_LOS / wavelength.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.constants import Avogadro, Boltzmann
+from scipy.optimize import brentq
+
+from lidar_mi.errors import InputError
+
+SHAPES = ("rayleigh", "rayleigh_brillouin")
+
+# Mean molecular mass of dry air, kg (28.9644 g / mol, ICAO standard atmosphere).
+_MASS = 28.9644e-3 / Avogadro
+_FWHM = 2 * math.sqrt(2 * math.log(2))
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A spectral line as a sum of Gaussians about the laser's frequency.
+
+    Parameters
+    ----------
+    wavelength : float
+        m, in vacuum, of the laser; the zero of the offsets.
+    weights : array (K,)
+        Share of the photons in each Gaussian, 0 or more; they sum to one.
+    offsets, sigmas : array (K,)
+        Centres and standard deviations, Hz; sigma 0 is a monochromatic line.
+
+    Raises
+    ------
+    InputError
+        Numbers out of range.
+    """
+
+    wavelength: float
+    weights: np.ndarray
+    offsets: np.ndarray
+    sigmas: np.ndarray
+
+    def __post_init__(self):
+        _check("line.wavelength", self.wavelength, self.wavelength > 0, "m above 0")
+        for name in ("weights", "offsets", "sigmas"):
+            values = np.array(getattr(self, name), float, ndmin=1)
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+            allowed = "finite Hz" if name == "offsets" else "0 or more"
+            _check(f"line.{name}", values, (values >= 0) | (name == "offsets"), allowed)
+        if not self.weights.shape == self.offsets.shape == self.sigmas.shape:
+            raise InputError("line: expected as many weights as offsets and sigmas")
+        total = self.weights.sum()
+        _check("line.weights", total, abs(total - 1) < 1e-9, "a sum of 1")
+
+    @property
+    def mean(self) -> float:
+        """Mean offset, Hz."""
+        return float(self.weights @ self.offsets)
+
+    @property
+    def width(self) -> float:
+        """Full width at half maximum about the highest point, Hz; 0 of a monochromatic line.
+
+        For lines that fall on both sides of one maximum, as all lines made here do.
+        """
+        if not self.sigmas.all():
+            return 0.0
+        reach = 10 * self.sigmas.max() + np.ptp(self.offsets)
+        nu = self.mean + np.linspace(-reach, reach, 20_001)
+        peak = nu[np.argmax(self.pdf(nu))]
+        half = self.pdf(peak) / 2
+        left, right = (
+            brentq(lambda x: float(self.pdf(x) - half), peak, peak + side * reach, xtol=1.0)
+            for side in (-1, 1)
+        )
+        return right - left
+
+    def characteristic(self, t):
+        """Fourier transform <exp(2 pi i nu t)> over the line, complex, at the times ``t`` (s)."""
+        t = np.asarray(t, float)[..., None]
+        phase = 2j * np.pi * t * self.offsets
+        return np.exp(phase - 2 * (np.pi * t * self.sigmas) ** 2) @ self.weights
+
+    def pdf(self, nu):
+        """Share of the photons per Hz at the offsets ``nu`` (Hz); no sigma may be 0."""
+        z = (np.asarray(nu, float)[..., None] - self.offsets) / self.sigmas
+        return np.exp(-(z**2) / 2) @ (self.weights / (math.sqrt(2 * math.pi) * self.sigmas))
+
+    def sample(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """Frequency offsets of ``n`` photons, Hz."""
+        which = rng.choice(len(self.weights), n, p=self.weights)
+        return self.offsets[which] + self.sigmas[which] * rng.standard_normal(n)
+
+    def shifted(self, offset: float) -> "Line":
+        """The line moved by ``offset`` Hz."""
+        return replace(self, offsets=self.offsets + offset)
+
+    def broadened(self, sigma: float) -> "Line":
+        """The line convolved with a Gaussian of standard deviation ``sigma`` (Hz)."""
+        return replace(self, sigmas=np.hypot(self.sigmas, sigma))
+
+
+def doppler_shift(v_los, wavelength: float):
+    """Frequency shift 2 v_LOS / wavelength of backscattered light, Hz.
+
+    Parameters
+    ----------
+    v_los : array
+        Speed along the line of sight, m/s; positive when the scatterer approaches.
+    wavelength : float
+        m, in vacuum.
+    """
+    return 2 * np.asarray(v_los, float) / wavelength
+
+
+def laser_line(wavelength: float, laser_width: float) -> Line:
+    """The emitted line: one Gaussian of full width ``laser_width`` (Hz) at half maximum."""
+    _check("laser_width", laser_width, laser_width >= 0, "0 Hz or more")
+    return Line(wavelength, [1.0], [0.0], [laser_width / _FWHM])
+
+
+def rayleigh_width(wavelength: float, temperature: float) -> float:
+    """Full width at half maximum of backscatter by molecules that never collide, Hz.
+
+    sigma = 2 v0 / wavelength with v0 = (k T / m)^(1/2), the thermal speed along one axis.
+    """
+    _check("wavelength", wavelength, wavelength > 0, "m above 0")
+    _check("temperature", temperature, temperature > 0, "K above 0")
+    return _FWHM * 2 / wavelength * math.sqrt(Boltzmann * temperature / _MASS)
+
+
+def rayleigh(wavelength: float, temperature: float) -> Line:
+    """Line of molecules that never collide: one Gaussian (m, K)."""
+    return Line(wavelength, [1.0], [0.0], [rayleigh_width(wavelength, temperature) / _FWHM])
+
+
+def viscosity(temperature: float) -> float:
+    """Shear viscosity of air, Pa s, by Sutherland's formula (ICAO standard atmosphere)."""
+    return 1.458e-6 * temperature**1.5 / (temperature + 110.4)
+
+
+def rayleigh_brillouin(wavelength: float, temperature: float, pressure: float) -> Line:
+    """Line of air in backscatter, with the sound waves that collisions carry.
+
+    Three Gaussians fitted to the Tenti S6 model (Witschas 2011, Appl. Opt. 50, 267, with the
+    coefficients of the erratum, Appl. Opt. 50, 5758): in the units x of 2^(1/2) 2 v0 / wavelength
+    their widths and places depend on y = p / (2^(1/2) k v0 eta) alone, k = 4 pi / wavelength.
+
+    Parameters
+    ----------
+    wavelength, temperature, pressure : float
+        m, K, Pa.
+
+    Raises
+    ------
+    InputError
+        y beyond 1.027, where the fit ends (0.85 % of the peak up to there).
+    """
+    _check("pressure", pressure, pressure >= 0, "0 Pa or more")
+    unit = math.sqrt(2) * rayleigh_width(wavelength, temperature) / _FWHM
+    y = pressure / (2 * math.pi * unit * viscosity(temperature))
+    _check("y = pressure / (2^(1/2) k v0 viscosity)", y, y <= 1.027, "0 to 1.027")
+    # the fit's sum at y = 0 is 1.0005: no photons are taken off the outer Gaussians there
+    centre = min(1, 0.18526 * math.exp(-1.31255 * y) + 0.07103 * math.exp(-18.26117 * y) + 0.74421)
+    sigma_r = 0.70813 - 0.16366 * y**2 + 0.19132 * y**3 - 0.07217 * y**4
+    sigma_b = 0.07845 * math.exp(-4.88663 * y) + 0.804 * math.exp(-0.15003 * y) - 0.45142
+    place = 0.80893 - 0.30208 * 0.10898**y
+    side = (1 - centre) / 2
+    return Line(
+        wavelength,
+        [side, centre, side],
+        unit * np.array([-place, 0, place]),
+        unit * np.array([sigma_b, sigma_r, sigma_b]),
+    )
+
+
+def backscatter_line(
+    wavelength: float,
+    temperature: float,
+    pressure: float,
+    laser_width: float = 100e6,
+    aerosol_share: float = 0.0,
+    shape: str = "rayleigh_brillouin",
+) -> Line:
+    """Line of the backscatter of air at rest, molecules and aerosol, with the laser's own width.
+
+    Parameters
+    ----------
+    wavelength, temperature, pressure : float
+        m, K, Pa; see `lidar_mi.atmosphere.molecules.standard_atmosphere`.
+    laser_width : float
+        Full width at half maximum of the emitted line, Hz.
+    aerosol_share : float
+        Share of the backscattered photons that comes from aerosol, 0 to 1: aerosol is too heavy
+        to broaden the line.
+    shape : {"rayleigh", "rayleigh_brillouin"}
+        Of the molecular line.
+
+    Raises
+    ------
+    InputError
+    """
+    if shape not in SHAPES:
+        raise InputError(f"shape: {shape!r} is not allowed; expected one of {', '.join(SHAPES)}")
+    _check("aerosol_share", aerosol_share, 0 <= aerosol_share <= 1, "0 to 1")
+    laser = laser_line(wavelength, laser_width)
+    if shape == "rayleigh":
+        air = rayleigh(wavelength, temperature)
+    else:
+        air = rayleigh_brillouin(wavelength, temperature, pressure)
+    air = air.broadened(laser.sigmas[0])
+    weights = np.concatenate([[aerosol_share], (1 - aerosol_share) * air.weights])
+    offsets, sigmas = np.append(laser.offsets, air.offsets), np.append(laser.sigmas, air.sigmas)
+    seen = weights > 0
+    return Line(wavelength, weights[seen], offsets[seen], sigmas[seen])
+
+
+def _check(name, value, good, allowed):
+    value, good = np.atleast_1d(value), np.atleast_1d(good)
+    good = good & np.isfinite(value)
+    if not good.all():
+        raise InputError(f"{name}: {value[~good][0]:g} is not allowed; expected {allowed}")
