@@ -19,6 +19,7 @@ from .assessment.errors import truth_at_vectors, wind_metrics
 from .config import Experiment
 from .errors import InputError
 from .instrument.detector import noise_budget, noisy_scan
+from .instrument.products import linear_depolarization, with_products
 from .instrument.scan import ScanPlan, plan_scans
 from .rendering import exr
 from .rendering.backscatter import extrude, render_scans
@@ -145,7 +146,7 @@ def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dat
         progress,
         missing,
     )
-    for index, scan in zip(missing, rendered):
+    for index, scan in zip(missing, map(with_products, rendered)):
         if experiment.detector:
             # numbers of their own, apart from those of the light transport
             seed = [experiment.seed, index, 1]
@@ -267,6 +268,10 @@ def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
         total = float(first["S0"].sum(dtype=float))
         single = float(first["order1.S0"].sum(dtype=float))
         metrics["backscatter.multiple_scattering_fraction"] = 1 - single / total
+    if "depolarization" in first:
+        s0, s1 = (float(first[name].sum(dtype=float)) for name in ("S0", "S1"))
+        metrics["backscatter.depolarization"] = float(linear_depolarization(s0, s1))
+        metrics["backscatter.depolarization_stderr"] = float(first["depolarization_stderr"].median())
     for core in cores:
         side = "port" if core.circulation > 0 else "starboard"
         for key in ("y", "z", "radius", "circulation"):

@@ -60,6 +60,16 @@ def draw_all(
     )  # fmt: skip
     if "Y_noisy" in scans[0]:
         plates += (("fig13_detector", "What the detector reads", _detected(scans, found, cores)),)
+    if "depolarization" in scans[0]:
+        plates += (("fig14_depolarization", "Linear depolarisation ratio", _product(
+            scans[0], "depolarization", "linear depolarisation ratio",
+            "Linear depolarisation ratio of the first picture, cross- over co-polarised light.",
+        )),)  # fmt: skip
+    if "multiple_scattering_fraction" in scans[0]:
+        plates += (("fig15_multiple_scattering", "Multiple scattering", _product(
+            scans[0], "multiple_scattering_fraction", "share of multiple scattering",
+            "Share of the light of the first picture that was scattered more than once.",
+        )),)  # fmt: skip
     drawn = []
     for index, (name, title, (figure, caption)) in enumerate(plates):
         log.bar(f"drawing {title.lower()}", index / len(plates))
@@ -214,6 +224,29 @@ def _detected(scans, found, cores):
         "The backscatter picture with photon, sky, dark and speckle noise of one pulse a beam, and "
         "the wind found in two of them."
     )
+
+
+def _product(scan, name, label, caption):
+    """What a scan tells of its first gate, and how well it knows it."""
+    figure, axes = _sheet(1, 2)
+    first = scan.isel(gate=0)
+    _image(axes[0, 0], first[name], "$t_1$", label, norm=_span(first[name]), cmap="cividis")
+    stderr = first[f"{name}_stderr"]
+    bound = scan.attrs[f"{name}_stderr_is_bound"]
+    kind = "upper bound of the standard error" if bound else "standard error"
+    _image(axes[0, 1], stderr, kind, label, norm=_span(stderr), cmap="cividis")
+    return figure, (
+        f"{caption} Right: {kind} of each pixel, from the simulation's photons. Colours span the "
+        "middle 99 % of the pixels."
+    )
+
+
+def _span(field: xr.DataArray) -> Normalize:
+    """The middle 99 % of the values: single bright pixels must not decide the colours."""
+    low, high = (float(field.quantile(q)) for q in (0.005, 0.995))
+    # equal values get one colour, not that of their rounding
+    half = max((high - low) / 2, 1e-5 * abs(high + low), 1e-9)
+    return Normalize((low + high) / 2 - half, (low + high) / 2 + half)
 
 
 def _picture_differences(truth, scans):

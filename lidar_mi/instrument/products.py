@@ -1,9 +1,13 @@
 """What else a scan tells: linear depolarisation ratio, share of multiple scattering."""
 
+import re
+
 import numpy as np
 import xarray as xr
 
 from ..errors import InputError
+
+_ORDER = re.compile(r"order\d+\.S0")
 
 
 def linear_depolarization(s0, s1):
@@ -75,10 +79,9 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
     InputError
         The scan was rendered without polarisation, or its light was not emitted along e_h.
     """
-    emitted = scan.attrs.get("stokes_emitted")
-    if emitted is None or not np.allclose(emitted, (1, 1, 0, 0), rtol=0, atol=1e-6):
+    if not _emitted_along_e_h(scan):
         raise InputError(
-            f"stokes_emitted: {emitted} is not allowed for the linear depolarisation ratio; "
+            f"stokes_emitted: {scan.attrs.get('stokes_emitted')} is not allowed for the linear depolarisation ratio; "
             "expected (1, 1, 0, 0), light polarised along the horizontal axis"
         )
     if not scan.attrs.get("polarized"):
@@ -142,6 +145,75 @@ def multiple_scattering_fraction(
     root, total = np.broadcast_arrays(root, total)
     stderr = np.divide(root, total**2, out=np.full(root.shape, np.nan), where=total > 0)
     return fraction, stderr
+
+
+def multiple_scattering_image(scan: xr.Dataset) -> xr.Dataset:
+    """Share of light scattered more than once, of a scan whose orders were told apart.
+
+    ``multiple_scattering_fraction`` and ``multiple_scattering_fraction_stderr``. A scan has the
+    standard error of all orders together: taken as that of the larger part alone, it is an upper
+    bound of the share's error, as long as a photon that brings more in one order does not bring
+    less in another (attribute ``stderr_is_bound``). Where few photons bring all of the multiple
+    scattering, S0_stderr itself is too small for most pixels, and so is the bound.
+
+    Raises
+    ------
+    InputError
+        The scan has no orders above one.
+    """
+    orders = sorted(str(name) for name in scan.data_vars if _ORDER.fullmatch(str(name)))
+    if len(orders) < 2 or "order1.S0" not in orders:
+        raise InputError(
+            f"orders: {', '.join(orders) or 'none'} is not allowed for the share of multiple "
+            "scattering; expected order1.S0 and others, from an integrator with orders"
+        )
+    dims = ("gate", "z", "y")
+    single, *further = (scan[name].transpose(*dims).values.astype(float) for name in orders)
+    fraction, _ = multiple_scattering_fraction(single, sum(further))
+    total = single + sum(further)
+    stderr = scan["S0_stderr"].transpose(*dims).values.astype(float)
+    relative = np.divide(stderr, total, out=np.full(total.shape, np.nan), where=total > 0)
+    text = "share of light scattered more than once"
+    return xr.Dataset(
+        {
+            "multiple_scattering_fraction": (dims, fraction, {"long_name": text, "units": "1"}),
+            "multiple_scattering_fraction_stderr": (
+                dims,
+                np.maximum(fraction, 1 - fraction) * relative,
+                {
+                    "long_name": f"upper bound of the standard error of the {text}",
+                    "units": "1",
+                    "stderr_is_bound": 1,
+                },
+            ),
+        },
+        coords={name: scan.coords[name] for name in dims if name in scan.coords},
+    )
+
+
+def with_products(scan: xr.Dataset) -> xr.Dataset:
+    """The scan with what else it tells, as far as it was rendered for that; float32.
+
+    Adds the variables of `depolarization_image`, if light polarised along e_h was followed in a
+    polarised variant, and of `multiple_scattering_image`, if orders were told apart. Attributes
+    ``NAME_is_bound`` say whether NAME, a standard error, is an upper bound.
+    """
+    images = []
+    if scan.attrs.get("polarized") and _emitted_along_e_h(scan):
+        images.append(depolarization_image)
+    if "order2.S0" in scan:
+        images.append(multiple_scattering_image)
+    for image in images:
+        for name, variable in image(scan).data_vars.items():
+            scan = scan.assign({name: variable.astype(np.float32)})
+            if "stderr_is_bound" in variable.attrs:
+                scan.attrs[f"{name}_is_bound"] = variable.attrs["stderr_is_bound"]
+    return scan
+
+
+def _emitted_along_e_h(scan: xr.Dataset) -> bool:
+    emitted = scan.attrs.get("stokes_emitted")
+    return emitted is not None and np.allclose(emitted, (1, 1, 0, 0), rtol=0, atol=1e-6)
 
 
 def _photons(scan: xr.Dataset) -> int:

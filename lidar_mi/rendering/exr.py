@@ -3,8 +3,10 @@
 A file shows what the pilot sees: top row = largest z, left column = largest y. Layers are
 ``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate (and
 ``gate000.order1.S0``, ... where orders of scattering were told apart), and ``Y``, the apparent
-backscatter of the first gate, so that any viewer shows something at once. With a detector, ``gate000.S0_noisy``,
-``gate000.S0_noise_std``, ``Y_noisy`` and ``Y_noise_std`` stand beside them. Everything else
+backscatter of the first gate, so that any viewer shows something at once. Of a run,
+``gate000.depolarization`` and ``gate000.multiple_scattering_fraction`` with their ``_stderr`` stand
+beside them, and with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``, ``Y_noisy`` and
+``Y_noise_std``. Everything else
 (beam positions, gates, instrument, units, seed, version) is in typed header attributes.
 """
 
@@ -147,12 +149,21 @@ def label_scan(scan: xr.Dataset) -> xr.Dataset:
         "S2": "Stokes U about the horizontal axis, over emitted pulse energy",
         "S3": "Stokes V, over emitted pulse energy",
         "S0_stderr": "Monte Carlo standard error of S0",
+        "S1_stderr": "Monte Carlo standard error of S1",
+        "S0_S1_correlation": "correlation of the Monte Carlo errors of S0 and S1",
+        "depolarization": "linear depolarisation ratio",
+        "depolarization_stderr": "standard error of the linear depolarisation ratio",
+        "multiple_scattering_fraction": "share of light scattered more than once",
+        "multiple_scattering_fraction_stderr": "standard error of the share of light scattered "
+        "more than once",
         "S0_noisy": "S0 with the detector's noise",
         "S0_noise_std": "standard deviation of the noise of S0_noisy",
     }
     for name in _quantities(scan):
         order = name.removeprefix("order").removesuffix(".S0")
         text = meaning.get(name, f"S0 of scattering order {order}")
+        if scan.attrs.get(f"{name}_is_bound"):
+            text = f"upper bound of the {text}"
         scan[name].attrs = {"long_name": text, "units": "1"}
     once = {
         "Y": "apparent backscatter of the first gate",

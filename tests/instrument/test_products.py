@@ -17,6 +17,8 @@ from lidar_mi.instrument.products import (
     depolarization_stderr_bound,
     linear_depolarization,
     multiple_scattering_fraction,
+    multiple_scattering_image,
+    with_products,
 )
 
 EXPERIMENTS, PHOTONS = 4000, 400
@@ -198,3 +200,53 @@ def test_error_of_the_fraction_is_its_spread(correlation):
     assert_spread(fraction, float(found))
     _, largest = multiple_scattering_fraction(3.0, 1.0, *errors, -1)
     assert found <= largest
+
+
+def with_orders(scan, share=0.2):
+    """The scan with its light split into three orders."""
+    parts = {"order1.S0": 1 - share, "order2.S0": 0.9 * share, "order3.S0": 0.1 * share}
+    return scan.assign({name: scan["S0"] * part for name, part in parts.items()})
+
+
+def test_image_of_the_fraction():
+    """0.2, and at most 0.8 of the light's relative error of 0.01."""
+    found = multiple_scattering_image(with_orders(a_scan()))
+    assert found["multiple_scattering_fraction"].dims == ("gate", "z", "y")
+    np.testing.assert_allclose(found["multiple_scattering_fraction"], 0.2, rtol=1e-6)
+    np.testing.assert_allclose(found["multiple_scattering_fraction_stderr"], 0.008, rtol=1e-6)
+    assert found["multiple_scattering_fraction_stderr"].attrs["stderr_is_bound"] == 1
+    np.testing.assert_array_equal(found["y"], np.arange(4.0))
+
+
+@pytest.mark.parametrize("share", [0.02, 0.3, 0.9])
+def test_bound_of_the_fraction_is_never_below_its_spread(share):
+    """Orders of a photon that know nothing of each other, the higher ones skewed."""
+    random = np.random.default_rng(5)
+    shape = (EXPERIMENTS, PHOTONS)
+    single = (1 - share) * random.gamma(25, 1 / 25, shape).mean(1)
+    multiple = share * random.gamma(0.3, 1 / 0.3, shape).mean(1)
+    scan = with_orders(a_scan(), share)
+    scan["S0_stderr"] = scan["S0"] * (single + multiple).std()
+    bound = multiple_scattering_image(scan)["multiple_scattering_fraction_stderr"].values
+    assert (bound > (multiple / (single + multiple)).std() * (1 - 4 / math.sqrt(2 * EXPERIMENTS))).all()
+
+
+def test_fraction_needs_orders():
+    with pytest.raises(InputError, match="orders: none is not allowed"):
+        multiple_scattering_image(a_scan())
+
+
+def test_products_are_those_the_scan_was_rendered_for():
+    def added(scan):
+        return {name.removesuffix("_stderr") for name in set(with_products(scan)) - set(scan)}
+
+    unpolarized, circular = a_scan(polarized=0), a_scan(stokes_emitted=[1.0, 0.0, 0.0, 1.0])
+    assert added(a_scan()) == {"depolarization"}
+    assert added(unpolarized) == added(circular) == set()
+    assert added(with_orders(unpolarized)) == {"multiple_scattering_fraction"}
+    scan = with_orders(a_scan())
+    found = with_products(scan)
+    assert added(scan) == {"depolarization", "multiple_scattering_fraction"}
+    assert found["depolarization"].dtype == np.float32
+    assert found.attrs["depolarization_stderr_is_bound"] == 1
+    assert "depolarization_stderr_is_bound" not in scan.attrs

@@ -45,6 +45,20 @@ def make_scan(gates=2, rows=5, columns=7, seed=0, **attributes):
     )
 
 
+def test_products_keep_their_meaning(tmp_path):
+    """Names of layers that are no Stokes component, and whether an error is a bound."""
+    scan = make_scan(depolarization_stderr_is_bound=1)
+    for name in ("depolarization", "depolarization_stderr", "S1_stderr", "order2.S0"):
+        scan[name] = scan["S0"] + 1
+    write_scan(tmp_path / "scan.exr", label_scan(scan))
+    again = read_scan(tmp_path / "scan.exr")
+    meaning = {name: variable.attrs["long_name"] for name, variable in again.data_vars.items()}
+    assert meaning["depolarization"] == "linear depolarisation ratio"
+    assert meaning["depolarization_stderr"].startswith("upper bound of the standard error of the")
+    assert meaning["S1_stderr"] == "Monte Carlo standard error of S1"
+    assert meaning["order2.S0"] == "S0 of scattering order 2"
+
+
 @pytest.mark.parametrize(
     ("gates", "rows", "columns"),
     # 2, 3, 4, 9 and 16 values have types of their own in a header: vectors and matrices
