@@ -1,0 +1,320 @@
+"""The etalon: two mirrors with a gap, which lets light through in rings.
+
+The order of light at the angle theta inside the gap is m = 2 n d nu cos(theta) / c, counted so that
+light passes where m is an integer: the phase of reflection is tuned away with the gap. m is about
+77 000, so it is computed in float64 and its integer part split off; the rest fits in float32.
+
+As a series in the order the transmission is T(m) = A_0 + 2 sum A_n cos(2 pi n m). A line with the
+Fourier transform chi (`lidar_mi.atmosphere.line.Line`) turns A_n into A_n chi(n / FSR), uneven
+plates into A_n D_n: all convolutions are products.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from scipy import constants
+from scipy.optimize import brentq
+
+from ..errors import InputError
+from ..units import Length, Number
+
+POLARIZATIONS = ("s", "p")
+# Less than this and a mirror is taken for opaque: even lossless, no pulse would be seen through it.
+_LEAST_TRANSMITTANCE = 1e-6
+
+
+class Layer(NamedTuple):
+    """One layer of a coating: refractive index, thickness (m), extinction coefficient."""
+
+    index: float
+    thickness: Length
+    extinction: float = 0.0
+
+
+class Mirrors(NamedTuple):
+    """What one mirror reflects and transmits, and how it shifts the orders (phase over pi)."""
+
+    reflectance: float
+    transmittance: float
+    order_shift: float
+
+
+class Etalon(BaseModel):
+    """A plane Fabry-Perot etalon; lengths in m, text with units is read as such.
+
+    The paper gives no numbers for its etalon. The defaults are derived: they put four rings on
+    960 x 780 pixels of 7.4 um behind a lens of 300 mm.
+
+    Mirrors are given by ``reflectivity`` and ``absorption``, or by ``coatings`` on the inner faces
+    of both plates. Outer faces are taken as perfectly antireflecting. A tilt is no property of the
+    etalon: it moves the centre of the rings (`lidar_mi.instrument.fringe_camera.FringeCamera`).
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+    )
+
+    gap: Length = Field(13.7e-3, gt=0, description="distance of the mirrors")
+    order_fraction: Number | None = Field(
+        0.5, ge=0, lt=1,
+        description="fractional order at the centre, to which the gap is tuned; null: as it comes",
+    )  # fmt: skip
+    index: Number = Field(1.0, ge=1, le=4, description="refractive index in the gap")
+    reflectivity: Number = Field(0.70, gt=0, lt=1, description="of each mirror")
+    absorption: Number = Field(0.0, ge=0, lt=1, description="share of the light lost in a mirror")
+    surface_rms: Length = Field(
+        2e-9, ge=0, description="standard deviation of the gap by irregular plates"
+    )
+    bow: Length = Field(0.0, ge=0, description="gap in the middle less gap at the rim")
+    coatings: tuple[Layer, ...] | None = Field(
+        None, min_length=1,
+        description="(index, thickness) from plate to gap, instead of reflectivity and absorption",
+    )  # fmt: skip
+    plate_index: Number = Field(1.476, ge=1, le=4, description="of the plates; fused silica")
+
+    @model_validator(mode="after")
+    def _mirrors_make_sense(self):
+        if self.reflectivity + self.absorption >= 1:
+            raise ValueError(
+                f"absorption: {self.absorption:g} is not allowed with reflectivity "
+                f"{self.reflectivity:g}; expected less than {1 - self.reflectivity:g}"
+            )
+        for layer in self.coatings or ():
+            if not (layer.index >= 1 and layer.thickness > 0 and layer.extinction >= 0):
+                raise ValueError(
+                    f"coatings: {tuple(layer)} is not allowed; expected index 1 or more, "
+                    "thickness above 0 and extinction 0 or more"
+                )
+        return self
+
+    def order_at_centre(self, wavelength: float) -> float:
+        """Order of light of the wavelength (m, in vacuum) at normal incidence."""
+        if not (math.isfinite(wavelength) and wavelength > 0):
+            raise InputError(f"wavelength: {wavelength!r} m is not allowed; expected more than 0 m")
+        order = 2 * self.index * self.gap / wavelength + mirrors(self, wavelength).order_shift
+        if self.order_fraction is not None:
+            order = round(order - self.order_fraction) + self.order_fraction
+        return order
+
+    def tuned_gap(self, wavelength: float) -> float:
+        """The gap that has ``order_fraction``, m; within a quarter of a wavelength of ``gap``."""
+        order = self.order_at_centre(wavelength) - mirrors(self, wavelength).order_shift
+        return order * wavelength / (2 * self.index)
+
+    def free_spectral_range(self, wavelength: float) -> float:
+        """Frequency from one order to the next, c / (2 n d), Hz."""
+        return constants.c / (2 * self.index * self.tuned_gap(wavelength))
+
+
+def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
+    """One mirror at normal incidence.
+
+    Coatings at the angles of a ring image (10 mrad) differ from this by 1e-4 at most, and shift
+    the orders by some 1e-5, or 0.02 m/s; `coated_transmission` has it all.
+
+    Raises
+    ------
+    InputError
+        A coating that does not transmit.
+    """
+    if etalon.coatings is None:
+        reflectivity = etalon.reflectivity
+        return Mirrors(reflectivity, 1 - reflectivity - etalon.absorption, 0.0)
+    r, t, _ = _mirror_amplitudes(etalon, wavelength, np.array(1.0), 0.0, "s")
+    transmittance = float(abs(t) ** 2)
+    if not transmittance >= _LEAST_TRANSMITTANCE:
+        raise InputError(
+            f"etalon.coatings: a mirror that transmits {transmittance:.1e} at {wavelength:g} m is "
+            f"not allowed; expected at least {_LEAST_TRANSMITTANCE:g}"
+        )
+    turns = float(np.angle(r)) / np.pi
+    # a whole order more or less is the same phase
+    return Mirrors(float(abs(r) ** 2), transmittance, turns - round(turns))
+
+
+def fractional_order(etalon: Etalon, wavelength: float, cosine, offset=0.0):
+    """Order less the integer part of the order at the centre.
+
+    Parameters
+    ----------
+    wavelength : float
+        m, in vacuum, of the laser.
+    cosine : array
+        Of the angle inside the gap.
+    offset : array
+        Frequency less that of the laser, Hz.
+    """
+    gap = 2 * etalon.index * etalon.tuned_gap(wavelength) / wavelength
+    centre = etalon.order_at_centre(wavelength)
+    return _less_whole_orders(centre, gap, wavelength, cosine, offset)
+
+
+def plate_defects(etalon: Etalon, wavelength: float, n):
+    """What uneven plates leave of harmonic ``n`` of the transmission.
+
+    Irregularities vary the order by a Gaussian of standard deviation 2 n rms / wavelength; a bow,
+    over a circular aperture in even light, uniformly by 2 n bow / wavelength about the mean gap,
+    which is the one that is tuned (Hernandez 1986, Fabry-Perot Interferometers, chap. 2).
+    """
+    orders = 2 * etalon.index / wavelength * np.asarray(n, float)
+    return np.exp(-2 * (np.pi * orders * etalon.surface_rms) ** 2) * np.sinc(orders * etalon.bow)
+
+
+def harmonics(etalon: Etalon, wavelength: float, line=None, count: int | None = None):
+    """A_0 ... A_count of T = A_0 + 2 Re sum A_n exp(2 pi i n m), m the order of the laser's light.
+
+    A_n = T^2 / (1 - R^2) R^n of the mirrors, times `plate_defects`, times the line's Fourier
+    transform.
+
+    Parameters
+    ----------
+    wavelength : float
+        m, in vacuum, of the laser.
+    line : lidar_mi.atmosphere.line.Line, optional
+        Default: monochromatic light.
+    count : int, optional
+        Highest harmonic; default: beyond it all others together are below 1e-12 of A_0.
+
+    Returns
+    -------
+    complex array (count + 1,)
+    """
+    reflectance, transmittance, _ = mirrors(etalon, wavelength)
+    if count is None:
+        count = math.ceil(math.log(1e-12 * (1 - reflectance)) / math.log(reflectance))
+    n = np.arange(count + 1)
+    amplitudes = transmittance**2 / (1 - reflectance**2) * reflectance ** n.astype(float)
+    amplitudes = amplitudes * plate_defects(etalon, wavelength, n)
+    chi = 1 if line is None else line.characteristic(n / etalon.free_spectral_range(wavelength))
+    amplitudes = amplitudes * (chi + 0j)
+    left = np.cumsum(abs(amplitudes[::-1]))[::-1]
+    return amplitudes[: max(2, np.count_nonzero(left > 1e-12 * left[0]))]
+
+
+def series(amplitudes, order: torch.Tensor) -> torch.Tensor:
+    """A_0 + 2 Re sum A_n exp(2 pi i n m) at the orders ``m``, by Horner's rule in float64."""
+    turns = 2 * math.pi * order.double()
+    z = torch.polar(torch.ones_like(turns), turns)
+    total = torch.zeros_like(z)
+    for amplitude in amplitudes[:0:-1].tolist():
+        total += amplitude
+        total *= z
+    return amplitudes[0].real + 2 * total.real
+
+
+def transmission(etalon: Etalon, wavelength: float, cosine, offset=0.0, line=None) -> np.ndarray:
+    """Transmission of the etalon with its plate defects, mean of both polarisations.
+
+    Parameters
+    ----------
+    wavelength : float
+        m, in vacuum, of the laser.
+    cosine, offset : array
+        Of the angle inside the gap; frequency less that of the laser, Hz.
+    line : lidar_mi.atmosphere.line.Line, optional
+        Average over this line, moved by ``offset``; default: monochromatic light.
+    """
+    order = fractional_order(etalon, wavelength, cosine, offset)
+    return series(harmonics(etalon, wavelength, line), torch.as_tensor(order)).numpy()
+
+
+def finesse(etalon: Etalon, wavelength: float, line=None) -> float:
+    """Free spectral range over the full width of a fringe at half its height above zero.
+
+    Raises
+    ------
+    InputError
+        Fringes so broad that they nowhere fall to half their height.
+    """
+    amplitudes = harmonics(etalon, wavelength, line)
+
+    def above_half(order):
+        both = series(amplitudes, torch.tensor([order, 0.0], dtype=torch.float64))
+        return float(both[0] - both[1] / 2)
+
+    if above_half(0.5) >= 0:
+        raise InputError("etalon: no finesse; its fringes nowhere fall to half their height")
+    return 0.5 / brentq(above_half, 0, 0.5, xtol=1e-12)
+
+
+def coated_transmission(
+    etalon: Etalon, wavelength: float, cosine, offset=0.0, polarization: str = "s"
+):
+    """Transmittance of perfectly even coated plates, by transfer matrices.
+
+    With all dispersion of the coatings and their dependence on angle and polarisation, which the
+    series leaves out.
+
+    Parameters
+    ----------
+    wavelength : float
+        m, in vacuum, of the laser, for which the gap is tuned.
+    cosine, offset : array
+        Of the angle inside the gap; frequency less that of the laser, Hz.
+    polarization : {"s", "p"}
+    """
+    r, t, _ = _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization)
+    round_trip = _round_trip(etalon, wavelength, cosine, offset)
+    return abs(t**2 / (1 - r**2 * round_trip)) ** 2
+
+
+def coated_reflection(
+    etalon: Etalon, wavelength: float, cosine, offset=0.0, polarization: str = "s"
+):
+    """Reflectance that belongs to `coated_transmission`."""
+    r, t, outside = _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization)
+    round_trip = _round_trip(etalon, wavelength, cosine, offset)
+    return abs(outside + t**2 * r * round_trip / (1 - r**2 * round_trip)) ** 2
+
+
+def _round_trip(etalon, wavelength, cosine, offset):
+    """Phase factor of the way there and back through the gap, without the mirrors'."""
+    gap = 2 * etalon.index * etalon.tuned_gap(wavelength) / wavelength
+    return np.exp(2j * np.pi * _less_whole_orders(gap, gap, wavelength, cosine, offset))
+
+
+def _less_whole_orders(centre, gap, wavelength, cosine, offset):
+    relative = np.asarray(offset, float) * wavelength / constants.c
+    change = gap * (np.asarray(cosine, float) * (1 + relative) - 1)
+    return (centre - math.floor(centre)) + change
+
+
+def _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization):
+    """Of one mirror: reflection in the gap, transmission, reflection in the plate.
+
+    Characteristic matrices of the layers (Macleod 2010, Thin-Film Optical Filters, chap. 2) for
+    fields as exp(-i omega t), normalised so that |t|^2 is the transmitted share of the power.
+    """
+    if polarization not in POLARIZATIONS:
+        raise InputError(f"polarization: {polarization!r} is not allowed; expected s or p")
+    if etalon.coatings is None:
+        raise InputError("etalon.coatings: null is not allowed here; expected layers")
+    cosine = np.asarray(cosine, float)
+    wavenumber = 2 * np.pi * (1 / wavelength + np.asarray(offset, float) / constants.c)
+    across = etalon.index**2 * (1 - cosine**2)
+
+    def admittance(index):
+        slope = np.sqrt(index**2 - across + 0j) / index
+        return (index * slope if polarization == "s" else index / slope), slope
+
+    gap, _ = admittance(etalon.index)
+    plate, _ = admittance(etalon.plate_index)
+    # Fields (E, H) at the gap from those at the plate, and the other way round
+    a, b, c, d = 1 + 0j, 0j, 0j, 1 + 0j
+    for layer in reversed(etalon.coatings):
+        index = layer.index + 1j * layer.extinction
+        eta, slope = admittance(index)
+        phase = wavenumber * index * slope * layer.thickness
+        cos, sin = np.cos(phase), -1j * np.sin(phase)
+        a, b, c, d = (
+            a * cos + b * eta * sin, a * sin / eta + b * cos,
+            c * cos + d * eta * sin, c * sin / eta + d * cos,
+        )  # fmt: skip
+    common = gap * a + gap * plate * b + c + plate * d
+    inside = (gap * a + gap * plate * b - c - plate * d) / common
+    # The same stack entered from the plate: a and d change places
+    outside = (plate * d + gap * plate * b - c - gap * a) / common
+    return inside, 2 * np.sqrt(gap * plate) / common, outside
