@@ -10,9 +10,23 @@ later ``mi.set_variant``.
 
 import mitsuba as mi
 
-from . import gated_volpath, laser, mueller, rayleigh_polarized, scanning_lidar
+from . import (
+    ccd,
+    etalon,
+    fringes,
+    gated_volpath,
+    laser,
+    mueller,
+    plane_waves,
+    rayleigh_polarized,
+    scanning_lidar,
+    spectral_line,
+)
 
-PLUGINS = (laser, scanning_lidar, gated_volpath, mueller, rayleigh_polarized)
+PLUGINS = (
+    laser, scanning_lidar, gated_volpath, mueller, rayleigh_polarized,
+    spectral_line, plane_waves, etalon, ccd, fringes,
+)  # fmt: skip
 
 _following_variants = False
 

@@ -73,3 +73,15 @@ def table(plugin: str, field: str, source, columns: int) -> np.ndarray:
         return np.loadtxt(path, ndmin=2)
     except (ValueError, EOFError) as error:
         fail(plugin, field, source, f"N lines of {columns} numbers ({error})")
+
+
+def numbers(props, plugin: str, field: str, default: str) -> list[float]:
+    """The parameter ``field`` of finite numbers, separated by commas or blanks."""
+    text = str(props.get(field, default))
+    try:
+        values = [float(v) for v in text.replace(",", " ").split()]
+    except ValueError:
+        values = []
+    if not values or not all(math.isfinite(v) for v in values):
+        fail(plugin, field, text, "finite numbers such as '1, 0.5'")
+    return values

@@ -1,0 +1,249 @@
+"""
+.. _sensor-ccd:
+
+Lens and CCD (``ccd``)
+----------------------
+
+A camera focused at infinity: parallel light through a round stop becomes a point on a CCD. The lens
+belongs to the camera and is followed in its own coordinates, surface by surface, without the
+displaced origins of rays between shapes (1e-4 m, some m/s of wind).
+
+============================ ========== ==================================================== =======
+Parameter                    Type       Meaning                                              Default
+============================ ========== ==================================================== =======
+``focal_length``             float      m                                                    0.3
+``pixel``                    float      side of a square pixel, m                            7.4e-6
+``centre_x, centre_y``       float      where the optical axis meets the CCD, px right and   middle
+                                        down from the centre of the top left pixel
+``stop_radius``              float      m                                                    5e-3
+``lens``                     string,    ``ideal``: light at an angle goes to r = f tan       ideal
+                             tensor     (angle), from everywhere on the stop; or N x 4
+                                        numbers or the name of a file of them (``.npy``,
+                                        text with ``#`` comments): a real lens
+``to_world``                 transform  of the camera's frame: stop at the origin, x to the  identity
+                                        scene, y to the left, z up
+============================ ========== ==================================================== =======
+
+The picture is upright: its top is z up, its left is y. A lens has a row for each surface in the
+light's way, the stop first: radius of curvature (m; positive: the centre lies on the CCD's side; 0:
+plane), conic constant, distance to the next surface or the CCD (m), refractive index behind. The
+lens is taken as coated: it loses nothing and leaves polarisation alone. ``focal_length`` then only
+tells others what it is.
+
+A sampled ray weighs as the étendue (m^2 sr) of its pixel, so that the mean of weight times radiance
+is the power on the pixel.
+
+.. code-block:: xml
+
+    <sensor type="ccd">
+      <float name="focal_length" value="0.3"/> <float name="pixel" value="7.4e-6"/>
+      <film type="hdrfilm">
+        <integer name="width" value="960"/> <integer name="height" value="780"/>
+        <rfilter type="box"/>
+      </film>
+    </sensor>
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .parameters import fail, number, pose, positive
+from .parameters import table as read_table
+
+NAME, KIND = "ccd", "sensor"
+
+
+def define():
+    class Ccd(mi.Sensor):
+        def __init__(self, props):
+            super().__init__(props)
+            width, height = self.film().size()
+            self.focal_length = positive(props, NAME, "focal_length", 0.3)
+            self.pixel = positive(props, NAME, "pixel", 7.4e-6)
+            self.centre = (
+                number(props, NAME, "centre_x", (width - 1) / 2),
+                number(props, NAME, "centre_y", (height - 1) / 2),
+            )
+            for axis, value in zip("xy", self.centre):
+                if not np.isfinite(value):
+                    fail(NAME, f"centre_{axis}", value, "a finite number")
+            self.stop_radius = positive(props, NAME, "stop_radius", 5e-3)
+            lens = props.get("lens", "ideal")
+            ideal = isinstance(lens, str) and lens == "ideal"
+            self.lens = None if ideal else read_lens(lens)
+            self.m_focal_length = dr.opaque(mi.Float, self.focal_length)
+            self.m_pixel = dr.opaque(mi.Float, self.pixel)
+            self.m_centre = dr.opaque(mi.Point2f, self.centre)
+            self.m_stop = dr.opaque(mi.Float, self.stop_radius)
+            self.m_pose = pose(props)
+            dr.make_opaque(self.m_pose)
+            if self.lens is not None:
+                self.m_exit = dr.opaque(mi.Float, self._exit_radius())
+
+        # --- light towards the CCD; (right, down, onward) are the lens's own coordinates
+
+        def sample_stop(self, sample):
+            """Points of the stop, uniformly (world)."""
+            disc = mi.warp.square_to_uniform_disk(sample) * self.m_stop
+            return self.m_pose @ mi.Point3f(0, disc.x, disc.y)
+
+        def stop_area(self):
+            """Area of the stop, m^2."""
+            return dr.pi * self.m_stop * self.m_stop
+
+        def receive(self, point, direction):
+            """Where light through ``point`` of the stop along ``direction`` (world) arrives.
+
+            Returns its place in px right and down from the centre of the top left pixel, and
+            whether that is on the CCD.
+            """
+            inverse = self.m_pose.inverse()
+            point, direction = inverse @ point, inverse @ direction
+            if self.lens is None:
+                scale = self.m_focal_length / -direction.x
+                right, down = direction.y * scale, direction.z * scale
+                arrives = direction.x < 0
+            else:
+                (right, down), _, arrives = _through(
+                    self.lens, (point.y, point.z), (direction.y, direction.z, -direction.x), dr
+                )
+                arrives &= direction.x < 0
+            place = mi.Point2f(right, down) / self.m_pixel + self.m_centre
+            width, height = self.film().size()
+            arrives &= (place.x >= -0.5) & (place.x < width - 0.5)
+            arrives &= (place.y >= -0.5) & (place.y < height - 0.5)
+            return place, arrives
+
+        # --- rays from the CCD into the scene
+
+        def sample_towards_scene(self, place, sample):
+            """A ray from ``place`` (px, as above) through the lens: stop point, direction, weight.
+
+            The weight is that of a pixel's étendue; the mean over ``sample`` counts.
+            """
+            at = (place - self.m_centre) * self.m_pixel
+            disc = mi.warp.square_to_uniform_disk(sample)
+            area = self.m_pixel * self.m_pixel
+            if self.lens is None:
+                point = mi.Point3f(0, disc.x * self.m_stop, disc.y * self.m_stop)
+                direction = dr.normalize(mi.Vector3f(self.m_focal_length, -at.x, -at.y))
+                distance, weight = self.m_focal_length, area * self.stop_area()
+                weight *= dr.square(dr.square(direction.x)) / dr.square(distance)
+                return self.m_pose @ point, self.m_pose @ direction, weight
+            distance = float(self.lens[-1, 2])
+            behind = disc * self.m_exit  # a point in the last surface's tangent plane
+            way = dr.normalize(mi.Vector3f(behind.x - at.x, behind.y - at.y, distance))
+            (right, down), out, passes = _through(
+                _reversed(self.lens), (at.x, at.y), (way.x, way.y, way.z), dr
+            )
+            passes &= dr.square(right) + dr.square(down) <= dr.square(self.m_stop)
+            weight = area * dr.pi * dr.square(self.m_exit) * dr.square(dr.square(way.z))
+            weight = dr.select(passes, weight / distance**2, 0)
+            point, direction = mi.Point3f(0, right, down), mi.Vector3f(out[2], out[0], out[1])
+            return self.m_pose @ point, self.m_pose @ direction, weight
+
+        def _exit_radius(self) -> float:
+            """Radius of the light's cross-section in the last surface's tangent plane, all pixels."""
+            width, height = self.film().size()
+            corner = np.abs(np.array([[0, 0], [width, height]]) - 0.5 - self.centre).max(0)
+            field = np.hypot(*corner) * self.pixel / self.focal_length
+            angle = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+            slopes = np.linspace(0, 1.01 * field, 16)[:, None]
+            length = np.sqrt(1 + slopes**2)
+            rim = self.stop_radius * np.cos(angle), self.stop_radius * np.sin(angle)
+            rays = slopes / length, np.zeros_like(slopes), 1 / length
+            (right, down), out, passes = _through(self.lens, rim, rays, np)
+            if not passes.all():
+                fail(NAME, "lens", "light misses a surface", "surfaces that all light meets")
+            back = -self.lens[-1, 2] / out[2]
+            return 1.01 * float(np.hypot(right + back * out[0], down + back * out[1]).max())
+
+        # --- Mitsuba
+
+        def world_transform(self):
+            return self.m_pose
+
+        def sample_ray(self, time, sample1, sample2, sample3, active=True):
+            """A ray of a film position in [0, 1]^2; its weight is a pixel's étendue."""
+            place = mi.Point2f(sample2) * mi.Point2f(self.film().size()) - 0.5
+            point, direction, weight = self.sample_towards_scene(place, sample3)
+            return mi.Ray3f(point, direction, time, type(mi.Ray3f().wavelengths)()), (
+                mi.Spectrum(weight) & active
+            )
+
+        def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
+            ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
+            return mi.RayDifferential3f(ray), weight
+
+        def bbox(self):
+            return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
+
+        def to_string(self):
+            width, height = self.film().size()
+            kind = "ideal lens" if self.lens is None else f"lens of {len(self.lens) - 1} surfaces"
+            return (
+                f"Ccd[{width} x {height} pixels of {self.pixel:g} m, {kind}, "
+                f"focal_length={self.focal_length:g} m]"
+            )
+
+    return Ccd
+
+
+def read_lens(source) -> np.ndarray:
+    """A lens (tensor or file name), checked: rows of radius, conic, distance, index behind."""
+    lens = np.asarray(read_table(NAME, "lens", source, 4), float)
+    if lens.ndim != 2 or lens.shape[1] != 4 or len(lens) < 2:
+        fail(NAME, "lens", f"shape {lens.shape}", "N x 4 numbers, the stop and at least a surface")
+    if not np.isfinite(lens).all():
+        fail(NAME, "lens", "NaN or infinity", "finite numbers; a plane has the radius 0")
+    if (lens[0, [0, 3]] != (0, 1)).any() or lens[-1, 3] != 1:
+        fail(NAME, "lens", lens[[0, -1]].tolist(), "a plane stop first, and air (1) at both ends")
+    if (lens[:, 2] < 0).any() or lens[-1, 2] == 0 or (lens[:, 3] < 1).any():
+        fail(NAME, "lens", lens.tolist(), "distances of at least 0 and indices of at least 1")
+    return lens
+
+
+def _reversed(lens: np.ndarray) -> np.ndarray:
+    """The lens as light from the CCD meets it: the CCD first, the stop's plane at the end."""
+    back = np.zeros_like(lens)
+    back[0, 2], back[0, 3] = lens[-1, 2], 1
+    back[1:, :2] = lens[:0:-1, :2] * (-1, 1)
+    back[1:, 2] = lens[-2::-1, 2]
+    back[1:, 3] = lens[-2::-1, 3]
+    return back
+
+
+def _through(lens, place, way, xp):
+    """Follow light through a lens: from the plane of its first row to that at its end.
+
+    ``place`` (2 arrays) and ``way`` (3 arrays, a unit vector) are (right, down) and (right, down,
+    onward). Returns the same at the end, and whether all surfaces were met and passed. Every
+    surface is met in coordinates of its own vertex: nothing large is ever added.
+    """
+    (x, y), (u, v, w) = place, way
+    z, met, before = 0.0, True, float(lens[0, 3])
+    distance = float(lens[0, 2])
+    for radius, conic, after, index in lens[1:].tolist():
+        step = (distance - z) / w
+        x, y = x + step * u, y + step * v
+        curvature = 1 / radius if radius else 0.0
+        # c (x^2 + y^2 + (1 + k) z^2) = 2 z from the vertex's tangent plane
+        high = curvature * (x * x + y * y)
+        slope = w - curvature * (u * x + v * y)
+        root = slope * slope - high * curvature * (1 + conic * w * w)
+        met = met & (root > 0)
+        step = high / (slope + xp.sqrt(xp.maximum(root, 0)))
+        x, y, z = x + step * u, y + step * v, step * w
+        nx, ny, nz = -curvature * x, -curvature * y, 1 - curvature * (1 + conic) * z
+        scale = 1 / xp.sqrt(nx * nx + ny * ny + nz * nz)
+        nx, ny, nz = nx * scale, ny * scale, nz * scale
+        arriving = u * nx + v * ny + w * nz
+        ratio = before / index
+        leaving2 = 1 - ratio * ratio * (1 - arriving * arriving)
+        met = met & (leaving2 > 0)
+        turn = xp.sqrt(xp.maximum(leaving2, 0)) - ratio * arriving
+        u, v, w = ratio * u + turn * nx, ratio * v + turn * ny, ratio * w + turn * nz
+        distance, before = after, index
+    step = (distance - z) / w
+    return (x + step * u, y + step * v), (u, v, w), met

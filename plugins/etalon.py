@@ -1,0 +1,391 @@
+"""
+.. _bsdf-etalon:
+
+Fabry-Perot etalon (``etalon``)
+-------------------------------
+
+Two plane mirrors and the gap between them as one surface: light of the frequencies and angles at
+which the waves of all round trips add up passes straight through, the rest is reflected. For the
+frequency *offset* from a laser line; the whole orders of the gap are split off in double precision,
+so that float32 holds the rest (2e-6 orders within 1 degree of the axis, 0.004 m/s at 355 nm).
+
+============================ ======= ====================================================== ========
+Parameter                    Type    Meaning                                                Default
+============================ ======= ====================================================== ========
+``gap``                      float   mean distance of the mirrors, m                        13.7e-3
+``order_fraction``           float   fractional order on the axis, mirrors included, to     as the
+                                     which the gap is tuned by at most half an order        gap is
+``index``                    float   refractive index in the gap                            1
+``reflectivity``             float   of a mirror, for any angle and polarisation            0.7
+``coating``                  string  instead of ``reflectivity``: layers of a mirror from   none
+                                     its plate to the gap, each as "index thickness" (m) or
+                                     "index thickness extinction", separated by commas:
+                                     "2.1 42e-9, 1.48 60e-9"
+``plate_index``              float   refractive index of the plates under a ``coating``     1.4761
+``absorption``               float   share a mirror absorbs, at its transmission's cost     0
+``surface_rms``              float   Gaussian defects: rms deviation of the gap, m          0
+``bow``                      float   spherical defect: difference of the gap between middle 0
+                                     and edge of the clear aperture, m
+``wavelength``               float   of the laser line, m                                   the
+                                                                                            line's
+``line_shape``               string  ``folded``: mean over the nested line, all defects and folded
+                                     the whole aperture, analytically; ``sampled``: the
+                                     ray's own frequency and one place on the plates
+*(nested)*                   texture the :ref:`line <texture-spectral_line>`; required if   none
+                                     folded
+============================ ======= ====================================================== ========
+
+Transmitted (component 1, ``Null``) and reflected light (component 0) carry Mueller matrices of s and
+p with their phases. The plates' outer faces are taken as coated and wedged: they reflect nothing
+that is seen. A coating is that of both mirrors, computed for the laser line at the ray's angle
+(transfer matrices); its dispersion enters as the delay of a reflection on the axis. Waves walk off
+sideways by 2 d tan(angle) a round trip, 0.4 mm at 15 mrad: nothing beside an aperture of a few cm.
+A gap index n bends light by Snell's law from air of index 1.
+
+With ``sampled`` a ray's ``time`` holds its frequency offset from the laser line in Hz, which the
+:ref:`fringes <integrator-fringes>` integrator sets; use it for several etalons in a row. Folding
+takes the line as seen at the axis: widths are then wrong by 1 - cos(angle), 1e-4 at 15 mrad.
+``gap``, ``reflectivity`` and ``surface_rms``, like the line, can differ between scenes of one kind
+without compiling anything again.
+
+.. code-block:: xml
+
+    <bsdf type="etalon">
+      <float name="gap" value="13.7e-3"/> <float name="order_fraction" value="0.5"/>
+      <float name="reflectivity" value="0.7"/> <float name="surface_rms" value="2e-9"/>
+      <texture type="spectral_line"/>
+    </bsdf>
+"""
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .parameters import at_least, choice, fail, number, positive
+
+NAME, KIND = "etalon", "bsdf"
+
+SPEED_OF_LIGHT = 299_792_458.0
+# of the strongest harmonic: what is left out of a folded line
+NEGLECTED = 1e-8
+
+
+def define():
+    class Etalon(mi.BSDF):
+        def __init__(self, props):
+            super().__init__(props)
+            lines = [o for _, o in props.objects() if hasattr(o, "characteristic")]
+            if len(lines) > 1:
+                fail(NAME, "line", len(lines), "one nested texture of type 'spectral_line'")
+            self.line = lines[0] if lines else None
+            self.line_shape = choice(props, NAME, "line_shape", "folded", ("folded", "sampled"))
+            if self.line_shape == "folded" and self.line is None:
+                fail(NAME, "line", None, "a nested texture of type 'spectral_line', or 'sampled'")
+            expected = self.line.wavelength if self.line else 354.7e-9
+            self.wavelength = positive(props, NAME, "wavelength", expected)
+            self.index = at_least(props, NAME, "index", 1.0, 1.0)
+            self.gap = positive(props, NAME, "gap", 13.7e-3)
+            self.order_fraction = number(props, NAME, "order_fraction", 0.0)
+            if not 0 <= self.order_fraction < 1:
+                fail(NAME, "order_fraction", self.order_fraction, "0 <= value < 1")
+            self.tuned = "order_fraction" in props
+            self.absorption = at_least(props, NAME, "absorption", 0.0, 0.0)
+            self.surface_rms = at_least(props, NAME, "surface_rms", 0.0, 0.0)
+            self.bow = number(props, NAME, "bow", 0.0)
+            if not np.isfinite(self.bow):
+                fail(NAME, "bow", self.bow, "a finite number")
+            self.plate_index = at_least(props, NAME, "plate_index", 1.4761, 1.0)
+            self.coating = _coating(props)
+            self.reflectivity = number(props, NAME, "reflectivity", 0.7)
+            for field in ("reflectivity", "absorption"):
+                if self.coating and field in props:
+                    fail(NAME, field, props[field], "either it or a coating")
+            self._prepare()
+            sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
+            self.m_components = [mi.BSDFFlags.DeltaReflection | sides, mi.BSDFFlags.Null | sides]
+            self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def _prepare(self):
+            """All that needs double precision."""
+            delay, shift = 0.0, 0.0  # of a reflection at a coating: s, half orders
+            if self.coating:
+                axial, passed, _ = self._mirror_on_axis(1.0)
+                self.reflectivity = float(abs(axial) ** 2)
+                if not abs(passed) > 1e-6:
+                    fail(NAME, "coating", f"transmittance {abs(passed):.1e}", "more than 1e-6")
+                shift = np.angle(axial) / np.pi
+                step = 1e-6
+                turn = np.angle(self._mirror_on_axis(1 + step)[0] / self._mirror_on_axis(1 - step)[0])
+                delay = turn / (2 * step) * self.wavelength / (2 * np.pi * SPEED_OF_LIGHT)
+            self.order = 2 * self.index * self.gap / self.wavelength
+            if self.tuned:
+                rest = self.order + shift - self.order_fraction
+                self.order += round(rest) - rest
+                self.gap = self.order * self.wavelength / (2 * self.index)
+            if not 0 < self.reflectivity < 1:
+                fail(NAME, "reflectivity", self.reflectivity, "a number between 0 and 1")
+            passed = 1 - self.reflectivity
+            if not self.absorption < passed:
+                fail(NAME, "absorption", self.absorption, f"less than 1 - reflectivity = {passed:g}")
+            self.free_spectral_range = 1 / (2 * self.index * self.gap / SPEED_OF_LIGHT + 2 * delay)
+            self.m_fraction = dr.opaque(mi.Float, self.order - round(self.order))
+            self.m_order = dr.opaque(mi.Float, self.order)
+            self.m_orders_per_hertz = dr.opaque(mi.Float, 1 / self.free_spectral_range)
+            self.m_reflectivity = dr.opaque(mi.Float, self.reflectivity)
+            # amplitude that a mirror's absorption leaves of what it transmits, twice
+            self.m_left = dr.opaque(mi.Float, 1 - self.absorption / passed)
+            self.m_defect_order = 2 * self.index / self.wavelength
+            self.m_rms = dr.opaque(mi.Float, self.surface_rms * self.m_defect_order)
+            self.m_bow = dr.opaque(mi.Float, self.bow * self.m_defect_order)
+            if self.line_shape == "folded":
+                # a coating reflects more at other angles and polarisations
+                grazing = (1 + self.reflectivity) / 2
+                self._fold(grazing if self.coating else self.reflectivity)
+
+        def _fold(self, strongest):
+            """Line and defects in Fourier space: the mean of exp(2 pi i n order), n = 0, 1, ..."""
+            number = np.arange(1 + int(np.ceil(np.log(NEGLECTED) / np.log(strongest))))
+            mean = self.line.characteristic(number / self.free_spectral_range)
+            rms, bow = (v * self.m_defect_order for v in (self.surface_rms, self.bow))
+            mean = mean * np.exp(-2 * (np.pi * number * rms) ** 2) * np.sinc(number * bow)
+            kept = np.flatnonzero(np.abs(mean) * strongest**number > NEGLECTED)[-1]
+            self.m_harmonics = [mi.Float(mean.real), mi.Float(mean.imag)]
+            self.m_last = dr.opaque(mi.Int32, int(kept))
+
+        # --- mirrors
+
+        def _mirror_on_axis(self, frequency):
+            """`_stack` at a frequency relative to the laser's, at normal incidence, in float64."""
+            layers = [(n, n * d * 2 * np.pi / self.wavelength * frequency) for n, d in self.coating]
+            return _stack(layers, self.index, self.plate_index, np)
+
+        def _mirrors(self, sine2):
+            """Per polarisation: reflection seen from the gap, passage of both mirrors, reflection
+            seen from outside; amplitudes of the transverse field at an outer angle's sine squared.
+            """
+            if not self.coating:
+                amplitude = dr.sqrt(self.m_reflectivity)
+                passed = (1 - self.m_reflectivity) * self.m_left
+                return [tuple(mi.Complex2f(a, 0) for a in (-amplitude, passed, amplitude))]
+            found = []
+            for polarisation in "sp":
+                layers = []
+                for n, thickness in self.coating:
+                    index = mi.Complex2f(n.real, n.imag)
+                    cosine = dr.sqrt(1 - sine2 / (index * index))
+                    phase = cosine * index * (2 * np.pi * thickness / self.wavelength)
+                    layers.append((_admittance(index, cosine, polarisation), phase))
+                ends = [
+                    _admittance(index, dr.sqrt(1 - sine2 / index**2), polarisation)
+                    for index in (self.index, self.plate_index)
+                ]
+                inside, passed, outside = _stack(layers, *ends, dr)
+                found.append((inside, passed * self.m_left, outside))
+            return found
+
+        # --- light
+
+        def order_of(self, sine2, offset):
+            """Phase order less a whole number, at an outer angle's sine squared and an offset (Hz)."""
+            sine2 = sine2 / self.index**2
+            cosine = dr.sqrt(1 - sine2)
+            # order (1 - cosine), without the difference of two large numbers
+            return self.m_fraction - self.m_order * (sine2 / (1 + cosine)) + (
+                offset * self.m_orders_per_hertz * cosine
+            )
+
+        def matrices(self, sine2, offset, defects, reflects=True):
+            """Mueller elements (m00, m01, m22, m23) of transmitted and of reflected light.
+
+            About the axis perpendicular to the plane of incidence. ``offset`` (Hz) is what a ray
+            has beyond the laser line if sampled, the line's shift if folded.
+            """
+            order = self.order_of(sine2, offset)
+            if self.line_shape == "sampled":
+                order += defects
+            sine, cosine = dr.sincos(dr.two_pi * (order - dr.round(order)))
+            turn = mi.Complex2f(cosine, sine)
+            waves = []
+            for inside, passed, outside in self._mirrors(sine2):
+                trip = inside * inside * turn
+                waves.append((inside, passed, outside, trip, self._resonance(trip)))
+            through = self._products(waves, lambda wave: (0, wave[1]))
+            if not reflects:
+                return through, None
+            # the wave reflected at once, and the round trips that leave backwards
+            back = self._products(waves, lambda wave: (wave[2], wave[1] / wave[0]), sign=-1)
+            return through, back
+
+        def _resonance(self, trip):
+            """Mean of the sum of all round trips, 1 / (1 - trip)."""
+            if self.line_shape == "sampled":
+                return 1 / (1 - trip)
+            return _power_series(self.m_harmonics, self.m_last, trip)
+
+        def _products(self, waves, amplitudes, sign=1):
+            """Means of products of s and p amplitudes ``a + b w / (1 - trip)`` as Mueller elements.
+
+            With w = 1 for transmitted, w = trip for reflected light (``a`` not 0). The product of
+            two sums of round trips is a sum again: (S1 + S2* - 1) / (1 - trip1 trip2*).
+            """
+
+            def product(first, second):
+                (a1, b1), (a2, b2) = amplitudes(first), amplitudes(second)
+                trip1, trip2, sum1, sum2 = first[3], second[3], first[4], second[4]
+                both = (sum1 + dr.conj(sum2) - 1) / (1 - trip1 * dr.conj(trip2))
+                if sign > 0:
+                    return b1 * dr.conj(b2) * both
+                crossed = dr.conj(a2) * b1 * (sum1 - 1) + a1 * dr.conj(b2) * dr.conj(sum2 - 1)
+                return a1 * dr.conj(a2) + crossed + b1 * dr.conj(b2) * trip1 * dr.conj(trip2) * both
+
+            s, p = waves[0], waves[-1]
+            ss = product(s, s).real
+            if len(waves) == 1:
+                return ss, mi.Float(0), sign * ss, mi.Float(0)
+            pp, sp = product(p, p).real, sign * product(s, p)
+            return (ss + pp) / 2, (ss - pp) / 2, sp.real, sp.imag
+
+        # --- Mitsuba
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            reflects = ctx.is_enabled(mi.BSDFFlags.DeltaReflection, 0)
+            transmits = ctx.is_enabled(mi.BSDFFlags.Null, 1)
+            bs = mi.BSDFSample3f()
+            if not (reflects or transmits):
+                return bs, mi.Spectrum(0)
+            if self.line_shape == "folded":
+                offset, defects = self.line.shift(), mi.Float(0)
+            else:
+                offset = si.time
+                # the place on the plates: a paraboloid's depth is evenly distributed over a disc
+                normal = dr.sqrt(2) * dr.erfinv(dr.clip(2 * sample2.y - 1, -0.9999999, 0.9999999))
+                defects = self.m_bow * (sample2.x - 0.5) + self.m_rms * normal
+            sine2 = dr.square(si.wi.x) + dr.square(si.wi.y)
+            through, back = self.matrices(sine2, offset, defects, reflects)
+            if reflects and transmits:
+                bs.pdf = back[0] / (back[0] + through[0])
+                reflected = sample1 < bs.pdf
+                bs.pdf = dr.select(reflected, bs.pdf, 1 - bs.pdf)
+                elements = [dr.select(reflected, b, t) for b, t in zip(back, through)]
+            else:
+                bs.pdf, reflected = mi.Float(1), mi.Bool(reflects)
+                elements = back if reflects else through
+            bs.wo = dr.select(reflected, mi.Vector3f(-si.wi.x, -si.wi.y, si.wi.z), -si.wi)
+            bs.eta = mi.Float(1)
+            bs.sampled_component = dr.select(reflected, mi.UInt32(0), mi.UInt32(1))
+            bs.sampled_type = dr.select(
+                reflected, mi.UInt32(+mi.BSDFFlags.DeltaReflection), mi.UInt32(+mi.BSDFFlags.Null)
+            )
+            elements = [e / bs.pdf for e in elements]
+            return bs, self._as_spectrum(ctx, si.wi, bs.wo, elements) & active
+
+        def _as_spectrum(self, ctx, wi, wo, elements):
+            if not mi.is_polarized:
+                return mi.Spectrum(elements[0])
+            arriving, leaving = (-wo, wi) if ctx.mode == mi.TransportMode.Radiance else (-wi, wo)
+            m00, m01, m22, m23 = elements
+            matrix = mi.Spectrum(0)
+            matrix[0, 0], matrix[0, 1] = m00, m01
+            matrix[1, 0], matrix[1, 1] = m01, m00
+            matrix[2, 2], matrix[2, 3] = m22, m23
+            matrix[3, 2], matrix[3, 3] = -m23, m22
+            normal = mi.Vector3f(0, 0, 1)
+
+            def axis(direction):
+                across = dr.cross(normal, direction)
+                length = dr.norm(across)
+                return dr.select(length > 0, across / length, mi.Vector3f(1, 0, 0))
+
+            return mi.mueller.rotate_mueller_basis(
+                matrix,
+                arriving, axis(arriving), mi.mueller.stokes_basis(arriving),
+                leaving, axis(leaving), mi.mueller.stokes_basis(leaving),
+            )  # fmt: skip
+
+        def eval(self, ctx, si, wo, active=True):
+            return mi.Spectrum(0)
+
+        def pdf(self, ctx, si, wo, active=True):
+            return mi.Float(0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            return mi.Spectrum(0), mi.Float(0)
+
+        def traverse(self, callback):
+            if self.line is not None:
+                callback.put("line", self.line, mi.ParamFlags.NonDifferentiable)
+
+        def to_string(self):
+            return (
+                f"Etalon[order={self.order:.6f}, gap={self.gap:.9g} m, "
+                f"free_spectral_range={self.free_spectral_range:g} Hz, "
+                f"reflectivity={self.reflectivity:g}, line_shape={self.line_shape}]"
+            )
+
+    return Etalon
+
+
+@dr.syntax
+def _power_series(harmonics, last, z):
+    """Sum of complex coefficients (real, imaginary arrays) times powers of z, by Horner's rule."""
+    total, k = mi.Complex2f(0, 0), mi.Int32(last)
+    while k >= 0:
+        coefficient = mi.Complex2f(*(dr.gather(mi.Float, part, k) for part in harmonics))
+        total = total * z + coefficient
+        k -= 1
+    return total
+
+
+def _coating(props) -> list[tuple[complex, float]]:
+    """Layers (index + i extinction, thickness in m) of a mirror from its plate to the gap."""
+    text = str(props.get("coating", "")).strip()
+    try:
+        layers = [tuple(float(v) for v in layer.split()) for layer in text.split(",") if text]
+    except ValueError:
+        layers = [()]
+    for layer in layers:
+        fine = len(layer) in (2, 3) and np.isfinite(layer).all()
+        if not fine or layer[0] < 1 or layer[1] <= 0 or min(layer[2:], default=0) < 0:
+            fail(NAME, "coating", text, "layers 'index thickness' (>= 1, > 0 m), comma-separated")
+    return [(complex(index, *rest), thickness) for index, thickness, *rest in layers]
+
+
+def _admittance(index, cosine, polarisation):
+    """Ratio of the transverse magnetic to the transverse electric field, in vacuum's."""
+    return index * cosine if polarisation == "s" else index / cosine
+
+
+def _stack(layers, gap, plate, xp):
+    """Amplitudes of a mirror by the characteristic matrices of its layers (Macleod 2010, ch. 2).
+
+    Parameters
+    ----------
+    layers : list
+        (admittance, phase thickness) from the plate to the gap.
+    gap, plate : array
+        Admittances of the media on both sides.
+    xp : module
+        ``drjit`` or ``numpy``.
+
+    Returns
+    -------
+    tuple
+        Reflection seen from the gap, product of the transmissions both ways, reflection seen from
+        the plate, for the transverse electric field and exp(-i omega t).
+    """
+    number = mi.Complex2f if xp is dr else complex
+    a, b, c, d = number(1, 0), number(0, 0), number(0, 0), number(1, 0)
+    for admittance, phase in reversed(layers):
+        cosine, sine = xp.cos(phase), number(0, -1) * xp.sin(phase)
+        a, b, c, d = (
+            a * cosine + b * sine * admittance,
+            a * sine / admittance + b * cosine,
+            c * cosine + d * sine * admittance,
+            c * sine / admittance + d * cosine,
+        )
+    forward, backward = gap * (a + b * plate), c + d * plate
+    total = forward + backward
+    inside = (forward - backward) / total
+    # the same stack from the other side has a and d exchanged
+    outside = (plate * (d + b * gap) - (c + a * gap)) / total
+    return inside, 4 * gap * plate / (total * total), outside

@@ -1,0 +1,251 @@
+"""
+.. _integrator-fringes:
+
+Fringes of an interferometer (``fringes``)
+------------------------------------------
+
+Plane waves of a :ref:`source <emitter-plane_waves>` through everything that lets light pass
+straight, such as an :ref:`etalon <bsdf-etalon>`, into a :ref:`camera <sensor-ccd>`: for every pixel
+the Stokes vector of the light that arrives as *received energy over the energy the source sends
+through the stop*, and the standard error of its first component.
+
+============================ ======= ======================================================= =======
+Parameter                    Type    Meaning                                                 Default
+============================ ======= ======================================================= =======
+``estimator``                string  ``camera``: from every pixel out to the source;         camera
+                                     ``forward``: plane waves of random direction,
+                                     frequency, polarisation and place, through the lens to
+                                     where they arrive, each with the share that is let
+                                     through; ``analog``: the same, and every photon is let
+                                     through or not: a picture of counts
+``samples_per_pass``         int     light paths at once; bounds the memory, does not        4194304
+                                     change the expectation
+============================ ======= ======================================================= =======
+
+All have the same expectation. A path is a straight line from the source to the stop, kept as it was
+drawn: surfaces weigh it (component ``Null`` of their BSDF) and never move it. Surfaces without that
+component are stops; what surfaces reflect is lost. Each path's frequency is drawn from the source's
+line and travels with the ray, as an offset in Hz in place of its ``time``.
+
+``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``S0`` ... ``S3``,
+``S0_stderr``; row 0 is the top. The Stokes vector refers to the horizontal axis. Unpolarised
+variants carry intensity only: S1 to S3 are 0 there. ``sample_count`` of the sensor's sampler (or
+``spp``) is the number of paths a pixel, forward on the average over all pixels. Forward, S0_stderr
+of a pixel that nothing reached is 0.
+
+.. code-block:: xml
+
+    <integrator type="fringes"> <string name="estimator" value="forward"/> </integrator>
+"""
+
+import drjit as dr
+import mitsuba as mi
+
+from .parameters import choice, fail, whole
+from .polarization import horizontal_axis, rotate_stokes
+
+NAME, KIND = "fringes", "integrator"
+
+STOKES = ("S0", "S1", "S2", "S3")
+
+
+def define():
+    class Fringes(mi.CppADIntegrator):
+        def __init__(self, props):
+            super().__init__(props)
+            self.estimator = choice(
+                props, NAME, "estimator", "camera", ("camera", "forward", "analog")
+            )
+            self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 2)
+            # called with (paths done, paths in all) after every pass, when set
+            self.progress = None
+
+        def aov_names(self):
+            return []
+
+        def quantities(self) -> list[str]:
+            """Names of the last axis of the rendered tensor."""
+            return [*STOKES, "S0_stderr"]
+
+        def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+            sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+            if not hasattr(sensor, "sample_towards_scene"):
+                fail(NAME, "sensor", type(sensor).__name__, "a sensor of type 'ccd'")
+            source = scene.environment()
+            if not hasattr(source, "sample_direction_of_light"):
+                fail(NAME, "source", type(source).__name__, "an emitter of type 'plane_waves'")
+            _check_straight(scene)
+            paths = int(spp) or sensor.sampler().sample_count()
+            if self.estimator == "camera" and not 2 <= paths <= self.samples_per_pass:
+                fail(NAME, "sample_count", paths, f"2 to samples_per_pass, {self.samples_per_pass}")
+            seed = dr.opaque(mi.UInt32, seed)  # a new seed compiles nothing
+            width, height = sensor.film().size()
+            with dr.suspend_grad():
+                trace = self._camera if self.estimator == "camera" else self._forward
+                channels = trace(scene, source, sensor, seed, paths, width * height)
+            image = dr.zeros(mi.Float, width * height * len(channels))
+            pixel = dr.arange(mi.UInt32, width * height) * len(channels)
+            for index, channel in enumerate(channels):
+                dr.scatter(image, channel, pixel + index)
+            return mi.TensorXf(image, (height, width, len(channels)))
+
+        # --- both directions
+
+        def _camera(self, scene, source, sensor, seed, paths, pixels):
+            """Mean and standard error over the paths of each pixel, all of them in one pass."""
+            channels = [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
+            at_once = max(1, self.samples_per_pass // paths)
+            for first in range(0, pixels, at_once):
+                count = min(at_once, pixels - first)
+                lane = dr.arange(mi.UInt32, count * paths)
+                number = dr.opaque(mi.UInt32, paths)
+                local = lane // number
+                pixel = local + dr.opaque(mi.UInt32, first)
+                rng = _generator(seed, pixel, lane - local * number)
+                width = dr.opaque(mi.UInt32, sensor.film().size().x)
+                row = pixel // width
+                corner = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row))
+                point, direction, weight = sensor.sample_towards_scene(
+                    corner + _pair(rng) - 0.5, _pair(rng)
+                )
+                weight &= source.in_field(-direction)
+                ray = mi.Ray3f(point, direction)
+                ray.time = source.line.sample(rng.next_float32(), _pair(rng))
+                matrix = _surfaces(scene, ray, rng, mi.BSDFContext(), weight > 0)
+                stokes = _applied(matrix, source.mean_stokes(-direction))
+                scale = weight / (source.projected_solid_angle() * sensor.stop_area())
+                stokes = [s * scale for s in _about_horizontal(stokes, -direction)]
+                dr.eval(stokes)
+                number = dr.opaque(mi.Float, paths)
+                means = [dr.block_sum(s, paths) / number for s in stokes]
+                deviation = stokes[0] - dr.gather(mi.Float, means[0], local)
+                square = dr.block_sum(deviation * deviation, paths)
+                means.append(dr.sqrt(square / (number * (number - 1))))
+                place = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
+                for channel, mean in zip(channels, means):
+                    dr.scatter(channel, mean, place)
+                self._tell(first + count, pixels, channels)
+            return channels
+
+        def _forward(self, scene, source, sensor, seed, paths, pixels):
+            """Light sorted into the pixels where it arrives."""
+            total = paths * pixels
+            sums = [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
+            context = mi.BSDFContext(mi.TransportMode.Importance)
+            width = dr.opaque(mi.UInt32, sensor.film().size().x)
+            share = dr.opaque(mi.Float, 1 / total)
+            for index, first in enumerate(range(0, total, self.samples_per_pass)):
+                count = min(self.samples_per_pass, total - first)
+                lane = dr.arange(mi.UInt32, count)
+                rng = _generator(seed, dr.opaque(mi.UInt32, index), lane)
+                direction = source.sample_direction_of_light(_pair(rng))
+                point = sensor.sample_stop(_pair(rng))
+                place, arrives = sensor.receive(point, direction)
+                # from before the first surface to the stop, and no further
+                way = dr.opaque(mi.Float, _reach(scene, sensor))
+                ray = mi.Ray3f(point - direction * way, direction)
+                ray.maxt = way
+                ray.time = source.line.sample(rng.next_float32(), _pair(rng))
+                stokes = source.sample_stokes(direction, rng.next_float32(), _pair(rng))
+                matrix = _surfaces(scene, ray, rng, context, arrives)
+                stokes = _applied(matrix, stokes)
+                if self.estimator == "analog":
+                    passes = rng.next_float32() < stokes[0]
+                    stokes = [dr.select(passes, s / stokes[0], 0) for s in stokes]
+                stokes = _about_horizontal(stokes, direction)
+                column, row = (mi.UInt32(dr.clip(v + 0.5, 0, 2**31)) for v in (place.x, place.y))
+                pixel = row * width + column
+                for channel, value in zip(sums, (*stokes, stokes[0] * stokes[0])):
+                    dr.scatter_reduce(dr.ReduceOp.Add, channel, value, pixel, arrives)
+                self._tell(first + count, total, sums)
+            *stokes, squares = sums
+            variance = dr.maximum(squares - stokes[0] * stokes[0] * share, 0)
+            return [*(s * share for s in stokes), dr.sqrt(variance) * share]
+
+        def _tell(self, done, total, values):
+            dr.eval(values)
+            if self.progress:
+                dr.sync_thread()
+                self.progress(done, total)
+
+        def to_string(self):
+            return f"Fringes[estimator={self.estimator}]"
+
+    return Fringes
+
+
+@dr.syntax
+def _surfaces(scene, ray, rng, context, active):
+    """What all surfaces along a line do to light of the source, as one matrix.
+
+    From the source's axes to those of the light that arrives, both Mitsuba's own; a single factor
+    in unpolarised variants. ``context`` says whether the line is followed with the light.
+    """
+    context.type_mask = +mi.BSDFFlags.Null
+    forward = context.mode == mi.TransportMode.Importance
+    matrix, ray, active = mi.Spectrum(1), mi.Ray3f(ray), mi.Bool(active)
+    while dr.hint(active, label="surfaces"):
+        si = scene.ray_intersect(ray, active)
+        active &= si.is_valid()
+        sample, place = rng.next_float32(active), _pair(rng)
+        _, weight = si.bsdf(ray).sample(context, si, sample, place, active)
+        onward = -si.wi
+        if dr.hint(forward, mode="scalar"):
+            weight = si.to_world_mueller(weight, onward, onward) * matrix
+        else:
+            weight = matrix * si.to_world_mueller(weight, si.wi, si.wi)
+        matrix = dr.select(active, weight, matrix)
+        left = ray.maxt - si.t
+        ray = si.spawn_ray(ray.d)
+        ray.maxt = left
+    return matrix
+
+
+def _applied(matrix, stokes):
+    """The Stokes vector behind a matrix; intensity alone in unpolarised variants."""
+    if not mi.is_polarized:
+        return [matrix[0] * stokes[0], mi.Float(0), mi.Float(0), mi.Float(0)]
+    return [
+        sum(matrix[row, column][0] * value for column, value in enumerate(stokes))
+        for row in range(4)
+    ]
+
+
+def _about_horizontal(stokes, direction):
+    """The Stokes vector about the horizontal axis instead of Mitsuba's."""
+    axis = mi.mueller.stokes_basis(direction)
+    return list(rotate_stokes(stokes, direction, axis, horizontal_axis(direction)))
+
+
+def _reach(scene, sensor) -> float:
+    """A distance from the stop beyond which there is nothing, m."""
+    box = scene.bbox()
+    if not box.valid():
+        return 1.0
+    stop = sensor.world_transform() @ mi.Point3f(0)
+    sphere = box.bounding_sphere()
+    offset = [a[0] - b for a, b in zip((stop.x, stop.y, stop.z), sphere.center)]
+    return 1.1 * (sum(v * v for v in offset) ** 0.5 + float(sphere.radius)) + 1e-3
+
+
+def _check_straight(scene):
+    """Surfaces that bend light would be passed over: that is a mistake of the scene."""
+    kinds = mi.BSDFFlags
+    bending = kinds.DiffuseTransmission | kinds.GlossyTransmission | kinds.DeltaTransmission
+    for shape in scene.shapes():
+        flags = shape.bsdf().flags()
+        if flags & bending and not flags & kinds.Null:
+            fail(NAME, "scene", shape.id(), "surfaces that light passes straight or not at all")
+
+
+def _generator(seed, group, number):
+    """Independent random numbers for every seed, group (pixel or pass) and number in it."""
+    key, counter = mi.sample_tea_32(seed, group)
+    state, stream = mi.sample_tea_32(key, counter + number)
+    rng = mi.PCG32()
+    rng.seed(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
+    return rng
+
+
+def _pair(rng):
+    return mi.Point2f(rng.next_float32(), rng.next_float32())
