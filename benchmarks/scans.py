@@ -10,7 +10,7 @@ import xarray as xr
 from lidar_mi.config import Experiment, load
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans, scene_dict
-from lidar_mi.rendering.phase import albedo, phase_function
+from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.truth import make_truth
 
@@ -30,9 +30,10 @@ class PaperScan:
 
     def air(self) -> tuple:
         """Environment extinction (m^-1), phase function and albedo."""
-        scattering = self.experiment.scattering
         background = self.experiment.wake.extinction.background
-        return background, phase_function(scattering), albedo(scattering)
+        return background, *scatterer(
+            self.experiment.scattering, wavelength=self.experiment.lidar.wavelength
+        )
 
     def scene(self):
         """The scan at t1 as a Mitsuba scene, in the experiment's variant."""

@@ -2,7 +2,7 @@
 
 import difflib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
@@ -102,24 +102,49 @@ class Platform(_Section):
     dt: Time = Field(0.1, gt=0)
 
 
-class Scattering(_Section):
+class _Scatterer(_Section):
+    """What any kind of scatterer may be asked."""
+
+    aerosol: str | None = Field(None, description="name of an aerosol, with phase: aerosol")
+    band: Literal["cabannes", "rayleigh"] = Field(
+        "cabannes", description="of molecules: the line a narrow filter lets through, or all"
+    )
+    depolarization: Number = Field(0.0, ge=0, lt=0.5, description="of Rayleigh, natural light")
+    table: str | None = Field(None, description="scattering-matrix file, see the mueller plugin")
+
+    @model_validator(mode="after")
+    def _named_what_it_needs(self):
+        for name in ("table", "aerosol"):
+            value = getattr(self, name)
+            if (self.phase == name) != (value is not None):
+                raise ValueError(f"{name}: {value!r} is not allowed with phase {self.phase}")
+        return self
+
+
+class Part(_Scatterer):
+    """One kind of scatterer in a mixture."""
+
+    phase: Literal["rayleigh", "molecules", "aerosol", "table"]
+    share: Number = Field(gt=0, description="of the extinction, relative to the other parts")
+
+
+class Scattering(_Scatterer):
     """How the air scatters, in the slab and around it."""
 
-    phase: Literal["rayleigh", "isotropic", "henyey_greenstein", "aerosol", "table"] = "rayleigh"
-    aerosol: str | None = Field(None, description="name of an aerosol, with phase: aerosol")
-    depolarization: Number = Field(0.0, ge=0, lt=0.5, description="of Rayleigh, natural light")
+    phase: Literal[
+        "rayleigh", "molecules", "isotropic", "henyey_greenstein", "aerosol", "table", "mixture"
+    ] = "rayleigh"
     asymmetry: Number = Field(0.0, gt=-1, lt=1, description="of Henyey-Greenstein")
-    table: str | None = Field(None, description="scattering-matrix file, see the mueller plugin")
+    parts: tuple[Part, ...] | None = Field(None, min_length=1, description="of a mixture")
     albedo: Number | None = Field(
-        None, ge=0, le=1, description="scattered share of the extinction; default: the aerosol's, or 1"
+        None, ge=0, le=1, description="scattered share of the extinction; default: the scatterers'"
     )
 
     @model_validator(mode="after")
-    def _table_given(self):
-        if (self.phase == "table") != (self.table is not None):
-            raise ValueError(f"table: {self.table!r} is not allowed with phase {self.phase}")
-        if (self.phase == "aerosol") != (self.aerosol is not None):
-            raise ValueError(f"aerosol: {self.aerosol!r} is not allowed with phase {self.phase}")
+    def _parts_of_a_mixture(self):
+        if (self.phase == "mixture") != (self.parts is not None):
+            value = None if self.parts is None else f"{len(self.parts)} parts"
+            raise ValueError(f"parts: {value} is not allowed with phase {self.phase}")
         return self
 
 
@@ -229,7 +254,9 @@ def _override(data: dict, text: str) -> None:
 
 
 def _first_fault(error: ValidationError) -> str:
-    fault = error.errors()[0]
+    faults = error.errors()
+    # a misspelt key also leaves one missing: what is there tells more
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     where = [str(p) for p in fault["loc"] if p not in ("float", "literal['advect']")]
     field = ".".join(where)
     message = fault["msg"].removeprefix("Value error, ")
@@ -247,7 +274,13 @@ def _first_fault(error: ValidationError) -> str:
 def _keys_at(location: tuple) -> list[str]:
     model: Any = Experiment
     for part in location:
-        annotation = model.model_fields[part].annotation
-        options = getattr(annotation, "__args__", (annotation,))
-        model = next(o for o in options if isinstance(o, type) and issubclass(o, BaseModel))
+        if isinstance(part, str):
+            model = _section(model.model_fields[part].annotation)
     return list(model.model_fields)
+
+
+def _section(annotation) -> type[BaseModel] | None:
+    """The model in an annotation such as ``tuple[Model, ...] | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_section, get_args(annotation))), None)

@@ -23,7 +23,7 @@ from .instrument.products import linear_depolarization, with_products
 from .instrument.scan import ScanPlan, plan_scans
 from .rendering import exr
 from .rendering.backscatter import extrude, render_scans
-from .rendering.phase import albedo, phase_function
+from .rendering.phase import Scatterer, scatterer
 from .rendering.variant import use_variant
 from .retrieval.images import resample_pair
 from .retrieval.wind import retrieve_wind
@@ -71,11 +71,13 @@ def run(
         notice("reading the wake", None)
         truth = make_truth(experiment, beside)
         plans = _plans(experiment, truth)
-    _check_ahead(experiment, truth, plans, beside)
+    notice("reading how the air scatters", None)
+    air = scatterer(experiment.scattering, beside, experiment.lidar.wavelength)
+    _check_ahead(experiment, truth, plans, air)
     claim(folder, experiment, beside, overwrite)
     log = Log(folder / "log.txt", notice)
     log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")
-    scans = pictures(experiment, truth, plans, folder, beside, log)
+    scans = pictures(experiment, truth, plans, air, folder, log)
     timing["render"] = sum(scan.attrs["render_seconds"] for scan in scans)
     with _timed(timing, "retrieve"):
         log("retrieving winds")
@@ -101,9 +103,8 @@ def run(
     return metrics
 
 
-def _check_ahead(experiment, truth, plans, beside) -> None:
+def _check_ahead(experiment, truth, plans, air: Scatterer) -> None:
     """What would only fail later is said before anything is written."""
-    phase_function(experiment.scattering, beside, experiment.lidar.wavelength)
     settings, image = experiment.retrieval, (len(plans[0].z), len(plans[0].y))
     Windows(image, settings.template, settings.search, settings.stride)
     if not max(float(field.max()) for field in truth.extinction) > 0:
@@ -111,11 +112,11 @@ def _check_ahead(experiment, truth, plans, beside) -> None:
             "wake.extinction: 0 everywhere is not allowed; expected air that scatters, by its "
             "background, tracer or aerosol"
         )
-    if not albedo(experiment.scattering, experiment.lidar.wavelength) > 0:
+    if not air.albedo > 0:
         raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
 
 
-def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dataset]:
+def pictures(experiment, truth, plans, air: Scatterer, folder: Path, log) -> list[xr.Dataset]:
     """The two scans: those in the folder, and the missing ones rendered and written to it."""
     paths = [folder / name for name in IMAGES]
     missing = [index for index, path in enumerate(paths) if not path.is_file()]
@@ -139,8 +140,7 @@ def pictures(experiment, truth, plans, folder: Path, beside, log) -> list[xr.Dat
         plans,
         experiment.lidar,
         experiment.wake.extinction.background,
-        phase_function(experiment.scattering, beside, experiment.lidar.wavelength),
-        albedo(experiment.scattering, experiment.lidar.wavelength),
+        *air,
         experiment.render,
         experiment.seed,
         progress,

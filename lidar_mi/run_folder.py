@@ -14,7 +14,7 @@ import yaml
 from . import __version__, config
 from .config import Experiment
 from .errors import InputError
-from .rendering.phase import phase_function
+from .rendering.phase import table_files
 from .truth import find_file
 
 IMAGES = ("image_t1.exr", "image_t2.exr")
@@ -60,11 +60,9 @@ def claim(folder: Path, experiment: Experiment, beside: str | Path, overwrite: b
 
 def _checksums(experiment: Experiment, beside: str | Path) -> dict[str, str]:
     """SHA-256 of the files an experiment names: a changed file is another experiment."""
-    paths = {}
+    paths = table_files(experiment.scattering, beside)
     if experiment.wake.file:
         paths["wake.file"] = find_file(experiment.wake.file, beside, "wake.file")
-    if experiment.scattering.table:
-        paths["scattering.table"] = Path(phase_function(experiment.scattering, beside)["table"])
     return {field: hashlib.sha256(path.read_bytes()).hexdigest() for field, path in paths.items()}
 
 

@@ -23,7 +23,7 @@ import yaml
 from pydantic import BaseModel
 
 from lidar_mi import cli, config, truth, units
-from lidar_mi.rendering.phase import phase_function
+from lidar_mi.rendering.phase import scatterer
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -64,7 +64,7 @@ def leaves(model=config.Experiment, path=()):
     """Every key of an experiment file: dotted name, section's model, field."""
     for name, field in model.model_fields.items():
         section = next((t for t in _parts(field.annotation) if _is_model(t)), None)
-        if section is None or section is config.VortexPair:
+        if section is None or section in (config.VortexPair, config.Part):
             yield ".".join((*path, name)), model, field
         if section is not None:
             yield from leaves(section, (*path, name))
@@ -140,8 +140,9 @@ def test_key_has_the_documented_unit_default_and_limits(name, model, field):
 def _value(name, model, *given):
     """A key's value in a valid experiment that gives it, or else leaves it to its default."""
     *parents, key = name.split(".")
-    if model is config.VortexPair:
-        return getattr(model.model_validate(dict(zip([key], given))), key)
+    if model in (config.VortexPair, config.Part):  # sections that an experiment need not have
+        whole = {"phase": "rayleigh", "share": 1.0} if model is config.Part else {}
+        return getattr(model.model_validate(whole | dict(zip([key], given))), key)
     data = copy.deepcopy(BASE)
     section = data
     for parent in parents:
@@ -264,7 +265,7 @@ def check_yaml(block):
         truth.make_truth(config.load(block.file))
         return
     loaded = config.check({**BASE, **data}, block.place)
-    phase_function(loaded.scattering)  # finds the table
+    scatterer(loaded.scattering, wavelength=loaded.lidar.wavelength)  # finds the tables
 
 
 def check_xml(block):

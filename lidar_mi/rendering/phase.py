@@ -1,53 +1,117 @@
-"""Which Mitsuba phase function stands for the scattering an experiment describes."""
+"""Which Mitsuba phase function and albedo stand for the scattering an experiment describes."""
 
+import math
 from pathlib import Path
+from typing import NamedTuple
 
 import mitsuba as mi
 import numpy as np
 
+from ..atmosphere.molecules import molecular_scattering, molecular_table
 from ..atmosphere.particles import aerosol_table
+from ..atmosphere.scattering import ScatteringTable, mix, rayleigh_table, read_table
 from ..errors import InputError
 
 
-def phase_function(scattering, beside: str | Path = ".", wavelength: float = 532e-9) -> dict:
-    """The phase function's dictionary for ``mi.load_dict``.
+class Scatterer(NamedTuple):
+    """``phase``: dictionary of the phase function for ``mi.load_dict``; ``albedo``."""
+
+    phase: dict
+    albedo: float
+
+
+def scatterer(scattering, beside: str | Path = ".", wavelength: float = 532e-9) -> Scatterer:
+    """How the air of an experiment scatters.
 
     Parameters
     ----------
     scattering : lidar_mi.config.Scattering
+        Its own albedo stands over that of the scatterers.
     beside : path
-        Folder in which a table is looked for.
+        Folder in which tables are looked for.
     wavelength : float
-        Of the laser, m; a named aerosol scatters accordingly.
+        Of the laser, m; aerosols and molecules scatter accordingly.
 
     Raises
     ------
     InputError
-        The table file does not exist, or the aerosol has no table at this wavelength.
+        A table that does not exist, that cannot be read or is for another wavelength; an aerosol
+        without a table at this one.
     """
+    albedo = 1.0
     match scattering.phase:
         case "rayleigh":
-            return {"type": "rayleigh_polarized", "depolarization": scattering.depolarization}
+            phase = {"type": "rayleigh_polarized", "depolarization": scattering.depolarization}
+        case "molecules":
+            air = molecular_scattering(wavelength, band=scattering.band)
+            phase = {"type": "rayleigh_polarized", "depolarization": air.depolarization}
+            albedo = air.albedo
         case "isotropic":
-            return {"type": "isotropic"}
+            phase = {"type": "isotropic"}
         case "henyey_greenstein":
-            return {"type": "hg", "g": scattering.asymmetry}
+            phase = {"type": "hg", "g": scattering.asymmetry}
+        case "mixture":
+            shares = [part.share for part in scattering.parts]
+            tables = [
+                _table(part, beside, wavelength, f"scattering.parts.{index}")
+                for index, part in enumerate(scattering.parts)
+            ]
+            phase, albedo = _tabulated(mix(tables, shares))
+        case "table" if not _is_complete(table_files(scattering, beside)["scattering.table"]):
+            path = table_files(scattering, beside)["scattering.table"]
+            phase = {"type": "mueller", "table": str(path)}
+        case _:
+            phase, albedo = _tabulated(_table(scattering, beside, wavelength, "scattering"))
+    return Scatterer(phase, albedo if scattering.albedo is None else scattering.albedo)
+
+
+def table_files(scattering, beside: str | Path = ".") -> dict[str, Path]:
+    """The table files that an experiment names, by the field that names them.
+
+    Raises
+    ------
+    InputError
+        One of them does not exist.
+    """
+    named = {f"scattering.parts.{k}.table": part for k, part in enumerate(scattering.parts or ())}
+    files = {}
+    for field, part in ({"scattering.table": scattering} | named).items():
+        if part.table is not None:
+            path = Path(beside) / part.table
+            if not path.is_file():
+                raise InputError(f"{field}: {path} not found; expected a scattering-matrix file")
+            files[field] = path.resolve()
+    return files
+
+
+def _table(part, beside, wavelength, field) -> ScatteringTable:
+    """One kind of scatterer as a table."""
+    match part.phase:
+        case "rayleigh":
+            # only shares of the extinction count: any cross-section will do
+            return rayleigh_table(part.depolarization, wavelength, 1.0)
+        case "molecules":
+            return molecular_table(wavelength, band=part.band)
         case "aerosol":
-            table = aerosol_table(scattering.aerosol, wavelength)
-            return {
-                "type": "mueller",
-                "table": mi.TensorXf(np.column_stack([table.angle, table.elements])),
-            }
-    path = Path(beside) / scattering.table
-    if not path.is_file():
-        raise InputError(f"scattering.table: {path} not found; expected a scattering-matrix file")
-    return {"type": "mueller", "table": str(path.resolve())}
+            return aerosol_table(part.aerosol, wavelength)
+    path = Path(beside) / part.table
+    table = read_table(path)
+    if not math.isclose(table.wavelength, wavelength, rel_tol=1e-6):
+        raise InputError(
+            f"{field}.table: {path} is not allowed; it is for {table.wavelength * 1e9:g} nm, "
+            f"expected lidar.wavelength = {wavelength * 1e9:g} nm"
+        )
+    return table
 
 
-def albedo(scattering, wavelength: float = 532e-9) -> float:
-    """Single-scattering albedo: as stated, else the named aerosol's own, else 1."""
-    if scattering.albedo is not None:
-        return scattering.albedo
-    if scattering.phase == "aerosol":
-        return aerosol_table(scattering.aerosol, wavelength).albedo
-    return 1.0
+def _tabulated(table: ScatteringTable) -> Scatterer:
+    rows = mi.TensorXf(np.column_stack([table.angle, table.elements]))
+    return Scatterer({"type": "mueller", "table": rows}, table.albedo)
+
+
+def _is_complete(path: Path) -> bool:
+    """Whether a table says more than numbers: albedo, wavelength, as `write_table` does."""
+    try:
+        return "# single_scattering_albedo:" in path.read_text()
+    except UnicodeDecodeError:  # .npy
+        return False

@@ -1,12 +1,18 @@
-"""From an experiment's words to Mitsuba's phase functions. Detects a lost parameter."""
+"""From an experiment's words to Mitsuba's phase functions.
+
+Detects a lost parameter, an albedo that is not the scatterers', a mixture that is weighted by
+anything but scattering coefficients (1e-4 in backscatter and depolarisation)."""
 
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from lidar_mi.atmosphere.molecules import molecular_scattering
+from lidar_mi.atmosphere.particles import aerosol_table
+from lidar_mi.atmosphere.scattering import write_table
 from lidar_mi.config import Scattering
 from lidar_mi.errors import InputError
-from lidar_mi.rendering.phase import phase_function
+from lidar_mi.rendering.phase import scatterer, table_files
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -38,7 +44,7 @@ def backscatter(dictionary):
     ],
 )
 def test_phase_function_at_180_degrees(scattering, expected):
-    assert backscatter(phase_function(scattering)) == pytest.approx(expected, rel=1e-5)
+    assert backscatter(scatterer(scattering).phase) == pytest.approx(expected, rel=1e-5)
 
 
 def test_table_is_found_beside_the_experiment(tmp_path):
@@ -47,10 +53,75 @@ def test_table_is_found_beside_the_experiment(tmp_path):
     np.savetxt(
         tmp_path / "table.txt", np.column_stack([angle, one, one, one, one, 0 * one, 0 * one])
     )
-    found = phase_function(Scattering(phase="table", table="table.txt"), tmp_path)
-    assert backscatter(found) == pytest.approx(1 / (4 * np.pi), rel=1e-3)
+    found = scatterer(Scattering(phase="table", table="table.txt"), tmp_path)
+    assert found.albedo == 1  # the file says nothing of it
+    assert backscatter(found.phase) == pytest.approx(1 / (4 * np.pi), rel=1e-3)
 
 
 def test_missing_table_is_named(tmp_path):
     with pytest.raises(InputError, match=r"^scattering\.table: .*absent\.txt not found; expected"):
-        phase_function(Scattering(phase="table", table="absent.txt"), tmp_path)
+        scatterer(Scattering(phase="table", table="absent.txt"), tmp_path)
+
+
+def test_a_table_brings_its_albedo(tmp_path):
+    write_table(aerosol_table("soot", 532e-9), tmp_path / "soot.txt")
+    soot = Scattering(phase="table", table="soot.txt")
+    assert scatterer(soot, tmp_path).albedo == pytest.approx(0.21553, abs=1e-5)
+    assert scatterer(soot.model_copy(update={"albedo": 0.5}), tmp_path).albedo == 0.5
+    with pytest.raises(InputError, match=r"soot.txt is not allowed; it is for 532 nm, expected"):
+        scatterer(soot, tmp_path, 355e-9)
+
+
+def matrix(dictionary, cosine):
+    """Phase matrix at a scattering angle in the horizontal plane, times 4 pi, (4, 4)."""
+    mei = mi.MediumInteraction3f()
+    mei.wi = mi.Vector3f(0, 0, 1)
+    mei.sh_frame = mi.Frame3f(0, 0, -1)
+    wo = mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, -cosine)
+    value, _ = mi.load_dict(dictionary).eval_pdf(mi.PhaseFunctionContext(), mei, wo)
+    return 4 * np.pi * np.array([[np.array(value[i, j]).ravel()[0] for j in range(4)]
+                                 for i in range(4)])  # fmt: skip
+
+
+def test_molecules_are_those_of_the_wavelength():
+    """Backscatter and depolarisation of the Cabannes line at 355 nm; the albedo it leaves."""
+    air = molecular_scattering(355e-9, band="cabannes")
+    found = scatterer(Scattering(phase="molecules"), wavelength=355e-9)
+    assert found.albedo == air.albedo
+    back = matrix(found.phase, -1)
+    per_extinction = found.albedo * back[0, 0] / (4 * np.pi)
+    assert per_extinction == pytest.approx(1 / air.lidar_ratio, rel=1e-5)
+    ratio = (back[0, 0] - back[1, 1]) / (back[0, 0] + back[1, 1])
+    assert ratio == pytest.approx(air.depolarization_ratio, rel=2e-3)  # in float32
+    whole = scatterer(Scattering(phase="molecules", band="rayleigh"), wavelength=355e-9)
+    assert whole.albedo == pytest.approx(1)
+
+
+@pytest.mark.parametrize("cosine", [-1.0, -0.3, 0.8])
+def test_a_mixture_is_weighted_by_scattering_coefficient(cosine):
+    """Three parts of soot (albedo 0.22) and one of molecules: by hand from the parts alone."""
+    parts = [
+        {"phase": "aerosol", "aerosol": "soot", "share": 3},
+        {"phase": "rayleigh", "depolarization": 0.1, "share": 1},
+    ]
+    mixture = scatterer(Scattering.model_validate({"phase": "mixture", "parts": parts}))
+    soot = scatterer(Scattering(phase="aerosol", aerosol="soot"))
+    molecules = scatterer(Scattering(depolarization=0.1))
+    assert mixture.albedo == pytest.approx((3 * soot.albedo + 1) / 4)
+    weight = 3 * soot.albedo / (3 * soot.albedo + 1)
+    expected = weight * matrix(soot.phase, cosine) + (1 - weight) * matrix(molecules.phase, cosine)
+    # molecules are a table of one degree here: 8e-5 of a1
+    np.testing.assert_allclose(
+        matrix(mixture.phase, cosine), expected, atol=2e-4 * expected[0, 0]
+    )
+
+
+def test_tables_of_a_mixture_are_found(tmp_path):
+    write_table(aerosol_table("dust", 532e-9), tmp_path / "dust.txt")
+    parts = [{"phase": "molecules", "share": 1}, {"phase": "table", "table": "dust.txt", "share": 1}]
+    mixture = Scattering.model_validate({"phase": "mixture", "parts": parts})
+    found = {"scattering.parts.1.table": (tmp_path / "dust.txt").resolve()}
+    assert table_files(mixture, tmp_path) == found
+    assert scatterer(mixture, tmp_path).phase["type"] == "mueller"
+    with pytest.raises(InputError, match=r"^scattering\.parts\.1\.table: .*dust.txt not found"):
+        table_files(mixture, tmp_path / "elsewhere")
