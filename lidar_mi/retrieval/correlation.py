@@ -76,7 +76,7 @@ def cross_correlation(
         coefficient = _correlate(
             image1[tile.pixels], image2[tile.pixels], windows, chosen, floors
         )
-        for whole, part in zip(found, _peak(coefficient, windows, min_correlation)):
+        for whole, part in zip(found[:4], _peak(coefficient, windows, min_correlation)):
             whole[tile.vectors] = part
     for displacement in (found.dz, found.dy):
         displacement[bad] = torch.nan

@@ -18,12 +18,15 @@ class Displacement(NamedTuple):
         How well the windows match: correlation or mismatch, as the method says.
     flag : torch.Tensor of uint8
         `quality.Flag` bits.
+    covariance : torch.Tensor of shape (3, *windows.count), optional
+        Variances of dz and of dy and their covariance, px^2, of methods that tell.
     """
 
     dz: torch.Tensor
     dy: torch.Tensor
     score: torch.Tensor
     flag: torch.Tensor
+    covariance: torch.Tensor | None = None
 
     @classmethod
     def empty(cls, windows: Windows, like: torch.Tensor) -> "Displacement":

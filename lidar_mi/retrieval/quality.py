@@ -31,6 +31,8 @@ class Flag(enum.IntFlag):
     """NaN or infinity in the search region of one of the images. No displacement."""
     NO_MATCH = 64
     """No candidate could be compared (no contrast, no positive weight). No displacement."""
+    REPLACED = 128
+    """An earlier pass found an outlier here and went on from its neighbours' median (multi-pass)."""
 
 
 # A Sobel derivative, scaled to give the slope of a ramp, passes 3/16 of the variance of white
@@ -227,6 +229,12 @@ def median_outliers(
         ]
         bands.append(torch.hypot(*residuals) > threshold)
     return torch.cat(bands)
+
+
+def neighbour_median(values: torch.Tensor) -> torch.Tensor:
+    """Median of the eight neighbours of each value of a field, NaN where all are missing."""
+    padded = torch.nn.functional.pad(values, (1,) * 4, value=torch.nan)
+    return _median(_neighbours(padded, 1, 1))
 
 
 def _normalised_residual(

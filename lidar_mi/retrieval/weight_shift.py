@@ -61,7 +61,7 @@ def weight_shift(
     found = Displacement.empty(windows, image1)
     for tile in windows.tiles(8 * 8 * windows.shifts**2 + 64 * (template + 4) * stride**2):
         part = _best_match(image1[tile.pixels], image2[tile.pixels], windows, rounding)
-        for whole, values in zip(found, part):
+        for whole, values in zip(found[:4], part):
             whole[tile.vectors] = values
     for displacement in (found.dz, found.dy):
         displacement[bad] = torch.nan

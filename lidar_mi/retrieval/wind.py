@@ -1,6 +1,7 @@
 """From two images to the wind: one call, CF data set out."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -9,21 +10,49 @@ import xarray as xr
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.correlation import cross_correlation
 from lidar_mi.retrieval.displacement import Displacement
+from lidar_mi.retrieval.multipass import multipass
 from lidar_mi.retrieval.quality import Flag, Texture, low_texture, median_outliers
 from lidar_mi.retrieval.weight_shift import weight_shift
 from lidar_mi.retrieval.windows import Windows
 
-METHODS: Mapping[str, Callable[..., Displacement]] = {
-    "cc": cross_correlation,
-    "ws": weight_shift,
-}
-"""Methods by name: (image1, image2, template, search, stride, **options) -> Displacement."""
 
-SCORES = {
-    "cc": ("correlation", "normalised cross-correlation at the peak"),
-    "ws": ("mismatch", "misfit of weight and centre of mass over their spread"),
+@dataclass(frozen=True)
+class Method:
+    """A way to find displacements.
+
+    Attributes
+    ----------
+    find : callable
+        (image1, image2, template, search, stride, **options) -> Displacement, in pixels.
+    score : (str, str)
+        What its `Displacement.score` is: name in the data set, meaning.
+    options : tuple of str
+        Keywords of `retrieve_wind` it takes, `min_correlation` and `noise` among them.
+    centred : bool
+        Vectors belong to the windows' centres, not half their displacement further on.
+    """
+
+    find: Callable[..., Displacement]
+    score: tuple[str, str]
+    options: tuple[str, ...] = ()
+    centred: bool = False
+
+
+METHODS: Mapping[str, Method] = {
+    "cc": Method(
+        cross_correlation,
+        ("correlation", "normalised cross-correlation at the peak"),
+        ("min_correlation",),
+    ),
+    "ws": Method(weight_shift, ("mismatch", "misfit of weight and centre of mass over their spread")),
+    "multipass": Method(
+        multipass,
+        ("correlation", "normalised cross-correlation of the deformed windows"),
+        ("min_correlation", "noise"),
+        centred=True,
+    ),
 }
-"""What a method's `Displacement.score` is: name in the data set, meaning."""
+"""Methods by name."""
 
 _METRES = ("m", "metre", "metres", "meter", "meters")
 
@@ -41,7 +70,7 @@ def retrieve_wind(
     min_correlation: float = 0.5,
     min_texture: float = 0.01,
     min_isotropy: float = 0.2,
-    noise: float | xr.DataArray = 0.0,
+    noise: float | xr.DataArray | None = None,
     median_size: int = 3,
     median_threshold: float = 2.0,
     median_epsilon: float = 0.1,
@@ -55,8 +84,8 @@ def retrieve_wind(
         the spacings may differ between z and y.
     dt : float
         Time from image 1 to image 2, s.
-    method : {"cc", "ws"}
-        Cross-correlation or weight shift, see `METHODS`.
+    method : {"cc", "ws", "multipass"}
+        Cross-correlation, weight shift or multi-pass correlation, see `METHODS`.
     template, search, stride : int
         Pixels: template n >= 2, search region >= n + 2, step from window to window >= 1. Winds
         beyond ((search - template) // 2 - 1/2) spacing / dt cannot be seen (17.5 m/s for 8 in 16
@@ -64,14 +93,15 @@ def retrieve_wind(
     device : str or torch.device
         Where to compute.
     min_correlation : float
-        Flag vectors with a lower peak ("cc" only).
+        Flag vectors with a lower peak (not "ws").
     min_texture, min_isotropy : float
         Flag vectors whose template of image 1 has an rms slope, in its weakest direction and
         relative to its mean, not above this (px^-1), or below this fraction of the slope in its
         strongest direction. See `quality.texture`.
-    noise : float or xr.DataArray
+    noise : float or xr.DataArray, optional
         Standard deviation of image 1's noise, in its unit; a template with less structure than
-        noise is flagged as without texture.
+        noise is flagged as without texture. Left out, no noise is assumed for that, and methods
+        that weight by it ("multipass") estimate it from the images.
     median_size, median_threshold, median_epsilon
         Normalised median test, see `quality.median_outliers`. Neighbours are taken half a
         template apart (or a stride, if that is more): closer ones share their pixels.
@@ -80,11 +110,13 @@ def retrieve_wind(
     -------
     xr.Dataset, dims (z, y)
         At the template centres (an even template's lies between pixels): `v`, `w` (m s-1),
+        `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
+        their correlation (NaN from methods that know none: "cc", "ws"),
         `displacement_y`, `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1),
         `isotropy`, `flag` (bits of `quality.Flag`, 0 = good). The auxiliary coordinates `y_vector`,
-        `z_vector` are where the vector belongs, at mid-time: the centre and half the
-        displacement. Rejected vectors keep their value (or NaN if there is none); nothing is
-        replaced.
+        `z_vector` are where the vector belongs, at mid-time: the centre and, with "cc" and "ws",
+        half the displacement. Rejected vectors keep their value (or NaN if there is none);
+        nothing is replaced.
 
     Raises
     ------
@@ -103,9 +135,12 @@ def retrieve_wind(
         _same_grid(image1, noise, "noise")
         noise = _tensor(noise, device)
 
-    options = {"min_correlation": min_correlation} if method == "cc" else {}
-    found = METHODS[method](pixels1, pixels2, template, search, stride, **options)
-    texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, noise)
+    chosen = METHODS[method]
+    offered = {"min_correlation": min_correlation, "noise": noise}
+    options = {name: offered[name] for name in chosen.options}
+    found = chosen.find(pixels1, pixels2, template, search, stride, **options)
+    level = 0.0 if noise is None else noise
+    texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
     spacing = max(1, round(template / 2 / stride))
     outlier = median_outliers(
         found.dz, found.dy, median_size, spacing, median_threshold, median_epsilon
@@ -124,8 +159,9 @@ def retrieve_wind(
         "median_size": median_size,
         "median_threshold": median_threshold,
         "median_epsilon": median_epsilon,
-        **options,
     }
+    if "min_correlation" in options:
+        attributes["min_correlation"] = min_correlation
     return _dataset(image1, windows, found._replace(flag=flag), texture, attributes)
 
 
@@ -146,12 +182,16 @@ def _dataset(
         "z": found.dz.cpu().numpy() * spacing["z"],
         "y": found.dy.cpu().numpy() * spacing["y"],
     }
+    method = METHODS[attributes["method"]]
+    further = 0.0 if method.centred else 0.5
+    shape = windows.count
     vector = {
-        "z": centre["z"][:, None] + moved["z"] / 2,
-        "y": centre["y"][None, :] + moved["y"] / 2,
+        "z": np.broadcast_to(centre["z"][:, None], shape) + further * moved["z"],
+        "y": np.broadcast_to(centre["y"][None, :], shape) + further * moved["y"],
     }
     dt = attributes["dt"]
-    score, score_name = SCORES[attributes["method"]]
+    score, score_name = method.score
+    stderr, correlation = _spread(found, spacing, dt)
 
     def field(values: np.ndarray | torch.Tensor, long_name: str, units: str, **more: str):
         values = values.cpu().numpy() if isinstance(values, torch.Tensor) else values
@@ -164,6 +204,14 @@ def _dataset(
             "w": field(
                 moved["z"] / dt, "wind along z", "m s-1", standard_name="upward_air_velocity"
             ),
+            "v_stderr": field(
+                stderr["y"], "standard error of v", "m s-1", standard_name="y_wind standard_error"
+            ),
+            "w_stderr": field(
+                stderr["z"], "standard error of w", "m s-1",
+                standard_name="upward_air_velocity standard_error",
+            ),
+            "vw_correlation": field(correlation, "correlation of the errors of v and w", "1"),
             "displacement_y": field(moved["y"], "displacement along y", "m"),
             "displacement_z": field(moved["z"], "displacement along z", "m"),
             score: field(found.score, score_name, "1"),
@@ -200,6 +248,22 @@ def _dataset(
     for name in ("z", "y"):
         dataset[name].encoding["_FillValue"] = None
     return dataset
+
+
+def _spread(
+    found: Displacement, spacing: Mapping[str, float], dt: float
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Standard errors of the wind along z and y, m/s, and their correlation; NaN if not known."""
+    if found.covariance is None:
+        nothing = np.full(found.dz.shape, np.nan)
+        return {"z": nothing, "y": nothing}, nothing
+    zz, yy, zy = (
+        torch.where(found.dz.isnan(), torch.nan, part).cpu().numpy() for part in found.covariance
+    )
+    root = {"z": np.sqrt(zz), "y": np.sqrt(yy)}
+    both = root["z"] * root["y"]
+    correlation = np.divide(zy, both, out=np.zeros_like(both), where=both != 0)
+    return {axis: root[axis] * spacing[axis] / dt for axis in root}, correlation
 
 
 def _tensor(image: xr.DataArray, device: str | torch.device) -> torch.Tensor:

@@ -1,0 +1,210 @@
+"""Images as smooth functions of place: band-limited, then read anywhere with their slopes."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import scipy.fft
+import torch
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.quality import filled
+from lidar_mi.retrieval.windows import working
+
+# Pixels of mirrored image around each image. The spline's answer to the edge falls by 0.27 a
+# pixel, the filter's within a correlation length of the texture.
+_MARGIN = 24
+# Rings of the power spectrum with fewer waves say too little about their mean.
+_RING_WAVES = 200
+
+
+class Spline(NamedTuple):
+    """Cubic B-spline through the pixels of images.
+
+    Attributes
+    ----------
+    coefficients : torch.Tensor, shape (images, z + 2 margin, y + 2 margin)
+    shape : (int, int)
+        Of the images, (z, y).
+    passed : float
+        Share of the variance of white noise that the filter before the spline let pass.
+    excess : float
+        Variance of a displacement over what the slopes would allow, were they free of noise.
+    """
+
+    coefficients: torch.Tensor
+    shape: tuple[int, int]
+    passed: float
+    excess: float
+
+    def holds(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """Which places lie on the images, up to the outer pixels' centres."""
+        inside = [(p >= 0) & (p <= n - 1) for p, n in zip((z, y), self.shape)]
+        return inside[0] & inside[1]
+
+    def sample(
+        self, z: torch.Tensor, y: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Value and slopes along z and y of every image at its own places.
+
+        Parameters
+        ----------
+        z, y : torch.Tensor, shape (images, ...)
+            Pixels from the first one; places beyond the image take the edge's value.
+
+        Returns
+        -------
+        value, slope_z, slope_y : torch.Tensor, shape (images, ...)
+        """
+        images, height, width = self.coefficients.shape
+        margin = (height - self.shape[0]) // 2
+        z, y = (
+            place.clamp(0, size - 1) + margin - 1 for place, size in zip((z, y), self.shape)
+        )
+        row, column = z.floor(), y.floor()
+        weight_z, weight_y = _weights(z - row), _weights(y - column)
+        first = torch.arange(images, device=z.device).view(-1, *[1] * (z.ndim - 1)) * height
+        corner = (first + row.long()) * width + column.long()
+        flat = self.coefficients.reshape(-1)
+        total = [torch.zeros_like(z) for _ in range(3)]
+        for i in range(4):
+            along = [torch.zeros_like(z) for _ in range(2)]
+            for j in range(4):
+                knot = flat[corner + (i * width + j)]
+                along[0].addcmul_(knot, weight_y[0][j])
+                along[1].addcmul_(knot, weight_y[1][j])
+            total[0].addcmul_(along[0], weight_z[0][i])
+            total[1].addcmul_(along[0], weight_z[1][i])
+            total[2].addcmul_(along[1], weight_z[0][i])
+        return tuple(total)
+
+
+def _weights(t: torch.Tensor) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    """The four cubic B-splines over a cell, and their slopes, at the fraction t of the cell."""
+    s, t2 = 1 - t, t * t
+    s2 = s * s
+    value = [s2 * s / 6, 2 / 3 - t2 + t2 * t / 2, 2 / 3 - s2 + s2 * s / 2, t2 * t / 6]
+    slope = [-s2 / 2, t * (1.5 * t - 2), s * (2 - 1.5 * s), t2 / 2]
+    return value, slope
+
+
+def levelled(images: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Images of one texture but unlike brightness: all with mean 0 and the first one's contrast."""
+    images = [working(filled(image)) for image in images]
+    images = torch.stack([image - image.mean() for image in images])
+    contrast = images.square().mean((1, 2), keepdim=True).sqrt()
+    return images * torch.where(contrast > 0, contrast[:1] / contrast, 1.0)
+
+
+def rms(noise: float | torch.Tensor) -> float:
+    """One standard deviation for an image, from its own or those of its pixels (NaN left out)."""
+    if not isinstance(noise, torch.Tensor):
+        return noise
+    finite = working(noise[torch.isfinite(noise)])
+    return float(finite.square().mean().sqrt()) if finite.numel() else 0.0
+
+
+def band_limited(images: torch.Tensor, noise: float | None = None) -> tuple[Spline, float]:
+    """Splines through the images, after a filter that passes the texture and stops the noise.
+
+    With texture of spectral density S and white noise N the filter is sqrt(S / (S + N / 2)): of
+    all filters applied to both images of a pair before their differences are squared, the one
+    with the least variance of the displacement (a wave k tells k^2 S of it, against a variance of
+    4 S N + 2 N^2, so its weight S / (2 S + N) is the square of this filter but for a factor).
+    Without it a spline would damp the noise where images are read half way between pixels and
+    not where they are read at pixels, which pulls displacements to whole numbers.
+
+    Parameters
+    ----------
+    images : torch.Tensor, shape (images, z, y)
+        Non-finite pixels take the image's mean.
+    noise : float, optional
+        Standard deviation of the images' white noise. Left out: from the lowest ring of the
+        power spectrum.
+
+    Returns
+    -------
+    spline : Spline
+    noise : float
+        As given or estimated.
+    """
+    if noise is not None and not noise >= 0:
+        raise InputError(f"noise: {noise!r} is not a standard deviation >= 0")
+    images = torch.stack([working(filled(image)) for image in images])
+    shape = tuple(images.shape[1:])
+    sizes = [scipy.fft.next_fast_len(n + 2 * _MARGIN, real=True) for n in shape]
+    frequency = [
+        torch.fft.fftfreq(sizes[0], dtype=images.dtype, device=images.device)[:, None],
+        torch.fft.rfftfreq(sizes[1], dtype=images.dtype, device=images.device)[None, :],
+    ]
+    radius = torch.hypot(*frequency)
+    ring = (radius * min(shape)).long()
+    density, uncertainty = _ring_means(images, ring, sizes)
+    if noise is None:
+        # the lowest rings are low by chance as well: the mean of all that may be as low
+        floor = (density * (1 + 2 * uncertainty)).min()
+        weight = uncertainty**-2 * (density <= floor * (1 + 2 * uncertainty))
+        floor = (weight * density).sum() / weight.sum()
+    else:
+        floor = torch.as_tensor(noise**2, dtype=images.dtype, device=images.device)
+    # rings of noise alone must not pass because their mean happens to be a little higher
+    texture = density - floor
+    texture = torch.where(density > floor * (1 + 2 * uncertainty), texture, 0.0)
+    tiny = torch.finfo(images.dtype).tiny
+    gain = (texture / (texture + floor / 2 + tiny)).sqrt()[ring]
+    passed = float(gain[:, :1].square().sum() + 2 * gain[:, 1:].square().sum())
+    # the slopes' power with noise and filter, and what of it tells the displacement
+    power, told = (
+        float((radius**2 * gain**2 * spectrum[ring]).sum())
+        for spectrum in (texture + floor / 2, texture)
+    )
+
+    mean = images.mean((1, 2), keepdim=True)
+    spectrum = torch.fft.rfft2(_extended(images - mean, sizes))
+    for axis in frequency:
+        spectrum = spectrum / ((2 + torch.cos(2 * torch.pi * axis)) / 3)
+    smooth = torch.fft.irfft2(spectrum * gain, s=sizes) + mean
+    smooth = smooth[:, : shape[0] + 2 * _MARGIN, : shape[1] + 2 * _MARGIN].contiguous()
+    excess = power / told if told > 0 else 1.0
+    return Spline(smooth, shape, passed / (sizes[0] * sizes[1]), excess), float(floor.sqrt())
+
+
+def _extended(images: torch.Tensor, sizes: list[int]) -> torch.Tensor:
+    """The images mirrored at their edges over the margin, the rest up to `sizes` as well."""
+    for axis, size in zip((1, 2), sizes):
+        n = images.shape[axis]
+        place = torch.arange(-_MARGIN, size - _MARGIN, device=images.device) % max(2 * n - 2, 1)
+        images = images.index_select(axis, torch.minimum(place, (2 * n - 2 - place) % (2 * n)))
+    return images
+
+
+def _ring_means(
+    images: torch.Tensor, ring: torch.Tensor, sizes: list[int]
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Power spectrum by rings of wavenumber, mean over the images; white noise gives its variance.
+
+    Each ring's value is a mean over itself and its four neighbours. Returns these means and their
+    relative standard errors.
+    """
+    shape = images.shape[1:]
+    window = [
+        torch.hann_window(n + 2, periodic=False, dtype=images.dtype, device=images.device)[1:-1]
+        for n in shape
+    ]
+    window = window[0][:, None] * window[1]
+    mean = (images * window).sum((1, 2), keepdim=True) / window.sum()
+    power = torch.fft.rfft2((images - mean) * window, s=sizes).abs().square().mean(0)
+    power = power / window.square().sum()
+    number = torch.bincount(ring.flatten())
+    total = torch.bincount(ring.flatten(), weights=power.flatten())
+    kernel = torch.ones(1, 1, 5, dtype=images.dtype, device=images.device)
+    total, number = (
+        torch.nn.functional.conv1d(sums.to(images)[None], kernel, padding=2)[0]
+        for sums in (total, number)
+    )
+    density = total / number.clamp(min=1)
+    # the last rings are cut by the corners: they take the last full ring's value
+    full = number >= _RING_WAVES
+    density = torch.where(full, density, density[full.nonzero().max()])
+    # independent waves: an image has as many as pixels, tapering leaves two fifths of them
+    share = 0.4 * len(images) * shape[0] * shape[1] / (sizes[0] * sizes[1])
+    return density, (share * number.clamp(min=1)).rsqrt()
