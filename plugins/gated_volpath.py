@@ -38,7 +38,7 @@ to S3 are 0 there. In RGB variants the colour channel nearest to the laser's wav
 estimator spreads them evenly over the gates and rounds up, so that every gate gets the same
 number, at least two. Photons are independent; the random numbers of a photon depend on the seed,
 its beam and its number alone. Phase functions that know no polarisation (``isotropic``, ``hg``)
-depolarise completely.
+depolarise completely; in polarised variants a ``blendphase`` must not mix them with ones that do.
 
 .. code-block:: xml
 
@@ -50,6 +50,7 @@ import mitsuba as mi
 
 from .parameters import choice, fail, whole
 from .paths import Lidar
+from .polarization import first_unpolarized_in_blend
 
 NAME, KIND = "gated_volpath", "integrator"
 
@@ -155,6 +156,7 @@ def define():
             if not hasattr(sensor, "beam_frame"):
                 fail(NAME, "sensor", type(sensor).__name__, "a sensor of type 'scanning_lidar'")
             _check_gate_meets_medium(scene, sensor)
+            _check_blends(scene, sensor)
             photons = int(spp) or sensor.sampler().sample_count()
             if self.estimator == "gated":
                 photons = sensor.gate_count * max(2, -(-photons // sensor.gate_count))
@@ -269,6 +271,20 @@ def _merge(first, second):
     means = [a + (b - a) * share for a, b in zip(means1, means2)]
     difference = means2[0] - means1[0]
     return n1 + n2, means, squares1 + squares2 + difference * difference * weight
+
+
+def _check_blends(scene, sensor):
+    """Parts of a blend that would pass for a Mueller matrix without being one."""
+    media = [sensor.get_medium()]
+    for shape in scene.shapes():
+        media += [shape.interior_medium(), shape.exterior_medium()]
+    for medium in media:
+        part = medium and first_unpolarized_in_blend(medium)
+        if part is not None:
+            fail(
+                NAME, "blendphase", part.class_name(),
+                "phase functions that all know polarisation, such as mueller, or none that does",
+            )  # fmt: skip
 
 
 def _check_gate_meets_medium(scene, sensor):

@@ -79,6 +79,44 @@ def rotate_from_scattering_plane(incident, scattered, elements):
     )
 
 
+def first_unpolarized_in_blend(medium):
+    """The first of a medium's blended phase functions that knows no polarisation beside ones that do.
+
+    Such a function (``hg``, ``isotropic``) answers with a multiple of the unit matrix between any
+    two axes. Alone it is recognised and depolarises; added to a Mueller matrix it cannot be told
+    apart. None where nothing is blended, or where all or none of the parts know polarisation.
+    """
+    leaves = []
+
+    def collect(phase):
+        nested = []
+
+        class Nested(mi.TraversalCallback):
+            def put(self, name, value, *_):
+                if isinstance(value, mi.PhaseFunction):
+                    nested.append(value)
+
+        phase.traverse(Nested())
+        for part in nested:
+            collect(part)
+        if not nested:
+            leaves.append(phase)
+
+    collect(medium.phase_function())
+    if len(leaves) < 2 or not mi.is_polarized:
+        return None
+    scalar = [leaf for leaf in leaves if _is_scalar(leaf)]
+    return scalar[0] if 0 < len(scalar) < len(leaves) else None
+
+
+def _is_scalar(phase) -> bool:
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.wi, mei.sh_frame = mi.Vector3f(0, 0, 1), mi.Frame3f(mi.Vector3f(0, 0, -1))
+    matrix, _ = phase.eval_pdf(mi.PhaseFunctionContext(), mei, mi.Vector3f(1, 0, 0))
+    diagonal = [matrix[i, i][0] for i in range(4)]
+    return all(dr.all(element == diagonal[0]) for element in diagonal)
+
+
 def rotate_stokes(stokes, direction, current_axis, target_axis):
     """Stokes vector (4 arrays) of light along ``direction``, referred to another axis."""
     cosine = dr.dot(current_axis, target_axis)
