@@ -40,7 +40,7 @@ def _next_surface(scene, origin, direction, travelled, skip, distance, medium, a
     active = active & (start < distance)
     ray = mi.Ray3f(origin + direction * start, direction)
     ray.maxt = distance - start
-    si = scene.ray_intersect(ray, ray_flags=+mi.RayFlags.Minimal, coherent=True, active=active)
+    si = scene.ray_intersect(ray, ray_flags=+mi.RayFlags.Minimal, coherent=False, active=active)
     hit = active & si.is_valid()
     end = dr.select(hit, dr.minimum(start + si.t, distance), distance)
     passes = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)

@@ -13,10 +13,15 @@ from .polarization import rotate_stokes, transverse
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
 
-# Share of photons whose first vertex is looked for near the gate when more orders follow.
-NEAR_SHARE = 0.5
-# Shortest distance from the gate that this search resolves, in radii of the field of view there.
-NEAR_SCALE = 0.02
+# Of the photons that go on after single scattering, the share whose first flight is free: these
+# scatter long before the gate, as paths of many orders do.
+FREE_SHARE = 0.4
+# How far such a photon's density is counted where it arrives (its transmittance is not known).
+FREE_ARRIVAL = 0.2
+# The others' first vertex is put near the gate: the share of these that is put closest to it.
+NEAR_SHARE = 0.7
+# A flight that would seldom collide within the gate's reach is followed this much more often.
+FOLLOWED = 3.0
 
 
 class Photon:
@@ -101,8 +106,8 @@ class Lidar:
 
         Three ways lead to a path's last vertex: along the photon's flight to where the path closes
         (``ahead``); from the telescope, along a direction of the field of view, to where it closes
-        (``back``); and a free flight that happens to end in the gate (``free``), which covers
-        vertices of small scattering angle, where a range says little about a place.
+        (``back``); and a flight that happens to end in the gate (``free``), which covers vertices
+        of small scattering angle, where a range says little about a place.
         """
         aperture, axes = photon.aperture, photon.axes
         width = high - low
@@ -111,38 +116,45 @@ class Lidar:
         stokes, medium = _copied(stokes), mi.MediumPtr(medium)
         low, high, path = mi.Float(low), mi.Float(high), mi.Float(path)
         density = mi.Float(0)  # of the flight's direction; 0: the laser's
+        thickness = mi.Float(0)  # extinction coefficient where the flight begins
         active = high > 0
         while dr.hint(active, label="scattering orders"):
             # the next vertex: no later than the far end of the gate
             reach = _closing(position - aperture, direction, high)
             active &= reach > 0
-            near = active & (order == 1) & (rng.next_float32(active) < NEAR_SHARE)
-            flight, behind, found = collision(
+            first = order == 1
+            free = active & first & (rng.next_float32(active) < FREE_SHARE)
+            scale = 0.5 * self._footprint(0.5 * path)
+            left = _sample_left(reach, scale, _pair(rng))
+            flight, followed = _sample_flight(thickness, reach, _pair(rng))
+            flight = dr.select(first, reach - left, flight)
+            active &= first | followed
+            flown, behind, found = collision(
                 self.scene, medium, position, direction, reach, self.channel, self.wavelengths,
-                rng, active & ~near,
+                rng, free,
             )  # fmt: skip
-            footprint = NEAR_SCALE * 0.5 * path * self.sensor.m_fov_tan
-            spread = dr.log((reach + footprint) / footprint)
-            left = footprint * (dr.exp(spread * rng.next_float32(active)) - 1)
-            flight = dr.select(near, reach - left, flight)
-            near &= flight > 0
-            survived, arrived = transmittance(
+            flight = dr.select(free, flown, flight)
+            active &= (flight > 0) & (found | ~free)
+            out, medium = transmittance(
                 self.scene, medium, position, direction, flight, self.channel, self.wavelengths,
-                rng, near,
+                rng, active & ~free,
             )  # fmt: skip
-            medium = dr.select(near, arrived, behind)
-            active &= (near & (medium != None)) | found
+            medium = dr.select(free, behind, medium)
+            active &= medium != None
             vertex = mi.Point3f(position + direction * flight)
             mei = interaction(medium, vertex, direction, self.wavelengths)
             scattering, extinction = coefficients(medium, mei, self.channel, active)
+            drawn = dr.select(
+                first,
+                _left_density(reach - flight, reach, scale),
+                _flight_density(thickness, reach, flight),
+            )
             # two ways of finding the first vertex; any partition of one keeps the mean
-            drawn = dr.rcp((reach - flight + footprint) * spread)
-            part = NEAR_SHARE * drawn / (NEAR_SHARE * drawn + (1 - NEAR_SHARE) * extinction)
-            weight = dr.select(
-                near,
-                survived * scattering / drawn * part / NEAR_SHARE,
-                scattering / extinction * dr.select(order == 1, (1 - part) / (1 - NEAR_SHARE), 1),
-            )  # fmt: skip
+            part = (1 - FREE_SHARE) * drawn
+            part /= part + FREE_SHARE * FREE_ARRIVAL * extinction
+            forced = out * scattering / drawn * dr.select(first, part / (1 - FREE_SHARE), 1)
+            chosen = scattering / extinction * (1 - part) / FREE_SHARE
+            weight = dr.select(free, chosen, forced)
             stokes = _scaled(stokes, dr.select(active, weight, 0))
             active &= stokes[0] > 0
             low, high, path = low - flight, high - flight, path - flight
@@ -152,7 +164,7 @@ class Lidar:
             outside = dr.norm(home)
             in_gate = active & (order > 1) & (outside >= low) & (outside < high)
             slope = 1 - dr.dot(direction, home / outside)
-            chance = extinction * dr.exp(-extinction * flight) * width
+            chance = drawn * width
             aimed = self._aimed(axes, home, outside, flight)
             share = chance / (chance + slope * (1 + aimed / density))
             gain = self._receive(photon, rng, medium, mei, stokes, in_gate, share)
@@ -161,8 +173,11 @@ class Lidar:
                 _add(by_order, gain[0], cell * max_order + order - 1, in_gate)
             order += 1
             active &= order <= last
+            position, thickness = mi.Point3f(vertex), mi.Float(extinction)
 
             # back: the last vertex looked for from the telescope
+            homeward = home / outside
+            turning = 0.5 / (1 + 0.5 * (high - outside) / self._footprint(outside))
             inward = self._in_field(axes, rng)
             outside = _closing(aperture - vertex, inward, path)
             end = aperture + inward * outside
@@ -170,30 +185,47 @@ class Lidar:
             outward = (end - vertex) / leg
             seen = active & (outside > 0) & (leg > 0)
             bent, density = self._scatter(medium, mei, stokes, outward, seen)
+            density = self._direction_density(medium, mei, density, turning, homeward, outward, seen)
             aimed = dr.square(leg / outside) / self._field_solid_angle()
             gain = self._connect(
                 photon, rng, vertex, outward, leg, medium, _scaled(bent, dr.rcp(aimed)), width,
-                seen, (aimed, density, aimed),
+                seen, (aimed, density, aimed, thickness, high),
             )  # fmt: skip
 
             # ahead: along the photon's next flight
-            onward, value, density = medium.phase_function().sample(
-                self.context, mei, rng.next_float32(active), _pair(rng), active
+            turned = rng.next_float32(active) < turning
+            guide = interaction(
+                medium, vertex, dr.select(turned, homeward, direction), self.wavelengths
             )
-            stokes = _apply(value, stokes, self.channel)
+            onward, _, density = medium.phase_function().sample(
+                self.context, guide, rng.next_float32(active), _pair(rng), active
+            )
             active &= density > 0
+            stokes, density = self._scatter(medium, mei, stokes, onward, active)
+            density = self._direction_density(medium, mei, density, turning, homeward, onward, active)
+            active &= density > 0
+            stokes = _scaled(stokes, dr.select(active, dr.rcp(density), 0))
             closure = _closing(vertex - aperture, onward, path)
             home = aperture - (vertex + onward * closure)
             aimed = self._aimed(axes, home, dr.norm(home), closure)
             gain = _sum(gain, self._connect(
                 photon, rng, vertex, onward, closure, medium, stokes, width,
-                active & (closure > 0), (density, density, aimed),
+                active & (closure > 0), (density, density, aimed, thickness, high),
             ))  # fmt: skip
             total = _sum(total, gain)
             if dr.hint(split, mode="scalar"):
                 _add(by_order, gain[0], cell * max_order + order - 1, active)
-            position, direction = mi.Point3f(vertex), mi.Vector3f(onward)
+            direction = mi.Vector3f(onward)
         return total
+
+    def _footprint(self, distance):
+        """Radius of the field of view at a distance."""
+        return distance * self.sensor.m_fov_tan
+
+    def _direction_density(self, medium, mei, density, turning, homeward, wo, active):
+        guide = interaction(medium, mei.p, homeward, self.wavelengths)
+        _, turned = medium.phase_function().eval_pdf(self.context, guide, wo, active)
+        return dr.lerp(density, turned, turning)
 
     def _aimed(self, axes, home, outside, leg):
         """Density, per solid angle of the flight, of finding its end from the telescope.
@@ -221,13 +253,14 @@ class Lidar:
         vertex = position + direction * distance
         mei = interaction(medium, vertex, direction, self.wavelengths)
         active = active & (medium != None)
-        scattering, extinction = coefficients(medium, mei, self.channel, active)
+        scattering, _ = coefficients(medium, mei, self.channel, active)
         slope = 1 - dr.dot(direction, dr.normalize(photon.aperture - vertex))
         volume = width / slope
         weight = out * scattering * volume
         if densities:
-            own, density, aimed = densities
-            free = density * extinction * dr.exp(-extinction * distance) * volume
+            own, density, aimed, thickness, high = densities
+            reach = _closing(position - photon.aperture, direction, high)
+            free = density * _flight_density(thickness, reach, distance) * volume
             weight *= own / (density + aimed + free)
         return self._receive(photon, rng, medium, mei, stokes, active, weight)
 
@@ -341,6 +374,40 @@ def _closing(offset, direction, path):
     length = dr.norm(offset)
     end = (path - length) * (path + length) / (2 * (path + dr.dot(offset, direction)))
     return dr.select(path > length, end, -1)
+
+
+def _sample_left(reach, scale, sample):
+    """Distance of a first vertex from the far end of the gate, seen along the beam.
+
+    Half the field of view's radius is the natural scale: from there on the share of directions
+    that lead back into view falls with the distance squared. Steeper phase functions fall later.
+    """
+    choice, where = sample.x, sample.y
+    near = scale * dr.tan(dr.atan(reach / scale) * where)
+    far = scale * (dr.exp(dr.log(1 + reach / scale) * where) - 1)
+    return dr.select(choice < NEAR_SHARE, near, far)
+
+
+def _left_density(left, reach, scale):
+    near = scale / ((left * left + scale * scale) * dr.atan(reach / scale))
+    far = dr.rcp((left + scale) * dr.log(1 + reach / scale))
+    return dr.lerp(far, near, NEAR_SHARE)
+
+
+def _sample_flight(thickness, reach, sample):
+    """A flight that ends before ``reach``, exponential; and whether it is followed at all.
+
+    ``thickness`` is the extinction coefficient where it begins, a guess for all of the way.
+    """
+    collides = 1 - dr.exp(-thickness * reach)
+    flight = -dr.log(1 - collides * sample.x) / thickness
+    return flight, sample.y < FOLLOWED * collides
+
+
+def _flight_density(thickness, reach, distance):
+    """Probability per metre that a flight is followed and ends at ``distance``."""
+    collides = 1 - dr.exp(-thickness * reach)
+    return thickness * dr.exp(-thickness * distance) * dr.minimum(dr.rcp(collides), FOLLOWED)
 
 
 def _apply(value, stokes, channel):
