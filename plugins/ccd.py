@@ -18,8 +18,8 @@ Parameter                    Type       Meaning                                 
 ``stop_radius``              float      m                                                    5e-3
 ``lens``                     string,    ``ideal``: light at an angle goes to r = f tan       ideal
                              tensor     (angle), from everywhere on the stop; or N x 4
-                                        numbers or the name of a file of them (``.npy``,
-                                        text with ``#`` comments): a real lens
+                                        numbers, row by row, or the name of a file of them
+                                        (``.npy``, text with ``#`` comments): a real lens
 ``to_world``                 transform  of the camera's frame: stop at the origin, x to the  identity
                                         scene, y to the left, z up
 ============================ ========== ==================================================== =======
@@ -193,6 +193,8 @@ def define():
 def read_lens(source) -> np.ndarray:
     """A lens (tensor or file name), checked: rows of radius, conic, distance, index behind."""
     lens = np.asarray(read_table(NAME, "lens", source, 4), float)
+    if lens.ndim == 1 and lens.size % 4 == 0:
+        lens = lens.reshape(-1, 4)
     if lens.ndim != 2 or lens.shape[1] != 4 or len(lens) < 2:
         fail(NAME, "lens", f"shape {lens.shape}", "N x 4 numbers, the stop and at least a surface")
     if not np.isfinite(lens).all():

@@ -122,6 +122,7 @@ def define():
                 rest = self.order + shift - self.order_fraction
                 self.order += round(rest) - rest
                 self.gap = self.order * self.wavelength / (2 * self.index)
+            self.order_on_axis = self.order + shift
             if not 0 < self.reflectivity < 1:
                 fail(NAME, "reflectivity", self.reflectivity, "a number between 0 and 1")
             passed = 1 - self.reflectivity
@@ -311,13 +312,28 @@ def define():
         def eval_pdf(self, ctx, si, wo, active=True):
             return mi.Spectrum(0), mi.Float(0)
 
+        def description(self) -> dict:
+            """What a picture's header says of it; the order in two parts, exact in float32."""
+            return {
+                "gap": self.gap,
+                "gap_index": self.index,
+                "order_whole": int(np.floor(self.order_on_axis)),
+                "order_fraction": float(self.order_on_axis % 1),
+                "free_spectral_range": self.free_spectral_range,
+                "reflectivity": self.reflectivity,
+                "absorption": self.absorption,
+                "surface_rms": self.surface_rms,
+                "bow": self.bow,
+                "line_shape": self.line_shape,
+            }
+
         def traverse(self, callback):
             if self.line is not None:
                 callback.put("line", self.line, mi.ParamFlags.NonDifferentiable)
 
         def to_string(self):
             return (
-                f"Etalon[order={self.order:.6f}, gap={self.gap:.9g} m, "
+                f"Etalon[order={self.order_on_axis:.6f}, gap={self.gap:.9g} m, "
                 f"free_spectral_range={self.free_spectral_range:g} Hz, "
                 f"reflectivity={self.reflectivity:g}, line_shape={self.line_shape}]"
             )

@@ -108,12 +108,12 @@ def define():
                 point, direction, weight = sensor.sample_towards_scene(
                     corner + _pair(rng) - 0.5, _pair(rng)
                 )
-                weight &= source.in_field(-direction)
+                weight *= source.radiance(-direction)
                 ray = mi.Ray3f(point, direction)
                 ray.time = source.line.sample(rng.next_float32(), _pair(rng))
                 matrix = _surfaces(scene, ray, rng, mi.BSDFContext(), weight > 0)
                 stokes = _applied(matrix, source.mean_stokes(-direction))
-                scale = weight / (source.projected_solid_angle() * sensor.stop_area())
+                scale = weight / (source.flux() * sensor.stop_area())
                 stokes = [s * scale for s in _about_horizontal(stokes, -direction)]
                 dr.eval(stokes)
                 number = dr.opaque(mi.Float, paths)
@@ -133,12 +133,11 @@ def define():
             sums = [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
             context = mi.BSDFContext(mi.TransportMode.Importance)
             width = dr.opaque(mi.UInt32, sensor.film().size().x)
-            share = dr.opaque(mi.Float, 1 / total)
             for index, first in enumerate(range(0, total, self.samples_per_pass)):
                 count = min(self.samples_per_pass, total - first)
                 lane = dr.arange(mi.UInt32, count)
                 rng = _generator(seed, dr.opaque(mi.UInt32, index), lane)
-                direction = source.sample_direction_of_light(_pair(rng))
+                direction, counts, drawn = source.sample_direction_of_light(_pair(rng))
                 point = sensor.sample_stop(_pair(rng))
                 place, arrives = sensor.receive(point, direction)
                 # from before the first surface to the stop, and no further
@@ -148,7 +147,7 @@ def define():
                 ray.time = source.line.sample(rng.next_float32(), _pair(rng))
                 stokes = source.sample_stokes(direction, rng.next_float32(), _pair(rng))
                 matrix = _surfaces(scene, ray, rng, context, arrives)
-                stokes = _applied(matrix, stokes)
+                stokes = [s * counts for s in _applied(matrix, stokes)]
                 if self.estimator == "analog":
                     passes = rng.next_float32() < stokes[0]
                     stokes = [dr.select(passes, s / stokes[0], 0) for s in stokes]
@@ -159,7 +158,9 @@ def define():
                     dr.scatter_reduce(dr.ReduceOp.Add, channel, value, pixel, arrives)
                 self._tell(first + count, total, sums)
             *stokes, squares = sums
-            variance = dr.maximum(squares - stokes[0] * stokes[0] * share, 0)
+            # the photons' share of all energy; those drawn stand for a little more than is sent
+            share = drawn / source.flux() * dr.opaque(mi.Float, 1 / total)
+            variance = dr.maximum(squares - dr.square(stokes[0]) * dr.opaque(mi.Float, 1 / total), 0)
             return [*(s * share for s in stokes), dr.sqrt(variance) * share]
 
         def _tell(self, done, total, values):

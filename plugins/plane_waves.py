@@ -4,15 +4,16 @@
 Plane waves from an extended source (``plane_waves``)
 -----------------------------------------------------
 
-Light from far away: plane waves from all directions of a cone, of equal radiance, as an extended
-source or the end of a multimode fibre behind a collimator sends them. It lies around the scene like
-an environment. Traced forward, every plane wave has a random direction, frequency, polarisation and
+Light from far away: plane waves from all directions of a cone, as an extended source or the end of
+a multimode fibre behind a collimator sends them. It lies around the scene like an environment. Traced forward, every plane wave has a random direction, frequency, polarisation and
 place on the stop of the :ref:`camera <sensor-ccd>`.
 
 ============================ ========== ==================================================== =======
 Parameter                    Type       Meaning                                              Default
 ============================ ========== ==================================================== =======
 ``field_half_mrad``          float      half angle of the cone, mrad                         16
+``radiance_radius_mrad``     float      angle at which the radiance has fallen to 1/e^2 of   infinite
+                                        the middle's; Gaussian in its tangent
 ``stokes``                   string     I, Q, U, V with I = 1, about the horizontal axis     1, 0,
                                                                                              0, 0
 ``to_world``                 transform  of a frame whose x axis points to the source's       identity
@@ -35,6 +36,7 @@ import math
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .parameters import fail, numbers, pose, positive
 from .polarization import horizontal_axis, rotate_stokes
@@ -54,6 +56,9 @@ def define():
             if half >= math.pi / 2:
                 fail(NAME, "field_half_mrad", half * 1e3, "less than a half space, 1570.8 mrad")
             self.field_half = half
+            radius = positive(props, NAME, "radiance_radius_mrad", math.inf) * 1e-3
+            self.even = math.isinf(radius)
+            scale = radius if self.even else math.tan(min(radius, 1.57))
             self.stokes = numbers(props, NAME, "stokes", "1, 0, 0, 0")
             if (
                 len(self.stokes) != 4
@@ -62,24 +67,48 @@ def define():
             ):
                 fail(NAME, "stokes", props["stokes"], "I = 1 and Q^2 + U^2 + V^2 <= 1")
             self.m_sine = dr.opaque(mi.Float, math.sin(half))
+            self.m_scale2 = dr.opaque(mi.Float, scale**2)
+            # flux per area of a wavefront, and that of `sample_direction_of_light`, which has the
+            # sine where the radiance has the tangent
+            limit = math.sin(half) ** 2
+            nodes, weights = np.polynomial.legendre.leggauss(200)
+            sine2 = limit * (nodes + 1) / 2
+            radiance = np.exp(-2 * sine2 / (1 - sine2) / scale**2)
+            self.m_flux = dr.opaque(mi.Float, math.pi * limit * (weights @ radiance) / 2)
+            drawn = -math.expm1(-2 * limit / scale**2) * scale**2 / 2 if not self.even else limit
+            self.m_drawn = dr.opaque(mi.Float, math.pi * drawn)
             self.m_pose = pose(props)
             dr.make_opaque(self.m_pose)
             self.m_flags = +mi.EmitterFlags.Infinite
 
-        def projected_solid_angle(self):
-            """Of the cone, sr."""
-            return dr.pi * self.m_sine * self.m_sine
+        def flux(self):
+            """Power per area across the axis, for a radiance of 1 in the middle."""
+            return mi.Float(self.m_flux)
 
         def sample_direction_of_light(self, sample):
-            """A direction light travels in (world), evenly in projected solid angle."""
-            disc = mi.warp.square_to_uniform_disk(sample) * self.m_sine
-            x = -dr.sqrt(1 - dr.squared_norm(disc))
-            return dr.normalize(self.m_pose @ mi.Vector3f(x, disc.x, disc.y))
+            """A direction light travels in (world), its share that counts (at most 1), and the flux
+            of all that is drawn.
+            """
+            if self.even:
+                disc = mi.warp.square_to_uniform_disk(sample) * self.m_sine
+            else:
+                inside = 1 - dr.exp(-2 * dr.square(self.m_sine) / self.m_scale2)
+                radius = dr.sqrt(-0.5 * self.m_scale2 * dr.log(1 - inside * sample.x))
+                sine, cosine = dr.sincos(dr.two_pi * sample.y)
+                disc = mi.Point2f(radius * cosine, radius * sine)
+            sine2 = dr.squared_norm(disc)
+            share = mi.Float(1) if self.even else dr.exp(
+                -2 * sine2 * sine2 / ((1 - sine2) * self.m_scale2)
+            )  # fmt: skip
+            local = mi.Vector3f(-dr.sqrt(1 - sine2), disc.x, disc.y)
+            return dr.normalize(self.m_pose @ local), share, mi.Float(self.m_drawn)
 
-        def in_field(self, direction):
-            """Whether light travelling along ``direction`` (world) belongs to the source."""
+        def radiance(self, direction):
+            """Radiance of light travelling along ``direction`` (world), 1 in the middle."""
             local = self.m_pose.inverse() @ direction
-            return (local.x < 0) & (dr.square(local.y) + dr.square(local.z) <= dr.square(self.m_sine))
+            sine2 = dr.square(local.y) + dr.square(local.z)
+            value = mi.Float(1) if self.even else dr.exp(-2 * sine2 / (1 - sine2) / self.m_scale2)
+            return dr.select((local.x < 0) & (sine2 <= dr.square(self.m_sine)), value, 0)
 
         def mean_stokes(self, direction):
             """Stokes vector of all waves along ``direction``, about Mitsuba's axis."""
@@ -101,14 +130,14 @@ def define():
             return rotate_stokes(stokes, direction, horizontal_axis(direction), axis)
 
         def eval(self, si, active=True):
-            """Radiance (1 inside the cone), for integrators that look along a ray."""
+            """Radiance, for integrators that look along a ray."""
             direction = si.wi  # of a ray that left the scene: the way the light comes
-            inside = self.in_field(direction) & active
+            value = dr.select(active, self.radiance(direction), 0)
             if not mi.is_polarized:
-                return mi.Spectrum(dr.select(inside, mi.Float(1), 0))
+                return mi.Spectrum(value)
             radiance = mi.Spectrum(0)
-            for row, value in enumerate(self.mean_stokes(direction)):
-                radiance[row, 0] = dr.select(inside, value, 0)
+            for row, stokes in enumerate(self.mean_stokes(direction)):
+                radiance[row, 0] = stokes * value
             return radiance
 
         def bbox(self):

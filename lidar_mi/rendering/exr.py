@@ -1,13 +1,14 @@
-"""Scans as OpenEXR files: one file a scan, one layer a gate and Stokes component.
+"""Pictures as OpenEXR files: one file a scan, one layer a gate and Stokes component.
 
-A file shows what the pilot sees: top row = largest z, left column = largest y. Layers are
+A scan's file shows what the pilot sees: top row = largest z, left column = largest y. Layers are
 ``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate (and
 ``gate000.order1.S0``, ... where orders of scattering were told apart), and ``Y``, the apparent
 backscatter of the first gate, so that any viewer shows something at once. Of a run,
 ``gate000.depolarization`` and ``gate000.multiple_scattering_fraction`` with their ``_stderr`` stand
 beside them, and with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``, ``Y_noisy`` and
 ``Y_noise_std``. Everything else
-(beam positions, gates, instrument, units, seed, version) is in typed header attributes.
+(beam positions, gates, instrument, units, seed, version) is in typed header attributes. A fringe
+camera's file has the layers ``S0`` ... ``S3``, ``S0_stderr`` and ``Y``, seen as the camera sees it.
 """
 
 import os
@@ -21,6 +22,13 @@ import xarray as xr
 from ..errors import InputError
 
 QUANTITIES = ("S0", "S1", "S2", "S3", "S0_stderr")
+_MEANING = {
+    "S0": "received energy over emitted pulse energy",
+    "S1": "Stokes Q about the horizontal axis, over emitted pulse energy",
+    "S2": "Stokes U about the horizontal axis, over emitted pulse energy",
+    "S3": "Stokes V, over emitted pulse energy",
+    "S0_stderr": "Monte Carlo standard error of S0",
+}
 _LAYER = re.compile(r"gate(\d+)\.(.+)$")
 # header entries that describe the file, not the scan
 _STRUCTURE = {
@@ -42,14 +50,58 @@ def write_scan(path: str | Path, scan: xr.Dataset) -> None:
     for gate in range(pilot.sizes["gate"]):
         for quantity in _quantities(pilot):
             channels[f"gate{gate:03d}.{quantity}"] = pilot[quantity].values[gate]
-    header = {
-        "compression": OpenEXR.ZIP_COMPRESSION,
-        "type": OpenEXR.scanlineimage,
-        # ascending, whatever the order in the dataset
-        "y": pilot["y"].values[::-1].astype(np.float32),
-        "z": pilot["z"].values[::-1].astype(np.float32),
-    }
-    for key, value in scan.attrs.items():
+    # ascending, whatever the order in the dataset
+    axes = {axis: pilot[axis].values[::-1] for axis in ("y", "z")}
+    _write(path, axes | scan.attrs, channels)
+
+
+def write_fringes(path: str | Path, picture: xr.Dataset) -> None:
+    """Write the picture of a fringe camera: S0 ... S3, S0_stderr with dims (y, x), y downwards.
+
+    ``Y`` is S0 once more, so that any viewer shows the rings. Files, values and attributes as in
+    `write_scan`.
+    """
+    layers = {name: picture[name].transpose("y", "x").values for name in QUANTITIES}
+    _write(Path(path), picture.attrs, layers | {"Y": layers["S0"]})
+
+
+def read_fringes(path: str | Path) -> xr.Dataset:
+    """Read a picture written by `write_fringes`; the round trip is exact in float32.
+
+    Raises
+    ------
+    InputError
+        Not an EXR file, or one without our layers.
+    """
+    header, layers = read_layers(path)
+    if not {*QUANTITIES, "Y"} <= set(layers):
+        raise InputError(
+            f"{path}: layers {', '.join(sorted(layers)) or 'none'} are not a picture of a fringe "
+            f"camera; expected {', '.join(QUANTITIES)} and Y"
+        )
+    return label_fringes({name: layers[name] for name in QUANTITIES}, header)
+
+
+def label_fringes(layers: dict[str, np.ndarray], attributes: dict) -> xr.Dataset:
+    """Layers (height, width) of a fringe camera with names, units and pixel numbers as axes."""
+    rows, columns = layers["S0"].shape
+    picture = xr.Dataset(
+        {name: (("y", "x"), values) for name, values in layers.items()},
+        coords={"y": np.arange(rows), "x": np.arange(columns)},
+        attrs=attributes,
+    )
+    for name, text in _MEANING.items():
+        if name in picture:
+            text = text.replace("emitted pulse energy", "the energy sent through the stop")
+            picture[name].attrs = {"long_name": text, "units": "1"}
+    picture["x"].attrs = {"long_name": "pixels to the right of the leftmost", "units": "1"}
+    picture["y"].attrs = {"long_name": "pixels down from the topmost", "units": "1"}
+    return picture
+
+
+def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for key, value in attributes.items():
         header[key] = value.astype(np.float32) if isinstance(value, np.ndarray) else value
     channels = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in channels.items()}
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -143,12 +195,7 @@ def unpack(image: np.ndarray, names: list[str], gates: int) -> dict[str, tuple]:
 
 def label_scan(scan: xr.Dataset) -> xr.Dataset:
     """The same scan with CF names and units on its variables."""
-    meaning = {
-        "S0": "received energy over emitted pulse energy",
-        "S1": "Stokes Q about the horizontal axis, over emitted pulse energy",
-        "S2": "Stokes U about the horizontal axis, over emitted pulse energy",
-        "S3": "Stokes V, over emitted pulse energy",
-        "S0_stderr": "Monte Carlo standard error of S0",
+    meaning = _MEANING | {
         "S1_stderr": "Monte Carlo standard error of S1",
         "S0_S1_correlation": "correlation of the Monte Carlo errors of S0 and S1",
         "depolarization": "linear depolarisation ratio",

@@ -10,7 +10,8 @@ import xarray as xr
 
 from .. import __version__
 from ..errors import InputError
-from .exr import label_scan, read_layers, unpack, write_scan
+from .exr import label_scan, read_layers, unpack, write_fringes, write_scan
+from .fringes import render_picture
 from .variant import use_variant
 
 
@@ -23,22 +24,23 @@ def render_file(
     definitions: dict[str, str] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
-    """Render an XML scene with a `scanning_lidar` and write its scan as EXR.
+    """Render an XML scene with a `scanning_lidar` or a `ccd` and write its picture as EXR.
 
-    ``Y`` in the file is the apparent backscatter of the first gate, S0 r^2 / (A dr), with the
+    ``Y`` in a scan's file is the apparent backscatter of the first gate, S0 r^2 / (A dr), with the
     transmittance left in: a scene says nothing about which of its media are "the environment".
 
     Parameters
     ----------
     samples : int
-        Photons a beam; 0: as the scene says.
+        Photons a beam or a pixel; 0: as the scene says.
     definitions : dict
         Values for ``$name`` in the scene.
 
     Raises
     ------
     InputError
-        Missing or broken scene, or one without a `scanning_lidar` and a `gated_volpath`.
+        Missing or broken scene, or one without a `scanning_lidar` and a `gated_volpath`, or a `ccd`
+        and `fringes`.
     """
     scene_path, out = Path(scene_path), Path(out)
     if not scene_path.is_file():
@@ -52,15 +54,22 @@ def render_file(
         if " is not allowed; expected " in str(error):
             raise
         raise InputError(f"{scene_path}: {_reason(error)}") from None
-    sensors = scene.sensors()
-    if not sensors or not hasattr(sensors[0], "beam_frame"):
-        raise InputError(f"{scene_path}: its first sensor is no 'scanning_lidar'; expected one")
-    integrator = scene.integrator()
-    if not hasattr(integrator, "estimator"):
-        raise InputError(f"{scene_path}: its integrator is no 'gated_volpath'; expected one")
+    sensor, integrator = next(iter(scene.sensors()), None), scene.integrator()
+    scans, fringes = hasattr(sensor, "beam_frame"), hasattr(sensor, "sample_towards_scene")
+    if not (scans or fringes):
+        raise InputError(
+            f"{scene_path}: its first sensor is no 'scanning_lidar' and no 'ccd'; expected one"
+        )
+    kind, name = ("GatedVolpath", "gated_volpath") if scans else ("Fringes", "fringes")
+    if type(integrator).__name__ != kind:
+        raise InputError(f"{scene_path}: its integrator is no '{name}'; expected one")
     if progress:
         integrator.progress = lambda done, total: progress(done / total)
-    sensor = sensors[0]
+    if fringes:
+        picture = render_picture(scene, samples, seed)
+        picture.attrs["scene"] = scene_path.name
+        write_fringes(out, picture)
+        return picture
     image = np.array(mi.render(scene, spp=samples, seed=seed))
     scan = _as_dataset(image, integrator.quantities(), sensor)
     scan.attrs |= {

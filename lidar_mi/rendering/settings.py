@@ -4,6 +4,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from ..units import Length
+
 VARIANTS = tuple(
     f"{backend}_ad_{colour}"
     for backend in ("llvm", "cuda")
@@ -21,3 +23,21 @@ class RenderSettings(BaseModel):
     max_order: int = Field(4, ge=1, le=64, description="scattering orders; 1 = single scattering")
     estimator: Literal["gated", "analog"] = "gated"
     samples_per_pass: int = Field(1 << 22, ge=1024, description="photons in flight: the memory")
+
+
+class FringeSettings(BaseModel):
+    """How the rings of a fringe camera are rendered."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+    variant: Literal[VARIANTS] = "llvm_ad_mono_polarized"
+    samples_per_pixel: int = Field(16, ge=2, lt=2**20, description="light paths, on the average")
+    estimator: Literal["camera", "forward", "analog"] = Field(
+        "camera", description="from the pixels out; plane waves forward; photons that pass or not"
+    )
+    line_shape: Literal["folded", "sampled"] = Field(
+        "folded", description="the line's mean in closed form; a frequency for every path"
+    )
+    lens: Literal["ideal", "singlet"] = "ideal"
+    stop_radius: Length = Field(5e-3, gt=0, description="of the light into the lens")
+    samples_per_pass: int = Field(1 << 22, ge=1024, description="light paths at once: the memory")

@@ -1,0 +1,204 @@
+"""The fringe camera's picture: an etalon, a camera and a line become a Mitsuba scene."""
+
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import mitsuba as mi
+import numpy as np
+import xarray as xr
+
+from .. import __version__
+from ..atmosphere.line import Line
+from ..errors import InputError
+from ..instrument.etalon import Etalon
+from ..instrument.fringe_camera import FringeCamera
+from ..instrument.lens import singlet
+from .exr import label_fringes
+from .settings import FringeSettings
+
+# from the stop to the etalon, m: any distance that leaves room for a lens
+_ETALON_AT = 0.05
+_UNITS = "Stokes: received energy over the energy sent through the stop; frequencies: Hz; lengths: m"
+
+
+def render_fringes(
+    etalon: Etalon,
+    camera: FringeCamera,
+    line: Line,
+    v_los: Sequence[float],
+    settings: FringeSettings,
+    seed: int = 0,
+    progress: Callable[[int, int, int], None] | None = None,
+) -> Iterator[xr.Dataset]:
+    """Render one velocity after the other in one scene; only the first compiles anything.
+
+    In Mitsuba's variant in force.
+
+    Parameters
+    ----------
+    line : lidar_mi.atmosphere.line.Line
+        Of air at rest.
+    v_los : sequence of float
+        m/s; positive when the air approaches.
+    seed : int
+        Picture k uses seed + k * 2^16.
+    progress : callable, optional
+        Called with (picture, paths done, paths in all).
+
+    Yields
+    ------
+    xr.Dataset
+        S0 ... S3 and S0_stderr, dims (y, x) from the top left, received energy over the energy the
+        source sends through the stop; one picture at a time, as soon as it is rendered.
+
+    Raises
+    ------
+    InputError
+        A velocity that is not finite, or a lens that is too fast or has too wide a field.
+    """
+    speeds = np.asarray(v_los, float).ravel()
+    if not np.isfinite(speeds).all():
+        wrong = speeds[~np.isfinite(speeds)][0]
+        raise InputError(f"v_los: {wrong:g} m/s is not allowed; expected finite speeds")
+    scene = mi.load_dict(scene_dict(etalon, camera, line, settings))
+    parameters = mi.traverse(scene)
+    for index, speed in enumerate(speeds):
+        parameters["line.v_los"] = float(speed)
+        parameters.update()
+        if progress:
+            scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
+        start = time.perf_counter()
+        picture = render_picture(scene, seed=(seed + (index << 16)) % 2**31)
+        picture.attrs |= {
+            "v_los": float(speed),  # the scene's is rounded to float32
+            "lens": settings.lens,
+            "render_seconds": time.perf_counter() - start,
+        }
+        yield picture
+
+
+def scene_dict(etalon: Etalon, camera: FringeCamera, line: Line, settings: FringeSettings) -> dict:
+    """The Mitsuba scene of a fringe camera as a dictionary for ``mi.load_dict``."""
+    wavelength = line.wavelength
+    x, y = camera.centre_pixel
+    corner = math.hypot(max(x, camera.width - 1 - x) + 0.5, max(y, camera.height - 1 - y) + 0.5)
+    field = math.atan(corner * camera.pixel / camera.focal_length)
+    lens = "ideal"
+    if settings.lens == "singlet":
+        rows = singlet(camera.focal_length, wavelength, settings.stop_radius, field)
+        lens = mi.TensorXf(rows.ravel())  # three rows of anything are tried as a colour first
+    source = {}
+    if math.isfinite(camera.illumination_radius):
+        radius = math.atan(camera.illumination_radius / camera.focal_length)
+        source["radiance_radius_mrad"] = 1e3 * radius
+    # light at any angle of the field meets the plate and then the whole stop
+    plate_radius = 1.1 * (settings.stop_radius + _ETALON_AT * math.tan(field))
+    place = mi.ScalarTransform4f().translate([_ETALON_AT, 0, 0]).rotate([0, 1, 0], 90)
+    return {
+        "type": "scene",
+        "integrator": {
+            "type": "fringes",
+            "estimator": settings.estimator,
+            "samples_per_pass": settings.samples_per_pass,
+        },
+        "line": {
+            "type": "spectral_line",
+            "wavelength": wavelength,
+            "weights": _numbers(line.weights),
+            "offsets": _numbers(line.offsets),
+            "sigmas": _numbers(line.sigmas),
+        },
+        "source": {
+            "type": "plane_waves",
+            # a real lens blurs: light from a little beyond the corners falls on the CCD
+            "field_half_mrad": 1e3 * field * (1.02 if settings.lens == "singlet" else 1.001),
+            "line": {"type": "ref", "id": "line"},
+            **source,
+        },
+        "plates": {
+            "type": "disk",
+            "to_world": place @ mi.ScalarTransform4f().scale(plate_radius),
+            "bsdf": {
+                "type": "etalon",
+                **_mirrors(etalon),
+                "gap": etalon.tuned_gap(wavelength),
+                "index": etalon.index,
+                "surface_rms": etalon.surface_rms,
+                "bow": etalon.bow,
+                "line_shape": settings.line_shape,
+                "line": {"type": "ref", "id": "line"},
+            },
+        },
+        "sensor": {
+            "type": "ccd",
+            "focal_length": camera.focal_length,
+            "pixel": camera.pixel,
+            "centre_x": x,
+            "centre_y": y,
+            "stop_radius": settings.stop_radius,
+            "lens": lens,
+            "film": {
+                "type": "hdrfilm",
+                "width": camera.width,
+                "height": camera.height,
+                "pixel_format": "luminance",
+                "rfilter": {"type": "box"},
+            },
+            "sampler": {"type": "independent", "sample_count": settings.samples_per_pixel},
+        },
+    }
+
+
+def render_picture(scene, samples: int = 0, seed: int = 0) -> xr.Dataset:
+    """Render a loaded scene of a `ccd` with the `fringes` integrator and say what it shows.
+
+    Parameters
+    ----------
+    samples : int
+        Light paths a pixel; 0: as the scene says.
+    """
+    sensor, integrator = scene.sensors()[0], scene.integrator()
+    image = np.array(mi.render(scene, spp=samples, seed=seed))
+    layers = {name: image[..., k] for k, name in enumerate(integrator.quantities())}
+    source, line = scene.environment(), scene.environment().line
+    x, y = sensor.centre
+    attributes = {
+        "software": f"lidar-mi {__version__}",
+        "units": _UNITS,
+        "variant": mi.variant(),
+        "polarized": int(mi.is_polarized),
+        "seed": int(seed),
+        "samples_per_pixel": samples or sensor.sampler().sample_count(),
+        "estimator": integrator.estimator,
+        "focal_length": sensor.focal_length,
+        "pixel": sensor.pixel,
+        "centre_x": x,
+        "centre_y": y,
+        "stop_radius": sensor.stop_radius,
+        "lens": "ideal" if sensor.lens is None else "surfaces",
+        "wavelength": line.wavelength,
+        "v_los": float(line.m_v_los[0]),
+        "line_weights": line.gaussians[:, 0],
+        "line_offsets": line.gaussians[:, 1],
+        "line_sigmas": line.gaussians[:, 2],
+        "field_half": source.field_half,
+        "stokes_emitted": list(source.stokes),
+    }
+    bsdfs = [shape.bsdf() for shape in scene.shapes()]
+    etalons = [bsdf for bsdf in bsdfs if hasattr(bsdf, "free_spectral_range")]
+    attributes["etalons"] = len(etalons)
+    if len(etalons) == 1:
+        attributes |= etalons[0].description()
+    return label_fringes(layers, attributes)
+
+
+def _mirrors(etalon: Etalon) -> dict:
+    if etalon.coatings is None:
+        return {"reflectivity": etalon.reflectivity, "absorption": etalon.absorption}
+    layers = (f"{n!r} {d!r} {k!r}" for n, d, k in etalon.coatings)
+    return {"coating": ", ".join(layers), "plate_index": etalon.plate_index}
+
+
+def _numbers(values) -> str:
+    return ", ".join(repr(float(v)) for v in values)
