@@ -99,6 +99,9 @@ def fringe_image(
 ) -> torch.Tensor:
     """Expected photons of every pixel, without noise or background.
 
+    The width of the line is that at the centre of the rings: too large by 1 - cos(theta), 1e-4 in
+    the corners. Its shift is exact.
+
     Parameters
     ----------
     line : lidar_mi.atmosphere.line.Line
@@ -246,6 +249,9 @@ def _read(mean, floor, modes, ccd, generator):
 
 def _generator(seed, number, device):
     """Streams of all pairs of seed and number are hashed apart."""
+    for name, value in (("seed", seed), ("images", number)):
+        if not isinstance(value, int | np.integer) or value < 0:
+            raise InputError(f"{name}: {value!r} is not allowed; expected an integer, 0 or more")
     state = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
     # torch takes seeds as signed numbers
     return torch.Generator(device).manual_seed(int(state) >> 1)
