@@ -136,6 +136,12 @@ def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
     return Mirrors(float(abs(r) ** 2), transmittance, turns - round(turns))
 
 
+def cosine_inside(etalon: Etalon, cosine):
+    """Cosine of the angle in the gap, of light that comes from outside (index 1): Snell's law."""
+    cosine = np.asarray(cosine, float)
+    return np.sqrt(1 - (1 - cosine**2) / etalon.index**2)
+
+
 def fractional_order(etalon: Etalon, wavelength: float, cosine, offset=0.0):
     """Order less the integer part of the order at the centre.
 

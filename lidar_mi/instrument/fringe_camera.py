@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ..errors import InputError
 from ..units import Frequency, Length, Number, Time
-from .etalon import Etalon, fractional_order, harmonics, series
+from .etalon import Etalon, cosine_inside, fractional_order, harmonics, series
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 # Two Gauss-Legendre points average a pixel to fourth order.
@@ -147,14 +147,15 @@ def ring_radii(camera: FringeCamera, etalon: Etalon, wavelength: float, v_los=0.
         m/s.
     """
     reach = math.hypot(camera.width, camera.height) / 2 * camera.pixel
-    cosines = camera.cosine(np.array([0, reach**2]))
+    cosines = cosine_inside(etalon, camera.cosine(np.array([0, reach**2])))
     offset = 2 * v_los / wavelength
     first, last = fractional_order(etalon, wavelength, cosines, offset)
     orders = np.arange(math.floor(first), last, -1)
-    # the order falls in proportion to the cosine
+    # the order falls in proportion to the cosine in the gap
     per_cosine = (first - last) / (cosines[0] - cosines[1])
     cosine = 1 - (first - orders) / per_cosine
-    return camera.focal_length * np.sqrt(1 / cosine**2 - 1) / camera.pixel
+    sine2 = etalon.index**2 * (1 - cosine**2)
+    return camera.focal_length * np.sqrt(sine2 / (1 - sine2)) / camera.pixel
 
 
 def expose(
@@ -221,7 +222,8 @@ def _passed(camera, etalon, line, speeds, subsamples):
     light = 0.0
     for shift in ((x, y) for y in nodes for x in nodes):
         squared = camera.radius_squared(shift)
-        cosine, falloff = camera.cosine(squared), camera.illumination(squared)
+        cosine = cosine_inside(etalon, camera.cosine(squared))
+        falloff = camera.illumination(squared)
         light += float(falloff.sum())
         for image, speed in zip(passed, speeds, strict=True):
             offset = 2 * speed / line.wavelength

@@ -22,6 +22,7 @@ WAVELENGTH = 354.7e-9
 AIR = backscatter_line(WAVELENGTH, 232.9, 33154.0, aerosol_share=0.1)
 LASER = laser_line(WAVELENGTH, 100e6)
 ETALON = Etalon()
+SOLID = Etalon(index=1.476, gap="9.3 mm")
 CAMERA = FringeCamera()
 SMALL = FringeCamera(width=60, height=40, pixel=60e-6)
 # nothing but the Poisson noise of the light
@@ -47,16 +48,18 @@ def test_radii_of_the_default_instrument():
 
 
 @pytest.mark.parametrize("v", [-300.0, 0.0, 300.0])
-def test_rings_are_where_the_image_is_brightest(v):
+@pytest.mark.parametrize("index", [1.0, 1.476])
+def test_rings_are_where_the_image_is_brightest(index, v):
     """On a cut through the image, parabolas through the peaks, to 0.02 px of 145 to 386."""
     wide = FringeCamera(width=3, height=4001, pixel=1.2e-6, centre=(1, 0))
-    cut = fringe_image(wide, Etalon(reflectivity=0.9), laser_line(WAVELENGTH, 1e6), v)[:, 1].numpy()
+    etalon = Etalon(reflectivity=0.9, index=index)
+    cut = fringe_image(wide, etalon, laser_line(WAVELENGTH, 1e6), v)[:, 1].numpy()
     peaks = 1 + np.flatnonzero((cut[1:-1] > cut[:-2]) & (cut[1:-1] > cut[2:]))
     a, b, c = (cut[peaks + k] for k in (-1, 0, 1))
     found = (peaks + (a - c) / 2 / (a - 2 * b + c)) * 1.2 / 7.4
-    radii = ring_radii(CAMERA, ETALON, WAVELENGTH, v)
+    radii = ring_radii(CAMERA, etalon, WAVELENGTH, v)
     count = min(len(found), len(radii))
-    assert count >= 7
+    assert count >= 3
     # rings of a finite width, r^2 and not r being even, peak outside by width^2 / (8 r^3)
     np.testing.assert_allclose(found[:count], radii[:count], atol=0.02)
 
@@ -74,7 +77,8 @@ def slow_pixel(camera, etalon, line, v, column, row):
     area = np.outer(area, area).ravel() / 4
     x, y = np.meshgrid(column + points / 2, row + points / 2)
     cx, cy = camera.centre
-    angle = np.arctan(np.hypot(x - cx, y - cy).ravel() * camera.pixel / camera.focal_length)
+    outside = np.arctan(np.hypot(x - cx, y - cy).ravel() * camera.pixel / camera.focal_length)
+    angle = np.arcsin(np.sin(outside) / etalon.index)
     nodes, weights = gaussian(41)
     gaps = etalon.tuned_gap(WAVELENGTH) + etalon.surface_rms * nodes
     total = 0.0
@@ -82,24 +86,30 @@ def slow_pixel(camera, etalon, line, v, column, row):
         for node, weight in zip(*gaussian(101), strict=True):
             nu = constants.c / WAVELENGTH * (1 + 2 * v / constants.c) + centre + sigma * node
             # in long double, for 77 000 orders
-            order = np.longdouble(2) * gaps[:, None] * nu / constants.c * np.cos(angle)
+            order = (
+                np.longdouble(2) * etalon.index * gaps[:, None] * nu / constants.c * np.cos(angle)
+            )
             order = (order - np.round(order)).astype(float)
             fringe = 1 / (1 + 4 * 0.7 / 0.3**2 * np.sin(np.pi * order) ** 2)
             total += share * weight * float(weights @ fringe @ area)
     return total
 
 
-@pytest.mark.parametrize("line, v", [(AIR, -40.0), (LASER, 250.0)], ids=["air", "laser"])
-def test_pixels_by_brute_force(line, v):
+@pytest.mark.parametrize(
+    "etalon, line, v",
+    [(ETALON, AIR, -40.0), (ETALON, LASER, 250.0), (SOLID, AIR, 100.0)],
+    ids=["air", "laser", "solid"],
+)
+def test_pixels_by_brute_force(etalon, line, v):
     """Ratios of pixels, at rings and between, in the middle and in a corner.
 
     To 3e-4: 850 px from the centre the line is taken as too wide by 2e-4, and flanks feel it.
     """
     camera = FringeCamera(centre=(300, 250.3))
     pixels = [(300, 250), (446, 250), (500, 400), (700, 60), (959, 779)]
-    image = fringe_image(camera, ETALON, line, v)
+    image = fringe_image(camera, etalon, line, v)
     found = np.array([float(image[row, column]) for column, row in pixels])
-    expected = np.array([slow_pixel(camera, ETALON, line, v, *pixel) for pixel in pixels])
+    expected = np.array([slow_pixel(camera, etalon, line, v, *pixel) for pixel in pixels])
     np.testing.assert_allclose(found / found.sum(), expected / expected.sum(), rtol=3e-4)
 
 
