@@ -68,6 +68,8 @@ NAME, KIND = "etalon", "bsdf"
 SPEED_OF_LIGHT = 299_792_458.0
 # of the strongest harmonic: what is left out of a folded line
 NEGLECTED = 1e-8
+# transmittance below which a mirror is taken for opaque
+LEAST_PASSED = 1e-6
 
 
 def define():
@@ -111,8 +113,8 @@ def define():
             if self.coating:
                 axial, passed, _ = self._mirror_on_axis(1.0)
                 self.reflectivity = float(abs(axial) ** 2)
-                if not abs(passed) > 1e-6:
-                    fail(NAME, "coating", f"transmittance {abs(passed):.1e}", "more than 1e-6")
+                if not abs(passed) > LEAST_PASSED:
+                    fail(NAME, "coating", f"transmittance {abs(passed):.1e}", f"above {LEAST_PASSED:g}")
                 shift = np.angle(axial) / np.pi
                 step = 1e-6
                 turn = np.angle(self._mirror_on_axis(1 + step)[0] / self._mirror_on_axis(1 - step)[0])
@@ -126,7 +128,7 @@ def define():
             if not 0 < self.reflectivity < 1:
                 fail(NAME, "reflectivity", self.reflectivity, "a number between 0 and 1")
             passed = 1 - self.reflectivity
-            if not self.absorption < passed:
+            if not passed - self.absorption > LEAST_PASSED:
                 fail(NAME, "absorption", self.absorption, f"less than 1 - reflectivity = {passed:g}")
             self.free_spectral_range = 1 / (2 * self.index * self.gap / SPEED_OF_LIGHT + 2 * delay)
             self.m_fraction = dr.opaque(mi.Float, self.order - round(self.order))
@@ -158,7 +160,8 @@ def define():
         def _mirror_on_axis(self, frequency):
             """`_stack` at a frequency relative to the laser's, at normal incidence, in float64."""
             layers = [(n, n * d * 2 * np.pi / self.wavelength * frequency) for n, d in self.coating]
-            return _stack(layers, self.index, self.plate_index, np)
+            with np.errstate(all="ignore"):  # a thick metal's NaN is refused as what it is: opaque
+                return _stack(layers, self.index, self.plate_index, np)
 
         def _mirrors(self, sine2):
             """Per polarisation: reflection seen from the gap, passage of both mirrors, reflection
