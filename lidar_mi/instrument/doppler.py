@@ -5,8 +5,9 @@ from typing import Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from ..errors import InputError
 from ..units import (
     Angle,
     Area,
@@ -65,6 +66,16 @@ class DopplerLidar(BaseModel):
     sky_radiance: SpectralRadiance = Field("0.18 W/m^2/sr/nm", ge=0, description="background")
     filter_bandwidth: Length = Field("1 nm", gt=0, description="equivalent width of the filter")
 
+    @model_validator(mode="after")
+    def _pulse_has_its_width(self):
+        # time-bandwidth product of a Gaussian pulse, 2 ln 2 / pi
+        if self.laser_width * self.pulse_duration < 0.44 and self.pulse_duration > 0:
+            raise ValueError(
+                f"laser_width: {self.laser_width:g} Hz is not allowed with pulses of "
+                f"{self.pulse_duration:g} s; expected at least {0.44 / self.pulse_duration:g} Hz"
+            )
+        return self
+
     @property
     def gate_duration(self) -> float:
         """Time in which the range bin is seen, s: 67 ns for 10 m."""
@@ -114,8 +125,15 @@ def coherence_time(etalon: Etalon, line, order: float = 0.0) -> float:
         Of air at rest, every Gaussian with a width.
     order : float
         Fractional order of the laser's light; 0 is the peak of a fringe, where the spectrum is
-        narrowest and the coherence time longest, the light of other places has more modes.
+        narrowest and the coherence time longest: light of other places has more modes.
+
+    Raises
+    ------
+    InputError
+        A line with a monochromatic part.
     """
+    if not line.sigmas.all():
+        raise InputError("line.sigmas: 0 Hz is not allowed; expected a line with a width")
     reach = 8 * line.sigmas.max() + abs(line.offsets).max()
     # an eighth of the narrowest Gaussian's sigma: sums of its square are exact to rounding
     nu = np.arange(-reach, reach, line.sigmas.min() / 8)

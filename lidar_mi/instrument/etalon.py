@@ -24,6 +24,8 @@ from ..units import Length, Number
 POLARIZATIONS = ("s", "p")
 # Less than this and a mirror is taken for opaque: even lossless, no pulse would be seen through it.
 _LEAST_TRANSMITTANCE = 1e-6
+# A finesse of 9000: the series is for rings on a camera, and is kept in memory.
+_MOST_HARMONICS = 100_000
 
 
 class Layer(NamedTuple):
@@ -192,6 +194,11 @@ def harmonics(etalon: Etalon, wavelength: float, line=None, count: int | None = 
     reflectance, transmittance, _ = mirrors(etalon, wavelength)
     if count is None:
         count = math.ceil(math.log(1e-12 * (1 - reflectance)) / math.log(reflectance))
+    if count > _MOST_HARMONICS:
+        raise InputError(
+            f"etalon: mirrors of reflectance {reflectance:.9g} need {count} harmonics; expected at "
+            f"most {_MOST_HARMONICS}, a reflectance of about 0.9996"
+        )
     n = np.arange(count + 1)
     amplitudes = transmittance**2 / (1 - reflectance**2) * reflectance ** n.astype(float)
     amplitudes = amplitudes * plate_defects(etalon, wavelength, n)

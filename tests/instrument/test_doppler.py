@@ -14,6 +14,7 @@ from pydantic import ValidationError
 from scipy import integrate
 
 from lidar_mi.atmosphere.line import Line, backscatter_line
+from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import (
     DopplerLidar,
     coherence_time,
@@ -187,8 +188,15 @@ def test_a_pulse_on_the_ccd():
         {"line_shape": "voigt"},
         {"aerosol_share": 1.1},
         {"divergence_full": 5e-4},
+        {"laser_width": "43 MHz"},
     ],
 )
 def test_bad_descriptions(changes):
     with pytest.raises(ValidationError, match=next(iter(changes))):
         DopplerLidar(**changes)
+
+
+def test_monochromatic_light_has_no_coherence_time():
+    line = Line(LIDAR.wavelength, [0.5, 0.5], [0.0, 0.0], [0.0, 1e9])
+    with pytest.raises(InputError, match="sigmas: 0 Hz"):
+        coherence_time(ETALON, line)

@@ -256,6 +256,10 @@ def test_coating_that_does_not_transmit():
     [
         (lambda: coated_transmission(ETALON, WAVELENGTH, 1.0), "etalon.coatings: null"),
         (lambda: coated_reflection(coated(ODD), WAVELENGTH, 1, 0, "x"), "'x'.* expected s or p"),
+        (
+            lambda: harmonics(Etalon(reflectivity=0.999999), WAVELENGTH),
+            "0.999999 need .* harmonics",
+        ),
         (lambda: ETALON.order_at_centre(-1.0), "wavelength: -1.0 m"),
     ],
 )
