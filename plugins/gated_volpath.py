@@ -16,6 +16,8 @@ Parameter                    Type    Meaning                                    
                                      ``analog``: free flights as nature draws them, most
                                      photons miss the gate (for validation)
 ``orders``                   bool    also give S0 of every order by itself                   false
+``covariance``               bool    also give S1's standard error and its correlation with  false
+                                     S0's, as the depolarisation ratio's error needs them
 ``samples_per_pass``         int     photons in flight at once; bounds the memory, does not  4194304
                                      change the result
 ============================ ======= ======================================================= =======
@@ -29,7 +31,8 @@ along a direction of the field of view, and both are weighted by the balance heu
 
 ``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
 ``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
-each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... behind these. The Stokes vector
+each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... behind these, with ``covariance``
+``gateNNN.S1_stderr`` and ``gateNNN.S0_S1_correlation`` behind all. The Stokes vector
 refers to the beam's horizontal axis e_h, as the emitted one does: to its part across the returning
 light, as seen by an analyser fixed to the telescope. Unpolarised variants carry intensity only: S1
 to S3 are 0 there. In RGB variants the colour channel nearest to the laser's wavelength is used.
@@ -55,6 +58,8 @@ from .polarization import first_unpolarized_in_blend
 NAME, KIND = "gated_volpath", "integrator"
 
 STOKES = ("S0", "S1", "S2", "S3")
+# products of deviations that are summed: S0's alone, or all that the errors of S0 and S1 need
+PRODUCTS = ((0, 0), (1, 1), (0, 1))
 
 
 def define():
@@ -64,6 +69,7 @@ def define():
             self.max_order = whole(props, NAME, "max_order", 1, 1)
             self.estimator = choice(props, NAME, "estimator", "gated", ("gated", "analog"))
             self.orders = bool(props.get("orders", False))
+            self.covariance = bool(props.get("covariance", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
             # called with (photons done, photons in all) after every pass, when set
             self.progress = None
@@ -74,7 +80,8 @@ def define():
         def quantities(self) -> list[str]:
             """What is rendered of every gate."""
             orders = range(1, self.max_order + 1) if self.orders else ()
-            return [*STOKES, "S0_stderr", *(f"order{order}.S0" for order in orders)]
+            more = ("S1_stderr", "S0_S1_correlation") if self.covariance else ()
+            return [*STOKES, "S0_stderr", *(f"order{order}.S0" for order in orders), *more]
 
         def channel_names(self, sensor) -> list[str]:
             """Names of the last axis of the rendered tensor."""
@@ -102,10 +109,9 @@ def define():
                         self.progress(done, beams * photons)
                     if not complete:
                         continue
-                    _, means, squares = total
-                    number = _opaque(total[0])
-                    error = dr.sqrt(squares / (number * (number - 1.0)))
-                    values = [*means[: len(STOKES)], error, *means[len(STOKES) :]]
+                    number, means, spreads = total
+                    errors = _errors(_opaque(number), spreads)
+                    values = [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:]]
                     for value, place in zip(values, self._places(first * gates, count * gates)):
                         dr.scatter(image, value, place)
                     dr.eval(image)
@@ -197,7 +203,7 @@ def define():
             return [cell + index for index in range(quantities)]
 
         def _gated(self, scene, sensor, seed, first, count, start, rounds, differentiable=False):
-            """Means, and S0's sum of squared deviations, last collisions forced into the gates."""
+            """Means and summed products of deviations, last collisions forced into the gates."""
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * gates * rounds)
             # opaque, so that neither the number of photons nor the pass is baked into the kernel
@@ -219,9 +225,9 @@ def define():
             )
             dr.eval(stokes, by_order)
             means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
-            deviation = stokes[0] - dr.gather(mi.Float, means[0], cell)
-            means += self._per_order(by_order, rounds)
-            return rounds, means, dr.block_sum(deviation * deviation, rounds)
+            off = [s - dr.gather(mi.Float, m, cell) for s, m in zip(stokes[:2], means)]
+            spreads = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
+            return rounds, means + self._per_order(by_order, rounds), spreads
 
         def _analog(self, scene, sensor, seed, first, count, start, rounds):
             """The same, free flights as nature draws them."""
@@ -235,13 +241,19 @@ def define():
 
             by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
             sums = [dr.zeros(mi.Float, count * gates) for _ in STOKES]
-            squares = dr.zeros(mi.Float, count * gates)
-            lidar.analog(photon, self.max_order, beam * gates, gates, sums, squares, self.orders, by_order)
-            dr.eval(sums, squares, by_order)
+            products = {pair: dr.zeros(mi.Float, count * gates) for pair in self._products()}
+            lidar.analog(
+                photon, self.max_order, beam * gates, gates, sums, products, self.orders, by_order
+            )
+            dr.eval(sums, products, by_order)
             number = _opaque(rounds)
             means = [s / number for s in sums]
-            spread = dr.maximum(squares - number * means[0] * means[0], 0)
-            return rounds, means + self._per_order(by_order, rounds), spread
+            spreads = [p - number * means[i] * means[j] for (i, j), p in products.items()]
+            return rounds, means + self._per_order(by_order, rounds), spreads
+
+        def _products(self):
+            """The pairs of Stokes components whose products are summed."""
+            return PRODUCTS if self.covariance else PRODUCTS[:1]
 
         def _per_order(self, by_order, rounds):
             if not self.orders:
@@ -265,12 +277,25 @@ def _opaque(number: float):
 
 def _merge(first, second):
     """Moments of two sets of photons together (Chan, Golub & LeVeque 1983)."""
-    n1, means1, squares1 = first
-    n2, means2, squares2 = second
+    n1, means1, spreads1 = first
+    n2, means2, spreads2 = second
     share, weight = _opaque(n2 / (n1 + n2)), _opaque(n1 * n2 / (n1 + n2))
-    means = [a + (b - a) * share for a, b in zip(means1, means2)]
-    difference = means2[0] - means1[0]
-    return n1 + n2, means, squares1 + squares2 + difference * difference * weight
+    off = [b - a for a, b in zip(means1, means2)]
+    means = [a + o * share for a, o in zip(means1, off)]
+    spreads = [
+        a + b + off[i] * off[j] * weight for a, b, (i, j) in zip(spreads1, spreads2, PRODUCTS)
+    ]
+    return n1 + n2, means, spreads
+
+
+def _errors(number, spreads):
+    """Standard error of S0, and with all three sums that of S1 and their correlation."""
+    variances = [dr.maximum(s, 0) / (number * (number - 1.0)) for s in spreads[:2]]
+    errors = [dr.sqrt(v) for v in variances]
+    if len(spreads) == 1:
+        return errors
+    both = dr.sqrt(dr.maximum(spreads[0], 0)) * dr.sqrt(dr.maximum(spreads[1], 0))
+    return [*errors, dr.select(both > 0, dr.clip(spreads[2] / both, -1, 1), 0)]
 
 
 def _check_blends(scene, sensor):

@@ -20,7 +20,8 @@ FREE_SHARE = 0.4
 FREE_ARRIVAL = 0.2
 # The others' first vertex is put near the gate: the share of these that is put closest to it.
 NEAR_SHARE = 0.7
-# A flight that would seldom collide within the gate's reach is followed this much more often.
+SHORT_SHARE = 0.3
+# A photon goes on with this times the weight its last flight has left it.
 FOLLOWED = 3.0
 
 
@@ -124,11 +125,11 @@ class Lidar:
             active &= reach > 0
             first = order == 1
             free = active & first & (rng.next_float32(active) < FREE_SHARE)
-            scale = 0.5 * self._footprint(0.5 * path)
+            scale = 0.5 * self._footprint(0.5 * high)
             left = _sample_left(reach, scale, _pair(rng))
-            flight, followed = _sample_flight(thickness, reach, _pair(rng))
-            flight = dr.select(first, reach - left, flight)
-            active &= first | followed
+            flight = dr.select(
+                first, reach - left, _sample_flight(thickness, reach, left, _pair(rng))
+            )
             flown, behind, found = collision(
                 self.scene, medium, position, direction, reach, self.channel, self.wavelengths,
                 rng, free,
@@ -147,7 +148,7 @@ class Lidar:
             drawn = dr.select(
                 first,
                 _left_density(reach - flight, reach, scale),
-                _flight_density(thickness, reach, flight),
+                _flight_density(thickness, reach, scale, flight),
             )
             # two ways of finding the first vertex; any partition of one keeps the mean
             part = (1 - FREE_SHARE) * drawn
@@ -172,7 +173,9 @@ class Lidar:
             if dr.hint(split, mode="scalar"):
                 _add(by_order, gain[0], cell * max_order + order - 1, in_gate)
             order += 1
-            active &= order <= last
+            followed = dr.select(first, 1, dr.minimum(FOLLOWED * weight, 1))
+            stokes = _scaled(stokes, dr.rcp(followed))
+            active &= (order <= last) & (rng.next_float32(active) < followed)
             position, thickness = mi.Point3f(vertex), mi.Float(extinction)
 
             # back: the last vertex looked for from the telescope
@@ -260,7 +263,8 @@ class Lidar:
         if densities:
             own, density, aimed, thickness, high = densities
             reach = _closing(position - photon.aperture, direction, high)
-            free = density * _flight_density(thickness, reach, distance) * volume
+            scale = 0.5 * self._footprint(0.5 * high)
+            free = density * _flight_density(thickness, reach, scale, distance) * volume
             weight *= own / (density + aimed + free)
         return self._receive(photon, rng, medium, mei, stokes, active, weight)
 
@@ -303,7 +307,7 @@ class Lidar:
         return axes.to_world(mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - below))
 
     @dr.syntax
-    def analog(self, photon, max_order, base, gates, sums, squares, split, by_order):
+    def analog(self, photon, max_order, base, gates, sums, products, split, by_order):
         """Free flights as nature draws them; every collision is connected to the telescope.
 
         A photon's apparent range never falls from one order to the next (triangle inequality), so
@@ -335,7 +339,7 @@ class Lidar:
             gain = self._receive(photon, rng, medium, mei, stokes, counts, mi.Float(1))
             now = dr.select(counts, mi.UInt32(dr.clip(share * gates, 0, gates - 1)), gate)
             done = now != gate
-            _deposit(sums, squares, base + gate, held, done)
+            _deposit(sums, products, base + gate, held, done)
             held = _sum(_scaled(held, dr.select(done, 0, 1)), gain)
             gate = now
             if dr.hint(split, mode="scalar"):
@@ -348,7 +352,7 @@ class Lidar:
             stokes = _apply(value, stokes, self.channel)
             direction = mi.Vector3f(onward)
             active &= (density > 0) & (stokes[0] > 0)
-            _deposit(sums, squares, base + gate, held, began & ~active)
+            _deposit(sums, products, base + gate, held, began & ~active)
 
 
 def _add(total, value, cell, active=True):
@@ -356,12 +360,13 @@ def _add(total, value, cell, active=True):
     dr.scatter_reduce(dr.ReduceOp.Add, total, value, cell, active, mode=dr.ReduceMode.Local)
 
 
-def _deposit(sums, squares, cell, held, active):
-    """Add what photons have brought to their gates, and its square."""
+def _deposit(sums, products, cell, held, active):
+    """Add what photons have brought to their gates, and products of its components."""
     active = active & (held[0] != 0)
     for total, value in zip(sums, held):
         _add(total, value, cell, active)
-    _add(squares, held[0] * held[0], cell, active)
+    for (i, j), total in products.items():
+        _add(total, held[i] * held[j], cell, active)
 
 
 def _closing(offset, direction, path):
@@ -394,20 +399,19 @@ def _left_density(left, reach, scale):
     return dr.lerp(far, near, NEAR_SHARE)
 
 
-def _sample_flight(thickness, reach, sample):
-    """A flight that ends before ``reach``, exponential; and whether it is followed at all.
+def _sample_flight(thickness, reach, near, sample):
+    """A later flight that ends before ``reach``: exponential, or ``near`` where it begins.
 
     ``thickness`` is the extinction coefficient where it begins, a guess for all of the way.
     """
     collides = 1 - dr.exp(-thickness * reach)
-    flight = -dr.log(1 - collides * sample.x) / thickness
-    return flight, sample.y < FOLLOWED * collides
+    return dr.select(sample.x < SHORT_SHARE, near, -dr.log(1 - collides * sample.y) / thickness)
 
 
-def _flight_density(thickness, reach, distance):
-    """Probability per metre that a flight is followed and ends at ``distance``."""
+def _flight_density(thickness, reach, scale, distance):
     collides = 1 - dr.exp(-thickness * reach)
-    return thickness * dr.exp(-thickness * distance) * dr.minimum(dr.rcp(collides), FOLLOWED)
+    exponential = thickness * dr.exp(-thickness * distance) / collides
+    return dr.lerp(exponential, _left_density(distance, reach, scale), SHORT_SHARE)
 
 
 def _apply(value, stokes, channel):

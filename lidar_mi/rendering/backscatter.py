@@ -1,5 +1,6 @@
 """The backscatter lidar's picture: an extinction field and a scan become a Mitsuba scene."""
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 
@@ -8,11 +9,14 @@ import numpy as np
 import xarray as xr
 
 from .. import __version__
+from ..errors import InputError
 from ..instrument.lidar import BackscatterLidar
 from ..instrument.scan import ScanPlan
 from ..instrument.signal import apparent_backscatter
 from .exr import label_scan, unpack
 from .settings import RenderSettings
+
+MOST_CELLS = 1e8  # of an extended plane: 0.8 GB
 
 
 def extrude(plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar) -> xr.DataArray:
@@ -21,6 +25,11 @@ def extrude(plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar) -> xr.
     Beams are wide and oblique: at the slab's faces and rims some of their light crosses outside
     the gate's planes and the outermost nodes. The plane is extended by that much (the outermost
     values repeated), so that the whole gate is filled with it.
+
+    Raises
+    ------
+    InputError
+        Beams so wide that the extended plane would not fit into the memory.
     """
     reach = lidar.beam_cut if np.isfinite(lidar.beam_cut) else 3 * lidar.beam_radius
     # the Gaussian divergence exceeds 2.2 times its 1/e^2 angle once in 16 000 photons
@@ -30,6 +39,13 @@ def extrude(plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar) -> xr.
     bulge = (plan.obliquity().max() - 1) * plan.gate_stop if plan.gate_kind == "spherical" else 0
     margin = reach * slope + bulge
     pad = {axis: int(np.ceil(reach / _spacing(plane, axis))) for axis in ("y", "z")}
+    cells = math.prod(plane.sizes[axis] + 2 * n for axis, n in pad.items())
+    if cells > MOST_CELLS:
+        raise InputError(
+            f"scan.range: {plan.gate_stop:g} m is not allowed with beams that spread by "
+            f"{reach:.3g} m until there; the plane would have {cells:.2g} nodes, expected at most "
+            f"{MOST_CELLS:g} (a narrower beam, a nearer range or a coarser wake.spacing)"
+        )
     padded = plane.pad({axis: (n, n) for axis, n in pad.items()}, mode="edge")
     for axis, n in pad.items():
         start = float(plane[axis][0]) - n * _spacing(plane, axis)
@@ -121,6 +137,7 @@ def scene_dict(
             "type": "gated_volpath",
             "max_order": settings.max_order,
             "orders": settings.max_order > 1,
+            "covariance": mi.is_polarized,
             "estimator": settings.estimator,
             "samples_per_pass": settings.samples_per_pass,
         },

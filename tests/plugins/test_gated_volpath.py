@@ -475,3 +475,51 @@ def test_one_sample_a_gate_is_raised_to_two(world):
     stokes, error = world.render(scene, spp=1)
     assert np.array_equal(stokes, world.render(scene, spp=2)[0])
     assert (error > 0).all()
+
+
+class TestCovariance:
+    """S1's error bar and its correlation with S0's, against many renderings of the same scan."""
+
+    def images(self, world, estimator, **parameters):
+        integrator = {"estimator": estimator, "max_order": 2, "covariance": True, **parameters}
+        scene = scan(world, (12, 8), integrator=integrator)
+        names = scene.integrator().quantities()
+        spp = 200 if estimator == "gated" else 5_000
+        seeds = 30 if estimator == "gated" else 20
+        found = np.stack([np.array(mi.render(scene, spp=spp, seed=s)) for s in range(seeds)])
+        return {name: found[..., k].astype(float) for k, name in enumerate(names)}
+
+    @pytest.mark.parametrize("estimator", ["gated", "analog"])
+    def test_is_that_over_seeds(self, world, estimator):
+        if not mi.is_polarized:
+            pytest.skip("unpolarised variants have no S1")
+        found = self.images(world, estimator)
+        number = found["S0"].shape[0]
+        off = {k: found[k] - found[k].mean(0) for k in ("S0", "S1")}
+        product = (off["S0"] * off["S1"]).sum(0) / (number - 1)
+        said = found["S0_S1_correlation"] * found["S0_stderr"] * found["S1_stderr"]
+        beams = product.size
+        for seen, expected in (
+            ((off["S1"] ** 2).sum(0) / (number - 1), found["S1_stderr"] ** 2),
+            (product, said),
+        ):
+            ratio = seen.mean() / expected.mean()
+            # the mean of `beams` sample variances of `number` draws
+            sigma = np.sqrt(2 / (beams * (number - 1)))
+            assert abs(ratio - 1) < 4 * sigma + 0.01, (ratio, sigma)
+
+    def test_does_not_depend_on_the_passes(self, world):
+        if not mi.is_polarized:
+            pytest.skip("unpolarised variants have no S1")
+        whole = scan(world, (4, 3), integrator={"covariance": True})
+        parts = scan(world, (4, 3), integrator={"covariance": True, "samples_per_pass": 50})
+        one, many = (np.array(mi.render(s, spp=64, seed=3)) for s in (whole, parts))
+        np.testing.assert_allclose(many[..., 5:], one[..., 5:], rtol=2e-4)
+
+    def test_single_scattering_by_molecules_is_fully_correlated(self, world):
+        """Backscatter without depolarisation: S1 = S0 of every photon."""
+        if not mi.is_polarized:
+            pytest.skip("unpolarised variants have no S1")
+        image = np.array(mi.render(scan(world, (4, 3), integrator={"covariance": True}), spp=200))
+        np.testing.assert_allclose(image[..., 5], image[..., 4], rtol=1e-3)
+        np.testing.assert_allclose(image[..., 6], 1, atol=1e-3)
