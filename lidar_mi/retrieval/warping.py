@@ -203,8 +203,9 @@ def _ring_means(
     )
     density = total / number.clamp(min=1)
     # the last rings are cut by the corners: they take the last full ring's value
-    full = number >= _RING_WAVES
-    density = torch.where(full, density, density[full.nonzero().max()])
+    most = int(number.argmax())
+    last = most + int((number[most:] >= min(_RING_WAVES, float(number[most]))).sum()) - 1
+    density[last + 1 :] = density[last]
     # independent waves: an image has as many as pixels, tapering leaves two fifths of them
     share = 0.4 * len(images) * shape[0] * shape[1] / (sizes[0] * sizes[1])
     return density, (share * number.clamp(min=1)).rsqrt()
