@@ -1,7 +1,6 @@
 """The command line: ``lidar-mi run | render | retrieve | info | aerosol | doctor``."""
 
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from .errors import InputError
+from .errors import InputError, causes, is_interrupt
 
 app = typer.Typer(
     name="lidar-mi",
@@ -164,6 +163,7 @@ def info(
     import json
 
     from .info import sections
+    from .run_folder import failure
 
     with _progress() as notice:
         found = list(
@@ -174,9 +174,12 @@ def info(
         )  # fmt: skip
     for title, rows in found:
         _print_rows(title, rows)
-    if Path(what).is_dir():
-        if (Path(what) / "metrics.json").is_file():
-            _print_metrics(json.loads((Path(what) / "metrics.json").read_text()))
+    folder = Path(what)
+    if folder.is_dir():
+        if reason := failure(folder):
+            _out.print(f"failed: {reason}", markup=False, soft_wrap=True)
+        elif (folder / "metrics.json").is_file():
+            _print_metrics(json.loads((folder / "metrics.json").read_text()))
         else:
             _out.print("unfinished: no metrics.json yet; run it again to go on")
 
@@ -257,8 +260,7 @@ def main() -> None:
     except InputError as error:
         _fail(str(error))
     except BaseException as error:
-        # Mitsuba and the command parser each put their own exception in an interrupt's place
-        if any(isinstance(cause, KeyboardInterrupt) for cause in _causes(error)):
+        if is_interrupt(error):
             _fail("stopped; a run goes on when started again", code=130)
         message = _plugin_message(error)
         if message is None:
@@ -271,16 +273,9 @@ def _fail(message: str, code: int = 2) -> None:
     sys.exit(code)
 
 
-def _causes(error: BaseException | None) -> Iterator[BaseException]:
-    """An exception, the one it came from, and so on."""
-    while error is not None:
-        yield error
-        error = error.__cause__ or error.__context__
-
-
 def _plugin_message(error: BaseException) -> str | None:
     """The one line a plugin said about a wrong parameter, from under the layers above it."""
-    for cause in _causes(error):
+    for cause in causes(error):
         for line in str(cause).splitlines():
             if " is not allowed; expected " in line:
                 return line.split("ValueError: ")[-1].strip()
@@ -353,8 +348,8 @@ class _progress:
             self.task, description=text, total=None if share is None else 1.0,
             completed=share or 0.0,
         )  # fmt: skip
-        if not _err.is_terminal and text != self.last:
-            _err.print(text, markup=False, highlight=False)
+        if text != self.last and (text.startswith("warning: ") or not _err.is_terminal):
+            _err.print(text, markup=False, highlight=False, soft_wrap=True)
         self.last = text
 
     def __exit__(self, *_):
@@ -376,7 +371,14 @@ def _print_metrics(metrics: dict[str, float]) -> None:
         shown = ["-" if value is None else f"{value:.2f}" for value in values]
         valid = f"{metrics[f'{source}.{method}.valid_fraction']:.0%}"
         table.add_row(source.replace("_", " ").replace("extinction ", ""), method, *shown, valid)
+    strength = [
+        metrics.get(f"true_wind.{key}")
+        for key in ("rms_v", "rms_w", "outside_cores.rms_v", "outside_cores.rms_w")
+    ]
+    shown = ["-" if value is None else f"{value:.2f}" for value in strength]
+    table.add_row("true wind (rms)", "", *shown, "", style="dim")
     _out.print(table)
+    _out.print("An error near the rms of the true wind means no skill: zero would be as good.")
 
 
 def _print_rows(title: str, rows) -> None:

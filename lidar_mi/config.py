@@ -194,6 +194,20 @@ class Experiment(_Section):
         return self
 
 
+class _Loader(yaml.SafeLoader):
+    """YAML as it should be: a key that is there twice is a fault, not the last one's value."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key.value!r} is there twice", key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
 def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
     """Read an experiment file; ``overrides`` are texts such as ``"wake.texture.rms=0.2"``.
 
@@ -203,6 +217,10 @@ def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
         Unreadable file, unknown key, wrong unit, value out of range: the first fault is named.
     """
     path = Path(path)
+    if path.suffix == ".xml":
+        raise InputError(
+            f"{path}: a Mitsuba scene, not an experiment; expected lidar-mi render {path}"
+        )
     try:
         text = path.read_text()
     except OSError as error:
@@ -210,7 +228,7 @@ def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
     except UnicodeDecodeError:
         raise InputError(f"{path}: not a text file; expected an experiment in YAML") from None
     try:
-        data = yaml.safe_load(text)
+        data = yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f" line {mark.line + 1}" if mark else ""
@@ -248,7 +266,7 @@ def _override(data: dict, text: str) -> None:
         if not isinstance(data, dict):
             raise InputError(f"--set {text}: {parent} is a value, not a section")
     try:
-        data[last] = yaml.safe_load(value)
+        data[last] = yaml.load(value, _Loader)
     except yaml.YAMLError:
         raise InputError(f"--set {text}: {value!r} is not a YAML value") from None
 

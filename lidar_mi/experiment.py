@@ -14,11 +14,11 @@ import xarray as xr
 
 from . import __version__, config
 from .assessment import figures, report
-from .assessment.cores import Core, find_cores
+from .assessment.cores import Core, find_cores, outside_cores
 from .assessment.errors import truth_at_vectors, wind_metrics
 from .config import Experiment
-from .errors import InputError
-from .instrument.detector import noise_budget, noisy_scan
+from .errors import InputError, is_interrupt
+from .instrument.detector import gate_duration, noise_budget, noisy_scan, speckle_modes
 from .instrument.products import linear_depolarization, with_products
 from .instrument.scan import ScanPlan, plan_scans
 from .rendering import exr
@@ -73,11 +73,23 @@ def run(
         plans = _plans(experiment, truth)
     notice("reading how the air scatters", None)
     air = scatterer(experiment.scattering, beside, experiment.lidar.wavelength)
+    fields = _solid(experiment, truth, plans)
     _check_ahead(experiment, truth, plans, air)
     claim(folder, experiment, beside, overwrite)
     log = Log(folder / "log.txt", notice)
     log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")
-    scans = pictures(experiment, truth, plans, air, folder, log)
+    try:
+        return _run(experiment, folder, beside, truth, plans, air, fields, timing, log)
+    except Exception as error:
+        if not is_interrupt(error):
+            log.fail(error)
+        raise
+
+
+def _run(experiment, folder, beside, truth, plans, air, fields, timing, log) -> dict[str, float]:
+    """The run from the pictures on; everything before is checked."""
+    _warn_of_wide_beams(experiment, truth, plans, log)
+    scans = pictures(experiment, plans, fields, air, folder, log)
     timing["render"] = sum(scan.attrs["render_seconds"] for scan in scans)
     with _timed(timing, "retrieve"):
         log("retrieving winds")
@@ -85,7 +97,8 @@ def run(
         found = winds(experiment, truth, plans, scans, log)
         write_netcdf(found, folder / "wind.nc")
         sweep = texture_sweep(experiment, beside, log)
-    metrics = verdict(found, scans, cores) | sweep
+    metrics = verdict(found, scans, cores) | true_wind(found, truth, cores) | sweep
+    _warn_of_no_vectors(found, metrics, log)
     if experiment.detector:
         budget = noise_budget(scans[0], experiment.lidar, experiment.detector)
         metrics |= {f"detector.{key}": value for key, value in budget.items()}
@@ -97,7 +110,9 @@ def run(
         folder / "metrics.json",
         lambda path: path.write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n"),
     )
-    page = report.page(experiment, config.dump(experiment), metrics, cores, drawn)
+    page = report.page(
+        experiment, config.dump(experiment), metrics, cores, drawn, log.warnings
+    )
     write(folder / "report.html", lambda path: path.write_text(page))
     log("done")
     return metrics
@@ -107,6 +122,10 @@ def _check_ahead(experiment, truth, plans, air: Scatterer) -> None:
     """What would only fail later is said before anything is written."""
     settings, image = experiment.retrieval, (len(plans[0].z), len(plans[0].y))
     Windows(image, settings.template, settings.search, settings.stride)
+    if experiment.detector:
+        for plan in plans:
+            duration = gate_duration(plan.gate_length())
+            speckle_modes(experiment.detector, experiment.lidar, duration, plan.ranges())
     if not max(float(field.max()) for field in truth.extinction) > 0:
         raise InputError(
             "wake.extinction: 0 everywhere is not allowed; expected air that scatters, by its "
@@ -116,19 +135,50 @@ def _check_ahead(experiment, truth, plans, air: Scatterer) -> None:
         raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
 
 
-def pictures(experiment, truth, plans, air: Scatterer, folder: Path, log) -> list[xr.Dataset]:
+def _solid(experiment, truth, plans) -> list[xr.DataArray]:
+    """The extinction at both times as deep and wide as the beams need it."""
+    fields = truth.extinction
+    if fields[0].sizes["x"] > 1:
+        return list(fields)
+    reach = max(plans, key=lambda plan: plan.gate_stop)
+    return [
+        extrude(field.isel(x=0).transpose("z", "y"), reach, experiment.lidar) for field in fields
+    ]
+
+
+def _warn_of_wide_beams(experiment, truth, plans, log) -> None:
+    width = 2 * float(experiment.lidar.radius_at(plans[0].centre))
+    y = truth.wind["y"].values
+    template = experiment.retrieval.template * float(y[1] - y[0])
+    if width > template:
+        log.remark(
+            f"beams are {width:.3g} m wide at {plans[0].centre:g} m, wider than a template of "
+            f"{template:g} m: structure that winds could be found from is blurred"
+        )
+
+
+def _warn_of_no_vectors(found: xr.Dataset, metrics, log) -> None:
+    """Sources of rendered pictures that gave no valid vector, and which flags say why."""
+    meanings = found["flag"].attrs["flag_meanings"].split()
+    masks = found["flag"].attrs["flag_masks"]
+    for source in (name for name in found["source"].values if name in ("backscatter", NOISY)):
+        for method in found["algorithm"].values:
+            if metrics[f"{source}.{method}.valid_fraction"] > 0:
+                continue
+            flags = found["flag"].sel(source=source, algorithm=method).values
+            shares = {text: ((flags & mask) != 0).mean() for text, mask in zip(meanings, masks)}
+            worst = max(shares, key=shares.get)
+            log.remark(
+                f"{source}, {method}: no vector is valid; {shares[worst]:.0%} have the flag {worst}"
+            )
+
+
+def pictures(experiment, plans, fields, air: Scatterer, folder: Path, log) -> list[xr.Dataset]:
     """The two scans: those in the folder, and the missing ones rendered and written to it."""
     paths = [folder / name for name in IMAGES]
     missing = [index for index, path in enumerate(paths) if not path.is_file()]
     if len(missing) < len(paths):
         log(f"using {len(paths) - len(missing)} of {len(paths)} pictures from an earlier run")
-    fields = truth.extinction
-    if fields[0].sizes["x"] == 1:
-        reach = max(plans, key=lambda plan: plan.gate_stop)
-        fields = [
-            extrude(field.isel(x=0).transpose("z", "y"), reach, experiment.lidar)
-            for field in fields
-        ]
 
     def progress(scan: int, done: int, total: int) -> None:
         log.bar(f"rendering scan {scan + 1} of {len(plans)}", done / total)
@@ -146,7 +196,9 @@ def pictures(experiment, truth, plans, air: Scatterer, folder: Path, log) -> lis
         progress,
         missing,
     )
+    platform = {"platform_speed": experiment.platform.speed, "dt": experiment.platform.dt}
     for index, scan in zip(missing, map(with_products, rendered)):
+        scan.attrs |= platform
         if experiment.detector:
             # numbers of their own, apart from those of the light transport
             seed = [experiment.seed, index, 1]
@@ -277,6 +329,20 @@ def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
         for key in ("y", "z", "radius", "circulation"):
             metrics[f"wake.{side}_core.{key}"] = getattr(core, key)
     return metrics
+
+
+def true_wind(found: xr.Dataset, truth: Truth, cores: list[Core]) -> dict[str, float]:
+    """How strong the true wind is where vectors are looked for: an error as large is no skill."""
+    place = {axis: slice(found[axis].min(), found[axis].max()) for axis in ("y", "z")}
+    wind = truth.wind.sel(place)
+    far = outside_cores(wind["y"].values, wind["z"].values[:, None], cores)
+    rms = {}
+    for name in ("v", "w"):
+        square = wind[name].transpose("z", "y").values ** 2
+        rms[f"true_wind.rms_{name}"] = float(np.sqrt(square.mean()))
+        if cores and far.any():
+            rms[f"true_wind.outside_cores.rms_{name}"] = float(np.sqrt(square[far].mean()))
+    return rms
 
 
 def _plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:

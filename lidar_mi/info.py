@@ -134,12 +134,30 @@ def _run_folder(folder: Path) -> Iterator[Section]:
     from .run_folder import read_record
 
     record = read_record(folder)
-    rows = [(name, str(number)) for name, number in record["versions"].items()]
-    yield f"{folder}: experiment {record['experiment'].get('name')}", rows
+    experiment = record["experiment"]
+    yield f"{folder}: experiment {experiment.get('name')}", [
+        (key, _short(value)) for key, value in _asked_first(experiment)
+    ]
+    yield "versions", [(name, str(number)) for name, number in record["versions"].items()]
     files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
     yield "files", [
         (str(path.relative_to(folder)), f"{path.stat().st_size / 1e6:.2f} MB") for path in files
     ]
+
+
+def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
+    """The keys of an experiment that tell one from another at a glance, as far as it has them."""
+    for key in (
+        "seed", "wake.file", "wake.time", "wake.second", "wake.texture.rms", "platform.speed",
+        "platform.dt", "scan.range", "scan.thickness", "scan.gates", "scan.gate_count",
+        "lidar.wavelength", "scattering.phase", "scattering.aerosol", "render.variant",
+        "render.samples_per_beam", "render.max_order", "retrieval.methods",
+    ):  # fmt: skip
+        value = experiment
+        for part in key.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        if value is not None:
+            yield key, ", ".join(value) if isinstance(value, list) else value
 
 
 def _short(value) -> str:

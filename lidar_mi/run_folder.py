@@ -19,6 +19,11 @@ from .truth import find_file
 
 IMAGES = ("image_t1.exr", "image_t2.exr")
 
+# other versions of these may give other pictures
+RENDERED_BY = ("lidar-mi", "mitsuba", "drjit")
+
+FAILED = "failed: "
+
 Notice = Callable[[str, float | None], None]
 """Called with what is running and how far it is (0 to 1, None: unknown)."""
 
@@ -38,12 +43,13 @@ def claim(folder: Path, experiment: Experiment, beside: str | Path, overwrite: b
     }
     if marker.is_file():
         before = read_record(folder)
-        if any(before.get(key) != record[key] for key in ("experiment", "files")):
+        other = _difference(before, record)
+        if other:
             pictures = [folder / name for name in IMAGES if (folder / name).is_file()]
             if pictures and not overwrite:
                 raise InputError(
-                    f"{folder}: holds a run of another experiment; expected an empty folder "
-                    "(-o DIR), or --overwrite to replace it"
+                    f"{folder}: holds a run of {other}; expected an empty folder (-o DIR), or "
+                    "--overwrite to replace it"
                 )
             # nothing of the other experiment may be taken for a result of this one
             old = [folder / name for name in ("wind.nc", "metrics.json", "report.html", "log.txt")]
@@ -56,6 +62,17 @@ def claim(folder: Path, experiment: Experiment, beside: str | Path, overwrite: b
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
     write(marker, lambda path: path.write_text(yaml.safe_dump(record, sort_keys=False)))
+
+
+def _difference(before: dict, now: dict) -> str | None:
+    """What makes an earlier run's pictures another experiment's; None: nothing does."""
+    if any(before.get(key) != now[key] for key in ("experiment", "files")):
+        return "another experiment"
+    for name in RENDERED_BY:
+        version = before["versions"].get(name)
+        if version != now["versions"][name]:
+            return f"{name} {version}, this is {now['versions'][name]}"
+    return None
 
 
 def _checksums(experiment: Experiment, beside: str | Path) -> dict[str, str]:
@@ -107,16 +124,34 @@ def write(path: Path, write: Callable[[Path], object]) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def failure(folder: str | Path) -> str | None:
+    """What the last run in a folder failed from; None: it did not, or was only stopped."""
+    path = Path(folder) / "log.txt"
+    lines = path.read_text().splitlines() if path.is_file() else []
+    _, _, text = lines[-1].split(" ", 2) if lines else ("", "", "")  # behind date and time
+    return text.removeprefix(FAILED) if text.startswith(FAILED) else None
+
+
 class Log:
     """Lines for the log file and the person in front of the screen."""
 
     def __init__(self, path: Path, notice: Notice):
         self.path, self.notice = path, notice
+        self.warnings = []
 
     def __call__(self, text: str) -> None:
         with self.path.open("a") as file:
             file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
         self.notice(text, None)
+
+    def remark(self, text: str) -> None:
+        """A warning: something that a reader of the results must know."""
+        self.warnings.append(text)
+        self(f"warning: {text}")
+
+    def fail(self, error: Exception) -> None:
+        """Why the run ended, so that nobody takes it for one that was stopped and can go on."""
+        self(f"{FAILED}{' '.join(str(error).split()) or type(error).__name__}")
 
     def bar(self, text: str, share: float) -> None:
         """Progress within a step: shown, not logged."""

@@ -12,7 +12,7 @@ from typing import Annotated
 import pint
 from pydantic import BeforeValidator, PlainSerializer
 
-_UNITS = pint.UnitRegistry()
+UNITS = pint.UnitRegistry()
 # one number, then a unit: pint alone reads "0,1 m" as 1 m and "500 m 3" as 1500 m
 _TEXT = re.compile(r"""([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan))\s*([^\n,;#"']*)""")
 # what pint raises, and what reaches us through it from Python's tokenizer and arithmetic
@@ -47,8 +47,8 @@ def to_si(value, unit: str, example: str) -> float:
             raise ValueError(f"{value!r} has no unit; expected an angle such as '{example}'")
         return number
     try:
-        given = _UNITS.parse_units("1" + text if text.startswith("/") else text)
-        return float(_UNITS.Quantity(number, given).to(unit or "dimensionless").magnitude)
+        given = UNITS.parse_units("1" + text if text.startswith("/") else text)
+        return float(UNITS.Quantity(number, given).to(unit or "dimensionless").magnitude)
     except _BAD_UNIT:
         raise wrong from None
 

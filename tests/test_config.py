@@ -280,3 +280,17 @@ def test_checking_a_dictionary_names_its_origin():
     with pytest.raises(InputError, match="^here: wake: missing$"):
         check({"name": "a"}, "here")
     assert isinstance(check({"name": "a", "wake": {"file": "b.nc"}}, "here"), Experiment)
+
+
+def test_a_key_that_is_there_twice_is_a_fault(write):
+    """YAML's libraries take the last one silently."""
+    path = write("name: a\nwake: {file: a.nc}\nscan: {range: 300 m}\nscan: {thickness: 3 m}\n")
+    with pytest.raises(InputError, match="line 4 not valid YAML .key 'scan' is there twice"):
+        load(path)
+    with pytest.raises(InputError, match="is not a YAML value"):
+        load(write(), ["scan={range: 300 m, range: 400 m}"])
+
+
+def test_a_scene_is_no_experiment(tmp_path):
+    with pytest.raises(InputError, match=r"slab\.xml: .*expected lidar-mi render .*slab\.xml"):
+        load(tmp_path / "slab.xml")

@@ -85,24 +85,27 @@ def _statistics(error: xr.Dataset, chosen: np.ndarray) -> dict[str, float]:
     return statistics
 
 
-def error_by_texture(wind: xr.Dataset, truth: xr.Dataset, bins: int = 12) -> xr.Dataset:
-    """How the error depends on the local texture: rms error of v and w in bins of texture.
+def error_by_quality(
+    wind: xr.Dataset, truth: xr.Dataset, quality: str, bins: int = 12
+) -> xr.Dataset:
+    """How the error depends on what a window holds: rms error of v and w in bins of a quality.
 
     All vectors with a displacement, flagged or not, in ``bins`` groups of equal number. Returns
     ``rmse`` (m s^-1, both components together), ``valid`` (share of unflagged vectors) and the
-    median ``texture`` (relative slope per pixel) of each group, dim ``group``.
+    median of ``quality`` ("texture", relative slope per pixel, or "isotropy") of each group, dim
+    ``group``.
     """
     error = deviations(wind, truth)
     square = (error["v"] ** 2 + error["w"] ** 2).values / 2
-    known = np.isfinite(square) & np.isfinite(wind["texture"].values)
-    order = np.argsort(wind["texture"].values[known])
-    texture = wind["texture"].values[known][order]
+    known = np.isfinite(square) & np.isfinite(wind[quality].values)
+    order = np.argsort(wind[quality].values[known])
+    values = wind[quality].values[known][order]
     groups = [g for g in np.array_split(np.arange(len(order)), bins) if len(g)]
     square, flag = square[known][order], wind["flag"].values[known][order]
     return xr.Dataset(
         {
             "rmse": ("group", [float(np.sqrt(square[g].mean())) for g in groups]),
             "valid": ("group", [float((flag[g] == 0).mean()) for g in groups]),
-            "texture": ("group", [float(np.median(texture[g])) for g in groups]),
+            quality: ("group", [float(np.median(values[g])) for g in groups]),
         }
     )

@@ -13,11 +13,28 @@ from matplotlib.colors import Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
 
 from .cores import Core
-from .errors import deviations, error_by_texture
+from .errors import deviations, error_by_quality
 
-METHOD_NAMES = {"cc": "cross-correlation", "ws": "weight shift"}
-ARROW = 0.35  # metres drawn for 1 m/s
-SPEED_LIMIT = 18.0  # m/s, the end of the colour scale
+METHOD_NAMES = {
+    "cc": "cross-correlation", "ws": "weight shift", "multipass": "multi-pass correlation",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Scale:
+    """What all wind maps of a run share: ``limit``, the speed (m/s) at the end of the colours and
+    drawn as an arrow one step long, and the plane's axes ``y``, ``z`` (m)."""
+
+    limit: float
+    y: np.ndarray
+    z: np.ndarray
+
+
+def _scale(truth) -> Scale:
+    speed = np.hypot(truth.wind["v"], truth.wind["w"])
+    # the few nodes of a core must not make all others dark and short
+    limit = float(speed.quantile(0.999)) or 1.0
+    return Scale(limit, truth.wind["y"].values, truth.wind["z"].values)
 
 
 @dataclass(frozen=True)
@@ -43,23 +60,24 @@ def draw_all(
     sweep : metrics from `lidar_mi.experiment.texture_sweep`
     """
     folder.mkdir(exist_ok=True)
+    scale = _scale(truth)
     plates = (
         ("fig05_extinction", "Extinction", _extinction(truth)),
         ("fig06_wind_from_extinction", "Wind: truth and from the extinction pair",
-         _wind_and_truth(truth, found, cores)),
+         _wind_and_truth(truth, found, cores, scale)),
         ("fig07_deviation_from_truth", "Winds from extinction against the truth",
          _deviation_maps(found, "extinction", None)),
         ("fig08_backscatter", "Backscatter images", _backscatter(scans)),
         ("fig09_backscatter_against_extinction", "Backscatter against extinction",
          _picture_differences(truth, scans)),
         ("fig10_wind_from_backscatter", "Wind from the backscatter pair",
-         _retrieved(found, "backscatter", cores)),
+         _retrieved(found, "backscatter", cores, scale)),
         ("fig11_deviation_from_extinction_winds", "What the instrument changes in the winds",
          _deviation_maps(found, "backscatter", "extinction")),
         ("fig12_error_by_texture", "Error and texture", _error_by_texture(found, sweep)),
     )  # fmt: skip
     if "Y_noisy" in scans[0]:
-        plates += (("fig13_detector", "What the detector reads", _detected(scans, found, cores)),)
+        plates += (("fig13_detector", "What the detector reads", _detected(scans, found, cores, scale)),)
     if "depolarization" in scans[0]:
         plates += (("fig14_depolarization", "Linear depolarisation ratio", _product(
             scans[0], "depolarization", "linear depolarisation ratio",
@@ -96,44 +114,42 @@ def _frame(axes, y, z, title: str) -> None:
     axes.set_ylim(float(z.min()), float(z.max()))
 
 
-def _image(axes, field: xr.DataArray, title: str, label: str, **style) -> None:
+def _image(axes, field: xr.DataArray, title: str, label: str, extend="neither", **style) -> None:
     y, z = field["y"], field["z"]
     mesh = axes.pcolormesh(
         y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
     )
     _frame(axes, y, z, title)
-    axes.figure.colorbar(mesh, ax=axes, label=label, pad=0.02)
+    axes.figure.colorbar(mesh, ax=axes, label=label, pad=0.02, extend=extend)
 
 
-def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, every: int) -> None:
-    """Vectors where they belong; flagged ones grey, valid ones coloured by speed."""
+def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale) -> None:
+    """Vectors where they belong, about 45 across; flagged ones grey, valid ones by speed."""
+    every = max(1, round(wind.sizes["y"] / 45))
+    step = every * float(wind["y"][1] - wind["y"][0]) if wind.sizes["y"] > 1 else 1.0
     thin = wind.isel(z=slice(every // 2, None, every), y=slice(every // 2, None, every))
     y, z = (np.broadcast_to(thin[f"{a}_vector"], thin["v"].shape).ravel() for a in "yz")
     v, w, flag = (thin[name].values.ravel() for name in ("v", "w", "flag"))
     known = np.isfinite(v) & np.isfinite(w)
-    style = {"angles": "xy", "scale_units": "xy", "scale": 1 / ARROW, "width": 0.0022}
+    style = {"angles": "xy", "scale_units": "xy", "scale": scale.limit / (1.5 * step),
+             "width": 0.0022}  # fmt: skip
     bad, good = known & (flag != 0), known & (flag == 0)
     if bad.any():
         axes.quiver(y[bad], z[bad], v[bad], w[bad], color="0.75", **style)
     arrows = axes.quiver(
         y[good], z[good], v[good], w[good], np.hypot(v, w)[good],
-        cmap="viridis", norm=Normalize(0, SPEED_LIMIT), **style,
+        cmap="viridis", norm=Normalize(0, scale.limit), **style,
     )  # fmt: skip
     for core in cores:
         axes.plot(core.y, core.z, "+", color="crimson", ms=9)
-    _frame(axes, wind["y"], wind["z"], title)
-    axes.figure.colorbar(arrows, ax=axes, label="speed / m s$^{-1}$", pad=0.02)
+    _frame(axes, scale.y, scale.z, title)
+    axes.figure.colorbar(arrows, ax=axes, label="speed / m s$^{-1}$", pad=0.02, extend="max")
 
 
 def _truth_vectors(wind: xr.Dataset) -> xr.Dataset:
     """True wind at the places of a retrieval's vectors, as a retrieval without flags."""
     true = wind[["v_true", "w_true", "y_vector", "z_vector"]].rename(v_true="v", w_true="w")
     return true.assign(flag=xr.zeros_like(wind["flag"]))
-
-
-def _step(wind: xr.Dataset) -> int:
-    """Thinning that leaves about 45 arrows across."""
-    return max(1, round(wind.sizes["y"] / 45))
 
 
 def _extinction(truth):
@@ -148,32 +164,34 @@ def _extinction(truth):
     )
 
 
-def _wind_and_truth(truth, found, cores):
-    figure, axes = _sheet(2, 2)
+def _wind_and_truth(truth, found, cores, scale):
+    figure, axes = _sheet(2, max(2, found.sizes["algorithm"]))
     first = found.sel(source="extinction").isel(algorithm=0)
-    _arrows(axes[0, 0], _truth_vectors(first), cores, "true wind", _step(first))
+    _arrows(axes[0, 0], _truth_vectors(first), cores, "true wind", scale)
     speed = np.hypot(truth.wind["v"], truth.wind["w"])
-    _image(axes[0, 1], speed, "speed of the true wind", "m s$^{-1}$",
-           norm=Normalize(0, SPEED_LIMIT), cmap="viridis")  # fmt: skip
-    _retrieved_into(axes[1], found, "extinction", cores)
+    _image(axes[0, 1], speed, "speed of the true wind", "speed / m s$^{-1}$", extend="max",
+           norm=Normalize(0, scale.limit), cmap="viridis")  # fmt: skip
+    for axis in axes[0, 2:]:
+        axis.set_axis_off()
+    _retrieved_into(axes[1], found, "extinction", cores, scale)
     return figure, (
         "Above: the true cross-flow wind and its speed. Below: winds retrieved from the "
         "extinction pair. Grey vectors are flagged; red crosses mark the true cores."
     )
 
 
-def _retrieved_into(axes, found, source, cores):
-    for axis, method in zip(axes, ("cc", "ws")):
-        if method not in found["algorithm"]:
-            axis.set_axis_off()
-            continue
+def _retrieved_into(axes, found, source, cores, scale):
+    methods = [str(method) for method in found["algorithm"].values]
+    for axis in axes[len(methods) :]:
+        axis.set_axis_off()
+    for axis, method in zip(axes, methods):
         wind = found.sel(source=source, algorithm=method)
-        _arrows(axis, wind, cores, f"{METHOD_NAMES[method]}, {source}", _step(wind))
+        _arrows(axis, wind, cores, f"{METHOD_NAMES[method]}, {source}", scale)
 
 
-def _retrieved(found, source, cores):
-    figure, axes = _sheet(1, 2)
-    _retrieved_into(axes[0], found, source, cores)
+def _retrieved(found, source, cores, scale):
+    figure, axes = _sheet(1, max(2, found.sizes["algorithm"]))
+    _retrieved_into(axes[0], found, source, cores, scale)
     return figure, (
         f"Winds retrieved from the {source} pair, unfiltered: grey vectors are flagged, red "
         "crosses mark the true cores."
@@ -189,37 +207,49 @@ def _deviation_maps(found, source, reference):
             _truth_vectors(wind) if reference is None
             else found.sel(source=reference, algorithm=method)
         )  # fmt: skip
-        error = deviations(wind, other)
-        _image(row[0], error["speed"], f"{METHOD_NAMES[method]}: speed", "m s$^{-1}$",
-               norm=TwoSlopeNorm(0, -5, 5), cmap="RdBu_r")  # fmt: skip
-        _image(row[1], error["direction"], f"{METHOD_NAMES[method]}: direction", "rad",
+        # a vector that its own flags call wrong says nothing of the method
+        error = deviations(wind, other).where((wind["flag"] == 0) & (other["flag"] == 0))
+        limit = _upper(abs(error["speed"]), 0.99) or 1.0
+        for axis in row:
+            axis.set_facecolor("0.7")
+        _image(row[0], error["speed"], f"{METHOD_NAMES[method]}: speed", "speed / m s$^{-1}$",
+               extend="both", norm=TwoSlopeNorm(0, -limit, limit), cmap="RdBu_r")  # fmt: skip
+        _image(row[1], error["direction"], f"{METHOD_NAMES[method]}: direction", "direction / rad",
                norm=TwoSlopeNorm(0, -np.pi, np.pi), cmap="twilight_shifted")  # fmt: skip
     against = "the true wind" if reference is None else f"winds from {reference}"
     return figure, (
         f"Deviations of winds from {source} against {against}: speed (left) and direction "
-        "(right). All vectors with a displacement, flagged or not; colours saturate at 5 m/s."
+        "(right). Grey: flagged, or no displacement."
     )
+
+
+def _upper(field: xr.DataArray, share: float) -> float:
+    """The value that this share of a field's finite values does not exceed; 0 if there is none."""
+    values = field.values[np.isfinite(field.values)]
+    return float(np.quantile(values, share)) if values.size else 0.0
 
 
 def _backscatter(scans):
     figure, axes = _sheet(1, 2)
-    norm = Normalize(0, max(float(s["Y"].max()) for s in scans) * 1e6)
+    # single bright pixels must not darken all others
+    norm = Normalize(0, max(_upper(s["Y"], 0.999) for s in scans) * 1e6)
     for k, scan in enumerate(scans):
-        _image(axes[0, k], scan["Y"] * 1e6, f"$t_{k + 1}$",
-               "apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$", norm=norm, cmap="cividis")  # fmt: skip
+        _image(axes[0, k], scan["Y"] * 1e6, f"$t_{k + 1}$", extend="max",
+               label="apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$", norm=norm, cmap="cividis")  # fmt: skip
     return figure, (
         "Rendered backscatter, normalised for range, gate length and the environment's "
         "transmittance."
     )
 
 
-def _detected(scans, found, cores):
+def _detected(scans, found, cores, scale):
     figure, axes = _sheet(1, 2)
-    _image(axes[0, 0], scans[0]["Y_noisy"] * 1e6, "$t_1$ with the detector's noise",
-           "apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$", cmap="cividis")  # fmt: skip
+    noisy = scans[0]["Y_noisy"] * 1e6
+    _image(axes[0, 0], noisy, "$t_1$ with the detector's noise", extend="both", cmap="cividis",
+           label="apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$", norm=_span(noisy))  # fmt: skip
     wind = found.sel(source="backscatter_noisy").isel(algorithm=0)
     name = METHOD_NAMES[str(wind["algorithm"].values)]
-    _arrows(axes[0, 1], wind, cores, f"{name}, with noise", _step(wind))
+    _arrows(axes[0, 1], wind, cores, f"{name}, with noise", scale)
     return figure, (
         "The backscatter picture with photon, sky, dark and speckle noise of one pulse a beam, and "
         "the wind found in two of them."
@@ -230,11 +260,11 @@ def _product(scan, name, label, caption):
     """What a scan tells of its first gate, and how well it knows it."""
     figure, axes = _sheet(1, 2)
     first = scan.isel(gate=0)
-    _image(axes[0, 0], first[name], "$t_1$", label, norm=_span(first[name]), cmap="cividis")
+    _image(axes[0, 0], first[name], "$t_1$", label, "both", norm=_span(first[name]), cmap="cividis")
     stderr = first[f"{name}_stderr"]
     bound = scan.attrs[f"{name}_stderr_is_bound"]
     kind = "upper bound of the standard error" if bound else "standard error"
-    _image(axes[0, 1], stderr, kind, label, norm=_span(stderr), cmap="cividis")
+    _image(axes[0, 1], stderr, kind, label, "both", norm=_span(stderr), cmap="cividis")
     return figure, (
         f"{caption} Right: {kind} of each pixel, from the simulation's photons. Colours span the "
         "middle 99 % of the pixels."
@@ -282,22 +312,23 @@ def _error_by_texture(found, sweep):
                            ("extinction_without_texture", "^")):  # fmt: skip
         for method in found["algorithm"].values:
             wind = found.sel(source=source, algorithm=method)
-            groups = error_by_texture(wind, _truth_vectors(wind))
+            groups = error_by_quality(wind, _truth_vectors(wind), "isotropy")
             right.plot(
-                groups["texture"], groups["rmse"], marker=marker, ms=5,
+                groups["isotropy"], groups["rmse"], marker=marker, ms=5,
                 ls="-" if method == "cc" else ":",
                 label=f"{method} from {source.replace('_', ' ')}",
             )  # fmt: skip
     right.set(
-        xlabel="local texture: weakest rms slope in a window, relative, per pixel",
-        ylabel="rms error of v and w / m s$^{-1}$", xscale="log", yscale="log",
-        title="all vectors, in groups by their local texture",
+        xlabel="isotropy: weakest over strongest rms slope in a window",
+        ylabel="rms error of v and w / m s$^{-1}$", yscale="log",
+        title="all vectors, in groups by their local isotropy",
     )  # fmt: skip
     for axes in (left, right):
         axes.legend(fontsize=8)
         axes.grid(alpha=0.3, which="both")
     return figure, (
         "Winds can only be as good as the structure that moves with them. Left: the extinction "
-        "pair with more and less sub-grid texture. Right: this run's vectors, grouped by what "
-        "their windows have to hold on to. A smooth image cannot tell (aperture problem)."
+        "pair with more and less sub-grid texture. Right: this run's vectors, grouped by whether "
+        "their windows have structure in both directions; along a mere edge nothing can be told "
+        "(aperture problem)."
     )

@@ -10,8 +10,7 @@ import xarray as xr
 from scipy.interpolate import CubicSpline
 
 from lidar_mi.errors import InputError
-
-_UNITS = pint.get_application_registry()
+from lidar_mi.units import UNITS
 
 _DIMENSIONS = ("time", "x", "y", "z")
 _VARIABLES = {
@@ -45,7 +44,7 @@ def parse_units(text: str) -> pint.Quantity:
     products = re.sub(r"(?<=[^\W_])\.(?=[^\W\d_])", "*", text)
     powers = re.sub(r"(?<![\w.])([^\W\d_]+)\^?(-?\d+)(?!\w)", r"\1**\2", products)
     try:
-        return 1.0 * _UNITS.parse_expression(powers or "1") * _UNITS.dimensionless
+        return 1.0 * UNITS.parse_expression(powers or "1") * UNITS.dimensionless
     except Exception as error:  # pint lets its tokenizer's own exceptions through
         raise ValueError(f"{text!r} is not a unit") from error
 
@@ -157,8 +156,8 @@ def _axis(data, name, ours, path):
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         raise InputError(
-            f"{path}: axis {name!r} has {bad.size} values that are not finite, the first at "
-            f"index {bad[0]}; allowed: finite numbers"
+            f"{path}: axis {name!r} is not finite at {bad.size} of {values.size} places, the first "
+            f"at index {bad[0]}; allowed: finite numbers"
         )
     if values.size == 1:
         return values, False
@@ -186,16 +185,20 @@ def _plane_index(axis, x, path, name):
     return int(np.argmin(np.abs(axis - x)))
 
 
-def _check_finite(values, axes, name, path):
-    bad = ~np.isfinite(values)
-    count = int(bad.sum())
-    if count:
-        first = np.unravel_index(int(bad.argmax()), bad.shape)
-        place = ", ".join(f"{d} = {axes[d][i]:g} m" for d, i in zip("xyz", first))
-        raise InputError(
-            f"{path}: variable {name!r} has {count} values that are not finite, the first at "
-            f"{place}; allowed: none"
-        )
+def _check_values(values, axes, name, path, may_be_negative):
+    """Every value finite and, unless it may, not negative."""
+    for fault, bad in (
+        ("not finite", ~np.isfinite(values)),
+        ("negative", (values < 0) & (not may_be_negative)),
+    ):
+        count = int(bad.sum())
+        if count:
+            first = np.unravel_index(int(bad.argmax()), bad.shape)
+            place = ", ".join(f"{d} = {axes[d][i]:g} m" for d, i in zip("xyz", first))
+            raise InputError(
+                f"{path}: variable {name!r} is {fault} at {count} of {values.size} places, the "
+                f"first at {place}; allowed: nowhere"
+            )
 
 
 def read_wake(
@@ -236,7 +239,7 @@ def read_wake(
     ------
     InputError
         Naming file and variable: unreadable, missing, wrong dims or units, values that are not
-        finite, axes that are not uniform, a time or plane that is not there.
+        finite, a tracer or aerosol that is asked for and negative somewhere, axes that are not uniform, a time or plane that is not there.
     """
     path = Path(path)
     table = _file_names(names, path)
@@ -316,7 +319,8 @@ def _read(data, table, asked, time, x, path):
             )
         variable = variable.transpose(*(table[d] for d in "xyz" if table[d] in variable.dims))
         values = variable.values.astype(float).reshape([axes[d].size for d in "xyz"]) * scale
-        _check_finite(values, axes, table[name], path)
+        amount = name in asked and name in ("tracer", "aerosol")
+        _check_values(values, axes, table[name], path, may_be_negative=not amount)
         wake[name] = ("x", "y", "z"), values, {"units": unit, "long_name": long_name}
     if seconds is not None:
         wake = wake.assign_coords(time=((), seconds, {"units": "s"}))

@@ -30,7 +30,9 @@ class Scan(BaseModel):
     )
 
     aim: Literal["grid", "angles"] = "grid"
-    range: Length = Field(500.0, gt=0, description="distance of the first gate's start at t1")
+    range: Length = Field(
+        500.0, gt=0, le=100_000, description="distance of the first gate's start at t1"
+    )
     thickness: Length = Field(2.5, gt=0, description="depth of all gates together")
     gates: Literal["planar", "spherical"] = "planar"
     gate_count: int = Field(1, ge=1, le=10_000)

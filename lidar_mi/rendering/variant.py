@@ -22,7 +22,11 @@ def use_variant(name: str) -> None:
     try:
         mi.set_variant(name)
     except ImportError as error:
-        raise InputError(f"variant: {name} cannot run here ({_first_line(error)})") from None
+        if name.startswith("cuda"):
+            reason = "no NVIDIA GPU with a driver that is new enough; expected an llvm_ad_* variant"
+        else:
+            reason = _first_line(error)
+        raise InputError(f"variant: {name} cannot run here: {reason}") from None
     # Mitsuba's hint that a monochrome film is monochrome is of no use to anyone here
     mi.set_log_level(mi.LogLevel.Error)
 

@@ -11,7 +11,7 @@ from lidar_mi.assessment.cores import Core
 from lidar_mi.assessment.errors import (
     deviations,
     direction,
-    error_by_texture,
+    error_by_quality,
     truth_at_vectors,
     wind_metrics,
 )
@@ -158,23 +158,23 @@ def test_without_valid_vectors_keys_are_absent_not_nan():
     json.dumps(metrics, allow_nan=False)
 
 
-def test_error_by_texture_groups():
+def test_error_by_quality_groups():
     """The error is the texture itself: every group's rmse follows from its 100 members."""
     rng = np.random.default_rng(2)
     texture = rng.permutation(np.arange(1, 1201)) / 1000
     flag = (texture <= 0.25).astype(np.uint8)
     wind = winds(texture, -texture, flag=flag, texture=texture)
-    groups = error_by_texture(wind, winds(0 * texture, 0 * texture), bins=12)
+    groups = error_by_quality(wind, winds(0 * texture, 0 * texture), "texture", bins=12)
     members = (np.arange(1, 1201) / 1000).reshape(12, 100)
     np.testing.assert_allclose(groups["rmse"], np.sqrt((members**2).mean(1)))
     np.testing.assert_allclose(groups["texture"], np.median(members, 1))
     np.testing.assert_allclose(groups["valid"], [0, 0, 0.5] + 9 * [1])
 
 
-def test_error_by_texture_leaves_out_what_is_unknown():
+def test_error_by_quality_leaves_out_what_is_unknown():
     wind = winds([1.0, np.nan, 3.0], [1.0, 2.0, 3.0], texture=[0.1, 0.2, np.nan])
-    groups = error_by_texture(wind, winds(np.zeros(3), np.zeros(3)))
+    groups = error_by_quality(wind, winds(np.zeros(3), np.zeros(3)), "texture")
     assert groups.sizes["group"] == 1
     assert groups["rmse"].item() == 1 and groups["texture"].item() == 0.1
     none = winds([np.nan], [np.nan])
-    assert error_by_texture(none, none).sizes["group"] == 0
+    assert error_by_quality(none, none, "texture").sizes["group"] == 0

@@ -189,12 +189,24 @@ def test_values_that_are_not_finite(write):
     data.v[1, 2, 3, 4] = np.nan
     data.v[1, 2, 4, 0] = np.inf
     fails(
-        write(data), "'v'", "2 values", "x = 2.5 m, y = 0.5 m, z = 8 m", "allowed: none", time=1.1
+        write(data), "'v'", "not finite at 2 of 90 places", "x = 2.5 m, y = 0.5 m, z = 8 m", time=1.1
     )
     np.testing.assert_allclose(read_wake(write(data), time=1.0).v, expected(1.0), rtol=1e-12)
     data = example()
     data["y"] = ("y", np.where(Y == 0.5, np.nan, Y), {"units": "m"})
     fails(write(data), "'y'", "index 3", time=1.0)
+
+
+def test_a_negative_tracer_is_named_where_it_is_asked_for(write):
+    data = example()
+    data = data.rename(tracer="smoke")
+    data.smoke[0, 2, 3, 4] = -0.25
+    names = {"tracer": "smoke"}
+    place = "x = 2.5 m, y = 0.5 m, z = 8 m"
+    fails(write(data), "'smoke' is negative at 1 of 90 places", place, time=1.0, names=names)
+    # not used, hence no fault; velocities may be what they like
+    assert "tracer" not in read_wake(write(data), time=1.0)
+    assert (read_wake(write(example()), time=1.0).w < 0).any()
 
 
 def test_uneven_axes(write):

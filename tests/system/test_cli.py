@@ -168,9 +168,11 @@ def test_run_folder_is_named_after_the_experiment(there, lidar_mi, quick):
 def test_info_on_a_run_folder(demo, lidar_mi):
     code, out, _ = lidar_mi("info", demo.folder)
     assert code == 0
-    for word in ("wake_backscatter", "mitsuba", "wind.nc", "image_t2.exr", "figures/fig08"):
+    for word in ("wake_backscatter", "mitsuba", "wind.nc", "image_t2.exr", "figures/fig08",
+                 "scan.range", "500.0 m", "scan.gate_count", "seed", "spheroids"):  # fmt: skip
         assert word in out
     assert f"{demo.metrics['backscatter.cc.rmse_v']:.2f}" in out
+    assert f"{demo.metrics['true_wind.rms_w']:.2f}" in out and "no skill" in out
 
 
 def test_info_on_a_picture_and_on_winds(demo, lidar_mi):
@@ -189,6 +191,10 @@ def test_info_on_a_run_that_was_stopped(there, lidar_mi, quick):
     (there / "run" / "metrics.json").unlink()
     code, out, _ = lidar_mi("info", "run")
     assert code == 0 and "unfinished" in out
+    with (there / "run" / "log.txt").open("a") as log:
+        log.write("2030-01-01 12:00:00 failed: no light; expected some\n")
+    _, out, _ = lidar_mi("info", "run")
+    assert "failed: no light; expected some" in out and "go on" not in out
 
 
 def test_info_on_named_scatterers(lidar_mi):
@@ -347,6 +353,8 @@ def bad(*arguments, says):
         bad("run", "tiny.yaml", "--set", "no_equals", says=["no_equals", "KEY=VALUE"]),
         bad("run", "tiny.yaml", "--set", "retrieval.search=60", says=["search", "60 px", "41 x 61"]),
         bad("run", "tiny.yaml", "-m", "llvm_mono", says=["render.variant", "llvm_mono", "llvm_ad"]),
+        bad("run", "slab.xml", says=["slab.xml", "scene", "lidar-mi render slab.xml"]),
+        bad("run", "tiny.yaml", "--set", "scan.range=1e9", says=["scan.range", "100000"]),
         bad("run", "none.yaml", says=["none.yaml", "no such file", "wake_backscatter"]),
         bad("run", "text.exr", says=["text.exr", "holds no keys"]),
         bad("run", "wake.yaml", says=["text.nc", "not NetCDF"]),

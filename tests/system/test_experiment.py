@@ -177,6 +177,7 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
                  for q in ("y", "z", "radius", "circulation")}  # fmt: skip
     expected |= {f"texture_sweep.{level}_percent.{q}" for level in (0, 2, 5, 10, 20, 40)
                  for q in ("rmse_v", "rmse_w", "valid_fraction")}  # fmt: skip
+    expected |= {f"true_wind.{part}rms_{q}" for part in ("", "outside_cores.") for q in "vw"}
     expected |= {f"timing.{step}_s" for step in ("truth", "render", "retrieve", "figures")}
     assert set(metrics) == expected
 
@@ -221,6 +222,7 @@ def test_pictures_say_what_they_show(demo):
         start = 500.0 - 15.0 * index
         assert (scan.attrs["gate_start"], scan.attrs["gate_stop"]) == (start, start + 2.5)
         assert scan.attrs["wavelength"] == pytest.approx(532e-9)
+        assert (scan.attrs["platform_speed"], scan.attrs["dt"]) == (150.0, pytest.approx(0.1))
         assert scan.attrs["seed"] == 1 + index * 2**16  # scans must not share their photons
         assert scan.attrs["samples_per_beam"] == 64
         assert scan.sizes == {"gate": 1, "z": 139, "y": 219}
@@ -313,7 +315,11 @@ def test_report_tells_the_numbers(demo):
     words = " ".join(Links((demo.folder / "report.html").read_text()).words)
     assert "wake_backscatter" in words and "seed: 1" in words
     assert f"{demo.metrics['backscatter.cc.rmse_v']:.3g}" in words
-    assert f"backscatter.cc.rmse_v: {demo.metrics['backscatter.cc.rmse_v']}" in words
+    assert f"backscatter.cc.rmse_v: {demo.metrics['backscatter.cc.rmse_v']:.4g} m/s" in words
+    assert f"wake.port_core.circulation: {demo.metrics['wake.port_core.circulation']:.4g} m^2/s" in words
+    assert f"{demo.metrics['true_wind.rms_v']:.3g}" in words and "no skill" in words
+    noise = f"simulation {demo.metrics['backscatter.mc_relative_error']:.2%} (64 photons a beam)"
+    assert noise in words and "no detector" in words
     assert "cross-correlation" in words and "weight shift" in words
 
 
@@ -842,6 +848,22 @@ def test_another_experiment_is_kept_out(tmp_path, quick):
     assert yaml.safe_load((folder / "experiment.yaml").read_text())["experiment"]["seed"] == 2
 
 
+def test_pictures_of_another_version_are_kept_out(tmp_path, quick):
+    folder = tmp_path / "run"
+    run(check(small()), folder)
+    record = yaml.safe_load((folder / "experiment.yaml").read_text())
+    record["versions"]["mitsuba"] = "3.5.0"
+    (folder / "experiment.yaml").write_text(yaml.safe_dump(record))
+    stamps = pictures_of(folder)
+    with pytest.raises(InputError, match="a run of mitsuba 3.5.0, this is 3.*; expected"):
+        run(check(small()), folder)
+    assert pictures_of(folder) == stamps
+    run(check(small()), folder, overwrite=True)
+    assert pictures_of(folder) != stamps
+    record["versions"]["numpy"] = "1.0"  # which makes no pictures
+    run(check(small()), folder)
+
+
 def test_a_changed_wake_file_is_another_experiment(tmp_path, quick):
     """Same name, other content: the old pictures must not be taken for it."""
     data = small()
@@ -944,9 +966,54 @@ def test_the_seed_decides(tmp_path, quick):
     assert runs["one"][0] != runs["other"][0]
 
 
+def test_a_run_that_fails_says_so_in_its_log(tmp_path, quick, monkeypatch):
+    """And one that is stopped does not; see `test_stopped_anywhere_it_goes_on`."""
+    folder = tmp_path / "run"
+
+    def broken(*_):
+        raise InputError("wind: 7 is not allowed;\nexpected 8")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(experiment, "winds", broken)
+        with pytest.raises(InputError):
+            run(check(small()), folder)
+    assert run_folder.failure(folder) == "wind: 7 is not allowed; expected 8"
+    run(check(small()), folder)
+    assert run_folder.failure(folder) is None
+
+
+def test_beams_wider_than_a_template_are_told_of(tmp_path, quick):
+    """At 5 km the paper's beam is 10 m wide, a template 4 m: nothing is left to follow, and the
+    report says so."""
+    told = []
+    data = small() | {"scan": {"range": "5 km"}}
+    metrics = run(check(data), tmp_path / "run", notice=lambda text, _: told.append(text))
+    warnings = [text for text in told if text.startswith("warning: ")]
+    assert len(warnings) == 2
+    assert "beams are 10 m wide at 5001" in warnings[0] and "template of 4 m" in warnings[0]
+    assert "backscatter, cc: no vector is valid; " in warnings[1] and "flag low_" in warnings[1]
+    assert metrics["backscatter.cc.valid_fraction"] == 0
+    page = (tmp_path / "run" / "report.html").read_text()
+    log = (tmp_path / "run" / "log.txt").read_text()
+    for text in warnings:
+        assert text.removeprefix("warning: ") in page and text in log
+
+
+def test_true_wind_is_as_strong_as_it_is(tmp_path, quick):
+    """A uniform wind of 10 and 5 m/s: an error of as much is no skill."""
+    data = small()
+    data["wake"] = {"file": write_wake(tmp_path / "w.nc", blob(8, -4)), "texture": {"rms": 0}}
+    metrics = run(check(data), tmp_path / "run", tmp_path)
+    assert metrics["true_wind.rms_v"] == pytest.approx(10)
+    assert metrics["true_wind.rms_w"] == pytest.approx(5)
+    assert "true_wind.outside_cores.rms_v" not in metrics
+
+
 @pytest.mark.parametrize(
     "change, words",
     [
+        ({"lidar": {"divergence_full": "0.4 rad"}, "scan": {"range": "50 km"}}, "scan.range: 500"),
+        ({"lidar": {"pulse_duration": "10 ns"}, "detector": {"line_width": "1 MHz"}}, "line_width"),
         ({"scattering": {"phase": "table", "table": "no.txt"}}, "scattering.table: .*no.txt"),
         ({"retrieval": {"template": 30, "search": 60}}, "search: 60 px"),
         ({"scattering": {"albedo": 0}}, "albedo"),
