@@ -12,6 +12,7 @@ from lidar_mi.retrieval.correlation import cross_correlation
 from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.multipass import multipass
 from lidar_mi.retrieval.quality import Flag, Texture, low_texture, median_outliers
+from lidar_mi.retrieval.variational import variational
 from lidar_mi.retrieval.weight_shift import weight_shift
 from lidar_mi.retrieval.windows import Windows
 
@@ -30,12 +31,16 @@ class Method:
         Keywords of `retrieve_wind` it takes, `min_correlation` and `noise` among them.
     centred : bool
         Vectors belong to the windows' centres, not half their displacement further on.
+    local : bool
+        A vector knows its window only: without texture there, or contradicted by its neighbours,
+        it is flagged. A field that is fitted as a whole says itself how certain it is where.
     """
 
     find: Callable[..., Displacement]
     score: tuple[str, str]
     options: tuple[str, ...] = ()
     centred: bool = False
+    local: bool = True
 
 
 METHODS: Mapping[str, Method] = {
@@ -50,6 +55,13 @@ METHODS: Mapping[str, Method] = {
         ("correlation", "normalised cross-correlation of the deformed windows"),
         ("min_correlation", "noise"),
         centred=True,
+    ),
+    "variational": Method(
+        variational,
+        ("correlation", "normalised cross-correlation of the images carried to mid-time"),
+        ("min_correlation", "noise"),
+        centred=True,
+        local=False,
     ),
 }
 """Methods by name."""
@@ -84,8 +96,9 @@ def retrieve_wind(
         the spacings may differ between z and y.
     dt : float
         Time from image 1 to image 2, s.
-    method : {"cc", "ws", "multipass"}
-        Cross-correlation, weight shift or multi-pass correlation, see `METHODS`.
+    method : {"cc", "ws", "multipass", "variational"}
+        Cross-correlation, weight shift, multi-pass correlation or a smooth flow fitted to the
+        images as a whole, see `METHODS`.
     template, search, stride : int
         Pixels: template n >= 2, search region >= n + 2, step from window to window >= 1. Winds
         beyond ((search - template) // 2 - 1/2) spacing / dt cannot be seen (17.5 m/s for 8 in 16
@@ -101,7 +114,7 @@ def retrieve_wind(
     noise : float or xr.DataArray, optional
         Standard deviation of image 1's noise, in its unit; a template with less structure than
         noise is flagged as without texture. Left out, no noise is assumed for that, and methods
-        that weight by it ("multipass") estimate it from the images.
+        that weight by it ("multipass", "variational") estimate it from the images.
     median_size, median_threshold, median_epsilon
         Normalised median test, see `quality.median_outliers`. Neighbours are taken half a
         template apart (or a stride, if that is more): closer ones share their pixels.
@@ -145,9 +158,9 @@ def retrieve_wind(
     outlier = median_outliers(
         found.dz, found.dy, median_size, spacing, median_threshold, median_epsilon
     )
-    flag = found.flag | (
-        Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier
-    ).to(torch.uint8)
+    flag = found.flag
+    if chosen.local:
+        flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.uint8)
     attributes = {
         "method": method,
         "template": template,

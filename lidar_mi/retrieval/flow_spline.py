@@ -1,0 +1,237 @@
+"""A flow as cubic B-splines: values anywhere, quadratic forms in its coefficients, their inverse.
+
+The coefficients (component, knot along z, knot along y) couple only where the knots are at most
+three apart. With the knots along y in threes the matrix of a quadratic form is block tridiagonal.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch.nn.functional import pad
+
+from lidar_mi.retrieval.block_tridiagonal import Factor, factor
+
+_REACH = 3
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Cubic B-splines along one direction, from pixel 0 to size - 1.
+
+    Attributes
+    ----------
+    size : int
+        Pixels.
+    spacing : float
+        Between knots, px; stretched so that knots are at both ends.
+    """
+
+    size: int
+    spacing: float
+
+    @property
+    def cells(self) -> int:
+        return max(1, math.floor((self.size - 1) / self.spacing))
+
+    @property
+    def knots(self) -> int:
+        return self.cells + _REACH
+
+    def basis(self, place: torch.Tensor, order: int = 0) -> torch.Tensor:
+        """Matrix (place, knot) of the splines' derivatives of this order, 0 to 3, at places (px)."""
+        width = (self.size - 1) / self.cells
+        scaled = place / width
+        cell = scaled.floor().clamp(0, self.cells - 1)
+        pieces = _pieces(scaled - cell, order) / width**order
+        matrix = pieces.new_zeros(len(place), self.knots)
+        columns = cell.long()[:, None] + torch.arange(4, device=place.device)
+        return matrix.scatter_(1, columns, pieces)
+
+
+def _pieces(t: torch.Tensor, order: int) -> torch.Tensor:
+    """The four cubic B-splines over a cell at the fraction t, or their derivatives; (..., 4)."""
+    coefficients = torch.tensor(
+        [[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]], dtype=t.dtype, device=t.device
+    ) / 6  # fmt: skip
+    for _ in range(order):
+        coefficients = coefficients[:, 1:] * torch.arange(
+            1, coefficients.shape[1], dtype=t.dtype, device=t.device
+        )
+    powers = torch.stack([t**k for k in range(coefficients.shape[1])], -1)
+    return powers @ coefficients.T
+
+
+class Mesh:
+    """The splines of both directions, and their products, at the nodes of a rectangular mesh.
+
+    Parameters
+    ----------
+    axes : (Axis, Axis)
+        z, y.
+    places : (torch.Tensor, torch.Tensor)
+        Rows and columns, px.
+    """
+
+    def __init__(self, axes: tuple[Axis, Axis], places: tuple[torch.Tensor, torch.Tensor]):
+        self.axes, self.places = axes, places
+        self.shape = tuple(len(place) for place in places)
+        self._bases = {}
+        self._products = {}
+
+    def basis(self, axis: int, order: int = 0) -> torch.Tensor:
+        """(place, knot)"""
+        if (axis, order) not in self._bases:
+            self._bases[axis, order] = self.axes[axis].basis(self.places[axis], order)
+        return self._bases[axis, order]
+
+    def products(self, axis: int, first: int, second: int) -> torch.Tensor:
+        """(shift, knot, place): the derivative `first` at a knot times `second` at knot + shift.
+
+        Shifts from -3 to 3; zero where there is no such knot.
+        """
+        key = axis, first, second
+        if key not in self._products:
+            one, two = self.basis(axis, first).T, self.basis(axis, second).T
+            padded = pad(two, (0, 0, _REACH, _REACH))
+            self._products[key] = torch.stack(
+                [one * padded[shift : shift + len(one)] for shift in range(2 * _REACH + 1)]
+            )
+        return self._products[key]
+
+
+@dataclass(frozen=True)
+class FlowSpline:
+    """A flow of two components, z and y, over the pixels of an image.
+
+    A quadratic form is held as its band: (component, component, shift z, knot z, shift y, knot y),
+    the coefficient at a knot against that at knot + shift, shifts from -3 to 3 in z and from 0 to
+    3 in y.
+    """
+
+    z: Axis
+    y: Axis
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        return 2, self.z.knots, self.y.knots
+
+    def mesh(self, z: torch.Tensor, y: torch.Tensor) -> Mesh:
+        return Mesh((self.z, self.y), (z, y))
+
+    def field(
+        self, coefficients: torch.Tensor, mesh: Mesh, order: tuple[int, int] = (0, 0)
+    ) -> torch.Tensor:
+        """Derivative of these orders (z, y) of every component, (2, *mesh.shape)."""
+        return mesh.basis(0, order[0]) @ coefficients @ mesh.basis(1, order[1]).T
+
+    def pulled(self, slope: torch.Tensor, mesh: Mesh) -> torch.Tensor:
+        """The coefficients' derivative (2, knots) of sum(slope * field) over the mesh."""
+        return mesh.basis(0).T @ slope @ mesh.basis(1)
+
+    def form(
+        self,
+        weight: torch.Tensor,
+        mesh: Mesh,
+        first: tuple[int, int] = (0, 0),
+        second: tuple[int, int] = (0, 0),
+    ) -> torch.Tensor:
+        """Band (..., shift z, knot z, shift y, knot y) of sum(weight * D1 f * D2 f) over the mesh.
+
+        weight has shape (..., *mesh.shape); D1 and D2 are derivatives of these orders in z and y.
+        """
+        along_z = mesh.products(0, first[0], second[0])
+        along_y = mesh.products(1, first[1], second[1])[_REACH:]
+        found = along_z.flatten(0, 1) @ weight @ along_y.flatten(0, 1).T
+        return found.unflatten(-1, along_y.shape[:2]).unflatten(-3, along_z.shape[:2])
+
+    def spread(
+        self,
+        band: torch.Tensor,
+        mesh: Mesh,
+        first: tuple[int, int] = (0, 0),
+        second: tuple[int, int] = (0, 0),
+    ) -> torch.Tensor:
+        """Covariance (..., *mesh.shape) of two derivatives of components, from `covariance`'s band."""
+        along = [mesh.products(axis, first[axis], second[axis]).flatten(0, 1) for axis in (0, 1)]
+        return along[0].T @ band.flatten(-4, -3).flatten(-2, -1) @ along[1]
+
+    # --- the band as a block tridiagonal matrix: columns (knot y, component, knot z)
+
+    @property
+    def _blocks(self) -> int:
+        return -(-self.y.knots // _REACH)
+
+    def factor(self, band: torch.Tensor) -> Factor:
+        """Factor of the matrix of a quadratic form, band of shape (2, 2, 7, Z, 4, Y)."""
+        knots, columns = self.z.knots, self._blocks * _REACH
+        n = 2 * knots
+        # (y, shift y, component, z, component, z)
+        full = band.new_zeros(columns, 4, 2, knots, 2, knots + 2 * _REACH)
+        at = torch.arange(knots, device=band.device)
+        for shift in range(2 * _REACH + 1):
+            full[: self.y.knots, :, :, at, :, at + shift] = band[:, :, shift].permute(2, 4, 3, 0, 1)
+        full = full[..., _REACH:-_REACH].reshape(columns, 4, n, n)
+        # knots that only fill up the last block
+        full[self.y.knots :, 0] = torch.eye(n, dtype=band.dtype, device=band.device)
+        full = full.unflatten(0, (self._blocks, _REACH))
+        diagonal = full.new_zeros(self._blocks, _REACH, n, _REACH, n)
+        below = full.new_zeros(self._blocks - 1, _REACH, n, _REACH, n)
+        for p in range(_REACH):
+            for q in range(_REACH):
+                if q >= p:
+                    diagonal[:, p, :, q] = full[:, p, q - p]
+                    below[:, p, :, q] = full[:-1, q, _REACH + p - q].mT
+                else:
+                    diagonal[:, p, :, q] = full[:, q, p - q].mT
+        side = _REACH * n
+        return factor(
+            diagonal.reshape(-1, side, side), below.reshape(-1, side, side)
+        )
+
+    def solve(self, root: Factor, right: torch.Tensor) -> torch.Tensor:
+        """Coefficients that solve the system, from the right hand side (2, Z, Y)."""
+        flat = right.permute(2, 0, 1).reshape(self.y.knots, -1)
+        flat = pad(flat, (0, 0, 0, self._blocks * _REACH - self.y.knots))
+        found = root.solve(flat.reshape(self._blocks, -1, 1))
+        return found.reshape(-1, 2, self.z.knots)[: self.y.knots].permute(1, 2, 0)
+
+    def covariance(self, root: Factor) -> torch.Tensor:
+        """The inverse within the band, all shifts: (2, 2, 7, Z, 7, Y)."""
+        diagonal, below = root.inverse()
+        knots, n = self.z.knots, 2 * self.z.knots
+        diagonal = diagonal.reshape(-1, _REACH, n, _REACH, n)
+        below = below.reshape(-1, _REACH, n, _REACH, n)
+        columns = self._blocks * _REACH
+        full = diagonal.new_zeros(columns, 2 * _REACH + 1, n, n).unflatten(
+            0, (self._blocks, _REACH)
+        )
+        for p in range(_REACH):
+            for q in range(_REACH):
+                full[:, p, _REACH + q - p] = diagonal[:, p, :, q]
+                if p <= q:
+                    # knot 3 (k + 1) + p against 3 k + q: 3 + p - q further
+                    full[:-1, q, 2 * _REACH + p - q] = below[:, p, :, q].mT
+                    full[1:, p, q - p] = below[:, p, :, q]
+        full = full.reshape(columns, 2 * _REACH + 1, 2, knots, 2, knots)[: self.y.knots]
+        padded = pad(full, (_REACH, _REACH))
+        at = torch.arange(knots, device=full.device)
+        band = [padded[:, :, :, at, :, at + shift] for shift in range(2 * _REACH + 1)]
+        # each (z, y, shift y, component, component)
+        return torch.stack(band).permute(4, 5, 0, 1, 3, 2)
+
+    def apply(self, band: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
+        """The form's matrix times coefficients (2, Z, Y)."""
+        reach = _REACH
+        padded = pad(coefficients, (reach,) * 4)
+        _, rows, columns = coefficients.shape
+        total = torch.zeros_like(padded)
+        here = slice(reach, reach + rows), slice(reach, reach + columns)
+        for i in range(2 * reach + 1):
+            for j in range(reach + 1):
+                there = slice(i, i + rows), slice(reach + j, reach + j + columns)
+                part = band[:, :, i, :, j]
+                total[:, *here] += (part * padded[None, :, *there]).sum(1)
+                if j:
+                    total[:, *there] += (part * coefficients[:, None]).sum(0)
+        return total[:, *here]
