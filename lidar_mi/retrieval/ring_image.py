@@ -1,0 +1,65 @@
+"""Which pictures may be analysed: finite ones that are not saturated."""
+
+import torch
+
+from lidar_mi.errors import InputError
+
+# A pixel's value that so many share, several times as many as share the next lower one, is the
+# end of the scale. Of a smooth crest, rounded to integers, the top value has at most 2.4 times as
+# many pixels as the one below it, for the area above a level grows with the root of the depth.
+PLATEAU = 1e-3
+EXCESS = 4.0
+
+
+def checked(images: torch.Tensor, saturation: float | None = None) -> torch.Tensor:
+    """The images as a batch (images, height, width) of floats.
+
+    Raises
+    ------
+    InputError
+        Other shapes, pictures below 16 px, NaN or infinity, saturated pixels.
+    """
+    images = torch.as_tensor(images)
+    if images.ndim not in (2, 3) or min(images.shape) < 1 or min(images.shape[-2:]) < 16:
+        raise InputError(
+            f"images: shape {tuple(images.shape)} is not allowed; expected (height, width) or "
+            "(images, height, width) of 16 px or more each way"
+        )
+    if images.ndim == 2:
+        images = images[None]
+    if not images.is_floating_point():
+        images = images.float()
+    for number, image in enumerate(images):
+        total = image.sum()
+        if not torch.isfinite(total) and not torch.isfinite(image).all():
+            share = int((~torch.isfinite(image)).sum())
+            raise InputError(
+                f"images[{number}]: {share} pixel(s) of NaN or infinity; expected finite values"
+            )
+        top = image.max()
+        if saturation is not None and top >= saturation:
+            share = int((image >= saturation).sum())
+            raise InputError(
+                f"images[{number}]: saturated, {share} pixel(s) at or above {saturation:g}; "
+                "expected all below"
+            )
+        full = image == top
+        count = int(full.sum())
+        if PLATEAU * image.numel() < count < image.numel():
+            below = int((image == image[~full].max()).sum())
+            if count > EXCESS * below:
+                raise InputError(
+                    f"images[{number}]: saturated, {count} pixels share the highest value "
+                    f"{float(top):g}; expected an exposure within the camera's range"
+                )
+    return images
+
+
+def inside(x: float, y: float, shape: tuple[int, int], name: str = "centre") -> None:
+    """Raise InputError unless (x, y) lies in a picture of (height, width)."""
+    height, width = shape
+    if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+        raise InputError(
+            f"{name}: ({x:.1f}, {y:.1f}) px is not allowed; expected inside the picture of "
+            f"{width} x {height} px"
+        )
