@@ -114,10 +114,12 @@ def define():
                 axial, passed, _ = self._mirror_on_axis(1.0)
                 self.reflectivity = float(abs(axial) ** 2)
                 if not abs(passed) > LEAST_PASSED:
-                    fail(NAME, "coating", f"transmittance {abs(passed):.1e}", f"above {LEAST_PASSED:g}")
+                    opaque = f"transmittance {abs(passed):.1e}"
+                    fail(NAME, "coating", opaque, f"above {LEAST_PASSED:g}")
                 shift = np.angle(axial) / np.pi
                 step = 1e-6
-                turn = np.angle(self._mirror_on_axis(1 + step)[0] / self._mirror_on_axis(1 - step)[0])
+                above, below = (self._mirror_on_axis(1 + h)[0] for h in (step, -step))
+                turn = np.angle(above / below)
                 delay = turn / (2 * step) * self.wavelength / (2 * np.pi * SPEED_OF_LIGHT)
             self.order = 2 * self.index * self.gap / self.wavelength
             if self.tuned:

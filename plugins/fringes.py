@@ -160,7 +160,8 @@ def define():
             *stokes, squares = sums
             # the photons' share of all energy; those drawn stand for a little more than is sent
             share = drawn / source.flux() * dr.opaque(mi.Float, 1 / total)
-            variance = dr.maximum(squares - dr.square(stokes[0]) * dr.opaque(mi.Float, 1 / total), 0)
+            mean = dr.square(stokes[0]) * dr.opaque(mi.Float, 1 / total)
+            variance = dr.maximum(squares - mean, 0)
             return [*(s * share for s in stokes), dr.sqrt(variance) * share]
 
         def _tell(self, done, total, values):

@@ -5,8 +5,9 @@ Plane waves from an extended source (``plane_waves``)
 -----------------------------------------------------
 
 Light from far away: plane waves from all directions of a cone, as an extended source or the end of
-a multimode fibre behind a collimator sends them. It lies around the scene like an environment. Traced forward, every plane wave has a random direction, frequency, polarisation and
-place on the stop of the :ref:`camera <sensor-ccd>`.
+a multimode fibre behind a collimator sends them. It lies around the scene like an environment.
+Traced forward, every plane wave has a random direction, frequency, polarisation and place on the
+stop of the :ref:`camera <sensor-ccd>`.
 
 ============================ ========== ==================================================== =======
 Parameter                    Type       Meaning                                              Default
@@ -139,6 +140,13 @@ def define():
             for row, stokes in enumerate(self.mean_stokes(direction)):
                 radiance[row, 0] = stokes * value
             return radiance
+
+        def sample_direction(self, it, sample, active=True):
+            """Nothing: other integrators find the source by following rays, see `pdf_direction`."""
+            return dr.zeros(mi.DirectionSample3f), mi.Spectrum(0)
+
+        def pdf_direction(self, it, ds, active=True):
+            return mi.Float(0)
 
         def bbox(self):
             return mi.ScalarBoundingBox3f()
