@@ -29,7 +29,7 @@ from .retrieval.images import resample_pair
 from .retrieval.wind import retrieve_wind
 from .retrieval.windows import Windows
 from .run_folder import IMAGES, Log, Notice, claim, write, write_netcdf
-from .truth import Truth, blur_by_beam, make_truth
+from .truth import Flows, Truth, blur_by_beam, make_truth, read_flows
 
 # what winds are retrieved from behind a detector, beside the noise-free picture
 NOISY = "backscatter_noisy"
@@ -69,7 +69,8 @@ def run(
     use_variant(experiment.render.variant)
     with _timed(timing, "truth"):
         notice("reading the wake", None)
-        truth = make_truth(experiment, beside)
+        flows = read_flows(experiment, beside)
+        truth = make_truth(experiment, beside, flows)
         plans = _plans(experiment, truth)
     notice("reading how the air scatters", None)
     air = scatterer(experiment.scattering, beside, experiment.lidar.wavelength)
@@ -79,14 +80,14 @@ def run(
     log = Log(folder / "log.txt", notice)
     log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")
     try:
-        return _run(experiment, folder, beside, truth, plans, air, fields, timing, log)
+        return _run(experiment, folder, flows, truth, plans, air, fields, timing, log)
     except Exception as error:
         if not is_interrupt(error):
             log.fail(error)
         raise
 
 
-def _run(experiment, folder, beside, truth, plans, air, fields, timing, log) -> dict[str, float]:
+def _run(experiment, folder, flows, truth, plans, air, fields, timing, log) -> dict[str, float]:
     """The run from the pictures on; everything before is checked."""
     _warn_of_wide_beams(experiment, truth, plans, log)
     scans = pictures(experiment, plans, fields, air, folder, log)
@@ -96,7 +97,7 @@ def _run(experiment, folder, beside, truth, plans, air, fields, timing, log) -> 
         cores = find_cores(truth.wind)
         found = winds(experiment, truth, plans, scans, log)
         write_netcdf(found, folder / "wind.nc")
-        sweep = texture_sweep(experiment, beside, log)
+        sweep = texture_sweep(experiment, flows, log)
     metrics = verdict(found, scans, cores) | true_wind(found, truth, cores) | sweep
     _warn_of_no_vectors(found, metrics, log)
     if experiment.detector:
@@ -272,7 +273,7 @@ def _windows(settings) -> dict:
     return settings.model_dump(exclude={"methods"})
 
 
-def texture_sweep(experiment: Experiment, beside, log) -> dict[str, float]:
+def texture_sweep(experiment: Experiment, flows: Flows, log) -> dict[str, float]:
     """How well CC does on extinction pairs of more and less sub-grid texture.
 
     Keys ``texture_sweep.10_percent.rmse_v`` and ``.rmse_w`` (m/s, every vector with a
@@ -284,7 +285,7 @@ def texture_sweep(experiment: Experiment, beside, log) -> dict[str, float]:
         log.bar(f"retrieving winds at {rms:.0%} texture", index / len(TEXTURE_SWEEP))
         texture = experiment.wake.texture.model_copy(update={"rms": rms})
         wake = experiment.wake.model_copy(update={"texture": texture})
-        truth = make_truth(experiment.model_copy(update={"wake": wake}), beside)
+        truth = make_truth(experiment.model_copy(update={"wake": wake}), flows=flows)
         wind = retrieve_wind(
             truth.image(0), truth.image(1), dt=experiment.platform.dt, method="cc",
             **_windows(settings),

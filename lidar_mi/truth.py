@@ -16,6 +16,8 @@ from .atmosphere.wake import centre, read_wake, resample
 from .config import Experiment
 from .errors import InputError
 
+Flows = tuple[xr.Dataset, xr.Dataset | None]
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -35,9 +37,18 @@ class Truth:
         return _slab_mean(field, self.wind.attrs["gates"])
 
 
-def make_truth(experiment: Experiment, beside: str | Path = ".") -> Truth:
-    """The flow and the extinction at both times, on the scan's grid, in the lidar's frame."""
-    first, second = _flows(experiment, beside)
+def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | None = None) -> Truth:
+    """The flow and the extinction at both times, on the scan's grid, in the lidar's frame.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    beside : path
+        Folder in which the wake's file is looked for first.
+    flows : optional
+        From `read_flows` of an experiment that differs in extinction and texture alone.
+    """
+    first, second = flows or read_flows(experiment, beside)
     mapping, dt = experiment.wake.extinction, experiment.platform.dt
     smooth1 = _extinction(first, mapping, first, second)
     if second is None:
@@ -72,7 +83,7 @@ def make_truth(experiment: Experiment, beside: str | Path = ".") -> Truth:
     return Truth((rough1, rough2), (smooth1, smooth2), wind)
 
 
-def _flows(experiment: Experiment, beside) -> tuple[xr.Dataset, xr.Dataset | None]:
+def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
     """The flow at t1 and, if it is a state of its own, at t2, centred and refined."""
     wake = experiment.wake
     gate_middle = experiment.scan.range + experiment.scan.thickness / 2
