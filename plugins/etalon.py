@@ -132,10 +132,11 @@ def define():
             passed = 1 - self.reflectivity
             if not passed - self.absorption > LEAST_PASSED:
                 fail(NAME, "absorption", self.absorption, f"less than 1 - reflectivity = {passed:g}")
-            self.free_spectral_range = 1 / (2 * self.index * self.gap / SPEED_OF_LIGHT + 2 * delay)
+            per_hertz = float(2 * self.index * self.gap / SPEED_OF_LIGHT + 2 * delay)
+            self.free_spectral_range = 1 / per_hertz
             self.m_fraction = dr.opaque(mi.Float, self.order - round(self.order))
             self.m_order = dr.opaque(mi.Float, self.order)
-            self.m_orders_per_hertz = dr.opaque(mi.Float, 1 / self.free_spectral_range)
+            self.m_orders_per_hertz = dr.opaque(mi.Float, per_hertz)
             self.m_reflectivity = dr.opaque(mi.Float, self.reflectivity)
             # amplitude that a mirror's absorption leaves of what it transmits, twice
             self.m_left = dr.opaque(mi.Float, 1 - self.absorption / passed)
