@@ -1,4 +1,4 @@
-"""The figures of a run: the paper's figures 5 to 11, and what texture does to the error.
+"""The figures of a run: an overview, the paper's figures 5 to 11, and what else a run tells.
 
 All of them show the slab as the pilot sees it: port (+y) on the left, up (+z) at the top.
 """
@@ -18,6 +18,9 @@ from .errors import deviations, error_by_quality
 METHOD_NAMES = {
     "cc": "cross-correlation", "ws": "weight shift", "multipass": "multi-pass correlation",
 }  # fmt: skip
+
+
+BACKSCATTER = "apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$"
 
 
 @dataclass(frozen=True)
@@ -62,6 +65,8 @@ def draw_all(
     folder.mkdir(exist_ok=True)
     scale = _scale(truth)
     plates = (
+        ("fig00_overview", "What the lidar sees, and the wind found in it",
+         _overview(scans, found, cores, scale)),
         ("fig05_extinction", "Extinction", _extinction(truth)),
         ("fig06_wind_from_extinction", "Wind: truth and from the extinction pair",
          _wind_and_truth(truth, found, cores, scale)),
@@ -131,7 +136,7 @@ def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale)
     y, z = (np.broadcast_to(thin[f"{a}_vector"], thin["v"].shape).ravel() for a in "yz")
     v, w, flag = (thin[name].values.ravel() for name in ("v", "w", "flag"))
     known = np.isfinite(v) & np.isfinite(w)
-    style = {"angles": "xy", "scale_units": "xy", "scale": scale.limit / (1.5 * step),
+    style = {"angles": "xy", "scale_units": "xy", "scale": scale.limit / (1.8 * step),
              "width": 0.0022}  # fmt: skip
     bad, good = known & (flag != 0), known & (flag == 0)
     if bad.any():
@@ -150,6 +155,20 @@ def _truth_vectors(wind: xr.Dataset) -> xr.Dataset:
     """True wind at the places of a retrieval's vectors, as a retrieval without flags."""
     true = wind[["v_true", "w_true", "y_vector", "z_vector"]].rename(v_true="v", w_true="w")
     return true.assign(flag=xr.zeros_like(wind["flag"]))
+
+
+def _overview(scans, found, cores, scale):
+    figure, axes = _sheet(1, 2)
+    first = scans[0]["Y"] * 1e6
+    _image(axes[0, 0], first, "backscatter, $t_1$", BACKSCATTER, "max",
+           norm=Normalize(0, _upper(first, 0.999)), cmap="cividis")  # fmt: skip
+    wind = found.sel(source="backscatter").isel(algorithm=0)
+    _arrows(axes[0, 1], wind, cores, "wind from two such pictures", scale)
+    return figure, (
+        "Left: the first backscatter picture. Right: the cross-flow wind found from it and the "
+        f"second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are flagged, "
+        "red crosses mark the true cores."
+    )
 
 
 def _extinction(truth):
@@ -235,7 +254,7 @@ def _backscatter(scans):
     norm = Normalize(0, max(_upper(s["Y"], 0.999) for s in scans) * 1e6)
     for k, scan in enumerate(scans):
         _image(axes[0, k], scan["Y"] * 1e6, f"$t_{k + 1}$", extend="max",
-               label="apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$", norm=norm, cmap="cividis")  # fmt: skip
+               label=BACKSCATTER, norm=norm, cmap="cividis")  # fmt: skip
     return figure, (
         "Rendered backscatter, normalised for range, gate length and the environment's "
         "transmittance."
@@ -246,7 +265,7 @@ def _detected(scans, found, cores, scale):
     figure, axes = _sheet(1, 2)
     noisy = scans[0]["Y_noisy"] * 1e6
     _image(axes[0, 0], noisy, "$t_1$ with the detector's noise", extend="both", cmap="cividis",
-           label="apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$", norm=_span(noisy))  # fmt: skip
+           label=BACKSCATTER, norm=_span(noisy))  # fmt: skip
     wind = found.sel(source="backscatter_noisy").isel(algorithm=0)
     name = METHOD_NAMES[str(wind["algorithm"].values)]
     _arrows(axes[0, 1], wind, cores, f"{name}, with noise", scale)
@@ -287,7 +306,7 @@ def _picture_differences(truth, scans):
         differences.append(scan["Y"] / scan["Y"].mean() - field / field.mean())
     limit = max(float(np.abs(d).quantile(0.999)) for d in differences)
     for k, difference in enumerate(differences):
-        _image(axes[0, k], difference, f"$t_{k + 1}$", "difference of relative values",
+        _image(axes[0, k], difference, f"$t_{k + 1}$", "difference of relative values", "both",
                norm=TwoSlopeNorm(0, -limit, limit), cmap="RdBu_r")  # fmt: skip
     return figure, (
         "Backscatter over its mean minus extinction over its mean: the beam's width rounds off "

@@ -25,6 +25,8 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import norm, qmc
 
 from lidar_mi import config, experiment, run_folder
+from lidar_mi import truth as truth_module
+from lidar_mi.atmosphere.wake import read_wake
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run
 from lidar_mi.instrument.lidar import BackscatterLidar
@@ -42,7 +44,7 @@ SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "ba
 SCENES = Path(str(files("lidar_mi.scenes")))
 
 FIGURES = {
-    "fig05_extinction", "fig06_wind_from_extinction", "fig07_deviation_from_truth",
+    "fig00_overview", "fig05_extinction", "fig06_wind_from_extinction", "fig07_deviation_from_truth",
     "fig08_backscatter", "fig09_backscatter_against_extinction", "fig10_wind_from_backscatter",
     "fig11_deviation_from_extinction_winds", "fig12_error_by_texture", "fig14_depolarization",
     "fig15_multiple_scattering",
@@ -145,6 +147,18 @@ def test_the_record_is_enough_to_repeat_the_run(demo):
     assert record["experiment"]["seed"] == 1
     assert {"lidar-mi", "python", "mitsuba", "drjit", "numpy", "torch"} <= set(record["versions"])
     assert len(record["files"]["wake.file"]) == 64  # SHA-256
+
+
+def test_the_wake_is_read_once(tmp_path, monkeypatch):
+    read = []
+    monkeypatch.setattr(
+        truth_module, "read_wake", lambda *a, **k: read.append(a) or read_wake(*a, **k)
+    )
+    monkeypatch.setattr(experiment.figures, "draw_all", lambda *_: [])
+    data = small()
+    data["wake"] = {"file": write_wake(tmp_path / "w.nc", blob(8, -4))}
+    metrics = run(check(data), tmp_path / "run", tmp_path)
+    assert len(read) == 1 and "texture_sweep.40_percent.rmse_v" in metrics
 
 
 def test_progress_names_every_step_and_stays_within_bounds(demo):
@@ -324,6 +338,33 @@ def test_report_tells_the_numbers(demo):
 
 
 # ---------------------------------------------------------------- how good the winds are
+
+
+def test_the_readme_tells_the_demo_s_numbers(demo):
+    """Within 0.02 m/s and 1 %, by which another order of rounding may change them; two digits are
+    printed of the larger ones."""
+    rows = {
+        "the extinction field itself": "extinction.cc.rmse",
+        "the same, blurred by the beam's width": "extinction_blurred.cc.rmse",
+        "rendered backscatter, all orders, 64 photons a beam": "backscatter.cc.rmse",
+        "the extinction field without sub-grid texture": "extinction_without_texture.cc.rmse",
+        "*(rms of the true wind)*": "true_wind.rms",
+    }
+    found = 0
+    for line in (Path(__file__).parents[2] / "README.md").read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if cells[0] not in rows:
+            continue
+        found += 1
+        source, _, statistic = rows[cells[0]].rpartition(".")
+        keys = [f"{source}.{part}{statistic}_{q}" for part in ("", "outside_cores.") for q in "vw"]
+        for key, cell in zip(keys, cells[1:5], strict=True):
+            rounding = 0.5 * 10.0 ** -len(cell.partition(".")[2])
+            assert float(cell) == pytest.approx(demo.metrics[key], abs=0.02 + rounding), key
+        if cells[5]:
+            share = float(cells[5].removesuffix("%")) / 100
+            assert share == pytest.approx(demo.metrics[f"{source}.valid_fraction"], abs=0.015)
+    assert found == len(rows)
 
 
 @pytest.mark.parametrize(
