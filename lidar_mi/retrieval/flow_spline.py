@@ -168,9 +168,9 @@ class FlowSpline:
         n = 2 * knots
         # (y, shift y, component, z, component, z)
         full = band.new_zeros(columns, 4, 2, knots, 2, knots + 2 * _REACH)
-        at = torch.arange(knots, device=band.device)
         for shift in range(2 * _REACH + 1):
-            full[: self.y.knots, :, :, at, :, at + shift] = band[:, :, shift].permute(2, 4, 3, 0, 1)
+            place = full[: self.y.knots].diagonal(shift, 3, 5)
+            place.copy_(band[:, :, shift].permute(4, 3, 0, 1, 2))
         full = full[..., _REACH:-_REACH].reshape(columns, 4, n, n)
         # knots that only fill up the last block
         full[self.y.knots :, 0] = torch.eye(n, dtype=band.dtype, device=band.device)
@@ -214,11 +214,12 @@ class FlowSpline:
                     full[:-1, q, 2 * _REACH + p - q] = below[:, p, :, q].mT
                     full[1:, p, q - p] = below[:, p, :, q]
         full = full.reshape(columns, 2 * _REACH + 1, 2, knots, 2, knots)[: self.y.knots]
-        padded = pad(full, (_REACH, _REACH))
-        at = torch.arange(knots, device=full.device)
-        band = [padded[:, :, :, at, :, at + shift] for shift in range(2 * _REACH + 1)]
-        # each (z, y, shift y, component, component)
-        return torch.stack(band).permute(4, 5, 0, 1, 3, 2)
+        band = full.new_zeros(2, 2, 2 * _REACH + 1, knots, 2 * _REACH + 1, self.y.knots)
+        for shift in range(-_REACH, _REACH + 1):
+            # from (y, shift y, component, component, z)
+            part = full.diagonal(shift, 3, 5).permute(2, 3, 4, 1, 0)
+            band[:, :, _REACH + shift, max(0, -shift) : knots - max(0, shift)] = part
+        return band
 
     def apply(self, band: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
         """The form's matrix times coefficients (2, Z, Y)."""

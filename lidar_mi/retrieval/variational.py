@@ -22,7 +22,7 @@ from lidar_mi.retrieval.warping import Spline, band_limited, levelled, rms
 from lidar_mi.retrieval.windows import Windows, image_pair, working
 
 # Rounds of flow and evidence on coarse and on fine knots, whose spacing is this over the template.
-_COARSE, _FINE = (1.25, 10), (0.6, 4)
+_COARSE, _FINE = (1.25, 8), (0.625, 5)
 # Divergence is first taken to have a tenth of the vorticity's standard deviation.
 _RATIO = 100.0
 # Width over which the prior's strength varies, over the template.
@@ -31,8 +31,8 @@ _WIDTH = 0.5
 _ROBUST = 3.0
 # Precision of each coefficient beside the prior's, px^-2: nothing for a displacement of some px.
 _RIDGE = 1e-4
-# Power of the evidence's fixed-point ratio that is taken as a step.
-_POWER = 2.0
+# Factor by which the prior may change in a round.
+_LARGEST = 4.0
 # Terms of the path's series in time.
 _PATH_ORDER = 6
 # Vorticity and divergence: (component, (order z, order y), sign) of their terms. Components: z, y.
@@ -116,11 +116,14 @@ class Prior(NamedTuple):
         return band
 
     def improved(self, knots: FlowSpline, coefficients: torch.Tensor, root: Factor) -> "Prior":
-        """The prior whose expected energies are nearer those found, two steps at once."""
+        """The prior nearer to the one of largest evidence (MacKay's fixed point).
+
+        There the flow's energy is what the prior expects less what the images leave open.
+        """
         found = knots.covariance(root)
         before = knots.covariance(knots.factor(self.band(knots)))
         weight = self.area * self.strength
-        ratios = []
+        energies = []
         for terms in (_VORTICITY, _DIVERGENCE):
             value = sum(
                 sign * knots.field(coefficients, self.mesh, order)[a] for a, order, sign in terms
@@ -133,12 +136,11 @@ class Prior(NamedTuple):
                 )
                 for band in (before, found)
             ]
-            ratios.append((weight * spread[0], weight * spread[1], weight * value.square()))
-        expected, left, energy = ratios[0]
-        factor = self.smooth(expected) / self.smooth(left + energy)
-        expected, left, energy = (float(part.sum()) for part in ratios[1])
-        ratio = self.ratio * min(max((expected - left) / energy, 0.25), 4.0)
-        return self._replace(strength=self.strength * factor**_POWER, ratio=ratio)
+            energies.append((weight * (spread[0] - spread[1]), weight * value.square()))
+        return self._replace(
+            strength=self.strength * _bounded(*(self.smooth(part) for part in energies[0])),
+            ratio=self.ratio * float(_bounded(*(part.sum() for part in energies[1]))),
+        )
 
     def smooth(self, values: torch.Tensor) -> torch.Tensor:
         for axis, place in enumerate(self.mesh.places):
@@ -146,6 +148,11 @@ class Prior(NamedTuple):
             kernel = kernel / kernel.sum(1, keepdim=True)
             values = kernel @ values if axis == 0 else values @ kernel.T
         return values
+
+
+def _bounded(told: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
+    """Ratio of the two, at most a factor of _LARGEST from 1: far from the fixed point it may be 0."""
+    return (told.clamp(min=0) / energy.clamp(min=1e-30)).clamp(1 / _LARGEST, _LARGEST)
 
 
 def variational(
@@ -169,10 +176,10 @@ def variational(
     with the images band-limited (`warping.band_limited`) and carried to mid-time along the curved
     paths of the flow, so that no texture has to be known; residuals beyond 3 s count linearly.
     The prior's strength L(x), which may vary over half a template, and the ratio q are those of
-    largest evidence: the expected energy of vorticity and of divergence is the same before and
-    after the images are seen (MacKay 1992, Neural Comput. 4, 415-447). So the flow is smoothed
+    largest evidence: the energy of vorticity and of divergence is as large as the prior
+    expects, of what the images tell (MacKay 1992, Neural Comput. 4, 415-447). So the flow is smoothed
     little in cores and strongly around them. Solved by Gauss-Newton steps from a coarse
-    correlation, first on knots 1.25 templates apart, then 0.6.
+    correlation, first on knots 1.25 templates apart, then 0.625.
 
     Parameters
     ----------
@@ -193,7 +200,7 @@ def variational(
     -------
     Displacement
         Wind times dt at the windows' centres at mid-time. `score` is the smallest correlation of
-        an image with the mean of all, `covariance` that of the posterior: what the noise leaves
+        an image with the mean of the others, `covariance` that of the posterior: what the noise leaves
         open and the prior does not know.
 
     Raises
@@ -370,36 +377,39 @@ def _finished(
     spread = knots.spread(knots.covariance(root), mesh)
     prior_spread = knots.spread(knots.covariance(knots.factor(prior.band(knots))), mesh)
     covariance = torch.stack([spread[0, 0], spread[1, 1], spread[0, 1]])
-    told = 1 - (spread[0, 0] + spread[1, 1]) / (prior_spread[0, 0] + prior_spread[1, 1])
+    # what is left of the prior's variance: in the worse direction, and in both
+    known = (prior_spread[0, 0] + prior_spread[1, 1]) / 2
+    middle = (spread[0, 0] + spread[1, 1]) / 2
+    worst = middle + torch.hypot((spread[0, 0] - spread[1, 1]) / 2, spread[0, 1])
     score = _agreement(seen, windows)
-    matched = (told > 0.5) & score.isfinite()
+    matched = (middle < known / 2) & score.isfinite()
     bad = torch.stack([non_finite(stack[0], image, windows) for image in stack[1:]]).any(0)
     d = torch.where(matched, d, torch.nan)
-    flag = Flag.NO_MATCH * ~matched + Flag.LOW_CORRELATION * (matched & (score < min_correlation))
-    flag = flag.to(torch.uint8)
+    flag = (
+        Flag.NO_MATCH * ~matched
+        + Flag.LOW_TEXTURE * ((worst > known / 2) | ~matched)
+        + Flag.LOW_CORRELATION * (matched & (score < min_correlation))
+    ).to(torch.uint8)
     flag[bad] |= Flag.NON_FINITE_INPUT.value
     return Displacement(d[0], d[1], score.nan_to_num(0.0), flag, covariance)
 
 
 def _agreement(seen: Linear, windows: Windows) -> torch.Tensor:
-    """Smallest correlation, over a template, of an image carried to mid-time with the mean of all."""
-    mean = seen.carried.mean(0)
-    fields = [seen.seen.to(mean), mean, mean**2]
-    for image in seen.carried:
-        fields += [image, image**2, image * mean]
-    box = [torch.ones(windows.template, dtype=mean.dtype, device=mean.device)]
-    sums = torch.stack(fields) * seen.seen
-    for axis in (1, 2):
-        lead = windows.lead
-        sums = sums.narrow(axis, lead, sums.shape[axis] - lead)
-        sums = window_sums(sums, box, windows.stride, axis)[0]
-        sums = sums.narrow(axis, 0, windows.count[axis - 1])
-    number = sums[0].clamp(min=1)
-    average = sums[1] / number
-    contrast = sums[2] / number - average**2
+    """Smallest correlation, over a template, of an image carried to mid-time with the others' mean."""
+    number = len(seen.carried)
+    box = [torch.ones(windows.template, dtype=seen.slope.dtype, device=seen.slope.device)]
     scores = []
-    for k in range(len(seen.carried)):
-        first, square, cross = sums[3 + 3 * k : 6 + 3 * k] / number
-        both = (square - first**2).clamp(min=0) * contrast.clamp(min=0)
-        scores.append((cross - first * average) / both.sqrt())
+    for image in seen.carried:
+        others = (seen.carried.sum(0) - image) / (number - 1)
+        sums = torch.stack(
+            [torch.ones_like(image), image, others, image**2, others**2, image * others]
+        )
+        sums = sums * seen.seen
+        for axis in (1, 2):
+            sums = sums.narrow(axis, windows.lead, sums.shape[axis] - windows.lead)
+            sums = window_sums(sums, box, windows.stride, axis)[0]
+            sums = sums.narrow(axis, 0, windows.count[axis - 1])
+        first, second, square1, square2, cross = sums[1:] / sums[0].clamp(min=1)
+        contrast = (square1 - first**2).clamp(min=0) * (square2 - second**2).clamp(min=0)
+        scores.append((cross - first * second) / contrast.sqrt())
     return torch.stack(scores).amin(0)
