@@ -7,7 +7,8 @@ degree of polarisation, an order counted twice or left out, a standard error wro
 import mitsuba as mi
 import numpy as np
 import pytest
-from transport_reference import Case, simulate
+
+from validation.transport_reference import Case, simulate
 
 pytestmark = pytest.mark.usefixtures("variant")
 
