@@ -27,7 +27,7 @@ if not (ROOT / "benchmarks").is_dir():
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import __main__ as command
-from benchmarks import cases, estimators, measure, renderer, report, transient, velocimetry
+from benchmarks import cases, estimators, fringes, measure, renderer, report, transient, velocimetry
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 
 
@@ -275,3 +275,29 @@ def test_openpiv_finds_the_same_wind():
         wind = np.nanmean(-ours.dz) * 0.5 / 0.1
         assert all(other < 0.5 * wind for _, other in errors.values())
     assert all(line.ratio > 0 for line in velocimetry.compare(1, 112, 88).rows)
+
+
+# --- fringes
+
+
+def test_numpy_s_rings_are_the_renderer_s(variant):
+    """Share of the light that passes, and where it goes; 4 sigma and the plates' 1e-3."""
+    etalon, camera = fringes.Etalon(), fringes.FringeCamera(width=48, height=39, pixel=148e-6)
+    line = fringes.backscatter_line(354.7e-9, 233.0, 33_000.0)
+    paths = 1 << 20
+    plain = fringes.plain_forward(np.random.default_rng(1), etalon, camera, line, paths)
+    settings = fringes.FringeSettings(samples_per_pixel=64)
+    scene = fringes.mi.load_dict(fringes.scene_dict(etalon, camera, line, settings))
+    ours = np.array(fringes.mi.render(scene, seed=1), float)[..., 0]
+    assert plain.sum() / ours.sum() == pytest.approx(1, abs=4 / (0.1 * paths) ** 0.5 + 2e-3)
+    assert np.corrcoef(plain.ravel(), ours.ravel())[0, 1] > 0.98
+
+
+def test_fringes_compare(variant):
+    found = lines(fringes.compare(1, 48, 39, 4))
+    lost = found["single precision", "velocity lost in the phase, rms"]
+    assert lost.ours < 0.01 and lost.other > 1
+    noise = found["from the camera", "noise of a pixel at 4 paths"]
+    assert 0 < noise.ours and noise.ratio > 1
+    rates = [line for (_, quantity), line in found.items() if quantity == "paths per second"]
+    assert len(rates) == 4 and all(line.ours > 0 and line.other > 0 for line in rates)
