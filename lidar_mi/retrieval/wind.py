@@ -8,6 +8,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.checks import checked_pair, on_device, positive
 from lidar_mi.retrieval.correlation import cross_correlation
 from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.multipass import multipass
@@ -65,8 +66,6 @@ METHODS: Mapping[str, Method] = {
     ),
 }
 """Methods by name."""
-
-_METRES = ("m", "metre", "metres", "meter", "meters")
 
 
 def retrieve_wind(
@@ -138,15 +137,12 @@ def retrieve_wind(
     """
     if method not in METHODS:
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
-    dt = _positive("dt", dt)
-    image1, image2 = _checked("image1", image1), _checked("image2", image2)
-    _same_grid(image1, image2)
+    dt = positive("dt", dt)
+    image1, image2, noise = checked_pair(image1, image2, noise)
     windows = Windows(image1.shape, template, search, stride)
-    pixels1, pixels2 = (_tensor(image, device) for image in (image1, image2))
+    pixels1, pixels2 = (on_device(image, device) for image in (image1, image2))
     if isinstance(noise, xr.DataArray):
-        noise = _checked("noise", noise)
-        _same_grid(image1, noise, "noise")
-        noise = _tensor(noise, device)
+        noise = on_device(noise, device)
 
     chosen = METHODS[method]
     offered = {"min_correlation": min_correlation, "noise": noise}
@@ -277,61 +273,3 @@ def _spread(
     both = root["z"] * root["y"]
     correlation = np.divide(zy, both, out=np.zeros_like(both), where=both != 0)
     return {axis: root[axis] * spacing[axis] / dt for axis in root}, correlation
-
-
-def _tensor(image: xr.DataArray, device: str | torch.device) -> torch.Tensor:
-    try:
-        target = torch.device(device)
-        return torch.as_tensor(np.ascontiguousarray(image.values), device=target)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(f"device: {str(device)!r} cannot be used here ({reason})") from error
-
-
-def _positive(name: str, value: float) -> float:
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        number = np.nan
-    if not (number > 0 and np.isfinite(number)):
-        raise InputError(f"{name}: {value!r} s is not a number > 0")
-    return number
-
-
-def _checked(name: str, image: xr.DataArray) -> xr.DataArray:
-    """The image as (z, y), its grid known to be in metres, ascending and uniform."""
-    if not isinstance(image, xr.DataArray):
-        raise InputError(f"{name}: {type(image).__name__} is not an xarray.DataArray")
-    if set(image.dims) != {"z", "y"} or image.ndim != 2:
-        raise InputError(f"{name}: dims {tuple(image.dims)} are not ('z', 'y')")
-    if image.dtype.kind not in "fiu":
-        raise InputError(f"{name}: values of type {image.dtype} are not real numbers")
-    for axis in ("z", "y"):
-        if axis not in image.coords:
-            raise InputError(f"{name}.{axis}: coordinate missing; give it in m")
-        coordinate = image[axis]
-        units = coordinate.attrs.get("units")
-        if units not in _METRES:
-            raise InputError(f"{name}.{axis}: units {units!r} are not 'm'")
-        steps = np.diff(coordinate.values.astype(float))
-        if not steps.size or not np.isfinite(steps).all() or steps.min() <= 0:
-            raise InputError(f"{name}.{axis}: not at least two finite, ascending values")
-        if np.ptp(steps) > 1e-3 * steps.mean():
-            raise InputError(
-                f"{name}.{axis}: spacing from {steps.min():g} to {steps.max():g} m is not "
-                "uniform (to 0.1 %)"
-            )
-    return image.transpose("z", "y")
-
-
-def _same_grid(image1: xr.DataArray, image2: xr.DataArray, name: str = "image2") -> None:
-    if image1.shape != image2.shape:
-        sizes = " and ".join(f"{z} x {y}" for z, y in (image1.shape, image2.shape))
-        raise InputError(f"{name}: sizes {sizes} px (z x y) differ; both must have one grid")
-    for axis in ("z", "y"):
-        first, second = (image[axis].values.astype(float) for image in (image1, image2))
-        off = np.abs(first - second).max()
-        if off > 1e-3 * np.diff(first).mean():
-            raise InputError(
-                f"{name}.{axis}: up to {off:g} m off image1's; resample both onto one grid"
-            )
