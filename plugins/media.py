@@ -13,6 +13,39 @@ import mitsuba as mi
 SURFACE_SKIP = 1e-5
 
 
+class Air:
+    """A scene's media, and the box that holds all surfaces between them.
+
+    Outside it, most of the way between telescope and slab, no surface need be searched.
+    """
+
+    def __init__(self, scene):
+        self.scene = scene
+        box = mi.ScalarBoundingBox3f()
+        for shape in scene.shapes():
+            box.expand(shape.bbox())
+        if not box.valid():
+            box = mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
+        margin = SURFACE_SKIP * (1 + max(dr.max(dr.abs(box.min)), dr.max(dr.abs(box.max))))
+        self.low, self.high = mi.Point3f(box.min - margin), mi.Point3f(box.max + margin)
+        # opaque, so that no scene's size is compiled into a kernel
+        dr.make_opaque(self.low, self.high)
+
+    def next_surface(self, ray, active):
+        """The next surface along a ray, up to its ``maxt``."""
+        # a component of 0 makes infinities; where it makes NaN (0 times infinity), comparisons fail
+        first = (self.low - ray.o) / ray.d
+        last = (self.high - ray.o) / ray.d
+        near = dr.max(dr.minimum(first, last))
+        far = dr.min(dr.maximum(first, last))
+        misses = (near > far) | (far < 0) | (near > ray.maxt)
+        active = active & ~misses
+        # one by one: packets of rays are slower here, coherent or not
+        return self.scene.ray_intersect(
+            ray, ray_flags=+mi.RayFlags.Minimal, coherent=False, active=active
+        ), active
+
+
 def interaction(medium, position, direction, wavelengths):
     """The medium interaction of light that arrives at ``position`` along ``direction``."""
     mei = dr.zeros(mi.MediumInteraction3f)
@@ -30,7 +63,7 @@ def coefficients(medium, mei, channel, active):
     return scattering[channel], extinction[channel]
 
 
-def _next_surface(scene, origin, direction, travelled, skip, distance, medium, active):
+def _next_surface(air, origin, direction, travelled, skip, distance, medium, active):
     """Where the straight line meets the next surface, and what lies behind it.
 
     Returns the end of the present segment, whether a surface ends it, whether light passes that
@@ -40,7 +73,7 @@ def _next_surface(scene, origin, direction, travelled, skip, distance, medium, a
     active = active & (start < distance)
     ray = mi.Ray3f(origin + direction * start, direction)
     ray.maxt = distance - start
-    si = scene.ray_intersect(ray, ray_flags=+mi.RayFlags.Minimal, coherent=False, active=active)
+    si, active = air.next_surface(ray, active)
     hit = active & si.is_valid()
     end = dr.select(hit, dr.minimum(start + si.t, distance), distance)
     passes = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
@@ -50,7 +83,7 @@ def _next_surface(scene, origin, direction, travelled, skip, distance, medium, a
 
 
 def transmittance(
-    scene, medium, origin, direction, distance, channel, wavelengths, rng, active,
+    air, medium, origin, direction, distance, channel, wavelengths, rng, active,
     differentiable=False,
 ):  # fmt: skip
     """Unbiased estimate of the transmittance along a straight line, and the medium at its end.
@@ -64,7 +97,7 @@ def transmittance(
     where = rng.next_float32(active) * distance if differentiable else mi.Float(-1)
     with dr.suspend_grad():
         value, end, between = _walk(
-            scene, medium, dr.detach(origin), dr.detach(direction), dr.detach(distance), where,
+            air, medium, dr.detach(origin), dr.detach(direction), dr.detach(distance), where,
             channel, wavelengths, rng, active,
         )  # fmt: skip
     if differentiable:
@@ -77,7 +110,7 @@ def transmittance(
 
 
 @dr.syntax
-def _walk(scene, medium, origin, direction, distance, where, channel, wavelengths, rng, active):
+def _walk(air, medium, origin, direction, distance, where, channel, wavelengths, rng, active):
     """Transmittance, medium at the end, and medium at the distance ``where``."""
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
@@ -85,7 +118,7 @@ def _walk(scene, medium, origin, direction, distance, where, channel, wavelength
     between = mi.MediumPtr(medium)
     while dr.hint(active, label="transmittance"):
         end, hit, passes, behind, skip = _next_surface(
-            scene, origin, direction, travelled, skip, distance, medium, active
+            air, origin, direction, travelled, skip, distance, medium, active
         )
         inside = active & (medium != None)
         # the extinction in the middle of the segment stands for all of it, the rest is tracked
@@ -112,7 +145,7 @@ def _walk(scene, medium, origin, direction, distance, where, channel, wavelength
 
 
 @dr.syntax
-def collision(scene, medium, origin, direction, distance, channel, wavelengths, rng, active):
+def collision(air, medium, origin, direction, distance, channel, wavelengths, rng, active):
     """Distance to the first real collision by delta tracking, its medium, and whether it happened.
 
     Nothing is forced: a photon that leaves ``distance`` behind or meets an opaque surface is lost.
@@ -123,7 +156,7 @@ def collision(scene, medium, origin, direction, distance, channel, wavelengths, 
     found = mi.Bool(False)
     while dr.hint(active, label="free flight"):
         end, hit, passes, behind, skip = _next_surface(
-            scene, origin, direction, travelled, skip, distance, medium, active
+            air, origin, direction, travelled, skip, distance, medium, active
         )
         inside = active & (medium != None)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths)

@@ -7,7 +7,7 @@ and sees whether they do. Both bring back Stokes vectors about the instrument's 
 import drjit as dr
 import mitsuba as mi
 
-from .media import coefficients, collision, interaction, transmittance
+from .media import Air, coefficients, collision, interaction, transmittance
 from .polarization import rotate_stokes, transverse
 
 SPEED_OF_LIGHT = 299_792_458.0
@@ -43,7 +43,7 @@ class Lidar:
     """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
 
     def __init__(self, scene, sensor, differentiable=False):
-        self.scene, self.sensor, self.differentiable = scene, sensor, differentiable
+        self.air, self.sensor, self.differentiable = Air(scene), sensor, differentiable
         self.wavelengths = sensor.laser.wavelengths()
         self.channel = _channel(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
@@ -131,13 +131,13 @@ class Lidar:
                 first, reach - left, _sample_flight(thickness, reach, left, _pair(rng))
             )
             flown, behind, found = collision(
-                self.scene, medium, position, direction, reach, self.channel, self.wavelengths,
+                self.air, medium, position, direction, reach, self.channel, self.wavelengths,
                 rng, free,
             )  # fmt: skip
             flight = dr.select(free, flown, flight)
             active &= (flight > 0) & (found | ~free)
             out, medium = transmittance(
-                self.scene, medium, position, direction, flight, self.channel, self.wavelengths,
+                self.air, medium, position, direction, flight, self.channel, self.wavelengths,
                 rng, active & ~free,
             )  # fmt: skip
             medium = dr.select(free, behind, medium)
@@ -249,11 +249,12 @@ class Lidar:
         volume. ``densities`` of the direction, for the balance heuristic: as it was drawn here, by
         the phase function, and from the telescope; without them this is the only way here.
         """
+        vertex = position + direction * distance
+        active = active & self.sensor.in_field_of_view(photon.axes, vertex - photon.aperture)
         out, medium = transmittance(
-            self.scene, medium, position, direction, distance, self.channel, self.wavelengths,
+            self.air, medium, position, direction, distance, self.channel, self.wavelengths,
             rng, active, self.differentiable,
         )  # fmt: skip
-        vertex = position + direction * distance
         mei = interaction(medium, vertex, direction, self.wavelengths)
         active = active & (medium != None)
         scattering, _ = coefficients(medium, mei, self.channel, active)
@@ -275,7 +276,7 @@ class Lidar:
         wo = back / distance
         active = active & self.sensor.in_field_of_view(photon.axes, -back)
         home, _ = transmittance(
-            self.scene, medium, mei.p, wo, distance, self.channel, self.wavelengths, rng, active,
+            self.air, medium, mei.p, wo, distance, self.channel, self.wavelengths, rng, active,
             self.differentiable,
         )  # fmt: skip
         weight = weight * home * self.area * -dr.dot(wo, photon.axes.n) / (distance * distance)
@@ -324,7 +325,7 @@ class Lidar:
         while dr.hint(active, label="scattering orders"):
             began = mi.Bool(active)
             flight, medium, active = collision(
-                self.scene, medium, position, direction, 2 * high - travelled, self.channel,
+                self.air, medium, position, direction, 2 * high - travelled, self.channel,
                 self.wavelengths, rng, active,
             )  # fmt: skip
             position = mi.Point3f(position + direction * flight)

@@ -1,0 +1,109 @@
+"""The gated estimator against the analog one in dense air, where nature's photons count often.
+
+A homogeneous slab from 500 to 600 m, extinction 20 / km, in a vacuum; gates of 10 m. Every pixel of
+a picture is the same beam again, so that the variance of a render is seen, not taken from its error
+bar. Efficiency = 1 / (variance x time). A gate rendered alone is what the gated estimator is for:
+the photons of the analog one that fall into other gates are lost there. Of ten gates at once they
+all count, while a gated photon still serves one (its gate's own), at ten times the photons.
+"""
+
+import mitsuba as mi
+import numpy as np
+
+from lidar_mi.rendering.variant import use_variant
+
+from .measure import in_turns
+from .report import Comparison, row
+
+CASES = {
+    "molecules, field of view 50 mrad": ({"type": "rayleigh_polarized"}, 1.0, 50.0),
+    "Henyey-Greenstein 0.7, albedo 0.95, 20 mrad": ({"type": "hg", "g": 0.7}, 0.95, 20.0),
+}
+GATES = ((500.0, 510.0), (540.0, 550.0), (590.0, 600.0))
+ORDERS = 4
+
+
+def compare(repeats: int = 5, beams: int = 1600) -> Comparison:
+    """One gate alone and ten gates at once, orders of scattering up to four."""
+    use_variant("llvm_ad_mono_polarized")
+    lines = []
+    for name, (phase, albedo, fov) in CASES.items():
+        for first, last in GATES:
+            scene = _scene(phase, albedo, fov, (first, last), 1, beams)
+            lines += _rows(f"{name}; {first:.0f} to {last:.0f} m alone", scene, repeats, 100, 1000)
+        scene = _scene(phase, albedo, fov, (500.0, 600.0), 10, beams)
+        lines += _rows(f"{name}; ten gates, the median one", scene, repeats, 200, 500)
+    return Comparison(
+        f"Gated against analog estimator in dense air ({ORDERS} orders)",
+        "gated",
+        "analog",
+        tuple(lines),
+        ("Relative variance of one photon's contribution; time of one photon: all cores.",),
+    )
+
+
+def _scene(phase, albedo, fov, gates, count, beams):
+    width = round(beams**0.5)
+    same = np.tile([[1.0, 0.0, 0.0]], (width * width, 1))
+    place = mi.ScalarTransform4f().translate([550, 0, 0]).scale([50, 1000, 1000])
+    medium = {"type": "homogeneous", "sigma_t": 0.02, "albedo": albedo, "phase": phase}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "gated_volpath", "max_order": ORDERS},
+            "sensor": {
+                "type": "scanning_lidar",
+                "gate_kind": "spherical",
+                "gate_start": gates[0],
+                "gate_stop": gates[1],
+                "gate_count": count,
+                "fov_half_mrad": fov,
+                "directions": mi.TensorXf(same),
+                "laser": {"type": "laser", "beam_cut": 100.0, "divergence_full_mrad": 2.0},
+                "film": {
+                    "type": "hdrfilm", "width": width, "height": width,
+                    "pixel_format": "luminance", "rfilter": {"type": "box"},
+                },
+                "sampler": {"type": "independent"},
+            },
+            "slab": {
+                "type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": medium,
+            },
+        }
+    )  # fmt: skip
+
+
+def _rows(case, scene, repeats, gated_photons, analog_photons):
+    analog = mi.load_dict(
+        {"type": "gated_volpath", "estimator": "analog", "max_order": ORDERS}
+    )
+    gates = scene.sensors()[0].gate_count
+    sides = {
+        "gated": (scene.integrator(), gated_photons),
+        "analog": (analog, analog_photons),
+    }
+
+    def task(integrator, photons):
+        return lambda turn: np.array(
+            mi.render(scene, integrator=integrator, spp=photons, seed=turn), float
+        ).reshape(-1, gates, 5)[..., 0]
+
+    found = in_turns({name: task(*side) for name, side in sides.items()}, repeats)
+    variances, times = {}, {}
+    for name, (_, photons) in sides.items():
+        images = [image for _, image in found[name]]
+        mean = np.mean(images, axis=(0, 1))
+        variances[name] = [
+            float(np.median(photons * image.var(0, ddof=1) / mean**2)) for image in images
+        ]
+        times[name] = [s / (photons * len(images[0])) for s, _ in found[name]]
+    products = {
+        name: [1e9 * v * t for v, t in zip(variances[name], times[name])] for name in sides
+    }
+    return [
+        row(case, "relative variance", "", variances["gated"], variances["analog"], "lower"),
+        row(case, "time of one photon", "ns", [1e9 * t for t in times["gated"]],
+            [1e9 * t for t in times["analog"]], "lower"),
+        row(case, "variance x time", "ns", products["gated"], products["analog"], "lower",
+            "ratio of efficiencies"),
+    ]  # fmt: skip
