@@ -33,6 +33,10 @@ def compare(repeats: int = 5, beams: int = 1600) -> Comparison:
             lines += _rows(f"{name}; {first:.0f} to {last:.0f} m alone", scene, repeats, 100, 1000)
         scene = _scene(phase, albedo, fov, (500.0, 600.0), 10, beams)
         lines += _rows(f"{name}; ten gates, the median one", scene, repeats, 200, 500)
+    scene = _scene({"type": "rayleigh_polarized"}, 1.0, 5.0, (500.0, 600.0), 500, 400)
+    lines += _rows("a profile of 500 gates, 5 mrad; the median gate", scene, repeats, 1000, 1000)
+    one = _scene({"type": "rayleigh_polarized"}, 1.0, 5.0, (500.0, 600.0), 1, 400)
+    lines += _time_of_gates(scene, one, repeats)
     return Comparison(
         f"Gated against analog estimator in dense air ({ORDERS} orders)",
         "gated",
@@ -40,6 +44,18 @@ def compare(repeats: int = 5, beams: int = 1600) -> Comparison:
         tuple(lines),
         ("Relative variance of one photon's contribution; time of one photon: all cores.",),
     )
+
+
+def _time_of_gates(profile, one, repeats):
+    def task(scene):
+        return lambda turn: np.array(mi.render(scene, spp=1000, seed=turn))
+
+    found = in_turns({"profile": task(profile), "one": task(one)}, repeats)
+    times = {name: [s for s, _ in turns] for name, turns in found.items()}
+    return [
+        row("as many gated photons in one gate", "time, 500 gates (left) and one", "s",
+            times["profile"], times["one"], "lower", "what more gates cost"),
+    ]  # fmt: skip
 
 
 def _scene(phase, albedo, fov, gates, count, beams):
