@@ -73,7 +73,7 @@ def run(
         truth = make_truth(experiment, beside, flows)
         plans = _plans(experiment, truth)
     notice("reading how the air scatters", None)
-    air = scatterer(experiment.scattering, beside, experiment.lidar.wavelength)
+    air = scatterer(experiment.scattering, beside, experiment.lidar.wavelength, notice)
     fields = _solid(experiment, truth, plans)
     _check_ahead(experiment, truth, plans, air)
     claim(folder, experiment, beside, overwrite)

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..atmosphere.molecules import molecular_scattering, molecular_table
-from ..atmosphere.particles import aerosol_table
+from ..atmosphere.particles import Notice, aerosol_table
 from ..atmosphere.scattering import ScatteringTable, mix, rayleigh_table, read_table
 from ..errors import InputError
 
@@ -20,7 +20,10 @@ class Scatterer(NamedTuple):
     albedo: float
 
 
-def scatterer(scattering, beside: str | Path = ".", wavelength: float = 532e-9) -> Scatterer:
+def scatterer(
+    scattering, beside: str | Path = ".", wavelength: float = 532e-9,
+    notice: Notice = lambda text, share: None,
+) -> Scatterer:  # fmt: skip
     """How the air of an experiment scatters.
 
     Parameters
@@ -31,6 +34,8 @@ def scatterer(scattering, beside: str | Path = ".", wavelength: float = 532e-9) 
         Folder in which tables are looked for.
     wavelength : float
         Of the laser, m; aerosols and molecules scatter accordingly.
+    notice : callable, optional
+        Told how far a table is that must be made first.
 
     Raises
     ------
@@ -53,7 +58,7 @@ def scatterer(scattering, beside: str | Path = ".", wavelength: float = 532e-9) 
         case "mixture":
             shares = [part.share for part in scattering.parts]
             tables = [
-                _table(part, beside, wavelength, f"scattering.parts.{index}")
+                _table(part, beside, wavelength, f"scattering.parts.{index}", notice)
                 for index, part in enumerate(scattering.parts)
             ]
             phase, albedo = _tabulated(mix(tables, shares))
@@ -61,7 +66,8 @@ def scatterer(scattering, beside: str | Path = ".", wavelength: float = 532e-9) 
             path = table_files(scattering, beside)["scattering.table"]
             phase = {"type": "mueller", "table": str(path)}
         case _:
-            phase, albedo = _tabulated(_table(scattering, beside, wavelength, "scattering"))
+            table = _table(scattering, beside, wavelength, "scattering", notice)
+            phase, albedo = _tabulated(table)
     return Scatterer(phase, albedo if scattering.albedo is None else scattering.albedo)
 
 
@@ -84,7 +90,7 @@ def table_files(scattering, beside: str | Path = ".") -> dict[str, Path]:
     return files
 
 
-def _table(part, beside, wavelength, field) -> ScatteringTable:
+def _table(part, beside, wavelength, field, notice) -> ScatteringTable:
     """One kind of scatterer as a table."""
     match part.phase:
         case "rayleigh":
@@ -93,7 +99,7 @@ def _table(part, beside, wavelength, field) -> ScatteringTable:
         case "molecules":
             return molecular_table(wavelength, band=part.band)
         case "aerosol":
-            return aerosol_table(part.aerosol, wavelength)
+            return aerosol_table(part.aerosol, wavelength, notice)
     path = Path(beside) / part.table
     table = read_table(path)
     if not math.isclose(table.wavelength, wavelength, rel_tol=1e-6):
