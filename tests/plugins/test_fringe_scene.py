@@ -91,14 +91,13 @@ def transmission(tan2, v_los=0.0, reflectivity=0.7):
 def _curve(cosine, v_los, reflectivity):
     n = np.arange(1, 60)
     weight, offset, sigma = GAUSSIANS.T[:, :, None]
-    offset = offset + 2 * v_los / WAVELENGTH
     t = n / SPECTRAL_RANGE
     line = (weight * np.exp(2j * np.pi * offset * t - 2 * (np.pi * sigma * t) ** 2)).sum(0)
     defects = np.exp(-2 * (np.pi * n * 2 * 2e-9 / WAVELENGTH) ** 2)
     coefficients = reflectivity**n * line * defects
     level = (1 - reflectivity) ** 2 / (1 - reflectivity**2)
     result = np.full(np.shape(cosine), level)
-    order = ORDER * cosine
+    order = (ORDER + 2 * v_los / WAVELENGTH / SPECTRAL_RANGE) * cosine
     for k, c in zip(n, coefficients):
         if abs(c) > 1e-9:
             result += 2 * level * np.real(c * np.exp(2j * np.pi * k * order))
@@ -180,7 +179,7 @@ def test_both_directions_give_the_analytic_rings(estimator, shape, lens, statist
 @pytest.mark.parametrize(
     ("estimator", "shape", "lens", "paths", "allowed"),
     [
-        ("camera", "folded", None, 16, 0.05),
+        ("camera", "folded", None, 16, 0.02),
         pytest.param("camera", "folded", LENS, 64, 0.05, marks=pytest.mark.slow),
         ("forward", "sampled", LENS, 32, None),
     ],
@@ -188,7 +187,8 @@ def test_both_directions_give_the_analytic_rings(estimator, shape, lens, statist
 def test_velocity_of_a_picture_without_noise(estimator, shape, lens, paths, allowed):
     """Full size: 960 x 780 pixels of 7.4 um. Maximum likelihood of the analytic rings.
 
-    The camera's direction has next to no noise: within 0.05 m/s. Forward, within 4 sigma of its own
+    The camera's direction has next to no noise: 0.005 m/s, with a real lens, for which some lines
+    miss the stop, 0.015 m/s; three to four sigma are allowed. Forward, within 4 sigma of its own
     Monte Carlo noise. Single precision without splitting off the orders is wrong by some m/s.
     """
     more = {} if lens is None else {"lens": mi.TensorXf(lens.ravel())}
