@@ -118,3 +118,23 @@ def test_blurred_slab_is_recovered_by_gradient_descent(slab):
         optimizer[KEY] = dr.maximum(optimizer[KEY], 1e-4)
         parameters.update(optimizer)
     assert float(misfit(1000).array[0]) < 0.02 * before
+
+
+def test_gradient_of_the_albedo_is_the_picture_over_the_albedo(variant, world):
+    """Single scattering is proportional to the albedo where the vertex is: Euler's relation."""
+    medium = world.homogeneous(2e-3, albedo=0.8)
+    scene = world.scene(
+        world.lidar((3, 2), (500.0, 503.0), **VIEW), slab=world.box(LOW, HIGH, medium)
+    )
+    parameters = mi.traverse(scene)
+    (key,) = [k for k in parameters.keys() if "albedo" in k]  # noqa: SIM118
+    dr.enable_grad(parameters[key])
+    parameters.update()
+    image = mi.render(scene, parameters, spp=64, seed=4)
+    dr.backward(dr.sum(image[..., 0]) * 1e7)
+    gradient = float(np.ravel(np.array(dr.grad(parameters[key])))[0])
+    signal, error = (np.array(image)[..., k].astype(float) for k in (0, 4))
+    # the gradient's photons are others than the picture's
+    sigma = 1e7 * np.sqrt(2 * (error**2).sum()) / 0.8
+    assert sigma < 1e-2 * gradient
+    assert abs(gradient - 1e7 * signal.sum() / 0.8) < 4 * sigma
