@@ -62,7 +62,6 @@ def draw_all(
     found : winds with dims (source, algorithm, z, y), from `lidar_mi.experiment.winds`
     sweep : metrics from `lidar_mi.experiment.texture_sweep`
     """
-    folder.mkdir(exist_ok=True)
     scale = _scale(truth)
     plates = (
         ("fig00_overview", "What the lidar sees, and the wind found in it",
@@ -93,6 +92,12 @@ def draw_all(
             scans[0], "multiple_scattering_fraction", "share of multiple scattering",
             "Share of the light of the first picture that was scattered more than once.",
         )),)  # fmt: skip
+    return save_all(folder, plates, log)
+
+
+def save_all(folder: Path, plates, log: Callable) -> list[Drawn]:
+    """Save plates, each (file name, title, (figure, caption)), as PNG, by temporary names."""
+    folder.mkdir(exist_ok=True)
     drawn = []
     for index, (name, title, (figure, caption)) in enumerate(plates):
         log.bar(f"drawing {title.lower()}", index / len(plates))
