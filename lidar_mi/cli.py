@@ -1,4 +1,4 @@
-"""The command line: ``lidar-mi run | render | retrieve | info | aerosol | doctor``."""
+"""The command line: ``lidar-mi run | render | retrieve | info | aerosol | rings | doctor``."""
 
 import sys
 from pathlib import Path
@@ -243,6 +243,48 @@ def aerosol(
     write(path, lambda part: write_table(table, part))
     _print_rows(particles.name, list(describe(table).items()))
     _out.print(f"table    {path}")
+
+
+@app.command(
+    epilog="Examples: `lidar-mi rings fringes.png` - `lidar-mi rings frame.exr --layer Y "
+    "--centre 479.5 389.5 -o frame_rings.png`"
+)
+def rings(
+    image: Annotated[Path, typer.Argument(help="EXR, PNG, TIFF, JPEG or FITS image.")],
+    centre: Annotated[
+        tuple[float, float] | None,
+        typer.Option(help="Where the rings' centre is known: x to the right, y down, pixels from "
+                     "the middle of the top left one. Default: found."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Picture (PNG). Default: IMAGE_rings.png.")
+    ] = None,
+    layer: Annotated[
+        str | None, typer.Option(help="Layer of an EXR file. Default: Y, or the only one.")
+    ] = None,
+    saturation: Annotated[
+        float | None, typer.Option(help="Value from which on a pixel is full.")
+    ] = None,
+) -> None:  # fmt: skip
+    """Measure the rings of an etalon in any image: centre, radii, orders, quality of the fit."""
+    from .assessment.ring_figures import draw_rings
+    from .pictures import read_picture
+    from .retrieval.rings import analyse, describe
+    from .run_folder import write
+
+    path = out or Path(f"{image.stem}_rings.png")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
+    values = read_picture(image, layer)
+    try:
+        found = analyse(values, centre, saturation)
+    except InputError as error:
+        raise InputError(f"{image}: {error}") from None
+    figure = draw_rings(values, found, image.name)
+    write(path, lambda part: figure.savefig(part, dpi=110, format="png"))
+    for title, rows in describe(found):
+        _print_rows(title, rows)
+    _out.print(f"picture  {path}")
 
 
 @app.command(epilog="Example: `lidar-mi doctor` (exit code 0: everything that is needed is there)")

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.optimize import minimize
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.peak_fit import peak
 
 
 def gradient_centre(image) -> tuple[float, float]:
@@ -114,7 +115,7 @@ def midpoint_points(
 ) -> np.ndarray:
     """Crests of one ring along lines across it, left and right and above and below.
 
-    Lines are bands of rows (columns) within half a radius of the centre; along each, a parabola
+    Lines are bands of rows (columns) within half a radius of the centre; along each, a Gaussian
     fitted within ``half_width`` of where the ring of ``radius`` should be gives the crest.
 
     Returns
@@ -141,12 +142,12 @@ def midpoint_points(
                 high = round(along + sign * half + half_width) + 1
                 if low < 0 or high > len(values) or high - low < 5:
                     continue
-                x = np.arange(low, high) - (low + high - 1) / 2
-                curve, slope, _ = np.polyfit(x, values[low:high], 2)
-                crest = -slope / (2 * curve) if curve < 0 else np.nan
-                if abs(crest) <= half_width:
-                    point = ((low + high - 1) / 2 + crest, place)
-                    found[direction, side, band] = point if direction == 0 else point[::-1]
+                x = np.arange(low, high, dtype=float)
+                try:
+                    point = peak(x, values[low:high], x.mean(), half_width), place
+                except InputError:
+                    continue
+                found[direction, side, band] = point if direction == 0 else point[::-1]
     return found
 
 

@@ -1,5 +1,6 @@
 """Which pictures may be analysed: finite ones that are not saturated."""
 
+import numpy as np
 import torch
 
 from lidar_mi.errors import InputError
@@ -19,7 +20,8 @@ def checked(images: torch.Tensor, saturation: float | None = None) -> torch.Tens
     InputError
         Other shapes, pictures below 16 px, NaN or infinity, saturated pixels.
     """
-    images = torch.as_tensor(images)
+    if not isinstance(images, torch.Tensor):
+        images = torch.as_tensor(np.array(images))
     if images.ndim not in (2, 3) or min(images.shape) < 1 or min(images.shape[-2:]) < 16:
         raise InputError(
             f"images: shape {tuple(images.shape)} is not allowed; expected (height, width) or "
