@@ -92,7 +92,7 @@ def multipass(
         fit = _fit(spline, flow, grid, rows, columns, width * sigma, variance)
         found, wrong = validated(fit.displacement, max(1, round(width * sigma / step)))
         flow = grid.spread(found, rows, columns)
-        replaced |= grid.spread(wrong.to(flow)[None], rows, columns)[0] > 0.5
+        replaced = grid.spread(wrong.to(flow)[None], rows, columns)[0] > 0.5
     rows, columns = grid.windows(windows)
     fit = _fit(spline, flow, grid, rows, columns, sigma, variance)
     d = travelled(fit.displacement, fit.gradient)

@@ -32,7 +32,7 @@ class Flag(enum.IntFlag):
     NO_MATCH = 64
     """No candidate could be compared (no contrast, no positive weight). No displacement."""
     REPLACED = 128
-    """An earlier pass found an outlier here and went on from its neighbours' median (multi-pass)."""
+    """The pass before found an outlier, and this one began at its neighbours' median (multi-pass)."""
 
 
 # A Sobel derivative, scaled to give the slope of a ramp, passes 3/16 of the variance of white
@@ -153,6 +153,15 @@ def low_texture(
         | (squared < 2 * _SOBEL_NOISE * variance)
     )
     return found, low
+
+
+def uncertain(covariance: torch.Tensor, limit: float = 0.5) -> torch.Tensor:
+    """Where a displacement's standard error is beyond `limit` px in its worst direction.
+
+    `covariance` (3, ...) holds the variances of dz and dy and their covariance, px^2.
+    """
+    zz, yy, zy = covariance
+    return (zz + yy) / 2 + torch.hypot((zz - yy) / 2, zy) > limit**2
 
 
 def non_finite(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:

@@ -191,7 +191,8 @@ def variational(
     more : sequence of torch.Tensor
         Further images, each dt after the one before. Mid-time is then that of the whole burst.
     min_correlation : float
-        Vectors are flagged where the images carried to mid-time correlate less over a template.
+        Vectors are flagged where the images carried to mid-time correlate over a template by less
+        than half way from this to 1: a flow that bends makes unrelated textures alike to 0.7.
     noise : float or torch.Tensor, optional
         Standard deviation of the images' white noise, of each pixel or of all; left out: from the
         images' spectra.
@@ -388,7 +389,7 @@ def _finished(
     flag = (
         Flag.NO_MATCH * ~matched
         + Flag.LOW_TEXTURE * ((worst > known / 2) | ~matched)
-        + Flag.LOW_CORRELATION * (matched & (score < min_correlation))
+        + Flag.LOW_CORRELATION * (matched & (score < (1 + min_correlation) / 2))
     ).to(torch.uint8)
     flag[bad] |= Flag.NON_FINITE_INPUT.value
     return Displacement(d[0], d[1], score.nan_to_num(0.0), flag, covariance)

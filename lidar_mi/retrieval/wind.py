@@ -12,7 +12,7 @@ from lidar_mi.retrieval.checks import checked_pair, on_device, positive
 from lidar_mi.retrieval.correlation import cross_correlation
 from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.multipass import multipass
-from lidar_mi.retrieval.quality import Flag, Texture, low_texture, median_outliers
+from lidar_mi.retrieval.quality import Flag, Texture, low_texture, median_outliers, uncertain
 from lidar_mi.retrieval.variational import variational
 from lidar_mi.retrieval.weight_shift import weight_shift
 from lidar_mi.retrieval.windows import Windows
@@ -125,7 +125,8 @@ def retrieve_wind(
         `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
         their correlation (NaN from methods that know none: "cc", "ws"),
         `displacement_y`, `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1),
-        `isotropy`, `flag` (bits of `quality.Flag`, 0 = good). The auxiliary coordinates `y_vector`,
+        `isotropy`, `flag` (bits of `quality.Flag`, 0 = good; also without texture counts a vector
+        whose standard error is beyond half a pixel in some direction). The auxiliary coordinates `y_vector`,
         `z_vector` are where the vector belongs, at mid-time: the centre and, with "cc" and "ws",
         half the displacement. Rejected vectors keep their value (or NaN if there is none);
         nothing is replaced.
@@ -155,6 +156,8 @@ def retrieve_wind(
         found.dz, found.dy, median_size, spacing, median_threshold, median_epsilon
     )
     flag = found.flag
+    if found.covariance is not None:
+        flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.uint8)
     if chosen.local:
         flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.uint8)
     attributes = {

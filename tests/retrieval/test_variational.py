@@ -1,0 +1,253 @@
+"""The variational retrieval on images of exactly known flows.
+
+Detects errors above those of a prototype four times better than the best public code, standard
+errors that are wrong by 15 %, a wrong block, band or derivative in the linear algebra, a path that
+is no arc, an aperture problem that is not admitted.
+"""
+
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.cases import DT, SPACING, origin, plane_waves, texture, vortex_pair_images
+from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.block_tridiagonal import factor
+from lidar_mi.retrieval.bound import displacement_bound
+from lidar_mi.retrieval.flow_spline import Axis, FlowSpline
+from lidar_mi.retrieval.quality import Flag
+from lidar_mi.retrieval.variational import _fitted, path, variational
+from lidar_mi.retrieval.wind import retrieve_wind
+from lidar_mi.retrieval.windows import Windows
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def wind_errors(pair):
+    """Errors of v and w (2, vectors), m/s, their standard errors, which are far, all of the whole."""
+    wind = retrieve_wind(pair.first, pair.second, DT, "variational", noise=pair.noise or None)
+    assert (wind.flag == 0).mean() > 0.95
+    z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
+    errors = np.stack([wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z))])
+    stderr = np.stack([wind["v_stderr"].values, wind["w_stderr"].values])
+    far = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) > 6
+    return errors, stderr, far
+
+
+KNOWN = [(0.0, 0.09, 0.06), (0.01, 0.12, 0.09), (0.03, 0.19, 0.13), (0.06, 0.38, 0.28)]
+
+
+def check_errors(noise, everywhere, beyond, seeds):
+    found = [wind_errors(vortex_pair_images(noise, seed)) for seed in seeds]
+    for component in (0, 1):
+        assert np.mean([rms(errors[component]) for errors, _, _ in found]) < everywhere
+        assert np.mean([rms(errors[component][far]) for errors, _, far in found]) < beyond
+    return found
+
+
+def check_coverage(found):
+    reduced = np.concatenate([(errors / stderr).ravel() for errors, stderr, _ in found])
+    assert np.std(reduced) == pytest.approx(1, abs=0.15)
+    assert np.mean(np.abs(reduced) < 1) == pytest.approx(0.683, abs=0.05)
+    assert np.mean(np.abs(reduced) < 1.96) == pytest.approx(0.95, abs=0.05)
+
+
+@pytest.mark.parametrize(("noise", "everywhere", "beyond"), [KNOWN[0], KNOWN[2]])
+def test_errors_are_below_the_prototypes(noise, everywhere, beyond):
+    check_errors(noise, everywhere, beyond, [1])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("noise", "everywhere", "beyond"), KNOWN)
+def test_errors_and_coverage_over_five_seeds(noise, everywhere, beyond):
+    """Without noise the spline's own error is left, which the standard error does not hold."""
+    found = check_errors(noise, everywhere, beyond, range(1, 6))
+    if noise:
+        check_coverage(found)
+
+
+def test_standard_errors_cover_the_errors_and_beat_the_bound_of_a_window():
+    """Beyond the cores, within 1.5 of what any method could get from a window of 16 px."""
+    pairs = [vortex_pair_images(0.03, seed) for seed in (1, 2)]
+    found = [wind_errors(pair) for pair in pairs]
+    check_coverage(found)
+    for pair, (errors, _, far) in zip(pairs, found):
+        images = [torch.tensor(image.values) for image in (pair.first, pair.second)]
+        bound = displacement_bound(*images, 0.03, 16)[1].mean().sqrt() * SPACING / DT
+        assert rms(errors[0][far]) < 1.5 * bound
+
+
+def burst(number, noise, columns=90, rows=80, seed=3):
+    """One vortex seen `number` times, DT / 2 apart; image and wind in px."""
+    y, z = ((np.arange(n) - (n - 1) / 2) * SPACING for n in (columns, rows))
+    vertical, lateral = np.meshgrid(z, y, indexing="ij")
+    vortices = vortex_pair(200.0, 30.0, 4.0)[:1]
+    random = np.random.default_rng(seed)
+    waves = plane_waves(seed, 3.0)
+    images = []
+    for k in range(number):
+        came = origin(vortices, lateral, vertical, k * DT / 2)
+        image = texture(waves, *came) + noise * random.standard_normal(vertical.shape)
+        images.append(torch.tensor(image))
+    windows = Windows((rows, columns))
+    starts = [np.array(windows.starts(axis)) + 3.5 for axis in (0, 1)]
+    at = np.meshgrid(z[0] + SPACING * starts[0], y[0] + SPACING * starts[1], indexing="ij")
+    v, w = velocity(vortices, at[1], at[0])
+    return images, v * DT / 2 / SPACING, w * DT / 2 / SPACING
+
+
+def test_a_burst_tells_more_than_a_pair_and_unlike_brightness_costs_nothing():
+    """Three images hold four times the information of the first two."""
+    (first, second, third), v, w = burst(3, 0.05)
+    pair = variational(first, second, noise=0.05)
+    three = variational(first, second, noise=0.05, more=[third])
+    errors = [rms(np.stack([d.dy.numpy() - v, d.dz.numpy() - w])) for d in (pair, three)]
+    assert errors[1] < 0.75 * errors[0] < 0.1
+    assert float((three.covariance[1] / pair.covariance[1]).median()) < 0.6
+    other = variational(first, 3 * second + 1, noise=0.05)
+    assert float((other.dy - pair.dy).abs().max()) < 0.03
+
+
+def test_bright_and_missing_pixels_spoil_little():
+    (first, second), v, _ = burst(2, 0.02)
+    random = np.random.default_rng(4)
+    first, second = first.clone(), second.clone()
+    first[tuple(random.integers(0, 80, (2, 60)))] = 3.0
+    second[40, 50] = torch.nan
+    found = variational(first, second)
+    assert rms(found.dy.nan_to_num().numpy() - v) < 0.1
+    assert ((found.flag & Flag.NON_FINITE_INPUT.value) > 0).sum() == 16 * 16
+
+
+def test_stripes_leave_one_direction_open():
+    """Waves nearly along (1, 1): little is known along (1, -1), and the covariance says so."""
+    z, y = np.meshgrid(np.arange(60.0), np.arange(70.0), indexing="ij")
+    random = np.random.default_rng(5)
+
+    def stripes(dy, dz):
+        at = y - dy, z - dz
+        total = np.cos(0.6 * at[0] + 0.6 * at[1]) + np.cos(0.57 * at[0] + 0.63 * at[1] + 1)
+        return torch.tensor(1 + 0.1 * total + 0.03 * random.standard_normal(z.shape))
+
+    found = variational(stripes(0, 0), stripes(0.3, 0.4), noise=0.03)
+    zz, yy, zy = found.covariance
+    assert float((zy / (zz * yy).sqrt()).median()) < -0.5
+    # along the mean wave vector, (z, y) = (0.615, 0.585), the displacement is well known
+    cosine, sine = np.array([0.615, 0.585]) / np.hypot(0.615, 0.585)
+    across = cosine**2 * zz + sine**2 * yy + 2 * cosine * sine * zy
+    assert float((across / (zz + yy - across)).median()) < 0.3
+    error = cosine * (found.dz - 0.4) + sine * (found.dy - 0.3)
+    assert rms(error[~error.isnan()].numpy()) < 0.1
+
+
+# --- linear algebra against dense matrices
+
+
+def spline(rows=23, columns=38):
+    return FlowSpline(Axis(rows, 4.0), Axis(columns, 5.0))
+
+
+def pixels(rows=23, columns=38):
+    return [torch.arange(n, dtype=torch.float64) for n in (rows, columns)]
+
+
+def test_block_tridiagonal_is_its_dense_matrix():
+    random = torch.Generator().manual_seed(1)
+    parts = torch.randn(4, 5, 5, generator=random, dtype=torch.float64)
+    below = torch.randn(3, 5, 5, generator=random, dtype=torch.float64)
+    diagonal = parts @ parts.mT + 20 * torch.eye(5, dtype=torch.float64)
+    dense = torch.block_diag(*diagonal)
+    for k in range(3):
+        dense[5 * k + 5 : 5 * k + 10, 5 * k : 5 * k + 5] = below[k]
+        dense[5 * k : 5 * k + 5, 5 * k + 5 : 5 * k + 10] = below[k].T
+    root = factor(diagonal, below)
+    right = torch.randn(4, 5, 2, generator=random, dtype=torch.float64)
+    solution = torch.linalg.solve(dense, right.reshape(20, 2))
+    torch.testing.assert_close(root.solve(right).reshape(20, 2), solution)
+    assert root.log_determinant() == pytest.approx(float(torch.logdet(dense)))
+    inverse = torch.linalg.inv(dense)
+    own, under = root.inverse()
+    for k in range(4):
+        torch.testing.assert_close(own[k], inverse[5 * k : 5 * k + 5, 5 * k : 5 * k + 5])
+    for k in range(3):
+        torch.testing.assert_close(under[k], inverse[5 * k + 5 : 5 * k + 10, 5 * k : 5 * k + 5])
+
+
+def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
+    knots = spline()
+    mesh = knots.mesh(*pixels())
+    random = torch.Generator().manual_seed(2)
+    slope = torch.randn(2, 23, 38, generator=random, dtype=torch.float64)
+    weight = torch.rand(23, 38, generator=random, dtype=torch.float64)
+    band = knots.form(slope[:, None] * slope, mesh)
+    bend = knots.form(weight, mesh, (1, 1), (1, 1))
+    for a in (0, 1):
+        band[a, a] += bend
+    plain, twist = (torch.kron(mesh.basis(0, k), mesh.basis(1, k)) for k in (0, 1))
+    rows = torch.cat([part.flatten()[:, None] * plain for part in slope], 1)
+    side = twist.T @ (weight.flatten()[:, None] * twist)
+    dense = rows.T @ rows + torch.block_diag(side, side)
+    some = torch.randn(knots.shape, generator=random, dtype=torch.float64)
+    torch.testing.assert_close(knots.apply(band, some).flatten(), dense @ some.flatten())
+    dense += 0.1 * torch.eye(len(dense), dtype=torch.float64)
+    for a in (0, 1):
+        band[a, a, 3, :, 0] += 0.1
+    root = knots.factor(band)
+    torch.testing.assert_close(
+        knots.solve(root, some).flatten(), torch.linalg.solve(dense, some.flatten())
+    )
+    inverse = torch.linalg.inv(dense).unflatten(0, (2, -1)).unflatten(2, (2, -1))
+    places = torch.tensor([0.0, 3.3, 21.5]), torch.tensor([2.0, 17.7, 36.9, 37.0])
+    few = knots.mesh(*(place.double() for place in places))
+    at = torch.kron(few.basis(0), few.basis(1))
+    spread = knots.spread(knots.covariance(root), few)
+    for a in (0, 1):
+        for b in (0, 1):
+            expected = (at @ inverse[a, :, b] @ at.T).diagonal().reshape(3, 4)
+            torch.testing.assert_close(spread[a, b], expected)
+
+
+def test_splines_hold_cubics_and_their_derivatives():
+    knots = spline()
+    mesh = knots.mesh(*pixels())
+    z, y = mesh.places[0][:, None] / 10, mesh.places[1] / 10
+    flow = torch.stack([z**3 * y - z * y**2, 2 * z**2 + y**3])
+    coefficients = _fitted(flow, mesh)
+    torch.testing.assert_close(knots.field(coefficients, mesh), flow, atol=1e-4, rtol=1e-4)
+    slope = torch.stack([3 * z**2 * y - y**2, 4 * z + 0 * y]) / 10
+    found = knots.field(coefficients, mesh, (1, 0))
+    torch.testing.assert_close(found, slope, atol=1e-3, rtol=1e-3)
+
+
+def test_paths_in_a_solid_rotation_are_arcs():
+    knots = spline()
+    mesh = knots.mesh(*pixels())
+    z, y = mesh.places[0][:, None] - 11, mesh.places[1] - 18.5
+    turn = 0.9
+    flow = torch.stack([turn * y + 0 * z, -turn * z + 0 * y])
+    time = torch.tensor([-0.5, 0.25, 0.5], dtype=torch.float64)
+    found = path(knots, mesh, _fitted(flow, mesh), time)
+    for k, t in enumerate(time):
+        cosine, sine = torch.cos(turn * t), torch.sin(turn * t)
+        limit = 25 * (turn * abs(float(t))) ** 7 / 5040 + 3e-3
+        assert (found[0, k] - 11 - cosine * z - sine * y).abs().max() < limit
+        assert (found[1, k] - 18.5 - cosine * y + sine * z).abs().max() < limit
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"min_correlation": -2}, "min_correlation: -2"),
+        ({"noise": -1.0}, "noise: -1.0 is not"),
+        ({"template": 40, "search": 41}, "search: 41 px"),
+        ({"search": 50}, "search: 50 px does not fit"),
+        ({"image2": torch.ones(40, 41)}, "differ"),
+        ({"more": [torch.ones(40, 41)]}, "differ"),
+    ],
+)
+def test_bad_input_is_named(change, message):
+    image = torch.rand(40, 40, generator=torch.Generator().manual_seed(1))
+    with pytest.raises(InputError, match=message):
+        variational(**{"image1": image, "image2": image} | change)
