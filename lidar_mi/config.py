@@ -151,7 +151,9 @@ class Scattering(_Scatterer):
 class Retrieval(_Section):
     """How winds are found in the image pair."""
 
-    methods: tuple[Literal["cc", "ws"], ...] = Field(("cc", "ws"), min_length=1)
+    methods: tuple[Literal["cc", "ws", "multipass", "variational"], ...] = Field(
+        ("cc", "ws"), min_length=1
+    )
     template: int = Field(8, ge=2)
     search: int = Field(16, ge=4)
     stride: int = Field(1, ge=1)

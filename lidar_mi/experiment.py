@@ -26,7 +26,7 @@ from .rendering.backscatter import extrude, render_scans
 from .rendering.phase import Scatterer, scatterer
 from .rendering.variant import use_variant
 from .retrieval.images import resample_pair
-from .retrieval.wind import retrieve_wind
+from .retrieval.wind import METHODS, retrieve_wind
 from .retrieval.windows import Windows
 from .run_folder import IMAGES, Log, Notice, claim, write, write_netcdf
 from .truth import Flows, Truth, blur_by_beam, make_truth, read_flows
@@ -254,7 +254,7 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
             )
             true = truth_at_vectors(wind, truth.wind)
             wind = wind.assign(v_true=true["v"], w_true=true["w"])
-            wind = wind.rename({"correlation" if method == "cc" else "mismatch": "score"})
+            wind = wind.rename({METHODS[method].score[0]: "score"})
             methods.append(wind.reset_coords(["y_vector", "z_vector"]))
         sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
     found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
