@@ -109,11 +109,12 @@ def render(
     epilog="Example: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc`"
 )
 def retrieve(
-    first: Annotated[Path, typer.Argument(help="EXR image at t1.")],
-    second: Annotated[Path, typer.Argument(help="EXR image at t2.")],
+    first: Annotated[Path, typer.Argument(help="Image at t1: EXR, TIFF, PNG or BMP.")],
+    second: Annotated[Path, typer.Argument(help="Image at t2.")],
     dt: Annotated[float, typer.Option(help="Time between the images, s.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="NetCDF file.")] = Path("wind.nc"),
-    method: Annotated[str, typer.Option(help="cc (cross-correlation) or ws (weight shift).")] = "cc",
+    method: Annotated[str, typer.Option(
+        help="cc (cross-correlation), ws (weight shift), multipass or variational.")] = "cc",
     template: Annotated[int, typer.Option(help="Template size, pixels.")] = 8,
     search: Annotated[int, typer.Option(help="Search region, pixels.")] = 16,
     stride: Annotated[int, typer.Option(help="Step between vectors, pixels.")] = 1,
@@ -121,19 +122,27 @@ def retrieve(
     spacing: Annotated[
         float | None, typer.Option(help="Pixel spacing in m, for files without axes.")
     ] = None,
+    noise: Annotated[
+        float | None,
+        typer.Option(min=0, help="Standard deviation of the images' noise. Default: estimated."),
+    ] = None,
     device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
-) -> None:
-    """Find the cross-flow wind (v, w) in any two EXR images of the same air."""
+) -> None:  # fmt: skip
+    """Find the cross-flow wind (v, w) in any two images of the same air."""
     from .rendering.scene import read_image
-    from .retrieval.images import on_one_grid
+    from .retrieval.images import on_one_grid, read_picture
     from .retrieval.wind import retrieve_wind
     from .run_folder import write_netcdf
 
-    images = [read_image(path, layer, spacing) for path in (first, second)]
+    images = [
+        read_image(path, layer, spacing)
+        if path.suffix.lower() == ".exr" else read_picture(path, spacing)
+        for path in (first, second)
+    ]  # fmt: skip
     pair = on_one_grid(*images)
     wind = retrieve_wind(
         *pair, dt=dt, method=method, template=template, search=search, stride=stride,
-        device=device,
+        device=device, noise=noise,
     )  # fmt: skip
     write_netcdf(wind, out)
     valid = float((wind["flag"] == 0).mean())
