@@ -1,0 +1,245 @@
+"""Wind vectors from line-of-sight velocities: triples of neighbours, and larger neighbourhoods."""
+
+import enum
+
+import numpy as np
+import xarray as xr
+from scipy.spatial import Delaunay, KDTree, QhullError
+
+from lidar_mi.errors import InputError
+
+COMPONENTS = ("u", "v", "w")
+_NAMES = ("v_los", "v_los_std", "direction", "range", "platform_velocity")
+# Singular values of directions, smallest over largest, below which they lie in one plane: rounding
+# leaves 1e-16 there, lines a second of arc apart 5e-6.
+_COPLANAR = 1e-8
+
+
+class LineFlag(enum.IntFlag):
+    """Why a vector is rejected, one bit a reason; 0 is a good vector."""
+
+    COPLANAR = 1
+    """The lines lie in one plane: they do not say how the wind blows across it. No vector."""
+    NO_VELOCITY = 2
+    """A line has no velocity. No vector."""
+
+
+def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
+    """The air's velocity along every line of sight, away from the instrument, m s-1.
+
+    Direction times wind: the platform's velocity along the line less the measured one, which is
+    positive toward the instrument.
+
+    Raises
+    ------
+    InputError
+        A variable is missing, has another shape, or a direction is no unit vector.
+    """
+    for name in _NAMES:
+        if name not in scan:
+            raise InputError(f"scan.{name}: missing; expected {', '.join(_NAMES)}")
+    for name, dims in (
+        ("v_los", {"line"}), ("v_los_std", {"line"}), ("range", {"line"}),
+        ("direction", {"line", "axis"}), ("platform_velocity", {"axis"}),
+    ):  # fmt: skip
+        if set(scan[name].dims) != dims:
+            raise InputError(f"scan.{name}: dims {scan[name].dims} are not {tuple(sorted(dims))}")
+    if scan.sizes["axis"] != 3:
+        raise InputError(f"scan.axis: {scan.sizes['axis']} components are not x, y, z")
+    length = np.linalg.norm(scan["direction"].transpose("line", "axis").values, axis=1)
+    if not (np.abs(length - 1) < 1e-6).all():
+        raise InputError("scan.direction: not of length 1; expected unit vectors")
+    if not (scan["v_los_std"].values[np.isfinite(scan["v_los"].values)] > 0).all():
+        raise InputError("scan.v_los_std: not > 0 m/s everywhere; every line needs its error")
+    return scan["direction"].dot(scan["platform_velocity"], dim="axis") - scan["v_los"]
+
+
+def solve_lines(
+    directions: np.ndarray, along: np.ndarray, std: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least squares for one wind seen along several lines, many times at once.
+
+    Parameters
+    ----------
+    directions : (n, k, 3) array
+        Unit vectors.
+    along : (n, k) array
+        Wind along them, m/s.
+    std : (n, k) array
+        Standard errors, m/s.
+
+    Returns
+    -------
+    wind : (n, 3) array, m/s
+    covariance : (n, 3, 3) array, (m/s)^2
+        (sum d d^T / s^2)^-1; infinite (and the wind NaN) where the lines lie in one plane.
+    chi_square : (n,) array
+        Squared misfit; of k - 3 degrees of freedom if the wind is the same along all lines.
+
+    Notes
+    -----
+    k lines evenly around a cone of half angle a about x, each of error s, give u to
+    s / (sqrt(k) cos a) and v, w to s sqrt(2 / k) / sin a: at small angles v and w are worse than u
+    by sqrt(2) / a.
+    """
+    matrix = directions / std[..., None]
+    left, values, right = np.linalg.svd(matrix, full_matrices=False)
+    # of the directions themselves: errors may differ by orders of magnitude
+    bare = np.linalg.svd(directions, compute_uv=False)
+    flat = bare[:, -1] <= _COPLANAR * bare[:, 0]
+    inverse = 1 / np.where(flat[:, None], np.nan, values)
+    root = right.swapaxes(-1, -2) * inverse[:, None]
+    data = along / std
+    wind = np.einsum("nij,nj->ni", root, np.einsum("nki,nk->ni", left, data))
+    misfit = data - np.einsum("nki,ni->nk", matrix, wind)
+    covariance = root @ root.swapaxes(-1, -2)
+    covariance[flat] = np.inf
+    return wind, covariance, (misfit**2).sum(1)
+
+
+def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
+    """A wind vector at the centre of every triangle of neighbouring lines of sight.
+
+    Neighbours are those of a Delaunay triangulation of the directions (of their tangents, so that
+    triangles are those in a plane x = const); the centre is the mean of the middles of the three
+    range bins (paper, fig. 1). The wind is taken to be the same along all three lines.
+
+    Parameters
+    ----------
+    scan : xr.Dataset, dim line
+        `v_los`, `v_los_std`, `range`, `direction` (line, axis), `platform_velocity` (axis), as
+        `lidar_mi.instrument.doppler_scan.scan_wind` gives them.
+
+    Returns
+    -------
+    xr.Dataset, dim vector
+        `u`, `v`, `w` (m s-1), their standard errors and correlations, `x`, `y`, `z` (m), `lines`
+        (vector, corner), `flag` (bits of `LineFlag`).
+
+    Raises
+    ------
+    InputError
+        Fewer than three lines, all of them in one plane, a scan without what is needed.
+    """
+    along = wind_along_lines(scan)
+    tangents = _tangents(scan)
+    try:
+        corners = Delaunay(tangents).simplices
+    except QhullError:
+        raise InputError(
+            f"scan.direction: all {len(tangents)} lines lie in one plane; expected three lines "
+            "that do not"
+        ) from None
+    # Qhull's order is its own: triangles by their lines, as the scan counts them
+    corners = np.sort(corners, axis=1)
+    return _vectors(scan, along, corners[np.lexsort(corners.T[::-1])], "triples")
+
+
+def wind_from_neighbours(scan: xr.Dataset, count: int = 9) -> xr.Dataset:
+    """A wind vector for every line of sight, from it and its nearest neighbours by least squares.
+
+    More lines, wider apart, constrain v and w better, if the wind is the same along all of
+    them: `misfit` (squared misfit over its degrees of freedom) is 1 then, and more where it is not;
+    the standard errors know only of the lines' noise.
+
+    Parameters
+    ----------
+    scan : xr.Dataset
+        As for `wind_from_triples`, which also says what is returned.
+    count : int
+        Lines a vector, itself included: 3 or more.
+
+    Raises
+    ------
+    InputError
+        As there; ``count`` less than 3 or more than there are.
+    """
+    along = wind_along_lines(scan)
+    tangents = _tangents(scan)
+    if not 3 <= count <= len(tangents):
+        raise InputError(f"count: {count} is not allowed; expected 3 to {len(tangents)}")
+    _, nearest = KDTree(tangents).query(tangents, k=count)
+    return _vectors(scan, along, nearest, "neighbours")
+
+
+def _tangents(scan: xr.Dataset) -> np.ndarray:
+    directions = scan["direction"].transpose("line", "axis").values
+    if len(directions) < 3:
+        raise InputError(
+            f"scan: {len(directions)} lines of sight are not enough for a wind vector; expected 3"
+        )
+    if not (directions[:, 0] > 0).all():
+        raise InputError("scan.direction: a line goes backward; expected x > 0 for all of them")
+    return directions[:, 1:] / directions[:, :1]
+
+
+def _vectors(scan, along, lines, method) -> xr.Dataset:
+    directions = scan["direction"].transpose("line", "axis").values[lines]
+    values, std = along.values[lines], scan["v_los_std"].values[lines]
+    missing = ~np.isfinite(values).all(1)
+    # any number will do: what comes of it is taken out below
+    wind, covariance, chi_square = solve_lines(
+        directions, np.where(missing[:, None], 0.0, values), np.where(missing[:, None], 1.0, std)
+    )
+    flat = np.isinf(covariance[:, 0, 0])
+    wind[missing], covariance[missing | flat] = np.nan, np.nan
+    flag = LineFlag.COPLANAR * flat + LineFlag.NO_VELOCITY * missing
+    freedom = lines.shape[1] - 3
+    misfit = {}
+    if freedom:
+        text = {"units": "1", "long_name": "squared misfit a degree of freedom"}
+        misfit["misfit"] = "vector", np.where(missing | flat, np.nan, chi_square / freedom), text
+    centre = (scan["range"].values[lines][..., None] * directions).mean(1)
+    return xr.Dataset(
+        {
+            **error_variables("vector", covariance),
+            **{
+                name: ("vector", wind[:, index], {"units": "m s-1", "long_name": _LONG[name]})
+                for index, name in enumerate(COMPONENTS)
+            },
+            **misfit,
+            "lines": (("vector", "corner"), lines, {"long_name": "lines of sight, as counted"}),
+            "flag": ("vector", flag.astype(np.uint8), flag_attributes(LineFlag)),
+        },
+        coords={
+            name: ("vector", centre[:, index], {"units": "m", "long_name": f"{name} of the vector"})
+            for index, name in enumerate("xyz")
+        },
+        attrs={
+            "Conventions": "CF-1.11",
+            "title": "Wind vectors from lines of sight",
+            "method": method,
+        },
+    )
+
+
+_LONG = {"u": "wind along x", "v": "wind along y", "w": "wind along z"}
+
+
+def error_variables(dims, covariance: np.ndarray) -> dict:
+    """Standard errors and correlations of u, v, w from covariances (..., 3, 3), as variables."""
+    stderr = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    found = {
+        f"{name}_stderr": (
+            dims, stderr[..., index], {"units": "m s-1", "long_name": f"standard error of {name}"}
+        )
+        for index, name in enumerate(COMPONENTS)
+    }  # fmt: skip
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        both = stderr[..., i] * stderr[..., j]
+        correlation = np.divide(covariance[..., i, j], both, out=np.zeros_like(both), where=both > 0)
+        correlation[np.isnan(both)] = np.nan
+        first, second = COMPONENTS[i], COMPONENTS[j]
+        text = {"units": "1", "long_name": f"correlation of the errors of {first} and {second}"}
+        found[f"{first}{second}_correlation"] = (dims, correlation, text)
+    return found
+
+
+def flag_attributes(flags: type[enum.IntFlag]) -> dict:
+    """CF attributes of a variable that holds bits of ``flags``."""
+    return {
+        "long_name": "reasons to reject the vector, 0 = good",
+        "standard_name": "quality_flag",
+        "flag_masks": np.array([bit.value for bit in flags], dtype=np.uint8),
+        "flag_meanings": " ".join(bit.name.lower() for bit in flags),
+    }
