@@ -1,17 +1,21 @@
 """What an experiment file may say: every key, its unit, its default and its limits."""
 
 import difflib
+import math
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from .errors import InputError
 from .instrument.detector import Detector
+from .instrument.doppler import DopplerLidar
+from .instrument.etalon import Etalon
+from .instrument.fringe_camera import CCD, FringeCamera
 from .instrument.lidar import BackscatterLidar
 from .instrument.scan import Scan
-from .rendering.settings import RenderSettings
+from .rendering.settings import FringeSettings, RenderSettings
 from .units import Circulation, Extinction, Length, Number, Speed, Time, to_si
 
 
@@ -171,12 +175,91 @@ class Retrieval(_Section):
         return self
 
 
+def _once(key: str, values: tuple) -> None:
+    twice = next((value for value in values if values.count(value) > 1), None)
+    if twice is not None:
+        raise ValueError(f"{key}: {twice!r} twice is not allowed; expected each once")
+
+
+class RingRetrieval(_Section):
+    """How the wind is read from pictures of rings, and how often, to know how well."""
+
+    methods: tuple[Literal["annular", "pixels", "ca", "ca_r2", "ml", "sg"], ...] = Field(
+        ("annular", "ca", "ca_r2", "ml", "sg"), min_length=1
+    )
+    centre: tuple[Literal["free", "known"], ...] = Field(("free", "known"), min_length=1)
+    averaged: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = Field(
+        (1, 5, 20), min_length=1, description="numbers of pictures averaged before they are read"
+    )
+    images: int = Field(16, ge=1, le=100_000, description="averages of each kind and speed")
+    slow_images: int = Field(
+        4, ge=0, description="of these, read by methods other than annular, which are slow"
+    )
+
+    @model_validator(mode="after")
+    def _each_once(self):
+        for key in ("methods", "centre", "averaged"):
+            _once(key, getattr(self, key))
+        if self.slow_images > self.images:
+            raise ValueError(
+                f"slow_images: {self.slow_images} is not allowed; expected at most images = "
+                f"{self.images}"
+            )
+        return self
+
+
+class Doppler(_Section):
+    """The fringe-imaging Doppler lidar and the winds along its line of sight."""
+
+    v_los: tuple[Speed, ...] = Field(
+        ("50 m/s", "-300 m/s", "-100 m/s", "0 m/s", "300 m/s"), min_length=1, max_length=100,
+        description="positive: the air approaches; figures show the first",
+    )  # fmt: skip
+    lidar: DopplerLidar = DopplerLidar()
+    etalon: Etalon = Etalon()
+    camera: FringeCamera = FringeCamera()
+    ccd: CCD = CCD()
+    speckle_modes: Literal["derived"] | Annotated[float, Field(allow_inf_nan=True)] = Field(
+        "derived", description="degrees of freedom of the speckle in a pixel; inf: no speckle"
+    )
+    render: FringeSettings = FringeSettings()
+    photon_samples: int = Field(
+        16, ge=0, le=2**16, description="light paths a pixel, photon by photon through a real lens"
+    )
+    retrieval: RingRetrieval = RingRetrieval()
+
+    @field_validator("speckle_modes", mode="before")
+    @classmethod
+    def _derived_or_number(cls, value):
+        if value == "derived":
+            return value
+        try:
+            number = to_si(value, "", "350")
+        except ValueError:
+            number = math.nan
+        if not number > 0:
+            raise ValueError(f"{value!r} is not allowed; expected derived or a number above 0")
+        return number
+
+    @model_validator(mode="after")
+    def _speeds_make_sense(self):
+        _once("v_los", self.v_los)
+        if self.photon_samples == 1:
+            raise ValueError("photon_samples: 1 is not allowed; expected 0 or 2 and more")
+        return self
+
+
+# keys of the backscatter lidar, which looks at a wake
+BACKSCATTER = ("platform", "lidar", "detector", "scan", "scattering", "render", "retrieval")
+
+
 class Experiment(_Section):
-    """One experiment, start to end."""
+    """One experiment, start to end: a wake for the backscatter lidar, a Doppler lidar, or both."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
     seed: int = Field(1, ge=0, lt=2**31)
-    wake: Wake
+    wake: Wake | None = Field(None, description="seen by the backscatter lidar")
+    doppler: Doppler | None = Field(None, description="the Doppler lidar; {} for the paper's")
     platform: Platform = Platform()
     lidar: BackscatterLidar = BackscatterLidar()
     detector: Detector | None = Field(None, description="adds a noisy picture and its winds")
@@ -184,6 +267,16 @@ class Experiment(_Section):
     scattering: Scattering = Scattering()
     render: RenderSettings = RenderSettings()
     retrieval: Retrieval = Retrieval()
+
+    @model_validator(mode="after")
+    def _something_to_do(self):
+        if self.wake is None and self.doppler is None:
+            raise ValueError("expected wake, doppler or both")
+        for key in BACKSCATTER:
+            unused = getattr(self, key) != type(self).model_fields[key].default
+            if self.wake is None and unused:
+                raise ValueError(f"{key}: not allowed without wake; expected it under doppler")
+        return self
 
     @model_validator(mode="after")
     def _telescope_stays_before_the_slab(self):
@@ -254,8 +347,15 @@ def check(data: dict, origin: str) -> Experiment:
 
 
 def dump(experiment: Experiment) -> str:
-    """The resolved experiment as YAML, quantities with their SI units; `load` reads it again."""
-    return yaml.safe_dump(experiment.model_dump(mode="json"), sort_keys=False)
+    """The resolved experiment as YAML, quantities with their SI units; `load` reads it again.
+
+    Without the sections of a lidar that it does not have.
+    """
+    unused = {"wake", *BACKSCATTER} if experiment.wake is None else set()
+    if experiment.doppler is None:
+        unused.add("doppler")
+    data = experiment.model_dump(mode="json", exclude=unused)
+    return yaml.safe_dump(data, sort_keys=False)
 
 
 def _override(data: dict, text: str) -> None:

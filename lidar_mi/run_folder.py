@@ -18,6 +18,8 @@ from .rendering.phase import table_files
 from .truth import find_file
 
 IMAGES = ("image_t1.exr", "image_t2.exr")
+PICTURES = (*IMAGES, "fringes_*.exr")
+RESULTS = ("wind.nc", "v_los.nc", "metrics.json", "report.html", "log.txt")
 
 # other versions of these may give other pictures
 RENDERED_BY = ("lidar-mi", "mitsuba", "drjit")
@@ -45,14 +47,14 @@ def claim(folder: Path, experiment: Experiment, beside: str | Path, overwrite: b
         before = read_record(folder)
         other = _difference(before, record)
         if other:
-            pictures = [folder / name for name in IMAGES if (folder / name).is_file()]
+            pictures = [path for pattern in PICTURES for path in folder.glob(pattern)]
             if pictures and not overwrite:
                 raise InputError(
                     f"{folder}: holds a run of {other}; expected an empty folder (-o DIR), or "
                     "--overwrite to replace it"
                 )
             # nothing of the other experiment may be taken for a result of this one
-            old = [folder / name for name in ("wind.nc", "metrics.json", "report.html", "log.txt")]
+            old = [folder / name for name in RESULTS]
             for path in (*pictures, *old, *(folder / "figures").glob("*.png")):
                 path.unlink(missing_ok=True)
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
@@ -77,6 +79,8 @@ def _difference(before: dict, now: dict) -> str | None:
 
 def _checksums(experiment: Experiment, beside: str | Path) -> dict[str, str]:
     """SHA-256 of the files an experiment names: a changed file is another experiment."""
+    if experiment.wake is None:
+        return {}
     paths = table_files(experiment.scattering, beside)
     if experiment.wake.file:
         paths["wake.file"] = find_file(experiment.wake.file, beside, "wake.file")

@@ -252,7 +252,7 @@ def test_a_broken_override_is_named(write, override, message):
         ("name: \x00", "not valid YAML (unacceptable character"),
         ("name: !!python/object:os.system 3", "not valid YAML"),
         ("wake: {file: wake.nc}", "name: missing"),
-        ("name: a", "wake: missing"),
+        ("name: a", "expected wake, doppler or both"),
     ],
 )
 def test_a_broken_file_is_named(write, text, message):
@@ -277,7 +277,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 
 
 def test_checking_a_dictionary_names_its_origin():
-    with pytest.raises(InputError, match="^here: wake: missing$"):
+    with pytest.raises(InputError, match="^here: expected wake, doppler or both$"):
         check({"name": "a"}, "here")
     assert isinstance(check({"name": "a", "wake": {"file": "b.nc"}}, "here"), Experiment)
 

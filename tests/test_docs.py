@@ -89,6 +89,7 @@ def _unit(field):
             (units.Length, "m"), (units.Angle, "rad"), (units.Speed, "m/s"), (units.Time, "s"),
             (units.Energy, "J"), (units.Extinction, "1/m"), (units.Circulation, "m²/s"),
             (units.Frequency, "Hz"), (units.SpectralRadiance, "W/m³/sr"),
+            (units.Backscatter, "1/m/sr"), (units.Area, "m²"),
             (units.Number, None),
         )
     }  # fmt: skip
@@ -132,7 +133,7 @@ def test_key_has_the_documented_unit_default_and_limits(name, model, field):
                 limit = getattr(part, attribute)
                 shown = str(limit) if isinstance(limit, int) else f"{limit:.5g}"
                 assert re.search(rf"{sign} {re.escape(shown)}(?![\d.]*\d)", allowed), shown
-        if typing.get_origin(part) is typing.Literal and name != "render.variant":
+        if typing.get_origin(part) is typing.Literal and not name.endswith("render.variant"):
             for option in typing.get_args(part):
                 assert f"`{option}`" in allowed
 

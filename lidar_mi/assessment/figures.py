@@ -58,10 +58,10 @@ def draw_all(
 
     Parameters
     ----------
-    truth : lidar_mi.experiment.Truth
+    truth : lidar_mi.truth.Truth
     scans : the two rendered scans
-    found : winds with dims (source, algorithm, z, y), from `lidar_mi.experiment.winds`
-    sweep : metrics from `lidar_mi.experiment.texture_sweep`
+    found : winds with dims (source, algorithm, z, y), from `lidar_mi.backscatter_chain.winds`
+    sweep : metrics from `lidar_mi.backscatter_chain.texture_sweep`
     """
     scale = _scale(truth)
     plates = (

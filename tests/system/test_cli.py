@@ -18,7 +18,7 @@ import OpenEXR
 import pytest
 import xarray as xr
 
-from lidar_mi import cli, experiment
+from lidar_mi import backscatter_chain, cli
 from lidar_mi.atmosphere.scattering import read_table
 from lidar_mi.rendering.exr import read_layers, read_scan
 
@@ -69,8 +69,8 @@ def lidar_mi(monkeypatch, capsys):
 @pytest.fixture
 def quick(monkeypatch):
     """Runs without figures and texture sweep: the demo has them."""
-    monkeypatch.setattr(experiment.figures, "draw_all", lambda *_: [])
-    monkeypatch.setattr(experiment, "TEXTURE_SWEEP", ())
+    monkeypatch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
+    monkeypatch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
 
 
 def shell(*arguments, **options):

@@ -24,7 +24,7 @@ from scipy import ndimage
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import norm, qmc
 
-from lidar_mi import config, experiment, run_folder
+from lidar_mi import backscatter_chain, config, run_folder
 from lidar_mi import truth as truth_module
 from lidar_mi.atmosphere.wake import read_wake
 from lidar_mi.errors import InputError
@@ -68,8 +68,8 @@ def free_scenes():
 def without_figures():
     """Runs without figures and texture sweep, most of a small run's time: the demo has them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(experiment.figures, "draw_all", lambda *_: [])
-        patch.setattr(experiment, "TEXTURE_SWEEP", ())
+        patch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
+        patch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
         yield
 
 
@@ -154,7 +154,7 @@ def test_the_wake_is_read_once(tmp_path, monkeypatch):
     monkeypatch.setattr(
         truth_module, "read_wake", lambda *a, **k: read.append(a) or read_wake(*a, **k)
     )
-    monkeypatch.setattr(experiment.figures, "draw_all", lambda *_: [])
+    monkeypatch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
     data = small()
     data["wake"] = {"file": write_wake(tmp_path / "w.nc", blob(8, -4))}
     metrics = run(check(data), tmp_path / "run", tmp_path)
@@ -1015,7 +1015,7 @@ def test_a_run_that_fails_says_so_in_its_log(tmp_path, quick, monkeypatch):
         raise InputError("wind: 7 is not allowed;\nexpected 8")
 
     with monkeypatch.context() as patch:
-        patch.setattr(experiment, "winds", broken)
+        patch.setattr(backscatter_chain, "winds", broken)
         with pytest.raises(InputError):
             run(check(small()), folder)
     assert run_folder.failure(folder) == "wind: 7 is not allowed; expected 8"

@@ -1,0 +1,80 @@
+"""How good line-of-sight winds are: spread and bias, with how well they are known."""
+
+import math
+
+import numpy as np
+import xarray as xr
+
+READERS = {
+    "annular": "all rings, full model",
+    "pixels": "all rings, every pixel",
+    "ca": "CA, peak in r",
+    "ca_r2": "CA, peak in r$^2$",
+    "ml": "ML, peak in r",
+    "sg": "Savitzky-Golay, peak in r",
+}
+"""What the methods are called in figures and tables."""
+
+CENTRES = {"free": "centre found", "known": "centre known"}
+
+
+def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
+    """Error measures of every method, centre and number of averaged pictures.
+
+    Keys ``doppler.METHOD.centre_CENTRE.averaged_N.`` and, all but the first in m/s,
+
+    found_fraction  share of the pictures from which a wind was read
+    bias            mean over the speeds of each speed's mean error
+    bias_stderr     standard error of the bias
+    bias_lowest, bias_highest   mean error of the speed at which it is lowest, highest
+    std             standard deviation about each speed's own mean, pooled over all speeds
+    std_stderr      its standard error, std / sqrt(2 degrees of freedom), for normal errors
+    expected_std    root mean square of the standard deviations that the fits state
+
+    Measures that the pictures do not determine are left out.
+
+    Parameters
+    ----------
+    found : xr.Dataset
+        ``v`` and ``v_std`` with dims (algorithm, centre, averaged, v_los, image), NaN where nothing
+        was read, and ``tried`` (algorithm), the pictures of every case.
+    """
+    metrics = {}
+    for algorithm in found["algorithm"].values:
+        tried = int(found["tried"].sel(algorithm=algorithm))
+        for centre in found["centre"].values:
+            for averaged in found["averaged"].values:
+                case = found.sel(algorithm=algorithm, centre=centre, averaged=averaged)
+                key = f"doppler.{algorithm}.centre_{centre}.averaged_{averaged}"
+                error = (case["v"] - case["v_los"]).transpose("v_los", "image").values
+                for name, value in _spread(error, tried).items():
+                    metrics[f"{key}.{name}"] = value
+                stated = case["v_std"].values[np.isfinite(case["v_std"].values)]
+                if stated.size:
+                    metrics[f"{key}.expected_std"] = float(np.sqrt((stated**2).mean()))
+    return metrics
+
+
+def _spread(error: np.ndarray, tried: int) -> dict[str, float]:
+    """Measures of errors (speeds, images)."""
+    known = np.isfinite(error)
+    count = known.sum(1)
+    measures = {}
+    if tried:
+        measures["found_fraction"] = float(count.sum() / (tried * len(error)))
+    seen = count > 0
+    if not seen.any():
+        return measures
+    means = np.nansum(error[seen], 1) / count[seen]
+    measures |= {
+        "bias": float(means.mean()),
+        "bias_lowest": float(means.min()),
+        "bias_highest": float(means.max()),
+    }
+    freedom = int((count[seen] - 1).sum())
+    if freedom:
+        std = math.sqrt(np.nansum((error[seen] - means[:, None]) ** 2) / freedom)
+        measures["bias_stderr"] = std * math.sqrt((1 / count[seen]).sum()) / seen.sum()
+        measures["std"] = std
+        measures["std_stderr"] = std / math.sqrt(2 * freedom)
+    return {name: float(value) for name, value in measures.items()}
