@@ -24,7 +24,7 @@ test-all: setup ## run all tests
 	$(PYTHON_ENV) -m pytest -m "slow or not slow" $(ARGS)
 
 bench: setup ## compare with other programs, side by side
-	@$(PYTHON_ENV) -c "from importlib.util import find_spec as f; exit(not (f('mitransient') and f('openpiv')))" \
+	@$(PYTHON_ENV) -c "from importlib.util import find_spec as f; exit(not (all(map(f, ('mitransient', 'openpiv', 'cv2', 'skimage')))))" \
 		|| $(PYTHON_ENV) -m pip install -q -e ".[bench]"
 	$(PYTHON_ENV) -m benchmarks $(ARGS)
 

@@ -27,7 +27,17 @@ if not (ROOT / "benchmarks").is_dir():
 sys.path.insert(0, str(ROOT))
 
 from benchmarks import __main__ as command
-from benchmarks import cases, estimators, fringes, measure, renderer, report, transient, velocimetry
+from benchmarks import (
+    cases,
+    estimators,
+    fringes,
+    measure,
+    methods,
+    renderer,
+    report,
+    transient,
+    velocimetry,
+)
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 
 
@@ -301,3 +311,23 @@ def test_fringes_compare(variant):
     assert 0 < noise.ours and noise.ratio > 1
     rates = [line for (_, quantity), line in found.items() if quantity == "paths per second"]
     assert len(rates) == 4 and all(line.ours > 0 and line.other > 0 for line in rates)
+
+
+def test_methods_table_has_every_method_and_says_which_peer_is_missing(monkeypatch):
+    monkeypatch.setattr(methods, "NOISE", (0.01,))
+    monkeypatch.setattr(methods, "find_spec", lambda name: None)
+    found = methods.compare(1, 60, 50)
+    notes = {line.quantity: line for line in found.rows}
+    for name in ("cc", "multipass", "variational"):
+        line = notes[f"lidar-mi {name}"]
+        assert 0 < line.other < 1 and line.note.endswith(" s")
+    assert notes["OpenCV DIS"].note == "skipped: pip install opencv-python-headless"
+    assert notes["OpenCV DIS"].ours is None
+
+
+def test_error_of_the_true_wind_is_zero_at_its_place():
+    pair = cases.vortex_pair_images(columns=70, rows=50)
+    dy, dz = (wind.values * cases.DT / cases.SPACING for wind in (pair.v, pair.w))
+    assert methods.rms_errors(pair, methods.Field(dz, dy, 0.0, 0.0)) == pytest.approx((0, 0))
+    off = methods.rms_errors(pair, methods.Field(dz, dy + 0.1, 0.0, 0.0))
+    assert off == pytest.approx((0.5, 0.5))

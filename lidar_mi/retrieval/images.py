@@ -9,7 +9,6 @@ from scipy.interpolate import RectBivariateSpline
 
 from lidar_mi.errors import InputError
 
-
 # Modes of the imaging library that are one number a pixel.
 _GREY = ("1", "L", "I", "F", "I;16", "I;16B", "I;16L")
 
