@@ -10,7 +10,7 @@ from rich.console import Console
 from . import report
 from .measure import fresh_process
 
-COMPARISONS = ("estimators", "dense", "transient", "velocimetry", "methods", "renderer", "fringes")
+COMPARISONS = ("estimators", "dense", "transient", "velocimetry", "methods", "renderer", "fringes", "rings")
 
 
 def main(arguments: list[str] | None = None) -> int:
