@@ -1,0 +1,100 @@
+"""Pulses and photons a scanning lidar needs for so many directions so many times a second."""
+
+import math
+from dataclasses import dataclass
+
+from scipy import constants
+
+from ..errors import InputError
+
+
+@dataclass(frozen=True)
+class PulseBudget:
+    """What a scan costs.
+
+    Attributes
+    ----------
+    pulses_per_second : float
+        Of all directions together, Hz.
+    average_power : float
+        Light sent, W.
+    echo_time : float
+        From a pulse's leaving to its echo's arrival from the farthest range, s.
+    beams : int
+        Directions that must be measured at the same time, as one receiver can wait for one
+        echo at a time: 1 if the pulses can follow each other.
+    photons_per_direction : float
+        Received from one range bin, of all pulses of a direction in one slab.
+    """
+
+    pulses_per_second: float
+    average_power: float
+    echo_time: float
+    beams: int
+    photons_per_direction: float
+
+
+def pulse_budget(
+    directions: int,
+    slabs_per_second: float,
+    pulses_per_direction: int,
+    pulse_energy: float,
+    farthest: float,
+    photons_per_pulse: float = math.nan,
+) -> PulseBudget:
+    """Pulses, power and beams for a scan.
+
+    Parameters
+    ----------
+    directions : int
+        Of one slab.
+    slabs_per_second : float
+        Hz.
+    pulses_per_direction : int
+        That are averaged in one direction of one slab, see `pulses_for_error`.
+    pulse_energy : float
+        J.
+    farthest : float
+        End of the farthest range bin, m.
+    photons_per_pulse : float
+        That come back from one range bin, as by `lidar_mi.instrument.doppler.photons`; NaN: not
+        known.
+
+    Raises
+    ------
+    InputError
+        A number that is not positive.
+    """
+    for name, value in (
+        ("directions", directions), ("slabs_per_second", slabs_per_second),
+        ("pulses_per_direction", pulses_per_direction), ("pulse_energy", pulse_energy),
+        ("farthest", farthest),
+    ):  # fmt: skip
+        if not (value > 0 and math.isfinite(value)):
+            raise InputError(f"{name}: {value} is not allowed; expected more than 0")
+    rate = directions * slabs_per_second * pulses_per_direction
+    echo_time = 2 * farthest / constants.c
+    return PulseBudget(
+        pulses_per_second=rate,
+        average_power=rate * pulse_energy,
+        echo_time=echo_time,
+        # an echo that just fits must not ask for a second beam by rounding
+        beams=max(1, math.ceil(rate * echo_time * (1 - 1e-12))),
+        photons_per_direction=pulses_per_direction * photons_per_pulse,
+    )
+
+
+def pulses_for_error(error_of_one: float, required: float) -> int:
+    """Pulses to average for a standard error, if those of single pulses are independent.
+
+    (error of one / required)^2, rounded up: a bias does not average out.
+
+    Raises
+    ------
+    InputError
+        A standard error that is not positive.
+    """
+    for name, value in (("error_of_one", error_of_one), ("required", required)):
+        if not (value > 0 and math.isfinite(value)):
+            raise InputError(f"{name}: {value} m/s is not allowed; expected more than 0 m/s")
+    return max(1, math.ceil((error_of_one / required) ** 2 * (1 - 1e-12)))
