@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.eye_safety import (
     PulseLimit,
     ViewingAid,
@@ -24,6 +25,7 @@ from lidar_mi.instrument.eye_safety import (
     permissible_pulse,
     time_base,
 )
+from lidar_mi.instrument.lidar import BackscatterLidar
 
 NM = 1e-9
 
@@ -231,6 +233,22 @@ def test_safe_at_the_exit_and_never_safe():
     limit = permissible_pulse(532e-9, 1e-8, 0, 1)
     ratio = exposure_at(0, 0.1, 0.01, 0.0, 7e-3) / 2e-3
     assert hazard_distance(0.1, limit, 0.01, 0.0, 1e-4) == pytest.approx(math.log(ratio) / 1e-4)
+
+
+def test_distances_of_the_default_lidars():
+    """As the theory quotes them."""
+    lidar, doppler = BackscatterLidar(), DopplerLidar()
+    beam = float(lidar.radius_at(0)), lidar.divergence_full
+    green = assess_pulses(lidar.wavelength, lidar.pulse_energy, 10e-9, *beam)
+    assert green.hazard_distance == pytest.approx(558, abs=0.5)
+    assert green.aided_hazard_distance == pytest.approx(3.9e3, abs=50)
+    for wavelength in (355e-9, 1550e-9):
+        train = assess_pulses(wavelength, lidar.pulse_energy, 10e-9, *beam, 20.0, 10.0)
+        assert train.hazard_distance == train.aided_hazard_distance == 0
+    beam = doppler.pulse_duration, doppler.beam_radius, doppler.divergence_full
+    for rate, distance in ((0.0, 52), (200.0, 365)):
+        found = assess_pulses(doppler.wavelength, doppler.pulse_energy, *beam, rate, 10.0)
+        assert found.hazard_distance == pytest.approx(distance, abs=0.5)
 
 
 # bad input

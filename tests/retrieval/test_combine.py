@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind
@@ -233,19 +234,36 @@ def test_uniform_wind_is_known_to_the_mean_of_all_lines():
     assert found.attrs["u_std"] < 0.5
 
 
-def test_the_combined_sensor_beats_lines_alone():
-    """The paper's conclusion: u from lines and images together, v and w of lines are useless."""
-    wind, flow, scan = scene(np.random.default_rng(9))
+def test_a_vortex_pair():
+    """The paper's conclusion: u from lines and images together; v and w of lines are useless.
+
+    Lamb-Oseen vortices with 2 m/s of axial flow in their cores, errors as the theory quotes them.
+    """
+    random = np.random.default_rng(0)
+    y, z = np.arange(-40, 40.1, 1.0), np.arange(-28, 28.1, 1.0)
+    pair = [Vortex(circulation=s * 458.0, core_radius=3.0, y=s * 15.0, z=0.0) for s in (1, -1)]
+    grid_y, grid_z = np.meshgrid(y, z)
+    v, w = velocity(pair, grid_y, grid_z)
+    axial = sum(2 * np.exp(-((grid_y - s * 15) ** 2 + grid_z**2) / 50) for s in (1, -1))
+    fields = {name: (("z", "y"), f) for name, f in (("u", axial), ("v", v), ("w", w))}
+    wind = xr.Dataset(fields, coords={"y": y, "z": z})
+    overlap = [np.linalg.cholesky(np.clip(1 - abs(a[:, None] - a) / 4, 0, None)
+                                  + 1e-12 * np.eye(len(a))) for a in (z, y)]  # fmt: skip
+    noise = (0.7 * overlap[0] @ random.standard_normal(axial.shape) @ overlap[1].T for _ in "vw")
+    flow = crossflow(wind.v + next(noise), wind.w + next(noise), 0.7, 0.0, y, z, template=4)
+    flow["w_stderr"] = flow.v_stderr
+    scan = scan_wind(wind, DopplerScan(azimuth_half="20 deg", elevation_half="13 deg"),
+                     DopplerLidar(range=76), 0.5, 1, 150.0)  # fmt: skip
     found = combine(flow, scan)
     inside = found.flag == 0
     rms = {c: float(np.sqrt((((found[c] - wind[c]) ** 2).where(inside)).mean())) for c in "uvw"}
     alone = wind_from_triples(scan)
     truth = {c: wind[c].interp(y=alone.y, z=alone.z) for c in "uvw"}
     lone = {c: float(np.sqrt(((alone[c] - truth[c]) ** 2).mean())) for c in "uvw"}
-    assert rms["u"] < 1 and lone["u"] > 1.5 * rms["u"]
+    assert rms["u"] == pytest.approx(0.4, abs=0.1) and lone["u"] == pytest.approx(3, abs=1)
+    assert lone["v"] == pytest.approx(13, abs=3)
     for c in "vw":
-        before = float(np.sqrt((((flow[c] - wind[c]) ** 2).where(inside)).mean()))
-        assert rms[c] < 1.01 * before and lone[c] > 4 * rms[c]
+        assert rms[c] < 1.01 * float(np.sqrt((((flow[c] - wind[c]) ** 2).where(inside)).mean()))
         assert (found[f"{c}_stderr"] <= flow[f"{c}_stderr"] * (1 + 1e-9)).all()
 
 

@@ -163,6 +163,8 @@ def test_the_papers_scan_cannot_tell_v_and_w():
     """Triples of 63 lines at 0.5 m/s each, the table's error of v_LOS: v and w beyond 2.5 m/s."""
     found = wind_from_triples(scanned(0.5))
     assert float(found.v_stderr.min()) > 2.5 and float(found.w_stderr.min()) > 2.5
+    assert float(found.v_stderr.mean()) == pytest.approx(7.4, abs=0.05)
+    assert float(found.u_stderr.mean()) == pytest.approx(1.9, abs=0.05)
     # two neighbours 5.4 degrees apart differ by their velocities' errors over the angle
     apart = 2 * math.tan(math.radians(21.5)) / 8
     assert float(found.v_stderr.min()) == pytest.approx(0.5 * math.sqrt(2) / apart, rel=0.2)
