@@ -2,7 +2,7 @@
 # ARGS goes to the command behind a target: make test ARGS="tests/test_llvm.py -x"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all bench lint clean
+.PHONY: help setup demo test test-all bench validate docs lint clean
 
 PYTHON_ENV := .venv/bin/python
 EXPERIMENT := wake_backscatter
@@ -28,10 +28,21 @@ bench: setup ## compare with other programs, side by side
 		|| $(PYTHON_ENV) -m pip install -q -e ".[bench]"
 	$(PYTHON_ENV) -m benchmarks $(ARGS)
 
+validate: setup ## check against closed forms, published numbers and other programs: docs/validation.md
+	@$(PYTHON_ENV) -c "from importlib.util import find_spec as f; exit(not (f('scatrs') and f('rustmatrix') and f('miepython')))" \
+		|| $(PYTHON_ENV) -m pip install -q -e ".[test]"
+	$(PYTHON_ENV) -m validation $(ARGS)
+
+docs: setup ## build the documentation as a site in site/, readable offline
+	@$(PYTHON_ENV) -c "import furo, latex2mathml, myst_parser" 2>/dev/null \
+		|| $(PYTHON_ENV) -m pip install -q -e ".[docs]"
+	$(PYTHON_ENV) -m sphinx -q -W --keep-going -d build/doctrees docs site $(ARGS)
+	@echo "open site/index.html"
+
 lint: setup ## check the style of the code
 	@$(PYTHON_ENV) -c "import ruff" 2>/dev/null || $(PYTHON_ENV) -m pip install -q ruff
 	$(PYTHON_ENV) -m ruff check $(if $(ARGS),$(ARGS),.)
 
 clean: ## remove caches and build leftovers; .venv and outputs stay
-	rm -rf build dist .pytest_cache .ruff_cache *.egg-info
+	rm -rf build dist site .pytest_cache .ruff_cache *.egg-info
 	find . -name .venv -prune -o -name outputs -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

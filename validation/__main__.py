@@ -1,0 +1,72 @@
+"""``python -m validation``: all groups of checks, or those named."""
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+from rich.console import Console
+
+from benchmarks.measure import fresh_process
+
+from . import GROUPS, report
+from . import __doc__ as description
+from .eradiate import provenance
+from .group import run
+from .scenes import Effort
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "validation.md"
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(
+        "python -m validation",
+        description=description,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("groups", nargs="*", metavar="NAME", help="some of the groups; default all")
+    parser.add_argument("--slow", action="store_true", help="sixteen times the photons")
+    parser.add_argument(
+        "--eradiate",
+        metavar="PYTHON",
+        default=os.environ.get("LIDAR_MI_ERADIATE_PYTHON"),
+        help="interpreter with eradiate-mitsuba to run beside (default: its stored numbers)",
+    )
+    parser.add_argument(
+        "-o", "--out", type=Path, default=PAGE, help="page to write when all groups run"
+    )
+    options = parser.parse_args(arguments)
+    unknown = [name for name in options.groups if name not in GROUPS]
+    if unknown:
+        parser.error(f"NAME: {unknown[0]!r} is none of {', '.join(GROUPS)}")
+
+    folder = options.out.parent / options.out.stem
+    effort = Effort(16 if options.slow else 1, folder, options.eradiate)
+    console = Console(width=None if sys.stdout.isatty() else 140)
+    found, failed = [], []
+    for name in options.groups or GROUPS:
+        with console.status(f"checking: {name}"), fresh_process() as process:
+            future = process.submit(run, name, effort)
+            # a group that breaks must not cost the others
+            if error := future.exception():
+                failed.append(f"{name}: {error!r}")
+                continue
+        found.append(future.result())
+        for check in found[-1][-1]:
+            report.show(check, console)
+            failed += [
+                f"{check.title}, {row.name}: expected {row.expected:.6g}, got {row.got:.6g}"
+                for row in check.rows
+                if not row.passed
+            ]
+    if len(found) == len(GROUPS):
+        command = "make validate" + (" ARGS=--slow" if options.slow else "")
+        report.write(report.page(found, command, [provenance()]), options.out)
+        console.print(f"written: {options.out}", highlight=False)
+    for line in failed:
+        console.print(f"FAILS: {line}", style="red", highlight=False, soft_wrap=True)
+    return int(bool(failed))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""Steady states of Eradiate: run beside in its own environment, or as stored."""
+
+import json
+import subprocess
+import tempfile
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+STORED = HERE / "eradiate_reference.json"
+PHOTONS = 1_000_000  # of every case, times the effort
+
+
+def reference(python: str | None, scale: int) -> dict:
+    """What ``eradiate_reference.py`` writes: newly made where an interpreter is given, else stored."""
+    if python is None:
+        return json.loads(STORED.read_text())
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "eradiate.json"
+        script = HERE / "eradiate_reference.py"
+        # its own environment: nothing of ours may lead it to another Mitsuba or LLVM
+        subprocess.run(
+            [python, str(script), "-n", str(PHOTONS * scale), "-o", str(out)], check=True
+        )
+        return json.loads(out.read_text())
+
+
+def provenance() -> str:
+    """Where the stored numbers come from."""
+    stored = json.loads(STORED.read_text())
+    versions = ", ".join(f"{name} {number}" for name, number in stored["versions"].items())
+    return (
+        f"Eradiate's stored numbers were made by `{stored['command']}` with {versions}, in the variant "
+        f"`{stored['variant']}`; `make validate ARGS='--eradiate PYTHON'` makes new ones with an "
+        "interpreter that has eradiate-mitsuba."
+    )

@@ -1,0 +1,266 @@
+"""Single scattering against closed forms."""
+
+import itertools
+import math
+from importlib.resources import files
+
+import mitsuba as mi
+import numpy as np
+
+from . import figures
+from .report import Check, Row, spread
+from .scenes import ENVIRONMENT, box, grid, layer, medium, render, scene, secants
+
+TITLE = "Single scattering"
+INTRODUCTION = (
+    "The lidar equation, integrated over each gate by Gauss-Legendre quadrature, for beams inside the "
+    "field of view. What it leaves out, the finite beam and telescope, is 1e-6 of the signal at 500 m; "
+    "ranges in single precision add about as much."
+)
+EQUATION = "lidar equation (Weitkamp 2005, chap. 1)"
+
+AREA = math.pi * 0.5**2
+RAYLEIGH = 3 / (8 * math.pi)
+TRUNCATION = 1e-5
+SCAN = {
+    "azimuth_min_deg": -6.2,
+    "azimuth_max_deg": 6.2,
+    "elevation_min_deg": -3.9,
+    "elevation_max_deg": 3.9,
+}
+
+
+def equation(edges, extinction, depth, breaks=(), backscatter=RAYLEIGH):
+    """Received over emitted energy of gates, the integral of A p sigma exp(-2 tau) / R^2.
+
+    Parameters
+    ----------
+    edges : (gates + 1, ...) array
+        Ranges along each beam, m.
+    extinction, depth : functions
+        Scattering coefficient (1 / m) and optical depth of a range.
+    breaks : sequence of arrays
+        Ranges where the extinction jumps, ascending.
+    backscatter : float
+        Phase function at 180 degrees, per steradian.
+    """
+    total = 0.0
+    for begin, end in itertools.pairwise([-np.inf, *breaks, np.inf]):
+        low, high = (np.clip(e, begin, end) for e in (edges[:-1], edges[1:]))
+        for node, weight in zip(*np.polynomial.legendre.leggauss(12)):
+            r = (low + high) / 2 + (high - low) / 2 * node
+            signal = AREA * backscatter * extinction(r) / r**2 * np.exp(-2 * depth(r))
+            total = total + weight * (high - low) / 2 * signal
+    return total
+
+
+def layered(edges, steps, secant=1.0):
+    """`equation` for layers across x, (start, extinction) each; all paths grow by ``secant``."""
+    starts, values = (np.array(v, float) for v in zip(*steps))
+    depths = np.concatenate([[0], np.cumsum(np.diff(starts) * values[:-1])])
+
+    def of(r):
+        return np.searchsorted(starts, r / secant, side="right") - 1
+
+    return equation(
+        np.multiply.outer(np.asarray(edges, float), secant),
+        lambda r: values[of(r)],
+        lambda r: secant * (depths[of(r)] + (r / secant - starts[of(r)]) * values[of(r)]),
+        [start * np.asarray(secant) for start in starts[1:]],
+    )
+
+
+def compared(name, found, truth, bias=TRUNCATION):
+    """Two rows: the sum over everything, and each beam and gate within its own error."""
+    value, error = found["S0"], found["S0_stderr"]
+    total = Row(
+        f"{name}: rendered over expected", EQUATION, 1.0, value.sum() / truth.sum(),
+        math.sqrt((error**2).sum()) / truth.sum(), bias,
+    )  # fmt: skip
+    return [total, spread(name, EQUATION, (value - truth) / error)]
+
+
+def scan_of_a_slab(effort):
+    """Beams up to 7 degrees off the axis, planar gates, the telescope in the environment."""
+    size, rows = (73, 47), []
+    layers = [(0, 1e-4), (490, 2e-2)]
+    media = {
+        "homogeneous slab": medium(2e-2),
+        "slab of a constant grid": grid(np.full((3, 4, 5), 2e-2), (490, -65, -45), (512, 65, 45)),
+    }
+    for seed, (name, slab) in enumerate(media.items()):
+        shape = box((490, -65, -45), (512, 65, 45), slab, ENVIRONMENT)
+        loaded = scene((500, 502.5), {"slab": shape}, size, environment=medium(1e-4), **SCAN)
+        found = render(loaded, 10 + seed, 4096 * effort.scale)
+        rows += compared(name, found, layered([500, 502.5], layers, secants(loaded, size)))
+    return Check(
+        "Scan of a slab in an environment",
+        f"{size[0]} x {size[1]} beams over 12.4 by 7.8 degrees; slab of 0.02 / m from 490 m, "
+        "environment of 0.0001 / m from the telescope on, gate from 500 to 502.5 m.",
+        tuple(rows),
+    )
+
+
+def profile_through_layers(effort):
+    """Many gates, faces of media inside them."""
+    steps = [(0, 1e-3), (300, 5e-3), (350, 2e-2), (416.25, 5e-3), (450, 1e-3)]
+    edges = np.linspace(250, 500, 101)
+    outer = {"type": "ref", "id": "outer"}
+    shapes = {
+        "slab": layer(300, 450, medium(5e-3) | {"id": "outer"}, ENVIRONMENT),
+        "core": layer(350, 416.25, medium(2e-2), outer, 1000.0),
+    }
+    loaded = scene(
+        (edges[0], edges[-1]), shapes, environment=medium(1e-3), gate_count=len(edges) - 1,
+        gate_kind="spherical",
+    )  # fmt: skip
+    found = render(loaded, 20, 400_000 * effort.scale)
+    truth = layered(edges, steps)[:, None, None]
+    place = effort.folder / "lidar_equation_profile.png"
+    middle = (edges[1:] + edges[:-1]) / 2
+    with figures.figure(place, (7, 4), 2, height_ratios=[2, 1], sharex=True) as (top, bottom):
+        top.semilogy(middle, truth.ravel(), color=figures.REFERENCE, label="lidar equation")
+        top.plot(middle, found["S0"].ravel(), ".", color=figures.OURS, label="rendered")
+        top.set_ylabel("received / emitted energy")
+        top.legend(frameon=False)
+        bottom.axhspan(-2, 2, color="0.92")
+        bottom.plot(middle, ((found["S0"] - truth) / found["S0_stderr"]).ravel(), ".",
+                    color=figures.OURS)  # fmt: skip
+        bottom.set(xlabel="range, m", ylabel="deviation, sigmas", ylim=(-5, 5))
+    return Check(
+        "Profile through nested layers",
+        "100 gates of 2.5 m; a slab of 0.005 / m from 300 to 450 m around one of 0.02 / m from 350 to "
+        "416.25 m (inside a gate), environment of 0.001 / m.",
+        tuple(compared("100 gates", found, truth)),
+        ((place.name, "Signal of every gate, and its difference from the lidar equation."),),
+    )
+
+
+def valley_of_extinction(effort):
+    """A grid that is linear between cell centres: no middle or mean value stands for it."""
+    size, edges = (9, 7), np.linspace(500, 540, 5)
+    centres = 400 + 10 * (np.arange(20) + 0.5)
+    values = 1e-3 * (1 + np.abs(centres - 465) / 10)
+    low, high = (400, -90, -90), (600, 90, 90)
+    rows = []
+    for name, raised in (("majorant as it is", 1.0), ("majorant raised 20 times", 20.0)):
+        filled = np.broadcast_to(values, (24, 24, 20)).copy()
+        filled[0, 0, 0] = raised * values.max()
+        shape = box(low, high, grid(filled, low, high))
+        loaded = scene((500, 540), {"slab": shape}, size, gate_count=4, **SCAN)
+        found = render(loaded, 30 + int(raised), 40_000 * effort.scale)
+        secant = secants(loaded, size)
+
+        def depth(r, secant=secant):
+            # 7e-3 in the outermost half cell, down to 1e-3 at 465 m and up again
+            x = r / secant - 465
+            return secant * 1e-3 * (5 * 7 + 60 * 4 + x + x**2 / 20)
+
+        truth = equation(
+            np.multiply.outer(edges, secant), lambda r, s=secant: 1e-3 * (1 + (r / s - 465) / 10),
+            depth,
+        )  # fmt: skip
+        rows += compared(name, found, truth, 5e-5)
+    return Check(
+        "Valley of extinction on a grid",
+        "Extinction falls from 0.007 to 0.001 / m at 465 m and rises again, four gates behind. The "
+        "majorant of the null collisions is raised by one voxel that no beam meets.",
+        tuple(rows),
+    )
+
+
+def _table_of_spheroids():
+    return np.loadtxt(str(files("lidar_mi.scenes") / "aerosol_spheroids_532nm.txt"))
+
+
+def phase_functions(effort):
+    """Backscatter coefficients of every kind of scatterer."""
+    table = _table_of_spheroids()
+    theta = np.radians(np.linspace(0, 180, 400_001))
+    a1 = np.interp(np.degrees(theta), table[:, 0], table[:, 1])
+    norm = 2 * math.pi * np.trapezoid(a1 * np.sin(theta), theta)
+    delta = 0.028
+    dipole = (1 - delta) / (1 + delta / 2)
+    cases = {
+        "isotropic": ({"type": "isotropic"}, 1 / (4 * math.pi), "1 / 4 pi"),
+        "Henyey-Greenstein g = 0.7": (
+            {"type": "hg", "g": 0.7}, 0.51 / (4 * math.pi * 1.7**3),
+            "Henyey & Greenstein 1941",
+        ),
+        "Rayleigh, depolarisation factor 0.028": (
+            {"type": "rayleigh_polarized", "depolarization": delta},
+            (1.5 * dipole + 1 - dipole) / (4 * math.pi), "Hansen & Travis 1974, eq. 2.15",
+        ),
+        "spheroids (table)": (
+            {"type": "mueller", "table": mi.TensorXf(table)}, a1[-1] / norm,
+            "the table, by the trapezoidal rule",
+        ),
+    }  # fmt: skip
+    rows = []
+    for name, (phase, expected, reference) in cases.items():
+        loaded = scene((500, 520), {"slab": layer(500, 520, medium(1e-2, phase))})
+        found = render(loaded, 40 + len(rows), 200_000 * effort.scale)
+        unit = layered([500, 520], [(0, 1e-12), (500, 1e-2)])[0] / RAYLEIGH
+        rows.append(
+            Row(
+                f"{name}: phase function at 180 degrees", reference, expected,
+                found["S0"].item() / unit, found["S0_stderr"].item() / unit, 2e-5 * expected, "1/sr",
+            )
+        )  # fmt: skip
+    return Check(
+        "Phase functions in backscatter",
+        "Rendered signal over the lidar equation's factor: what the scatterer itself contributes.",
+        tuple(rows),
+    )
+
+
+def depolarisation(effort):
+    """Depolarisation ratios of backscatter, linear and circular."""
+    rows = []
+    laser = {"stokes": "1, 1, 0, 0", "divergence_full_mrad": 0.0}
+    for delta in (0.00713, 0.0284, 0.3):
+        phase = {"type": "rayleigh_polarized", "depolarization": delta}
+        linear = delta / (2 - delta)
+        for kind, stokes, expected in (
+            ("linear", "1, 1, 0, 0", linear),
+            ("circular", "1, 0, 0, 1", 2 * linear / (1 - linear)),
+        ):
+            shapes = {"slab": layer(500, 520, medium(1e-3, phase))}
+            loaded = scene((500, 520), shapes, laser=laser | {"stokes": stokes})
+            found = render(loaded, 50, 2000)
+            polarised = found["S1"] if kind == "linear" else -found["S3"]
+            got = (found["S0"] - polarised) / (found["S0"] + polarised)
+            rows.append(
+                Row(
+                    f"{kind} ratio, depolarisation factor {delta:g}",
+                    "D / (2 - D), circular 2 d / (1 - d) of the linear one (Mishchenko & Hovenier 1995)",
+                    expected, got.item(), tolerance=1e-5,
+                )
+            )  # fmt: skip
+    table = _table_of_spheroids()
+    phase = {"type": "mueller", "table": mi.TensorXf(table)}
+    loaded = scene((500, 520), {"slab": layer(500, 520, medium(1e-3, phase))}, laser=laser)
+    found = render(loaded, 51, 2000)
+    got = (found["S0"] - found["S1"]) / (found["S0"] + found["S1"])
+    a1, a2 = table[-1, 1:3]
+    rows.append(
+        Row(
+            "linear ratio of the spheroids", "(a1 - a2) / (a1 + a2) of the last line of the table",
+            (a1 - a2) / (a1 + a2), got.item(), tolerance=1e-5,
+        )
+    )  # fmt: skip
+    return Check(
+        "Depolarisation in backscatter",
+        "I and Q of a photon are fully correlated here, so the ratio has no noise. Light returns up to "
+        "1 mrad off 180 degrees, for the telescope has a size: second order in that.",
+        tuple(rows),
+    )
+
+
+CHECKS = (
+    scan_of_a_slab,
+    profile_through_layers,
+    valley_of_extinction,
+    phase_functions,
+    depolarisation,
+)

@@ -1,0 +1,226 @@
+"""What checks found: rows, a table on the terminal and a page of the documentation."""
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+SIGMAS = 4
+"""A row passes within so many standard errors; of 1000 right ones, 0.06 do not."""
+
+PACKAGES = ("lidar-mi", "mitsuba", "drjit", "numpy", "scipy", "scatrs", "rustmatrix", "miepython")
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number held against its reference.
+
+    Parameters
+    ----------
+    name, reference : str
+        What is compared, and where ``expected`` comes from.
+    expected, got : float
+    sigma : float
+        Standard error of ``got - expected``; 0 for numbers without chance.
+    tolerance : float
+        What the reference or the comparison leaves open beside chance: rounding of published
+        digits, a stated truncation.
+    unit : str
+
+    Raises
+    ------
+    ValueError
+        Neither a standard error nor a tolerance: such a row says nothing.
+    """
+
+    name: str
+    reference: str
+    expected: float
+    got: float
+    sigma: float = 0.0
+    tolerance: float = 0.0
+    unit: str = ""
+
+    def __post_init__(self):
+        for name in ("expected", "got", "sigma", "tolerance"):
+            object.__setattr__(self, name, float(getattr(self, name)))
+        allowed = SIGMAS * self.sigma + self.tolerance
+        if not (self.sigma >= 0 and self.tolerance >= 0 and 0 < allowed < math.inf):
+            raise ValueError(
+                f"{self.name}: sigma {self.sigma}, tolerance {self.tolerance}; "
+                "expected numbers >= 0, not both 0"
+            )
+
+    @property
+    def deviation(self) -> float:
+        """In standard errors, or in tolerances where there is no chance."""
+        return (self.got - self.expected) / (self.sigma or self.tolerance)
+
+    @property
+    def passed(self) -> bool:
+        return abs(self.got - self.expected) <= SIGMAS * self.sigma + self.tolerance
+
+
+@dataclass(frozen=True)
+class Check:
+    """Rows that belong together, with what has to be known to read them.
+
+    ``figures`` are the names of PNGs beside the page and their captions; ``name`` is that of the
+    function that made it, with its group's.
+    """
+
+    title: str
+    text: str
+    rows: tuple[Row, ...]
+    figures: tuple[tuple[str, str], ...] = ()
+    name: str = ""
+
+    @property
+    def passed(self) -> bool:
+        return bool(self.rows) and all(row.passed for row in self.rows)
+
+
+def largest(name: str, reference: str, got, expected, tolerance: float, unit: str = "") -> Row:
+    """A row for arrays without chance: their largest difference, which should be none."""
+    difference = np.asarray(got, float) - np.asarray(expected, float)
+    worst = np.abs(difference).max() if np.isfinite(difference).all() else math.nan
+    return Row(name, reference, 0.0, worst, 0.0, tolerance, unit)
+
+
+def mean_and_error(batches) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard error over independent batches (first axis)."""
+    batches = np.asarray(batches, float)
+    return batches.mean(0), batches.std(0, ddof=1) / math.sqrt(len(batches))
+
+
+def spread(name: str, reference: str, z, batches: float = math.inf) -> Row:
+    """Mean square of independent z-scores: tells of errors in any of them, and of their bars.
+
+    ``batches`` are those that the standard errors were taken from: z is then Student's, with a
+    wider distribution than the normal one.
+    """
+    z = np.asarray(z, float).ravel()
+    freedom = batches - 1
+    expected, fourth = 1.0, 3.0
+    if math.isfinite(batches):
+        expected = freedom / (freedom - 2)
+        fourth = 3 * freedom**2 / ((freedom - 2) * (freedom - 4))
+    sigma = math.sqrt((fourth - expected**2) / z.size)
+    return Row(f"{name}: mean square of {z.size} z-scores", reference, expected, (z**2).mean(), sigma)
+
+
+def show(check: Check, console: Console) -> None:
+    """Print a check as a table."""
+    table = Table(title=check.title, title_justify="left", title_style="bold")
+    for name, justify in (("", "left"), ("expected", "right"), ("got", "right"),
+                          ("sigma", "right"), ("deviation", "right"), ("", "left")):  # fmt: skip
+        table.add_column(name, justify=justify)
+    for row in check.rows:
+        verdict = "ok" if row.passed else "[bold red]FAILS[/bold red]"
+        table.add_row(*_cells(row), verdict)
+    console.print(table)
+
+
+def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes=()) -> str:
+    """The whole page as GitHub-flavoured Markdown.
+
+    Parameters
+    ----------
+    groups : sequence of (title, introduction, checks)
+    command : str
+        What makes the page again.
+    notes : sequence of str
+        Lines about where stored references come from.
+    """
+    checks = [check for _, _, found in groups for check in found]
+    rows = [row for check in checks for row in check.rows]
+    failed = sum(not row.passed for row in rows)
+    verdict = f"{failed} of {len(rows)} fail" if failed else f"all {len(rows)} pass"
+    lines = [
+        "# Validation",
+        "",
+        "<!-- Written by `python -m validation`; edit validation/ instead. -->",
+        "",
+        "Numbers of lidar-mi against numbers that did not come from it: closed forms, published",
+        "values, conservation laws and other programs. Every row of this page is made again by",
+        "",
+        "```sh",
+        command,
+        "```",
+        "",
+        f"A row passes if the numbers agree within {SIGMAS} standard errors plus what the reference",
+        "itself leaves open (the tolerance). *Sigma* is the standard error of the difference, of",
+        "both sides together; *deviation* is the difference in sigmas. Rows without chance have a",
+        "tolerance in place of sigma (marked with a bar, as in \\|5e-05\\|), and their deviation is in",
+        f"tolerances. Seeds are fixed. **Of {len(rows)} rows, {verdict}.**",
+        "",
+    ]
+    for title, _, found in groups:
+        lines += [f"- [{title}](#{_anchor(title)})"]
+        lines += [f"  - [{check.title}](#{_anchor(check.title)})" for check in found]
+    lines.append("")
+    for title, introduction, found in groups:
+        lines += [f"## {title}", "", introduction, ""]
+        for check in found:
+            lines += _section(check)
+    lines += ["## Versions", "", *notes, ""]
+    known = [(name, _version(name)) for name in PACKAGES]
+    lines += ["| package | version |", "| --- | --- |"]
+    lines += [f"| {name} | {number} |" for name, number in known if number]
+    return "\n".join(lines) + "\n"
+
+
+def _section(check: Check) -> list[str]:
+    lines = [f"### {check.title}", "", f"<!-- {check.name} -->", "", check.text, ""]
+    lines += [
+        "| what | expected | got | sigma | deviation | | reference |",
+        "| --- | ---: | ---: | ---: | ---: | --- | --- |",
+    ]
+    for row in check.rows:
+        verdict = "pass" if row.passed else "**FAIL**"
+        cells = [cell.replace("|", "\\|") for cell in (*_cells(row), verdict, row.reference)]
+        lines.append(f"| {' | '.join(cells)} |")
+    lines.append("")
+    for name, caption in check.figures:
+        lines += [f"![{caption}](validation/{name})", "", f"*{caption}*", ""]
+    return lines
+
+
+def _cells(row: Row) -> list[str]:
+    name = f"{row.name}, {row.unit}" if row.unit else row.name
+    allowed = f"{row.sigma:.1e}" if row.sigma else f"|{row.tolerance:.1e}|"
+    return [name, _number(row.expected), _number(row.got), allowed, f"{row.deviation:+.1f}"]
+
+
+def _number(value: float) -> str:
+    """Six digits."""
+    return f"{value:.6g}"
+
+
+def _anchor(title: str) -> str:
+    """GitHub's name for a heading."""
+    return "".join(c for c in title.lower() if c.isalnum() or c in " -_").replace(" ", "-")
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def write(text: str, path: Path) -> None:
+    """Write a page, complete or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
