@@ -1,0 +1,61 @@
+"""The documentation as a site: ``make docs`` builds it in site/, readable offline.
+
+The pages are the Markdown files beside this one, as they stand; formulas become MathML, which
+browsers draw by themselves.
+"""
+
+import html
+import re
+import unicodedata
+from importlib import metadata
+
+from docutils import nodes
+from latex2mathml.converter import convert
+
+project = "lidar-mi"
+author = "The lidar-mi developers"
+release = metadata.version("lidar-mi")
+
+extensions = ["myst_parser"]
+source_suffix = {".md": "markdown"}
+
+# as GitHub reads the same files
+myst_enable_extensions = ["dollarmath"]
+myst_fence_as_directive = ["math"]
+myst_heading_anchors = 4
+
+html_theme = "furo"
+html_title = f"lidar-mi {release}"
+html_copy_source = False
+html_show_sphinx = False
+pygments_style = "tango"
+html_math_renderer = "mathml"
+html_theme_options = {"navigation_with_keys": True}
+
+
+def _inline(writer, node):
+    writer.body.append(_mathml(node.astext(), "inline"))
+    raise nodes.SkipNode
+
+
+def _block(writer, node):
+    writer.body.append(f'<div class="math">{_mathml(node.astext(), "block")}</div>')
+    raise nodes.SkipNode
+
+
+def _mathml(formula, display):
+    """A formula, its source kept for those who copy it."""
+    drawn = convert(formula, display=display)
+    # browsers know of styled letters only as characters of their own
+    drawn = re.sub(r'<mi mathvariant="(bold|script|bold-italic)">([^<]+)</mi>', _styled, drawn)
+    return drawn.replace("<math ", f'<math title="{html.escape(formula.strip())}" ', 1)
+
+
+def _styled(found):
+    style, letter = found[1].upper().replace("-", " "), unicodedata.name(html.unescape(found[2]))
+    letter = re.sub("LATIN |GREEK |LUNATE |LETTER ", "", letter)
+    return f"<mi>{unicodedata.lookup(f'MATHEMATICAL {style} {letter}')}</mi>"
+
+
+def setup(app):
+    app.add_html_math_renderer("mathml", (_inline, None), (_block, None))

@@ -1,0 +1,55 @@
+"""The documentation as a site.
+
+Detects a page that the site lists but does not have, or has but does not list, a picture or link
+that leads nowhere, a formula that is left as its source, and styled letters that browsers would
+draw plain.
+"""
+
+import importlib.util
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+NEEDED = ("sphinx", "myst_parser", "furo", "latex2mathml")
+missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+with_sphinx = pytest.mark.skipif(bool(missing), reason=f"no {', '.join(missing)}: extra docs")
+
+
+def test_every_page_is_listed_and_there():
+    text = (DOCS / "index.md").read_text()
+    listed = re.search(r"^```\{toctree\}\n(?::.*\n)*\n([^`]+)```$", text, re.MULTILINE)[1].split()
+    pages = {page.stem for page in DOCS.glob("*.md")} - {"index"}
+    assert set(listed) == pages and len(listed) == len(pages)
+
+
+def test_pictures_are_there():
+    for page in DOCS.glob("*.md"):
+        for picture in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page.read_text()):
+            assert (DOCS / picture).is_file(), f"{page.name}: {picture}"
+
+
+@with_sphinx
+def test_formulas_become_mathml():
+    mathml = runpy.run_path(str(DOCS / "conf.py"))["_mathml"]
+    drawn = mathml(r"\mathbf x = \mathcal T \boldsymbol\epsilon^2", "inline")
+    assert "<mi>\U0001d431</mi>" in drawn and "<mi>\U0001d4af</mi>" in drawn
+    assert "\U0001d750" in drawn and "<msup>" in drawn and "mathvariant" not in drawn
+
+
+@pytest.mark.slow
+@with_sphinx
+def test_site_is_built_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d",
+               str(tmp_path / "doctrees"), str(DOCS), str(tmp_path / "site")]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    theory = (tmp_path / "site" / "theory.html").read_text()
+    assert theory.count("<math ") > 500 and "merror" not in theory
+    # no script or style from elsewhere: it opens offline
+    for page in (tmp_path / "site").glob("*.html"):
+        assert not re.search(r'(?:src|href)="https?://[^"]+\.(?:js|css)', page.read_text())
