@@ -8,6 +8,7 @@ estimators   the gated estimator against the analog one
 transient    the renderer against mitransient's volumetric integrator
 velocimetry  cross-correlation against OpenPIV
 renderer     speed and memory of the renderer alone
+rings        wind from ring pictures, all rings at once, against a 2-D fit and scipy
 """
 
 import lidar_mi  # noqa: F401  chooses the LLVM before any of the modules here imports drjit
