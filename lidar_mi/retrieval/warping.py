@@ -29,12 +29,22 @@ class Spline(NamedTuple):
         Share of the variance of white noise that the filter before the spline let pass.
     excess : float
         Variance of a displacement over what the slopes would allow, were they free of noise.
+    gain : torch.Tensor, shape (rings,)
+        Of the filter, by wavenumber in cycles per shorter side of the image.
     """
 
     coefficients: torch.Tensor
     shape: tuple[int, int]
     passed: float
     excess: float
+    gain: torch.Tensor
+
+    def filtered(self, field: torch.Tensor) -> torch.Tensor:
+        """A field on the images' pixels after the images' filter; it is zero beyond them."""
+        sizes = [scipy.fft.next_fast_len(n + _MARGIN, real=True) for n in self.shape]
+        ring = _ring(_frequencies(sizes, field), self.shape)
+        smooth = torch.fft.irfft2(torch.fft.rfft2(field, s=sizes) * self.gain[ring], s=sizes)
+        return smooth[..., : self.shape[0], : self.shape[1]]
 
     def holds(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         """Which places lie on the images, up to the outer pixels' centres."""
@@ -132,12 +142,9 @@ def band_limited(images: torch.Tensor, noise: float | None = None) -> tuple[Spli
     images = torch.stack([working(filled(image)) for image in images])
     shape = tuple(images.shape[1:])
     sizes = [scipy.fft.next_fast_len(n + 2 * _MARGIN, real=True) for n in shape]
-    frequency = [
-        torch.fft.fftfreq(sizes[0], dtype=images.dtype, device=images.device)[:, None],
-        torch.fft.rfftfreq(sizes[1], dtype=images.dtype, device=images.device)[None, :],
-    ]
+    frequency = _frequencies(sizes, images)
     radius = torch.hypot(*frequency)
-    ring = (radius * min(shape)).long()
+    ring = _ring(frequency, shape)
     density, uncertainty = _ring_means(images, ring, sizes)
     if noise is None:
         # the lowest rings are low by chance as well: the mean of all that may be as low
@@ -150,7 +157,8 @@ def band_limited(images: torch.Tensor, noise: float | None = None) -> tuple[Spli
     texture = density - floor
     texture = torch.where(density > floor * (1 + 2 * uncertainty), texture, 0.0)
     tiny = torch.finfo(images.dtype).tiny
-    gain = (texture / (texture + floor / 2 + tiny)).sqrt()[ring]
+    response = (texture / (texture + floor / 2 + tiny)).sqrt()
+    gain = response[ring]
     passed = float(gain[:, :1].square().sum() + 2 * gain[:, 1:].square().sum())
     # the slopes' power with noise and filter, and what of it tells the displacement
     power, told = (
@@ -165,7 +173,21 @@ def band_limited(images: torch.Tensor, noise: float | None = None) -> tuple[Spli
     smooth = torch.fft.irfft2(spectrum * gain, s=sizes) + mean
     smooth = smooth[:, : shape[0] + 2 * _MARGIN, : shape[1] + 2 * _MARGIN].contiguous()
     excess = power / told if told > 0 else 1.0
-    return Spline(smooth, shape, passed / (sizes[0] * sizes[1]), excess), float(floor.sqrt())
+    passed /= sizes[0] * sizes[1]
+    return Spline(smooth, shape, passed, excess, response), float(floor.sqrt())
+
+
+def _frequencies(sizes: list[int], like: torch.Tensor) -> list[torch.Tensor]:
+    """Cycles per pixel along z and y of a real Fourier transform, as they broadcast."""
+    return [
+        torch.fft.fftfreq(sizes[0], dtype=like.dtype, device=like.device)[:, None],
+        torch.fft.rfftfreq(sizes[1], dtype=like.dtype, device=like.device)[None, :],
+    ]
+
+
+def _ring(frequency: list[torch.Tensor], shape: tuple[int, int]) -> torch.Tensor:
+    """Wavenumber in whole cycles per shorter side of the image."""
+    return (torch.hypot(*frequency) * min(shape)).long()
 
 
 def _extended(images: torch.Tensor, sizes: list[int]) -> torch.Tensor:

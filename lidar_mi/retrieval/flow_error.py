@@ -1,0 +1,149 @@
+"""How far a flow departs from its model, and what that does to the model's parameters.
+
+A real flow is not two vortices. What is left of it moves the air by a smooth random field, taken to
+be isotropic: each component has the covariance sum_j a_j exp(-h^2 / (2 L_j^2)) at the distance h.
+It shows in the residuals of a fit as displacement that neighbours share, and in the parameters as
+an error that does not average out over pixels.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+import torch
+from scipy.optimize import nnls
+
+# Lengths L_j in steps of the grid; up to a fifth of its shorter side are used.
+_LENGTHS = (3.0, 6.0, 12.0, 24.0, 48.0)
+
+
+@dataclass(frozen=True)
+class FlowError:
+    """Covariance of each component of what the model misses.
+
+    Attributes
+    ----------
+    variances : tuple of float
+        a_j, m^2 (of displacements) or m^2 s^-2 (of winds).
+    lengths : tuple of float
+        L_j, steps of the grid.
+    """
+
+    variances: tuple[float, ...] = ()
+    lengths: tuple[float, ...] = ()
+
+    @property
+    def variance(self) -> float:
+        """Of each component at a place."""
+        return float(sum(self.variances))
+
+    def covariance(self, distance: torch.Tensor) -> torch.Tensor:
+        """At distances in steps of the grid."""
+        total = torch.zeros_like(distance)
+        for variance, length in zip(self.variances, self.lengths):
+            total = total + variance * torch.exp(-(distance**2) / (2 * length**2))
+        return total
+
+
+@dataclass(frozen=True)
+class Lags:
+    """Correlations of fields on a (z, y) grid, by Fourier transforms padded against wrapping.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Of the grid.
+    like : torch.Tensor
+        Of the type and device to work in.
+    """
+
+    shape: tuple[int, int]
+    like: torch.Tensor
+
+    @property
+    def sizes(self) -> list[int]:
+        return [scipy.fft.next_fast_len(2 * n, real=True) for n in self.shape]
+
+    def distance(self) -> torch.Tensor:
+        """Of every lag, steps of the grid."""
+        along = [
+            torch.fft.fftfreq(n, 1 / n, dtype=self.like.dtype, device=self.like.device)
+            for n in self.sizes
+        ]
+        return torch.hypot(along[0][:, None], along[1][None, :])
+
+    def transform(self, fields: torch.Tensor) -> torch.Tensor:
+        return torch.fft.rfft2(fields, s=self.sizes)
+
+    def autocorrelation(self, fields: Sequence[torch.Tensor], weights: Sequence[float]):
+        """Sum over the fields of weight * sum_x f(x) f(x + lag)."""
+        power = sum(w * self.transform(f).abs().square() for f, w in zip(fields, weights))
+        return torch.fft.irfft2(power, s=self.sizes)
+
+    def quadratic(self, fields: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+        """Matrix sum_a sum_x,x' f_ia(x) C(x - x') f_ja(x') of fields (i, a, z, y), C by lags."""
+        spectrum = torch.fft.rfft2(covariance).real.clamp(min=0)
+        double = torch.full_like(spectrum, 2.0)
+        double[:, 0] = 1
+        if self.sizes[1] % 2 == 0:
+            double[:, -1] = 1
+        root = (spectrum * double / (self.sizes[0] * self.sizes[1])).sqrt()
+        total = fields.new_zeros(fields.shape[0], fields.shape[0])
+        for component in fields.unbind(1):
+            waves = torch.view_as_real(self.transform(component) * root).flatten(1)
+            total += waves @ waves.T
+        return total
+
+
+def flow_error(pushed: torch.Tensor, stiffness: torch.Tensor, shortest: float) -> FlowError:
+    """The departure from a model that explains what the residuals of its fit share.
+
+    With the residual r, its slope g and its weight w, the push is q = w g r and the stiffness
+    A = w g g^T. A field of displacements with covariance C(h) adds C(h) tr sum A(x) A(x + h) to
+    the correlation sum q(x) . q(x + h); noise that differs from pixel to pixel adds nothing at
+    h > 0. The variances a_j >= 0 follow by least squares over the lags.
+
+    Parameters
+    ----------
+    pushed : torch.Tensor, shape (2, z, y)
+        q; zero where nothing is known.
+    stiffness : torch.Tensor, shape (3, z, y)
+        A: yy, yz, zz.
+    shortest : float
+        Lags below this (steps of the grid) are left out, as noise may correlate over them.
+    """
+    lags = Lags(tuple(pushed.shape[1:]), pushed)
+    seen = lags.autocorrelation(pushed, (1.0, 1.0))
+    unit = lags.autocorrelation(stiffness, (1.0, 2.0, 1.0))
+    distance = lags.distance()
+    side = min(lags.shape)
+    lengths = [length for length in _LENGTHS if length <= side / 5] or [side / 5]
+    used = (distance >= shortest) & (distance <= 2 * max(lengths))
+    scale = unit[0, 0]
+    if not float(scale) > 0 or not bool(used.any()):
+        return FlowError()
+    columns = [unit[used] / scale * torch.exp(-(distance[used] ** 2) / (2 * n**2)) for n in lengths]
+    # normalised in both directions: least squares needs numbers near one
+    size = float((seen[used] / scale).abs().max())
+    if not size > 0:
+        return FlowError()
+    amplitudes, _ = nnls(
+        torch.stack(columns, 1).cpu().numpy(), (seen[used] / scale / size).cpu().numpy()
+    )
+    variances = amplitudes * size
+    kept = [(float(a), n) for a, n in zip(variances, lengths) if a > 0]
+    return FlowError(tuple(a for a, _ in kept), tuple(n for _, n in kept))
+
+
+def spread_of(pulls: torch.Tensor, error: FlowError) -> torch.Tensor:
+    """Covariance (p, p) of sum_x P_p(x) . d(x), d the field of the flow's error, P (p, 2, z, y)."""
+    lags = Lags(tuple(pulls.shape[2:]), pulls)
+    if not error.variances:
+        return pulls.new_zeros(len(pulls), len(pulls))
+    return lags.quadratic(pulls, error.covariance(lags.distance()))
+
+
+def mean_length(error: FlowError) -> float:
+    """Length over which the error correlates, steps of the grid, weighted by variance."""
+    return float(np.average(error.lengths, weights=error.variances)) if error.variances else 0.0

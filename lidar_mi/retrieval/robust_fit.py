@@ -1,0 +1,137 @@
+"""Weighted nonlinear least squares with a bounded influence of outliers (Levenberg-Marquardt)."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+
+# Residuals beyond so many standard deviations pull with the force of those at it (Huber, 1964):
+# costs normal noise 0.1 % of its information.
+_HUBER = 3.0
+_LARGEST_DAMPING = 1e4
+# Squared standard errors from the bottom that a fit may stop at.
+_NEAR = 0.1
+
+
+class Misfit(NamedTuple):
+    """Residuals of a model and their derivatives, tensors of shape (..., z, y).
+
+    Attributes
+    ----------
+    residual : torch.Tensor
+    jacobian : torch.Tensor, shape (p, ..., z, y)
+        Derivatives of the residual with respect to the parameters.
+    slope : torch.Tensor, shape (2, ..., z, y)
+        Change of the residual per metre (per m/s) that the model's flow is off along y, z.
+    seen : torch.Tensor of bool
+        Which residuals exist.
+    variance : torch.Tensor
+        Of the noise, as it tells on the parameters.
+    scatter : torch.Tensor
+        Of the noise, as it shows in a residual (less than `variance` after a filter).
+    """
+
+    residual: torch.Tensor
+    jacobian: torch.Tensor
+    slope: torch.Tensor
+    seen: torch.Tensor
+    variance: torch.Tensor
+    scatter: torch.Tensor
+
+
+class Solution(NamedTuple):
+    """Where a fit came to: parameters (p,), the misfit there, its weights, sum of w J J^T."""
+
+    parameters: torch.Tensor
+    misfit: Misfit
+    weight: torch.Tensor
+    normal: torch.Tensor
+    cost: float
+    converged: bool
+
+
+def weights(misfit: Misfit, flow_variance: float) -> torch.Tensor:
+    """1 / variance of noise and flow error together, less for outliers; 0 where nothing is seen."""
+    moved = flow_variance * misfit.slope.square().sum(0)
+    size = misfit.residual.abs() / (misfit.scatter + moved).sqrt()
+    return misfit.seen * (_HUBER / size.clamp(min=_HUBER)) / (misfit.variance + moved)
+
+
+def fit(
+    evaluate: Callable[[torch.Tensor], Misfit],
+    parameters: torch.Tensor,
+    allowed: Callable[[torch.Tensor, torch.Tensor], bool],
+    flow_variance: float,
+    iterations: int,
+    tolerance: float,
+) -> Solution:
+    """Minimise the weighted squares of the residuals.
+
+    Parameters
+    ----------
+    evaluate : callable
+        Parameters (p,) -> Misfit.
+    parameters : torch.Tensor, shape (p,)
+        Where to start.
+    allowed : callable
+        (parameters, step) -> whether such a step may be tried.
+    flow_variance : float
+        Of what the model's flow is off in each component; adds to the noise through `slope`.
+    iterations : int
+        At most.
+    tolerance : float
+        Stop at a step of so many standard errors, squared.
+    """
+    damping = 1e-4
+    misfit = evaluate(parameters)
+    for _ in range(iterations):
+        weight = weights(misfit, flow_variance)
+        normal, force = _normal(misfit, weight)
+        while True:
+            step = _step(normal, force, damping)
+            if step is not None and allowed(parameters, step):
+                tried = evaluate(parameters + step)
+                if float(step @ normal @ step) < tolerance and damping < 1:
+                    return _solution(parameters + step, tried, flow_variance, True)
+                both = misfit.seen & tried.seen
+                before, after = (
+                    float((weight * m.residual.square())[both].sum()) for m in (misfit, tried)
+                )
+                # derivatives are approximate: what is no worse to the eye of the noise will do
+                if after <= before + tolerance and bool(both.any()):
+                    break
+            damping = 8 * max(damping, 1e-4)
+            if damping > _LARGEST_DAMPING:
+                # no way down: at the bottom if the way would have been short
+                step = _step(normal, force, 1e-6)
+                near = step is not None and float(step @ normal @ step) < _NEAR
+                return _solution(parameters, misfit, flow_variance, near)
+        damping /= 8
+        parameters, misfit = parameters + step, tried
+    return _solution(parameters, misfit, flow_variance, False)
+
+
+def _normal(misfit: Misfit, weight: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sums of w J J^T and of -w J r."""
+    columns = misfit.jacobian.flatten(1)
+    weighted = columns * weight.flatten()
+    return weighted @ columns.T, -weighted @ misfit.residual.flatten()
+
+
+def _step(normal, force, damping: float) -> torch.Tensor | None:
+    diagonal = normal.diagonal()
+    if not bool((diagonal > 0).all()):
+        return None
+    root, info = torch.linalg.cholesky_ex(normal + damping * torch.diag(diagonal))
+    if int(info):
+        return None
+    step = torch.cholesky_solve(force[:, None], root)[:, 0]
+    return step if bool(torch.isfinite(step).all()) else None
+
+
+def _solution(parameters, misfit: Misfit, flow_variance: float, converged: bool) -> Solution:
+    weight = weights(misfit, flow_variance)
+    normal, _ = _normal(misfit, weight)
+    number = max(1, int(misfit.seen.sum()))
+    cost = float((weight * misfit.residual.square()).sum()) / number
+    return Solution(parameters, misfit, weight, normal, cost, converged)

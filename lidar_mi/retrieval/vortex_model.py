@@ -1,0 +1,150 @@
+"""The flow of two vortices in a mean wind: the wind, paths of the air, what each parameter does.
+
+Frame: y to port, z up. A vortex with positive circulation turns from +y towards +z.
+"""
+
+from typing import Literal, get_args
+
+import torch
+
+Profile = Literal["lamb_oseen", "burnham_hallock"]
+PROFILES: tuple[str, ...] = get_args(Profile)
+
+PARAMETERS = (
+    "port_circulation", "port_log_radius", "port_y", "port_z",
+    "starboard_circulation", "starboard_log_radius", "starboard_y", "starboard_z",
+    "mean_v", "mean_w",
+)  # fmt: skip
+"""Order of the parameters: m^2 s^-1, log of the core radius in m, m, m; twice; m s^-1."""
+
+# Root of 1 + 2 a = exp(a): puts the peak of the Lamb-Oseen swirl at the core radius.
+_LAMB_OSEEN = 1.2564
+# Angle (rad) that the fastest air may turn in one Runge-Kutta step: errs by 3e-4 of its radius.
+_STEP_ANGLE = 0.5
+
+
+def turning(s: torch.Tensor, profile: Profile) -> tuple[torch.Tensor, torch.Tensor]:
+    """Angular velocity over Gamma/(2 pi r_c^2), and its derivative, at s = r^2 / r_c^2.
+
+    Lamb-Oseen: (1 - exp(-1.2564 s)) / s. Burnham-Hallock: 1 / (1 + s).
+    """
+    if profile == "burnham_hallock":
+        value = 1 / (1 + s)
+        return value, -(value**2)
+    a = _LAMB_OSEEN
+    small = s < 1e-3
+    t = torch.where(small, 1.0, s)
+    value = -torch.expm1(-a * t) / t
+    slope = (a - (1 + a * t) * value) / t
+    return (
+        torch.where(small, a - a**2 * s / 2 + a**3 * s**2 / 6, value),
+        torch.where(small, -(a**2) / 2 + a**3 * s / 3, slope),
+    )
+
+
+def wind(theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, profile: Profile) -> torch.Tensor:
+    """Wind (2, ...), v and w in m s^-1, at places (...) with the parameters (10,)."""
+    v, w = theta[8].expand(y.shape), theta[9].expand(y.shape)
+    for first in (0, 4):
+        circulation, radius = theta[first], theta[first + 1].exp()
+        dy, dz = y - theta[first + 2], z - theta[first + 3]
+        value, _ = turning((dy**2 + dz**2) / radius**2, profile)
+        omega = circulation / (2 * torch.pi * radius**2) * value
+        v, w = v - omega * dz, w + omega * dy
+    return torch.stack([v, w])
+
+
+def gradient(
+    theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, profile: Profile
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """dv/dy, dv/dz and dw/dy of the wind, s^-1; dw/dz = -dv/dy."""
+    v_y, v_z, w_y = (torch.zeros_like(y) for _ in range(3))
+    for first in (0, 4):
+        circulation, radius = theta[first], theta[first + 1].exp()
+        dy, dz = y - theta[first + 2], z - theta[first + 3]
+        value, slope = turning((dy**2 + dz**2) / radius**2, profile)
+        omega = circulation / (2 * torch.pi * radius**2) * value
+        bend = circulation / (torch.pi * radius**4) * slope
+        v_y = v_y - bend * dy * dz
+        v_z = v_z - omega - bend * dz**2
+        w_y = w_y + omega + bend * dy**2
+    return v_y, v_z, w_y
+
+
+def sensitivity(
+    theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, along: torch.Tensor, profile: Profile
+) -> torch.Tensor:
+    """Derivatives (10, ...) of along . wind with respect to `PARAMETERS`; along is (2, ...)."""
+    along_y, along_z = along
+    columns = torch.empty(10, *y.shape, dtype=y.dtype, device=y.device)
+    for first in (0, 4):
+        circulation, radius = theta[first], theta[first + 1].exp()
+        dy, dz = y - theta[first + 2], z - theta[first + 3]
+        square = dy**2 + dz**2
+        value, slope = turning(square / radius**2, profile)
+        unit = value / (2 * torch.pi * radius**2)
+        omega = circulation * unit
+        bend = circulation / (torch.pi * radius**4) * slope
+        across = along_z * dy - along_y * dz
+        columns[first] = unit * across
+        columns[first + 1] = -(2 * omega + bend * square) * across
+        columns[first + 2] = -(bend * dy * across + omega * along_z)
+        columns[first + 3] = -(bend * dz * across - omega * along_y)
+    columns[8], columns[9] = along_y, along_z
+    return columns
+
+
+def carried(
+    theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, time: float, profile: Profile
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where air at places (...) is after half of a time and after all of it, (2, ...) each, in m.
+
+    Runge-Kutta of fourth order in a flow that stands still; `time` in s, negative: where it was
+    before. The middle, which only derivatives are taken at, is Hermite's cubic.
+    """
+    centre = {"lamb_oseen": _LAMB_OSEEN, "burnham_hallock": 1.0}[profile] / (2 * torch.pi)
+    fastest = max(
+        float(centre * theta[first].abs() * (-2 * theta[first + 1]).exp()) for first in (0, 4)
+    )
+    steps = int(min(64, 1 + fastest * abs(time) // _STEP_ANGLE))
+    h = time / steps
+    place = start = torch.stack([y, z])
+    k1 = began = wind(theta, y, z, profile)
+    for _ in range(steps):
+        k2 = wind(theta, *(place + h / 2 * k1), profile)
+        k3 = wind(theta, *(place + h / 2 * k2), profile)
+        k4 = wind(theta, *(place + h * k3), profile)
+        place = place + h / 6 * (k1 + 2 * (k2 + k3) + k4)
+        k1 = wind(theta, *place, profile)
+    return (start + place) / 2 + time / 8 * (began - k1), place
+
+
+def drift(theta: torch.Tensor, profile: Profile) -> torch.Tensor:
+    """Velocity (2,) of the pair, m s^-1: the mean wind and what the vortices do to each other."""
+    centres = theta[[2, 6]], theta[[3, 7]]
+    return wind(theta, *centres, profile).mean(1)
+
+
+def path_sensitivity(
+    theta: torch.Tensor, middle: torch.Tensor, along: torch.Tensor, time: float, profile: Profile
+) -> torch.Tensor:
+    """Derivatives (10, ...) of along . (end of the path) with respect to `PARAMETERS`.
+
+    A parameter's push du along the path is carried to its end by the flow. The integral over the
+    path is taken by its value in the middle, carried on by exp(L time/2) with the gradient L of the
+    wind there: off by (omega time)^2/24, 0.7 % for 0.4 rad.
+    """
+    v_y, v_z, w_y = gradient(theta, *middle, profile)
+    h = time / 2
+    # exp(L h) = cosh(c) + L sinh(c) / c with c^2 = -det(L h), as L has no trace
+    square = h**2 * (v_y**2 + v_z * w_y)
+    even = 1 + square / 2 + square**2 / 24
+    odd = h * (1 + square / 6 + square**2 / 120)
+    along_y, along_z = along
+    pulled = torch.stack(
+        [
+            even * along_y + odd * (v_y * along_y + w_y * along_z),
+            even * along_z + odd * (v_z * along_y - v_y * along_z),
+        ]
+    )
+    return time * sensitivity(theta, *middle, pulled, profile)
