@@ -1,9 +1,12 @@
 """What a method finds: one displacement per window, in pixels."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import torch
 
+from lidar_mi.retrieval.quantity import Quantity
 from lidar_mi.retrieval.windows import Windows
 
 
@@ -20,6 +23,10 @@ class Displacement(NamedTuple):
         `quality.Flag` bits.
     covariance : torch.Tensor of shape (3, *windows.count), optional
         Variances of dz and of dy and their covariance, px^2, of methods that tell.
+    quantities : mapping, optional
+        Numbers with standard errors that describe the whole, by name (`quantity.Quantity`).
+    attributes : mapping, optional
+        What else a method says about its result.
     """
 
     dz: torch.Tensor
@@ -27,6 +34,8 @@ class Displacement(NamedTuple):
     score: torch.Tensor
     flag: torch.Tensor
     covariance: torch.Tensor | None = None
+    quantities: Mapping[str, Quantity] = MappingProxyType({})
+    attributes: Mapping[str, str] = MappingProxyType({})
 
     @classmethod
     def empty(cls, windows: Windows, like: torch.Tensor) -> "Displacement":

@@ -16,8 +16,10 @@ from kornia.filters import gaussian_blur2d
 from lidar_mi.atmosphere.vortex import Vortex
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_image, checked_pair, on_device, positive
+from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.flow_error import FlowError, flow_error, mean_length, spread_of
-from lidar_mi.retrieval.quality import filled
+from lidar_mi.retrieval.quality import Flag, filled, non_finite
+from lidar_mi.retrieval.quantity import Quantity
 from lidar_mi.retrieval.robust_fit import Misfit, Solution, fit
 from lidar_mi.retrieval.vortex_model import (
     PROFILES,
@@ -31,6 +33,7 @@ from lidar_mi.retrieval.vortex_model import (
 )
 from lidar_mi.retrieval.vortex_search import Observations, starting_points
 from lidar_mi.retrieval.warping import Spline, band_limited, levelled
+from lidar_mi.retrieval.windows import Windows, image_pair
 
 # Coarse to fine: standard deviation of the blur and step between the pixels used, px.
 _LEVELS = ((3.0, 4), (1.5, 2), (0.0, 1))
@@ -46,16 +49,6 @@ _TOLERANCE = 0.03
 # A fit is refused below these: circulation over its standard error, correlation of the images.
 _SIGNIFICANCE = 5.0
 _MATCH = 0.5
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A number with its standard error and what it is."""
-
-    value: float
-    stderr: float
-    units: str
-    long_name: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +173,7 @@ class VortexPairFit:
 
     def wind_and_covariance(self, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """v, w (2, ...) at places and their covariance vv, ww, vw (3, ...)."""
+        y, z = np.broadcast_arrays(y, z)
         theta = torch.as_tensor(self.parameters)
         places = [torch.as_tensor(np.array(axis, dtype=float)) for axis in (y, z)]
         unit = torch.eye(2, dtype=theta.dtype)
@@ -427,6 +421,77 @@ def _typical(noise: float | torch.Tensor | None) -> float | None:
     if not isinstance(noise, torch.Tensor):
         return noise
     return float(noise[torch.isfinite(noise)].double().median())
+
+
+def vortex_windows(
+    image1: torch.Tensor,
+    image2: torch.Tensor,
+    template: int = 8,
+    search: int = 16,
+    stride: int = 1,
+    *,
+    axes: tuple[np.ndarray, np.ndarray],
+    dt: float,
+    noise: float | torch.Tensor | None = None,
+) -> Displacement:
+    """The wind of a fitted pair at the windows' centres, as displacement in dt.
+
+    Parameters
+    ----------
+    image1, image2 : torch.Tensor, shape (z, y)
+    template, search, stride : int
+        Pixels; they say where vectors are wanted and nothing else.
+    axes : (array, array)
+        z and y of the pixels, m.
+    dt : float
+        s.
+    noise : float or torch.Tensor, optional
+        As `fit_vortices`.
+
+    Returns
+    -------
+    Displacement
+        With the pair's `quantities`. Without a fit that can be believed every vector has the flag
+        NO_MATCH, and no number where there is none.
+    """
+    image_pair(image1, image2)
+    windows = Windows(tuple(image1.shape), template, search, stride)
+    found = fit_pixels(image1, image2, *axes, dt, noise, "lamb_oseen")
+    centres = [
+        (axis[start := np.asarray(windows.starts(k))] + axis[start + template - 1]) / 2
+        for k, axis in enumerate(axes)
+    ]
+    values, covariance = found.wind_and_covariance(centres[1][None, :], centres[0][:, None])
+    pixel_z, pixel_y = (float(a[-1] - a[0]) / (len(a) - 1) / dt for a in axes)
+
+    def tensor(array):
+        return torch.as_tensor(np.ascontiguousarray(array), device=image1.device)
+
+    v, w = tensor(values)
+    variances = tensor(covariance)
+    flag = torch.zeros(windows.count, dtype=torch.uint8, device=image1.device)
+    flag[non_finite(image1, image2, windows)] |= Flag.NON_FINITE_INPUT.value
+    if not found.success:
+        flag |= Flag.NO_MATCH.value
+    if "an image is constant" in found.reasons:
+        flag |= Flag.LOW_TEXTURE.value
+    return Displacement(
+        w / pixel_z,
+        v / pixel_y,
+        torch.full_like(v, found.correlation),
+        flag,
+        torch.stack(
+            [variances[1] / pixel_z**2, variances[0] / pixel_y**2, variances[2] / (pixel_y * pixel_z)]
+        ),
+        found.quantities,
+        {
+            "profile": found.profile,
+            "fit": "; ".join(found.reasons) or "good",
+            "chi2": found.chi2,
+            "flow_error": found.flow_error,
+            "flow_error_length": found.flow_error_length,
+        },
+    )
 
 
 @dataclass(frozen=True)

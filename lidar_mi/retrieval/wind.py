@@ -14,6 +14,7 @@ from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.multipass import multipass
 from lidar_mi.retrieval.quality import Flag, Texture, low_texture, median_outliers, uncertain
 from lidar_mi.retrieval.variational import variational
+from lidar_mi.retrieval.vortex_fit import vortex_windows
 from lidar_mi.retrieval.weight_shift import weight_shift
 from lidar_mi.retrieval.windows import Windows
 
@@ -64,6 +65,13 @@ METHODS: Mapping[str, Method] = {
         centred=True,
         local=False,
     ),
+    "vortex_fit": Method(
+        vortex_windows,
+        ("correlation", "correlation of the images, each carried to mid-time"),
+        ("noise", "axes", "dt"),
+        centred=True,
+        local=False,
+    ),
 }
 """Methods by name."""
 
@@ -95,9 +103,9 @@ def retrieve_wind(
         the spacings may differ between z and y.
     dt : float
         Time from image 1 to image 2, s.
-    method : {"cc", "ws", "multipass", "variational"}
-        Cross-correlation, weight shift, multi-pass correlation or a smooth flow fitted to the
-        images as a whole, see `METHODS`.
+    method : {"cc", "ws", "multipass", "variational", "vortex_fit"}
+        Cross-correlation, weight shift, multi-pass correlation, a smooth flow or a vortex pair
+        fitted to the images as a whole, see `METHODS`.
     template, search, stride : int
         Pixels: template n >= 2, search region >= n + 2, step from window to window >= 1. Winds
         beyond ((search - template) // 2 - 1/2) spacing / dt cannot be seen (17.5 m/s for 8 in 16
@@ -113,7 +121,7 @@ def retrieve_wind(
     noise : float or xr.DataArray, optional
         Standard deviation of image 1's noise, in its unit; a template with less structure than
         noise is flagged as without texture. Left out, no noise is assumed for that, and methods
-        that weight by it ("multipass", "variational") estimate it from the images.
+        that weight by it ("multipass", "variational", "vortex_fit") estimate it from the images.
     median_size, median_threshold, median_epsilon
         Normalised median test, see `quality.median_outliers`. Neighbours are taken half a
         template apart (or a stride, if that is more): closer ones share their pixels.
@@ -128,7 +136,8 @@ def retrieve_wind(
         `isotropy`, `flag` (bits of `quality.Flag`, 0 = good; also without texture counts a vector
         whose standard error is beyond half a pixel in some direction). The auxiliary coordinates `y_vector`,
         `z_vector` are where the vector belongs, at mid-time: the centre and, with "cc" and "ws",
-        half the displacement. Rejected vectors keep their value (or NaN if there is none);
+        half the displacement. "vortex_fit" adds the pair's numbers (`port_circulation` and so on,
+        each with `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or NaN if there is none);
         nothing is replaced.
 
     Raises
@@ -146,7 +155,8 @@ def retrieve_wind(
         noise = on_device(noise, device)
 
     chosen = METHODS[method]
-    offered = {"min_correlation": min_correlation, "noise": noise}
+    axes = tuple(image1[name].values.astype(float) for name in ("z", "y"))
+    offered = {"min_correlation": min_correlation, "noise": noise, "axes": axes, "dt": dt}
     options = {name: offered[name] for name in chosen.options}
     found = chosen.find(pixels1, pixels2, template, search, stride, **options)
     level = 0.0 if noise is None else noise
@@ -255,6 +265,12 @@ def _dataset(
             "dt_units": "s",
         },
     )
+    for name, quantity in found.quantities.items():
+        about = {"long_name": quantity.long_name, "units": quantity.units}
+        dataset[name] = (), quantity.value, about
+        about = about | {"long_name": f"standard error of {quantity.long_name}"}
+        dataset[f"{name}_stderr"] = (), quantity.stderr, about
+    dataset.attrs |= found.attributes
     dataset["z"].attrs |= {"axis": "Z", "positive": "up"}
     dataset["y"].attrs |= {"axis": "Y"}
     for name in ("z", "y"):
