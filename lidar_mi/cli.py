@@ -114,7 +114,8 @@ def retrieve(
     dt: Annotated[float, typer.Option(help="Time between the images, s.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="NetCDF file.")] = Path("wind.nc"),
     method: Annotated[str, typer.Option(
-        help="cc (cross-correlation), ws (weight shift), multipass or variational.")] = "cc",
+        help="cc (cross-correlation), ws (weight shift), multipass, variational or vortex_fit.")]
+        = "cc",
     template: Annotated[int, typer.Option(help="Template size, pixels.")] = 8,
     search: Annotated[int, typer.Option(help="Search region, pixels.")] = 16,
     stride: Annotated[int, typer.Option(help="Step between vectors, pixels.")] = 1,
@@ -146,8 +147,19 @@ def retrieve(
     )  # fmt: skip
     write_netcdf(wind, out)
     valid = float((wind["flag"] == 0).mean())
+    if "fit" in wind.attrs:
+        _print_vortices(wind)
     _out.print(f"{wind.sizes['y']} x {wind.sizes['z']} vectors, {valid:.1%} valid")
     _out.print(f"winds    {out}")
+
+
+def _print_vortices(wind) -> None:
+    """The numbers of a fitted vortex pair with their standard errors."""
+    rows = []
+    for name in (n for n in wind.data_vars if f"{n}_stderr" in wind and not wind[n].dims):
+        value, stderr = float(wind[name]), float(wind[f"{name}_stderr"])
+        rows.append((name, f"{value:.2f} +- {stderr:.2f} {wind[name].attrs['units']}"))
+    _print_rows(f"vortex pair, {wind.attrs['profile'].replace('_', ' ')} ({wind.attrs['fit']})", rows)
 
 
 @app.command(

@@ -155,7 +155,7 @@ class Scattering(_Scatterer):
 class Retrieval(_Section):
     """How winds are found in the image pair."""
 
-    methods: tuple[Literal["cc", "ws", "multipass", "variational"], ...] = Field(
+    methods: tuple[Literal["cc", "ws", "multipass", "variational", "vortex_fit"], ...] = Field(
         ("cc", "ws"), min_length=1
     )
     template: int = Field(8, ge=2)
