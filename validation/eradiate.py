@@ -1,6 +1,7 @@
 """Steady states of Eradiate: run beside in its own environment, or as stored."""
 
 import json
+import os
 import subprocess
 import tempfile
 from pathlib import Path
@@ -17,10 +18,10 @@ def reference(python: str | None, scale: int) -> dict:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "eradiate.json"
         script = HERE / "eradiate_reference.py"
-        # its own environment: nothing of ours may lead it to another Mitsuba or LLVM
-        subprocess.run(
-            [python, str(script), "-n", str(PHOTONS * scale), "-o", str(out)], check=True
-        )
+        # its own Mitsuba must not be hidden by one on our path
+        environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
+        command = [python, str(script), "-n", str(PHOTONS * scale), "-o", str(out)]
+        subprocess.run(command, check=True, env=environment)
         return json.loads(out.read_text())
 
 

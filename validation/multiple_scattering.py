@@ -131,6 +131,7 @@ def _draw_orders(place, case, ours, other):
             got, error = mean_and_error(ours[..., k])
             colour = f"C{k}"
             lower = np.maximum(expected - 2 * other_error, 1e-14)
+            axis.plot(range_, expected, color=colour, linewidth=0.8, alpha=0.6)
             axis.fill_between(range_, lower, expected + 2 * other_error, color=colour, alpha=0.35,
                               linewidth=0)  # fmt: skip
             axis.errorbar(range_, got, 2 * error, fmt=".", color=colour, label=f"order {k + 1}")
@@ -138,7 +139,7 @@ def _draw_orders(place, case, ours, other):
         axis.set(yscale="log", xlabel="range, m", ylabel="received / emitted energy")
         axis.set_ylim(bottom=other[:, :, -1, 0].mean(0)[1:].min() / 3)
         axis.legend(frameon=False, ncols=2, fontsize=8)
-    return "Order by order: points rendered (gated), bands the reference; 2 sigma each."
+    return "Order by order: points rendered (gated), lines and bands the reference; 2 sigma each."
 
 
 def _draw_depolarisation(place, case, pictures, other):
