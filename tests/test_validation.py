@@ -195,6 +195,7 @@ def test_stored_numbers_belong_to_the_cases():
         assert 0 < case["stderr"][0] < 3e-3 * case["stokes"][0]
     assert stored["command"] in eradiate.provenance()
     assert all(v in eradiate.provenance() for v in stored["versions"].values())
+    assert stored["command"] not in eradiate.provenance("python")
 
 
 def test_another_interpreter_is_asked(tmp_path):

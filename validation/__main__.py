@@ -61,7 +61,7 @@ def main(arguments: list[str] | None = None) -> int:
             ]
     if len(found) == len(GROUPS):
         command = "make validate" + (" ARGS=--slow" if options.slow else "")
-        report.write(report.page(found, command, [provenance()]), options.out)
+        report.write(report.page(found, command, [provenance(options.eradiate)]), options.out)
         console.print(f"written: {options.out}", highlight=False)
     for line in failed:
         console.print(f"FAILS: {line}", style="red", highlight=False, soft_wrap=True)

@@ -25,8 +25,10 @@ def reference(python: str | None, scale: int) -> dict:
         return json.loads(out.read_text())
 
 
-def provenance() -> str:
-    """Where the stored numbers come from."""
+def provenance(python: str | None = None) -> str:
+    """Where Eradiate's numbers come from."""
+    if python is not None:
+        return "Eradiate's numbers were made beside this page, by `validation/eradiate_reference.py`."
     stored = json.loads(STORED.read_text())
     versions = ", ".join(f"{name} {number}" for name, number in stored["versions"].items())
     return (
