@@ -66,15 +66,20 @@ def run(
     from . import experiment as chain
 
     path = _experiment_file(experiment)
-    overrides = list(set_ or []) + ([f"render.variant={variant}"] if variant else [])
-    loaded = config.load(path, overrides)
+    loaded = config.load(path, set_)
+    if variant:
+        sections = {"render": loaded.wake, "doppler.render": loaded.doppler}
+        chosen = [f"{key}.variant={variant}" for key, asked in sections.items() if asked]
+        loaded = config.load(path, [*(set_ or []), *chosen])
     folder = out or Path("outputs") / loaded.name
     with _progress() as notice:
         metrics = chain.run(loaded, folder, path.parent, overwrite, notice)
     _print_metrics(metrics)
     _out.print(f"report   {folder / 'report.html'}")
     _out.print(f"figures  {folder / 'figures'}")
-    _out.print(f"winds    {folder / 'wind.nc'}")
+    for name, asked in (("wind.nc", loaded.wake), ("v_los.nc", loaded.doppler)):
+        if asked:
+            _out.print(f"winds    {folder / name}")
 
 
 @app.command(epilog="Example: `lidar-mi render slab.xml -s 256 -D range=485 -o slab.exr`")
@@ -421,6 +426,39 @@ class _progress:
 
 def _print_metrics(metrics: dict[str, float]) -> None:
     """The few numbers people ask for first."""
+    if any(key.startswith("doppler.bound.") for key in metrics):
+        _print_doppler(metrics)
+    if any(key.startswith("backscatter.") for key in metrics):
+        _print_winds(metrics)
+
+
+def _print_doppler(metrics: dict[str, float]) -> None:
+    """Standard deviation and bias of every method, for every number of pictures averaged."""
+    cases = [key.split(".")[1:4] for key in metrics if key.startswith("doppler.") and "averaged" in key]
+    rows = dict.fromkeys((method, centre) for method, centre, _ in cases)
+    numbers = sorted({int(averaged.removeprefix("averaged_")) for *_, averaged in cases})
+    table = Table(
+        title="line-of-sight wind from averages of so many pictures, m/s", title_justify="left"
+    )
+    for head in ("method", "centre"):
+        table.add_column(head)
+    for number in numbers:
+        for head in (f"{number}: std", "bias"):
+            table.add_column(head, justify="right")
+    for method, centre in rows:
+        keys = [
+            f"doppler.{method}.{centre}.averaged_{number}.{name}"
+            for number in numbers for name in ("std", "bias")
+        ]  # fmt: skip
+        shown = ["-" if key not in metrics else f"{metrics[key]:.3f}" for key in keys]
+        style = "dim" if method == "bound" else None
+        name = "(bound)" if method == "bound" else method
+        table.add_row(name, centre.removeprefix("centre_"), *shown, style=style)
+    _out.print(table)
+
+
+def _print_winds(metrics: dict[str, float]) -> None:
+    """Rms errors of the winds from every source, by every method."""
     table = Table(title="rms error of the wind, valid vectors", title_justify="left")
     for head in ("winds from", "method", "v / m/s", "w / m/s", "beyond cores v", "w", "valid"):
         table.add_column(head, justify="left" if head in ("winds from", "method") else "right")

@@ -191,9 +191,9 @@ class RingRetrieval(_Section):
     averaged: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = Field(
         (1, 5, 20), min_length=1, description="numbers of pictures averaged before they are read"
     )
-    images: int = Field(16, ge=1, le=100_000, description="averages of each kind and speed")
+    images: int = Field(8, ge=1, le=100_000, description="averages of each kind and speed")
     slow_images: int = Field(
-        4, ge=0, description="of these, read by methods other than annular, which are slow"
+        3, ge=0, description="of these, read by methods other than annular, which are slow"
     )
 
     @model_validator(mode="after")

@@ -7,6 +7,7 @@ the CCD draws noisy ones, and every method says which speed it sees in them.
 import math
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -268,7 +269,9 @@ def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, f
                 place = doppler.camera.centre_pixel
                 if centre == "free":
                     place = ring_peaks.find_centre(image, finder)
-                centres[finder] = place, ring_peaks.innermost(image, place)
+                # about the crest to a pixel: what a fit in r is off by goes with its piece
+                near = ring_peaks.ring_radius(image, place, "ca", "r2")
+                centres[finder] = place, near
             place, near = centres[finder]
             radii[name] = ring_peaks.ring_radius(image, place, way, coordinate, near)
         except InputError:
@@ -368,10 +371,15 @@ def _expected(picture: xr.Dataset, total: float) -> torch.Tensor:
 
 def _frames(doppler, rings, expected, averaged, seed, numbers) -> torch.Tensor:
     """Sums of so many noisy pictures each, photoelectrons."""
-    return expose(
-        averaged * expected, summed(doppler.ccd, averaged), seed, numbers, averaged * rings.modes,
-        averaged * rings.background,
-    )  # fmt: skip
+    mean, ccd = averaged * expected, summed(doppler.ccd, averaged)
+    modes, background = averaged * rings.modes, averaged * rings.background
+
+    def one(number: int) -> torch.Tensor:
+        return expose(mean, ccd, seed, [number], modes, background)
+
+    # every picture has a stream of its own, so that it is the same from any thread
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        return torch.cat(list(pool.map(one, numbers)))
 
 
 def summed(ccd: CCD, pictures: int) -> CCD:

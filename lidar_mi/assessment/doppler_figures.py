@@ -63,7 +63,8 @@ def _rings(doppler, exposure, photons):
     axes = figure.subplots(1, panels)
     shown = [(exposure.noisy, f"one pulse, air at {doppler.v_los[0]:g} m/s", "photoelectrons")]
     if photons is not None:
-        hits = photons["S0"].values * photons.attrs["samples_per_pixel"]
+        # every path carries the same energy
+        hits = photons["S0"].values * photons["S0"].size * photons.attrs["samples_per_pixel"]
         shown.append((hits, "the laser's light, photon by photon through a lens", "photons"))
     for axis, (image, title, label) in zip(axes, shown):
         # single noisy pixels must not darken all others
@@ -79,8 +80,9 @@ def _rings(doppler, exposure, photons):
         near = weight > 30  # beyond, circles have a few pixels in the corners only
         axes[-1].plot(radius[near], mean[near], label=label, **style)
     axes[-1].set(title="means over circles, without noise", xlabel="radius / px",
-                 ylabel="photons a pixel", ylim=(0, None))  # fmt: skip
-    axes[-1].legend()
+                 ylabel="photons a pixel")  # fmt: skip
+    axes[-1].set_ylim(0, 1.25 * exposure.emitted.max())
+    axes[-1].legend(loc="upper right")
     axes[-1].grid(alpha=0.3)
     right = "" if photons is None else (
         " Middle: the laser's own light, plane waves of random direction, frequency and place, "
@@ -113,6 +115,7 @@ def _cuts(doppler, exposure):
         axis.legend(loc="upper right")
         axis.grid(alpha=0.3)
     left.set_ylabel("photoelectrons a pixel")
+    left.set_ylim(top=1.35 * mean[weight > 30].max())
     return figure, (
         "As the paper's figure 4: a cut through the picture of one pulse from the centre to the "
         "rim (red), and the same ring profile with less noise (blue). Left: 360 such cuts behind a "
@@ -144,6 +147,8 @@ def _errors(doppler, metrics):
             axis.plot(stated["averaged"], stated[quantity], "*", color="k", ms=13, zorder=5,
                       label=f"paper: {'below ' * (centre == 'known')}{stated[quantity]:g} m/s")  # fmt: skip
             axis.set(xscale="log", yscale="log")
+            axis.set_xticks(settings.averaged, [str(n) for n in settings.averaged])
+            axis.minorticks_off()
             axis.grid(alpha=0.3, which="both")
         column[0].set_title(CENTRES[centre])
         column[1].set_xlabel("pictures averaged")
@@ -154,8 +159,7 @@ def _errors(doppler, metrics):
     return figure, (
         "Standard deviation (above) and bias (below) of the line-of-sight wind against the number "
         "of pictures that are averaged, over all speeds, with standard errors; stars: what the "
-        "paper states. Peaks are those of the innermost ring. The fit of the full model is at the "
-        "bound for a single picture, and its bias is zero within its error."
+        "paper states. Peaks are those of the innermost ring, the bound is that at the first speed."
     )
 
 
@@ -213,9 +217,12 @@ def _speeds(found):
     left.set(xlabel="true wind / m s$^{-1}$", ylabel="wind read / m s$^{-1}$")
     right.set(xlabel="true wind / m s$^{-1}$", ylabel="wind read less true wind / m s$^{-1}$")
     right.set_yscale("symlog", linthresh=1.0)
+    ticks = [sign * value for sign in (-1, 1) for value in (0.5, 1, 10, 100)]
+    low, high = right.get_ylim()
+    right.set_yticks(*zip(*((t, f"{t:g}") for t in sorted([0, *ticks]) if low <= t <= high)))
     n, centre = int(case["averaged"]), CENTRES[str(case["centre"].values)]
     for axis in (left, right):
-        axis.set_title(f"averages of {n} picture(s), {centre}")
+        axis.set_title(f"{'single pictures' if n == 1 else f'averages of {n} pictures'}, {centre}")
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
     return figure, (

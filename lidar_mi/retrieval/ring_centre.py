@@ -6,7 +6,6 @@ Coordinates are pixels, x to the right and y down, from the top left pixel's cen
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter
-from scipy.optimize import minimize
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.peak_fit import peak
@@ -85,28 +84,44 @@ def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[floa
     """Centre about which the circular average has the most contrast: the paper's CA.
 
     The contrast, the variance of the averages over all pixels, falls with the square of the
-    distance to the centre: averages about another point smear the rings.
+    distance to the centre: averages about another point smear the rings. Its top is found by
+    Newton's method, on differences over 1 px.
 
     Parameters
     ----------
     image : array, shape (height, width)
     start : (float, float)
         Within about a third of a ring's width.
+
+    Raises
+    ------
+    InputError
+        A contrast without a top: no rings about one centre.
     """
     # variances do not depend on an offset; sums of squares lose least without one
     image = np.asarray(image, float) - np.mean(image)
 
-    def contrast(centre):
-        _, mean, weight = circular_average(image, centre)
-        return -float(weight @ mean**2) / image.size
+    def contrast(*place):
+        _, mean, weight = circular_average(image, place)
+        return float(weight @ mean**2)
 
-    scale = np.var(image)
-    found = minimize(
-        lambda p: contrast(p) / scale, start, method="Nelder-Mead",
-        options={"initial_simplex": np.add(start, [[0, 0], [2, 0], [0, 2]]),
-                 "xatol": 2e-3, "fatol": 1e-10},
-    )  # fmt: skip
-    return float(found.x[0]), float(found.x[1])
+    x, y = start
+    for _ in range(20):
+        middle, corner = contrast(x, y), contrast(x + 1, y + 1)
+        right, left = contrast(x + 1, y), contrast(x - 1, y)
+        below, above = contrast(x, y + 1), contrast(x, y - 1)
+        slope = np.array([right - left, below - above]) / 2
+        mixed = corner - right - below + middle
+        curve = np.array([
+            [right + left - 2 * middle, mixed], [mixed, below + above - 2 * middle],
+        ])  # fmt: skip
+        # where the contrast is not yet a hill's top, uphill
+        hill = np.linalg.eigvalsh(curve)[1] < 0
+        step = -np.linalg.solve(curve, slope) if hill else 2 * np.sign(slope)
+        x, y = np.array([x, y]) + step.clip(-2, 2)
+        if hill and np.hypot(*step) < 0.01:
+            return float(x), float(y)
+    raise InputError("image: averages over circles have no best centre; expected rings")
 
 
 def midpoint_points(
