@@ -11,12 +11,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from .errors import InputError
 from .instrument.detector import Detector
 from .instrument.doppler import DopplerLidar
+from .instrument.doppler_scan import DopplerScan, PlatformErrors
 from .instrument.etalon import Etalon
 from .instrument.fringe_camera import CCD, FringeCamera
 from .instrument.lidar import BackscatterLidar
 from .instrument.scan import Scan
 from .rendering.settings import FringeSettings, RenderSettings
-from .units import Circulation, Extinction, Length, Number, Speed, Time, to_si
+from .units import Circulation, Extinction, Frequency, Length, Number, Speed, Time, to_si
 
 
 class _Section(BaseModel):
@@ -249,6 +250,23 @@ class Doppler(_Section):
         return self
 
 
+class Sensor(_Section):
+    """Both lidars as one sensor: the Doppler lidar scans the slab of the backscatter lidar."""
+
+    directions: DopplerScan = DopplerScan()
+    pulses: int = Field(20, ge=1, le=10_000, description="averaged in a direction of a slab")
+    slabs_per_second: Frequency = Field(10.0, gt=0, description="that are measured")
+    method: Literal["cc", "ws", "multipass", "variational", "vortex_fit"] = Field(
+        "variational", description="that the cross-flow wind is taken from"
+    )
+    crossflow_std: Speed | None = Field(
+        None, gt=0, description="standard error of v and w; default: as the method says"
+    )
+    errors: PlatformErrors = PlatformErrors()
+    requirements: str | None = Field(None, description="requirement table; default: the paper's")
+    exposure: Time = Field(10.0, gt=0, le=30_000, description="time of looking into the beams")
+
+
 # keys of the backscatter lidar, which looks at a wake
 BACKSCATTER = ("platform", "lidar", "detector", "scan", "scattering", "render", "retrieval")
 
@@ -267,6 +285,25 @@ class Experiment(_Section):
     scattering: Scattering = Scattering()
     render: RenderSettings = RenderSettings()
     retrieval: Retrieval = Retrieval()
+    sensor: Sensor | None = Field(None, description="both lidars combined; {} for all defaults")
+
+    @model_validator(mode="after")
+    def _both_lidars_for_the_sensor(self):
+        if self.sensor is None:
+            return self
+        if self.wake is None or self.doppler is None:
+            raise ValueError("sensor: not allowed without wake and doppler; expected both")
+        method = self.sensor.method
+        if method not in self.retrieval.methods:
+            raise ValueError(
+                f"sensor.method: {method!r} is not allowed; expected one of retrieval.methods, "
+                f"{', '.join(self.retrieval.methods)}"
+            )
+        if method in ("cc", "ws") and self.sensor.crossflow_std is None:
+            raise ValueError(
+                f"sensor.crossflow_std: missing; expected a speed, as method {method} knows no errors"
+            )
+        return self
 
     @model_validator(mode="after")
     def _something_to_do(self):
@@ -352,8 +389,7 @@ def dump(experiment: Experiment) -> str:
     Without the sections of a lidar that it does not have.
     """
     unused = {"wake", *BACKSCATTER} if experiment.wake is None else set()
-    if experiment.doppler is None:
-        unused.add("doppler")
+    unused |= {name for name in ("doppler", "sensor") if getattr(experiment, name) is None}
     data = experiment.model_dump(mode="json", exclude=unused)
     return yaml.safe_dump(data, sort_keys=False)
 

@@ -7,7 +7,7 @@ goes on with those, and everything after them is made again.
 import json
 from pathlib import Path
 
-from . import __version__, backscatter_chain, config, fringe_chain
+from . import __version__, backscatter_chain, config, fringe_chain, sensor_chain
 from .assessment import report
 from .config import Experiment
 from .errors import is_interrupt
@@ -46,6 +46,8 @@ def run(
         chains.append(backscatter_chain.prepare(experiment, beside, notice))
     if experiment.doppler:
         chains.append(fringe_chain.prepare(experiment))
+    if experiment.sensor:
+        chains.append(sensor_chain.prepare(experiment, beside))
     claim(folder, experiment, beside, overwrite)
     log = Log(folder / "log.txt", notice)
     log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")

@@ -19,7 +19,9 @@ from .truth import find_file
 
 IMAGES = ("image_t1.exr", "image_t2.exr")
 PICTURES = (*IMAGES, "fringes_*.exr")
-RESULTS = ("wind.nc", "v_los.nc", "metrics.json", "report.html", "log.txt")
+RESULTS = (
+    "wind.nc", "v_los.nc", "lines_of_sight.nc", "wind3d.nc", "metrics.json", "report.html", "log.txt",
+)  # fmt: skip
 
 # other versions of these may give other pictures
 RENDERED_BY = ("lidar-mi", "mitsuba", "drjit")

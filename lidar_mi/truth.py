@@ -78,7 +78,8 @@ def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | 
     # winds are retrieved from the first gate
     depth = experiment.scan.thickness / experiment.scan.gate_count
     gates = (experiment.scan.range, experiment.scan.range + depth)
-    wind = xr.Dataset({name: _slab_mean(flow[name], gates) for name in ("v", "w")})
+    components = [name for name in ("u", "v", "w") if name in flow]
+    wind = xr.Dataset({name: _slab_mean(flow[name], gates) for name in components})
     wind.attrs["gates"] = gates
     return Truth((rough1, rough2), (smooth1, smooth2), wind)
 

@@ -145,6 +145,8 @@ def _value(name, model, *given):
         whole = {"phase": "rayleigh", "share": 1.0} if model is config.Part else {}
         return getattr(model.model_validate(whole | dict(zip([key], given))), key)
     data = copy.deepcopy(BASE)
+    if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors
+        data |= {"doppler": {}, "retrieval": {"methods": ["variational"]}}
     section = data
     for parent in parents:
         section = section.setdefault(parent, {})

@@ -1,0 +1,184 @@
+"""The combined sensor's chapter of a report: its figures, its verdict, its numbers."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from scipy import stats
+
+from ..retrieval.line_of_sight import COMPONENTS
+from .cores import Core
+from .figures import Drawn, save_all
+from .report import Chapter
+from .requirements import as_rows, fulfilled, look_ahead
+
+_SPEED = "m s$^{-1}$"
+
+
+def draw_all(
+    folder: Path, found: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core], log: Callable
+) -> list[Drawn]:
+    """Draw the combined sensor's figures as PNG into ``folder``.
+
+    Parameters
+    ----------
+    found : xr.Dataset
+        From `lidar_mi.retrieval.combine.combine`, with the truth as u_true, v_true, w_true.
+    lines : xr.Dataset
+        From `lidar_mi.sensor_chain.measure_lines`.
+    """
+    plates = (
+        ("fig20_wind3d", "The wind from both lidars", _maps(found, lines, cores)),
+        ("fig21_uncertainty", "How certain it is", _uncertainty(found)),
+    )
+    return save_all(folder, plates, log)
+
+
+def _maps(found, lines, cores):
+    figure = Figure(figsize=(17, 10.5), layout="compressed")
+    axes = figure.subplots(3, 3, sharex=True, sharey=True)
+    good = found["flag"] == 0
+    y, z = found["y"], found["z"]
+    place = (lines["range"] * lines["direction"]).transpose("line", "axis").values
+    for row, name in zip(axes, COMPONENTS):
+        true, value = found[f"{name}_true"], found[name].where(good)
+        error = value - true
+        limit = _limit(np.concatenate([true.values.ravel(), value.values.ravel()]))
+        columns = (
+            (true, limit, f"{name}, true"), (value, limit, f"{name}, found"),
+            (error, _limit(error.values), f"{name}, error"),
+        )  # fmt: skip
+        for panel, (field, bound, title) in zip(row, columns):
+            mesh = panel.pcolormesh(
+                y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True,
+                cmap="RdBu_r", vmin=-bound, vmax=bound,
+            )  # fmt: skip
+            panel.set(title=title, aspect="equal")
+            figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
+            for core in cores:
+                panel.plot(core.y, core.z, "+", color="k", ms=8)
+    # lines of sight where they are used
+    axes[0, 1].plot(place[:, 1], place[:, 2], "k.", ms=2)
+    axes[0, 0].set_xlim(float(y.max()), float(y.min()))
+    axes[0, 0].set_ylim(float(z.min()), float(z.max()))
+    for panel in axes[-1]:
+        panel.set_xlabel("y / m (port is left)")
+    for panel in axes[:, 0]:
+        panel.set_ylabel("z / m")
+    return figure, (
+        "Rows: u from the lines of sight (dots: their middles) with the cross-flow wind of the "
+        "images taken out, v and w from the images. Good vectors alone; crosses: true cores."
+    )
+
+
+def _uncertainty(found):
+    figure = Figure(figsize=(17, 4.3), layout="compressed")
+    axes = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 1))
+    good = (found["flag"] == 0).transpose("z", "y").values
+    y, z = found["y"], found["z"]
+    for panel, name in zip(axes, ("u", "w")):
+        stderr = found[f"{name}_stderr"].transpose("z", "y").values
+        top = float(np.quantile(stderr[good], 0.99)) if good.any() else 1.0
+        mesh = panel.pcolormesh(
+            y, z, np.where(good, stderr, np.nan), shading="nearest", rasterized=True,
+            cmap="viridis", vmin=0, vmax=top,
+        )  # fmt: skip
+        panel.set(title=f"standard error of {name}", aspect="equal", xlabel="y / m (port is left)",
+                  ylabel="z / m")  # fmt: skip
+        panel.set_xlim(float(y.max()), float(y.min()))
+        figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="max")
+    axes = axes[-1]
+    edges = np.linspace(-5, 5, 51)
+    for name in COMPONENTS:
+        error = (found[name] - found[f"{name}_true"]) / found[f"{name}_stderr"]
+        values = error.transpose("z", "y").values[good]
+        axes.hist(np.clip(values[np.isfinite(values)], -5, 5), edges, density=True, histtype="step",
+                  label=name)  # fmt: skip
+    middle = (edges[1:] + edges[:-1]) / 2
+    axes.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
+    axes.set(title="errors over standard errors", xlabel="reduced error", ylabel="density")
+    axes.legend()
+    return figure, (
+        "Left, middle: standard errors of good vectors. Right: how errors against the truth, in "
+        "units of their standard errors, are distributed; the last bins hold all beyond."
+    )
+
+
+def _limit(values: np.ndarray) -> float:
+    known = np.abs(values[np.isfinite(values)])
+    return (float(np.quantile(known, 0.995)) if known.size else 0.0) or 1.0
+
+
+def sensor_chapter(
+    experiment, metrics: dict[str, float], judged: Sequence[tuple], drawn: Sequence[Drawn]
+) -> Chapter:
+    """What both lidars together tell, and whether that satisfies flight control.
+
+    Parameters
+    ----------
+    experiment : lidar_mi.config.Experiment
+    metrics : dict
+        From `lidar_mi.sensor_chain`.
+    judged : sequence of (RequirementTable, list of Finding)
+    drawn : sequence of Drawn
+    """
+    platform = experiment.platform
+    ahead = look_ahead(experiment.scan.range + experiment.scan.thickness / 2, platform.speed)
+    purpose = (
+        "Both lidars look at the same slab of air: the Doppler lidar's lines of sight and the "
+        "cross-flow wind of the backscatter lidar's images give the wind in three dimensions."
+    )
+    warning = "The platform stands still."
+    if platform.speed:
+        warning = f"At {platform.speed:g} m/s the aircraft is there {ahead:.2g} s later."
+    verdicts = {True: "fulfilled", False: "not fulfilled", None: "cannot be told"}
+    tables = [
+        (
+            f"{table.title}, {table.phase}: {verdicts[fulfilled(findings)]}",
+            ["required", "measured", "margin", "verdict"],
+            [(name, "", values) for name, *values in as_rows(findings)],
+        )
+        for table, findings in judged
+    ]
+    return Chapter(
+        lead=[purpose, warning, *_costs(metrics)],
+        drawn=drawn,
+        heading="Whether it does what flight control asks for",
+        legend="Errors of u, v, w are rms errors of good vectors beyond two core radii, those of v_LOS "
+        "rms errors of lines of sight. A margin is the distance from the limit, as a share of it.",
+        tables=[*tables, _numbers(metrics)],
+    )
+
+
+def _costs(metrics) -> list[str]:
+    text = (
+        f"The Doppler lidar's directions take {metrics['sensor.doppler.pulses_per_second']:.4g} "
+        f"pulses a second, {metrics['sensor.doppler.average_power']:.3g} W of light, and give "
+        f"{metrics['sensor.doppler.photons_per_direction']:.2g} photons each."
+    )
+    safety = []
+    for name, title in (("doppler", "Doppler"), ("backscatter", "backscatter")):
+        distance = metrics.get(f"sensor.{name}.hazard_distance")
+        if distance is not None:
+            aided = metrics[f"sensor.{name}.aided_hazard_distance"]
+            safety.append(
+                f"The {title} lidar's beam is safe for eyes from {distance:.3g} m on, with "
+                f"binoculars from {aided:.3g} m (IEC 60825-1:2014)."
+            )
+    return [text, *safety]
+
+
+def _numbers(metrics):
+    rows = []
+    for key, label, unit in (
+        ("rmse_{}", "rms error", "m/s"), ("outside_cores.rmse_{}", "rms error beyond cores", "m/s"),
+        ("bias_{}", "bias", "m/s"), ("reduced_variance_{}", "variance of reduced errors", ""),
+        ("coverage_68_{}", "within one standard error", ""),
+        ("coverage_95_{}", "within 1.96 standard errors", ""),
+        ("triples.rmse_{}", "rms error, lines of sight alone", "m/s"),
+    ):  # fmt: skip
+        values = [metrics.get(f"sensor.{key.format(name)}") for name in (*COMPONENTS, "v_los")]
+        rows.append((label, unit, ["-" if v is None else f"{v:.3g}" for v in values]))
+    return "Errors against the truth", ["u", "v", "w", "v_LOS"], rows

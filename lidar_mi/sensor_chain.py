@@ -1,0 +1,278 @@
+"""The combined sensor of an experiment: both lidars' winds as one field, and what it is good for.
+
+The Doppler lidar scans the slab that the backscatter lidar has looked at. Every line of sight
+gets pictures of rings of its own, which are read for its velocity; all of them and the cross-flow
+wind together give (u, v, w).
+"""
+
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import torch
+import xarray as xr
+
+from . import __version__, fringe_chain
+from .assessment.cores import find_cores, outside_cores
+from .assessment.report import Chapter
+from .assessment.requirements import judge, read_requirements
+from .assessment.sensor_report import draw_all, sensor_chapter
+from .backscatter_chain import NOISY
+from .config import Experiment
+from .errors import InputError
+from .instrument.budget import pulse_budget
+from .instrument.doppler import photons
+from .instrument.doppler_scan import scan_wind, sight_volumes, wind_at
+from .instrument.eye_safety import assess_pulses
+from .instrument.fringe_camera import fringe_image
+from .retrieval.combine import combine
+from .retrieval.line_of_sight import COMPONENTS, wind_from_triples
+from .run_folder import Log, write_netcdf
+from .truth import find_file, make_truth
+
+LINES, WIND = "lines_of_sight.nc", "wind3d.nc"
+
+# Speeds at which pictures without noise are made; those between are interpolated (Chebyshev).
+_NODES = 9
+# First number of the lines' pictures, which make their random streams.
+_STREAMS = 1 << 24
+
+
+def prepare(
+    experiment: Experiment, beside: str | Path
+) -> Callable[[Path, Log], tuple[dict[str, float], Chapter]]:
+    """Check everything that can be checked ahead; what it returns runs the rest into a folder.
+
+    Raises
+    ------
+    InputError
+        Lidars that do not look at the same air, a scan wider than the wake, a bad requirement table.
+    """
+    sensor, lidar = experiment.sensor, experiment.doppler.lidar
+    middle = experiment.scan.range + experiment.scan.thickness / 2
+    if abs(lidar.range - middle) > lidar.range_bin / 2:
+        raise InputError(
+            f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected the slab of "
+            f"scan, {middle - lidar.range_bin / 2:g} to {middle + lidar.range_bin / 2:g} m"
+        )
+    tables = read_requirements(
+        *([find_file(sensor.requirements, beside, "sensor.requirements")]
+          if sensor.requirements else [])
+    )  # fmt: skip
+    truth = true_wind(experiment, beside)
+    # lines that leave the wake, bins that reach the telescope
+    wind_at(truth, _volumes(experiment))
+    fastest = experiment.platform.speed + float(np.sqrt(sum(truth[n] ** 2 for n in COMPONENTS)).max())
+    limit = fringe_chain._rings(experiment.doppler).model.velocity_range / 2
+    if fastest > limit:
+        raise InputError(
+            f"platform.speed: {experiment.platform.speed:g} m/s is not allowed with sensor; expected "
+            f"less than {limit:.0f} m/s with the wind, half an order of doppler.etalon"
+        )
+    return lambda folder, log: _run(experiment, truth, tables, folder, log)
+
+
+def _volumes(experiment: Experiment) -> np.ndarray:
+    scan, lidar = experiment.sensor.directions, experiment.doppler.lidar
+    return sight_volumes(scan.directions(), scan.ranges(lidar), lidar)[0]
+
+
+def true_wind(experiment: Experiment, beside: str | Path = ".") -> xr.Dataset:
+    """u, v, w on (z, y), averaged over the slab; u is 0 in a wake that has none."""
+    wind = make_truth(experiment, beside).wind
+    return wind if "u" in wind else wind.assign(u=xr.zeros_like(wind["v"]))
+
+
+def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chapter]:
+    start = time.perf_counter()
+    lines = measure_lines(experiment, truth, log)
+    write_netcdf(lines, folder / LINES)
+    log("combining both lidars")
+    with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
+        source = NOISY if experiment.detector else "backscatter"
+        crossflow = winds.sel(source=source, algorithm=experiment.sensor.method).load()
+    found = combine(crossflow, lines, crossflow_std=experiment.sensor.crossflow_std)
+    triples = wind_from_triples(lines)
+    for name in COMPONENTS:
+        at = {axis: found[axis] for axis in ("z", "y")}
+        found[f"{name}_true"] = truth[name].interp(at).assign_attrs(
+            units="m s-1", long_name=f"true {name}, mean over the slab"
+        )
+    found.attrs |= {
+        "title": f"Wind from both lidars of the experiment {experiment.name}",
+        "source": f"lidar-mi {__version__}",
+    }
+    write_netcdf(found, folder / WIND)
+    cores = find_cores(truth)
+    metrics = errors(found, cores) | _line_errors(lines) | _triple_errors(triples, truth)
+    metrics |= _costs(experiment)
+    judged = [(table, judge(table, measured(experiment, metrics, table))) for table in tables.values()]
+    for table, findings in judged:
+        for row in findings:
+            if not math.isnan(row.margin):
+                key = f"sensor.{table.application}.{table.phase}.{row.quantity}.margin"
+                metrics[key] = row.margin
+    drawn = draw_all(folder / "figures", found, lines, cores, log)
+    metrics["timing.sensor_s"] = round(time.perf_counter() - start, 3)
+    return metrics, sensor_chapter(experiment, metrics, judged, drawn)
+
+
+def measure_lines(experiment: Experiment, truth: xr.Dataset, log: Log) -> xr.Dataset:
+    """Line-of-sight velocities as the Doppler lidar reads them from its rings.
+
+    Pictures without noise are made at a few speeds and interpolated between them (their rings
+    move by far less than an order); each line's are drawn by the CCD and read by the annular fit,
+    which says how good it is. A picture that cannot be read leaves NaN.
+    """
+    sensor, doppler = experiment.sensor, experiment.doppler
+    lines = scan_wind(
+        truth, sensor.directions, doppler.lidar, 0.0, experiment.seed, experiment.platform.speed,
+        sensor.errors,
+    )  # fmt: skip
+    true = lines["v_los_true"].values
+    log(f"measuring {len(true)} lines of sight, {sensor.pulses} pulses each")
+    middle, half = (true.max() + true.min()) / 2, max(np.ptp(true) / 2, 1e-3)
+    nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    rings = fringe_chain._rings(doppler)
+    light, counted = photons(doppler.lidar), doppler.lidar.counted
+    images = torch.stack([
+        fringe_image(doppler.camera, doppler.etalon, rings.line, speed, light, counted)
+        for speed in middle + half * nodes
+    ])  # fmt: skip
+    noise = fringe_chain._summed_noise(doppler.ccd, rings.modes, sensor.pulses)
+    read = np.empty((2, len(true)))
+    for index, place in enumerate((true - middle) / half):
+        log.bar(f"reading line of sight {index + 1} of {len(true)}", index / len(true))
+        weights = torch.from_numpy(_lagrange(nodes, place)).to(images.dtype)
+        farther = doppler.lidar.model_copy(update={"range": float(lines["range"][index])})
+        image = torch.tensordot(weights, images, 1) * (photons(farther) / light)
+        # numbers of their own, apart from those of the pictures of the Doppler lidar's chapter
+        frame = fringe_chain._frames(
+            doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
+        )
+        read[:, index] = np.ravel(
+            fringe_chain._fitted(frame, doppler, rings.model, noise, "annular", "free")
+        )
+    v_los, std = read
+    return lines.assign(
+        v_los=("line", v_los, lines["v_los"].attrs),
+        v_los_std=("line", std, lines["v_los_std"].attrs),
+    )
+
+
+def _lagrange(nodes: np.ndarray, place: float) -> np.ndarray:
+    """Weights of values at the nodes in the polynomial through them, at a place."""
+    others = ~np.eye(len(nodes), dtype=bool)
+    return np.array(
+        [np.prod((place - nodes[o]) / (node - nodes[o])) for node, o in zip(nodes, others)]
+    )
+
+
+def errors(found: xr.Dataset, cores) -> dict[str, float]:
+    """Errors of good vectors (flag 0), and whether they are what the standard errors say.
+
+    ``rmse_*``, ``bias_*`` (m/s), ``reduced_variance_*`` (1 where errors are as stated),
+    ``coverage_68_*`` and ``coverage_95_*`` (share within 1 and 1.96 standard errors);
+    ``outside_cores.rmse_*`` beyond two core radii.
+    """
+    good = found["flag"].values == 0
+    z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
+    far = good & outside_cores(y, z, cores)
+    metrics = {"sensor.good_fraction": float(good.mean()), "sensor.vectors": int(good.sum())}
+    for name in COMPONENTS:
+        error = (found[name] - found[f"{name}_true"]).values
+        known = good & np.isfinite(error)
+        if not known.any():
+            continue
+        reduced = error[known] / found[f"{name}_stderr"].values[known]
+        metrics |= {
+            f"sensor.rmse_{name}": float(np.sqrt((error[known] ** 2).mean())),
+            f"sensor.bias_{name}": float(error[known].mean()),
+            f"sensor.reduced_variance_{name}": float((reduced**2).mean()),
+            f"sensor.coverage_68_{name}": float((abs(reduced) < 1).mean()),
+            f"sensor.coverage_95_{name}": float((abs(reduced) < 1.96).mean()),
+        }
+        if (far & known).any():
+            rmse = float(np.sqrt((error[far & known] ** 2).mean()))
+            metrics[f"sensor.outside_cores.rmse_{name}"] = rmse
+    return metrics
+
+
+def _line_errors(lines: xr.Dataset) -> dict[str, float]:
+    error = (lines["v_los"] - lines["v_los_true"]).values
+    read = np.isfinite(error)
+    metrics = {"sensor.lines": len(error), "sensor.lines_read": int(read.sum())}
+    if read.any():
+        reduced = error[read] / lines["v_los_std"].values[read]
+        metrics |= {
+            "sensor.rmse_v_los": float(np.sqrt((error[read] ** 2).mean())),
+            "sensor.bias_v_los": float(error[read].mean()),
+            "sensor.reduced_variance_v_los": float((reduced**2).mean()),
+        }
+    return metrics
+
+
+def _triple_errors(triples: xr.Dataset, truth: xr.Dataset) -> dict[str, float]:
+    """What the Doppler lidar alone would say."""
+    good = triples["flag"] == 0
+    metrics = {}
+    for name in COMPONENTS:
+        true = truth[name].interp(z=triples["z"], y=triples["y"])
+        error = (triples[name] - true).values[good.values]
+        if error.size:
+            metrics[f"sensor.triples.rmse_{name}"] = float(np.sqrt((error**2).mean()))
+    return metrics
+
+
+def measured(experiment: Experiment, metrics: dict[str, float], table) -> dict[str, float | None]:
+    """What the sensor does, as `requirements.judge` takes it; errors beyond two core radii.
+
+    Points are lines of sight where velocities along them are asked for, else good vectors whose
+    windows do not overlap.
+    """
+    retrieval = experiment.retrieval
+    overlap = min(1.0, retrieval.stride / retrieval.template) ** 2
+    along = any(row.quantity == "error_v_los" for row in table.rows)
+    points = metrics["sensor.lines_read"] if along else math.floor(overlap * metrics["sensor.vectors"])
+    return {
+        "range": experiment.scan.range + experiment.scan.thickness / 2,
+        "points_per_slab": points,
+        "slabs_per_second": experiment.sensor.slabs_per_second,
+        "slab_depth": experiment.doppler.lidar.range_bin if along else max(
+            experiment.doppler.lidar.range_bin, experiment.scan.thickness
+        ),
+        "error_v_los": metrics.get("sensor.rmse_v_los"),
+        **{f"error_{n}": metrics.get(f"sensor.outside_cores.rmse_{n}") for n in COMPONENTS},
+    }  # fmt: skip
+
+
+def _costs(experiment: Experiment) -> dict[str, float]:
+    """Pulses, power and hazard distances of both beams."""
+    sensor, doppler, lidar = experiment.sensor, experiment.doppler.lidar, experiment.lidar
+    far = float(sensor.directions.ranges(doppler).max()) + doppler.range_bin / 2
+    directions = sensor.directions.columns * sensor.directions.rows
+    rate = sensor.slabs_per_second
+    budget = pulse_budget(directions, rate, sensor.pulses, doppler.pulse_energy, far, photons(doppler))
+    metrics = {
+        "sensor.doppler.pulses_per_second": budget.pulses_per_second,
+        "sensor.doppler.average_power": budget.average_power,
+        "sensor.doppler.beams": budget.beams,
+        "sensor.doppler.photons_per_direction": budget.photons_per_direction,
+    }
+    beams = {"doppler": (doppler, doppler.beam_radius, sensor.pulses * rate)}
+    # a pulse of no duration has no limit of exposure
+    if lidar.pulse_duration > 0:
+        beams["backscatter"] = lidar, float(lidar.radius_at(0)), rate
+    for name, (beam, radius, repetition) in beams.items():
+        if beam.pulse_duration > 0:
+            safety = assess_pulses(
+                beam.wavelength, beam.pulse_energy, beam.pulse_duration, radius,
+                beam.divergence_full, repetition, sensor.exposure,
+            )  # fmt: skip
+            for key in ("hazard_distance", "aided_hazard_distance"):
+                if math.isfinite(getattr(safety, key)):
+                    metrics[f"sensor.{name}.{key}"] = getattr(safety, key)
+            metrics[f"sensor.{name}.permissible_exposure"] = safety.limit.exposure
+    return metrics

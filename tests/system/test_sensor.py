@@ -1,0 +1,148 @@
+"""Both lidars as one sensor, from the experiment file to the report.
+
+Detects a chain that does not run or leaves something out, lines of sight that are read wrongly or
+with wrong errors (4 sigma), a verdict that contradicts its numbers, and descriptions of lidars that do
+not look at the same air.
+"""
+
+import json
+import math
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidar_mi import config, sensor_chain
+from lidar_mi.assessment.cores import Core
+from lidar_mi.assessment.requirements import read_requirements
+from lidar_mi.errors import InputError
+from lidar_mi.experiment import run
+
+# a coarse wake, few photons, a CCD of a sixteenth of the pixels
+SMALL = {
+    "name": "small",
+    "wake": {"file": "wake_slab_40s.nc", "time": "40 s", "spacing": "1 m"},
+    "platform": {"speed": "70 m/s"},
+    "lidar": {"pulse_duration": "10 ns"},
+    "scan": {"range": "148.75 m"},
+    "render": {"samples_per_beam": 2, "max_order": 1},
+    "retrieval": {"methods": ["cc"], "stride": 2},
+    "doppler": {
+        "lidar": {"range": "150 m"},
+        "v_los": ["70 m/s"],
+        "camera": {"pixel": "29.6 um", "width": 240, "height": 195},
+        "ccd": {"full_well": 1e6},
+        "retrieval": {"methods": ["annular"], "averaged": [1], "images": 2, "slow_images": 0},
+        "photon_samples": 0,
+        "render": {"samples_per_pixel": 16},
+    },
+    "sensor": {
+        "directions": {"columns": 5, "rows": 3, "azimuth_half": "14 deg", "elevation_half": "8 deg"},
+        "method": "cc",
+        "crossflow_std": "0.8 m/s",
+    },
+}
+
+
+def changed(**sections):
+    data = json.loads(json.dumps(SMALL))
+    for section, values in sections.items():
+        data[section] = values if values is None else data.get(section, {}) | values
+    return config.check(data, "small.yaml")
+
+
+@pytest.mark.usefixtures("variant")
+def test_the_whole_chain(tmp_path):
+    experiment = changed()
+    metrics = run(experiment, tmp_path / "run")
+    lines = xr.open_dataset(tmp_path / "run" / "lines_of_sight.nc", engine="h5netcdf")
+    wind = xr.open_dataset(tmp_path / "run" / "wind3d.nc", engine="h5netcdf")
+    assert lines.sizes["line"] == 15 == metrics["sensor.lines_read"]
+    assert wind.attrs["Conventions"] == "CF-1.11" and {"u", "v", "w", "u_true"} <= set(wind)
+    # read from rings, with the errors that the fit states
+    reduced = (lines.v_los - lines.v_los_true) / lines.v_los_std
+    assert abs(float(reduced.mean())) < 4 / math.sqrt(15)
+    assert float((reduced**2).mean()) < 1 + 4 * math.sqrt(2 / 15)
+    # u of the combined sensor is what the lines are good for; triples are not
+    assert metrics["sensor.rmse_u"] < 0.5 < metrics["sensor.triples.rmse_v"]
+    good = wind["flag"].values == 0
+    error = (wind["u"] - wind["u_true"]).values[good]
+    assert metrics["sensor.rmse_u"] == pytest.approx(np.sqrt((error**2).mean()), rel=1e-3)
+    # the verdict is that of the numbers
+    margin = 1 - metrics["sensor.outside_cores.rmse_w"] / 2.5
+    assert metrics["sensor.flight_control.landing.error_w.margin"] == pytest.approx(margin)
+    assert metrics["sensor.doppler.pulses_per_second"] == 15 * 10 * 20
+    report = (tmp_path / "run" / "report.html").read_text()
+    for text in ("flight control, from wind vectors, landing", "at most 2.5 m/s",
+                 "safe for eyes from", "2.1 s later", "The wind from both lidars"):  # fmt: skip
+        assert text in report, text
+    assert (tmp_path / "run" / "figures" / "fig20_wind3d.png").stat().st_size > 10_000
+
+
+def test_interpolation_is_exact_for_polynomials():
+    nodes = np.cos(np.pi * (np.arange(9) + 0.5) / 9)
+    for place in (-1.0, -0.3, nodes[4], 0.77):
+        weights = sensor_chain._lagrange(nodes, place)
+        for power in range(9):
+            assert weights @ nodes**power == pytest.approx(place**power, abs=1e-12)
+
+
+def test_errors_of_a_known_field():
+    """u off by its standard error, v by twice, w by 3 at one node of ten within a core."""
+    axes = {"z": np.zeros(1), "y": np.arange(10.0)}
+    one = xr.DataArray(np.ones((1, 10)), coords=axes, dims=("z", "y"))
+    spot = one * (one.y == 0)
+    found = xr.Dataset({
+        "u": 5 + 0.5 * one, "v": 2 * one, "w": 3 * spot, "u_true": 5 * one, "v_true": 0 * one,
+        "w_true": 0 * one, "u_stderr": 0.51 * one, "v_stderr": one, "w_stderr": one,
+        "flag": (one * (one.y == 9)).astype(np.uint8),
+    })  # fmt: skip
+    metrics = sensor_chain.errors(found, [Core(y=0.0, z=0.0, radius=0.3, circulation=400.0)])
+    assert metrics["sensor.vectors"] == 9 and metrics["sensor.good_fraction"] == 0.9
+    assert metrics["sensor.rmse_u"] == pytest.approx(0.5) == metrics["sensor.bias_u"]
+    assert metrics["sensor.coverage_68_u"] == 1 and metrics["sensor.coverage_95_v"] == 0
+    assert metrics["sensor.reduced_variance_v"] == pytest.approx(4)
+    assert metrics["sensor.rmse_w"] == pytest.approx(1)
+    assert metrics["sensor.outside_cores.rmse_w"] == 0
+
+
+def test_points_are_counted_as_each_table_means_them():
+    """Lines of sight for velocities along them; windows that do not overlap for vectors."""
+    metrics = {"sensor.lines_read": 15, "sensor.vectors": 1000}
+    tables = read_requirements()
+    for application, points in (("disturbance", 15), ("flight_control", 62)):
+        found = sensor_chain.measured(changed(), metrics, tables[application, "landing"])
+        assert found["points_per_slab"] == points  # (2 / 8)^2 of 1000
+        assert found["range"] == 150 and found["error_u"] is None
+
+
+@pytest.mark.parametrize(
+    ("sections", "message"),
+    [
+        ({"doppler": None}, "sensor: not allowed without wake and doppler"),
+        ({"sensor": {"method": "variational"}}, "sensor.method: 'variational' is not allowed"),
+        ({"sensor": {"crossflow_std": None}}, "sensor.crossflow_std: missing"),
+        ({"sensor": {"directions": {"rows": 0}}}, "sensor.directions.rows: 0"),
+        ({"sensor": {"errors": {"yaw": 0.1}}}, "sensor.errors.yaw: 0.1"),
+    ],
+)
+def test_bad_descriptions_are_named(sections, message):
+    with pytest.raises(InputError) as error:
+        changed(**sections)
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize(
+    ("sections", "start"),
+    [
+        ({"doppler": {"lidar": {"range": "56 m"}}}, "doppler.lidar.range: 56 m is not allowed with"),
+        ({"sensor": {"directions": {"azimuth_half": "25 deg"}}}, "wind: y from -54.5 to 54.5 m"),
+        ({"sensor": {"requirements": "mine.yaml"}}, "sensor.requirements: mine.yaml not found"),
+        ({"platform": {"speed": "1200 m/s"}}, "platform.speed: 1200 m/s is not allowed with sensor"),
+    ],
+)
+def test_what_does_not_go_together_is_said_ahead(sections, start):
+    with pytest.raises(InputError) as error:
+        sensor_chain.prepare(changed(**sections), ".")
+    assert str(error.value).startswith(start) and "\n" not in str(error.value)
