@@ -35,7 +35,7 @@ from .truth import find_file, make_truth
 LINES, WIND = "lines_of_sight.nc", "wind3d.nc"
 
 # Speeds at which pictures without noise are made; those between are interpolated (Chebyshev).
-_NODES = 9
+_NODES = 7
 # First number of the lines' pictures, which make their random streams.
 _STREAMS = 1 << 24
 
@@ -142,18 +142,21 @@ def measure_lines(experiment: Experiment, truth: xr.Dataset, log: Log) -> xr.Dat
         for speed in middle + half * nodes
     ])  # fmt: skip
     noise = fringe_chain._summed_noise(doppler.ccd, rings.modes, sensor.pulses)
+    weights = torch.from_numpy(_lagrange(nodes, (true - middle) / half)).to(images.dtype)
     read = np.empty((2, len(true)))
-    for index, place in enumerate((true - middle) / half):
-        log.bar(f"reading line of sight {index + 1} of {len(true)}", index / len(true))
-        weights = torch.from_numpy(_lagrange(nodes, place)).to(images.dtype)
-        farther = doppler.lidar.model_copy(update={"range": float(lines["range"][index])})
-        image = torch.tensordot(weights, images, 1) * (photons(farther) / light)
-        # numbers of their own, apart from those of the pictures of the Doppler lidar's chapter
-        frame = fringe_chain._frames(
-            doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
-        )
-        read[:, index] = np.ravel(
-            fringe_chain._fitted(frame, doppler, rings.model, noise, "annular", "free")
+    for start in range(0, len(true), fringe_chain.FRAMES):
+        log.bar(f"reading line of sight {start + 1} of {len(true)}", start / len(true))
+        chunk = range(start, min(start + fringe_chain.FRAMES, len(true)))
+        frames = []
+        for index in chunk:
+            farther = doppler.lidar.model_copy(update={"range": float(lines["range"][index])})
+            image = torch.tensordot(weights[index], images, 1) * (photons(farther) / light)
+            # numbers of their own, apart from those of the pictures of the Doppler lidar's chapter
+            frames.append(fringe_chain._frames(
+                doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
+            ))  # fmt: skip
+        read[:, start : chunk.stop] = fringe_chain._fitted(
+            torch.cat(frames), doppler, rings.model, noise, "annular", "free"
         )
     v_los, std = read
     return lines.assign(
@@ -162,11 +165,12 @@ def measure_lines(experiment: Experiment, truth: xr.Dataset, log: Log) -> xr.Dat
     )
 
 
-def _lagrange(nodes: np.ndarray, place: float) -> np.ndarray:
-    """Weights of values at the nodes in the polynomial through them, at a place."""
+def _lagrange(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Weights (places, nodes) of values at the nodes in the polynomial through them, at places."""
     others = ~np.eye(len(nodes), dtype=bool)
-    return np.array(
-        [np.prod((place - nodes[o]) / (node - nodes[o])) for node, o in zip(nodes, others)]
+    return np.stack(
+        [((places[:, None] - nodes[o]) / (node - nodes[o])).prod(1) for node, o in zip(nodes, others)],
+        axis=1,
     )
 
 

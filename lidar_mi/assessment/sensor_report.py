@@ -154,20 +154,26 @@ def sensor_chapter(
 
 def _costs(metrics) -> list[str]:
     text = (
-        f"The Doppler lidar's directions take {metrics['sensor.doppler.pulses_per_second']:.4g} "
-        f"pulses a second, {metrics['sensor.doppler.average_power']:.3g} W of light, and give "
+        f"The Doppler lidar's directions take {_three(metrics['sensor.doppler.pulses_per_second'])} "
+        f"pulses a second, {_three(metrics['sensor.doppler.average_power'])} W of light, and give "
         f"{metrics['sensor.doppler.photons_per_direction']:.2g} photons each."
     )
     safety = []
     for name, title in (("doppler", "Doppler"), ("backscatter", "backscatter")):
         distance = metrics.get(f"sensor.{name}.hazard_distance")
-        if distance is not None:
-            aided = metrics[f"sensor.{name}.aided_hazard_distance"]
-            safety.append(
-                f"The {title} lidar's beam is safe for eyes from {distance:.3g} m on, with "
-                f"binoculars from {aided:.3g} m (IEC 60825-1:2014)."
-            )
+        if distance is None:
+            continue
+        aided = metrics[f"sensor.{name}.aided_hazard_distance"]
+        where = "where it leaves"
+        if aided > 0:
+            where = f"from {_three(distance)} m on, with binoculars from {_three(aided)} m"
+        safety.append(f"The {title} lidar's beam is safe for eyes {where} (IEC 60825-1:2014).")
     return [text, *safety]
+
+
+def _three(value: float) -> str:
+    """Three digits, without an exponent."""
+    return f"{float(f'{value:.3g}'):.10g}"
 
 
 def _numbers(metrics):
