@@ -175,6 +175,7 @@ def test_errors_of_quantities_and_wind_against_drawn_parameters():
 # --- from images
 
 
+@pytest.mark.slow
 def test_known_pair_at_three_percent_noise():
     """Parameters within 4 standard errors, which are those of the bound; chi2 is 1.
 
@@ -216,6 +217,7 @@ def reduced_errors(noise, seeds):
     return np.array(reduced)
 
 
+@pytest.mark.slow
 def test_reduced_errors_have_unit_variance():
     """Ten parameters, eight image pairs: the rms of 80 numbers scatters by 8 %."""
     reduced = reduced_errors(0.03, range(40, 48))
