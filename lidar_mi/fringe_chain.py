@@ -260,19 +260,19 @@ def _fitted(frames, doppler, model, noise, method, centre) -> tuple[np.ndarray, 
 def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, float]:
     """Innermost ring's radius (px) by all peak methods wanted; NaN where one finds none."""
     methods = [name for name in doppler.retrieval.methods if name in PEAKS]
-    centres, radii = {}, {}
+    centres, radii, near = {}, {}, None
     for name in methods:
         way, coordinate = PEAKS[name]
         finder = "ml" if way == "ml" else "ca"
         try:
             if finder not in centres:
-                place = doppler.camera.centre_pixel
-                if centre == "free":
-                    place = ring_peaks.find_centre(image, finder)
-                # about the crest to a pixel: what a fit in r is off by goes with its piece
-                near = ring_peaks.ring_radius(image, place, "ca", "r2")
-                centres[finder] = place, near
-            place, near = centres[finder]
+                known = centre == "known"
+                centres[finder] = (
+                    doppler.camera.centre_pixel if known else ring_peaks.find_centre(image, finder)
+                )
+            place = centres[finder]
+            # the crest to a pixel: what a fit in r is off by goes with the piece about it
+            near = near or ring_peaks.ring_radius(image, place, "ca", "r2")
             radii[name] = ring_peaks.ring_radius(image, place, way, coordinate, near)
         except InputError:
             radii[name] = math.nan

@@ -37,7 +37,7 @@ SMALL = {
         "photon_samples": 2,
         "retrieval": {
             "methods": ["annular", "pixels", "ca", "ca_r2", "ml", "sg"],
-            "averaged": [1, 9], "images": 6, "slow_images": 2,
+            "averaged": [1, 9], "images": 6, "slow_images": 1,
         },
     },
 }  # fmt: skip
@@ -153,8 +153,8 @@ def test_the_paper_s_chain_has_its_bias_and_its_cure(found):
     error = found["v"] - found["v_los"]
     for name in ("ca", "ml", "sg"):
         one = error.sel(algorithm=name).values
-        assert np.isfinite(one[..., :2]).all() and np.isnan(one[..., 2:]).all()
-        assert (one[..., :2] < -10).all() and (one[..., :2] > -45).all()
+        assert np.isfinite(one[..., 0]).all() and np.isnan(one[..., 1:]).all()
+        assert (one[..., 0] < -10).all() and (one[..., 0] > -45).all()
     assert abs(error.sel(algorithm="ca_r2")).max() < 2.0
     bias = found["peak_bias"]
     assert (bias.sel(coordinate="r", piece=slice(0.3, 0.5)) < -10).all()
@@ -165,7 +165,7 @@ def test_the_paper_s_chain_has_its_bias_and_its_cure(found):
 
 def test_both_fits_agree(found):
     """Sums over sectors lose little of what pixels know: the same noise moves both alike."""
-    fits = [found["v"].sel(algorithm=name).isel(image=slice(2)) for name in ("annular", "pixels")]
+    fits = [found["v"].sel(algorithm=name).isel(image=0) for name in ("annular", "pixels")]
     assert float(abs(fits[0] - fits[1]).max()) < 0.5 * float(found["v_std"].max())
 
 
@@ -201,7 +201,11 @@ def test_metrics_are_the_stable_ones(small):
     expected = {f"doppler.bound.{case}.std" for case in cases}
     for method in SMALL["doppler"]["retrieval"]["methods"]:
         more = {"expected_std"} if method in ("annular", "pixels") else set()
-        expected |= {f"doppler.{method}.{c}.{name}" for c in cases for name in measures | more}
+        # one picture at a speed has no spread
+        spread = {"bias_stderr", "std", "std_stderr"} if method != "annular" else set()
+        expected |= {
+            f"doppler.{method}.{c}.{name}" for c in cases for name in (measures | more) - spread
+        }
     expected |= {
         f"doppler.{name}" for name in (
             "photons", "background_photons", "signal", "speckle_modes", "line_width",
