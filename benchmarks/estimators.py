@@ -34,7 +34,7 @@ def compare(
         def render(integrator):
             return lambda turn: np.array(
                 mi.render(scene, integrator=integrator, spp=photons, seed=seed + turn), float
-            ).reshape(-1, 5)
+            ).reshape(columns * rows, -1)[:, :5]
 
         return in_turns({"gated": render(gated), "analog": render(analog)}, repeats)
 

@@ -82,7 +82,9 @@ def warm_scans(repeats: int, columns: int, rows: int, photons: int) -> dict:
     scene = paper_scan(columns, rows).scene()
 
     def render(count):
-        return lambda turn: np.array(mi.render(scene, spp=count, seed=1 + turn)).reshape(-1, 5)
+        return lambda turn: np.array(mi.render(scene, spp=count, seed=1 + turn)).reshape(
+            columns * rows, -1
+        )
 
     def noise(images):
         return float(np.median([image[:, 4] / image[:, 0] for _, image in images]))

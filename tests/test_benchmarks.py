@@ -264,7 +264,7 @@ def test_errors_are_zero_for_the_true_wind_wherever_the_grids_begin():
 
 def test_cross_correlation_sees_the_vortices():
     # 30 m of the flow between the vortices, about 4 m/s downwards
-    pair = velocimetry.vortex_images(64, 40)
+    pair = cases.vortex_pair_images(columns=64, rows=40)
     found = velocimetry.cross_correlation(pair, 8, 16)
     assert found.start == 7.5 and found.dz.shape == (25, 49)
     errors, vectors = velocimetry.wind_errors(pair, found, found)
@@ -274,7 +274,7 @@ def test_cross_correlation_sees_the_vortices():
 
 @pytest.mark.skipif(find_spec("openpiv") is None, reason="openpiv is not installed")
 def test_openpiv_finds_the_same_wind():
-    pair = velocimetry.vortex_images(112, 88)
+    pair = cases.vortex_pair_images(columns=112, rows=88)
     ours = velocimetry.cross_correlation(pair, 16, 24)
     for theirs, start in (
         (velocimetry.extended_search(pair, 16, 16, "circular"), 7.5),

@@ -485,6 +485,7 @@ def test_vectors_and_numbers_in_one_data_set(tmp_path):
     assert np.isnan(both.separation[0]) and both.separation[1] == found.separation
 
 
+@pytest.mark.slow
 def test_a_failed_fit_leaves_no_good_vector():
     random = np.random.default_rng(5)
     pair = vortex_pair_images(0.0, columns=60, rows=50)
