@@ -13,6 +13,7 @@ from lidar_mi.atmosphere.particles import AEROSOLS, Aerosol, LogNormal, make_tab
 from lidar_mi.atmosphere.scattering import ELEMENTS, read_table
 
 from . import figures
+from .amplitude_matrix import phase_matrix
 from .published_spheroids import POLYDISPERSE
 from .report import Check, Row, largest
 
@@ -183,23 +184,6 @@ def _draw(place, ours, published_table):
 def amplitudes(solver, incident, scattered, azimuths, alpha, beta):
     solver.set_geometry((incident, scattered, *azimuths, alpha, beta))
     return solver.get_S()
-
-
-def phase_matrix(s):
-    """Z11, Z22, Z33, Z44, Z12, Z34 of amplitude matrices (Mishchenko et al. 2002, eqs. 2.106-2.121)."""
-    s11, s12, s21, s22 = s[..., 0, 0], s[..., 0, 1], s[..., 1, 0], s[..., 1, 1]
-    p11, p12, p21, p22 = (abs(each) ** 2 for each in (s11, s12, s21, s22))
-    return np.stack(
-        [
-            (p11 + p12 + p21 + p22) / 2,
-            (p11 - p12 - p21 + p22) / 2,
-            (s11 * s22.conj() + s12 * s21.conj()).real,
-            (s22 * s11.conj() - s12 * s21.conj()).real,
-            (p11 - p12 + p21 - p22) / 2,
-            (s11 * s22.conj() + s21 * s12.conj()).imag,
-        ],
-        axis=-1,
-    )
 
 
 def orientations(x, index, elongation, angle, order=24):

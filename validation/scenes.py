@@ -57,12 +57,8 @@ def layer(start: float, stop: float, interior: dict, exterior=None, half_width=2
 ENVIRONMENT = {"type": "ref", "id": "environment"}
 
 
-def scene(gate, shapes: dict, size=(1, 1), laser=None, integrator=None, environment=None, **lidar):
-    """A scanning lidar of (width, height) beams that records the gates from ``gate[0]`` to ``[1]``.
-
-    ``environment`` is the medium around all, which shapes refer to as `ENVIRONMENT`.
-    """
-    gc.collect()  # live scenes hold cycles, and take part in the kernels of later ones
+def lidar(size, gate, laser=None, environment=None, **parameters) -> dict:
+    """A scanning lidar of (width, height) beams that records the gates from ``gate[0]`` to ``[1]``."""
     sensor = {
         "type": "scanning_lidar",
         "gate_start": gate[0],
@@ -74,9 +70,18 @@ def scene(gate, shapes: dict, size=(1, 1), laser=None, integrator=None, environm
             "height": size[1],
             "rfilter": {"type": "box"},
         },
-        **({"medium": ENVIRONMENT} if environment else {}),
-        **lidar,
+        **parameters,
     }
+    return sensor | ({"medium": environment} if environment else {})
+
+
+def scene(gate, shapes: dict, size=(1, 1), laser=None, integrator=None, environment=None, **more):
+    """A `lidar` and the shapes it looks at; ``more`` are parameters of the lidar.
+
+    ``environment`` is the medium around all, which shapes refer to as `ENVIRONMENT`.
+    """
+    gc.collect()  # live scenes hold cycles, and take part in the kernels of later ones
+    sensor = lidar(size, gate, laser, ENVIRONMENT if environment else None, **more)
     return mi.load_dict(
         {
             "type": "scene",

@@ -18,7 +18,7 @@ from kornia.contrib import extract_tensor_patches
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.displacement import Displacement
-from lidar_mi.retrieval.quality import Flag, filled, non_finite
+from lidar_mi.retrieval.quality import Flag, check_between, filled, non_finite
 from lidar_mi.retrieval.windows import Windows, box_sum, candidates, image_pair, strided, working
 
 ALGORITHMS = ("auto", "dense", "fft")
@@ -63,8 +63,7 @@ def cross_correlation(
     InputError
         Sizes, algorithm or threshold out of range; images that differ in size.
     """
-    if not -1 <= min_correlation <= 1:
-        raise InputError(f"min_correlation: {min_correlation!r} is not between -1 and 1")
+    check_between("min_correlation", min_correlation, -1, 1)
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)
     chosen = _choose(algorithm, windows)

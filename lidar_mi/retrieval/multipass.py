@@ -12,11 +12,16 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import grid_sample, pad
 
-from lidar_mi.errors import InputError
 from lidar_mi.retrieval import windows as geometry
 from lidar_mi.retrieval.correlation import cross_correlation
 from lidar_mi.retrieval.displacement import Displacement
-from lidar_mi.retrieval.quality import Flag, median_outliers, neighbour_median, non_finite
+from lidar_mi.retrieval.quality import (
+    Flag,
+    check_between,
+    median_outliers,
+    neighbour_median,
+    non_finite,
+)
 from lidar_mi.retrieval.warping import Spline, band_limited, levelled, rms
 from lidar_mi.retrieval.windows import Windows, image_pair
 
@@ -76,8 +81,7 @@ def multipass(
     InputError
         Sizes, threshold or noise out of range; images that differ in size.
     """
-    if not -1 <= min_correlation <= 1:
-        raise InputError(f"min_correlation: {min_correlation!r} is not between -1 and 1")
+    check_between("min_correlation", min_correlation, -1, 1)
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)
     noise = noise if noise is None else rms(noise)

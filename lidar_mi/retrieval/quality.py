@@ -35,6 +35,12 @@ class Flag(enum.IntFlag):
     """The pass before found an outlier, and this one began at its neighbours' median (multi-pass)."""
 
 
+def check_between(name: str, value: float, low: float, high: float) -> None:
+    """Raise an `InputError` unless a threshold lies between its limits."""
+    if not low <= value <= high:
+        raise InputError(f"{name}: {value!r} is not between {low} and {high}")
+
+
 # A Sobel derivative, scaled to give the slope of a ramp, passes 3/16 of the variance of white
 # noise: (1/2) from the difference times (1 + 4 + 1) / 16 from the smoothing across it.
 _SOBEL_NOISE = 3 / 16
@@ -133,8 +139,7 @@ def low_texture(
     """
     if not min_texture >= 0:
         raise InputError(f"min_texture: {min_texture!r} px^-1 is not >= 0")
-    if not 0 <= min_isotropy <= 1:
-        raise InputError(f"min_isotropy: {min_isotropy!r} is not between 0 and 1")
+    check_between("min_isotropy", min_isotropy, 0, 1)
     image = working(image)
     found = texture(image, windows)
     sigma = torch.as_tensor(noise, dtype=image.dtype, device=image.device)

@@ -12,12 +12,11 @@ from typing import NamedTuple
 import torch
 from torch.nn.functional import max_pool2d
 
-from lidar_mi.errors import InputError
 from lidar_mi.retrieval.block_tridiagonal import Factor
 from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.flow_spline import Axis, FlowSpline, Mesh
 from lidar_mi.retrieval.multipass import Grid, first_pass, window_sums
-from lidar_mi.retrieval.quality import Flag, non_finite
+from lidar_mi.retrieval.quality import Flag, check_between, non_finite
 from lidar_mi.retrieval.warping import Spline, band_limited, levelled, rms
 from lidar_mi.retrieval.windows import Windows, image_pair, working
 
@@ -209,8 +208,7 @@ def variational(
     InputError
         Sizes, threshold or noise out of range; images that differ in size.
     """
-    if not -1 <= min_correlation <= 1:
-        raise InputError(f"min_correlation: {min_correlation!r} is not between -1 and 1")
+    check_between("min_correlation", min_correlation, -1, 1)
     stack = [image1, image2, *more]
     for other in stack[1:]:
         image_pair(image1, other)

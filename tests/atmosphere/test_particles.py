@@ -17,6 +17,7 @@ from lidar_mi.atmosphere.molecules import molecular_table
 from lidar_mi.atmosphere.particles import AEROSOLS, Aerosol, LogNormal, ModifiedGamma, make_table
 from lidar_mi.atmosphere.scattering import mix, read_table
 from lidar_mi.errors import InputError
+from validation.amplitude_matrix import phase_matrix
 
 GREEN = 532e-9
 
@@ -204,25 +205,7 @@ def test_published_amplitude_matrix_of_a_prolate_spheroid(rustmatrix):
     ]
     np.testing.assert_allclose(s, expected, atol=6e-4)
     published = [650.3172, 631.6323, 635.2768, 643.1738, -17.9846, -34.7730]
-    np.testing.assert_allclose(six_of(s[None])[0], published, atol=6e-3)
-
-
-def six_of(s):
-    """Z11, Z22, Z33, Z44, Z12, Z34 from amplitude matrices (Mishchenko et al. 2002, eqs.
-    2.106-2.121)."""
-    s11, s12, s21, s22 = s[..., 0, 0], s[..., 0, 1], s[..., 1, 0], s[..., 1, 1]
-    p11, p12, p21, p22 = (abs(each) ** 2 for each in (s11, s12, s21, s22))
-    return np.stack(
-        [
-            (p11 + p12 + p21 + p22) / 2,
-            (p11 - p12 - p21 + p22) / 2,
-            (s11 * s22.conj() + s12 * s21.conj()).real,
-            (s22 * s11.conj() - s12 * s21.conj()).real,
-            (p11 - p12 + p21 - p22) / 2,
-            (s11 * s22.conj() + s21 * s12.conj()).imag,
-        ],
-        axis=-1,
-    )
+    np.testing.assert_allclose(phase_matrix(s[None])[0], published, atol=6e-3)
 
 
 @pytest.mark.parametrize("x, elongation", [(2.0, 3.0), (5.0, 2.0)])
@@ -242,7 +225,7 @@ def test_random_orientation_against_brute_force(scatrs, rustmatrix, x, elongatio
         beta = math.degrees(math.acos(c))
         for k, scattered in enumerate(angle):
             s = [amplitudes(solver, 0.0, scattered, (0.0, 0.0), turn, beta) for turn in turns]
-            elements[k] += w * six_of(np.array(s)).mean(axis=0)
+            elements[k] += w * phase_matrix(np.array(s)).mean(axis=0)
     q_ext, q_sca, ours = one_matrix(x, m, elongation, angle)
     # differential cross-section = C_sca a1/(4 pi); here k = 1 and C = pi x^2 Q
     ours = ours * q_sca * math.pi * x**2 / (4 * math.pi)

@@ -56,16 +56,6 @@ def read(photons, detector, seed=1, count=DRAWS, lidar=LIDAR):
     return detect(np.full(count, s0_of(photons)), lidar, detector, GATE, 500.0, seed)
 
 
-def chi_square_p(counts, distribution):
-    """Probability of so bad a fit, bins of at least 50 expected counts."""
-    edges = np.unique(distribution.ppf(np.linspace(0, 1, 60)[1:-1]))
-    bins = np.concatenate([[-0.5], edges + 0.5, [np.inf]])
-    expected = len(counts) * np.diff(np.concatenate([[0], distribution.cdf(edges), [1]]))
-    assert expected.min() > 50
-    found = np.histogram(counts, bins)[0]
-    return stats.chisquare(found, expected * found.sum() / expected.sum()).pvalue
-
-
 def assert_moments(values, mean, variance, sigmas=4):
     n, deviation = len(values), values - mean
     assert abs(deviation.mean()) < sigmas * math.sqrt(variance / n)
@@ -264,14 +254,14 @@ def test_line_narrower_than_the_pulse_allows_is_refused():
 
 
 @pytest.mark.parametrize("photons", [3.0, 40.0])
-def test_shot_noise_is_poisson(photons):
+def test_shot_noise_is_poisson(photons, chi_square_p):
     counts = read(photons, IDEAL).counts
     assert chi_square_p(counts, stats.poisson(photons)) > 1e-3
 
 
 @pytest.mark.parametrize("photons", [3.0, 40.0])
 @pytest.mark.parametrize("modes", [1.0, 2.5])
-def test_speckled_counts_are_negative_binomial(photons, modes):
+def test_speckled_counts_are_negative_binomial(photons, modes, chi_square_p):
     counts = read(photons, ideal(speckle=True, speckle_modes=modes)).counts
     assert chi_square_p(counts, stats.nbinom(modes, modes / (modes + photons))) > 1e-3
 
@@ -281,7 +271,7 @@ def test_one_mode_of_strong_light_is_exponential():
     assert stats.kstest(counts, stats.expon(scale=1e6).cdf).pvalue > 1e-3
 
 
-def test_many_modes_are_poisson():
+def test_many_modes_are_poisson(chi_square_p):
     """Variance n (1 + n / M): 4e-8 more than without speckle."""
     counts = read(40.0, ideal(speckle=True, speckle_modes=1e9)).counts
     assert chi_square_p(counts, stats.poisson(40)) > 1e-3

@@ -6,61 +6,17 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from validation import scenes
+from validation.scenes import box, grid
+from validation.scenes import medium as homogeneous
+
 # --- scenes ---------------------------------------------------------------------------------
-
-
-def box(low, high, interior, exterior=None):
-    """A cuboid between two corners whose surface lets light pass into another medium."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    t = mi.ScalarTransform4f()
-    shape = {
-        "type": "cube",
-        "to_world": t.translate((low + high) / 2).scale((high - low) / 2),
-        "bsdf": {"type": "null"},
-        "interior": interior,
-    }
-    return shape | ({"exterior": exterior} if exterior else {})
-
-
-def homogeneous(extinction, phase="rayleigh_polarized", albedo=1.0):
-    phase = {"type": phase} if isinstance(phase, str) else phase
-    return {"type": "homogeneous", "sigma_t": extinction, "albedo": albedo, "phase": phase}
-
-
-def grid(values, low, high, phase="rayleigh_polarized", albedo=1.0):
-    """A medium with ``values`` (z, y, x) at the centres of the cells between two corners."""
-    low, high = np.asarray(low, float), np.asarray(high, float)
-    phase = {"type": phase} if isinstance(phase, str) else phase
-    return {
-        "type": "heterogeneous",
-        "sigma_t": {
-            "type": "gridvolume",
-            "grid": mi.VolumeGrid(np.asarray(values, np.float32)[..., None]),
-            "to_world": mi.ScalarTransform4f().translate(low).scale(high - low),
-            "accel": False,
-        },
-        "albedo": albedo,
-        "phase": phase,
-    }
 
 
 def lidar(size, gate, laser=None, environment=None, samples=64, **parameters):
     """A scanning lidar of (width, height) beams that records the gate (start, stop)."""
-    sensor = {
-        "type": "scanning_lidar",
-        "gate_start": gate[0],
-        "gate_stop": gate[1],
-        "laser": {"type": "laser", "beam_cut": 0.1, "divergence_full_mrad": 2.0, **(laser or {})},
-        "film": {
-            "type": "hdrfilm",
-            "width": size[0],
-            "height": size[1],
-            "rfilter": {"type": "box"},
-        },
-        "sampler": {"type": "independent", "sample_count": samples},
-        **parameters,
-    }
-    return sensor | ({"medium": environment} if environment else {})
+    sampler = {"type": "independent", "sample_count": samples}
+    return scenes.lidar(size, gate, laser, environment, sampler=sampler, **parameters)
 
 
 def scene(sensor, integrator=None, **shapes):
