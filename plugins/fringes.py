@@ -43,6 +43,7 @@ import mitsuba as mi
 
 from .parameters import choice, fail, whole
 from .polarization import horizontal_axis, rotate_stokes
+from .random_numbers import generator, pair
 
 NAME, KIND = "fringes", "integrator"
 
@@ -101,16 +102,16 @@ def define():
                 number = dr.opaque(mi.UInt32, paths)
                 local = lane // number
                 pixel = local + dr.opaque(mi.UInt32, first)
-                rng = _generator(seed, pixel, lane - local * number)
+                rng = generator(seed, pixel, lane - local * number)
                 width = dr.opaque(mi.UInt32, sensor.film().size().x)
                 row = pixel // width
                 corner = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row))
                 point, direction, weight = sensor.sample_towards_scene(
-                    corner + _pair(rng) - 0.5, _pair(rng)
+                    corner + pair(rng) - 0.5, pair(rng)
                 )
                 weight *= source.radiance(-direction)
                 ray = mi.Ray3f(point, direction)
-                ray.time = source.line.sample(rng.next_float32(), _pair(rng))
+                ray.time = source.line.sample(rng.next_float32(), pair(rng))
                 matrix = _surfaces(scene, ray, rng, mi.BSDFContext(), weight > 0)
                 stokes = _applied(matrix, source.mean_stokes(-direction))
                 scale = weight / (source.flux() * sensor.stop_area())
@@ -136,16 +137,16 @@ def define():
             for index, first in enumerate(range(0, total, self.samples_per_pass)):
                 count = min(self.samples_per_pass, total - first)
                 lane = dr.arange(mi.UInt32, count)
-                rng = _generator(seed, dr.opaque(mi.UInt32, index), lane)
-                direction, counts, drawn = source.sample_direction_of_light(_pair(rng))
-                point = sensor.sample_stop(_pair(rng))
+                rng = generator(seed, dr.opaque(mi.UInt32, index), lane)
+                direction, counts, drawn = source.sample_direction_of_light(pair(rng))
+                point = sensor.sample_stop(pair(rng))
                 place, arrives = sensor.receive(point, direction)
                 # from before the first surface to the stop, and no further
                 way = dr.opaque(mi.Float, _reach(scene, sensor))
                 ray = mi.Ray3f(point - direction * way, direction)
                 ray.maxt = way
-                ray.time = source.line.sample(rng.next_float32(), _pair(rng))
-                stokes = source.sample_stokes(direction, rng.next_float32(), _pair(rng))
+                ray.time = source.line.sample(rng.next_float32(), pair(rng))
+                stokes = source.sample_stokes(direction, rng.next_float32(), pair(rng))
                 matrix = _surfaces(scene, ray, rng, context, arrives)
                 stokes = [s * counts for s in _applied(matrix, stokes)]
                 if self.estimator == "analog":
@@ -189,7 +190,7 @@ def _surfaces(scene, ray, rng, context, active):
     while dr.hint(active, label="surfaces"):
         si = scene.ray_intersect(ray, active)
         active &= si.is_valid()
-        sample, place = rng.next_float32(active), _pair(rng)
+        sample, place = rng.next_float32(active), pair(rng)
         _, weight = si.bsdf(ray).sample(context, si, sample, place, active)
         onward = -si.wi
         if dr.hint(forward, mode="scalar"):
@@ -238,16 +239,3 @@ def _check_straight(scene):
         flags = shape.bsdf().flags()
         if flags & bending and not flags & kinds.Null:
             fail(NAME, "scene", shape.id(), "surfaces that light passes straight or not at all")
-
-
-def _generator(seed, group, number):
-    """Independent random numbers for every seed, group (pixel or pass) and number in it."""
-    key, counter = mi.sample_tea_32(seed, group)
-    state, stream = mi.sample_tea_32(key, counter + number)
-    rng = mi.PCG32()
-    rng.seed(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
-    return rng
-
-
-def _pair(rng):
-    return mi.Point2f(rng.next_float32(), rng.next_float32())

@@ -9,6 +9,7 @@ import mitsuba as mi
 
 from .media import Air, coefficients, collision, interaction, transmittance
 from .polarization import rotate_stokes, transverse
+from .random_numbers import generator, pair
 
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
@@ -20,6 +21,7 @@ FREE_SHARE = 0.4
 FREE_ARRIVAL = 0.2
 # The others' first vertex is put near the gate: the share of these that is put closest to it.
 NEAR_SHARE = 0.7
+# Of later flights, the share that is as short as such a vertex is near.
 SHORT_SHARE = 0.3
 # A photon goes on with this times the weight its last flight has left it.
 FOLLOWED = 3.0
@@ -50,19 +52,19 @@ class Lidar:
         self.context = mi.PhaseFunctionContext()
 
     def emit(self, seed, beam, number) -> Photon:
-        rng = _generator(seed, beam, number)
+        rng = generator(seed, beam, number)
         sensor, laser = self.sensor, self.sensor.laser
         to_world = sensor.world_transform()
         frame = sensor.beam_frame(beam)
-        origin, direction = laser.sample_local(_pair(rng), _pair(rng))
+        origin, direction = laser.sample_local(pair(rng), pair(rng))
         origin = to_world @ mi.Point3f(frame.to_world(mi.Vector3f(origin)))
         direction = dr.normalize(to_world @ frame.to_world(direction))
-        aperture = to_world @ sensor.sample_aperture(frame, _pair(rng))
+        aperture = to_world @ sensor.sample_aperture(frame, pair(rng))
         axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
         delay = mi.Float(0)
         if laser.pulse_duration > 0:
             sigma = FWHM_TO_SIGMA * laser.pulse_duration * SPEED_OF_LIGHT / 2
-            delay = sigma * mi.warp.square_to_std_normal(_pair(rng)).x
+            delay = sigma * mi.warp.square_to_std_normal(pair(rng)).x
         stokes = [mi.Float(1)]
         if mi.is_polarized:
             stokes = rotate_stokes(
@@ -125,10 +127,10 @@ class Lidar:
             active &= reach > 0
             first = order == 1
             free = active & first & (rng.next_float32(active) < FREE_SHARE)
-            scale = 0.5 * self._footprint(0.5 * high)
-            left = _sample_left(reach, scale, _pair(rng))
+            scale = self._near_scale(high)
+            left = _sample_left(reach, scale, pair(rng))
             flight = dr.select(
-                first, reach - left, _sample_flight(thickness, reach, left, _pair(rng))
+                first, reach - left, _sample_flight(thickness, reach, left, pair(rng))
             )
             flown, behind, found = collision(
                 self.air, medium, position, direction, reach, self.channel, self.wavelengths,
@@ -201,7 +203,7 @@ class Lidar:
                 medium, vertex, dr.select(turned, homeward, direction), self.wavelengths
             )
             onward, _, density = medium.phase_function().sample(
-                self.context, guide, rng.next_float32(active), _pair(rng), active
+                self.context, guide, rng.next_float32(active), pair(rng), active
             )
             active &= density > 0
             stokes, density = self._scatter(medium, mei, stokes, onward, active)
@@ -225,7 +227,12 @@ class Lidar:
         """Radius of the field of view at a distance."""
         return distance * self.sensor.m_fov_tan
 
+    def _near_scale(self, path):
+        """Half the field of view's radius where a path of this length turns back."""
+        return 0.5 * self._footprint(0.5 * path)
+
     def _direction_density(self, medium, mei, density, turning, homeward, wo, active):
+        """Of a flight that turns homeward now and then; ``density`` is the phase function's."""
         guide = interaction(medium, mei.p, homeward, self.wavelengths)
         _, turned = medium.phase_function().eval_pdf(self.context, guide, wo, active)
         return dr.lerp(density, turned, turning)
@@ -246,8 +253,10 @@ class Lidar:
         """Scatter at ``distance`` along a flight, where the path closes: Stokes vector about e_h.
 
         ``width`` (of the gate, as whole path) times d(distance)/d(path) makes a path length a
-        volume. ``densities`` of the direction, for the balance heuristic: as it was drawn here, by
-        the phase function, and from the telescope; without them this is the only way here.
+        volume. ``densities`` for the balance heuristic, without which this is the only way here: of
+        the direction as it was drawn here, along a flight and from the telescope; then what the
+        flight's length depends on, the extinction coefficient at its start and the far end of the
+        gate (as what is left of the path).
         """
         vertex = position + direction * distance
         active = active & self.sensor.in_field_of_view(photon.axes, vertex - photon.aperture)
@@ -264,7 +273,7 @@ class Lidar:
         if densities:
             own, density, aimed, thickness, high = densities
             reach = _closing(position - photon.aperture, direction, high)
-            scale = 0.5 * self._footprint(0.5 * high)
+            scale = self._near_scale(high)
             free = density * _flight_density(thickness, reach, scale, distance) * volume
             weight *= own / (density + aimed + free)
         return self._receive(photon, rng, medium, mei, stokes, active, weight)
@@ -300,7 +309,7 @@ class Lidar:
 
     def _in_field(self, axes, rng):
         """A direction of the field of view, uniform in solid angle."""
-        sample = _pair(rng)
+        sample = pair(rng)
         # 1 - cos, kept apart from 1: fields of view are milliradians
         below = sample.x * self._field_solid_angle() * dr.inv_two_pi
         sine = dr.safe_sqrt(below * (2 - below))
@@ -348,7 +357,7 @@ class Lidar:
             order += 1
             active &= (order <= max_order) & (range_ < high)
             onward, value, density = medium.phase_function().sample(
-                self.context, mei, rng.next_float32(active), _pair(rng), active
+                self.context, mei, rng.next_float32(active), pair(rng), active
             )
             stokes = _apply(value, stokes, self.channel)
             direction = mi.Vector3f(onward)
@@ -438,19 +447,6 @@ def _sum(first, second):
 
 def _scaled(stokes, factor):
     return [s * factor for s in stokes]
-
-
-def _pair(rng):
-    return mi.Point2f(rng.next_float32(), rng.next_float32())
-
-
-def _generator(seed, beam, number):
-    """Independent random numbers for every seed, beam and photon number."""
-    key, counter = mi.sample_tea_32(seed, beam)
-    state, stream = mi.sample_tea_32(key, counter + number)
-    rng = mi.PCG32()
-    rng.seed(initstate=mi.UInt64(state), initseq=mi.UInt64(stream))
-    return rng
 
 
 def _channel(wavelength: float) -> int:
