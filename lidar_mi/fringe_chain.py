@@ -81,7 +81,7 @@ def prepare(experiment: Experiment) -> Callable[[Path, Log], tuple[dict[str, flo
     InputError
         Values that do not go together.
     """
-    rings = _rings(experiment.doppler)
+    rings = ring_instrument(experiment.doppler)
     use_variant(experiment.doppler.render.variant)
     for line, settings in ((rings.line, experiment.doppler.render), _photon_by_photon(experiment)):
         scene_dict(experiment.doppler.etalon, experiment.doppler.camera, line, settings)
@@ -110,7 +110,7 @@ def _run(experiment, rings, folder, log) -> tuple[dict[str, float], Chapter]:
     exposure = Exposure(
         _expected(seen.emitted, rings.photons).numpy(),
         expected[0].numpy(),
-        _frames(doppler, rings, expected[0], 1, experiment.seed, [0])[0].numpy(),
+        exposed_frames(doppler, rings, expected[0], 1, experiment.seed, [0])[0].numpy(),
     )
     drawn = doppler_figures.draw_all(
         folder / "figures", doppler, exposure, seen.photons, found, metrics, log
@@ -193,21 +193,21 @@ def velocities(
     tried = [settings.images if m == "annular" else settings.slow_images for m in settings.methods]
     done, total = 0, math.prod(shape[2:])
     for j, n in enumerate(settings.averaged):
-        noise = _summed_noise(doppler.ccd, rings.modes, n)
+        noise = summed_noise(doppler.ccd, rings.modes, n)
         for k, speed in enumerate(speeds):
             for first in range(0, settings.images, FRAMES):
                 text = f"reading averages of {n} pictures at {speed:g} m/s"
                 log.bar(text, done / total)
                 images = range(first, min(first + FRAMES, settings.images))
                 numbers = [(j * len(speeds) + k) * settings.images + i for i in images]
-                frames = _frames(doppler, rings, expected[k], n, seed, numbers)
+                frames = exposed_frames(doppler, rings, expected[k], n, seed, numbers)
                 few = max(0, min(settings.slow_images - first, len(images)))
                 for c, centre in enumerate(settings.centre):
                     for name in fits:
                         count = len(images) if name == "annular" else few
                         if count:
                             place = places[name], c, j, k, slice(first, first + count)
-                            read = _fitted(frames[:count], doppler, rings.model, noise, name, centre)
+                            read = fitted_speeds(frames[:count], doppler, rings.model, noise, name, centre)
                             v[place], v_std[place] = read
                             v[place] -= reference
                     for i in range(few if peaks else 0):
@@ -240,7 +240,7 @@ def velocities(
     )  # fmt: skip
 
 
-def _fitted(frames, doppler, model, noise, method, centre) -> tuple[np.ndarray, np.ndarray]:
+def fitted_speeds(frames, doppler, model, noise, method, centre) -> tuple[np.ndarray, np.ndarray]:
     """v_LOS and its standard deviation by `fit_rings`; NaN of pictures that it refuses."""
     known = {}
     if centre == "known":
@@ -251,7 +251,7 @@ def _fitted(frames, doppler, model, noise, method, centre) -> tuple[np.ndarray, 
     except InputError:
         if len(frames) == 1:
             return np.array([np.nan]), np.array([np.nan])
-        alone = [_fitted(f[None], doppler, model, noise, method, centre) for f in frames]
+        alone = [fitted_speeds(f[None], doppler, model, noise, method, centre) for f in frames]
         v, std = zip(*alone)
         return np.concatenate(v), np.concatenate(std)
     return fit.v_los.numpy(), fit.v_los_std.numpy()
@@ -311,7 +311,7 @@ def _emitted_velocity(doppler: Doppler, emitted: xr.Dataset, total: float) -> fl
     return float(fit_rings(_expected(emitted, total)[None], model).v_los)
 
 
-def _rings(doppler: Doppler) -> Rings:
+def ring_instrument(doppler: Doppler) -> Rings:
     """What the pictures follow from, checked."""
     lidar, etalon, camera, ccd = doppler.lidar, doppler.etalon, doppler.camera, doppler.ccd
     pressure, temperature = standard_atmosphere(lidar.altitude)
@@ -369,7 +369,7 @@ def _expected(picture: xr.Dataset, total: float) -> torch.Tensor:
     return image * (total / image.sum())
 
 
-def _frames(doppler, rings, expected, averaged, seed, numbers) -> torch.Tensor:
+def exposed_frames(doppler, rings, expected, averaged, seed, numbers) -> torch.Tensor:
     """Sums of so many noisy pictures each, photoelectrons."""
     mean, ccd = averaged * expected, summed(doppler.ccd, averaged)
     modes, background = averaged * rings.modes, averaged * rings.background
@@ -399,7 +399,7 @@ def summed(ccd: CCD, pictures: int) -> CCD:
     })  # fmt: skip
 
 
-def _summed_noise(ccd: CCD, modes: float, pictures: int) -> PixelNoise:
+def summed_noise(ccd: CCD, modes: float, pictures: int) -> PixelNoise:
     return PixelNoise(math.sqrt(pictures) * pixel_noise(ccd).read_noise, pictures * modes)
 
 

@@ -65,7 +65,7 @@ def prepare(
     # lines that leave the wake, bins that reach the telescope
     wind_at(truth, _volumes(experiment))
     fastest = experiment.platform.speed + float(np.sqrt(sum(truth[n] ** 2 for n in COMPONENTS)).max())
-    limit = fringe_chain._rings(experiment.doppler).model.velocity_range / 2
+    limit = fringe_chain.ring_instrument(experiment.doppler).model.velocity_range / 2
     if fastest > limit:
         raise InputError(
             f"platform.speed: {experiment.platform.speed:g} m/s is not allowed with sensor; expected "
@@ -135,13 +135,13 @@ def measure_lines(experiment: Experiment, truth: xr.Dataset, log: Log) -> xr.Dat
     log(f"measuring {len(true)} lines of sight, {sensor.pulses} pulses each")
     middle, half = (true.max() + true.min()) / 2, max(np.ptp(true) / 2, 1e-3)
     nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-    rings = fringe_chain._rings(doppler)
+    rings = fringe_chain.ring_instrument(doppler)
     light, counted = photons(doppler.lidar), doppler.lidar.counted
     images = torch.stack([
         fringe_image(doppler.camera, doppler.etalon, rings.line, speed, light, counted)
         for speed in middle + half * nodes
     ])  # fmt: skip
-    noise = fringe_chain._summed_noise(doppler.ccd, rings.modes, sensor.pulses)
+    noise = fringe_chain.summed_noise(doppler.ccd, rings.modes, sensor.pulses)
     weights = torch.from_numpy(_lagrange(nodes, (true - middle) / half)).to(images.dtype)
     read = np.empty((2, len(true)))
     for start in range(0, len(true), fringe_chain.FRAMES):
@@ -152,10 +152,10 @@ def measure_lines(experiment: Experiment, truth: xr.Dataset, log: Log) -> xr.Dat
             farther = doppler.lidar.model_copy(update={"range": float(lines["range"][index])})
             image = torch.tensordot(weights[index], images, 1) * (photons(farther) / light)
             # numbers of their own, apart from those of the pictures of the Doppler lidar's chapter
-            frames.append(fringe_chain._frames(
+            frames.append(fringe_chain.exposed_frames(
                 doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
             ))  # fmt: skip
-        read[:, start : chunk.stop] = fringe_chain._fitted(
+        read[:, start : chunk.stop] = fringe_chain.fitted_speeds(
             torch.cat(frames), doppler, rings.model, noise, "annular", "free"
         )
     v_los, std = read
