@@ -6,7 +6,7 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from lidar_mi.errors import InputError
 
-# Cells of edge values put around a plane, so that the spline's response to the edge (it falls
+# Cells of edge values put around a plane or a volume, so that the spline's response to the edge (it falls
 # by 0.27 a cell) and air that blows in find the edge value.
 _MARGIN = 12
 
@@ -22,12 +22,12 @@ def _axis(field, name):
     return values, (values[-1] - values[0]) / (values.size - 1)
 
 
-def _sampler(plane):
-    """Cubic B-spline through the nodes of a plane; call it with fractional node indices.
+def _sampler(values):
+    """Cubic B-spline through the nodes of a plane or a volume; call it with fractional indices.
 
-    Outside the plane the value at the nearest edge holds.
+    Outside the value at the nearest edge holds.
     """
-    coefficients = spline_filter(np.pad(plane, _MARGIN, mode="edge"), order=3, mode="mirror")
+    coefficients = spline_filter(np.pad(values, _MARGIN, mode="edge"), order=3, mode="mirror")
 
     def sample(indices):
         return map_coordinates(
@@ -37,22 +37,26 @@ def _sampler(plane):
     return sample
 
 
-def _departures(v, w, dt, steps):
-    """Node indices from which the air at the nodes came; v, w in nodes per second."""
-    nodes = np.indices(v.shape, dtype=float)
-    sample_v, sample_w = _sampler(v), _sampler(w)
+def _departures(velocity, dt, steps):
+    """Node indices from which the air at the nodes came; velocity by axis, in nodes per second."""
+    samplers = [_sampler(component) for component in velocity]
     h = dt / steps
-    place = nodes
+    place = np.indices(velocity[0].shape, dtype=float)
     for _ in range(steps):
-        half = place - 0.5 * h * np.stack([sample_v(place), sample_w(place)])
-        place = place - h * np.stack([sample_v(half), sample_w(half)])
+        half = place - 0.5 * h * np.stack([sample(place) for sample in samplers])
+        place = place - h * np.stack([sample(half) for sample in samplers])
     return place
 
 
 def advect(
-    field: xr.DataArray, v: xr.DataArray, w: xr.DataArray, dt: float, steps: int = 4
+    field: xr.DataArray,
+    v: xr.DataArray,
+    w: xr.DataArray,
+    dt: float,
+    steps: int = 4,
+    u: xr.DataArray | None = None,
 ) -> xr.DataArray:
-    """The field after dt in the frozen cross flow (v, w): Df/Dt = 0, semi-Lagrangian.
+    """The field after dt in the frozen flow: Df/Dt = 0, semi-Lagrangian.
 
     Every node is followed back along its trajectory in `steps` midpoint steps (second order:
     in solid rotation the departure point is off by r (omega dt)^3/(6 steps^2), which for
@@ -60,7 +64,8 @@ def advect(
     there is read from the cubic B-spline through its nodes (Staniforth and Cote,
     Mon. Wea. Rev. 119, 1991). The
     spline keeps waves of 4 cells and longer; a wave of 2 cells is lost at half-cell shifts, as
-    it must be on this grid. Along x nothing moves. Air that enters through an edge carries
+    it must be on this grid. Without u nothing moves along x, and planes know nothing of each
+    other. Air that enters through an edge carries
     the edge's value, so a strip of width speed*dt along inflow edges is not meaningful. A field
     that is nowhere negative stays so: the spline's undershoots at sharp edges are set to zero.
 
@@ -74,6 +79,8 @@ def advect(
         s; negative goes back in time.
     steps : int
         Trajectory steps in dt, >= 1.
+    u : xarray.DataArray, optional
+        Velocity along x, m s^-1, for a field on (x, y, z) with x equally spaced as well.
 
     Returns
     -------
@@ -94,11 +101,16 @@ def advect(
         raise InputError(
             f"advection.field: dims {tuple(field.dims)} are not allowed; (y, z) or (x, y, z) are"
         )
-    (_, dy), (_, dz) = _axis(field, "y"), _axis(field, "z")
-    for name, component in (("field", field), ("v", v), ("w", w)):
+    if u is not None and "x" not in dims:
+        raise InputError("advection.u: not allowed for a plane (y, z); expected a field on (x, y, z)")
+    velocity = {"y": ("v", v), "z": ("w", w)}
+    if u is not None:
+        velocity = {"x": ("u", u), **velocity}
+    spacing = {axis: _axis(field, axis)[1] for axis in velocity}
+    for name, component in (("field", field), *velocity.values()):
         if set(component.dims) != dims or any(
             component.sizes[d] != field.sizes[d]
-            or not np.allclose(component[d], field[d], rtol=0, atol=1e-3 * min(dy, dz))
+            or not np.allclose(component[d], field[d], rtol=0, atol=1e-3 * min(spacing.values()))
             for d in dims
         ):
             raise InputError(
@@ -112,17 +124,18 @@ def advect(
             )
 
     order = [d for d in ("x", "y", "z") if d in dims]
-    shape = (-1, field.sizes["y"], field.sizes["z"])
-    planes, vs, ws = (
-        a.transpose(*order).values.astype(float).reshape(shape) for a in (field, v, w)
-    )
-    moved = np.stack(
-        [
-            _sampler(plane)(_departures(pv / dy, pw / dz, dt, int(steps)))
-            for plane, pv, pw in zip(planes, vs, ws)
-        ]
-    )
-    if planes.min() >= 0:
+    # what moves as one: the volume, or every plane by itself
+    shape = (-1, *(field.sizes[axis] for axis in velocity))
+    pieces = field.transpose(*order).values.astype(float).reshape(shape)
+    speeds = [
+        component.transpose(*order).values.astype(float).reshape(shape) / spacing[axis]
+        for axis, (_, component) in velocity.items()
+    ]
+    moved = np.stack([
+        _sampler(piece)(_departures(speed, dt, int(steps)))
+        for piece, *speed in zip(pieces, *speeds)
+    ])  # fmt: skip
+    if pieces.min() >= 0:
         moved = np.maximum(moved, 0.0)
     result = field.transpose(*order).astype(float)
     result = result.copy(data=moved.reshape(result.shape))

@@ -327,20 +327,21 @@ def _read(data, table, asked, time, x, path):
     return wake
 
 
-def resample(wake: xr.Dataset, spacing: float) -> xr.Dataset:
-    """Finer nodes in y and z by cubic splines; x stays as it is.
+def resample(wake: xr.Dataset, spacing: float, axes: str = "yz") -> xr.Dataset:
+    """Finer nodes by cubic splines, in y and z unless other axes are named.
 
-    Splines (not-a-knot) in y, then in z, through the nodes; exact for cubic polynomials. The
-    end nodes are kept: 110 x 70 nodes of 1 m become 219 x 139 of 0.5 m. tracer and aerosol are
-    clipped to the range of their data, which a spline leaves at sharp edges (a tracer would go
-    negative there).
+    Splines (not-a-knot) along one axis after the other, through the nodes; exact for cubic
+    polynomials. The end nodes are kept: 110 x 70 nodes of 1 m become 219 x 139 of 0.5 m. tracer and
+    aerosol are clipped to the range of their data, which a spline leaves at sharp edges (a tracer
+    would go negative there).
 
     Parameters
     ----------
     wake : xarray.Dataset
         Variables on (x, y, z), from `read_wake`.
     spacing : float
-        m; it must divide the extent of y and of z.
+        m; it must divide the extent along each of the axes.
+    axes : "yz" or "xyz"
 
     Returns
     -------
@@ -354,7 +355,7 @@ def resample(wake: xr.Dataset, spacing: float) -> xr.Dataset:
     if not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"wake.spacing: {spacing} m is not allowed; it must be > 0 m")
     nodes = {}
-    for name in ("y", "z"):
+    for name in axes:
         axis = wake[name].values.astype(float)
         if axis.size < 4:
             raise InputError(
@@ -369,14 +370,14 @@ def resample(wake: xr.Dataset, spacing: float) -> xr.Dataset:
             )
         nodes[name] = np.linspace(axis[0], axis[-1], cells + 1)
 
-    fine = wake.drop_vars([*wake.data_vars, "y", "z"]).assign_coords(
+    fine = wake.drop_vars([*wake.data_vars, *axes]).assign_coords(
         {name: (name, values, {"units": "m"}) for name, values in nodes.items()}
     )
     for name, variable in wake.data_vars.items():
         values = variable.transpose("x", "y", "z").values.astype(float)
         low, high = values.min(), values.max()
-        for number, axis in ((1, "y"), (2, "z")):
-            values = CubicSpline(wake[axis].values, values, axis=number)(nodes[axis])
+        for axis in axes:
+            values = CubicSpline(wake[axis].values, values, axis="xyz".index(axis))(nodes[axis])
         if name in ("tracer", "aerosol"):
             values = values.clip(low, high)
         fine[name] = ("x", "y", "z"), values, variable.attrs
