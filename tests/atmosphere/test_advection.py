@@ -70,8 +70,10 @@ def test_volumes_turn_about_any_axis():
     )
     c, s = np.cos(angle), np.sin(angle)
     exact = volume(blob(c * x + s * z, y - 1.2, -s * x + c * z))
-    # departure points off by r angle^3 / (6 4^2) = 0.0013 r of 5 m, against the steepest slope
-    assert float(np.abs(moved - exact).max()) < 5 * 0.0013 * np.exp(-0.5) / 1.8 + 1e-3
+    # departure points off by r angle^3 / (6 4^2) = 0.0013 r of 5 m, against the steepest slope;
+    # air that has come in through the faces left out
+    off = np.abs(moved - exact).sel(x=slice(-7, 7), y=slice(-4, 4), z=slice(-7, 7))
+    assert float(off.max()) < 5 * 0.0013 * np.exp(-0.5) / 1.8
 
 
 def test_sense_air_moves_with_the_flow():
