@@ -62,15 +62,19 @@ def run(
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
     A run that was stopped goes on with the images it has.
     """
-    from . import config
+    from . import config, study
     from . import experiment as chain
 
-    path = _experiment_file(experiment)
-    loaded = config.load(path, set_)
+    path, changes = _experiment_file(experiment), list(set_ or [])
+    variants = config.load_variants(path, changes)
+    loaded = next(iter(variants.values())) if variants else config.load(path, changes)
     if variant:
         sections = {"render": loaded.wake, "doppler.render": loaded.doppler}
-        chosen = [f"{key}.variant={variant}" for key, asked in sections.items() if asked]
-        loaded = config.load(path, [*(set_ or []), *chosen])
+        changes += [f"{key}.variant={variant}" for key, asked in sections.items() if asked]
+    if variants:
+        _run_study(config.load_variants(path, changes), out, path, overwrite, study.run)
+        return
+    loaded = config.load(path, changes)
     folder = out or Path("outputs") / loaded.name
     with _progress() as notice:
         metrics = chain.run(loaded, folder, path.parent, overwrite, notice)
@@ -80,6 +84,19 @@ def run(
     for name, asked in (("wind.nc", loaded.wake), ("v_los.nc", loaded.doppler)):
         if asked:
             _out.print(f"winds    {folder / name}")
+
+
+def _run_study(variants, out, path, overwrite, start) -> None:
+    """Variants of one experiment, each in a folder of its own, and their comparison."""
+    first, experiment = next(iter(variants.items()))
+    name = experiment.name.removesuffix(f".{first}")
+    folder = out or Path("outputs") / name
+    with _progress() as notice:
+        metrics = start(name, variants, folder, path.parent, overwrite, notice)
+    for variant, found in metrics.items():
+        _out.print(f"\n{variant}", style="bold")
+        _print_metrics(found)
+    _out.print(f"report   {folder / 'report.html'}")
 
 
 @app.command(epilog="Example: `lidar-mi render slab.xml -s 256 -D range=485 -o slab.exr`")

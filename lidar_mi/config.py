@@ -1,7 +1,9 @@
 """What an experiment file may say: every key, its unit, its default and its limits."""
 
+import copy
 import difflib
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 
@@ -271,10 +273,14 @@ class Sensor(_Section):
 BACKSCATTER = ("platform", "lidar", "detector", "scan", "scattering", "render", "retrieval")
 
 
+NAME = "[A-Za-z0-9][A-Za-z0-9_.-]*"
+"""What an experiment or a variant may be called: both name folders."""
+
+
 class Experiment(_Section):
     """One experiment, start to end: a wake for the backscatter lidar, a Doppler lidar, or both."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")
+    name: str = Field(pattern=f"^{NAME}$")
     seed: int = Field(1, ge=0, lt=2**31)
     wake: Wake | None = Field(None, description="seen by the backscatter lidar")
     doppler: Doppler | None = Field(None, description="the Doppler lidar; {} for the paper's")
@@ -346,8 +352,71 @@ def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
     Raises
     ------
     InputError
-        Unreadable file, unknown key, wrong unit, value out of range: the first fault is named.
+        Unreadable file, unknown key, wrong unit, value out of range: the first fault is named. A
+        file of several variants: `load_variants` reads it.
     """
+    data = _read(path)
+    for override in overrides or []:
+        _override(data, override)
+    if "variants" in data:
+        raise InputError(
+            f"{path}: variants: not allowed for a single experiment; expected load_variants"
+        )
+    return check(data, str(path))
+
+
+def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[str, Experiment]:
+    """Read a file whose ``variants`` each change some keys of the experiment; empty if it has none.
+
+    Sections merge key by key, other values replace; null removes a section. ``overrides`` count for
+    all variants and over what these say, but those of ``variants.NAME.KEY`` for one. A variant's
+    experiment is called NAME-OF-ALL.NAME.
+
+    Raises
+    ------
+    InputError
+        As `load`, with the variant's name; no variants, or one that is no section.
+    """
+    data = _read(path)
+    own = [text for text in overrides or [] if text.strip().startswith("variants.")]
+    if "variants" not in data and not own:
+        return {}
+    for override in own:
+        _override(data, override)
+    variants = data.pop("variants")
+    if not isinstance(variants, dict) or not variants:
+        raise InputError(f"{path}: variants: {variants!r} is not allowed; expected names with keys")
+    found = {}
+    for name, changes in variants.items():
+        place = f"{path}: variants.{name}"
+        if not re.fullmatch(NAME, str(name)):
+            raise InputError(f"{place}: not allowed; expected a name of letters, digits, _, . and -")
+        if not isinstance(changes, dict):
+            raise InputError(f"{place}: {changes!r} is not allowed; expected keys to change")
+        if "name" in changes:
+            raise InputError(f"{place}.name: not allowed; the variant is its name")
+        merged = _merged(data, changes)
+        for override in overrides or []:
+            if override not in own:
+                _override(merged, override)
+        if isinstance(merged.get("name"), str):
+            merged["name"] += f".{name}"
+        found[str(name)] = check(merged, place)
+    return found
+
+
+def _merged(data: dict, changes: dict) -> dict:
+    """``data`` with ``changes`` in it, section by section; neither is touched."""
+    merged = copy.deepcopy(data)
+    for key, value in changes.items():
+        inner = merged.get(key)
+        both = isinstance(inner, dict) and isinstance(value, dict)
+        merged[key] = _merged(inner, value) if both else copy.deepcopy(value)
+    return merged
+
+
+def _read(path: str | Path) -> dict:
+    """The keys of an experiment file, as they stand."""
     path = Path(path)
     if path.suffix == ".xml":
         raise InputError(
@@ -370,9 +439,7 @@ def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
         raise InputError(f"{path}: holds no keys; expected name, wake, ...")
     if isinstance(data.get("experiment"), dict) and "versions" in data:
         data = data["experiment"]  # the record in a run folder can be run again
-    for override in overrides or []:
-        _override(data, override)
-    return check(data, str(path))
+    return data
 
 
 def check(data: dict, origin: str) -> Experiment:

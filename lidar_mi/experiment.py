@@ -5,6 +5,7 @@ goes on with those, and everything after them is made again.
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 from . import __version__, backscatter_chain, config, fringe_chain, sensor_chain
@@ -40,7 +41,16 @@ def run(
     InputError
         Bad input, or the folder holds another experiment.
     """
-    folder = Path(folder)
+    return prepare(experiment, beside, notice)(folder, overwrite, notice)
+
+
+def prepare(
+    experiment: Experiment, beside: str | Path = ".", notice: Notice = lambda text, share: None
+) -> Callable[[str | Path, bool, Notice], dict[str, float]]:
+    """Check all that can be checked before anything is written; what it returns runs the rest.
+
+    It takes ``folder``, ``overwrite`` and ``notice`` as `run` does, which see for errors.
+    """
     chains = []
     if experiment.wake:
         chains.append(backscatter_chain.prepare(experiment, beside, notice))
@@ -48,15 +58,20 @@ def run(
         chains.append(fringe_chain.prepare(experiment))
     if experiment.sensor:
         chains.append(sensor_chain.prepare(experiment, beside))
-    claim(folder, experiment, beside, overwrite)
-    log = Log(folder / "log.txt", notice)
-    log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")
-    try:
-        return _run(experiment, chains, folder, log)
-    except Exception as error:
-        if not is_interrupt(error):
-            log.fail(error)
-        raise
+
+    def start(folder: str | Path, overwrite: bool, notice: Notice) -> dict[str, float]:
+        folder = Path(folder)
+        claim(folder, experiment, beside, overwrite)
+        log = Log(folder / "log.txt", notice)
+        log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")
+        try:
+            return _run(experiment, chains, folder, log)
+        except Exception as error:
+            if not is_interrupt(error):
+                log.fail(error)
+            raise
+
+    return start
 
 
 def _run(experiment, chains, folder: Path, log: Log) -> dict[str, float]:

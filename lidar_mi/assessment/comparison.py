@@ -1,0 +1,164 @@
+"""What several variants of one experiment have in common, and what not."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import xarray as xr
+from matplotlib.figure import Figure
+
+from .figures import BACKSCATTER, METHOD_NAMES, Drawn, save_all
+from .report import Chapter
+
+_SPEED = "m s$^{-1}$"
+
+# rows of the comparison: key, name, unit; {} stands for a method's winds
+_ROWS = (
+    ("detector.signal", "photoelectrons of a pixel, median", ""),
+    ("detector.noise.all", "noise of a pixel over its signal, median", ""),
+    ("backscatter.multiple_scattering_fraction", "share of multiple scattering", ""),
+    ("{}.outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
+    ("{}.outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
+    ("{}.valid_fraction", "share of valid vectors", ""),
+    ("true_wind.outside_cores.rms_v", "the true v itself, rms", "m/s"),
+    ("true_wind.outside_cores.rms_w", "the true w itself, rms", "m/s"),
+    ("sensor.outside_cores.rmse_u", "both lidars: rms error of u beyond two core radii", "m/s"),
+    ("sensor.outside_cores.rmse_v", "both lidars: v", "m/s"),
+    ("sensor.outside_cores.rmse_w", "both lidars: w", "m/s"),
+    ("sensor.triples.rmse_u", "lines of sight alone: u", "m/s"),
+    ("sensor.triples.rmse_v", "lines of sight alone: v", "m/s"),
+    ("sensor.triples.rmse_w", "lines of sight alone: w", "m/s"),
+    ("sensor.rmse_v_los", "rms error of a line-of-sight velocity", "m/s"),
+    ("sensor.doppler.photons_per_direction", "Doppler lidar: photons of a direction", ""),
+    ("sensor.doppler.hazard_distance", "Doppler lidar: hazard distance, naked eye", "m"),
+    ("safety.permissible_exposure", "permissible exposure by a pulse", "J/m^2"),
+    ("safety.hazard_distance", "hazard distance of a beam, naked eye", "m"),
+    ("safety.aided_hazard_distance", "hazard distance of a beam, binoculars", "m"),
+    ("safety.scan_hazard_distance", "hazard distance of the whole scan, naked eye", "m"),
+    ("safety.scan_power", "average power of the scan", "W"),
+)  # fmt: skip
+
+
+def flat(settings: Mapping, prefix: str = "") -> dict[str, object]:
+    """Nested sections as dotted keys; lists are values."""
+    found = {}
+    for key, value in settings.items():
+        name = f"{prefix}{key}"
+        found |= flat(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return found
+
+
+def differences(settings: Mapping[str, Mapping[str, object]]) -> dict[str, list]:
+    """Keys that not all variants have alike, with each one's value (None: has no such key)."""
+    keys = dict.fromkeys(key for one in settings.values() for key in one if key != "name")
+    values = {key: [one.get(key) for one in settings.values()] for key in keys}
+    return {key: row for key, row in values.items() if any(value != row[0] for value in row)}
+
+
+def comparison_chapter(
+    settings: Mapping[str, Mapping[str, object]],
+    metrics: Mapping[str, Mapping[str, float]],
+    drawn: Sequence[Drawn],
+) -> Chapter:
+    """What differs between the variants of a study, and what comes of it.
+
+    Parameters
+    ----------
+    settings : mapping of variant to dotted keys
+        From `flat`.
+    metrics : mapping of variant to metrics
+    drawn : sequence of Drawn
+    """
+    heads = list(metrics)
+    changed = [
+        (key, "", [_setting(value) for value in values])
+        for key, values in differences(settings).items()
+    ]
+    places = ", ".join(f"{name}/report.html" for name in heads)
+    return Chapter(
+        lead=[f"One experiment in {len(heads)} variants, each with a report of its own: {places}."],
+        drawn=drawn,
+        heading="Side by side",
+        legend="Errors are those of valid vectors against the truth; an error near the true wind's "
+        "own rms means no skill. What a variant has no number for is left open.",
+        tables=[
+            ("What differs", heads, changed),
+            ("What comes of it", heads, list(_results(metrics))),
+        ],
+    )
+
+
+def _results(metrics):
+    """Rows that any variant has a number for."""
+    winds = dict.fromkeys(
+        key.removesuffix(".valid_fraction") for one in metrics.values() for key in one
+        if key.startswith("backscatter") and key.endswith(".valid_fraction")
+    )  # fmt: skip
+    for template, label, unit in _ROWS:
+        for wind in winds if "{}" in template else (None,):
+            key = template.format(wind)
+            values = [one.get(key) for one in metrics.values()]
+            if any(value is not None for value in values):
+                shown = ["-" if value is None else _three(value) for value in values]
+                yield (f"{_named(wind)}: {label}" if wind else label), unit, shown
+
+
+def _named(wind: str) -> str:
+    source, method = wind.split(".")
+    title = METHOD_NAMES.get(method, method.replace("_", " "))
+    return f"{title}, with the detector's noise" if source.endswith("noisy") else title
+
+
+def _three(value: float) -> str:
+    """Three digits, without an exponent where that is shorter."""
+    text = f"{value:.3g}"
+    return text if abs(value) >= 1e6 or 0 < abs(value) < 1e-3 else f"{float(text):.10g}"
+
+
+def _setting(value) -> str:
+    if value is None:
+        return "-"
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def draw_comparison(
+    folder: Path, rows: Mapping[str, tuple[xr.DataArray, xr.Dataset, Sequence]], log: Callable
+) -> list[Drawn]:
+    """One row a variant: its first picture, the w found in the pair, and its error.
+
+    Parameters
+    ----------
+    rows : mapping of variant to (picture, winds, cores)
+        Apparent backscatter (m^-1 sr^-1) and winds on (z, y), these with w_true and flag; places
+        (y, z) of the true cores, m.
+    """
+    figure = Figure(figsize=(19, 4.0 * len(rows)), layout="compressed")
+    axes = figure.subplots(len(rows), 3, squeeze=False)
+    limit = max(float(abs(wind["w_true"]).quantile(0.995)) for _, wind, _ in rows.values()) or 1.0
+    speeds = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    for row, (name, (picture, wind, cores)) in zip(axes, rows.items()):
+        low, high = (float(1e6 * picture.quantile(share)) for share in (0.002, 0.998))
+        good, place = wind["flag"] == 0, {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"}
+        columns = (
+            (1e6 * picture.sel(place), {"cmap": "cividis", "vmin": low, "vmax": high},
+             f"{name}: picture", BACKSCATTER),
+            (wind["w"].where(good), speeds, f"{name}: w found", _SPEED),
+            ((wind["w"] - wind["w_true"]).where(good), speeds, f"{name}: error of w", _SPEED),
+        )  # fmt: skip
+        for panel, (field, style, title, label) in zip(row, columns):
+            y, z = field["y"].values, field["z"].values
+            mesh = panel.pcolormesh(
+                y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
+            )
+            panel.set(title=title, aspect="equal", xlim=(y.max(), y.min()), ylim=(z.min(), z.max()))
+            for core in cores:
+                panel.plot(*core, "k+", ms=8)
+            figure.colorbar(mesh, ax=panel, label=label, pad=0.02, extend="both")
+        row[0].set_ylabel("z / m")
+    for panel in axes[-1]:
+        panel.set_xlabel("y / m (port is left)")
+    caption = (
+        "Each variant's first picture, the vertical wind found by its first method (white: flagged "
+        "vectors), and its error, on one scale. Crosses: true cores."
+    )
+    plate = ("fig00_comparison", "The variants side by side", (figure, caption))
+    return save_all(folder, [plate], log)

@@ -1,0 +1,95 @@
+"""Several variants of one experiment, run one after the other and held against each other.
+
+Each variant is a run of its own in a folder of its own; beside these folders lie the comparison's
+report, its figure and all metrics, named VARIANT.METRIC.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import xarray as xr
+import yaml
+
+from . import config, experiment
+from .assessment import report
+from .assessment.comparison import comparison_chapter, draw_comparison, flat
+from .config import Experiment
+from .errors import InputError
+from .rendering import exr
+from .run_folder import IMAGES, Log, Notice, write
+
+RECORD = "study.yaml"
+
+
+def run(
+    name: str,
+    variants: Mapping[str, Experiment],
+    folder: str | Path,
+    beside: str | Path = ".",
+    overwrite: bool = False,
+    notice: Notice = lambda text, share: None,
+) -> dict[str, dict[str, float]]:
+    """Run all variants into sub-folders and compare them; metrics by variant.
+
+    Parameters
+    ----------
+    name : str
+        Of the study.
+    variants : mapping
+        From `lidar_mi.config.load_variants`.
+    folder, beside, overwrite, notice
+        As in `lidar_mi.experiment.run`.
+
+    Raises
+    ------
+    InputError
+        Bad input in any of the variants, or a folder that holds something else.
+    """
+    folder = Path(folder)
+    free = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    if not free and not (folder / RECORD).is_file():
+        raise InputError(f"{folder}: is no study's folder; expected an empty or a new one (-o DIR)")
+    # what is wrong with the last one is said before the first one has taken its time
+    ready = {
+        key: experiment.prepare(one, beside, _of(key, notice)) for key, one in variants.items()
+    }
+    settings = {key: yaml.safe_load(config.dump(one)) for key, one in variants.items()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
+    record = yaml.safe_dump({"name": name, "variants": list(variants)}, sort_keys=False)
+    write(folder / RECORD, lambda path: path.write_text(record))
+    metrics = {
+        key: one(folder / key, overwrite, _of(key, notice)) for key, one in ready.items()
+    }
+    log = Log(folder / "log.txt", notice)
+    log(f"comparing {', '.join(variants)}")
+    rows = {
+        key: _pictures(folder / key, metrics[key]) for key, one in variants.items() if one.wake
+    }
+    drawn = draw_comparison(folder / "figures", rows, log) if rows else []
+    chapter = comparison_chapter({key: flat(one) for key, one in settings.items()}, metrics, drawn)
+    merged = {f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()}
+    page = report.page(name, yaml.safe_dump(settings, sort_keys=False), merged, [chapter])
+    text = json.dumps(merged, indent=1, allow_nan=False) + "\n"
+    write(folder / "metrics.json", lambda path: path.write_text(text))
+    write(folder / "report.html", lambda path: path.write_text(page))
+    log("done")
+    return metrics
+
+
+def _of(variant: str, notice: Notice) -> Notice:
+    return lambda text, share: notice(f"{variant}: {text}", share)
+
+
+def _pictures(folder: Path, metrics) -> tuple[xr.DataArray, xr.Dataset, list]:
+    """First picture as the instrument gives it, wind by the first method, places of true cores."""
+    scan = exr.read_scan(folder / IMAGES[0])
+    with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
+        source = winds["source"].values[-1]  # behind the detector, where there is one
+        wind = winds.sel(source=source).isel(algorithm=0).load()
+    sides = [f"wake.{side}_core" for side in ("port", "starboard")]
+    cores = [(metrics[f"{one}.y"], metrics[f"{one}.z"]) for one in sides if f"{one}.y" in metrics]
+    return scan["Y_noisy" if "Y_noisy" in scan else "Y"], wind, cores
