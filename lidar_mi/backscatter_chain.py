@@ -315,7 +315,7 @@ def true_wind(found: xr.Dataset, truth: Truth, cores: list[Core]) -> dict[str, f
 
 
 def _plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
-    flown = experiment.platform.speed * experiment.platform.dt
+    flown = (experiment.platform.speed - experiment.scan.follow) * experiment.platform.dt
     return plan_scans(
         experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown)
     )

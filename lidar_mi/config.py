@@ -39,6 +39,24 @@ class VortexPair(_Section):
     height: Length = Field(69.0, gt=0, description="extent of the domain in z")
 
 
+class Turbine(_Section):
+    """The analytic wake of a wind turbine, seen downstream from its nacelle."""
+
+    diameter: Length = Field(50.0, gt=0, description="of the rotor")
+    thrust: Number = Field(0.75, gt=0, lt=1, description="thrust coefficient")
+    tip_speed_ratio: Number = Field(7.0, description="speed of the tips over that of the wind")
+    wind_speed: Speed = Field(8.0, gt=0, description="of the undisturbed wind, along x")
+    growth: Number = Field(0.035, gt=0, description="of the wake's width with the distance")
+    hub_core: Length = Field(3.0, gt=0, description="core radius of the swirl")
+    downstream: Length | None = Field(
+        None, gt=0, description="distance from the rotor; default: the middle of the gates"
+    )
+    turbulence: Number = Field(0.06, ge=0, le=0.5, description="intensity of the undisturbed wind")
+    outer_scale: Length = Field(30.0, gt=0, description="of the turbulence")
+    width: Length = Field(109.0, gt=0, description="extent of the domain in y")
+    height: Length = Field(69.0, gt=0, description="extent of the domain in z")
+
+
 class ExtinctionMapping(_Section):
     """From tracers (or from the wind's speed) to the extinction coefficient."""
 
@@ -62,6 +80,7 @@ class Wake(_Section):
 
     file: str | None = Field(None, description="NetCDF file; beside the experiment or shipped")
     vortex_pair: VortexPair | None = None
+    turbine: Turbine | None = None
     time: Time | None = Field(None, description="needed when the file holds several")
     second: Literal["advect"] | Time = Field("advect", description="t2: advected, or a time")
     x: Length | None = Field(None, description="plane put in the middle of the gates")
@@ -90,15 +109,18 @@ class Wake(_Section):
 
     @model_validator(mode="after")
     def _one_source(self):
-        if (self.file is None) == (self.vortex_pair is None):
-            raise ValueError("expected either file or vortex_pair")
-        if self.vortex_pair and self.second != "advect":
-            raise ValueError(f"second: {self.second!r} is not allowed with vortex_pair")
-        if self.vortex_pair and self.depth == "volume":
-            raise ValueError("depth: 'volume' is not allowed with vortex_pair")
+        sources = [name for name in ("file", "vortex_pair", "turbine") if getattr(self, name)]
+        if len(sources) != 1:
+            raise ValueError("expected one of file, vortex_pair and turbine")
+        if sources == ["file"]:
+            return self
+        if self.second != "advect":
+            raise ValueError(f"second: {self.second!r} is not allowed with {sources[0]}")
+        if self.depth == "volume":
+            raise ValueError(f"depth: 'volume' is not allowed with {sources[0]}")
         for key in ("time", "x", "centre", "names"):
-            if self.vortex_pair and getattr(self, key):
-                raise ValueError(f"{key}: {getattr(self, key)!r} is not allowed with vortex_pair")
+            if getattr(self, key):
+                raise ValueError(f"{key}: {getattr(self, key)!r} is not allowed with {sources[0]}")
         return self
 
 
@@ -323,7 +345,7 @@ class Experiment(_Section):
 
     @model_validator(mode="after")
     def _telescope_stays_before_the_slab(self):
-        flown = self.platform.speed * self.platform.dt
+        flown = (self.platform.speed - self.scan.follow) * self.platform.dt
         if flown >= self.scan.range:
             raise ValueError(
                 f"scan.range: {self.scan.range:g} m is not allowed; expected more than the "

@@ -12,8 +12,7 @@ import xarray as xr
 import yaml
 
 from . import config, experiment
-from .assessment import report
-from .assessment.comparison import comparison_chapter, draw_comparison, flat
+from .assessment.comparison import draw_comparison, page
 from .config import Experiment
 from .errors import InputError
 from .rendering import exr
@@ -70,12 +69,11 @@ def run(
         key: _pictures(folder / key, metrics[key]) for key, one in variants.items() if one.wake
     }
     drawn = draw_comparison(folder / "figures", rows, log) if rows else []
-    chapter = comparison_chapter({key: flat(one) for key, one in settings.items()}, metrics, drawn)
     merged = {f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()}
-    page = report.page(name, yaml.safe_dump(settings, sort_keys=False), merged, [chapter])
+    html = page(name, settings, metrics, drawn)
     text = json.dumps(merged, indent=1, allow_nan=False) + "\n"
     write(folder / "metrics.json", lambda path: path.write_text(text))
-    write(folder / "report.html", lambda path: path.write_text(page))
+    write(folder / "report.html", lambda path: path.write_text(html))
     log("done")
     return metrics
 

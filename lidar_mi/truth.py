@@ -1,5 +1,6 @@
 """The truth of an experiment: flow and extinction at both times, in the lidar's frame."""
 
+import math
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -11,6 +12,7 @@ from scipy import integrate, ndimage, stats
 from .atmosphere.advection import advect
 from .atmosphere.extinction import extinction_from_speed, extinction_from_tracer
 from .atmosphere.texture import corrsin_obukhov
+from .atmosphere.turbine import TurbineWake, turbine_flow
 from .atmosphere.vortex import pair_wake, vortex_pair
 from .atmosphere.wake import centre, read_wake, resample
 from .config import Experiment
@@ -49,11 +51,11 @@ def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | 
         From `read_flows` of an experiment that differs in extinction and texture alone.
     """
     first, second = flows or read_flows(experiment, beside)
-    mapping, dt = experiment.wake.extinction, experiment.platform.dt
+    mapping = experiment.wake.extinction
     smooth1 = _extinction(first, mapping, first, second)
     if second is None:
         flow = first
-        smooth2 = advect(smooth1, flow["v"], flow["w"], dt)
+        smooth2 = _carried(smooth1, flow, experiment)
     else:
         flow = (first + second) / 2
         smooth2 = _extinction(second, mapping, first, second)
@@ -69,10 +71,10 @@ def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | 
         factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
         if second is None:
             rough1 = smooth1 * factor
-            rough2 = advect(rough1, flow["v"], flow["w"], dt)
+            rough2 = _carried(rough1, flow, experiment)
         else:
             rough1 = smooth1 * factor
-            rough2 = smooth2 * advect(factor, flow["v"], flow["w"], dt)
+            rough2 = smooth2 * _carried(factor, flow, experiment)
     else:
         rough1, rough2 = smooth1, smooth2
     # winds are retrieved from the first gate
@@ -84,20 +86,29 @@ def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | 
     return Truth((rough1, rough2), (smooth1, smooth2), wind)
 
 
+def _carried(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> xr.DataArray:
+    """A field after dt, in the frame that goes along with the gates."""
+    v, w, dt = flow["v"], flow["w"], experiment.platform.dt
+    if float(field.min()) == float(field.max()):
+        return field
+    if experiment.wake.turbine is None:
+        return advect(field, v, w, dt)
+    return advect(field, v, w, dt, u=flow["u"] - experiment.scan.follow)
+
+
 def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
     """The flow at t1 and, if it is a state of its own, at t2, centred and refined."""
     wake = experiment.wake
     gate_middle = experiment.scan.range + experiment.scan.thickness / 2
     if wake.vortex_pair:
         pair = wake.vortex_pair
-        axes = [
-            np.linspace(-extent / 2, extent / 2, _cells(extent, wake.spacing, name) + 1)
-            for name, extent in (("width", pair.width), ("height", pair.height))
-        ]
+        axes = _axes(wake, "vortex_pair")
         vortices = vortex_pair(
             pair.circulation, pair.separation, pair.core_radius, model=pair.model
         )
         return pair_wake(vortices, *axes, x=gate_middle), None
+    if wake.turbine:
+        return _turbine(experiment, gate_middle), None
     mapping = wake.extinction
     # what the extinction is made from goes by our names from here on, and must be in the file
     needed = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
@@ -130,14 +141,38 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
     return flows[0], flows[1]
 
 
-def _cells(extent: float, spacing: float, name: str) -> int:
-    cells = round(extent / spacing)
-    if cells < 1 or abs(cells * spacing - extent) > 1e-6 * extent:
-        raise InputError(
-            f"wake.vortex_pair.{name}: {extent:g} m is not allowed; expected a multiple of "
-            f"wake.spacing = {spacing:g} m"
-        )
-    return cells
+def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
+    """Wind behind a turbine on planes that hold the gates and the air that blows through them."""
+    wake, turbine, scan = experiment.wake, experiment.wake.turbine, experiment.scan
+    mean = TurbineWake(
+        **turbine.model_dump(
+            include={"diameter", "thrust", "tip_speed_ratio", "wind_speed", "growth", "hub_core"}
+        ),
+        downstream=turbine.downstream or gate_middle,
+    )
+    # what comes in at an end must not reach the gates: the wake's air moves at 0 to the full wind
+    fastest = max(abs(scan.follow), abs(turbine.wind_speed - scan.follow))
+    margin = fastest * experiment.platform.dt + 2 * wake.spacing
+    half = math.ceil((scan.thickness / 2 + margin) / wake.spacing)
+    x = gate_middle + wake.spacing * np.arange(-half, half + 1)
+    return turbine_flow(
+        mean, x, *_axes(wake, "turbine"), turbine.turbulence, turbine.outer_scale, experiment.seed
+    )
+
+
+def _axes(wake, key: str) -> list[np.ndarray]:
+    """y and z of an analytic wake, about the scan's axis."""
+    axes = []
+    for name in ("width", "height"):
+        extent = getattr(getattr(wake, key), name)
+        cells = round(extent / wake.spacing)
+        if cells < 1 or abs(cells * wake.spacing - extent) > 1e-6 * extent:
+            raise InputError(
+                f"wake.{key}.{name}: {extent:g} m is not allowed; expected a multiple of "
+                f"wake.spacing = {wake.spacing:g} m"
+            )
+        axes.append(np.linspace(-extent / 2, extent / 2, cells + 1))
+    return axes
 
 
 def _extinction(flow, mapping, first, second) -> xr.DataArray:

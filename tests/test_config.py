@@ -206,8 +206,8 @@ FAULTS = [
     ("wake.texture.rms=", "wake.texture.rms: None is not allowed; expected a quantity"),
     ("render.samples_per_beam=many", "render.samples_per_beam: 'many': Input should be a valid"),
     # values that exclude each other
-    ("wake.vortex_pair={}", "wake: expected either file or vortex_pair"),
-    ("wake.file=null", "wake: expected either file or vortex_pair"),
+    ("wake.vortex_pair={}", "wake: expected one of file, vortex_pair and turbine"),
+    ("wake.file=null", "wake: expected one of file, vortex_pair and turbine"),
     ("wake={vortex_pair: {}, second: 41 s}", "wake: second: 41.0 is not allowed with vortex_pair"),
     ("wake={vortex_pair: {}, depth: volume}", "wake: depth: 'volume' is not allowed with vortex"),
     ("scattering.phase=table", "scattering: table: None is not allowed with phase table"),

@@ -29,6 +29,8 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 PAGES = ("README.md", "docs/theory.md", "docs/user_guide.md", "docs/plugins.md")
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
+# sections that an experiment need not have
+OPTIONAL = (config.VortexPair, config.Turbine, config.Part)
 # what makes a printed run small; nothing else of it changes
 SMALLER = ("wake.spacing=1 m", "render.samples_per_beam=2", "retrieval.stride=8")
 
@@ -64,7 +66,7 @@ def leaves(model=config.Experiment, path=()):
     """Every key of an experiment file: dotted name, section's model, field."""
     for name, field in model.model_fields.items():
         section = next((t for t in _parts(field.annotation) if _is_model(t)), None)
-        if section is None or section in (config.VortexPair, config.Part):
+        if section is None or section in OPTIONAL:
             yield ".".join((*path, name)), model, field
         if section is not None:
             yield from leaves(section, (*path, name))
@@ -141,7 +143,7 @@ def test_key_has_the_documented_unit_default_and_limits(name, model, field):
 def _value(name, model, *given):
     """A key's value in a valid experiment that gives it, or else leaves it to its default."""
     *parents, key = name.split(".")
-    if model in (config.VortexPair, config.Part):  # sections that an experiment need not have
+    if model in OPTIONAL:
         whole = {"phase": "rayleigh", "share": 1.0} if model is config.Part else {}
         return getattr(model.model_validate(whole | dict(zip([key], given))), key)
     data = copy.deepcopy(BASE)

@@ -1,13 +1,17 @@
-"""What several variants of one experiment have in common, and what not."""
+"""Several variants of one experiment side by side: what differs, and what comes of it."""
 
+import base64
 from collections.abc import Callable, Mapping, Sequence
+from importlib.resources import files
 from pathlib import Path
 
+import jinja2
 import xarray as xr
+import yaml
 from matplotlib.figure import Figure
 
+from .. import __version__
 from .figures import BACKSCATTER, METHOD_NAMES, Drawn, save_all
-from .report import Chapter
 
 _SPEED = "m s$^{-1}$"
 
@@ -54,36 +58,47 @@ def differences(settings: Mapping[str, Mapping[str, object]]) -> dict[str, list]
     return {key: row for key, row in values.items() if any(value != row[0] for value in row)}
 
 
-def comparison_chapter(
-    settings: Mapping[str, Mapping[str, object]],
+def page(
+    name: str,
+    settings: Mapping[str, Mapping],
     metrics: Mapping[str, Mapping[str, float]],
     drawn: Sequence[Drawn],
-) -> Chapter:
-    """What differs between the variants of a study, and what comes of it.
+) -> str:
+    """What differs between the variants of a study and what comes of it, as HTML that needs nothing else.
 
     Parameters
     ----------
-    settings : mapping of variant to dotted keys
-        From `flat`.
+    name : str
+        Of the study.
+    settings : mapping of variant to experiment
+        As nested sections, with all defaults.
     metrics : mapping of variant to metrics
     drawn : sequence of Drawn
     """
-    heads = list(metrics)
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
+    template = environment.from_string(
+        files("lidar_mi.assessment").joinpath("comparison.html").read_text()
+    )
     changed = [
         (key, "", [_setting(value) for value in values])
-        for key, values in differences(settings).items()
+        for key, values in differences({key: flat(one) for key, one in settings.items()}).items()
     ]
-    places = ", ".join(f"{name}/report.html" for name in heads)
-    return Chapter(
-        lead=[f"One experiment in {len(heads)} variants, each with a report of its own: {places}."],
-        drawn=drawn,
-        heading="Side by side",
-        legend="Errors are those of valid vectors against the truth; an error near the true wind's "
-        "own rms means no skill. What a variant has no number for is left open.",
-        tables=[
-            ("What differs", heads, changed),
-            ("What comes of it", heads, list(_results(metrics))),
+    legend = (
+        "Errors are those of valid vectors against the truth; an error near the true wind's own rms "
+        "means no skill. A variant without a number has a dash."
+    )
+    return template.render(
+        name=name,
+        version=__version__,
+        variants=list(settings),
+        pictures=[
+            (one.title, one.caption, base64.b64encode(one.path.read_bytes()).decode()) for one in drawn
         ],
+        tables=[
+            ("What comes of it", legend, list(_results(metrics))),
+            ("What differs", "In SI units; a dash: the variant has no such key.", changed),
+        ],
+        resolved=yaml.safe_dump(dict(settings), sort_keys=False),
     )
 
 

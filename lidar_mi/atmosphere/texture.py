@@ -27,12 +27,13 @@ def _spacing(name, values):
 
 
 def gaussian_field(
-    shape: tuple[int, ...], spacing: tuple[float, ...], outer_scale: float, seed: int
-) -> np.ndarray:
-    """Periodic Gaussian random field, isotropic, with -5/3 line spectra.
+    shape: tuple[int, ...], spacing: tuple[float, ...], outer_scale: float, seed: int,
+    slope: float = 5 / 3,
+) -> np.ndarray:  # fmt: skip
+    """Periodic Gaussian random field, isotropic, with line spectra that fall with k^-slope.
 
-    The spectral density is (k^2 + k0^2)^(-(5/3 + d - 1)/2) in d dimensions, k0 = 2 pi/L: its
-    integral over the d - 1 other wavenumbers, the line spectrum, is (k^2 + k0^2)^(-5/6) (von
+    The spectral density is (k^2 + k0^2)^(-(slope + d - 1)/2) in d dimensions, k0 = 2 pi/L: its
+    integral over the d - 1 other wavenumbers, the line spectrum, is, for 5/3, (k^2 + k0^2)^(-5/6) (von
     Karman's form of the Corrsin-Obukhov spectrum; Monin and Yaglom, Statistical Fluid
     Mechanics 2, 1975, section 21). Waves up to the grid's shortest along each axis are filled;
     those it cannot hold are missing from a line spectrum, which for d = 2 (3) lies below the law
@@ -47,6 +48,8 @@ def gaussian_field(
     outer_scale : float
         L, m.
     seed : int
+    slope : float
+        Of the line spectra.
 
     Returns
     -------
@@ -60,7 +63,7 @@ def gaussian_field(
     frequencies.append(rfftfreq(shape[-1], spacing[-1]))
     k2 = sum(f**2 for f in np.meshgrid(*frequencies, indexing="ij", sparse=True))
     # Frequencies in cycles per metre: the common 2 pi drops out of the shape.
-    spectrum *= (k2 + outer_scale**-2) ** (-(5 / 3 + d - 1) / 4)
+    spectrum *= (k2 + outer_scale**-2) ** (-(slope + d - 1) / 4)
     spectrum.flat[0] = 0
     return irfftn(spectrum, s=shape, overwrite_x=True)
 

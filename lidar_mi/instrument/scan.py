@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..units import Angle, Length
+from ..units import Angle, Length, Speed
 
 HalfAngle = Annotated[Angle, Field(gt=0, lt=math.pi / 2)]
 
@@ -36,6 +36,9 @@ class Scan(BaseModel):
     thickness: Length = Field(2.5, gt=0, description="depth of all gates together")
     gates: Literal["planar", "spherical"] = "planar"
     gate_count: int = Field(1, ge=1, le=10_000)
+    follow: Speed = Field(
+        0.0, description="wind along x with which the gates go along from scan to scan"
+    )
     columns: int = Field(219, ge=1, description="beams across, with aim: angles")
     rows: int = Field(139, ge=1, description="beams up, with aim: angles")
     azimuth_half: tuple[HalfAngle, HalfAngle] = ("6.2 deg", "6.4 deg")
@@ -55,7 +58,8 @@ class ScanPlan:
     gate_kind : "planar" or "spherical"
     gate_count : int
     position : float
-        How far the telescope has come along x since the first scan.
+        How far the telescope has come along x since the first scan, in the frame of the air that
+        the gates stay with.
     """
 
     y: np.ndarray
@@ -108,8 +112,8 @@ def plan_scans(scan: Scan, y, z, travelled) -> list[ScanPlan]:
     y, z : arrays
         Nodes of the wake's grid (used with ``aim: grid``), m, ascending.
     travelled : sequence of float
-        How far the telescope has come along x at each scan, m; the gates stay with the air, so
-        they come nearer by as much.
+        How far the telescope has come along x at each scan, m, in the frame of the air; the gates
+        stay with the air, so they come nearer by as much. Negative: the air goes away.
 
     Raises
     ------
