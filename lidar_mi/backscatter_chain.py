@@ -17,10 +17,11 @@ from .config import Experiment
 from .errors import InputError
 from .instrument.detector import gate_duration, noise_budget, noisy_scan, speckle_modes
 from .instrument.products import linear_depolarization, with_products
+from .instrument.eye_safety import assess_pulses, scan_hazard_distance
 from .instrument.scan import ScanPlan, plan_scans
 from .rendering import exr
 from .rendering.backscatter import extrude, render_scans
-from .rendering.phase import Scatterer, scatterer
+from .rendering.phase import Scatterer, molecules, scatterer
 from .rendering.variant import use_variant
 from .retrieval.images import resample_pair
 from .retrieval.wind import METHODS, retrieve_wind
@@ -32,6 +33,9 @@ from .truth import Flows, Truth, blur_by_beam, make_truth, read_flows
 NOISY = "backscatter_noisy"
 
 # relative rms of the sub-grid texture for which `texture_sweep` says how good winds get
+# time of looking into the beams, s, where no sensor says another
+EXPOSURE = 10.0
+
 TEXTURE_SWEEP = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 
 
@@ -84,6 +88,7 @@ def _run(
         log("drawing figures")
         drawn = figures.draw_all(folder / "figures", truth, scans, found, cores, sweep, log)
     metrics |= {f"timing.{k}_s": round(v, 3) for k, v in timing.items()}
+    metrics |= safety(experiment, plans[0])
     return metrics, backscatter_chapter(experiment, metrics, cores, drawn)
 
 
@@ -157,8 +162,9 @@ def pictures(experiment, plans, fields, air: Scatterer, folder: Path, log) -> li
     rendered = render_scans(
         fields,
         plans,
+    mapping = experiment.wake.extinction
         experiment.lidar,
-        experiment.wake.extinction.background,
+        mapping.background + mapping.molecules,
         *air,
         experiment.render,
         experiment.seed,
@@ -167,6 +173,7 @@ def pictures(experiment, plans, fields, air: Scatterer, folder: Path, log) -> li
     )
     platform = {"platform_speed": experiment.platform.speed, "dt": experiment.platform.dt}
     for index, scan in zip(missing, map(with_products, rendered)):
+        molecules(mapping.molecules, experiment.lidar.wavelength, experiment.scattering.band),
         scan.attrs |= platform
         if experiment.detector:
             # numbers of their own, apart from those of the light transport
@@ -315,6 +322,30 @@ def true_wind(found: xr.Dataset, truth: Truth, cores: list[Core]) -> dict[str, f
 
 
 def _plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
+def safety(experiment: Experiment, plan: ScanPlan) -> dict[str, float]:
+    """Eye safety of the beams, if their pulses last: ``safety.*``, J m^-2, m and W.
+
+    Every direction has a pulse each ``platform.dt``; infinite distances are left out.
+    """
+    lidar, rate = experiment.lidar, 1 / experiment.platform.dt
+    if lidar.pulse_duration == 0:
+        return {}
+    exposure = experiment.sensor.exposure if experiment.sensor else EXPOSURE
+    pulse = (lidar.wavelength, lidar.pulse_energy, lidar.pulse_duration)
+    beam = (float(lidar.radius_at(0)), lidar.divergence_full)
+    one = assess_pulses(*pulse, *beam, rate, exposure)
+    spacing = float(np.mean([np.diff(plan.y).mean(), np.diff(plan.z).mean()])) / plan.centre
+    beams = len(plan.y) * len(plan.z)
+    found = {
+        "permissible_exposure": one.limit.exposure,
+        "hazard_distance": one.hazard_distance,
+        "aided_hazard_distance": one.aided_hazard_distance,
+        "scan_hazard_distance": scan_hazard_distance(*pulse, *beam, spacing, beams, rate, exposure),
+        "scan_power": lidar.pulse_energy * beams * rate,
+    }
+    return {f"safety.{key}": value for key, value in found.items() if np.isfinite(value)}
+
+
     flown = (experiment.platform.speed - experiment.scan.follow) * experiment.platform.dt
     return plan_scans(
         experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown)

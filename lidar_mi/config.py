@@ -65,6 +65,9 @@ class ExtinctionMapping(_Section):
     aerosol: str | None = Field("aerosol", description="background aerosol, or null for a flat one")
     background: Extinction = Field("0.1 / km", ge=0, description="also of the environment")
     maximum: Extinction = Field("1.8 / km", gt=0)
+    molecules: Extinction = Field(
+        0.0, ge=0, description="on top of it, in slab and environment: by air, which has no texture"
+    )
     stretch: Number = Field(2.0, ge=1, description="contrast of thin tracer; 1 = linear")
 
 
@@ -330,6 +333,16 @@ class Experiment(_Section):
         if method in ("cc", "ws") and self.sensor.crossflow_std is None:
             raise ValueError(
                 f"sensor.crossflow_std: missing; expected a speed, as method {method} knows no errors"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _molecules_beside_particles(self):
+        phase = self.scattering.phase
+        if self.wake and self.wake.extinction.molecules and phase in ("isotropic", "henyey_greenstein"):
+            raise ValueError(
+                f"wake.extinction.molecules: not allowed with scattering.phase {phase}, which knows no "
+                "polarisation; expected 0"
             )
         return self
 

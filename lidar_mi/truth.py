@@ -83,7 +83,11 @@ def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | 
     components = [name for name in ("u", "v", "w") if name in flow]
     wind = xr.Dataset({name: _slab_mean(flow[name], gates) for name in components})
     wind.attrs["gates"] = gates
-    return Truth((rough1, rough2), (smooth1, smooth2), wind)
+    rough, smooth = (
+        tuple(field.copy(data=field.values + mapping.molecules) for field in pair)
+        for pair in ((rough1, rough2), (smooth1, smooth2))
+    )
+    return Truth(rough, smooth, wind)
 
 
 def _carried(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> xr.DataArray:

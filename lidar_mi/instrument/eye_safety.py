@@ -256,6 +256,66 @@ def hazard_distance(
     return float(optimize.brentq(excess, 0.0, far, xtol=1e-9 * far, rtol=1e-12))
 
 
+def scan_hazard_distance(
+    wavelength: float,
+    pulse_energy: float,
+    pulse_duration: float,
+    beam_radius: float,
+    divergence_full: float,
+    spacing: float,
+    beams: int,
+    scan_rate: float,
+    exposure_duration: float,
+) -> float:
+    """Distance from which an eye may look into a whole scan, m.
+
+    Beams side by side, ``spacing`` (rad) apart in both directions, overlap near the scanner, where they
+    leave one aperture, and, if they diverge by more than the spacing, anywhere. An eye at the
+    distance r gets the light of n pulses in every scan, n = (pi w^2 / 2) / (spacing r)^2 for the 1/e^2
+    radius w, between 1 and ``beams``, each taken as strong as the one that points at it.
+
+    Parameters
+    ----------
+    scan_rate : float
+        Scans a second, Hz.
+    exposure_duration : float
+        s.
+
+    Raises
+    ------
+    InputError
+        As `permissible_pulse`; a spacing or number of beams that is not positive.
+
+    Notes
+    -----
+    Where the limit of the whole time decides, r = sqrt(energy scan_rate time / MPE(time)) / spacing.
+    """
+    _positive("spacing", spacing, " rad")
+    _positive("beams", beams, "")
+
+    def excess(distance):
+        radius2 = beam_radius**2 + (divergence_full / 2 * distance) ** 2
+        overlap = min(max(1.0, math.pi / 2 * radius2 / (spacing * distance) ** 2), beams)
+        limit = permissible_pulse(
+            wavelength, pulse_duration, scan_rate * overlap, exposure_duration
+        )
+        beam = (pulse_energy, beam_radius, divergence_full, limit.aperture)
+        return exposure_at(distance, *beam) / limit.exposure - 1
+
+    # limits step where rules change: look for the farthest place that is not safe
+    places = [10 ** (k / 20) for k in range(-40, 140)]
+    unsafe = [place for place in places if excess(place) > 0]
+    if not unsafe:
+        return 0.0
+    if unsafe[-1] == places[-1]:
+        return math.inf
+    low, high = unsafe[-1], places[places.index(unsafe[-1]) + 1]
+    while high / low > 1 + 1e-6:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+    return high
+
+
 def assess_pulses(
     wavelength: float,
     pulse_energy: float,

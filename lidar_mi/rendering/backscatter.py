@@ -14,6 +14,7 @@ from ..instrument.lidar import BackscatterLidar
 from ..instrument.scan import ScanPlan
 from ..instrument.signal import apparent_backscatter
 from .exr import label_scan, unpack
+from .phase import Molecules
 from .settings import RenderSettings
 
 MOST_CELLS = 1e8  # of an extended plane: 0.8 GB
@@ -67,6 +68,7 @@ def render_scans(
     seed: int,
     progress: Callable[[int, int, int], None] | None = None,
     scans: Sequence[int] | None = None,
+    molecules: Molecules | None = None,
 ) -> Iterator[xr.Dataset]:
     """Render one scan after the other in one scene; only the first compiles anything.
 
@@ -87,6 +89,8 @@ def render_scans(
         Called with (scan, photons done, photons in all).
     scans : sequence of int, optional
         Which of the scans to render; default: all.
+    molecules : Molecules, optional
+        A part of all ``extinctions`` and of ``environment`` that scatters in a way of its own.
 
     Yields
     ------
@@ -99,14 +103,15 @@ def render_scans(
         return
     scene = mi.load_dict(
         scene_dict(
-            extinctions[chosen[0]], plans[chosen[0]], lidar, environment, phase, albedo, settings
+            extinctions[chosen[0]], plans[chosen[0]], lidar, environment, phase, albedo, settings,
+            molecules,
         )
     )
     parameters = mi.traverse(scene)
     for index in chosen:
         plan = plans[index]
         if index != chosen[0]:
-            _move(parameters, extinctions[index], plan)
+            _move(parameters, extinctions[index], plan, albedo, molecules)
         if progress:
             scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
         start = time.perf_counter()
@@ -126,11 +131,22 @@ def scene_dict(
     phase: dict,
     albedo: float,
     settings: RenderSettings,
+    molecules: Molecules | None = None,
 ) -> dict:
     """The Mitsuba scene of one scan as a dictionary for ``mi.load_dict``."""
     low, high = _box(extinction)
     place = mi.ScalarTransform4f().translate(low).scale(high - low)
-    medium = {"albedo": albedo, "phase": phase}
+
+    def volume(field):
+        grid = mi.VolumeGrid(_voxels(field))
+        return {"type": "gridvolume", "grid": grid, "to_world": place, "accel": False}
+
+    around = within = {"albedo": albedo, "phase": phase}
+    if molecules:
+        both, share = _mixed(environment, albedo, molecules)
+        around = {"albedo": both, "phase": _blend(phase, molecules, share)}
+        both, share = (volume(field) for field in _mixed(extinction, albedo, molecules))
+        within = {"albedo": both, "phase": _blend(phase, molecules, share)}
     return {
         "type": "scene",
         "integrator": {
@@ -141,7 +157,7 @@ def scene_dict(
             "estimator": settings.estimator,
             "samples_per_pass": settings.samples_per_pass,
         },
-        "environment": {"type": "homogeneous", "sigma_t": environment, **medium},
+        "environment": {"type": "homogeneous", "sigma_t": environment, **around},
         "sensor": {
             "type": "scanning_lidar",
             "aperture_radius": lidar.aperture_radius,
@@ -178,26 +194,40 @@ def scene_dict(
             "bsdf": {"type": "null"},
             "interior": {
                 "type": "heterogeneous",
-                "sigma_t": {
-                    "type": "gridvolume",
-                    "grid": mi.VolumeGrid(_voxels(extinction)),
-                    "to_world": place,
-                    "accel": False,
-                },
-                **medium,
+                "sigma_t": volume(extinction),
+                **within,
             },
             "exterior": {"type": "ref", "id": "environment"},
         },
     }
 
 
-def _move(parameters, extinction: xr.DataArray, plan: ScanPlan) -> None:
+def _mixed(extinction, albedo: float, molecules: Molecules):
+    """Albedo of air, and the molecules' share of what it scatters."""
+    by_molecules = molecules.albedo * molecules.extinction
+    # rounding may leave a little less extinction than the molecules'
+    by_others = albedo * np.maximum(extinction - molecules.extinction, 0)
+    return (by_molecules + by_others) / extinction, by_molecules / (by_molecules + by_others)
+
+
+def _blend(phase: dict, molecules: Molecules, share) -> dict:
+    return {"type": "blendphase", "weight": share, "others": phase, "molecules": molecules.phase}
+
+
+def _move(
+    parameters, extinction: xr.DataArray, plan: ScanPlan, albedo: float, molecules: Molecules | None
+) -> None:
     """Put the telescope, its beams and the air in the slab where they are at a later scan."""
     parameters["sensor.to_world"] = mi.Transform4f().translate([plan.position, 0, 0])
     parameters["sensor.directions"] = mi.Float(plan.directions().ravel())
     parameters["sensor.gate_start"] = plan.gate_start
     parameters["sensor.gate_stop"] = plan.gate_stop
-    parameters["slab.interior_medium.sigma_t.data"] = mi.TensorXf(_voxels(extinction))
+    fields = {"sigma_t": extinction}
+    if molecules:
+        both, share = _mixed(extinction, albedo, molecules)
+        fields |= {"albedo": both, "phase_function.weight": share}
+    for name, field in fields.items():
+        parameters[f"slab.interior_medium.{name}.data"] = mi.TensorXf(_voxels(field))
     parameters.update()
 
 

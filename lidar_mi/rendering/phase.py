@@ -20,6 +20,33 @@ class Scatterer(NamedTuple):
     albedo: float
 
 
+class Molecules(NamedTuple):
+    """The molecules' part of the air, the same everywhere: extinction (m^-1), phase function, albedo."""
+
+    extinction: float
+    phase: dict
+    albedo: float
+
+
+def molecules(extinction: float, wavelength: float, band: str = "cabannes") -> Molecules | None:
+    """Molecules of a given extinction coefficient; None without any.
+
+    Parameters
+    ----------
+    extinction : float
+        m^-1, of the whole Rayleigh band.
+    wavelength : float
+        m.
+    band : "cabannes" or "rayleigh"
+        Whose light is received.
+    """
+    if extinction == 0:
+        return None
+    air = molecular_scattering(wavelength, band=band)
+    phase = {"type": "rayleigh_polarized", "depolarization": air.depolarization}
+    return Molecules(extinction, phase, air.albedo)
+
+
 def scatterer(
     scattering, beside: str | Path = ".", wavelength: float = 532e-9,
     notice: Notice = lambda text, share: None,

@@ -23,6 +23,7 @@ from lidar_mi.instrument.eye_safety import (
     limiting_aperture,
     permissible_exposure,
     permissible_pulse,
+    scan_hazard_distance,
     time_base,
 )
 from lidar_mi.instrument.lidar import BackscatterLidar
@@ -274,3 +275,29 @@ def test_bad_input_is_named(call, start):
     with pytest.raises(InputError) as error:
         call()
     assert str(error.value).startswith(start) and "\n" not in str(error.value)
+
+
+# scans
+
+
+def test_scan_whose_light_adds_up():
+    """Infrared, 10 s: E rate t / (spacing r)^2 = 1e4 J/m^2 where beams overlap; 1e-3 J: 3.16 m."""
+    beam = {"beam_radius": 0.08, "divergence_full": 2e-3, "spacing": 1e-3, "beams": 30441}
+    for energy in (1e-3, 1e-2):
+        found = scan_hazard_distance(
+            1550e-9, energy, 1e-8, **beam, scan_rate=10, exposure_duration=10
+        )
+        assert found == pytest.approx(math.sqrt(energy * 100 / 1e4) / 1e-3, rel=0.01)
+
+
+def test_scan_of_beams_far_apart_is_one_beam():
+    """Green, single pulses decide: as `hazard_distance`, wherever no neighbour overlaps."""
+    one = assess_pulses(532e-9, 1e-3, 1e-8, 0.08, 2e-3, 10, 10)
+    wide = scan_hazard_distance(532e-9, 1e-3, 1e-8, 0.08, 2e-3, 5e-3, 100, 10, 10)
+    assert wide == pytest.approx(one.hazard_distance, rel=1e-4)
+
+
+def test_weak_scan_is_safe_everywhere_and_none_without_spacing():
+    assert scan_hazard_distance(1550e-9, 1e-9, 1e-8, 0.08, 2e-3, 1e-3, 100, 10, 10) == 0
+    with pytest.raises(InputError, match="spacing: 0.0 rad is not allowed"):
+        scan_hazard_distance(1550e-9, 1e-3, 1e-8, 0.08, 2e-3, 0.0, 100, 10, 10)
