@@ -16,8 +16,8 @@ from .assessment.report import Chapter, backscatter_chapter
 from .config import Experiment
 from .errors import InputError
 from .instrument.detector import gate_duration, noise_budget, noisy_scan, speckle_modes
-from .instrument.products import linear_depolarization, with_products
 from .instrument.eye_safety import assess_pulses, scan_hazard_distance
+from .instrument.products import linear_depolarization, with_products
 from .instrument.scan import ScanPlan, plan_scans
 from .rendering import exr
 from .rendering.backscatter import extrude, render_scans
@@ -32,10 +32,10 @@ from .truth import Flows, Truth, blur_by_beam, make_truth, read_flows
 # what winds are retrieved from behind a detector, beside the noise-free picture
 NOISY = "backscatter_noisy"
 
-# relative rms of the sub-grid texture for which `texture_sweep` says how good winds get
 # time of looking into the beams, s, where no sensor says another
 EXPOSURE = 10.0
 
+# relative rms of the sub-grid texture for which `texture_sweep` says how good winds get
 TEXTURE_SWEEP = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 
 
@@ -87,8 +87,8 @@ def _run(
     with _timed(timing, "figures"):
         log("drawing figures")
         drawn = figures.draw_all(folder / "figures", truth, scans, found, cores, sweep, log)
-    metrics |= {f"timing.{k}_s": round(v, 3) for k, v in timing.items()}
     metrics |= safety(experiment, plans[0])
+    metrics |= {f"timing.{k}_s": round(v, 3) for k, v in timing.items()}
     return metrics, backscatter_chapter(experiment, metrics, cores, drawn)
 
 
@@ -159,10 +159,10 @@ def pictures(experiment, plans, fields, air: Scatterer, folder: Path, log) -> li
 
     if missing:
         log(f"rendering {len(missing)} scans of {len(plans[0].y)} x {len(plans[0].z)} beams")
+    mapping = experiment.wake.extinction
     rendered = render_scans(
         fields,
         plans,
-    mapping = experiment.wake.extinction
         experiment.lidar,
         mapping.background + mapping.molecules,
         *air,
@@ -170,10 +170,10 @@ def pictures(experiment, plans, fields, air: Scatterer, folder: Path, log) -> li
         experiment.seed,
         progress,
         missing,
+        molecules(mapping.molecules, experiment.lidar.wavelength, experiment.scattering.band),
     )
     platform = {"platform_speed": experiment.platform.speed, "dt": experiment.platform.dt}
     for index, scan in zip(missing, map(with_products, rendered)):
-        molecules(mapping.molecules, experiment.lidar.wavelength, experiment.scattering.band),
         scan.attrs |= platform
         if experiment.detector:
             # numbers of their own, apart from those of the light transport
@@ -307,21 +307,6 @@ def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
     return metrics
 
 
-def true_wind(found: xr.Dataset, truth: Truth, cores: list[Core]) -> dict[str, float]:
-    """How strong the true wind is where vectors are looked for: an error as large is no skill."""
-    place = {axis: slice(found[axis].min(), found[axis].max()) for axis in ("y", "z")}
-    wind = truth.wind.sel(place)
-    far = outside_cores(wind["y"].values, wind["z"].values[:, None], cores)
-    rms = {}
-    for name in ("v", "w"):
-        square = wind[name].transpose("z", "y").values ** 2
-        rms[f"true_wind.rms_{name}"] = float(np.sqrt(square.mean()))
-        if cores and far.any():
-            rms[f"true_wind.outside_cores.rms_{name}"] = float(np.sqrt(square[far].mean()))
-    return rms
-
-
-def _plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
 def safety(experiment: Experiment, plan: ScanPlan) -> dict[str, float]:
     """Eye safety of the beams, if their pulses last: ``safety.*``, J m^-2, m and W.
 
@@ -346,6 +331,21 @@ def safety(experiment: Experiment, plan: ScanPlan) -> dict[str, float]:
     return {f"safety.{key}": value for key, value in found.items() if np.isfinite(value)}
 
 
+def true_wind(found: xr.Dataset, truth: Truth, cores: list[Core]) -> dict[str, float]:
+    """How strong the true wind is where vectors are looked for: an error as large is no skill."""
+    place = {axis: slice(found[axis].min(), found[axis].max()) for axis in ("y", "z")}
+    wind = truth.wind.sel(place)
+    far = outside_cores(wind["y"].values, wind["z"].values[:, None], cores)
+    rms = {}
+    for name in ("v", "w"):
+        square = wind[name].transpose("z", "y").values ** 2
+        rms[f"true_wind.rms_{name}"] = float(np.sqrt(square.mean()))
+        if cores and far.any():
+            rms[f"true_wind.outside_cores.rms_{name}"] = float(np.sqrt(square[far].mean()))
+    return rms
+
+
+def _plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
     flown = (experiment.platform.speed - experiment.scan.follow) * experiment.platform.dt
     return plan_scans(
         experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown)
