@@ -101,8 +101,8 @@ def test_chord_of_a_solid_rotation():
     v, w = chord_wind(truth, y, z, DT)
     stretch = np.tan(rate * DT / 2) / (rate * DT / 2)
     assert stretch == pytest.approx(1.057, abs=1e-3)
-    np.testing.assert_allclose(v, -rate * z * stretch + 0 * y, atol=1e-4)
-    np.testing.assert_allclose(w, rate * y * stretch, atol=1e-4)
+    np.testing.assert_allclose(v, -rate * z * stretch + 0 * y, rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(w, rate * y * stretch, rtol=1e-4, atol=1e-6)
 
 
 def test_window_means_of_a_curved_wind():
