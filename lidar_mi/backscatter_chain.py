@@ -13,6 +13,7 @@ from .assessment import figures
 from .assessment.cores import Core, find_cores, outside_cores
 from .assessment.errors import truth_at_vectors, wind_metrics
 from .assessment.report import Chapter, backscatter_chapter
+from .assessment.vector_map import map_data
 from .config import Experiment
 from .errors import InputError
 from .instrument.detector import gate_duration, noise_budget, noisy_scan, speckle_modes
@@ -55,7 +56,7 @@ def prepare(
         notice("reading the wake", None)
         flows = read_flows(experiment, beside)
         truth = make_truth(experiment, beside, flows)
-        plans = _plans(experiment, truth)
+        plans = scan_plans(experiment, truth)
     notice("reading how the air scatters", None)
     air = scatterer(experiment.scattering, beside, experiment.lidar.wavelength, notice)
     fields = _solid(experiment, truth, plans)
@@ -89,7 +90,9 @@ def _run(
         drawn = figures.draw_all(folder / "figures", truth, scans, found, cores, sweep, log)
     metrics |= safety(experiment, plans[0])
     metrics |= {f"timing.{k}_s": round(v, 3) for k, v in timing.items()}
-    return metrics, backscatter_chapter(experiment, metrics, cores, drawn)
+    source = NOISY if experiment.detector else "backscatter"
+    vectors = map_data(found.sel(source=source).isel(algorithm=0), ("v", "w"), cores)
+    return metrics, backscatter_chapter(experiment, metrics, cores, drawn, vectors)
 
 
 def _check_ahead(experiment, truth, plans, air: Scatterer) -> None:
@@ -192,29 +195,22 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
     would see), the rendered backscatter and, with a detector, the same with its noise.
     """
     settings, lidar = experiment.retrieval, experiment.lidar
+    rendered = rendered_pairs(experiment, scans)
     images = {
         "extinction": [truth.image(k) for k in (0, 1)],
         "extinction_without_texture": [truth.image(k, smooth=True) for k in (0, 1)],
         "extinction_blurred": [
             blur_by_beam(truth.image(k), lidar, plans[k].centre) for k in (0, 1)
         ],
-        "backscatter": [scan["Y"] for scan in scans],
     }
-    noise = {"backscatter": apparent_noise(scans[0])}
-    if experiment.detector:
-        images[NOISY] = [scan["Y_noisy"] for scan in scans]
-        noise[NOISY] = np.hypot(noise["backscatter"], scans[0]["Y_noise_std"])
     if experiment.scan.aim == "angles":
-        # the noise has no structure to interpolate: its level goes along
-        noise = {name: float(level.median()) for name, level in noise.items()}
-        rendered = {
-            name: resample_pair(*images[name], experiment.wake.spacing) for name in noise
-        }
-        grid = rendered["backscatter"][0]
+        grid = rendered["backscatter"][0][0]
         images = {
             name: [image.interp(y=grid["y"], z=grid["z"]) for image in pair]
-            for name, pair in images.items() if name not in rendered
-        } | rendered  # fmt: skip
+            for name, pair in images.items()
+        }
+    images |= {name: pair for name, (pair, _) in rendered.items()}
+    noise = {name: level for name, (_, level) in rendered.items()}
     sources = []
     for index, source in enumerate(images):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(images))
@@ -224,7 +220,7 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
                 *images[source],
                 dt=experiment.platform.dt,
                 method=method,
-                **_windows(settings),
+                **window_settings(settings),
                 noise=noise.get(source, 0.0),
             )
             true = truth_at_vectors(wind, truth.wind)
@@ -243,9 +239,28 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
     return found
 
 
-def _windows(settings) -> dict:
+def rendered_pairs(experiment: Experiment, scans) -> dict[str, tuple[list[xr.DataArray], object]]:
+    """Pictures that winds are found in, on one grid, and their noise (a map or its level).
+
+    By source: the rendered backscatter, and with a detector the same with its noise.
+    """
+    noise = apparent_noise(scans[0])
+    pairs = {"backscatter": ([scan["Y"] for scan in scans], noise)}
+    if experiment.detector:
+        noisy = np.hypot(noise, scans[0]["Y_noise_std"])
+        pairs[NOISY] = [scan["Y_noisy"] for scan in scans], noisy
+    if experiment.scan.aim == "angles":
+        # the noise has no structure to interpolate: its level goes along
+        pairs = {
+            name: (resample_pair(*pair, experiment.wake.spacing), float(level.median()))
+            for name, (pair, level) in pairs.items()
+        }
+    return pairs
+
+
+def window_settings(settings) -> dict:
     """Window sizes and thresholds, as `retrieve_wind` takes them."""
-    return settings.model_dump(exclude={"methods"})
+    return settings.model_dump(exclude={"methods", "error_budget"})
 
 
 def texture_sweep(experiment: Experiment, flows: Flows, log) -> dict[str, float]:
@@ -263,7 +278,7 @@ def texture_sweep(experiment: Experiment, flows: Flows, log) -> dict[str, float]
         truth = make_truth(experiment.model_copy(update={"wake": wake}), flows=flows)
         wind = retrieve_wind(
             truth.image(0), truth.image(1), dt=experiment.platform.dt, method="cc",
-            **_windows(settings),
+            **window_settings(settings),
         )  # fmt: skip
         found = wind_metrics(wind, truth_at_vectors(wind, truth.wind), [])
         for key in ("all.rmse_v", "all.rmse_w", "valid_fraction"):
@@ -345,7 +360,8 @@ def true_wind(found: xr.Dataset, truth: Truth, cores: list[Core]) -> dict[str, f
     return rms
 
 
-def _plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
+def scan_plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
+    """The scans of both pictures."""
     flown = (experiment.platform.speed - experiment.scan.follow) * experiment.platform.dt
     return plan_scans(
         experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown)

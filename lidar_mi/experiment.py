@@ -8,11 +8,18 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from . import __version__, backscatter_chain, config, fringe_chain, sensor_chain
+from . import (
+    __version__,
+    backscatter_chain,
+    config,
+    fringe_chain,
+    sensor_chain,
+    vortex_chain,
+)
 from .assessment import report
 from .config import Experiment
 from .errors import is_interrupt
-from .run_folder import Log, Notice, claim, write
+from .run_folder import Log, Notice, claim, read_record, write
 
 
 def run(
@@ -58,6 +65,8 @@ def prepare(
         chains.append(fringe_chain.prepare(experiment))
     if experiment.sensor:
         chains.append(sensor_chain.prepare(experiment, beside))
+    if experiment.wake and (experiment.sensor or "vortex_fit" in experiment.retrieval.methods):
+        chains.append(vortex_chain.prepare(experiment, beside))
 
     def start(folder: str | Path, overwrite: bool, notice: Notice) -> dict[str, float]:
         folder = Path(folder)
@@ -84,8 +93,9 @@ def _run(experiment, chains, folder: Path, log: Log) -> dict[str, float]:
         folder / "metrics.json",
         lambda path: path.write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n"),
     )
+    versions = read_record(folder)["versions"]
     resolved = config.dump(experiment)
-    page = report.page(experiment.name, resolved, metrics, chapters, log.warnings)
+    page = report.page(experiment, resolved, versions, metrics, chapters, log.warnings)
     write(folder / "report.html", lambda path: path.write_text(page))
     log("done")
     return metrics

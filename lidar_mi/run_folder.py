@@ -20,7 +20,8 @@ from .truth import find_file
 IMAGES = ("image_t1.exr", "image_t2.exr")
 PICTURES = (*IMAGES, "fringes_*.exr")
 RESULTS = (
-    "wind.nc", "v_los.nc", "lines_of_sight.nc", "wind3d.nc", "metrics.json", "report.html", "log.txt",
+    "wind.nc", "v_los.nc", "lines_of_sight.nc", "wind3d.nc", "vortex.json", "metrics.json",
+    "report.html", "log.txt",
 )  # fmt: skip
 
 # other versions of these may give other pictures

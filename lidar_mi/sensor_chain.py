@@ -19,6 +19,7 @@ from .assessment.cores import find_cores, outside_cores
 from .assessment.report import Chapter
 from .assessment.requirements import judge, read_requirements
 from .assessment.sensor_report import draw_all, sensor_chapter
+from .assessment.vector_map import map_data
 from .backscatter_chain import NOISY
 from .config import Experiment
 from .errors import InputError
@@ -89,24 +90,24 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
     start = time.perf_counter()
     lines = measure_lines(experiment, truth, log)
     write_netcdf(lines, folder / LINES)
-    log("combining both lidars")
-    with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
-        source = NOISY if experiment.detector else "backscatter"
-        crossflow = winds.sel(source=source, algorithm=experiment.sensor.method).load()
-    found = combine(crossflow, lines, crossflow_std=experiment.sensor.crossflow_std)
-    triples = wind_from_triples(lines)
-    for name in COMPONENTS:
-        at = {axis: found[axis] for axis in ("z", "y")}
-        found[f"{name}_true"] = truth[name].interp(at).assign_attrs(
-            units="m s-1", long_name=f"true {name}, mean over the slab"
-        )
-    found.attrs |= {
-        "title": f"Wind from both lidars of the experiment {experiment.name}",
-        "source": f"lidar-mi {__version__}",
-    }
-    write_netcdf(found, folder / WIND)
     cores = find_cores(truth)
-    metrics = errors(found, cores) | _line_errors(lines) | _triple_errors(triples, truth)
+    metrics = _line_errors(lines)
+    log("combining both lidars")
+    # what cannot be computed is said, the rest is shown
+    try:
+        found = _combined(experiment, truth, lines, folder)
+    except InputError as error:
+        log.remark(f"no wind from both lidars: {error}")
+        (folder / WIND).unlink(missing_ok=True)
+        found = None
+        metrics |= {"sensor.good_fraction": 0.0, "sensor.vectors": 0}
+    else:
+        write_netcdf(found, folder / WIND)
+        metrics |= errors(found, cores)
+    try:
+        metrics |= _triple_errors(wind_from_triples(lines), truth)
+    except InputError as error:
+        log.remark(f"no wind from lines of sight alone: {error}")
     metrics |= _costs(experiment)
     judged = [(table, judge(table, measured(experiment, metrics, table))) for table in tables.values()]
     for table, findings in judged:
@@ -116,7 +117,26 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
                 metrics[key] = row.margin
     drawn = draw_all(folder / "figures", found, lines, cores, log)
     metrics["timing.sensor_s"] = round(time.perf_counter() - start, 3)
-    return metrics, sensor_chapter(experiment, metrics, judged, drawn)
+    vectors = None if found is None else map_data(found, COMPONENTS, cores)
+    return metrics, sensor_chapter(experiment, metrics, judged, drawn, vectors)
+
+
+def _combined(experiment, truth, lines, folder) -> xr.Dataset:
+    """The wind from the lines and from the pictures' winds in the folder, with the truth."""
+    with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
+        source = NOISY if experiment.detector else "backscatter"
+        crossflow = winds.sel(source=source, algorithm=experiment.sensor.method).load()
+    found = combine(crossflow, lines, crossflow_std=experiment.sensor.crossflow_std)
+    for name in COMPONENTS:
+        at = {axis: found[axis] for axis in ("z", "y")}
+        found[f"{name}_true"] = truth[name].interp(at).assign_attrs(
+            units="m s-1", long_name=f"true {name}, mean over the slab"
+        )
+    found.attrs |= {
+        "title": f"Wind from both lidars of the experiment {experiment.name}",
+        "source": f"lidar-mi {__version__}",
+    }
+    return found
 
 
 def measure_lines(experiment: Experiment, truth: xr.Dataset, log: Log) -> xr.Dataset:

@@ -1,6 +1,8 @@
 """Where the vortices of a cross-flow wind field are."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -54,7 +56,7 @@ def find_cores(wind: xr.Dataset, least_circulation: float = 20.0) -> list[Core]:
         if edge < 4 * spacing:
             continue
         rings = np.arange(spacing, edge, spacing / 2)
-        profile = sign * _ring_mean_swirl(v, w, y, z, cy, cz, rings)
+        profile = sign * _ring_means(v, w, y, z, cy, cz, rings)[2]
         peak = int(np.argmax(profile))
         if peak == len(rings) - 1:
             continue
@@ -65,9 +67,49 @@ def find_cores(wind: xr.Dataset, least_circulation: float = 20.0) -> list[Core]:
     return cores
 
 
-def _ring_mean_swirl(v, w, y, z, cy: float, cz: float, rings: np.ndarray) -> np.ndarray:
-    """Mean tangential velocity on rings around (cy, cz), m/s, positive from +y towards +z.
+class Rings(NamedTuple):
+    """What rings around a vortex say of it: its circulation (m^2 s^-1), the wind that carries it."""
 
+    circulation: float
+    v: float
+    w: float
+
+
+def ring_averages(
+    wind: xr.Dataset, core: Core, others: Sequence[Core] = (), inner: float = 5.0,
+    outer: float = 15.0,
+) -> Rings | None:  # fmt: skip
+    """Averages over rings around a core, with radii from ``inner`` to ``outer``, m.
+
+    Circulation is 2 pi r times the mean swirl, which vortices beyond the rings do not change (as
+    Holzaepfel et al., J. Atmos. Ocean. Technol. 20, 2003, average it). The mean wind on a ring is
+    that which carries the vortex: a vortex within adds nothing to it, one beyond what it
+    makes at the centre.
+
+    Returns
+    -------
+    Rings or None
+        None where the rings leave the field, or come within two radii of another core.
+    """
+    y, z = wind["y"].values, wind["z"].values
+    edge = min(core.y - y[0], y[-1] - core.y, core.z - z[0], z[-1] - core.z)
+    near = min(
+        (np.hypot(o.y - core.y, o.z - core.z) - 2 * o.radius for o in others), default=np.inf
+    )
+    if outer > min(edge, near):
+        return None
+    rings = np.arange(inner, outer + 0.125, 0.25)
+    v, w = (wind[name].transpose("z", "y").values for name in ("v", "w"))
+    mean_v, mean_w, swirl = _ring_means(v, w, y, z, core.y, core.z, rings)
+    return Rings(
+        float((2 * np.pi * rings * swirl).mean()), float(mean_v.mean()), float(mean_w.mean())
+    )
+
+
+def _ring_means(v, w, y, z, cy: float, cz: float, rings: np.ndarray) -> np.ndarray:
+    """Means of v, w and the tangential velocity on rings around (cy, cz), (3, rings), m/s.
+
+    Tangential is positive from +y towards +z.
     By cubic interpolation at equal angles: averaging the nodes that happen to lie near a ring
     instead would turn a passing flow of 10 m/s into a swirl of some tenths of a metre per second.
     """
@@ -75,7 +117,8 @@ def _ring_mean_swirl(v, w, y, z, cy: float, cz: float, rings: np.ndarray) -> np.
     rows = (cz + rings[:, None] * np.sin(angle) - z[0]) / (z[1] - z[0])
     columns = (cy + rings[:, None] * np.cos(angle) - y[0]) / (y[1] - y[0])
     on_v, on_w = (ndimage.map_coordinates(f, [rows, columns], mode="nearest") for f in (v, w))
-    return (on_w * np.cos(angle) - on_v * np.sin(angle)).mean(1)
+    swirl = on_w * np.cos(angle) - on_v * np.sin(angle)
+    return np.stack([field.mean(1) for field in (on_v, on_w, swirl)])
 
 
 def outside_cores(y, z, cores: list[Core], radii: float = 2.0):

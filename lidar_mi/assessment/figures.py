@@ -17,7 +17,7 @@ from .errors import deviations, error_by_quality
 
 METHOD_NAMES = {
     "cc": "cross-correlation", "ws": "weight shift", "multipass": "multi-pass correlation",
-    "variational": "variational",
+    "variational": "variational", "vortex_fit": "vortex fit",
 }  # fmt: skip
 
 

@@ -1,14 +1,19 @@
 """The report of a run: one HTML file that needs nothing else."""
 
 import base64
+import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
+from pathlib import Path
 from typing import NamedTuple
 
 import jinja2
+from markupsafe import Markup
+from PIL import Image
 
-from .. import __version__
+from ..retrieval.vortex_fit import MEANING
 from .cores import Core
 from .figures import METHOD_NAMES, Drawn
 from .velocities import CENTRES, READERS
@@ -33,69 +38,150 @@ _DOPPLER_UNITS = {
     "doppler.velocity_range": "m/s", "doppler.render.largest_error": "m/s",
 }  # fmt: skip
 
+_VORTEX_UNITS = {
+    name: units.replace(" s-1", "/s").replace("m2", "m^2") for name, (units, _) in MEANING.items()
+} | {"flow_error": "m/s"}
+
+
+class Tables(NamedTuple):
+    """Tables under one heading; each is (title, heads, rows), a row (name, unit, values as text)."""
+
+    heading: str
+    legend: str
+    tables: Sequence[tuple[str, Sequence[str], Sequence[tuple[str, str, Sequence[str]]]]]
+
 
 class Chapter(NamedTuple):
     """What one instrument of a run tells.
 
     Attributes
     ----------
+    title : str
     lead : sequence of str
         Paragraphs before the figures.
     drawn : sequence of Drawn
-    heading, legend : str
-        Of the tables.
-    tables : sequence of (title, heads, rows)
-        Rows are (name, unit, values as text).
+    numbers : Tables
+    verdict : Tables, optional
+        Whether what is asked for is fulfilled; stands before all chapters' numbers.
+    vectors : dict, optional
+        `vector_map.map_data` with a ``title``, for a map to be looked at vector by vector.
     """
 
+    title: str
     lead: Sequence[str]
     drawn: Sequence[Drawn]
-    heading: str
-    legend: str
-    tables: Sequence[tuple[str, Sequence[str], Sequence[tuple[str, str, Sequence[str]]]]]
+    numbers: Tables
+    verdict: Tables | None = None
+    vectors: dict | None = None
 
 
 def page(
-    name: str, resolved: str, metrics: dict[str, float], chapters: Sequence[Chapter],
-    warnings: Sequence[str] = (),
+    experiment, resolved: str, versions: Mapping[str, str], metrics: Mapping[str, float],
+    chapters: Sequence[Chapter], warnings: Sequence[str] = (),
 ) -> str:  # fmt: skip
     """The report as HTML, pictures embedded, everything named by the user escaped.
 
     Parameters
     ----------
-    name : str
-        Of the experiment.
+    experiment : lidar_mi.config.Experiment
     resolved : str
         The experiment with all defaults, as YAML.
-    metrics : dict
+    versions : mapping
+        Of lidar-mi and the libraries.
+    metrics : mapping
         All numbers of the run.
     chapters : sequence of Chapter
     warnings : sequence of str
         What a reader of the results must know.
     """
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string(
-        files("lidar_mi.assessment").joinpath("report.html").read_text()
-    )
+    folder = files("lidar_mi.assessment")
+    with ThreadPoolExecutor() as pool:
+        drawn = [figure for chapter in chapters for figure in chapter.drawn]
+        embedded = dict(zip(drawn, pool.map(lambda figure: _embedded(figure.path), drawn)))
+    template = environment.from_string(folder.joinpath("report.html").read_text())
     return template.render(
-        name=name,
-        version=__version__,
+        name=experiment.name,
+        simulated=simulated(experiment, versions),
         resolved=resolved,
         metrics={key: _rounded(key, value) for key, value in metrics.items()},
-        warnings=warnings,
+        warnings=[text.rstrip(".") for text in warnings],
+        script=Markup(folder.joinpath("vector_map.js").read_text()),
         chapters=[
-            chapter._asdict() | {"pictures": [
-                (d.title, d.caption, base64.b64encode(d.path.read_bytes()).decode())
-                for d in chapter.drawn
-            ]}
+            chapter._asdict()
+            | {"pictures": [(d.title, d.caption, embedded[d]) for d in chapter.drawn]}
             for chapter in chapters
         ],
-    )  # fmt: skip
+    )
+
+
+def _embedded(path: Path) -> str:
+    """A picture as the text that a page holds it by: lossless WebP, two thirds of its PNG."""
+    part = io.BytesIO()
+    with Image.open(path) as picture:
+        # more effort takes twice as long for 3 % less
+        picture.convert("RGB").save(part, "WEBP", lossless=True, quality=25, method=1)
+    return f"data:image/webp;base64,{base64.b64encode(part.getvalue()).decode()}"
+
+
+def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
+    """What was simulated, as (name, text): wake, instruments, seed, versions."""
+    rows = []
+    if experiment.wake:
+        wake, scan, lidar = experiment.wake, experiment.scan, experiment.lidar
+        if wake.vortex_pair:
+            pair = wake.vortex_pair
+            flow = (
+                f"{pair.model.replace('_', ' ')} vortices, circulation {pair.circulation:g} m^2/s, "
+                f"separation {pair.separation:g} m, core radius {pair.core_radius:g} m"
+            )
+        else:
+            when = "" if wake.time is None else f" at {wake.time:g} s"
+            flow = f"{wake.file}{when}, {wake.spacing:g} m grid"
+        texture = "no texture added"
+        if wake.texture.rms:
+            texture = f"texture of {wake.texture.rms:.0%} rms, {wake.texture.outer_scale:g} m"
+        rows.append(("wake", f"{flow}; {texture}"))
+        platform = experiment.platform
+        rows.append(("platform", f"{platform.speed:g} m/s, pictures {platform.dt:g} s apart"))
+        beam = (
+            f"{lidar.wavelength * 1e9:.5g} nm, {lidar.pulse_energy * 1e3:g} mJ, divergence "
+            f"{lidar.divergence_full * 1e3:g} mrad, telescope of {2 * lidar.aperture_radius:g} m; slab "
+            f"of {scan.thickness:g} m from {scan.range:g} m"
+        )
+        detector = "with the noise of a detector" if experiment.detector else "no detector"
+        rows.append(("backscatter lidar", f"{beam}; {detector}"))
+        air, render = experiment.scattering, experiment.render
+        light = (
+            f"scattering by {air.aerosol or air.phase.replace('_', ' ')}, orders up to "
+            f"{render.max_order}, {render.samples_per_beam} photons a beam, {render.variant}"
+        )
+        rows.append(("light", light))
+        methods = ", ".join(METHOD_NAMES[name] for name in experiment.retrieval.methods)
+        rows.append(("winds by", methods))
+    if experiment.doppler:
+        lidar = experiment.doppler.lidar
+        beam = (
+            f"{lidar.wavelength * 1e9:.5g} nm, {lidar.pulse_energy * 1e3:g} mJ, {lidar.range_bin:g} m "
+            f"at {lidar.range:g} m, in air of {lidar.altitude:g} m altitude"
+        )
+        rows.append(("Doppler lidar", beam))
+    if experiment.sensor:
+        scan = experiment.sensor.directions
+        both = (
+            f"{scan.columns} x {scan.rows} lines of sight of {experiment.sensor.pulses} pulses, v and "
+            f"w by {METHOD_NAMES[experiment.sensor.method]}"
+        )
+        rows.append(("both together", both))
+    rows.append(("seed", str(experiment.seed)))
+    rows.append(("versions", ", ".join(f"{name} {version}" for name, version in versions.items())))
+    return rows
 
 
 def backscatter_chapter(
-    experiment, metrics: dict[str, float], cores: Sequence[Core], drawn: Sequence[Drawn]
-) -> Chapter:
+    experiment, metrics: dict[str, float], cores: Sequence[Core], drawn: Sequence[Drawn],
+    vectors: dict | None = None,
+) -> Chapter:  # fmt: skip
     """What the backscatter lidar tells.
 
     Parameters
@@ -103,6 +189,8 @@ def backscatter_chapter(
     experiment : lidar_mi.config.Experiment
     metrics : dict
         From `lidar_mi.backscatter_chain.verdict`.
+    vectors : dict, optional
+        From `vector_map.map_data`.
     """
     lead = [
         "A backscatter lidar looks at a wake twice; cross-flow winds follow from the two images."
@@ -113,10 +201,8 @@ def backscatter_chapter(
             for core in cores
         )
         lead.append(f"The true flow holds {places}.")
-    return Chapter(
-        lead=[*lead, _noise(experiment, metrics)],
-        drawn=drawn,
-        heading="How good the winds are",
+    numbers = Tables(
+        heading="How good the cross-flow winds are",
         legend="Valid vectors against the truth at their place and time. Columns: what the winds "
         "were retrieved from. Blurred is the extinction as wide beams see it, without noise: its "
         "difference to the extinction is what the beam's width costs. The last column says how "
@@ -124,6 +210,12 @@ def backscatter_chapter(
         "be no worse.",
         tables=list(_tables(experiment, metrics)),
     )
+    if vectors:
+        vectors = {"title": "The wind from the backscatter pair, vector by vector"} | vectors
+    return Chapter(
+        "The backscatter lidar", [*lead, _noise(experiment, metrics)], drawn, numbers,
+        vectors=vectors,
+    )  # fmt: skip
 
 
 def doppler_chapter(doppler, metrics: dict[str, float], drawn: Sequence[Drawn]) -> Chapter:
@@ -152,9 +244,7 @@ def doppler_chapter(doppler, metrics: dict[str, float], drawn: Sequence[Drawn]) 
         f"{metrics['doppler.velocity_range']:.0f} m/s. Without noise, the rendered pictures give "
         f"the true winds to {metrics['doppler.render.largest_error']:.2g} m/s."
     )
-    return Chapter(
-        lead=[purpose, light, rings],
-        drawn=drawn,
+    numbers = Tables(
         heading="How good the line-of-sight winds are",
         legend="Winds that each method reads from noisy pictures, or from averages of several "
         "(columns), over all speeds. CA: circular averaging; ML: midpoint lines; both, like the "
@@ -166,6 +256,7 @@ def doppler_chapter(doppler, metrics: dict[str, float], drawn: Sequence[Drawn]) 
             for centre in doppler.retrieval.centre
         ],
     )
+    return Chapter("The Doppler lidar", [purpose, light, rings], drawn, numbers)
 
 
 def _doppler_table(settings, centre, metrics):
@@ -227,10 +318,13 @@ def _rounded(key: str, value: float) -> str:
     """A metric with four digits and its unit."""
     *_, parent, name = ("", *key.split("."))
     quantity = name.rpartition("_")[2]
+    described = _VORTEX_UNITS.get(name.removesuffix("_stderr"))
     if name.startswith(("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_std")):
         unit = "rad" if quantity == "direction" else "m/s"
     elif key in _DOPPLER_UNITS:
         unit = _DOPPLER_UNITS[key]
+    elif key.startswith("vortex.") and described:
+        unit = described
     elif parent.endswith("_core"):
         unit = "m^2/s" if name == "circulation" else "m"
     else:

@@ -11,29 +11,61 @@ from scipy import stats
 from ..retrieval.line_of_sight import COMPONENTS
 from .cores import Core
 from .figures import Drawn, save_all
-from .report import Chapter
+from .report import Chapter, Tables
 from .requirements import as_rows, fulfilled, look_ahead
 
 _SPEED = "m s$^{-1}$"
 
 
 def draw_all(
-    folder: Path, found: xr.Dataset, lines: xr.Dataset, cores: Sequence[Core], log: Callable
-) -> list[Drawn]:
+    folder: Path, found: xr.Dataset | None, lines: xr.Dataset, cores: Sequence[Core],
+    log: Callable,
+) -> list[Drawn]:  # fmt: skip
     """Draw the combined sensor's figures as PNG into ``folder``.
 
     Parameters
     ----------
-    found : xr.Dataset
-        From `lidar_mi.retrieval.combine.combine`, with the truth as u_true, v_true, w_true.
+    found : xr.Dataset or None
+        From `lidar_mi.retrieval.combine.combine`, with the truth as u_true, v_true, w_true. None:
+        there is no wind.
     lines : xr.Dataset
         From `lidar_mi.sensor_chain.measure_lines`.
     """
-    plates = (
-        ("fig20_wind3d", "The wind from both lidars", _maps(found, lines, cores)),
-        ("fig21_uncertainty", "How certain it is", _uncertainty(found)),
-    )
+    plates = [("fig19_lines_of_sight", "The scan of the Doppler lidar", _scan(lines, cores))]
+    if found is not None:
+        plates += [
+            ("fig20_wind3d", "The wind from both lidars", _maps(found, lines, cores)),
+            ("fig21_uncertainty", "How certain it is", _uncertainty(found)),
+        ]
     return save_all(folder, plates, log)
+
+
+def _scan(lines, cores):
+    figure = Figure(figsize=(13.6, 4.6), layout="compressed")
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    place = (lines["range"] * lines["direction"]).transpose("line", "axis").values
+    speed, true = lines["v_los"].values, lines["v_los_true"].values
+    reduced = (speed - true) / lines["v_los_std"].values
+    read = np.isfinite(speed)
+    span = np.quantile(np.where(read, speed, true), (0.0, 1.0))
+    for panel, values, title, label, style in (
+        (panels[0], speed, "velocity along the line of sight", _SPEED,
+         {"cmap": "cividis", "vmin": span[0], "vmax": span[1]}),
+        (panels[1], reduced, "its error over its standard error", "reduced error",
+         {"cmap": "RdBu_r", "vmin": -4, "vmax": 4}),
+    ):  # fmt: skip
+        dots = panel.scatter(place[read, 1], place[read, 2], c=values[read], s=90,
+                             edgecolors="0.3", linewidths=0.5, **style)  # fmt: skip
+        panel.plot(place[~read, 1], place[~read, 2], "kx", ms=6)
+        for core in cores:
+            panel.plot(core.y, core.z, "+", color="crimson", ms=9)
+        panel.set(title=title, aspect="equal", xlabel="y / m (port is left)", ylabel="z / m")
+        figure.colorbar(dots, ax=panel, label=label, pad=0.02)
+    panels[0].set_xlim(place[:, 1].max() + 4, place[:, 1].min() - 4)
+    return figure, (
+        "Middles of the range bins; what the aircraft flies is part of the velocity. Black crosses: "
+        "lines of sight whose rings could not be read. Red crosses: true cores."
+    )
 
 
 def _maps(found, lines, cores):
@@ -112,8 +144,9 @@ def _limit(values: np.ndarray) -> float:
 
 
 def sensor_chapter(
-    experiment, metrics: dict[str, float], judged: Sequence[tuple], drawn: Sequence[Drawn]
-) -> Chapter:
+    experiment, metrics: dict[str, float], judged: Sequence[tuple], drawn: Sequence[Drawn],
+    vectors: dict | None = None,
+) -> Chapter:  # fmt: skip
     """What both lidars together tell, and whether that satisfies flight control.
 
     Parameters
@@ -123,6 +156,8 @@ def sensor_chapter(
         From `lidar_mi.sensor_chain`.
     judged : sequence of (RequirementTable, list of Finding)
     drawn : sequence of Drawn
+    vectors : dict, optional
+        From `vector_map.map_data`.
     """
     platform = experiment.platform
     ahead = look_ahead(experiment.scan.range + experiment.scan.thickness / 2, platform.speed)
@@ -142,13 +177,28 @@ def sensor_chapter(
         )
         for table, findings in judged
     ]
+    if vectors:
+        vectors = {"title": "The wind from both lidars, vector by vector"} | vectors
     return Chapter(
+        title="Both lidars as one sensor",
         lead=[purpose, warning, *_costs(metrics)],
         drawn=drawn,
-        heading="Whether it does what flight control asks for",
-        legend="Errors of u, v, w are rms errors of good vectors beyond two core radii, those of v_LOS "
-        "rms errors of lines of sight. A margin is the distance from the limit, as a share of it.",
-        tables=[*tables, _numbers(metrics)],
+        verdict=Tables(
+            "Whether it does what flight control asks for",
+            "Errors of u, v, w are rms errors of good vectors beyond two core radii, those of v_LOS "
+            "rms errors of lines of sight. A margin is the distance from the limit, as a share of "
+            "it.",
+            tables,
+        ),
+        numbers=Tables(
+            "How good the wind from both lidars is",
+            f"{metrics['sensor.lines_read']} of {metrics['sensor.lines']} lines of sight were read; "
+            f"{metrics['sensor.vectors']} vectors, {metrics['sensor.good_fraction']:.0%}, are good. "
+            "Errors over standard errors have a variance of 1 where they are as stated; then 68 % "
+            "lie within one standard error and 95 % within 1.96.",
+            [_numbers(metrics)],
+        ),
+        vectors=vectors,
     )
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.cores import Core, find_cores, outside_cores
+from lidar_mi.assessment.cores import Core, find_cores, outside_cores, ring_averages
 from lidar_mi.atmosphere.vortex import Vortex, pair_wake, vortex_pair
 from lidar_mi.atmosphere.wake import centre, read_wake, resample
 
@@ -144,3 +144,35 @@ def test_outside_cores():
     assert far.tolist() == [False, False, True, False, False, True, True]
     assert outside_cores(y, np.zeros(7), []).all()
     assert outside_cores(y, np.zeros(7), cores, radii=0.9)[1]
+
+
+@pytest.mark.parametrize("model", ["lamb_oseen", "burnham_hallock"])
+def test_rings_give_circulation_and_what_carries_the_vortex(model):
+    """Circulation: the mean of its closed form. The partner and a wind of (3, -1) m/s carry it."""
+    pair = vortex_pair(458.0, 47.1, 3.0, model=model)
+    flow = flow_of(*pair)
+    flow = flow.assign(v=flow["v"] + 3.0, w=flow["w"] - 1.0)
+    radius = np.linspace(5, 15, 1001)
+    share = circulation_inside(radius, 458.0, 3.0, model).mean()
+    cores = [Core(o.y, o.z, o.core_radius, o.circulation) for o in pair]
+    for core, other, side in zip(cores, cores[::-1], (1, -1)):
+        rings = ring_averages(flow, core, [other])
+        assert rings.circulation == pytest.approx(side * share, rel=2e-3)
+        assert rings.v == pytest.approx(3.0, abs=0.01)
+        # Burnham and Hallock's partner still has 0.4 % of its circulation beyond b0
+        assert rings.w == pytest.approx(-1.0 - 458 / (2 * np.pi * 47.1), abs=0.02)
+
+
+def test_rings_that_hold_something_else_tell_nothing():
+    flow = flow_of(*vortex_pair(458.0, 20.0))
+    port, starboard = (Core(s * 10.0, 0.0, 3.0, s * 458.0) for s in (1, -1))
+    assert ring_averages(flow, port, [starboard]) is None
+    assert ring_averages(flow, port) is not None
+    assert ring_averages(flow, Core(45.0, 0.0, 3.0, 458.0)) is None
+    # 440 and 438 m^2/s, as the simulation's own file says
+    path = files("lidar_mi.scenes").joinpath("wake_slab_40s.nc")
+    wake = centre(resample(read_wake(path, 40.0), 0.5), None, None).isel(x=0)
+    cores = find_cores(wake)
+    for core, said in zip(cores, (440.0, -438.4)):
+        others = [o for o in cores if o is not core]
+        assert ring_averages(wake, core, others).circulation == pytest.approx(said, rel=5e-3)

@@ -172,6 +172,31 @@ def test_errors_of_quantities_and_wind_against_drawn_parameters():
         assert fit.quantities[name].stderr == pytest.approx(np.std(values), rel=0.2), name
 
 
+def test_the_pair_drifts_on_and_its_errors_grow():
+    """Alike vortices sink by Gamma t/(2 pi b) and go with the mean wind; errors as drawn ones."""
+    pair = vortex_pair(400.0, 40.0, 3.0)
+    covariance = np.diag([4.0, 1e-4, 0.01, 0.01] * 2 + [0.04] * 2)
+    now = VortexPairFit(
+        vector(*pair, mean=(2.0, 0.5)), covariance, "lamb_oseen", 1.0, 1.0, 0.1, 3.0
+    )
+    later = now.after(2.0)
+    sunk = 2.0 * (0.5 - 400 / (2 * np.pi * 40))
+    np.testing.assert_allclose(
+        later.parameters - now.parameters, [0, 0, 4, sunk, 0, 0, 4, sunk, 0, 0], atol=1e-9
+    )
+    assert now.quantities["drift_w"].value == pytest.approx(sunk / 2)
+    # the wind goes along
+    here, there = now.wind([5.0], [3.0]), later.wind([9.0], [3.0 + sunk])
+    np.testing.assert_allclose(here["w"], there["w"])
+    drawn = np.random.default_rng(5).multivariate_normal(now.parameters, covariance, 150)
+    moved = np.array([
+        VortexPairFit(p, covariance, "lamb_oseen", 1.0, 1.0, 0.1, 3.0).after(2.0).parameters
+        for p in drawn
+    ])  # fmt: skip
+    # the spread of 150 scatters by 6 %
+    np.testing.assert_allclose(moved.std(0), np.sqrt(np.diag(later.covariance)), rtol=0.24)
+
+
 # --- from images
 
 

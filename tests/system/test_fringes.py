@@ -226,7 +226,7 @@ def test_report_tells_the_numbers(small):
         value = metrics[f"doppler.annular.centre_free.averaged_{n}.std"]
         assert f"{value:.3g} \u00b1 " in page
         assert f"{metrics[f'doppler.bound.centre_free.averaged_{n}.std']:.3g}" in page
-    assert page.count("data:image/png;base64,") == len(FIGURES)
+    assert page.count("data:image/webp;base64,") == len(FIGURES)
     assert "backscatter lidar" not in page and "Savitzky-Golay" in page
 
 

@@ -7,25 +7,29 @@ not look at the same air.
 
 import json
 import math
+import shutil
 
+import mitsuba as mi
 import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi import config, sensor_chain
+from lidar_mi import backscatter_chain, config, fringe_chain, sensor_chain
 from lidar_mi.assessment.cores import Core
+from lidar_mi.assessment.report import page
 from lidar_mi.assessment.requirements import read_requirements
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run
+from lidar_mi.retrieval.vortex_file import read_vortices
 
-# a coarse wake, few photons, a CCD of a sixteenth of the pixels
+# a coarse wake, single scattering, a CCD of a sixteenth of the pixels
 SMALL = {
     "name": "small",
     "wake": {"file": "wake_slab_40s.nc", "time": "40 s", "spacing": "1 m"},
     "platform": {"speed": "70 m/s"},
     "lidar": {"pulse_duration": "10 ns"},
     "scan": {"range": "148.75 m"},
-    "render": {"samples_per_beam": 2, "max_order": 1},
+    "render": {"samples_per_beam": 64, "max_order": 1},
     "retrieval": {"methods": ["cc"], "stride": 2},
     "doppler": {
         "lidar": {"range": "150 m"},
@@ -51,12 +55,18 @@ def changed(**sections):
     return config.check(data, "small.yaml")
 
 
-@pytest.mark.usefixtures("variant")
-def test_the_whole_chain(tmp_path):
-    experiment = changed()
-    metrics = run(experiment, tmp_path / "run")
-    lines = xr.open_dataset(tmp_path / "run" / "lines_of_sight.nc", engine="h5netcdf")
-    wind = xr.open_dataset(tmp_path / "run" / "wind3d.nc", engine="h5netcdf")
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Folder and metrics of one run."""
+    mi.set_variant("llvm_ad_mono_polarized")
+    folder = tmp_path_factory.mktemp("whole") / "run"
+    return folder, run(changed(), folder)
+
+
+def test_the_whole_chain(whole):
+    folder, metrics = whole
+    lines = xr.open_dataset(folder / "lines_of_sight.nc", engine="h5netcdf")
+    wind = xr.open_dataset(folder / "wind3d.nc", engine="h5netcdf")
     assert lines.sizes["line"] == 15 == metrics["sensor.lines_read"]
     assert wind.attrs["Conventions"] == "CF-1.11" and {"u", "v", "w", "u_true"} <= set(wind)
     # read from rings, with the errors that the fit states
@@ -72,11 +82,92 @@ def test_the_whole_chain(tmp_path):
     margin = 1 - metrics["sensor.outside_cores.rmse_w"] / 2.5
     assert metrics["sensor.flight_control.landing.error_w.margin"] == pytest.approx(margin)
     assert metrics["sensor.doppler.pulses_per_second"] == 15 * 10 * 20
-    report = (tmp_path / "run" / "report.html").read_text()
+    report = (folder / "report.html").read_text()
     for text in ("flight control, from wind vectors, landing", "at most 2.5 m/s",
                  "safe for eyes from", "2.1 s later", "The wind from both lidars"):  # fmt: skip
         assert text in report, text
-    assert (tmp_path / "run" / "figures" / "fig20_wind3d.png").stat().st_size > 10_000
+    for name in ("fig19_lines_of_sight", "fig20_wind3d", "fig22_vortices"):
+        assert (folder / "figures" / f"{name}.png").stat().st_size > 10_000
+    # pictures, then the verdict, then numbers
+    order = ["what is required:", "<canvas", "data:image", 'id="verdict-1"', 'class="pass"',
+             'id="numbers-1"', "All numbers"]  # fmt: skip
+    places = [report.index(text) for text in order]
+    assert places == sorted(places)
+
+
+def test_the_vortices_are_told_and_kept(whole):
+    """On a grid of 1 m: circulation to 10 %, places to 1 m; the file says the same."""
+    folder, metrics = whole
+    fit = read_vortices(folder / "vortex.json")["images"]
+    for name in ("port_circulation_5_15", "starboard_circulation_5_15"):
+        assert metrics[f"vortex.images.{name}"] == pytest.approx(fit.quantities[name].value)
+        assert metrics[f"vortex.images.{name}"] == pytest.approx(
+            metrics[f"vortex.truth.{name}"], rel=0.1
+        )
+    assert abs(metrics["vortex.images.port_y"] - metrics["vortex.truth.port_y"]) < 1
+    with xr.open_dataset(folder / "wind3d.nc", engine="h5netcdf") as wind:
+        model = fit.wind(wind.y.values[None, :], wind.z.values[:, None])
+        rmse = np.sqrt(((model["w"].values - wind["w_true"].values) ** 2).mean())
+    # a grid a little smaller than the slab
+    assert metrics["vortex.images.rmse_w"] == pytest.approx(rmse, rel=0.2)
+    assert "From the images, circulation is off by" in (folder / "report.html").read_text()
+
+
+def again(whole, tmp_path, monkeypatch, spoil):
+    """The same run with its pictures as they are and its winds spoilt: the report's text."""
+    folder, _ = whole
+    shutil.copytree(folder, tmp_path / "run")
+    (tmp_path / "run" / "wind3d.nc").write_text("of another run")
+    kept = xr.open_dataset(folder / "lines_of_sight.nc", engine="h5netcdf").load()
+    wind = xr.open_dataset(folder / "wind.nc", engine="h5netcdf").load()
+    wind, kept = spoil(wind, kept)
+
+    monkeypatch.setattr(sensor_chain, "measure_lines", lambda *_: kept)
+    monkeypatch.setattr(backscatter_chain, "winds", lambda *_: wind)
+    monkeypatch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
+    monkeypatch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
+    monkeypatch.setattr(fringe_chain, "prepare", lambda _: lambda *_: ({}, None))
+    monkeypatch.setattr("lidar_mi.experiment.report.page", lambda *a: page(*without(a)))
+    run(changed(), tmp_path / "run")
+    return (tmp_path / "run" / "report.html").read_text(), tmp_path / "run"
+
+
+def without(arguments):
+    """A report's arguments without the chapter that was not run."""
+    *others, chapters, warnings = arguments
+    return *others, [chapter for chapter in chapters if chapter], warnings
+
+
+@pytest.mark.usefixtures("variant")
+def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
+    report, folder = again(
+        whole, tmp_path, monkeypatch,
+        lambda wind, lines: (wind.assign(flag=xr.full_like(wind["flag"], 4)), lines),
+    )  # fmt: skip
+    assert "Warning: no wind from both lidars: crossflow" in report
+    assert "no vortex pair from the wind vectors: vectors: none were found" in report
+    # what there is: the scan, the verdict on it, the pair in the images
+    for text in ("The scan of the Doppler lidar", "at most 2.5 m/s", "not known", "cannot be told",
+                 "From the images, circulation is off by"):  # fmt: skip
+        assert text in report, text
+    assert not (folder / "wind3d.nc").exists()
+    assert set(read_vortices(folder / "vortex.json")) == {"images"}
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["sensor.vectors"] == 0 and metrics["sensor.lines_read"] == 15
+    assert "sensor.triples.rmse_u" in metrics and "sensor.rmse_u" not in metrics
+
+
+@pytest.mark.usefixtures("variant")
+def test_lines_that_cannot_be_read_are_said_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
+    report, folder = again(
+        whole, tmp_path, monkeypatch,
+        lambda wind, lines: (wind, lines.assign(v_los=lines["v_los"] * np.nan)),
+    )  # fmt: skip
+    assert "Warning: no wind from both lidars: " in report
+    assert "0 of 15 lines of sight were read" in report
+    assert "From the images, circulation is off by" in report
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert "sensor.rmse_v_los" not in metrics
 
 
 def test_interpolation_is_exact_for_polynomials():

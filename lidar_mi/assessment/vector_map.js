@@ -1,0 +1,155 @@
+// Vectors of a wind field to be looked at one by one: hover, tap, or arrow keys. Needs nothing else.
+(() => {
+  "use strict";
+  const grey = "#bbb";
+  // viridis and a diverging map, sampled; colours between are linear
+  const speeds = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
+  const errors = [[33, 102, 172], [103, 169, 207], [215, 215, 215], [239, 138, 98], [178, 24, 43]];
+
+  function colour(scale, share) {
+    const at = Math.min(Math.max(share, 0), 1) * (scale.length - 1), k = Math.min(Math.floor(at), scale.length - 2);
+    return "rgb(" + scale[k].map((c, i) => Math.round(c + (at - k) * (scale[k + 1][i] - c))).join() + ")";
+  }
+
+  function highest(values, share) {
+    const known = values.filter(v => v !== null).map(Math.abs).sort((a, b) => a - b);
+    return known.length ? known[Math.floor(share * (known.length - 1))] || 1 : 1;
+  }
+
+  function start(box) {
+    const data = JSON.parse(box.querySelector("script").textContent);
+    const canvas = box.querySelector("canvas"), choice = box.querySelector("select");
+    const flagged = box.querySelector("input"), key = box.querySelector(".key");
+    const told = box.querySelector("tbody"), where = box.querySelector(".where");
+    const part = Object.fromEntries(data.components.map(c => [c.name, c]));
+    const { v, w } = part, many = data.y.length;
+    const difference = c => c.found.map((f, k) => f === null || c.true[k] === null ? null : f - c.true[k]);
+    const speed = v.found.map((f, k) => f === null || w.found[k] === null ? null : Math.hypot(f, w.found[k]));
+    const good = values => values.filter((_, k) => data.flag[k] === 0);
+    const fastest = highest([...good(speed), ...v.true.map((f, k) => f === null ? null : Math.hypot(f, w.true[k]))], 0.995);
+    const shown = [{ label: "speed of v and w", values: speed, scale: speeds, low: 0, high: fastest }];
+    for (const c of data.components) {
+      const off = difference(c), top = highest(good(off), 0.98);
+      shown.push({ label: "error of " + c.name, values: off, scale: errors, low: -top, high: top });
+    }
+    if (part.u) {
+      const top = highest(good(part.u.found), 0.995);
+      shown.push({ label: "u", values: part.u.found, scale: errors, low: -top, high: top });
+    }
+    shown.forEach((s, k) => choice.add(new Option(s.label, k)));
+
+    const half = data.step / 2;
+    const left = Math.max(...data.y) + half, right = Math.min(...data.y) - half;
+    const top = Math.max(...data.z) + half, bottom = Math.min(...data.z) - half;
+    let chosen = -1, width = 0, height = 0, unit = 1;
+
+    const px = (y, z) => [(left - y) * unit, (top - z) * unit];
+
+    function arrow(pen, y, z, v, w) {
+      // a step and a half long at the fastest; port is on the left
+      const long = 1.6 * data.step * unit / fastest, [x0, y0] = px(y, z);
+      const dx = -v * long, dy = -w * long, size = Math.hypot(dx, dy), head = Math.min(4, 0.4 * size);
+      const a = Math.atan2(dy, dx);
+      pen.beginPath();
+      pen.moveTo(x0, y0);
+      pen.lineTo(x0 + dx, y0 + dy);
+      for (const turn of [2.6, -2.6]) {
+        pen.moveTo(x0 + dx, y0 + dy);
+        pen.lineTo(x0 + dx + head * Math.cos(a + turn), y0 + dy + head * Math.sin(a + turn));
+      }
+      pen.stroke();
+    }
+
+    function draw() {
+      width = canvas.clientWidth;
+      unit = width / (left - right);
+      height = Math.round((top - bottom) * unit);
+      canvas.style.height = height + "px";
+      const dense = window.devicePixelRatio || 1;
+      canvas.width = width * dense;
+      canvas.height = height * dense;
+      const pen = canvas.getContext("2d"), what = shown[choice.value];
+      pen.scale(dense, dense);
+      pen.lineWidth = Math.max(1, unit * data.step / 12);
+      for (let k = 0; k < many; k++) {
+        if (v.found[k] === null || w.found[k] === null) continue;
+        if (data.flag[k] !== 0 && !flagged.checked) continue;
+        const value = what.values[k], share = (value - what.low) / (what.high - what.low);
+        pen.strokeStyle = data.flag[k] !== 0 || value === null ? grey : colour(what.scale, share);
+        arrow(pen, data.y[k], data.z[k], v.found[k], w.found[k]);
+      }
+      pen.strokeStyle = "crimson";
+      pen.lineWidth = 1.5;
+      for (const [y, z] of data.cores) {
+        const [x, up] = px(y, z);
+        pen.beginPath();
+        pen.moveTo(x - 6, up); pen.lineTo(x + 6, up); pen.moveTo(x, up - 6); pen.lineTo(x, up + 6);
+        pen.stroke();
+      }
+      if (chosen >= 0) {
+        const [x, up] = px(data.y[chosen], data.z[chosen]);
+        pen.strokeStyle = "#000";
+        pen.beginPath();
+        pen.arc(x, up, 7, 0, 7);
+        pen.stroke();
+        pen.strokeStyle = "#d62728";
+        if (v.true[chosen] !== null) arrow(pen, data.y[chosen], data.z[chosen], v.true[chosen], w.true[chosen]);
+      }
+      key.style.background = "linear-gradient(to right," + what.scale.map(c => "rgb(" + c + ")") + ")";
+      box.querySelector(".low").textContent = what.low.toFixed(1);
+      box.querySelector(".high").textContent = what.high.toFixed(1) + " m/s";
+    }
+
+    function tell(k) {
+      if (k === chosen || k < 0) return;
+      chosen = k;
+      const number = value => value === null || value === undefined ? "\u2013" : value.toFixed(2);
+      const reasons = Object.entries(data.flags).filter(([mask]) => data.flag[k] & mask).map(([, text]) => text);
+      where.textContent = "y = " + data.y[k].toFixed(1) + " m, z = " + data.z[k].toFixed(1) + " m: " +
+        (reasons.length ? "rejected, " + reasons.join(", ") : "good");
+      told.replaceChildren(...data.components.map(c => {
+        const row = document.createElement("tr"), f = c.found[k], t = c.true[k];
+        const off = f === null || t === null ? null : f - t;
+        for (const text of [c.name, number(f), number(t), number(off), number(c.stderr && c.stderr[k])]) {
+          row.append(Object.assign(document.createElement("td"), { textContent: text }));
+        }
+        return row;
+      }));
+      draw();
+    }
+
+    function nearest(y, z) {
+      let best = -1, least = Infinity;
+      for (let k = 0; k < many; k++) {
+        if (data.flag[k] !== 0 && !flagged.checked) continue;
+        const far = (data.y[k] - y) ** 2 + (data.z[k] - z) ** 2;
+        if (far < least) { least = far; best = k; }
+      }
+      return best;
+    }
+
+    function point(event) {
+      const edge = canvas.getBoundingClientRect();
+      tell(nearest(left - (event.clientX - edge.left) / unit, top - (event.clientY - edge.top) / unit));
+    }
+
+    canvas.addEventListener("pointermove", point);
+    canvas.addEventListener("pointerdown", point);
+    canvas.addEventListener("keydown", event => {
+      const step = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
+      if (!step || chosen < 0) return;
+      event.preventDefault();
+      tell(nearest(data.y[chosen] + step[0] * data.step, data.z[chosen] + step[1] * data.step));
+    });
+    choice.addEventListener("change", draw);
+    flagged.addEventListener("change", draw);
+    window.addEventListener("resize", draw);
+    flagged.checked = !data.flag.some(bits => bits === 0);
+    box.hidden = false;
+    draw();
+    const [y, z] = data.cores.length ? data.cores[0] : [0, 0];
+    tell(nearest(y, z + 4));
+  }
+
+  document.querySelectorAll(".map").forEach(start);
+})();
