@@ -11,6 +11,7 @@ from pathlib import Path
 from . import (
     __version__,
     backscatter_chain,
+    budget_chain,
     config,
     fringe_chain,
     sensor_chain,
@@ -61,6 +62,8 @@ def prepare(
     chains = []
     if experiment.wake:
         chains.append(backscatter_chain.prepare(experiment, beside, notice))
+    if experiment.wake and experiment.retrieval.error_budget:
+        chains.append(budget_chain.prepare(experiment, beside))
     if experiment.doppler:
         chains.append(fringe_chain.prepare(experiment))
     if experiment.sensor:
