@@ -17,6 +17,7 @@ _SPEED = "m s$^{-1}$"
 
 # rows of the comparison: key, name, unit; {} stands for a method's winds
 _ROWS = (
+    ("backscatter.mc_relative_error", "Monte Carlo noise of a pixel over its signal, median", ""),
     ("detector.signal", "photoelectrons of a pixel, median", ""),
     ("detector.noise.all", "noise of a pixel over its signal, median", ""),
     ("backscatter.multiple_scattering_fraction", "share of multiple scattering", ""),

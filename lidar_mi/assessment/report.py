@@ -135,6 +135,12 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
                 f"{pair.model.replace('_', ' ')} vortices, circulation {pair.circulation:g} m^2/s, "
                 f"separation {pair.separation:g} m, core radius {pair.core_radius:g} m"
             )
+        elif wake.turbine:
+            rotor = wake.turbine
+            flow = (
+                f"wake of a turbine of {rotor.diameter:g} m, thrust coefficient {rotor.thrust:g}, in wind "
+                f"of {rotor.wind_speed:g} m/s with a turbulence of {rotor.turbulence:.0%}"
+            )
         else:
             when = "" if wake.time is None else f" at {wake.time:g} s"
             flow = f"{wake.file}{when}, {wake.spacing:g} m grid"
