@@ -7,6 +7,7 @@ median over the turns, because machines are noisy and differ.
 estimators   the gated estimator against the analog one
 transient    the renderer against mitransient's volumetric integrator
 velocimetry  cross-correlation against OpenPIV
+rendered     wind from rendered pictures by all methods, and the share of every cause of error
 renderer     speed and memory of the renderer alone
 rings        wind from ring pictures, all rings at once, against a 2-D fit and scipy
 """

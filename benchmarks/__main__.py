@@ -10,7 +10,10 @@ from rich.console import Console
 from . import report
 from .measure import fresh_process
 
-COMPARISONS = ("estimators", "dense", "transient", "velocimetry", "methods", "renderer", "fringes", "rings")
+COMPARISONS = (
+    "estimators", "dense", "transient", "velocimetry", "methods", "rendered", "renderer", "fringes",
+    "rings",
+)  # fmt: skip
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,14 +1,14 @@
 """What limits the cross-flow wind of an experiment: found again without each cause of error."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import xarray as xr
 
 from .assessment.budget_report import budget_chapter, draw_all
-from .assessment.cores import find_cores
+from .assessment.cores import Core, find_cores
 from .assessment.error_budget import error_budget, picture_unit, pictures_without
 from .assessment.report import Chapter
 from .atmosphere.advection import advect
@@ -37,7 +37,7 @@ def _run(experiment, truth, folder, log) -> tuple[dict[str, float], Chapter]:
     methods = experiment.retrieval.methods
     metrics = {
         f"error_budget.{method}.{key}": value
-        for method, budget in budgets(experiment, truth, scans, log, known).items()
+        for method, budget in budgets(experiment, truth, scans, log.bar, known).items()
         for key, value in budget.items()
     }
     drawn = draw_all(folder / "figures", metrics, methods, log)
@@ -49,8 +49,9 @@ def budgets(
     experiment: Experiment,
     truth: Truth,
     scans,
-    log,
+    progress: Callable[[str, float], None] = lambda text, share: None,
     known: xr.Dataset | None = None,
+    cores: Sequence[Core] | None = None,
     flagged: bool = False,
 ) -> dict[str, dict[str, float]]:
     """`error_budget` of every method of an experiment, by method.
@@ -58,13 +59,15 @@ def budgets(
     Parameters
     ----------
     scans : the two rendered scans
+    progress : callable, optional
+        Told what is done, and its share.
     known : xr.Dataset, optional
         Winds that need not be found again, from `lidar_mi.backscatter_chain.winds`.
-    flagged : bool
-        See `error_budget`.
+    cores, flagged : optional
+        See `error_budget`; cores left out: those of the true wind.
     """
     pictures = _pictures(experiment, truth, scans)
-    cores = find_cores(truth.wind)
+    cores = find_cores(truth.wind) if cores is None else cores
     methods = experiment.retrieval.methods
     settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
     sources = {"seen": "backscatter", "perfect": "extinction"}
@@ -72,7 +75,7 @@ def budgets(
         sources |= {"seen": NOISY, "detector_noise": "backscatter"}
     found = {}
     for index, method in enumerate(methods):
-        log.bar(f"finding what limits {method}", index / len(methods))
+        progress(f"finding what limits {method}", index / len(methods))
         winds = {}
         for cause, (pair, noise) in pictures.items():
             source = sources.get(cause)

@@ -33,6 +33,7 @@ from benchmarks import (
     fringes,
     measure,
     methods,
+    rendered,
     renderer,
     report,
     transient,
@@ -331,3 +332,20 @@ def test_error_of_the_true_wind_is_zero_at_its_place():
     assert methods.rms_errors(pair, methods.Field(dz, dy, 0.0, 0.0)) == pytest.approx((0, 0))
     off = methods.rms_errors(pair, methods.Field(dz, dy + 0.1, 0.0, 0.0))
     assert off == pytest.approx((0.5, 0.5))
+
+
+def test_rendered_pictures_have_a_row_for_every_energy_and_method(monkeypatch):
+    monkeypatch.setattr(rendered, "ENERGIES", (1e-4, 1e-2))
+    found = rendered.compare(1, 60, 50, 16, ("cc", "multipass"))
+    dark, bright = (
+        [line for line in found.rows if line.case.startswith(energy)]
+        for energy in ("0.1 mJ", "10 mJ")
+    )
+    for weak, strong in zip(dark, bright, strict=True):
+        # a hundredth of the light: noise decides, and takes the largest share
+        assert 0 < strong.ours < weak.ours and 0 < strong.other < weak.other
+        shares = dict(part.split(" ", 1) for part in weak.note.split(", "))
+        everywhere = {cause: float(text.split(" / ")[0]) for cause, text in shares.items()}
+        assert max(everywhere, key=everywhere.get) == "detector" and everywhere["detector"] > 50
+        assert {"simulation", "beam", "window", "method"} < set(shares)
+    assert "paths" in dark[0].note and "paths" not in dark[1].note

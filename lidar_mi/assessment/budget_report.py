@@ -95,18 +95,22 @@ def limit_sentence(metrics: Mapping[str, float], method: str) -> str:
         prefix, where = f"{prefix}outside_cores.", " beyond two core radii"
     shares = {cause: metrics[f"{prefix}{cause}.share"] for cause in causes}
     ranked = sorted(causes, key=shares.get, reverse=True)
-    parts = [f"{CAUSES[c]} ({shares[c]:.0%})" for c in ranked if shares[c] >= _LEAST][:3]
-    error = f"{_both(metrics, prefix):.2g} m/s"
+    parts = [f"{CAUSES[c]} ({100 * shares[c]:.0f} %" for c in ranked if shares[c] >= _LEAST][:3]
+    error = f"{_both(metrics, prefix):.2f} m/s"
     if not parts:
         return (
-            f"The wind by {name} is off by {error} rms{where}; no single cause has "
-            f"{_LEAST:.0%} of the mean square error."
+            f"The wind by {name} is off by {error} rms{where}; no single cause has {100 * _LEAST:.0f} % "
+            "of the mean square error."
         )
-    then = f", then by {' and '.join(parts[1:])}" if parts[1:] else ""
-    return (
-        f"The wind by {name} is off by {error} rms{where}, limited by {parts[0]}{then} of the mean "
-        "square error."
+    text = (
+        f"The wind by {name} is off by {error} rms{where}, limited by "
+        + "), then ".join([f"{parts[0]} of the mean square error", *parts[1:]]) + ")."
     )
+    if ranked[0] == "monte_carlo":
+        text += (
+            " That noise is not the lidar's: more photons a beam (render.samples_per_beam) lower it."
+        )
+    return text
 
 
 def budget_chapter(
@@ -125,8 +129,8 @@ def budget_chapter(
         heading="Errors without each cause in turn",
         legend="Rms errors in m/s of v and w, and the share of the mean square error of both that goes "
         "with the cause: over valid vectors, always the same, and over those beyond two core radii. "
-        "Noise is taken out as it fell, not drawn anew. The method on perfect pictures: what it is "
-        "off by on the air as it is, without blur and noise.",
+        "Noise is taken out as it fell, not drawn anew. The method itself: what it is off by "
+        "on pictures of the air as it is, without blur and noise.",
         tables=[_table(metrics, method) for method in methods],
     )
     lead = [limit_sentence(metrics, method) for method in methods]

@@ -15,13 +15,13 @@ from .cores import Core, outside_cores
 from .errors import truth_at_vectors
 
 CAUSES = {
-    "detector_noise": "detector's noise",
-    "monte_carlo": "simulation's noise (Monte Carlo)",
-    "beam_blur": "beam's width",
+    "detector_noise": "noise of the detector",
+    "monte_carlo": "noise of the simulation",
+    "beam_blur": "width of the beam",
     "slab": "what the slab's mean wind does not carry",
     "window": "averaging over the window",
     "time_step": "curved paths in the time step",
-    "method": "the method on perfect pictures",
+    "method": "the method itself",
 }
 """Causes of error by key, and how they are called."""
 
