@@ -1,0 +1,218 @@
+"""Variants of one experiment: read, run, compared.
+
+Detects changes that reach another variant or are lost, faults that do not name the variant and key,
+a comparison that leaves a variant out or sets the wrong number beside it, and shipped
+experiments that cannot be read or do not fit together.
+"""
+
+import json
+import re
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+import yaml
+from matplotlib.image import imread
+
+from lidar_mi import backscatter_chain, config, experiment, study
+from lidar_mi.assessment.comparison import differences, flat
+from lidar_mi.errors import InputError
+
+SCENES = Path(str(files("lidar_mi.scenes"))).resolve()
+PAIR = {"circulation": 150, "separation": 16, "core_radius": 2, "width": 30, "height": 20}
+SMALL = {
+    "name": "two",
+    "wake": {"vortex_pair": PAIR, "spacing": 1},
+    "lidar": {"pulse_duration": "10 ns"},
+    "render": {"samples_per_beam": 4, "max_order": 1},
+    "retrieval": {"methods": ["cc"]},
+    "variants": {
+        "near": {"scan": {"range": "150 m"}, "lidar": {"fov_half": "6 mrad"}},
+        "far": {"scan": {"range": "500 m"}, "detector": {}},
+    },
+}
+
+
+@pytest.fixture
+def file(tmp_path):
+    """Writes an experiment file with some top-level keys replaced."""
+
+    def write(**changes):
+        path = tmp_path / "two.yaml"
+        path.write_text(yaml.safe_dump(SMALL | changes, sort_keys=False))
+        return path
+
+    return write
+
+
+def test_each_variant_changes_its_own_keys(file):
+    found = config.load_variants(file())
+    near, far = found["near"], found["far"]
+    assert list(found) == ["near", "far"] and near.name == "two.near"
+    assert (near.scan.range, far.scan.range) == (150, 500)
+    assert near.lidar.fov_half == pytest.approx(6e-3) and far.lidar.fov_half == pytest.approx(5e-3)
+    assert near.lidar.pulse_duration == 1e-8 == far.lidar.pulse_duration
+    assert near.detector is None and far.detector is not None
+
+
+def test_null_takes_a_section_away(file):
+    path = file(detector={}, variants={"dark": {"detector": None}, "lit": {}})
+    found = config.load_variants(path)
+    assert found["dark"].detector is None and found["lit"].detector is not None
+
+
+def test_overrides_count_for_all_or_for_one(file):
+    sets = ["seed=7", "scan.range=300 m", "variants.near.scan.thickness=1 m"]
+    found = config.load_variants(file(), sets)
+    assert {one.seed for one in found.values()} == {7}
+    assert [one.scan.range for one in found.values()] == [300, 300]
+    assert [one.scan.thickness for one in found.values()] == [1, 2.5]
+
+
+def test_plain_files_have_none(file):
+    assert config.load_variants(SCENES / "wake_backscatter.yaml") == {}
+    with pytest.raises(InputError, match="variants: not allowed for a single experiment"):
+        config.load(file())
+
+
+@pytest.mark.parametrize(
+    ("variants", "message"),
+    [
+        ({}, "variants: {} is not allowed"),
+        ([1], "variants: [1] is not allowed"),
+        ({"near": 3}, "variants.near: 3 is not allowed; expected keys to change"),
+        ({"a/b": {}}, "variants.a/b: not allowed; expected a name of letters"),
+        ({"near": {"name": "x"}}, "variants.near.name: not allowed"),
+        ({"near": {"scan": {"rnage": 1}}}, "variants.near: scan.rnage: unknown key; did you mean range?"),
+        ({"near": {"seed": -1}}, "variants.near: seed: -1"),
+    ],
+)
+def test_faults_name_the_variant(file, variants, message):
+    with pytest.raises(InputError) as error:
+        config.load_variants(file(variants=variants))
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.usefixtures("variant")
+def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
+    monkeypatch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
+    monkeypatch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
+    folder, told = tmp_path / "out", []
+    variants = config.load_variants(file())
+    found = study.run("two", variants, folder, notice=lambda text, _: told.append(text))
+    assert {text.split(":")[0] for text in told} >= {"near", "far"}
+    merged = json.loads((folder / "metrics.json").read_text())
+    for name in variants:
+        alone = json.loads((folder / name / "metrics.json").read_text())
+        assert alone == found[name]
+        assert {key: merged[f"{name}.{key}"] for key in alone} == alone
+        assert (folder / name / "report.html").is_file()
+    page = (folder / "report.html").read_text()
+    assert '<a href="near/report.html">' in page and '<a href="far/report.html">' in page
+    cells = dict(re.findall(r"<tr><td>([^<]+)</td><td>[^<]*</td><td>([^<]+)</td><td>", page))
+    assert cells["scan.range"] == "150.0 m"
+    assert float(cells["hazard distance of a beam, naked eye"]) == pytest.approx(
+        found["near"]["safety.hazard_distance"], rel=5e-3
+    )
+    assert imread(folder / "figures" / "fig00_comparison.png").std() > 0.05
+    # again: nothing is rendered; other things are not overwritten
+    before = (folder / "near" / "image_t1.exr").stat().st_mtime_ns
+    study.run("two", variants, folder)
+    assert (folder / "near" / "image_t1.exr").stat().st_mtime_ns == before
+    with pytest.raises(InputError, match="is no study's folder"):
+        study.run("two", variants, tmp_path)
+
+
+def test_a_fault_in_the_last_stops_the_first(file, tmp_path):
+    """What a chain finds out ahead is said before anything is written."""
+    variants = SMALL["variants"] | {"bad": {"retrieval": {"template": 60, "search": 70}}}
+    with pytest.raises(InputError):
+        study.run("two", config.load_variants(file(variants=variants)), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_differences_of_settings():
+    one, other = {"a": {"b": 1, "c": [1]}, "name": "x"}, {"a": {"b": 2, "c": [1]}, "d": 3, "name": "y"}
+    assert differences({"x": flat(one), "y": flat(other)}) == {"a.b": [1, 2], "d": [None, 3]}
+
+
+# --- what ships ---------------------------------------------------------------------------------
+
+
+def shipped():
+    """Every shipped experiment, and every variant of one, on a coarser grid."""
+    for path in sorted(SCENES.glob("*.yaml")):
+        coarse = ["wake.spacing=1 m"] if "wake" in yaml.safe_load(path.read_text()) else []
+        variants = config.load_variants(path, coarse)
+        yield from ((one.name, one) for one in variants.values() or [config.load(path, coarse)])
+
+
+def test_shipped_experiments_are_documented():
+    """Each has a page that says what it finds."""
+    pages = {page.stem for page in (SCENES.parent / "docs" / "experiments").glob("*.md")} - {"index"}
+    assert pages and pages <= {path.stem for path in SCENES.glob("*.yaml")}
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize(("name", "one"), list(shipped()))
+def test_shipped_experiments_fit_together(name, one):
+    """Everything that a run checks before it writes: files, tables, lines of sight within the wake."""
+    experiment.prepare(one, SCENES)
+
+
+# what makes a shipped experiment small; what it is about stays
+SMALLER = (
+    "wake.spacing=1 m", "render.samples_per_beam=8", "render.max_order=1", "retrieval.methods=[cc]",
+    "retrieval.stride=4", "seed=2",
+)  # fmt: skip
+SMALLER_SENSOR = (
+    "sensor.method=cc", "sensor.crossflow_std=0.5 m/s", "sensor.pulses=5", "doppler.ccd.full_well=1e6",
+    "doppler.camera={pixel: 29.6 um, width: 240, height: 195}", "doppler.render.samples_per_pixel=16",
+    "doppler.retrieval={methods: [annular], averaged: [1], images: 2, slow_images: 0}",
+)  # fmt: skip
+
+
+def small_run(name, folder, more=()):
+    path = SCENES / f"{name}.yaml"
+    sets = [*SMALLER, *more]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
+        patch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
+        variants = config.load_variants(path, sets)
+        if variants:
+            return study.run(name, variants, folder, SCENES)
+        return experiment.run(config.load(path, sets), folder, SCENES)
+
+
+@pytest.mark.usefixtures("variant")
+def test_turbine_is_seen_by_both(tmp_path):
+    """The deficit from lines of sight, to 0.5 m/s; and no look-ahead time of a platform that stands."""
+    metrics = small_run("turbine", tmp_path / "run", SMALLER_SENSOR)
+    assert metrics["sensor.lines_read"] == 63
+    assert metrics["sensor.rmse_u"] < 0.5
+    assert metrics["backscatter.cc.rmse_v"] < 0.8 * metrics["true_wind.rms_v"]
+    assert "The platform stands still" in (tmp_path / "run" / "report.html").read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("variant")
+def test_nearer_light_is_stronger(tmp_path):
+    """Photons of a direction go with 1 / r^2 and the air between; lines are read better by as much."""
+    found = small_run("near_range", tmp_path / "run", SMALLER_SENSOR)
+    far, near = found["at_150m"], found["at_76m"]
+    ratio = near["sensor.doppler.photons_per_direction"] / far["sensor.doppler.photons_per_direction"]
+    assert ratio == pytest.approx((150 / 76) ** 2, rel=0.01)
+    assert near["sensor.rmse_v_los"] < far["sensor.rmse_v_los"]
+    for one in found.values():
+        assert one["sensor.rmse_u"] < 1 and one["backscatter.cc.rmse_v"] < 1.5
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("variant")
+def test_infrared_and_ultraviolet_may_be_strong(tmp_path):
+    """At what eyes may look into from 10 m on, green light is lost in its noise, others are not."""
+    found = small_run("eye_safe", tmp_path / "run")
+    for one in found.values():
+        assert one["safety.scan_hazard_distance"] < 10.5
+    noise = {name: one["detector.noise.all"] for name, one in found.items()}
+    assert max(noise["nm355"], noise["nm1550"]) < 0.2 < noise["nm532"]
