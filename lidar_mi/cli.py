@@ -84,6 +84,8 @@ def run(
     for name, asked in (("wind.nc", loaded.wake), ("v_los.nc", loaded.doppler)):
         if asked:
             _out.print(f"winds    {folder / name}")
+    if "timing.vortex_s" in metrics:
+        _out.print(f"vortices {folder / 'vortex.json'}")
 
 
 def _run_study(variants, out, path, overwrite, start) -> None:

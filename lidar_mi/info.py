@@ -9,6 +9,7 @@ from .atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphe
 from .atmosphere.particles import AEROSOLS, Notice, aerosol_table
 from .atmosphere.scattering import describe, read_table
 from .errors import InputError
+from .retrieval.vortex_file import read_vortices
 
 MOLECULES = "molecules"
 
@@ -44,6 +45,7 @@ def sections(
         raise InputError(f"--altitude: not allowed with {what}; expected {MOLECULES}")
     kinds = {
         ".exr": _picture, ".nc": _netcdf, ".nc4": _netcdf, ".cdf": _netcdf, ".txt": _table_file,
+        ".json": _vortices,
     }  # fmt: skip
     if named:
         wavelength = wavelength or 532e-9
@@ -53,7 +55,7 @@ def sections(
             yield _scatterer(what, aerosol_table(what, wavelength, notice))
     elif not path.exists():
         raise InputError(
-            f"{what}: no such file; expected .exr, .nc, .txt, a run folder, {MOLECULES} or one "
+            f"{what}: no such file; expected .exr, .nc, .txt, .json, a run folder, {MOLECULES} or one "
             f"of the aerosols {', '.join(AEROSOLS)}"
         )
     elif path.is_dir():
@@ -62,9 +64,18 @@ def sections(
         yield from kinds[path.suffix](path)
     else:
         raise InputError(
-            f"{path}: unknown kind of file; expected .exr, .nc, .txt (scattering table) or a run "
-            "folder"
+            f"{path}: unknown kind of file; expected .exr, .nc, .txt (scattering table), "
+            ".json (vortex pairs) or a run folder"
         )
+
+
+def _vortices(path: Path) -> Iterator[Section]:
+    for name, fit in read_vortices(path).items():
+        rows = [
+            (quantity.long_name, f"{quantity.value:.4g} \u00b1 {quantity.stderr:.2g}", quantity.units)
+            for quantity in fit.quantities.values()
+        ]
+        yield f"{path}: vortex pair, {name}, {fit.profile.replace('_', ' ')}", rows
 
 
 def _scatterer(title: str, table) -> Section:

@@ -41,13 +41,13 @@ def _run(experiment, truth, folder, log) -> tuple[dict[str, float], Chapter]:
     start = time.perf_counter()
     log("fitting vortex pairs")
     picture, vectors = _seen(experiment, folder)
+    ways = {"images": lambda: fit_vortices(*picture[0], experiment.platform.dt, picture[1])}
+    if experiment.sensor or vectors is not None:
+        ways["vectors"] = lambda: _from_vectors(vectors)
     fits, refused = {}, {}
-    for name, fit in (
-        ("images", lambda: fit_vortices(*picture[0], experiment.platform.dt, picture[1])),
-        ("vectors", lambda: _from_vectors(vectors)),
-    ):
+    for name, way in ways.items():
         try:
-            found = fit()
+            found = way()
         except InputError as error:
             refused[name] = str(error)
             continue

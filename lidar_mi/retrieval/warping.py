@@ -42,7 +42,8 @@ class Spline(NamedTuple):
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
         """A field on the images' pixels after the images' filter; it is zero beyond them."""
         sizes = [scipy.fft.next_fast_len(n + _MARGIN, real=True) for n in self.shape]
-        ring = _ring(_frequencies(sizes, field), self.shape)
+        # sizes of another parity may reach one ring further
+        ring = _ring(_frequencies(sizes, field), self.shape).clamp(max=len(self.gain) - 1)
         smooth = torch.fft.irfft2(torch.fft.rfft2(field, s=sizes) * self.gain[ring], s=sizes)
         return smooth[..., : self.shape[0], : self.shape[1]]
 

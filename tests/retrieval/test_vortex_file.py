@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lidar_mi.errors import InputError
+from lidar_mi.info import sections
 from lidar_mi.retrieval.vortex_file import read_vortices, write_vortices
 from lidar_mi.retrieval.vortex_fit import VortexPairFit
 
@@ -68,3 +69,11 @@ def test_what_is_no_file_of_pairs_is_named(tmp_path):
         with pytest.raises(InputError) as error:
             read_vortices(path)
         assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_info_tells_a_pair(tmp_path):
+    write_vortices(tmp_path / "vortex.json", {"images": some_pair()})
+    ((title, rows),) = sections(str(tmp_path / "vortex.json"))
+    assert "images" in title and "lamb oseen" in title
+    ((_, value, units),) = [row for row in rows if row[0] == "circulation of the port vortex"]
+    assert value.startswith("400 ") and units == "m2 s-1"

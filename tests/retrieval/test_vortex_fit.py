@@ -33,6 +33,7 @@ from lidar_mi.retrieval.vortex_model import (
     sensitivity,
     wind,
 )
+from lidar_mi.retrieval.warping import band_limited
 from lidar_mi.retrieval.wind import retrieve_wind
 from lidar_mi.truth import make_truth
 
@@ -318,6 +319,16 @@ def test_nothing_is_made_up():
         found = fit_vortices(*images, DT, noise=0.05)
         assert not found.success
         assert any(reason in text for text in found.reasons), (reason, found.reasons)
+
+
+def test_the_filter_takes_any_size():
+    """Paddings of unlike parity reach unlike corners of the spectrum: 81 x 61 px did not run."""
+    random = np.random.default_rng(4)
+    for shape in ((61, 81), (60, 81), (41, 43), (62, 102)):
+        spline, _ = band_limited(torch.as_tensor(random.standard_normal((2, *shape))), 0.5)
+        field = torch.ones(shape, dtype=torch.float64)
+        middle = spline.filtered(field)[shape[0] // 2, shape[1] // 2]
+        assert spline.filtered(field).shape == shape and torch.isfinite(middle)
 
 
 def test_bad_input_is_named():

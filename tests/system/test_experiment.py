@@ -38,6 +38,7 @@ from lidar_mi.rendering.exr import read_scan
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.images import on_one_grid
+from lidar_mi.retrieval.vortex_file import read_vortices
 from lidar_mi.retrieval.wind import retrieve_wind
 from lidar_mi.run_folder import IMAGES
 from lidar_mi.truth import blur_by_beam, make_truth
@@ -1048,6 +1049,20 @@ def test_beams_wider_than_a_template_are_told_of(tmp_path, quick):
     log = (tmp_path / "run" / "log.txt").read_text()
     for text in warnings:
         assert text.removeprefix("warning: ") in page and text in log
+
+
+def test_air_without_vortices_is_told_of(tmp_path, quick):
+    """Nothing turns: the report says that, and shows the rest."""
+    data = small(texture={"rms": 0.3, "outer_scale": "5 m"})
+    data["wake"]["vortex_pair"]["circulation"] = 1e-3
+    data["retrieval"] = {"methods": ["vortex_fit"]}
+    metrics = run(check(data), tmp_path / "run")
+    page = (tmp_path / "run" / "report.html").read_text()
+    assert "Warning: no vortex pair from the images: " in page
+    assert "No pair from the images: " in page and "How well the vortices are known" in page
+    assert not [key for key in metrics if key.startswith("vortex.")]
+    assert read_vortices(tmp_path / "run" / "vortex.json") == {}
+    assert "vortex fit" in page
 
 
 def test_true_wind_is_as_strong_as_it_is(tmp_path, quick):
