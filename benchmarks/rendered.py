@@ -30,7 +30,7 @@ ENERGIES = (1e-3, 10e-3, 100e-3)
 EXTINCTION = 1e-3
 SHORT = {
     "detector_noise": "detector", "monte_carlo": "simulation", "beam_blur": "beam",
-    "window": "window", "time_step": "paths", "method": "method",
+    "window": "window", "shear": "shear", "time_step": "paths", "method": "method",
 }  # fmt: skip
 
 
@@ -78,7 +78,7 @@ def compare(
             (
                 f"Remark: by how many per cent the mean square error of v falls without a cause, "
                 f"everywhere / beyond 2 core radii: the detector's noise; the simulation's "
-                f"({samples} photons a beam); the beam's width; averaging over the window; curved "
+                f"({samples} photons a beam); the beam's width; averaging over the window; shear within it; curved "
                 "paths in the time step; the method on perfect pictures. They need not add up."
             ),
         ),

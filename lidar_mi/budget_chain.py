@@ -9,7 +9,12 @@ import xarray as xr
 
 from .assessment.budget_report import budget_chapter, draw_all
 from .assessment.cores import Core, find_cores
-from .assessment.error_budget import error_budget, picture_unit, pictures_without
+from .assessment.error_budget import (
+    error_budget,
+    moved_as_one,
+    picture_unit,
+    pictures_without,
+)
 from .assessment.report import Chapter
 from .atmosphere.advection import advect
 from .backscatter_chain import NOISY, rendered_pairs, scan_plans, window_settings
@@ -66,7 +71,7 @@ def budgets(
     cores, flagged : optional
         See `error_budget`; cores left out: those of the true wind.
     """
-    pictures = _pictures(experiment, truth, scans)
+    pictures, blurred = _pictures(experiment, truth, scans)
     cores = find_cores(truth.wind) if cores is None else cores
     methods = experiment.retrieval.methods
     settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
@@ -85,12 +90,22 @@ def budgets(
             else:
                 winds[cause] = retrieve_wind(*pair, method=method, noise=noise, **settings)
         seen, perfect = winds.pop("seen"), winds.pop("perfect")
+        stiff = moved_as_one(
+            seen, pictures["seen"][0], blurred, truth.wind,
+            lambda pair, stride, method=method: retrieve_wind(
+                *pair, method=method, **settings | {"stride": stride}
+            ),
+        )  # fmt: skip
+        winds |= {} if stiff is None else {"shear": stiff}
         found[method] = error_budget(seen, winds, truth.wind, cores, perfect, flagged)
     return found
 
 
-def _pictures(experiment, truth, scans) -> dict[str, tuple]:
-    """Pictures and their noise: as they are seen, without each cause, and of the air as it is."""
+def _pictures(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataArray]]:
+    """Pictures and their noise: as they are seen, without each cause, and of the air as it is.
+
+    Beside them the air as beams see it.
+    """
     rendered = rendered_pairs(experiment, scans)
     pair, noise = rendered["backscatter"]
     seen, level = rendered.get(NOISY, (pair, noise))
@@ -116,8 +131,9 @@ def _pictures(experiment, truth, scans) -> dict[str, tuple]:
         moved = advect(air[0], truth.wind["v"], truth.wind["w"], experiment.platform.dt)
         carried = as_seen([air[0], moved])
     sharp = as_seen(air, blurred=False)
+    blurred = as_seen(air)
     without = pictures_without(
-        seen, as_seen(air), sharp, pair if experiment.detector else None, carried
+        seen, blurred, sharp, pair if experiment.detector else None, carried
     )
     # without the simulation's noise the detector's is left, if there is one
     counts = np.sqrt(np.maximum(level**2 - noise**2, 0)) if experiment.detector else 0.0
@@ -126,4 +142,4 @@ def _pictures(experiment, truth, scans) -> dict[str, tuple]:
         "seen": (seen, level),
         "perfect": (sharp, 0.0),
         **{cause: (images, levels.get(cause, level)) for cause, images in without.items()},
-    }
+    }, blurred

@@ -4,7 +4,7 @@ Causes that act on the pictures are taken out of them and the wind is found agai
 what a vector means are taken out of the truth it is compared with.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
@@ -20,6 +20,7 @@ CAUSES = {
     "beam_blur": "width of the beam",
     "slab": "what the slab's mean wind does not carry",
     "window": "averaging over the window",
+    "shear": "shear within the window",
     "time_step": "curved paths in the time step",
     "method": "the method itself",
 }
@@ -180,6 +181,73 @@ def window_mean(truth: xr.Dataset, template: int, method: str) -> xr.Dataset | N
     return xr.Dataset({n: (("z", "y"), w.mean((2, 3))) for n, w in windows.items()}, axes)
 
 
+def moved_as_one(
+    found: xr.Dataset,
+    seen: Pair,
+    blurred: Pair,
+    truth: xr.Dataset,
+    retrieve: Callable[[Pair, int], xr.Dataset],
+) -> xr.Dataset | None:
+    """The wind found where the air of every window moves as one, by the window's mean wind.
+
+    Shear deforms what a window holds, so that its two pictures do not match at any shift. Here every
+    window's search region is a picture of its own, all of them laid side by side: the second shows
+    the blurred air of the first, carried by the mean wind over the template, and what the second
+    picture seen has besides its own blurred air.
+
+    Parameters
+    ----------
+    found : xr.Dataset
+        From `retrieve_wind`; its attributes say method, template, search, stride and dt.
+    seen, blurred : pair
+        See `pictures_without`.
+    truth : xr.Dataset
+        v, w on (z, y).
+    retrieve : callable
+        Finds the wind in a pair by found's method, with windows so many pixels apart.
+
+    Returns
+    -------
+    xr.Dataset or None
+        `found` with other v and w; None for a method whose windows depend on each other.
+    """
+    if found.attrs["method"] not in _BOXES:
+        return None
+    template, search, stride, dt = (found.attrs[n] for n in ("template", "search", "stride", "dt"))
+    mean = truth_at_vectors(found, window_mean(truth, template, found.attrs["method"]))
+    regions = sliding_window_view(np.zeros(seen[0].shape), (search, search))[::stride, ::stride]
+    places = []
+    for axis, (name, component) in enumerate((("z", "w"), ("y", "v"))):
+        spacing = float(seen[0][name][1] - seen[0][name][0])
+        start = np.arange(regions.shape[axis]) * stride
+        start = start[:, None] if axis == 0 else start[None, :]
+        pixel = np.arange(search)[:, None] if axis == 0 else np.arange(search)[None, :]
+        shift = np.nan_to_num(mean[component].values) * dt / spacing
+        place = (start - shift)[:, :, None, None] + pixel
+        places.append(np.broadcast_to(place, regions.shape))
+    carried = ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
+
+    def cut(image):
+        return sliding_window_view(image, (search, search))[::stride, ::stride]
+
+    rest = cut(seen[1].values - blurred[1].values)
+    pair = [_side_by_side(blocks, seen[0]) for blocks in (cut(seen[0].values), carried + rest)]
+    wind = retrieve(pair, search)
+    return found.assign({name: (("z", "y"), wind[name].values) for name in ("v", "w")})
+
+
+def _side_by_side(blocks: np.ndarray, like: xr.DataArray) -> xr.DataArray:
+    """Blocks (rows, columns, z, y) as one image with the pixels of another."""
+    image = blocks.transpose(0, 2, 1, 3).reshape(
+        blocks.shape[0] * blocks.shape[2], blocks.shape[1] * blocks.shape[3]
+    )
+    axes = {}
+    for name, size in zip(("z", "y"), image.shape):
+        spacing = float(like[name][1] - like[name][0])
+        axes[name] = (name, np.arange(size) * spacing, {"units": "m"})
+    return xr.DataArray(image, axes, ("z", "y"))
+
+
 def error_budget(
     found: xr.Dataset,
     without: Mapping[str, xr.Dataset],
@@ -199,7 +267,7 @@ def error_budget(
     found : xr.Dataset
         From `lidar_mi.retrieval.wind.retrieve_wind`; its attributes say method, template and dt.
     without : mapping of xr.Dataset
-        The same from `pictures_without`, by cause.
+        The same from `pictures_without`, by cause, and from `moved_as_one` as `shear`.
     truth : xr.Dataset
         v, w on (z, y).
     cores : sequence of Core
