@@ -57,7 +57,7 @@ def _bars(metrics, methods):
             for y, share in zip(at, shares):
                 if np.isfinite(share):
                     end = min(max(share, 0), 1) + 0.015
-                    panel.text(end, y, f"{share:.0%}", va="center", fontsize=7)
+                    panel.text(end, y, _percent(share), va="center", fontsize=7)
         for y, cause in zip(rows, used):
             if cause not in _causes(metrics, method):
                 panel.text(0.015, y, "does not apply", va="center", color="0.5", fontsize=8)
@@ -76,6 +76,11 @@ def _bars(metrics, methods):
         "the rms error with all of them (of a component). Shares need not add up to 100 %; below 0 "
         "the wind is worse without the cause."
     )
+
+
+def _percent(share: float) -> str:
+    """Without a sign before 0."""
+    return f"{round(100 * share) + 0} %"
 
 
 def _both(metrics, prefix: str) -> float:
@@ -141,9 +146,10 @@ def _table(metrics, method):
     def values(cause: str) -> list[str]:
         shown = []
         for place in _PLACES:
-            for key, style in (("rmse_v", ".3g"), ("rmse_w", ".3g"), ("share", ".0%")):
+            for key, style in (("rmse_v", "{:.3g}".format), ("rmse_w", "{:.3g}".format),
+                               ("share", _percent)):  # fmt: skip
                 value = metrics.get(f"error_budget.{method}.{place}{cause}{key}")
-                shown.append("-" if value is None else format(value, style))
+                shown.append("-" if value is None else style(value))
         return shown
 
     rows = [("with all causes", "", values(""))]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from lidar_mi.assessment.budget_report import budget_chapter, draw_all, limit_sentence
 from lidar_mi.assessment.cores import Core
 from lidar_mi.assessment.error_budget import (
     CAUSES,
@@ -274,3 +275,42 @@ def test_shear_within_the_window(texture, shear):
         assert budget["shear.share"] == pytest.approx(0, abs=0.1)
         assert np.nanmedian(abs(stiff["v"] - found["v"])) < 0.02
     assert moved_as_one(found.assign_attrs(method="multipass"), seen, sharp, truth, None) is None
+
+
+# --- the report
+
+
+def described(place="", **shares):
+    keys = {f"{place}rmse_v": 0.3, f"{place}rmse_w": 0.4}
+    keys |= {f"{place}{cause}.{q}": 0.1 for cause in shares for q in ("rmse_v", "rmse_w")}
+    keys |= {f"{place}{cause}.share": x for cause, x in shares.items()}
+    return {f"error_budget.cc.{key}": x for key, x in keys.items()}
+
+
+def test_the_sentence_names_the_largest_causes_in_turn():
+    metrics = described(beam_blur=0.2, detector_noise=0.7, window=0.01, method=-0.4)
+    assert limit_sentence(metrics, "cc") == (
+        "The wind by cross-correlation is off by 0.35 m/s rms, limited by noise of the detector (70 % "
+        "of the mean square error), then width of the beam (20 %)."
+    )
+    # beyond the cores where there are any; that noise of the simulation is not the lidar's is said
+    both = described(beam_blur=0.9, detector_noise=0.1, monte_carlo=0.1)
+    both |= described("outside_cores.", beam_blur=0.1, detector_noise=0.2, monte_carlo=0.5)
+    text = limit_sentence(both, "cc")
+    assert "beyond two core radii, limited by noise of the simulation (50 %" in text
+    assert "render.samples_per_beam" in text
+
+
+def test_nothing_to_name_is_said():
+    assert "no single cause has 10 %" in limit_sentence(described(beam_blur=0.05), "cc")
+    assert "no vector is valid" in limit_sentence({}, "cc")
+
+
+def test_a_chapter_without_vectors_has_no_figure_and_dashes(tmp_path):
+    assert draw_all(tmp_path, {}, ["cc"], None) == []
+    chapter = budget_chapter({}, ["cc"], [])
+    ((title, heads, rows),) = chapter.numbers.tables
+    assert title == "cross-correlation" and len(heads) == 6
+    assert rows == [("with all causes", "", ["-"] * 6)]
+    found = budget_chapter(described(beam_blur=-0.001), ["cc"], []).numbers.tables[0][2]
+    assert found[1] == ("without: width of the beam", "", ["0.1", "0.1", "0 %", "-", "-", "-"])
