@@ -48,6 +48,9 @@ depolarise completely; in polarised variants a ``blendphase`` must not mix them 
     <integrator type="gated_volpath"> <integer name="max_order" value="4"/> </integrator>
 """
 
+import contextlib
+import gc
+
 import drjit as dr
 import mitsuba as mi
 
@@ -98,7 +101,7 @@ def define():
             image = dr.zeros(mi.Float, beams * gates * quantities)
             trace = self._gated if self.estimator == "gated" else self._analog
             done, total = 0, None
-            with dr.suspend_grad():
+            with dr.suspend_grad(), _nothing_freed():
                 for first, count, start, now, complete in self._passes(sensor, photons):
                     part = trace(scene, sensor, seed, first, count, start, now)
                     total = part if total is None else _merge(total, part)
@@ -268,6 +271,22 @@ def define():
             return f"GatedVolpath[max_order={self.max_order}, estimator={self.estimator}]"
 
     return GatedVolpath
+
+
+@contextlib.contextmanager
+def _nothing_freed():
+    """Hold Python's garbage collection off while kernels are recorded.
+
+    A scene without references, freed between two virtual calls, makes them differ in what they may
+    meet; Dr.Jit 1.5 then emits a function twice and aborts.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _opaque(number: float):

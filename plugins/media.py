@@ -12,6 +12,8 @@ import mitsuba as mi
 import numpy as np
 
 SURFACE_SKIP = 1e-5
+# m, beyond any air
+FAR = 1e9
 
 
 class Air:
@@ -36,12 +38,21 @@ class Air:
         # opaque, so that no scene's size is compiled into a kernel
         dr.make_opaque(self.low, self.high)
 
+    def bounds(self, outside):
+        """Corners of a box that holds all air, for a telescope in the medium ``outside``."""
+        shapes = self.scene.shapes()
+        within = [shape.interior_medium() for shape in shapes]
+        beyond = [shape.exterior_medium() for shape in shapes]
+        if outside is None and all(medium is None or medium in within for medium in beyond):
+            return self.low, self.high
+        return dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)
+
     def crossings(self, origin, direction):
         """Where a line enters and leaves each cube, if it does: first and last distance."""
         found = []
         for to_local, offset, _, _ in self.cubes or ():
             start, step = to_local @ origin + offset, to_local @ direction
-            near, far = _slabs(mi.Vector3f(-1), mi.Vector3f(1), start, step)
+            near, far = slabs(mi.Vector3f(-1), mi.Vector3f(1), start, step)
             found.append((dr.select(near < far, near, dr.inf), dr.select(near < far, far, -dr.inf)))
         return found
 
@@ -66,7 +77,7 @@ class Air:
     def _trace(self, origin, direction, start, distance, medium, active):
         ray = mi.Ray3f(origin + direction * start, direction)
         ray.maxt = distance - start
-        near, far = _slabs(self.low, self.high, ray.o, ray.d)
+        near, far = slabs(self.low, self.high, ray.o, ray.d)
         active &= ~((near > far) | (far < 0) | (near > ray.maxt))
         # one by one: packets of rays are slower here, coherent or not
         si = self.scene.ray_intersect(
@@ -79,7 +90,7 @@ class Air:
         return end, hit, passes, behind
 
 
-def _slabs(low, high, origin, direction):
+def slabs(low, high, origin, direction):
     """Distances along a line at which it is inside a box, first and last."""
     # a component of 0 makes infinities; where it makes NaN (0 times infinity), comparisons fail
     first, last = (low - origin) / direction, (high - origin) / direction

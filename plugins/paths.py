@@ -7,24 +7,28 @@ and sees whether they do. Both bring back Stokes vectors about the instrument's 
 import drjit as dr
 import mitsuba as mi
 
-from .media import Air, coefficients, collision, interaction, transmittance
+from .closed_paths import Way, quarter_turn
+from .media import Air, coefficients, collision, interaction, slabs, transmittance
 from .polarization import rotate_stokes, transverse
 from .random_numbers import generator, pair
 
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
 
-# Of the photons that go on after single scattering, the share whose first flight is free: these
-# scatter long before the gate, as paths of many orders do.
-FREE_SHARE = 0.4
-# How far such a photon's density is counted where it arrives (its transmittance is not known).
-FREE_ARRIVAL = 0.2
-# The others' first vertex is put near the gate: the share of these that is put closest to it.
-NEAR_SHARE = 0.7
-# Of later flights, the share that is as short as such a vertex is near.
-SHORT_SHARE = 0.3
+# Of first vertices, the share that is put where isotropic scattering closes paths most often.
+NEAR_SHARE = 0.35
+# Of last flights, the share whose direction is the phase function's, and the largest share that is
+# looked for from the telescope.
+PHASE_SHARE = 0.2
+BACK_SHARE = 0.5
+# Of flights between, the share whose direction is the phase function's; the others mostly stay in
+# a field of view that is wider than the telescope's by this factor.
+PHASE_FLIGHT_SHARE = 0.3
+WIDER = 1.6
+# Of flights between, the share that leaves as much of the path as first vertices do.
+NEAR_FLIGHT_SHARE = 0.3
 # A photon goes on with this times the weight its last flight has left it.
-FOLLOWED = 3.0
+FOLLOWED = 30.0
 
 
 class Photon:
@@ -46,6 +50,7 @@ class Lidar:
 
     def __init__(self, scene, sensor, differentiable=False):
         self.air, self.sensor, self.differentiable = Air(scene), sensor, differentiable
+        self.low, self.high = self.air.bounds(sensor.get_medium())
         self.wavelengths = sensor.laser.wavelengths()
         self.channel = _channel(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
@@ -86,177 +91,196 @@ class Lidar:
         offset = photon.origin - photon.aperture
         path = dr.lerp(low, high, share)
         closure = _closing(offset, photon.direction, path)
+        home = dr.normalize(photon.aperture - (photon.origin + photon.direction * closure))
+        volume = (high - low) / (1 - dr.dot(photon.direction, home))
         total = self._connect(
             photon, photon.rng, photon.origin, photon.direction, closure, medium, photon.stokes,
-            high - low, (path > 0) & (closure > 0),
+            volume, (path > 0) & (closure > 0),
         )  # fmt: skip
         if split:
             _add(by_order, total[0], cell * max_order)
         if max_order == 1:
             return total
         further = self._forced_further(
-            photon, photon.rng, photon.origin, photon.direction, photon.stokes, medium, low, high,
-            path, mi.UInt32(max_order), split, by_order, cell, max_order,
-        )  # fmt: skip
+            photon, medium, path, high - low, mi.UInt32(max_order), split, by_order, cell, max_order
+        )
         return _sum(total, further)
 
     @dr.syntax
-    def _forced_further(
-        self, photon, rng, position, direction, stokes, medium, low, high, path, last, split,
-        by_order, cell, max_order,
-    ):  # fmt: skip
-        """Orders from two on.
-
-        Three ways lead to a path's last vertex: along the photon's flight to where the path closes
-        (``ahead``); from the telescope, along a direction of the field of view, to where it closes
-        (``back``); and a flight that happens to end in the gate (``free``), which covers vertices
-        of small scattering angle, where a range says little about a place.
-        """
-        aperture, axes = photon.aperture, photon.axes
-        width = high - low
-        total, order = _copied([0, 0, 0, 0]), mi.UInt32(1)
-        position, direction = mi.Point3f(position), mi.Vector3f(direction)
-        stokes, medium = _copied(stokes), mi.MediumPtr(medium)
-        low, high, path = mi.Float(low), mi.Float(high), mi.Float(path)
-        density = mi.Float(0)  # of the flight's direction; 0: the laser's
-        thickness = mi.Float(0)  # extinction coefficient where the flight begins
-        active = high > 0
+    def _forced_further(self, photon, medium, path, width, last, split, by_order, cell, max_order):
+        """Orders from two on: from every vertex but the last one the path is closed once."""
+        # a local name, since the loop carries local variables, not what objects hold
+        aperture, rng = photon.aperture, photon.rng
+        total, order = _copied([0, 0, 0, 0]), mi.UInt32(2)
+        path, medium = mi.Float(path), mi.MediumPtr(medium)
+        position, direction = mi.Point3f(photon.origin), mi.Vector3f(photon.direction)
+        stokes = _copied(photon.stokes)
+        flight, weight = self._first_flight(rng, position, direction, aperture, path)
+        active = flight > 0
         while dr.hint(active, label="scattering orders"):
-            # the next vertex: no later than the far end of the gate
-            reach = _closing(position - aperture, direction, high)
-            active &= reach > 0
-            first = order == 1
-            free = active & first & (rng.next_float32(active) < FREE_SHARE)
-            scale = self._near_scale(high)
-            left = _sample_left(reach, scale, pair(rng))
-            flight = dr.select(
-                first, reach - left, _sample_flight(thickness, reach, left, pair(rng))
-            )
-            flown, behind, found = collision(
-                self.air, medium, position, direction, reach, self.channel, self.wavelengths,
-                rng, free,
-            )  # fmt: skip
-            flight = dr.select(free, flown, flight)
-            active &= (flight > 0) & (found | ~free)
             out, medium = transmittance(
                 self.air, medium, position, direction, flight, self.channel, self.wavelengths,
-                rng, active & ~free,
+                rng, active,
             )  # fmt: skip
-            medium = dr.select(free, behind, medium)
             active &= medium != None
-            vertex = mi.Point3f(position + direction * flight)
-            mei = interaction(medium, vertex, direction, self.wavelengths)
-            scattering, extinction = coefficients(medium, mei, self.channel, active)
-            drawn = dr.select(
-                first,
-                _left_density(reach - flight, reach, scale),
-                _flight_density(thickness, reach, scale, flight),
+            position = mi.Point3f(position + direction * flight)
+            mei = interaction(medium, position, direction, self.wavelengths)
+            scattering, _ = coefficients(medium, mei, self.channel, active)
+            weight *= out * scattering
+            # the first vertex plays no roulette: in thin air it is the signal
+            followed = dr.select(order == 2, 1, dr.minimum(FOLLOWED * weight, 1))
+            active &= (weight > 0) & (rng.next_float32(active) < followed)
+            stokes = _scaled(stokes, dr.select(active, weight / followed, 0))
+            path -= flight
+
+            away = position - aperture
+            distance = dr.norm(away)
+            away, budget = away / distance, path - distance
+            active &= budget > 0
+            _, room = slabs(self.low, self.high, position, -away)
+            way = Way(away, distance, budget, self._half_field(photon.axes, away), room)
+            closing, bent, leg, volume = self._last_flight(
+                rng, photon, medium, mei, stokes, way, active
             )
-            # two ways of finding the first vertex; any partition of one keeps the mean
-            part = (1 - FREE_SHARE) * drawn
-            part /= part + FREE_SHARE * FREE_ARRIVAL * extinction
-            forced = out * scattering / drawn * dr.select(first, part / (1 - FREE_SHARE), 1)
-            chosen = scattering / extinction * (1 - part) / FREE_SHARE
-            weight = dr.select(free, chosen, forced)
-            stokes = _scaled(stokes, dr.select(active, weight, 0))
-            active &= stokes[0] > 0
-            low, high, path = low - flight, high - flight, path - flight
-
-            # free: this vertex may be the last one
-            home = aperture - vertex
-            outside = dr.norm(home)
-            in_gate = active & (order > 1) & (outside >= low) & (outside < high)
-            slope = 1 - dr.dot(direction, home / outside)
-            chance = drawn * width
-            aimed = self._aimed(axes, home, outside, flight)
-            share = chance / (chance + slope * (1 + aimed / density))
-            gain = self._receive(photon, rng, medium, mei, stokes, in_gate, share)
-            total = _sum(total, gain)
-            if dr.hint(split, mode="scalar"):
-                _add(by_order, gain[0], cell * max_order + order - 1, in_gate)
-            order += 1
-            followed = dr.select(first, 1, dr.minimum(FOLLOWED * weight, 1))
-            stokes = _scaled(stokes, dr.rcp(followed))
-            active &= (order <= last) & (rng.next_float32(active) < followed)
-            position, thickness = mi.Point3f(vertex), mi.Float(extinction)
-
-            # back: the last vertex looked for from the telescope
-            homeward = home / outside
-            turning = 0.5 / (1 + 0.5 * (high - outside) / self._footprint(outside))
-            inward = self._in_field(axes, rng)
-            outside = _closing(aperture - vertex, inward, path)
-            end = aperture + inward * outside
-            leg = dr.norm(end - vertex)
-            outward = (end - vertex) / leg
-            seen = active & (outside > 0) & (leg > 0)
-            bent, density = self._scatter(medium, mei, stokes, outward, seen)
-            density = self._direction_density(medium, mei, density, turning, homeward, outward, seen)
-            aimed = dr.square(leg / outside) / self._field_solid_angle()
             gain = self._connect(
-                photon, rng, vertex, outward, leg, medium, _scaled(bent, dr.rcp(aimed)), width,
-                seen, (aimed, density, aimed, thickness, high),
-            )  # fmt: skip
-
-            # ahead: along the photon's next flight
-            turned = rng.next_float32(active) < turning
-            guide = interaction(
-                medium, vertex, dr.select(turned, homeward, direction), self.wavelengths
+                photon, rng, position, closing, leg, medium, bent, width * volume, volume > 0
             )
-            onward, _, density = medium.phase_function().sample(
-                self.context, guide, rng.next_float32(active), pair(rng), active
-            )
-            active &= density > 0
-            stokes, density = self._scatter(medium, mei, stokes, onward, active)
-            density = self._direction_density(medium, mei, density, turning, homeward, onward, active)
-            active &= density > 0
-            stokes = _scaled(stokes, dr.select(active, dr.rcp(density), 0))
-            closure = _closing(vertex - aperture, onward, path)
-            home = aperture - (vertex + onward * closure)
-            aimed = self._aimed(axes, home, dr.norm(home), closure)
-            gain = _sum(gain, self._connect(
-                photon, rng, vertex, onward, closure, medium, stokes, width,
-                active & (closure > 0), (density, density, aimed, thickness, high),
-            ))  # fmt: skip
             total = _sum(total, gain)
             if dr.hint(split, mode="scalar"):
                 _add(by_order, gain[0], cell * max_order + order - 1, active)
-            direction = mi.Vector3f(onward)
+
+            order += 1
+            active &= order <= last
+            direction, stokes, flight, weight = self._next_flight(
+                rng, medium, mei, stokes, way, active
+            )
+            active &= weight > 0
         return total
 
-    def _footprint(self, distance):
-        """Radius of the field of view at a distance."""
-        return distance * self.sensor.m_fov_tan
+    def _first_flight(self, rng, origin, direction, aperture, path):
+        """Length of a first flight and one over its density; -1 where the beam meets no air."""
+        reach = _closing(origin - aperture, direction, path)
+        enters, leaves = slabs(self.low, self.high, origin, direction)
+        least, most = reach - dr.minimum(leaves, reach), reach - dr.maximum(enters, 0)
+        # half the field of view's radius where the path turns back
+        scale = 0.25 * path * self.sensor.m_fov_tan
+        choice, near = pair(rng), _sample_near(least, most, scale, pair(rng), rng.next_float32())
+        # steeper phase functions than the isotropic one fall later
+        steps = dr.log((most + scale) / (least + scale))
+        far = (least + scale) * dr.exp(steps * choice.y) - scale
+        left = dr.select(choice.x < NEAR_SHARE, near, far)
+        density = dr.lerp(
+            dr.rcp((left + scale) * steps), _near_density(left, least, most, scale), NEAR_SHARE
+        )
+        return dr.select((path > 0) & (most > least), reach - left, -1), dr.rcp(density)
 
-    def _near_scale(self, path):
-        """Half the field of view's radius where a path of this length turns back."""
-        return 0.5 * self._footprint(0.5 * path)
+    def _half_field(self, axes, away):
+        """Tangent of half the widest angle between a direction and one of the field of view."""
+        local = axes.to_local(away)
+        vertex = dr.norm(local.xy) / (1 + local.z)
+        field = self._half_fov()
+        return dr.select(vertex * field < 1, (vertex + field) / (1 - vertex * field), dr.inf)
 
-    def _direction_density(self, medium, mei, density, turning, homeward, wo, active):
-        """Of a flight that turns homeward now and then; ``density`` is the phase function's."""
-        guide = interaction(medium, mei.p, homeward, self.wavelengths)
-        _, turned = medium.phase_function().eval_pdf(self.context, guide, wo, active)
-        return dr.lerp(density, turned, turning)
+    def _half_fov(self):
+        return self.sensor.m_fov_tan / (1 + dr.sqrt(1 + dr.square(self.sensor.m_fov_tan)))
 
-    def _aimed(self, axes, home, outside, leg):
-        """Density, per solid angle of the flight, of finding its end from the telescope.
+    def _last_flight(self, rng, photon, medium, mei, stokes, way, active):
+        """Direction, Stokes vector and length of the flight to the last vertex; its weight.
 
-        Flight and return meet an ellipsoid under the same angle, so the solid angles of a piece
-        of it, seen from its foci, are as one over the distances squared.
+        Of two candidates one is taken, by what it brings back if nothing is in the way and the air
+        is the same there. The weight includes d(length)/d(path).
         """
-        visible = self.sensor.in_field_of_view(axes, -home)
-        return dr.select(visible, dr.square(leg / outside) / self._field_solid_angle(), 0)
+        phase, axes, path = medium.phase_function(), photon.axes, way.distance + way.budget
+        # the telescope finds last vertices far off, in units of the field of view's radius
+        beside = way.field / self._half_fov() - 1
+        ahead = 0.5 * way.budget / (way.distance * self.sensor.m_fov_tan)
+        far = dr.square(beside) + dr.square(ahead)
+        backward = BACK_SHARE * (1 - dr.rcp(1 + far))
+        sort = rng.next_float32(active)
+        by_phase, by_back = sort < PHASE_SHARE, sort > 1 - backward
+
+        drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
+        aimed = way.sample(way.budget, pair(rng))
+        inward = self._in_field(axes, rng)
+        first = dr.select(by_phase, drawn, dr.select(by_back, inward, aimed))
+        axis = dr.select(by_phase, -mei.wi, dr.select(by_back, axes.n, way.away))
+        tried = []
+        for wo in (first, quarter_turn(axis, first)):
+            end = photon.aperture + wo * _closing(photon.aperture - mei.p, wo, path)
+            wo = dr.select(by_back, dr.normalize(end - mei.p), wo)
+            raised = way.raised(wo)
+            leg = way.leg(way.budget, raised)
+            volume = dr.rcp(way.slope(way.budget, raised, leg))
+            end = mei.p + wo * leg
+            seen = active & self.sensor.in_field_of_view(axes, end - photon.aperture)
+            # both legs meet the ellipsoid under the same angle
+            found = dr.select(seen, dr.square(leg / (path - leg)) / self._field_solid_angle(), 0)
+            seen &= dr.all((end > self.low) & (end < self.high))
+            bent, pdf = self._scatter(medium, mei, stokes, wo, seen)
+            there = interaction(medium, end, wo, self.wavelengths)
+            home = dr.normalize(photon.aperture - end)
+            received, chance = self._scatter(medium, there, bent, home, seen)
+            density = PHASE_SHARE * pdf + backward * found
+            density += (1 - PHASE_SHARE - backward) * way.density(way.budget, raised)
+            # never 0 where there may be light: the air may be another there
+            worth = (0.95 * received[0] + 0.05 * bent[0] * chance) * volume
+            worth = dr.select(seen & (density > 0), worth, 0)
+            tried.append((worth, density, (wo, bent, leg, volume)))
+        (wo, bent, leg, volume), weight = _choose(rng, *tried)
+        return wo, bent, leg, volume * weight
+
+    def _next_flight(self, rng, medium, mei, stokes, way, active):
+        """Direction, Stokes vector (of unchanged S0), length and weight of a flight between."""
+        phase, way = medium.phase_function(), way.widened(WIDER)
+        by_phase = rng.next_float32(active) < PHASE_FLIGHT_SHARE
+        drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
+        # optical paths to the gate differ little, so that any use of the budget is about as likely
+        most, scale = 0.5 * way.budget, 0.5 * way.distance * self.sensor.m_fov_tan
+        choice, near = pair(rng), _sample_near(0, most, scale, pair(rng), rng.next_float32(active))
+        left = dr.select(choice.x < NEAR_FLIGHT_SHARE, near, most * choice.y)
+        spread = dr.lerp(dr.rcp(most), _near_density(left, 0, most, scale), NEAR_FLIGHT_SHARE)
+        spread *= 0.5
+        used = way.budget - 2 * left
+        sample = pair(rng)
+        mirrored = mi.Point2f(1 - sample.x, sample.y + 0.25)
+        # two candidates again, across each other; the steep one is paired with a flat one
+        tried = []
+        for wo in (
+            dr.select(by_phase, drawn, way.sample(used, sample)),
+            dr.select(by_phase, quarter_turn(-mei.wi, drawn), way.sample(used, mirrored)),
+        ):
+            raised = way.raised(wo)
+            leg = way.leg(used, raised)
+            bent, pdf = self._scatter(medium, mei, stokes, wo, active)
+            density = dr.lerp(way.density(used, raised), pdf, PHASE_FLIGHT_SHARE)
+            density *= way.slope(used, raised, leg) * spread
+            end = mei.p + wo * leg
+            inside = active & (leg > 0) & dr.all((end > self.low) & (end < self.high))
+            worth = dr.select(inside & (density > 0), bent[0], 0)
+            tried.append((worth, density, (wo, bent, leg)))
+        (wo, bent, leg), weight = _choose(rng, *tried)
+        kept = dr.select(weight > 0, stokes[0] / bent[0], 0)
+        return wo, _scaled(bent, kept), leg, dr.select(kept > 0, weight / kept, 0)
+
+    def _field_solid_angle(self):
+        cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
+        return dr.two_pi * dr.square(self.sensor.m_fov_tan * cosine) / (1 + cosine)
+
+    def _in_field(self, axes, rng):
+        """A direction of the field of view, uniform in solid angle."""
+        sample = pair(rng)
+        # 1 - cos, kept apart from 1: fields of view are milliradians
+        below = sample.x * self._field_solid_angle() * dr.inv_two_pi
+        sine = dr.safe_sqrt(below * (2 - below))
+        sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
+        return axes.to_world(mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - below))
 
     def _connect(
-        self, photon, rng, position, direction, distance, medium, stokes, width, active,
-        densities=None,
+        self, photon, rng, position, direction, distance, medium, stokes, volume, active
     ):  # fmt: skip
         """Scatter at ``distance`` along a flight, where the path closes: Stokes vector about e_h.
 
-        ``width`` (of the gate, as whole path) times d(distance)/d(path) makes a path length a
-        volume. ``densities`` for the balance heuristic, without which this is the only way here: of
-        the direction as it was drawn here, along a flight and from the telescope; then what the
-        flight's length depends on, the extinction coefficient at its start and the far end of the
-        gate (as what is left of the path).
+        ``volume``: width of the gate (as whole path) times d(distance)/d(path).
         """
         vertex = position + direction * distance
         active = active & self.sensor.in_field_of_view(photon.axes, vertex - photon.aperture)
@@ -267,16 +291,7 @@ class Lidar:
         mei = interaction(medium, vertex, direction, self.wavelengths)
         active = active & (medium != None)
         scattering, _ = coefficients(medium, mei, self.channel, active)
-        slope = 1 - dr.dot(direction, dr.normalize(photon.aperture - vertex))
-        volume = width / slope
-        weight = out * scattering * volume
-        if densities:
-            own, density, aimed, thickness, high = densities
-            reach = _closing(position - photon.aperture, direction, high)
-            scale = self._near_scale(high)
-            free = density * _flight_density(thickness, reach, scale, distance) * volume
-            weight *= own / (density + aimed + free)
-        return self._receive(photon, rng, medium, mei, stokes, active, weight)
+        return self._receive(photon, rng, medium, mei, stokes, active, out * scattering * volume)
 
     def _receive(self, photon, rng, medium, mei, stokes, active, weight):
         """Next-event estimation from an interaction to the telescope point."""
@@ -302,19 +317,6 @@ class Lidar:
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
         return _apply(value, stokes, self.channel), pdf
-
-    def _field_solid_angle(self):
-        cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
-        return dr.two_pi * dr.square(self.sensor.m_fov_tan * cosine) / (1 + cosine)
-
-    def _in_field(self, axes, rng):
-        """A direction of the field of view, uniform in solid angle."""
-        sample = pair(rng)
-        # 1 - cos, kept apart from 1: fields of view are milliradians
-        below = sample.x * self._field_solid_angle() * dr.inv_two_pi
-        sine = dr.safe_sqrt(below * (2 - below))
-        sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
-        return axes.to_world(mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - below))
 
     @dr.syntax
     def analog(self, photon, max_order, base, gates, sums, products, split, by_order):
@@ -391,37 +393,47 @@ def _closing(offset, direction, path):
     return dr.select(path > length, end, -1)
 
 
-def _sample_left(reach, scale, sample):
-    """Distance of a first vertex from the far end of the gate, seen along the beam.
+def _sample_near(least, most, scale, sample, again):
+    """Distance of a vertex from where a flight along the beam would close the path.
 
-    Half the field of view's radius is the natural scale: from there on the share of directions
-    that lead back into view falls with the distance squared. Steeper phase functions fall later.
+    Of directions of isotropic scattering there, weighted by the length they close at, a share of
+    ln(1 + (scale / left)^2) leads back into view. Uniform, if that falls out of the range.
     """
-    choice, where = sample.x, sample.y
-    near = scale * dr.tan(dr.atan(reach / scale) * where)
-    far = scale * (dr.exp(dr.log(1 + reach / scale) * where) - 1)
-    return dr.select(choice < NEAR_SHARE, near, far)
+    left = scale * sample.x * dr.tan(0.5 * dr.pi * sample.y)
+    return dr.select((left > least) & (left < most), left, dr.lerp(least, most, again))
 
 
-def _left_density(left, reach, scale):
-    near = scale / ((left * left + scale * scale) * dr.atan(reach / scale))
-    far = dr.rcp((left + scale) * dr.log(1 + reach / scale))
-    return dr.lerp(far, near, NEAR_SHARE)
+def _near_density(left, least, most, scale):
+    outside = 1 - _near_chance(most, scale) + _near_chance(least, scale)
+    density = dr.log(1 + dr.square(scale / left)) / (dr.pi * scale)
+    return density + outside / (most - least)
 
 
-def _sample_flight(thickness, reach, near, sample):
-    """A later flight that ends before ``reach``: exponential, or ``near`` where it begins.
+def _near_chance(left, scale):
+    """Integral of ln(1 + (scale / left)^2) / (pi scale) from 0 on."""
+    value = left * dr.log(1 + dr.square(scale / left)) + 2 * scale * dr.atan(left / scale)
+    return dr.select(left > 0, value / (dr.pi * scale), 0)
 
-    ``thickness`` is the extinction coefficient where it begins, a guess for all of the way.
+
+def _choose(rng, first, second):
+    """One of two candidates and its weight (resampled importance sampling, Talbot et al. 2005).
+
+    A candidate is its worth, to which what it brings should be proportional, its density, and what
+    is taken of it.
     """
-    collides = 1 - dr.exp(-thickness * reach)
-    return dr.select(sample.x < SHORT_SHARE, near, -dr.log(1 - collides * sample.y) / thickness)
+    (worth, density, one), (other_worth, other_density, other) = first, second
+    share = dr.select(worth > 0, worth / density, 0)
+    other_share = dr.select(other_worth > 0, other_worth / other_density, 0)
+    total = share + other_share
+    turned = rng.next_float32() * total >= share
+    worth = dr.select(turned, other_worth, worth)
+    return _either(turned, other, one), dr.select(worth > 0, 0.5 * total / worth, 0)
 
 
-def _flight_density(thickness, reach, scale, distance):
-    collides = 1 - dr.exp(-thickness * reach)
-    exponential = thickness * dr.exp(-thickness * distance) / collides
-    return dr.lerp(exponential, _left_density(distance, reach, scale), SHORT_SHARE)
+def _either(condition, yes, no):
+    if isinstance(yes, list | tuple):
+        return [_either(condition, y, n) for y, n in zip(yes, no)]
+    return dr.select(condition, yes, no)
 
 
 def _apply(value, stokes, channel):

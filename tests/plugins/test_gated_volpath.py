@@ -4,6 +4,7 @@ Detects: 3 % between the two estimators, a standard error wrong by 5 %, rounding
 between ways to do the same thing, a kernel compiled twice.
 """
 
+import gc
 import math
 import subprocess
 import sys
@@ -523,3 +524,23 @@ class TestCovariance:
         image = np.array(mi.render(scan(world, (4, 3), integrator={"covariance": True}), spp=200))
         np.testing.assert_allclose(image[..., 5], image[..., 4], rtol=1e-3)
         np.testing.assert_allclose(image[..., 6], 1, atol=1e-3)
+
+
+def test_nothing_is_freed_while_kernels_are_recorded(world, monkeypatch):
+    """A scene freed between two virtual calls makes Dr.Jit 1.5 emit a function twice and abort."""
+    scene = world.scene(
+        world.lidar((1, 1), (500.0, 502.5)),
+        {"max_order": 2},
+        slab=world.box((490.0, -5.0, -5.0), (510.0, 5.0, 5.0), world.homogeneous(1e-2)),
+    )
+    render = type(scene.integrator()).render
+    lidar = render.__globals__["Lidar"]
+    forced, collecting = lidar.forced, []
+
+    def watched(*arguments):
+        collecting.append(gc.isenabled())
+        return forced(*arguments)
+
+    monkeypatch.setattr(lidar, "forced", watched)
+    mi.render(scene, spp=4)
+    assert collecting == [False] and gc.isenabled()
