@@ -26,8 +26,8 @@ Both estimators connect every collision to a sampled point of the telescope, che
 view and carry the transmittance of all media on the way; they have the same expectation. In the
 gated one every photon belongs to a gate and has a range R in it. Of each scattering order the last
 vertex is placed so that the whole path is 2 R long: on the ellipsoid whose foci are the last but
-one vertex and the telescope point. It is looked for from both foci, along the photon's flight and
-along a direction of the field of view, and both are weighted by the balance heuristic (Veach 1997).
+one vertex and the telescope point. Its direction is drawn where it is likely to be seen; of two
+candidates the better one is taken in proportion (Talbot, Cline & Egbert 2005).
 
 ``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
 ``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
