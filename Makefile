@@ -5,7 +5,7 @@
 .PHONY: help setup demo test test-all bench validate docs lint clean
 
 PYTHON_ENV := .venv/bin/python
-EXPERIMENT := wake_backscatter
+EXPERIMENT := wake_sensor
 
 help: ## show this list
 	@echo "make demo or make test on a fresh machine do everything by themselves."
@@ -14,7 +14,7 @@ help: ## show this list
 setup: ## make .venv, install the package and an LLVM for it (nothing to do: does nothing)
 	@scripts/setup.sh
 
-demo: setup ## run the main experiment on the embedded wake
+demo: setup ## run the main experiment; another: make demo EXPERIMENT=turbine
 	.venv/bin/lidar-mi run scenes/$(EXPERIMENT).yaml -o outputs/$(EXPERIMENT) $(ARGS)
 
 test: setup ## run the tests, without those marked slow

@@ -27,7 +27,8 @@ from lidar_mi.rendering.phase import scatterer
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = ("README.md", "docs/theory.md", "docs/user_guide.md", "docs/plugins.md")
+EXPERIMENTS = tuple(f"docs/experiments/{page.name}" for page in (DOCS / "experiments").glob("*.md"))
+PAGES = ("README.md", "docs/theory.md", "docs/user_guide.md", "docs/plugins.md", *EXPERIMENTS)
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
 OPTIONAL = (config.VortexPair, config.Turbine, config.Part)
@@ -267,7 +268,8 @@ def check_yaml(block):
     data = yaml.safe_load(block.text)
     if block.file:
         Path(block.file).write_text(block.text)
-        truth.make_truth(config.load(block.file))
+        for experiment in config.load_variants(block.file).values() or [config.load(block.file)]:
+            truth.make_truth(experiment)
         return
     loaded = config.check({**BASE, **data}, block.place)
     scatterer(loaded.scattering, wavelength=loaded.lidar.wavelength)  # finds the tables

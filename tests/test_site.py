@@ -20,17 +20,24 @@ missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
 with_sphinx = pytest.mark.skipif(bool(missing), reason=f"no {', '.join(missing)}: extra docs")
 
 
+def listed(page):
+    """Pages in the tables of contents of a page and those it lists."""
+    tables = re.findall(r"^```\{toctree\}\n(?::.*\n)*\n([^`]+)```$", page.read_text(), re.MULTILINE)
+    for name in " ".join(tables).split():
+        below = page.parent / f"{name}.md"
+        yield below
+        yield from listed(below)
+
+
 def test_every_page_is_listed_and_there():
-    text = (DOCS / "index.md").read_text()
-    listed = re.search(r"^```\{toctree\}\n(?::.*\n)*\n([^`]+)```$", text, re.MULTILINE)[1].split()
-    pages = {page.stem for page in DOCS.glob("*.md")} - {"index"}
-    assert set(listed) == pages and len(listed) == len(pages)
+    found = sorted(listed(DOCS / "index.md"))
+    assert found == sorted(set(DOCS.rglob("*.md")) - {DOCS / "index.md"})
 
 
 def test_pictures_are_there():
-    for page in DOCS.glob("*.md"):
+    for page in DOCS.rglob("*.md"):
         for picture in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page.read_text()):
-            assert (DOCS / picture).is_file(), f"{page.name}: {picture}"
+            assert (page.parent / picture).is_file(), f"{page.name}: {picture}"
 
 
 @with_sphinx
