@@ -772,7 +772,26 @@ def _covariance(found: Solution, error: FlowError, excess: float) -> np.ndarray:
     inverse = inverse / scale / scale[:, None]
     covariance = (inverse @ spread @ inverse)[:10, :10]
     drawn = _drawn_to_rest(found)
-    return (covariance + torch.outer(drawn, drawn)).cpu().numpy()
+    covariance = covariance + torch.outer(drawn, drawn)
+    if not found.converged:
+        left = _step_left(found)
+        covariance = covariance + torch.outer(left, left)
+    return covariance.cpu().numpy()
+
+
+def _step_left(found: Solution) -> torch.Tensor:
+    """The step (10,) that a fit would still take, where noise in the interpolation stopped it."""
+    misfit, weight = found.misfit, found.weight
+    force = -misfit.jacobian.flatten(1) @ (weight * misfit.residual).flatten()
+    scale = found.normal.diagonal().sqrt()
+    scaled = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
+    return (scaled @ (force / scale) / scale)[:10]
+
+
+def _far_from_rest(found: Solution, covariance: np.ndarray) -> bool:
+    """Whether the step left is more than a standard error of any parameter, itself apart."""
+    left = _step_left(found).cpu().numpy() ** 2
+    return not (left < np.diagonal(covariance) - left).all()
 
 
 def _drawn_to_rest(found: Solution) -> torch.Tensor:
@@ -805,7 +824,7 @@ def _checked_fit(
 ) -> VortexPairFit:
     theta = found.parameters[:10].cpu().numpy()
     reasons = []
-    if not found.converged:
+    if not found.converged and _far_from_rest(found, covariance):
         reasons.append("did not converge")
     if not match >= _MATCH:
         reasons.append(f"what the fit carries together correlates by {match:.2f} only")
