@@ -186,11 +186,13 @@ def small_run(name, folder, more=()):
 
 @pytest.mark.usefixtures("variant")
 def test_turbine_is_seen_by_both(tmp_path):
-    """The deficit from lines of sight, to 0.5 m/s; and no look-ahead time of a platform that stands."""
-    metrics = small_run("turbine", tmp_path / "run", SMALLER_SENSOR)
+    """The mean wake's deficit of 4 m/s from lines of sight 11 m apart, to 0.5 m/s rms.
+
+    Without gusts, which lines step over; and no look-ahead time of a platform that stands.
+    """
+    metrics = small_run("turbine", tmp_path / "run", [*SMALLER_SENSOR, "wake.turbine.turbulence=0"])
     assert metrics["sensor.lines_read"] == 63
-    assert metrics["sensor.rmse_u"] < 0.5
-    assert metrics["backscatter.cc.rmse_v"] < 0.8 * metrics["true_wind.rms_v"]
+    assert metrics["sensor.rmse_u"] < 0.5 < metrics["sensor.triples.rmse_u"]
     assert "The platform stands still" in (tmp_path / "run" / "report.html").read_text()
 
 
