@@ -135,6 +135,9 @@ def render(
 def retrieve(
     first: Annotated[Path, typer.Argument(help="Image at t1: EXR, TIFF, PNG or BMP.")],
     second: Annotated[Path, typer.Argument(help="Image at t2.")],
+    *,
+    more: Annotated[list[Path] | None, typer.Argument(
+        help="Further images of a burst, each dt after the one before (variational).")] = None,
     dt: Annotated[float, typer.Option(help="Time between the images, s.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="NetCDF file.")] = Path("wind.nc"),
     method: Annotated[str, typer.Option(
@@ -149,12 +152,13 @@ def retrieve(
     ] = None,
     noise: Annotated[
         float | None,
-        typer.Option(min=0, help="Standard deviation of the images' noise. Default: estimated."),
+        typer.Option(min=0, help="Standard deviation of the images' noise. Default: what our EXR "
+                     "files say, else estimated."),
     ] = None,
     device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
 ) -> None:  # fmt: skip
     """Find the cross-flow wind (v, w) in any two images of the same air."""
-    from .rendering.scene import read_image
+    from .rendering.scene import read_image, read_noise
     from .retrieval.images import on_one_grid, read_picture
     from .retrieval.wind import retrieve_wind
     from .run_folder import write_netcdf
@@ -162,12 +166,17 @@ def retrieve(
     images = [
         read_image(path, layer, spacing)
         if path.suffix.lower() == ".exr" else read_picture(path, spacing)
-        for path in (first, second)
+        for path in (first, second, *(more or []))
     ]  # fmt: skip
-    pair = on_one_grid(*images)
+    pair = on_one_grid(*images[:2])
+    if noise is None and first.suffix.lower() == ".exr":
+        noise = read_noise(first, layer, spacing)
+        if noise is not None and pair[0] is not images[0]:
+            # noise has no structure to interpolate: its level goes along
+            noise = float(noise.median())
     wind = retrieve_wind(
         *pair, dt=dt, method=method, template=template, search=search, stride=stride,
-        device=device, noise=noise,
+        device=device, noise=noise, more=images[2:],
     )  # fmt: skip
     write_netcdf(wind, out)
     valid = float((wind["flag"] == 0).mean())

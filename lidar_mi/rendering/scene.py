@@ -167,6 +167,26 @@ def read_image(path: str | Path, layer: str = "Y", spacing: float | None = None)
     )
 
 
+def read_noise(path: str | Path, layer: str = "Y", spacing: float | None = None):
+    """Standard deviation of the noise of a layer, as `read_image` gives the layer; None if unsaid.
+
+    For ``Y`` and ``Y_noisy`` of our scans: the light transport's standard error and, with a
+    detector, its noise. For any other layer: the one of the same name with ``_stderr``.
+    """
+    layers = read_layers(path)[1]
+    transport = {"gate000.S0", "gate000.S0_stderr", "Y"}
+    if layer in ("Y", "Y_noisy") and transport <= set(layers):
+        signal, stderr, scaled = (
+            read_image(path, name, spacing) for name in ("gate000.S0", "gate000.S0_stderr", "Y")
+        )
+        noise = (scaled * stderr / signal.where(signal > 0)).fillna(0.0)
+        if layer == "Y_noisy" and "Y_noise_std" in layers:
+            noise = np.hypot(noise, read_image(path, "Y_noise_std", spacing))
+        return noise
+    known = f"{layer}_stderr"
+    return read_image(path, known, spacing) if known in layers else None
+
+
 def _reason(error: Exception) -> str:
     """Mitsuba's message in one line; of a plugin's traceback only what it ends with."""
     text = re.sub(r"Traceback \(most recent call last\):\n(  .*\n)+", "", str(error))

@@ -17,11 +17,20 @@ from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.flow_spline import Axis, FlowSpline, Mesh
 from lidar_mi.retrieval.multipass import Grid, first_pass, window_sums
 from lidar_mi.retrieval.quality import Flag, check_between, non_finite
-from lidar_mi.retrieval.warping import Spline, band_limited, levelled, rms
+from lidar_mi.retrieval.warping import (
+    Spline,
+    averaged,
+    band_limited,
+    levelled,
+    mismatch,
+    rms,
+)
 from lidar_mi.retrieval.windows import Windows, image_pair, working
 
 # Rounds of flow and evidence on coarse and on fine knots, whose spacing is this over the template.
 _COARSE, _FINE = (1.25, 8), (0.625, 5)
+# Rounds on fine knots before which noise is taken from what the images do not share.
+_WEIGHED = (3,)
 # Divergence is first taken to have a tenth of the vorticity's standard deviation.
 _RATIO = 100.0
 # Width over which the prior's strength varies, over the template.
@@ -31,7 +40,9 @@ _ROBUST = 3.0
 # Precision of each coefficient beside the prior's, px^-2: nothing for a displacement of some px.
 _RIDGE = 1e-4
 # Factor by which the prior may change in a round.
-_LARGEST = 4.0
+_LARGEST, _LARGEST_DIVERGENCE = 4.0, 16.0
+# Width over which the misfit is averaged, over the template; px for what is known of the noise.
+_MISFIT_WIDTH, _NOISE_WIDTH = 0.75, 3.0
 # Terms of the path's series in time.
 _PATH_ORDER = 6
 # Vorticity and divergence: (component, (order z, order y), sign) of their terms. Components: z, y.
@@ -54,6 +65,10 @@ class Images(NamedTuple):
         Standard deviation of the images' white noise.
     trust : torch.Tensor, shape (z, y)
         Mean variance of the noise over its own at each pixel.
+    stack : torch.Tensor, shape (images, z, y)
+        The images, of one brightness.
+    weighed : bool
+        Whether noise holds the misfit at each place already.
     """
 
     spline: Spline
@@ -61,6 +76,8 @@ class Images(NamedTuple):
     time: torch.Tensor
     noise: float
     trust: torch.Tensor
+    stack: torch.Tensor
+    weighed: bool = False
 
 
 class Linear(NamedTuple):
@@ -80,39 +97,49 @@ class Linear(NamedTuple):
 
 
 class Prior(NamedTuple):
-    """Vorticity and divergence are white noise of variance 1 / strength and 1 / (ratio strength).
+    """Vorticity and divergence are white noise of variance 1 / strength and 1 / divergence.
 
     Attributes
     ----------
     strength : torch.Tensor
-        On the mesh.
+        Of vorticity, on the mesh.
+    divergence : float
+        Strength of the divergence where there is no vorticity, as of wind through the plane.
     ratio : float
+        Strength over the vorticity's of further divergence, as where splines cannot follow a core.
     mesh : Mesh
         Half as far apart as the knots.
     area : float
         Of a cell of the mesh, px^2.
     width : float
         Over which the strength may vary, px.
+    trend : (float, float), optional
+        ln of the divergence's strength a round before, and of the ratio found for it.
     """
 
     strength: torch.Tensor
+    divergence: float
     ratio: float
     mesh: Mesh
     area: float
     width: float
+    trend: tuple[float, float] | None = None
 
     def band(self, knots: FlowSpline) -> torch.Tensor:
         """The prior's quadratic form; rigid motion and what else it leaves free is just not inf."""
-        weight = self.area * self.strength
-        band = weight.new_zeros(2, 2, 7, knots.z.knots, 4, knots.y.knots)
-        for terms, factor in ((_VORTICITY, 1.0), (_DIVERGENCE, self.ratio)):
+        band = self.strength.new_zeros(2, 2, 7, knots.z.knots, 4, knots.y.knots)
+        for terms, strength in ((_VORTICITY, self.strength), (_DIVERGENCE, self._divergent())):
             for a, first, sign in terms:
                 for b, second, other in terms:
-                    form = knots.form(weight, self.mesh, first, second)
-                    band[a, b] += factor * sign * other * form
+                    form = knots.form(self.area * strength, self.mesh, first, second)
+                    band[a, b] += sign * other * form
         for a in (0, 1):
             band[a, a, 3, :, 0] += _RIDGE
         return band
+
+    def _divergent(self) -> torch.Tensor:
+        """Strength of all divergence: its variances add."""
+        return 1 / (1 / self.divergence + 1 / (self.ratio * self.strength))
 
     def improved(self, knots: FlowSpline, coefficients: torch.Tensor, root: Factor) -> "Prior":
         """The prior nearer to the one of largest evidence (MacKay's fixed point).
@@ -121,25 +148,44 @@ class Prior(NamedTuple):
         """
         found = knots.covariance(root)
         before = knots.covariance(knots.factor(self.band(knots)))
-        weight = self.area * self.strength
-        energies = []
+        told, energy = [], []
         for terms in (_VORTICITY, _DIVERGENCE):
             value = sum(
                 sign * knots.field(coefficients, self.mesh, order)[a] for a, order, sign in terms
             )
-            spread = [
-                sum(
-                    sign * other * knots.spread(band[a, b], self.mesh, first, second)
-                    for a, first, sign in terms
-                    for b, second, other in terms
-                )
-                for band in (before, found)
-            ]
-            energies.append((weight * (spread[0] - spread[1]), weight * value.square()))
-        return self._replace(
-            strength=self.strength * _bounded(*(self.smooth(part) for part in energies[0])),
-            ratio=self.ratio * float(_bounded(*(part.sum() for part in energies[1]))),
+            energy.append(value.square())
+            told.append(sum(
+                sign * other * knots.spread(before[a, b] - found[a, b], self.mesh, first, second)
+                for a, first, sign in terms
+                for b, second, other in terms
+            ))  # fmt: skip
+        local = (self.smooth(self.strength * part) for part in (told[0], energy[0]))
+        strength = self._divergent()
+        share = strength / self.divergence
+        everywhere, beside = (
+            float(_bounded(*((part * strength * f[1]).mean() for f in (told, energy)), most))
+            for part, most in ((share, _LARGEST_DIVERGENCE), (1 - share, _LARGEST))
         )
+        everywhere = math.log(everywhere)
+        return self._replace(
+            strength=self.strength * _bounded(*local, _LARGEST),
+            divergence=self.divergence * math.exp(self._step(everywhere)),
+            ratio=self.ratio * beside,
+            trend=(math.log(self.divergence), everywhere),
+        )
+
+    def _step(self, ratio: float) -> float:
+        """Change of ln divergence that takes ln of the ratio to 0, by the secant of two rounds.
+
+        Where the images tell little, the fixed point alone would take hundreds of rounds.
+        """
+        slope = -1.0
+        if self.trend is not None:
+            x, y = self.trend
+            run = math.log(self.divergence) - x
+            slope = min(max((ratio - y) / run, -1.0), -0.15) if run else -1.0
+        limit = math.log(_LARGEST_DIVERGENCE)
+        return min(max(-ratio / slope, -limit), limit)
 
     def smooth(self, values: torch.Tensor) -> torch.Tensor:
         for axis, place in enumerate(self.mesh.places):
@@ -149,9 +195,9 @@ class Prior(NamedTuple):
         return values
 
 
-def _bounded(told: torch.Tensor, energy: torch.Tensor) -> torch.Tensor:
-    """Ratio of the two, at most a factor of _LARGEST from 1: far from the fixed point it may be 0."""
-    return (told.clamp(min=0) / energy.clamp(min=1e-30)).clamp(1 / _LARGEST, _LARGEST)
+def _bounded(told: torch.Tensor, energy: torch.Tensor, most: float) -> torch.Tensor:
+    """Ratio of the two, at most this factor from 1: far from the fixed point it may be 0."""
+    return (told.clamp(min=0) / energy.clamp(min=1e-30)).clamp(1 / most, most)
 
 
 def variational(
@@ -213,7 +259,8 @@ def variational(
     for other in stack[1:]:
         image_pair(image1, other)
     windows = Windows(tuple(image1.shape), template, search, stride)
-    images = _prepared(stack, noise)
+    first = images = _prepared(stack, noise)
+    width = _MISFIT_WIDTH * template
     shape, like = windows.shape, images.spline.coefficients[:0]
     grid = Grid(shape, 0.0, like)
     flow, _ = first_pass(image1, image2, windows, grid)
@@ -226,6 +273,9 @@ def variational(
         prior = _prior_on(knots, coefficients, prior, _WIDTH * template, like)
         for turn in range(rounds):
             seen = _linear(images, knots, mesh, coefficients)
+            if (spacing, rounds) == _FINE and turn in _WEIGHED:
+                images = _weighed(first, _linear(first, knots, mesh, coefficients), width)
+                seen = _linear(images, knots, mesh, coefficients)
             root, coefficients = _step(seen, knots, mesh, coefficients, prior)
             if turn:
                 prior = prior.improved(knots, coefficients, root)
@@ -239,16 +289,39 @@ def _prepared(stack: Sequence[torch.Tensor], noise: float | torch.Tensor | None)
     usable = torch.stack([torch.isfinite(image) for image in stack])
     trust = torch.ones_like(working(stack[0]))
     if isinstance(noise, torch.Tensor) and noise.ndim:
-        square = working(noise).square()
-        mean = rms(noise) ** 2
-        usable = usable & torch.isfinite(noise)
-        trust = torch.where((square > 0) & torch.isfinite(noise), mean / square, trust)
+        known = torch.isfinite(noise)
+        usable = usable & known
+        # a level that few photons tell is lowest where an image is too dark by chance
+        square = averaged(working(noise).nan_to_num(0.0).square(), known, _NOISE_WIDTH)
+        trust = torch.where(square > 0, rms(noise) ** 2 / square, trust)
         # no pixel may outweigh a window of others
         trust = trust.clamp(max=100.0)
-    spline, level = band_limited(levelled(stack), noise if noise is None else rms(noise))
+    images = levelled(stack)
+    spline, level = band_limited(
+        images, noise if noise is None else rms(noise), weight=trust.sqrt()
+    )
     wide = max_pool2d((~usable).to(trust)[:, None], 7, stride=1, padding=3)[:, 0]
     time = torch.arange(len(stack), dtype=trust.dtype, device=trust.device)
-    return Images(spline, wide == 0, time - time.mean(), level, trust)
+    return Images(spline, wide == 0, time - time.mean(), level, trust, images)
+
+
+def _weighed(images: Images, seen: Linear, width: float) -> Images:
+    """The images with noise as large, at each place and wave, as what they do not share.
+
+    Where no flow of the splines explains the images there is more than their noise: structure
+    that moved through the plane or that is lost between pixels, motion on too small scales. What
+    is known of the noise is the least.
+    """
+    rest = (seen.carried - seen.carried.mean(0)) * seen.seen
+    free = (len(rest) - 1) * max(images.spline.passed, 1e-6)
+    local = averaged(rest.square().sum(0) * images.trust / free, seen.seen, width)
+    mean = float(local[seen.seen].mean()) if seen.seen.any() else 0.0
+    level = max(images.noise**2, mean, 1e-30)
+    local = local.clamp(min=max(images.noise**2, 0.5 * level))
+    trust = images.trust * (level / local)
+    share = mismatch(images.spline, rest * trust.sqrt()).clamp(min=max(images.noise**2, 0.5 * level))
+    spline, noise = band_limited(images.stack, level**0.5, share, trust.sqrt())
+    return images._replace(spline=spline, noise=noise, trust=trust, weighed=True)
 
 
 def _fitted(flow: torch.Tensor, mesh: Mesh) -> torch.Tensor:
@@ -297,7 +370,9 @@ def _linear(
     misfit = rest.square().sum(0)
     # what no flow explains counts as noise: images are never taken to be better than they fit
     level = misfit[seen].median() / _MEDIAN[min(len(value), len(_MEDIAN) - 1)] if seen.any() else 0.0
-    variance = max(images.noise**2, float(level) / max(images.spline.passed, 1e-6), 1e-30)
+    variance = max(images.noise**2, 1e-30)
+    if not images.weighed:
+        variance = max(variance, float(level) / max(images.spline.passed, 1e-6))
     off = (misfit / (free * variance)).sqrt()
     trust = images.trust * (_ROBUST / off.clamp(min=_ROBUST)) * seen
     pull = -(images.time[:, None, None] * (value - value.mean(0))).sum(0) * trust / variance
@@ -342,7 +417,8 @@ def _prior_on(
         )
         cells = knots.z.cells * knots.y.cells / (knots.z.size * knots.y.size)
         strength = cells / float(vorticity.square().mean() + 1e-6)
-        return Prior(torch.full(mesh.shape, strength).to(like), _RATIO, mesh, area, width)
+        start = torch.full(mesh.shape, strength).to(like)
+        return Prior(start, _RATIO * strength, _RATIO, mesh, area, width)
     strength = before.strength.log()
     for axis in (0, 1):
         place, known = mesh.places[axis], before.mesh.places[axis]
@@ -352,7 +428,7 @@ def _prior_on(
         strength = torch.lerp(
             strength.index_select(axis, low), strength.index_select(axis, low + 1), part
         )
-    return Prior(strength.exp(), before.ratio, mesh, area, width)
+    return Prior(strength.exp(), before.divergence, before.ratio, mesh, area, width)
 
 
 def _finished(

@@ -1,5 +1,6 @@
 """Images as smooth functions of place: band-limited, then read anywhere with their slopes."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -114,7 +115,25 @@ def rms(noise: float | torch.Tensor) -> float:
     return float(finite.square().mean().sqrt()) if finite.numel() else 0.0
 
 
-def band_limited(images: torch.Tensor, noise: float | None = None) -> tuple[Spline, float]:
+def averaged(field: torch.Tensor, known: torch.Tensor, width: float) -> torch.Tensor:
+    """Mean of a field (z, y) over Gaussians, of what is known; of all of it where nothing is near."""
+    reach = math.ceil(3 * width)
+    place = torch.arange(-reach, reach + 1, dtype=field.dtype, device=field.device) / width
+    bell = torch.exp(-place.square() / 2)
+    both = torch.stack([torch.where(known, field, 0.0), known.to(field)])[:, None]
+    for shape, rim in (((-1, 1), (reach, 0)), ((1, -1), (0, reach))):
+        both = torch.nn.functional.conv2d(both, bell.reshape(1, 1, *shape), padding=rim)
+    total, number = both[:, 0]
+    mean = field[known].mean() if bool(known.any()) else 0.0
+    return torch.where(number > 1e-3, total / number.clamp(min=1e-3), mean)
+
+
+def band_limited(
+    images: torch.Tensor,
+    noise: float | None = None,
+    mismatch: torch.Tensor | None = None,
+    weight: torch.Tensor | None = None,
+) -> tuple[Spline, float]:
     """Splines through the images, after a filter that passes the texture and stops the noise.
 
     With texture of spectral density S and white noise N the filter is sqrt(S / (S + N / 2)): of
@@ -131,6 +150,12 @@ def band_limited(images: torch.Tensor, noise: float | None = None) -> tuple[Spli
     noise : float, optional
         Standard deviation of the images' white noise. Left out: from the lowest ring of the
         power spectrum.
+    mismatch : torch.Tensor, shape (rings,), optional
+        Spectral density N of what the images do not share, see `mismatch`. The filter is then
+        sqrt(noise^2 / N) of what it would be in white noise (Hannan & Thomson 1973, Biometrika
+        60, 117-130), so that what it passes of the mismatch is as if it had been white.
+    weight : torch.Tensor, shape (z, y), optional
+        Of the pixels, for the texture's spectrum.
 
     Returns
     -------
@@ -146,8 +171,11 @@ def band_limited(images: torch.Tensor, noise: float | None = None) -> tuple[Spli
     frequency = _frequencies(sizes, images)
     radius = torch.hypot(*frequency)
     ring = _ring(frequency, shape)
-    density, uncertainty = _ring_means(images, ring, sizes)
-    if noise is None:
+    density, uncertainty = _ring_means(images if weight is None else images * weight, ring, sizes)
+    if mismatch is not None:
+        # rings that were stopped before stay stopped
+        floor = torch.where(mismatch.isfinite(), mismatch, density).clamp(min=1e-9 * density.max())
+    elif noise is None:
         # the lowest rings are low by chance as well: the mean of all that may be as low
         floor = (density * (1 + 2 * uncertainty)).min()
         weight = uncertainty**-2 * (density <= floor * (1 + 2 * uncertainty))
@@ -158,9 +186,13 @@ def band_limited(images: torch.Tensor, noise: float | None = None) -> tuple[Spli
     texture = density - floor
     texture = torch.where(density > floor * (1 + 2 * uncertainty), texture, 0.0)
     tiny = torch.finfo(images.dtype).tiny
-    response = (texture / (texture + floor / 2 + tiny)).sqrt()
+    response = texture / (texture + floor / 2 + tiny)
+    # as if all noise were white and of this variance
+    level = floor if mismatch is None else torch.as_tensor(noise**2).to(floor)
+    passed = response[ring]
+    passed = float(passed[:, :1].sum() + 2 * passed[:, 1:].sum())
+    response = (response * (level / floor if mismatch is not None else 1.0)).sqrt()
     gain = response[ring]
-    passed = float(gain[:, :1].square().sum() + 2 * gain[:, 1:].square().sum())
     # the slopes' power with noise and filter, and what of it tells the displacement
     power, told = (
         float((radius**2 * gain**2 * spectrum[ring]).sum())
@@ -175,7 +207,30 @@ def band_limited(images: torch.Tensor, noise: float | None = None) -> tuple[Spli
     smooth = smooth[:, : shape[0] + 2 * _MARGIN, : shape[1] + 2 * _MARGIN].contiguous()
     excess = power / told if told > 0 else 1.0
     passed /= sizes[0] * sizes[1]
-    return Spline(smooth, shape, passed, excess, response), float(floor.sqrt())
+    return Spline(smooth, shape, passed, excess, response), float(level.sqrt())
+
+
+def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
+    """Spectral density, by rings, of what carried images do not share, before their filter.
+
+    Parameters
+    ----------
+    spline : Spline
+        That the images were read from.
+    rest : torch.Tensor, shape (images, z, y)
+        Each carried image less the mean of all; zero where not all are seen.
+
+    Returns
+    -------
+    torch.Tensor, shape (rings,)
+        As `band_limited` takes it. Infinite where the filter passed nothing.
+    """
+    sizes = [scipy.fft.next_fast_len(n + 2 * _MARGIN, real=True) for n in spline.shape]
+    ring = _ring(_frequencies(sizes, rest), spline.shape)
+    number = len(rest)
+    density, _ = _ring_means(rest * (number / (number - 1)) ** 0.5, ring, sizes)
+    passed = spline.gain.square()
+    return torch.where(passed > 1e-3, density / passed, torch.inf)
 
 
 def _frequencies(sizes: list[int], like: torch.Tensor) -> list[torch.Tensor]:

@@ -1,6 +1,6 @@
 """From two images to the wind: one call, CF data set out."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,11 +8,20 @@ import torch
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.bound import displacement_bound
 from lidar_mi.retrieval.checks import checked_pair, on_device, positive
 from lidar_mi.retrieval.correlation import cross_correlation
 from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.multipass import multipass
-from lidar_mi.retrieval.quality import Flag, Texture, low_texture, median_outliers, uncertain
+from lidar_mi.retrieval.quality import (
+    Flag,
+    Texture,
+    filled,
+    low_texture,
+    median_outliers,
+    non_finite,
+    uncertain,
+)
 from lidar_mi.retrieval.variational import variational
 from lidar_mi.retrieval.vortex_fit import vortex_windows
 from lidar_mi.retrieval.weight_shift import weight_shift
@@ -61,7 +70,7 @@ METHODS: Mapping[str, Method] = {
     "variational": Method(
         variational,
         ("correlation", "normalised cross-correlation of the images carried to mid-time"),
-        ("min_correlation", "noise"),
+        ("min_correlation", "noise", "more"),
         centred=True,
         local=False,
     ),
@@ -90,6 +99,7 @@ def retrieve_wind(
     min_texture: float = 0.01,
     min_isotropy: float = 0.2,
     noise: float | xr.DataArray | None = None,
+    more: Sequence[xr.DataArray] = (),
     median_size: int = 3,
     median_threshold: float = 2.0,
     median_epsilon: float = 0.1,
@@ -122,6 +132,9 @@ def retrieve_wind(
         Standard deviation of image 1's noise, in its unit; a template with less structure than
         noise is flagged as without texture. Left out, no noise is assumed for that, and methods
         that weight by it ("multipass", "variational", "vortex_fit") estimate it from the images.
+    more : sequence of xr.DataArray
+        Further images on the same grid, each dt after the one before ("variational"): a burst,
+        whose mid-time is the winds'.
     median_size, median_threshold, median_epsilon
         Normalised median test, see `quality.median_outliers`. Neighbours are taken half a
         template apart (or a stride, if that is more): closer ones share their pixels.
@@ -149,6 +162,13 @@ def retrieve_wind(
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
     dt = positive("dt", dt)
     image1, image2, noise = checked_pair(image1, image2, noise)
+    more = [checked_pair(image1, image)[1] for image in more]
+    if more and "more" not in METHODS[method].options:
+        takes = ", ".join(name for name, known in METHODS.items() if "more" in known.options)
+        raise InputError(
+            f"more: {len(more) + 2} images are not allowed with method {method!r}; expected two, "
+            f"or method {takes}"
+        )
     windows = Windows(image1.shape, template, search, stride)
     pixels1, pixels2 = (on_device(image, device) for image in (image1, image2))
     if isinstance(noise, xr.DataArray):
@@ -156,7 +176,10 @@ def retrieve_wind(
 
     chosen = METHODS[method]
     axes = tuple(image1[name].values.astype(float) for name in ("z", "y"))
-    offered = {"min_correlation": min_correlation, "noise": noise, "axes": axes, "dt": dt}
+    offered = {
+        "min_correlation": min_correlation, "noise": noise, "axes": axes, "dt": dt,
+        "more": [on_device(image, device) for image in more],
+    }  # fmt: skip
     options = {name: offered[name] for name in chosen.options}
     found = chosen.find(pixels1, pixels2, template, search, stride, **options)
     level = 0.0 if noise is None else noise
@@ -176,6 +199,7 @@ def retrieve_wind(
         "search": search,
         "stride": stride,
         "dt": dt,
+        "images": 2 + len(more),
         "min_texture": min_texture,
         "min_isotropy": min_isotropy,
         "median_size": median_size,
@@ -185,6 +209,56 @@ def retrieve_wind(
     if "min_correlation" in options:
         attributes["min_correlation"] = min_correlation
     return _dataset(image1, windows, found._replace(flag=flag), texture, attributes)
+
+
+def wind_bound(
+    image1: xr.DataArray,
+    image2: xr.DataArray,
+    dt: float,
+    noise: float | xr.DataArray,
+    template: int = 8,
+    search: int = 16,
+    stride: int = 1,
+) -> xr.Dataset:
+    """Least standard error of v and w (m/s) that any unbiased method has from each template alone.
+
+    The Cramer-Rao bound, see `bound.displacement_bound`; on the grid of `retrieve_wind`, which
+    says what the parameters are. Infinite without texture, NaN near non-finite pixels. A field that is fitted to the images
+    as a whole uses more than a template and may be better. Noise of 0 in some pixels of a map
+    counts as a thousandth of the median.
+
+    Returns
+    -------
+    xr.Dataset, dims (z, y)
+        `v_bound`, `w_bound`.
+
+    Raises
+    ------
+    InputError
+        As `retrieve_wind`.
+    """
+    dt = positive("dt", dt)
+    image1, image2, noise = checked_pair(image1, image2, noise)
+    windows = Windows(image1.shape, template, search, stride)
+    if isinstance(noise, xr.DataArray):
+        noise = on_device(noise.clip(min=1e-3 * float(noise.median())), "cpu")
+    pair = [on_device(image, "cpu") for image in (image1, image2)]
+    covariance = displacement_bound(*(filled(image) for image in pair), noise, template)
+    rows, columns = (torch.as_tensor(windows.starts(axis)) for axis in (0, 1))
+    root = covariance[:2, rows][:, :, columns].sqrt()
+    root = torch.where(non_finite(*pair, windows), torch.nan, root).numpy()
+    axes = {axis: image1[axis].values.astype(float) for axis in ("z", "y")}
+    found = {}
+    for name, axis, values in (("w", "z", root[0]), ("v", "y", root[1])):
+        spacing = (axes[axis][-1] - axes[axis][0]) / (len(axes[axis]) - 1)
+        about = {"long_name": f"Cramer-Rao bound of {name} from one template", "units": "m s-1"}
+        found[f"{name}_bound"] = ("z", "y"), (values * spacing / dt).astype(np.float32), about
+    half = (template - 1) / 2
+    coords = {
+        axis: np.interp(np.asarray(windows.starts(k)) + half, np.arange(len(axes[axis])), axes[axis])
+        for k, axis in enumerate(("z", "y"))
+    }
+    return xr.Dataset(found, coords)
 
 
 def _dataset(

@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.quality import Flag
-from lidar_mi.retrieval.wind import METHODS, retrieve_wind
+from lidar_mi.retrieval.wind import METHODS, retrieve_wind, wind_bound
 
 DT = 0.1
 CIRCULATION, SEPARATION, RADIUS = 400.0, 47.1, 3.0
@@ -283,3 +283,60 @@ def test_bad_input_is_named(synthetic):
         with pytest.raises(InputError) as error:
             call()
         assert str(error.value).startswith(start) and "\n" not in str(error.value), start
+
+
+def burst(synthetic, number, noise, seed=7):
+    """A texture in a uniform wind of (3, -2) m/s, seen `number` times."""
+    y, z = np.arange(70) * 0.5, np.arange(60) * 0.5
+    grid = np.meshgrid(y, z)
+    random = np.random.default_rng(seed)
+    for k in range(number):
+        picture = synthetic.texture(grid[0] - 3 * k * DT, grid[1] + 2 * k * DT, seed, 1.5, 0.2)
+        picture += noise * random.standard_normal(picture.shape)
+        yield synthetic.data_array(picture, y, z)
+
+
+def test_more_images_of_a_burst_lower_the_error(synthetic):
+    """N images in uniform wind hold N (N^2 - 1) / 6 times the information of two: 10 for four.
+
+    The standard error falls by sqrt(10) where noise alone limits it; half of that is asked for, as
+    the prior helps the pair more.
+    """
+    first, second, *more = burst(synthetic, 4, 0.1)
+    stderr, error = [], []
+    for rest in ([], more):
+        wind = retrieve_wind(first, second, DT, "variational", noise=0.1, more=rest)
+        assert wind.attrs["images"] == 2 + len(rest)
+        stderr.append(float(wind["v_stderr"].median()))
+        error.append(rms(np.stack([wind["v"] - 3, wind["w"] + 2])))
+    assert stderr[1] < 0.63 * stderr[0]
+    assert error[1] < 0.63 * error[0]
+
+
+def test_a_burst_needs_a_method_that_takes_it(synthetic):
+    first, second, third = burst(synthetic, 3, 0.0)
+    with pytest.raises(InputError, match="more: 3 images are not allowed with method 'cc'"):
+        retrieve_wind(first, second, DT, more=[third])
+    with pytest.raises(InputError, match="differ"):
+        retrieve_wind(first, second, DT, "variational", more=[third[:-1]])
+
+
+def test_bound_of_two_waves_on_the_grid_of_the_vectors():
+    """Waves (a, b) and (a, -b): rms slopes 0.1 a and 0.1 b per metre of both together."""
+    y, z = np.arange(80) * 0.5, np.arange(60) * 0.25
+    a, b, noise = 2 * np.pi / 4, 2 * np.pi / 2, 1e-3
+    grid = np.meshgrid(y, z)
+    waves = sum(0.1 * np.cos(a * grid[0] + s * b * grid[1] + s) for s in (-1, 1))
+    image = xr.DataArray(
+        1 + waves, {n: (n, x, {"units": "m"}) for n, x in (("z", z), ("y", y))}, ("z", "y")
+    )
+    bound = wind_bound(image, image, DT, noise, 16, 24, 3)
+    wind = retrieve_wind(image, image, DT, template=16, search=24, stride=3)
+    np.testing.assert_allclose(bound["z"], wind["z"])
+    np.testing.assert_allclose(bound["y"], wind["y"])
+    # a template holds whole waves: sqrt(2 noise^2 / (pixels mean squared slope)) / dt
+    for name, wavenumber in (("v", a), ("w", b)):
+        expected = np.sqrt(2) * noise / (16 * 0.1 * wavenumber) / DT
+        np.testing.assert_allclose(bound[f"{name}_bound"], expected, rtol=0.02)
+    image[30, 40] = np.nan
+    assert np.isnan(wind_bound(image, image, DT, noise)["v_bound"]).sum() == 16 * 16
