@@ -25,7 +25,7 @@ from .rendering.backscatter import extrude, render_scans
 from .rendering.phase import Scatterer, molecules, scatterer
 from .rendering.variant import use_variant
 from .retrieval.images import resample_pair
-from .retrieval.wind import METHODS, retrieve_wind
+from .retrieval.wind import METHODS, retrieve_wind, wind_bound
 from .retrieval.windows import Windows
 from .run_folder import IMAGES, Log, Notice, write_netcdf
 from .truth import Flows, Truth, blur_by_beam, make_truth, read_flows
@@ -60,7 +60,9 @@ def prepare(
     notice("reading how the air scatters", None)
     air = scatterer(experiment.scattering, beside, experiment.lidar.wavelength, notice)
     fields = _solid(experiment, truth, plans)
-    _check_ahead(experiment, truth, plans, air)
+    settings, image = experiment.retrieval, (len(plans[0].z), len(plans[0].y))
+    Windows(image, settings.template, settings.search, settings.stride)
+    check_ahead(experiment, truth, plans, air)
     return lambda folder, log: _run(
         experiment, folder, flows, truth, plans, air, fields, timing, log
     )
@@ -95,10 +97,8 @@ def _run(
     return metrics, backscatter_chapter(experiment, metrics, cores, drawn, vectors)
 
 
-def _check_ahead(experiment, truth, plans, air: Scatterer) -> None:
+def check_ahead(experiment, truth, plans, air: Scatterer) -> None:
     """What would only fail later is said before anything is written."""
-    settings, image = experiment.retrieval, (len(plans[0].z), len(plans[0].y))
-    Windows(image, settings.template, settings.search, settings.stride)
     if experiment.detector:
         for plan in plans:
             duration = gate_duration(plan.gate_length())
@@ -215,13 +215,19 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
     for index, source in enumerate(images):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(images))
         methods = []
+        level = noise.get(source, 0.0)
+        sizes = {name: getattr(settings, name) for name in ("template", "search", "stride")}
+        bound = wind_bound(*images[source], experiment.platform.dt, level, **sizes)
         for method in settings.methods:
             wind = retrieve_wind(
                 *images[source],
                 dt=experiment.platform.dt,
                 method=method,
                 **window_settings(settings),
-                noise=noise.get(source, 0.0),
+                noise=level,
+            )
+            wind = wind.assign(
+                {name: (field.dims, field.data, field.attrs) for name, field in bound.items()}
             )
             true = truth_at_vectors(wind, truth.wind)
             wind = wind.assign(v_true=true["v"], w_true=true["w"])
@@ -304,6 +310,8 @@ def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
             true = wind[["v_true", "w_true"]].rename(v_true="v", w_true="w")
             for key, value in wind_metrics(wind, true, cores).items():
                 metrics[f"{source}.{method}.{key}"] = value
+            for key, value in efficiency(wind).items():
+                metrics[f"{source}.{method}.{key}"] = value
     first = scans[0].isel(gate=0)
     lit = first["S0"].where(first["S0"] > 0)
     metrics["backscatter.mc_relative_error"] = float((first["S0_stderr"] / lit).median())
@@ -344,6 +352,24 @@ def safety(experiment: Experiment, plan: ScanPlan) -> dict[str, float]:
         "scan_power": lidar.pulse_energy * beams * rate,
     }
     return {f"safety.{key}": value for key, value in found.items() if np.isfinite(value)}
+
+
+def efficiency(wind: xr.Dataset) -> dict[str, float]:
+    """What the images' noise allows over what a method finds, of v and w; valid vectors only.
+
+    ``bound_*``: rms of the Cramer-Rao bound of one template, m/s. ``efficiency_*``: that over the
+    rms error; above 1 where a method smooths over more than a template. Nothing without noise.
+    """
+    metrics = {}
+    for name in ("v", "w"):
+        error = (wind[name] - wind[f"{name}_true"]).values
+        bound = wind[f"{name}_bound"].values
+        used = (wind["flag"].values == 0) & np.isfinite(error) & np.isfinite(bound)
+        if used.any() and (bound[used] > 0).all():
+            least = float(np.sqrt(np.mean(bound[used].astype(float) ** 2)))
+            metrics[f"bound_{name}"] = least
+            metrics[f"efficiency_{name}"] = least / float(np.sqrt(np.mean(error[used] ** 2)))
+    return metrics
 
 
 def true_wind(found: xr.Dataset, truth: Truth, cores: list[Core]) -> dict[str, float]:

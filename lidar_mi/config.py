@@ -295,6 +295,23 @@ class Sensor(_Section):
     exposure: Time = Field(10.0, gt=0, le=30_000, description="time of looking into the beams")
 
 
+class Volume(_Section):
+    """Wind in three dimensions, from all gates of both scans as two volumes."""
+
+    methods: tuple[Literal["correlation", "variational"], ...] = Field(
+        ("correlation", "variational"), min_length=1
+    )
+    template: int = Field(8, ge=4, description="voxels along each side of a window")
+    search: int = Field(16, ge=6)
+    stride: int = Field(4, ge=1)
+    min_correlation: Number = Field(0.5, ge=-1, le=1)
+
+    @model_validator(mode="after")
+    def _each_once(self):
+        _once("methods", self.methods)
+        return self
+
+
 # keys of the backscatter lidar, which looks at a wake
 BACKSCATTER = ("platform", "lidar", "detector", "scan", "scattering", "render", "retrieval")
 
@@ -318,6 +335,31 @@ class Experiment(_Section):
     render: RenderSettings = RenderSettings()
     retrieval: Retrieval = Retrieval()
     sensor: Sensor | None = Field(None, description="both lidars combined; {} for all defaults")
+    volume: Volume | None = Field(
+        None, description="u, v, w from all gates, in place of retrieval; {} for all defaults"
+    )
+
+    @model_validator(mode="after")
+    def _gates_that_make_a_volume(self):
+        if self.volume is None:
+            return self
+        wake, scan = self.wake, self.scan
+        if wake is None or (wake.depth != "volume" and wake.turbine is None):
+            raise ValueError("volume: not allowed without a wake in three dimensions; expected "
+                             "wake.depth: volume")  # fmt: skip
+        if wake.second != "advect":
+            raise ValueError(f"wake.second: {wake.second:g} s is not allowed with volume; expected advect")
+        if self.sensor or self.retrieval != Retrieval():
+            key = "sensor" if self.sensor else "retrieval"
+            raise ValueError(f"{key}: not allowed with volume, which finds the wind in its stead")
+        if scan.gates != "planar":
+            raise ValueError(f"scan.gates: {scan.gates} is not allowed with volume; expected planar")
+        if scan.gate_count < self.volume.template:
+            raise ValueError(
+                f"scan.gate_count: {scan.gate_count} is not allowed with volume; expected at least "
+                f"volume.template = {self.volume.template}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _both_lidars_for_the_sensor(self):
@@ -492,7 +534,7 @@ def dump(experiment: Experiment) -> str:
     Without the sections of a lidar that it does not have.
     """
     unused = {"wake", *BACKSCATTER} if experiment.wake is None else set()
-    unused |= {name for name in ("doppler", "sensor") if getattr(experiment, name) is None}
+    unused |= {name for name in ("doppler", "sensor", "volume") if getattr(experiment, name) is None}
     data = experiment.model_dump(mode="json", exclude=unused)
     return yaml.safe_dump(data, sort_keys=False)
 

@@ -15,6 +15,7 @@ from . import (
     config,
     fringe_chain,
     sensor_chain,
+    volume_chain,
     vortex_chain,
 )
 from .assessment import report
@@ -61,7 +62,8 @@ def prepare(
     """
     chains = []
     if experiment.wake:
-        chains.append(backscatter_chain.prepare(experiment, beside, notice))
+        looking = volume_chain if experiment.volume else backscatter_chain
+        chains.append(looking.prepare(experiment, beside, notice))
     if experiment.wake and experiment.retrieval.error_budget:
         chains.append(budget_chain.prepare(experiment, beside))
     if experiment.doppler:

@@ -18,10 +18,11 @@ from .rendering.phase import table_files
 from .truth import find_file
 
 IMAGES = ("image_t1.exr", "image_t2.exr")
+VOLUME = "wind_volume.nc"
 PICTURES = (*IMAGES, "fringes_*.exr")
 RESULTS = (
-    "wind.nc", "v_los.nc", "lines_of_sight.nc", "wind3d.nc", "vortex.json", "metrics.json",
-    "report.html", "log.txt",
+    "wind.nc", "v_los.nc", "lines_of_sight.nc", "wind3d.nc", VOLUME, "vortex.json",
+    "metrics.json", "report.html", "log.txt",
 )  # fmt: skip
 
 # other versions of these may give other pictures

@@ -95,7 +95,7 @@ def _carried(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> x
     v, w, dt = flow["v"], flow["w"], experiment.platform.dt
     if float(field.min()) == float(field.max()):
         return field
-    if experiment.wake.turbine is None:
+    if experiment.wake.turbine is None and experiment.volume is None:
         return advect(field, v, w, dt)
     return advect(field, v, w, dt, u=flow["u"] - experiment.scan.follow)
 
@@ -139,7 +139,8 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
                 f"{places[0]:g} to {places[-1]:g} m (or wake.depth: volume)"
             )
         y, z = wake.centre or (None, None)
-        flow = centre(resample(flow, wake.spacing), y, z).drop_vars("time", errors="ignore")
+        axes = "xyz" if experiment.volume else "yz"
+        flow = centre(resample(flow, wake.spacing, axes), y, z).drop_vars("time", errors="ignore")
         middle = wake.x if wake.x is not None else float(flow["x"].mean())
         flows.append(flow.assign_coords(x=flow["x"] - middle + gate_middle))
     return flows[0], flows[1]

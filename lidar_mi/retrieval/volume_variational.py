@@ -29,7 +29,7 @@ from lidar_mi.retrieval.volume_windows import (
 )
 
 # Knot spacing over the template, and rounds of flow and evidence.
-_KNOTS, _ROUNDS = 0.625, 6
+_KNOTS, _ROUNDS = 0.625, 5
 # Divergence is first taken to have a tenth of the vorticity's standard deviation.
 _RATIO = 100.0
 # Width over which the prior's strength varies, over the template.
@@ -47,7 +47,7 @@ _DAMPING = 0.05
 # Flows drawn from the posterior: in a round, and for the standard errors.
 _DRAWS, _FINAL_DRAWS = 4, 16
 # Conjugate gradients end at this residual over the first one, or after so many steps.
-_TOLERANCE, _LOOSE, _STEPS = 1e-2, 1e-1, 100
+_TOLERANCE, _LOOSE, _STEPS = 1e-2, 1e-1, 60
 # Median of chi-square with n - 1 degrees of freedom, by the number n of volumes.
 _MEDIAN = (1.0, 1.0, 0.4549, 1.3863, 2.3660, 3.3567, 4.3515, 5.3481)
 

@@ -173,8 +173,14 @@ def validated(d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def _neighbours(d: torch.Tensor) -> torch.Tensor:
-    """(26, 3, ...); NaN beyond the faces."""
-    padded = torch.nn.functional.pad(d, (1,) * 6, value=torch.nan)
+    """(26, 3, ...); beyond the faces the field goes on as it changes there."""
+    padded = d
+    for axis in (1, 2, 3):
+        first, last = padded.narrow(axis, 0, 1), padded.narrow(axis, -1, 1)
+        inner = [torch.full_like(first, torch.nan)] * 2
+        if d.shape[axis] > 1:
+            inner = [padded.narrow(axis, 1, 1), padded.narrow(axis, -2, 1)]
+        padded = torch.cat([2 * first - inner[0], padded, 2 * last - inner[1]], axis)
     x, z, y = d.shape[1:]
     return torch.stack([
         padded[:, i : i + x, j : j + z, k : k + y]
