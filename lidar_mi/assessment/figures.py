@@ -81,6 +81,8 @@ def draw_all(
          _deviation_maps(found, "backscatter", "extinction")),
         ("fig12_error_by_texture", "Error and texture", _error_by_texture(found, sweep)),
     )  # fmt: skip
+    if (drawn := _error_and_bound(found)) is not None:
+        plates += (("fig16_error_and_bound", "Errors and what the noise allows", drawn),)
     if "Y_noisy" in scans[0]:
         plates += (("fig13_detector", "What the detector reads", _detected(scans, found, cores, scale)),)
     if "depolarization" in scans[0]:
@@ -317,6 +319,44 @@ def _picture_differences(truth, scans):
     return figure, (
         "Backscatter over its mean minus extinction over its mean: the beam's width rounds off "
         "sharp structure, Monte Carlo noise adds grain."
+    )
+
+
+def _error_and_bound(found):
+    """Rms errors in groups of vectors of like Cramer-Rao bound; None where no noise bounds any."""
+    figure = Figure(figsize=(13, 4.6), layout="constrained")
+    span = []
+    for axes, name in zip(figure.subplots(1, 2), ("v", "w")):
+        for source in (s for s in found["source"].values if s.startswith("backscatter")):
+            for method in found["algorithm"].values:
+                wind = found.sel(source=source, algorithm=method)
+                bound = wind[f"{name}_bound"].values
+                error = (wind[name] - wind[f"{name}_true"]).values
+                used = (wind["flag"].values == 0) & np.isfinite(error) & np.isfinite(bound)
+                used &= bound > 0
+                if used.sum() < 100:
+                    continue
+                groups = np.array_split(np.argsort(bound[used]), 12)
+                least, rms = (
+                    [float(np.sqrt(np.mean(values[used][g].astype(float) ** 2))) for g in groups]
+                    for values in (bound, error)
+                )
+                axes.plot(least, rms, "o-", ms=4, label=f"{METHOD_NAMES[method]} from {source}")
+                span += [min(least), max(least)]
+        if not span:
+            return None
+        axes.plot([0, max(span)], [0, max(span)], "k--", lw=1, label="bound")
+        axes.set(
+            xlabel=f"Cramer-Rao bound of {name} / m s$^{{-1}}$", xlim=(0, None), ylim=(0, None),
+            ylabel=f"rms error of {name} / m s$^{{-1}}$", title=f"valid vectors, {name}",
+        )  # fmt: skip
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    return figure, (
+        "Errors of valid vectors, in groups by what the pictures' noise allows any unbiased method "
+        "that uses one template alone. Below the line: methods that use more than a template. "
+        "Far above it on the left: errors that are not the noise's, as of flow that a window or a "
+        "smooth field cannot follow."
     )
 
 
