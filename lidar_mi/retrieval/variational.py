@@ -216,11 +216,11 @@ def variational(
     Least is, over the flow u (displacement in dt) as B-splines,
 
         sum_k sum_x (I_k(x + path(u, t_k)) - mean_k)^2 / (2 s^2)
-            + 1/2 integral L(x) (vorticity^2 + q divergence^2),
+            + 1/2 integral L(x) vorticity^2 + divergence^2 / (1 / D + 1 / (q L(x))),
 
     with the images band-limited (`warping.band_limited`) and carried to mid-time along the curved
     paths of the flow, so that no texture has to be known; residuals beyond 3 s count linearly.
-    The prior's strength L(x), which may vary over half a template, and the ratio q are those of
+    The prior's strength L(x), which may vary over half a template, D and q are those of
     largest evidence: the energy of vorticity and of divergence is as large as the prior
     expects, of what the images tell (MacKay 1992, Neural Comput. 4, 415-447). So the flow is smoothed
     little in cores and strongly around them. Solved by Gauss-Newton steps from a coarse
@@ -240,14 +240,16 @@ def variational(
         than half way from this to 1: a flow that bends makes unrelated textures alike to 0.7.
     noise : float or torch.Tensor, optional
         Standard deviation of the images' white noise, of each pixel or of all; left out: from the
-        images' spectra.
+        images' spectra. Where images carried by the flow differ by more, that is taken.
 
     Returns
     -------
     Displacement
         Wind times dt at the windows' centres at mid-time. `score` is the smallest correlation of
-        an image with the mean of the others, `covariance` that of the posterior: what the noise leaves
-        open and the prior does not know.
+        an image with the mean of the others, `covariance` that of the posterior: what the noise, and
+        what else the images do not share, leaves open and the prior does not know. Errors that
+        neighbours share show in neither: 0.01 px without noise, 0.02 to 0.1 px on particles of 3 px
+        and less.
 
     Raises
     ------
