@@ -30,7 +30,8 @@ def compare(repeats: int = 5, beams: int = 1600) -> Comparison:
     for name, (phase, albedo, fov) in CASES.items():
         for first, last in GATES:
             scene = _scene(phase, albedo, fov, (first, last), 1, beams)
-            lines += _rows(f"{name}; {first:.0f} to {last:.0f} m alone", scene, repeats, 100, 1000)
+            # as many that both take long against recording and launching a kernel
+            lines += _rows(f"{name}; {first:.0f} to {last:.0f} m alone", scene, repeats, 500, 1500)
         scene = _scene(phase, albedo, fov, (500.0, 600.0), 10, beams)
         lines += _rows(f"{name}; ten gates, the median one", scene, repeats, 200, 500)
     scene = _scene({"type": "rayleigh_polarized"}, 1.0, 5.0, (500.0, 600.0), 500, 400)
