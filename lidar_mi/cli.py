@@ -202,14 +202,14 @@ def _print_vortices(wind) -> None:
 )
 def info(
     what: Annotated[str, typer.Argument(
-        help="EXR, NetCDF or scattering-table file (.txt), run folder, or a name: molecules, "
+        help="EXR, NetCDF or scattering-table file (.txt), folder of a run or of variants, or a name: molecules, "
              "spheroids, spheres, continental, sea_salt, dust, droplets, soot.")],
     wavelength: Annotated[str | None, typer.Option(
         help="Of a named scatterer. Default: 532 nm.")] = None,
     altitude: Annotated[str | None, typer.Option(
         help="Of molecules, in the standard atmosphere. Default: 0 m.")] = None,
 ) -> None:  # fmt: skip
-    """Say what a file or a run folder holds, or how an aerosol or air scatters.
+    """Say what a file or a folder of results holds, or how an aerosol or air scatters.
 
     Of scatterers: extinction and backscatter coefficient and the number of particles they go with,
     single-scattering albedo, lidar ratio, depolarisation ratio.
@@ -218,6 +218,7 @@ def info(
 
     from .info import sections
     from .run_folder import failure
+    from .study import RECORD
 
     with _progress() as notice:
         found = list(
@@ -232,6 +233,10 @@ def info(
     if folder.is_dir():
         if reason := failure(folder):
             _out.print(f"failed: {reason}", markup=False, soft_wrap=True)
+        elif (folder / RECORD).is_file():
+            if not (folder / "metrics.json").is_file():
+                _out.print("unfinished: no metrics.json yet; run it again to go on")
+            _out.print(f"more of a variant: lidar-mi info {folder}/VARIANT", markup=False, soft_wrap=True)
         elif (folder / "metrics.json").is_file():
             _print_metrics(json.loads((folder / "metrics.json").read_text()))
         else:

@@ -1,6 +1,6 @@
-"""What a file, a run folder or a named scatterer holds, as titled tables of text."""
+"""What a file, a folder of results or a named scatterer holds, as titled tables of text."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,12 +21,12 @@ def sections(
     what: str, wavelength: float | None = None, altitude: float | None = None,
     notice: Notice = lambda text, share: None,
 ) -> Iterator[Section]:  # fmt: skip
-    """Describe a file, a run folder, a named aerosol or the molecules of air.
+    """Describe a file, a folder of a run or a study, a named aerosol or the molecules of air.
 
     Parameters
     ----------
     what : str
-        Path of an EXR or NetCDF file, a scattering table or a run folder; or a name.
+        Path of an EXR or NetCDF file, a scattering table, a run folder or a study's; or a name.
     wavelength : float, optional
         m, of a named scatterer; default 532 nm.
     altitude : float, optional
@@ -59,7 +59,7 @@ def sections(
             f"of the aerosols {', '.join(AEROSOLS)}"
         )
     elif path.is_dir():
-        yield from _run_folder(path)
+        yield from _folder(path)
     elif path.suffix in kinds:
         yield from kinds[path.suffix](path)
     else:
@@ -141,6 +141,33 @@ def _netcdf(path: Path) -> Iterator[Section]:
         yield "attributes", [(key, _short(value)) for key, value in data.attrs.items()]
 
 
+def _folder(folder: Path) -> Iterator[Section]:
+    from .study import RECORD
+
+    yield from _study(folder) if (folder / RECORD).is_file() else _run_folder(folder)
+
+
+def _study(folder: Path) -> Iterator[Section]:
+    """What differs between a study's variants, and what came of it, one column a variant."""
+    from .assessment.comparison import differences, flat, results, setting
+    from .study import read_study
+
+    name, records, metrics = read_study(folder)
+    rows = [("variant", *records), ("folder", *(
+        str(folder / key) if record else "not run" for key, record in records.items()
+    ))]  # fmt: skip
+    settings = {key: flat(record["experiment"]) if record else {} for key, record in records.items()}
+    done = {key: one for key, one in settings.items() if one}
+    for key, values in differences(done).items():
+        shown = dict(zip(done, map(setting, values)))
+        rows.append((key, *(shown.get(variant, "-") for variant in records)))
+    yield f"{folder}: study {name}", rows
+    found = [(f"{label} / {unit}" if unit else label, *values) for label, unit, values in results(metrics)]
+    if found:
+        yield "what comes of it", [("", *metrics), *found]
+    yield _files(folder, beside=records)
+
+
 def _run_folder(folder: Path) -> Iterator[Section]:
     from .run_folder import read_record
 
@@ -150,10 +177,16 @@ def _run_folder(folder: Path) -> Iterator[Section]:
         (key, _short(value)) for key, value in _asked_first(experiment)
     ]
     yield "versions", [(name, str(number)) for name, number in record["versions"].items()]
-    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    yield "files", [
-        (str(path.relative_to(folder)), f"{path.stat().st_size / 1e6:.2f} MB") for path in files
-    ]
+    yield _files(folder)
+
+
+def _files(folder: Path, beside: Iterable[str] = ()) -> Section:
+    """Files in a folder, without those in some of its folders."""
+    paths = {path.relative_to(folder): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    return "files", [
+        (str(name), f"{path.stat().st_size / 1e6:.2f} MB")
+        for name, path in paths.items() if name.parts[0] not in beside
+    ]  # fmt: skip
 
 
 def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:

@@ -58,10 +58,12 @@ def prepare(
             f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected the slab of "
             f"scan, {middle - lidar.range_bin / 2:g} to {middle + lidar.range_bin / 2:g} m"
         )
-    tables = read_requirements(
-        *([find_file(sensor.requirements, beside, "sensor.requirements")]
-          if sensor.requirements else [])
-    )  # fmt: skip
+    tables = {}
+    if sensor.requirements:
+        tables = read_requirements(find_file(sensor.requirements, beside, "sensor.requirements"))
+    elif experiment.platform.speed:
+        # the paper's are those of flight control: nothing to ask of a platform that stands
+        tables = read_requirements()
     truth = true_wind(experiment, beside)
     # lines that leave the wake, bins that reach the telescope
     wind_at(truth, _volumes(experiment))

@@ -16,7 +16,7 @@ from .assessment.comparison import draw_comparison, page
 from .config import Experiment
 from .errors import InputError
 from .rendering import exr
-from .run_folder import IMAGES, Log, Notice, write
+from .run_folder import IMAGES, Log, Notice, read_record, write
 
 RECORD = "study.yaml"
 
@@ -76,6 +76,44 @@ def run(
     write(folder / "report.html", lambda path: path.write_text(html))
     log("done")
     return metrics
+
+
+def read_study(
+    folder: str | Path,
+) -> tuple[str, dict[str, dict | None], dict[str, dict[str, float]]]:
+    """What a study's folder says it holds.
+
+    Returns
+    -------
+    name : str
+        Of the study.
+    records : dict
+        By variant, as of `run_folder.read_record`; None: not run yet.
+    metrics : dict
+        By variant; of those that are done.
+
+    Raises
+    ------
+    InputError
+        A file in it that was not written by a study.
+    """
+    folder = Path(folder)
+    try:
+        record = yaml.safe_load((folder / RECORD).read_text())
+        name, variants = str(record["name"]), [str(key) for key in record["variants"]]
+    except (OSError, yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError):
+        raise InputError(f"{folder / RECORD}: not written by a study; expected its folder") from None
+    started = {key: (folder / key / "experiment.yaml").is_file() for key in variants}
+    records = {key: read_record(folder / key) if started[key] else None for key in variants}
+    metrics = {}
+    for key in variants:
+        path = folder / key / "metrics.json"
+        if path.is_file():
+            try:
+                metrics[key] = json.loads(path.read_text())
+            except ValueError:
+                raise InputError(f"{path}: not written by a run; expected metrics") from None
+    return name, records, metrics
 
 
 def _of(variant: str, notice: Notice) -> Notice:

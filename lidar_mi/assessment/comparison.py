@@ -1,7 +1,7 @@
 """Several variants of one experiment side by side: what differs, and what comes of it."""
 
 import base64
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -81,7 +81,7 @@ def page(
         files("lidar_mi.assessment").joinpath("comparison.html").read_text()
     )
     changed = [
-        (key, "", [_setting(value) for value in values])
+        (key, "", [setting(value) for value in values])
         for key, values in differences({key: flat(one) for key, one in settings.items()}).items()
     ]
     legend = (
@@ -96,15 +96,15 @@ def page(
             (one.title, one.caption, base64.b64encode(one.path.read_bytes()).decode()) for one in drawn
         ],
         tables=[
-            ("What comes of it", legend, list(_results(metrics))),
+            ("What comes of it", legend, list(results(metrics))),
             ("What differs", "In SI units; a dash: the variant has no such key.", changed),
         ],
         resolved=yaml.safe_dump(dict(settings), sort_keys=False),
     )
 
 
-def _results(metrics):
-    """Rows that any variant has a number for."""
+def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, str, list[str]]]:
+    """What comes of variants: (name, unit, one text a variant), where any of them has a number."""
     winds = dict.fromkeys(
         key.removesuffix(".valid_fraction") for one in metrics.values() for key in one
         if key.startswith("backscatter") and key.endswith(".valid_fraction")
@@ -130,7 +130,8 @@ def _three(value: float) -> str:
     return text if abs(value) >= 1e6 or 0 < abs(value) < 1e-3 else f"{float(text):.10g}"
 
 
-def _setting(value) -> str:
+def setting(value) -> str:
+    """An experiment's value as text; a dash: there is none."""
     if value is None:
         return "-"
     return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

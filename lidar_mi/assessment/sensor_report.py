@@ -155,19 +155,22 @@ def sensor_chapter(
     metrics : dict
         From `lidar_mi.sensor_chain`.
     judged : sequence of (RequirementTable, list of Finding)
+        Empty: nothing is asked for.
     drawn : sequence of Drawn
     vectors : dict, optional
         From `vector_map.map_data`.
     """
-    platform = experiment.platform
-    ahead = look_ahead(experiment.scan.range + experiment.scan.thickness / 2, platform.speed)
+    speed = experiment.platform.speed
     purpose = (
         "Both lidars look at the same slab of air: the Doppler lidar's lines of sight and the "
         "cross-flow wind of the backscatter lidar's images give the wind in three dimensions."
     )
-    warning = "The platform stands still."
-    if platform.speed:
-        warning = f"At {platform.speed:g} m/s the aircraft is there {ahead:.2g} s later."
+    if speed:
+        ahead = look_ahead(experiment.scan.range + experiment.scan.thickness / 2, speed)
+        warning = f"At {speed:g} m/s the aircraft is there {ahead:.2g} s later."
+    else:
+        warning = "The platform stands still: there is no look-ahead time"
+        warning += "." if judged else ", and requirements for flight control do not apply."
     verdicts = {True: "fulfilled", False: "not fulfilled", None: "cannot be told"}
     tables = [
         (
@@ -184,12 +187,12 @@ def sensor_chapter(
         lead=[purpose, warning, *_costs(metrics)],
         drawn=drawn,
         verdict=Tables(
-            "Whether it does what flight control asks for",
+            "Whether it does what flight control asks for" if speed else "Whether it does what is asked for",
             "Errors of u, v, w are rms errors of good vectors beyond two core radii, those of v_LOS "
             "rms errors of lines of sight. A margin is the distance from the limit, as a share of "
             "it.",
             tables,
-        ),
+        ) if judged else None,
         numbers=Tables(
             "How good the wind from both lidars is",
             f"{metrics['sensor.lines_read']} of {metrics['sensor.lines']} lines of sight were read; "

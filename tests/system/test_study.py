@@ -17,6 +17,7 @@ from matplotlib.image import imread
 from lidar_mi import backscatter_chain, config, experiment, study
 from lidar_mi.assessment.comparison import differences, flat
 from lidar_mi.errors import InputError
+from lidar_mi.info import sections
 
 SCENES = Path(str(files("lidar_mi.scenes"))).resolve()
 PAIR = {"circulation": 150, "separation": 16, "core_radius": 2, "width": 30, "height": 20}
@@ -115,12 +116,33 @@ def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
         found["near"]["safety.hazard_distance"], rel=5e-3
     )
     assert imread(folder / "figures" / "fig00_comparison.png").std() > 0.05
+    told = {title: rows for title, rows in sections(str(folder))}
+    rows = {name: values for name, *values in next(iter(told.values()))}
+    assert f"{folder}: study two" in told and rows["variant"] == ["near", "far"]
+    assert rows["scan.range"] == ["150.0 m", "500.0 m"] and rows["folder"][1] == str(folder / "far")
+    results = {name: values for name, *values in told["what comes of it"]}
+    assert float(results["hazard distance of a beam, naked eye / m"][0]) == pytest.approx(
+        found["near"]["safety.hazard_distance"], rel=5e-3
+    )
+    names = [name for name, _ in told["files"]]
+    assert "report.html" in names and "near/report.html" not in names
     # again: nothing is rendered; other things are not overwritten
     before = (folder / "near" / "image_t1.exr").stat().st_mtime_ns
     study.run("two", variants, folder)
     assert (folder / "near" / "image_t1.exr").stat().st_mtime_ns == before
     with pytest.raises(InputError, match="is no study's folder"):
         study.run("two", variants, tmp_path)
+
+
+def test_info_on_a_study_that_was_stopped(tmp_path):
+    folder = tmp_path / "out"
+    folder.mkdir()
+    (folder / "study.yaml").write_text("{name: two, variants: [near, far]}")
+    title, rows = next(sections(str(folder)))
+    assert title == f"{folder}: study two" and rows[1] == ("folder", "not run", "not run")
+    (folder / "study.yaml").write_text("[1]")
+    with pytest.raises(InputError, match="study.yaml: not written by a study"):
+        list(sections(str(folder)))
 
 
 def test_a_fault_in_the_last_stops_the_first(file, tmp_path):
@@ -188,12 +210,17 @@ def small_run(name, folder, more=()):
 def test_turbine_is_seen_by_both(tmp_path):
     """The mean wake's deficit of 4 m/s from lines of sight 11 m apart, to 0.5 m/s rms.
 
-    Without gusts, which lines step over; and no look-ahead time of a platform that stands.
+    Without gusts, which lines step over; and no look-ahead time of a platform that stands, nor a
+    verdict on what flight control asks for.
     """
     metrics = small_run("turbine", tmp_path / "run", [*SMALLER_SENSOR, "wake.turbine.turbulence=0"])
     assert metrics["sensor.lines_read"] == 63
     assert metrics["sensor.rmse_u"] < 0.5 < metrics["sensor.triples.rmse_u"]
-    assert "The platform stands still" in (tmp_path / "run" / "report.html").read_text()
+    report = (tmp_path / "run" / "report.html").read_text()
+    assert "The platform stands still: there is no look-ahead time" in report
+    assert "flight control do not apply" in report and " s later" not in report
+    assert 'id="verdict-1"' not in report and "fulfilled" not in report
+    assert not [key for key in metrics if key.endswith(".margin")]
 
 
 @pytest.mark.slow
