@@ -54,10 +54,10 @@ def prepare(
         raise InputError(
             "wake.file: no wind along x (u) in it; expected u, v and w for volume"
         )
+    _check_gates(experiment, flow)
     truth = make_truth(experiment, beside, flows)
     plans = scan_plans(experiment, truth)
     nodes = grid(experiment, plans)
-    _check_gates(experiment, flow)
     settings = experiment.volume
     VolumeWindows(tuple(map(len, nodes)), settings.template, settings.search, settings.stride)
     notice("reading how the air scatters", None)

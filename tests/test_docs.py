@@ -150,6 +150,9 @@ def _value(name, model, *given):
     data = copy.deepcopy(BASE)
     if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors
         data |= {"doppler": {}, "retrieval": {"methods": ["variational"]}}
+    if name.split(".")[0] == "volume":  # it needs air in three dimensions
+        data["wake"] |= {"file": "wake_volume_40s.nc", "depth": "volume"}
+        data["scan"] = {"gate_count": 24}
     section = data
     for parent in parents:
         section = section.setdefault(parent, {})

@@ -41,7 +41,7 @@ def draw_all(
 
 
 def _seen(volumes, cores):
-    figure = Figure(figsize=(15, 8.2), layout="compressed")
+    figure = Figure(figsize=(16, 6.4), layout="compressed")
     axes = figure.subplots(2, 2, height_ratios=(3.2, 1))
     values = [1e6 * volume for volume in volumes]
     limits = [float(values[0].quantile(q)) for q in (0.01, 0.995)]
@@ -77,7 +77,7 @@ def _cuts(wind, cores):
 
 
 def _along_x(wind, cores):
-    figure = Figure(figsize=(17, 5.4), layout="compressed")
+    figure = Figure(figsize=(17, 3.5), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     cut = wind.sel(z=cores[0].z if cores else 0, method="nearest")
     for row, name in zip(axes, _COMPONENTS):
