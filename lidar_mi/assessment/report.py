@@ -163,7 +163,8 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
             f"{render.max_order}, {render.samples_per_beam} photons a beam, {render.variant}"
         )
         rows.append(("light", light))
-        methods = ", ".join(METHOD_NAMES[name] for name in experiment.retrieval.methods)
+        chosen = experiment.volume or experiment.retrieval
+        methods = ", ".join(METHOD_NAMES.get(name, name) for name in chosen.methods)
         rows.append(("winds by", methods))
     if experiment.doppler:
         lidar = experiment.doppler.lidar
