@@ -81,7 +81,8 @@ def run(
     _print_metrics(metrics)
     _out.print(f"report   {folder / 'report.html'}")
     _out.print(f"figures  {folder / 'figures'}")
-    for name, asked in (("wind.nc", loaded.wake), ("v_los.nc", loaded.doppler)):
+    winds = "wind_volume.nc" if loaded.volume else "wind.nc"
+    for name, asked in ((winds, loaded.wake), ("v_los.nc", loaded.doppler)):
         if asked:
             _out.print(f"winds    {folder / name}")
     if "timing.vortex_s" in metrics:
