@@ -30,7 +30,7 @@ def draw_all(
     known = [method for method in methods if _causes(metrics, method)]
     if not known:
         return []
-    plates = [("fig16_error_budget", "What limits the wind", _bars(metrics, known))]
+    plates = [("fig23_error_budget", "What limits the wind", _bars(metrics, known))]
     return save_all(folder, plates, log)
 
 

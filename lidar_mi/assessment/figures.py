@@ -82,7 +82,7 @@ def draw_all(
         ("fig12_error_by_texture", "Error and texture", _error_by_texture(found, sweep)),
     )  # fmt: skip
     if (drawn := _error_and_bound(found)) is not None:
-        plates += (("fig16_error_and_bound", "Errors and what the noise allows", drawn),)
+        plates += (("fig12b_error_and_bound", "Errors and what the noise allows", drawn),)
     if "Y_noisy" in scans[0]:
         plates += (("fig13_detector", "What the detector reads", _detected(scans, found, cores, scale)),)
     if "depolarization" in scans[0]:

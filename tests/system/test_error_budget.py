@@ -54,7 +54,7 @@ def test_a_weak_pulse_is_what_limits(ran):
         assert 0 < metrics[f"error_budget.{method}.vectors"] <= round(count * 33 * 17)
     written = json.loads((folder / "out/metrics.json").read_text())
     assert written["error_budget.cc.time_step.share"] == metrics["error_budget.cc.time_step.share"]
-    assert (folder / "out/figures/fig16_error_budget.png").is_file()
+    assert (folder / "out/figures/fig23_error_budget.png").is_file()
     page = (folder / "out/report.html").read_text()
     assert "limited by noise of the detector" in page and "curved paths in the time step" in page
 
