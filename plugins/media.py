@@ -110,11 +110,13 @@ def _cubes(scene):
         if shape.class_name() != "Cube" or not passes or shape.has_flipped_normals():
             return None
         # x = A c + b for each corner c; a mirrored cube's normals point inwards
-        affine, *_ = np.linalg.lstsq(
-            np.column_stack([corners, np.ones(len(corners))]), _corners(shape), rcond=None
-        )
+        reference, moved = np.column_stack([corners, np.ones(len(corners))]), _corners(shape)
+        if moved.shape != corners.shape:
+            return None
+        affine, *_ = np.linalg.lstsq(reference, moved, rcond=None)
         matrix, centre = affine[:3].T, affine[3]
-        if np.linalg.det(matrix) <= 0:
+        bent = np.abs(reference @ affine - moved).max() > 1e-5 * np.abs(moved).max()
+        if bent or np.linalg.det(matrix) <= 0:
             return None
         if not shape.is_medium_transition():
             continue

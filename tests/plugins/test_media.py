@@ -99,3 +99,14 @@ def test_other_surfaces_are_traced(surface):
 def test_a_cube_without_media_changes_nothing():
     scene, _ = nested({"type": "cube", "bsdf": {"type": "null"}})
     assert len(Air(scene).cubes) == 2
+
+
+def test_a_cube_bent_by_hand_is_traced():
+    scene, _ = nested()
+    shape = next(s for s in scene.shapes() if s.class_name() == "Cube")
+    params = mi.traverse(shape)
+    corners = np.array(params["vertex_positions"])
+    corners[0] += 0.1
+    params["vertex_positions"] = mi.Float(corners)
+    params.update()
+    assert Air(scene).cubes is None
