@@ -6,10 +6,12 @@ components on the images' grid, with their covariance.
 """
 
 import enum
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from scipy import ndimage
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.spatial import ConvexHull, QhullError
 
@@ -26,6 +28,8 @@ from lidar_mi.retrieval.line_of_sight import (
 _ALONG = 5
 # Values of u's standard deviation and length that the evidence is averaged over, of each.
 _CHOICES = 8
+# Powers of the cross-flow's shear that u's standard deviation may go with.
+_POWERS = (0.0, 0.5, 1.0)
 # Share of the evidence below which such a pair is left out.
 _NEGLIGIBLE = 1e-2
 # How far v and w are from their mean where the images gave none, in standard deviations of the
@@ -77,6 +81,7 @@ def combine(
     window: float | None = None,
     u_std: float | None = None,
     u_length: float | None = None,
+    u_power: float | None = None,
 ) -> xr.Dataset:
     """The wind (u, v, w) on the images' grid from both lidars.
 
@@ -100,6 +105,9 @@ def combine(
         exp(-(|dy| + |dz|) / length). Left out: averaged over values of both, each as probable as
         what was measured makes it, from 0.05 to 10 m/s and from a quarter of the lines' spacing
         to twice their extent.
+    u_power : float, optional
+        u's standard deviation goes with this power of the shear of v and w about a place, and is
+        ``u_std`` in the rms over the lines: 0 is even. Left out: averaged over 0, 0.5 and 1 likewise.
 
     Returns
     -------
@@ -107,8 +115,8 @@ def combine(
         `u`, `v`, `w` (m s-1), their standard errors and correlations, `flag` (bits of
         `CombinedFlag`). Where the images gave no vector, v and w are NaN, and lines count for
         less: there v and w are taken to be the others' mean, give or take twice their scatter. Attributes: `lines_used`,
-        `misfit` (of the lines, 1 where errors are as stated), the most probable `u_std` and
-        `u_length`.
+        `misfit` (of the lines, 1 where errors are as stated), the most probable `u_std`,
+        `u_length` and `u_power`.
 
     Raises
     ------
@@ -124,7 +132,8 @@ def combine(
         x = x_b + P H^T S^-1 (b - H x_b),   S = H P H^T + R,   P_x = P - P H^T S^-1 H P .
 
     A line through nodes of good v and w says what u is there; a little is said on v and w too. The
-    stated errors are as good as those of v, w and v_LOS, and hold for u as far as it varies evenly.
+    stated errors are as good as those of v, w and v_LOS, and hold for u as far as it varies evenly, or
+    more where v and w do.
     """
     field = _crossflow(crossflow, crossflow_std)
     z, y = (crossflow[axis].values.astype(float) for axis in ("z", "y"))
@@ -143,29 +152,34 @@ def combine(
     fixed += _MEAN_STD**2 * np.outer(forward, forward)
     fixed += _between_lines(lines, _pull(field, lines), *tent)
 
-    found = _statistics(fixed, residual, lines, z, y, u_std, u_length)
+    spacing = _spacing(lines, z, y)
+    strengths = _strengths(field, lines, z, y, spacing, u_power)
+    found = _statistics(fixed, residual, lines, z, y, spacing, strengths, u_std, u_length)
     good = field.good
     wind = np.zeros((*good.shape, 3))
     covariance = np.zeros((*good.shape, 3, 3))
     rows = max(1, int(_CHUNK_NUMBERS / (3 * len(residual) * len(y))))
     for start in range(0, len(z), rows):
         chunk = slice(start, start + rows)
-        wind[chunk], covariance[chunk] = _posterior(chunk, field, lines, tent, found, residual, z, y)
+        wind[chunk], covariance[chunk] = _posterior(
+            chunk, field, lines, tent, found, strengths, residual, z, y
+        )
     wind[~good, 1:] = np.nan
     covariance[~good, 1:] = covariance[~good, :, 1:] = np.nan
     flag = CombinedFlag.NO_CROSSFLOW * ~good + CombinedFlag.BEYOND_LINES * ~_inside(hull, z, y)
     best = max(found, key=lambda choice: choice.share)
     return _dataset(crossflow, wind, covariance, flag, {
         "lines_used": len(residual), "misfit": best.misfit,
-        "u_std": best.std, "u_length": best.length, "window": window,
+        "u_std": best.std, "u_length": best.length, "u_power": best.power, "window": window,
     })  # fmt: skip
 
 
 class _Choice(NamedTuple):
-    """One statistics of u: standard deviation, length, share of the evidence, S, misfit."""
+    """One statistics of u: how it varies, its share of the evidence, S, misfit."""
 
     std: float
     length: float
+    power: float
     share: float
     factor: tuple
     misfit: float
@@ -298,33 +312,71 @@ def _correlation(axis: np.ndarray, length: float) -> np.ndarray:
     return np.exp(-abs(axis[:, None] - axis) / length)
 
 
-def _statistics(fixed, residual, lines, z, y, std, length) -> list[_Choice]:
+def _spacing(lines: _Lines, z: np.ndarray, y: np.ndarray) -> float:
+    """Of the lines, m."""
+    extent = max(np.ptp(z[lines.z]), np.ptp(y[lines.y]), z[1] - z[0])
+    return extent / np.sqrt(len(lines.along))
+
+
+def _strengths(field, lines, z, y, spacing, power) -> dict[float, np.ndarray]:
+    """Standard deviation of u at the nodes in units of u_std, (z, y), by the power of the shear."""
+    if power is not None and not power >= 0:
+        raise InputError(f"u_power: {power} is not allowed; expected >= 0")
+    square, known = np.zeros(field.good.shape), np.zeros(field.good.shape)
+    for axis, nodes in enumerate((z, y)):
+        step = np.diff(nodes).mean()
+        both = np.stack([np.roll(field.good, shift, axis) for shift in (1, -1)]).all(0)
+        edge = np.arange(len(nodes))[[0, -1]]
+        both[(slice(None),) * axis + (edge,)] = False
+        change = np.roll(field.value, -1, axis) - np.roll(field.value, 1, axis)
+        square += np.where(both, ((change / (2 * step)) ** 2).sum(-1), 0)
+        known += both
+    # over the lines' spacing: finer than this they do not tell how u varies
+    width = [spacing / np.diff(nodes).mean() for nodes in (z, y)]
+    square, known = (ndimage.gaussian_filter(a, width, mode="constant") for a in (square, known))
+    even = np.ones_like(square)
+    seen = known > 1e-3
+    if not (square[seen] > 0).any():
+        return {0.0: even} if power is None else {power: even}
+    shear = np.sqrt(square / np.where(seen, known, 1))
+    shear = np.where(seen, shear, shear[seen].mean())
+    shear = np.maximum(shear, 1e-3 * shear.max())
+    found = {}
+    for one in _POWERS if power is None else (power,):
+        strength = shear**one
+        found[one] = strength / np.sqrt((strength[lines.z, lines.y] ** 2 * lines.weight).sum(1).mean())
+    return found
+
+
+def _statistics(
+    fixed, residual, lines, z, y, spacing, strengths, std, length
+) -> list[_Choice]:
     """Statistics of u with what the lines' velocities make of them (their evidence)."""
     for name, value, unit in (("u_std", std, "m/s"), ("u_length", length, "m")):
         if value is not None and not value > 0:
             raise InputError(f"{name}: {value} {unit} is not allowed; expected more than 0 {unit}")
-    extent = max(np.ptp(z[lines.z]), np.ptp(y[lines.y]), z[1] - z[0])
-    spacing = extent / np.sqrt(len(residual))
+    extent = spacing * np.sqrt(len(residual))
     stds = np.geomspace(0.05, 10, _CHOICES) if std is None else [std]
     lengths = np.geomspace(spacing / 4, 2 * extent, _CHOICES) if length is None else [length]
     along = np.outer(lines.direction[:, 0], lines.direction[:, 0])
     found, evidence = [], []
-    for one_length in lengths:
+    for (power, strength), one_length in itertools.product(strengths.items(), lengths):
         correlations = _correlation(z, one_length), _correlation(y, one_length)
-        shape = along * _between_lines(lines, lines.weight[..., None], *correlations)
+        pull = (lines.weight * strength[lines.z, lines.y])[..., None]
+        shape = along * _between_lines(lines, pull, *correlations)
         for one_std in stds:
             factor = cho_factor(fixed + one_std**2 * shape, lower=True)
             square = float(residual @ cho_solve(factor, residual))
             evidence.append(-np.log(np.diag(factor[0])).sum() - square / 2)
             misfit = square / len(residual)
-            found.append(_Choice(float(one_std), float(one_length), 0.0, factor, misfit))
+            found.append(_Choice(float(one_std), float(one_length), power, 0.0, factor, misfit))
     share = np.exp(np.array(evidence) - max(evidence))
     share[share < _NEGLIGIBLE * share.sum()] = 0
     share /= share.sum()
     return [choice._replace(share=float(s)) for choice, s in zip(found, share) if s > 0]
 
 
-def _posterior(rows, field, lines, tent, choices, residual, z, y):
+def _posterior(rows, field, lines, tent, choices, strengths, residual, z, y):
     """Wind (z, y, 3) and covariance (z, y, 3, 3) at the nodes of some rows."""
     root = field.root[rows]
     across = _onto_nodes(rows, lines, _pull(field, lines), *tent)
@@ -334,8 +386,10 @@ def _posterior(rows, field, lines, tent, choices, residual, z, y):
     winds, covariances = [], []
     for choice in choices:
         correlations = _correlation(z, choice.length), _correlation(y, choice.length)
-        (along,) = _onto_nodes(rows, lines, lines.weight[..., None], *correlations)
-        along = lines.direction[:, 0] * (_MEAN_STD**2 + choice.std**2 * along)
+        strength = choice.std * strengths[choice.power]
+        pull = (lines.weight * strength[lines.z, lines.y])[..., None]
+        (along,) = strength[rows, :, None] * _onto_nodes(rows, lines, pull, *correlations)
+        along = lines.direction[:, 0] * (_MEAN_STD**2 + along)
         both = np.concatenate([along[None], across])
         shape = both.shape
         whitened = solve_triangular(choice.factor[0], both.reshape(-1, shape[-1]).T, lower=True)
@@ -343,7 +397,7 @@ def _posterior(rows, field, lines, tent, choices, residual, z, y):
         data = solve_triangular(choice.factor[0], residual, lower=True)
         winds.append(prior + np.einsum("lazy,l->zya", whitened, data))
         covariance = -np.einsum("lazy,lbzy->zyab", whitened, whitened, optimize=True)
-        covariance[..., 0, 0] += _MEAN_STD**2 + choice.std**2
+        covariance[..., 0, 0] += _MEAN_STD**2 + strength[rows] ** 2
         covariance[..., 1:, 1:] += known
         covariances.append(covariance)
     share = np.array([choice.share for choice in choices])
