@@ -37,6 +37,8 @@ LINES, WIND = "lines_of_sight.nc", "wind3d.nc"
 
 # Speeds at which pictures without noise are made; those between are interpolated (Chebyshev).
 _NODES = 7
+# What counts as no error and no length in a budget of errors, m/s and m.
+_SURE, _SHORT = 0.01, 0.1
 # First number of the lines' pictures, which make their random streams.
 _STREAMS = 1 << 24
 
@@ -97,7 +99,8 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
     log("combining both lidars")
     # what cannot be computed is said, the rest is shown
     try:
-        found = _combined(experiment, truth, lines, folder)
+        crossflow = _crossflow(experiment, folder)
+        found = _combined(experiment, truth, lines, crossflow)
     except InputError as error:
         log.remark(f"no wind from both lidars: {error}")
         (folder / WIND).unlink(missing_ok=True)
@@ -106,6 +109,7 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
     else:
         write_netcdf(found, folder / WIND)
         metrics |= errors(found, cores)
+        metrics |= budget_of_u(experiment, truth, lines, crossflow, found, cores)
     try:
         metrics |= _triple_errors(wind_from_triples(lines), truth)
     except InputError as error:
@@ -123,11 +127,15 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
     return metrics, sensor_chapter(experiment, metrics, judged, drawn, vectors)
 
 
-def _combined(experiment, truth, lines, folder) -> xr.Dataset:
-    """The wind from the lines and from the pictures' winds in the folder, with the truth."""
+def _crossflow(experiment, folder) -> xr.Dataset:
+    """The pictures' wind that the folder holds."""
     with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
         source = NOISY if experiment.detector else "backscatter"
-        crossflow = winds.sel(source=source, algorithm=experiment.sensor.method).load()
+        return winds.sel(source=source, algorithm=experiment.sensor.method).load()
+
+
+def _combined(experiment, truth, lines, crossflow) -> xr.Dataset:
+    """The wind from the lines and from the pictures' wind, with the truth."""
     found = combine(crossflow, lines, crossflow_std=experiment.sensor.crossflow_std)
     for name in COMPONENTS:
         at = {axis: found[axis] for axis in ("z", "y")}
@@ -223,6 +231,65 @@ def errors(found: xr.Dataset, cores) -> dict[str, float]:
         if (far & known).any():
             rmse = float(np.sqrt((error[far & known] ** 2).mean()))
             metrics[f"sensor.outside_cores.rmse_{name}"] = rmse
+    return metrics
+
+
+def budget_of_u(experiment, truth, lines, crossflow, found, cores) -> dict[str, float]:
+    """What limits u: its mean square error without each cause, and without all of them at once.
+
+    Causes: `line_noise` (what the rings' noise leaves), `range_bin` (averaging along it, here over
+    `_SHORT`), `crossflow` (errors of v and w). What is left without all three is the air between the
+    lines (`between_lines`). ``share`` is 1 - (rms error without it)^2 / (rms error)^2, of the last one
+    what is left; shares need not add up to 1.
+
+    Returns
+    -------
+    dict
+        ``sensor.error_budget.CAUSE.rmse_u`` (m/s) and ``.share_u``; good vectors, beyond two core radii
+        where there are cores. Empty without any.
+    """
+    scan = scan_wind(
+        truth, experiment.sensor.directions,
+        experiment.doppler.lidar.model_copy(update={"range_bin": _SHORT}), 0.0, experiment.seed,
+        experiment.platform.speed, experiment.sensor.errors,
+    )  # fmt: skip
+    short = scan["v_los_true"] - lines["v_los_true"]
+    quiet = np.full(lines.sizes["line"], _SURE)
+    at = {axis: crossflow[axis] for axis in ("z", "y")}
+    true = {name: truth[name].interp(at).transpose("z", "y").values for name in COMPONENTS}
+    surely = {f"{name}_stderr": np.full_like(true[name], _SURE) for name in ("v", "w")}
+    surely |= {"v": true["v"], "w": true["w"], "vw_correlation": np.zeros_like(true["v"])}
+    known = crossflow.assign({name: (("z", "y"), field) for name, field in surely.items()})
+    z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
+    chosen = (found["flag"].values == 0) & outside_cores(y, z, cores)
+
+    def square(causes) -> float:
+        changed = lines
+        if "line_noise" in causes:
+            read = lines["v_los_true"].where(lines["v_los"].notnull())
+            changed = changed.assign(v_los=read, v_los_std=("line", quiet))
+        if "range_bin" in causes:
+            changed = changed.assign(v_los=changed["v_los"] + short, range_bin=((), _SHORT))
+        flow, std = crossflow, experiment.sensor.crossflow_std
+        if "crossflow" in causes:
+            flow, std = known, None
+        u = combine(flow, changed, crossflow_std=std)["u"].transpose("z", "y").values
+        return float(((u - true["u"])[chosen] ** 2).mean())
+
+    if not chosen.any():
+        return {}
+    full = square(())
+    if not full > 0:
+        return {}
+    causes = ("line_noise", "range_bin", "crossflow")
+    left = {cause: square((cause,)) for cause in causes}
+    rest = square(causes)
+    metrics = {}
+    for cause, value in left.items():
+        metrics[f"sensor.error_budget.{cause}.rmse_u"] = math.sqrt(value)
+        metrics[f"sensor.error_budget.{cause}.share_u"] = 1 - value / full
+    metrics["sensor.error_budget.between_lines.rmse_u"] = math.sqrt(rest)
+    metrics["sensor.error_budget.between_lines.share_u"] = rest / full
     return metrics
 
 

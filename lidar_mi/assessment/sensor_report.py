@@ -184,7 +184,7 @@ def sensor_chapter(
         vectors = {"title": "The wind from both lidars, vector by vector"} | vectors
     return Chapter(
         title="Both lidars as one sensor",
-        lead=[purpose, warning, *_costs(metrics)],
+        lead=[purpose, warning, *_limit_of_u(metrics), *_costs(metrics)],
         drawn=drawn,
         verdict=Tables(
             "Whether it does what flight control asks for" if speed else "Whether it does what is asked for",
@@ -203,6 +203,31 @@ def sensor_chapter(
         ),
         vectors=vectors,
     )
+
+
+# A cause with less of u's mean square error is no limit.
+_LEAST = 0.05
+_CAUSES = {
+    "between_lines": "the air between the lines of sight",
+    "line_noise": "the noise of the rings",
+    "range_bin": "averaging along the range bin",
+    "crossflow": "errors of v and w",
+}
+
+
+def _limit_of_u(metrics) -> list[str]:
+    """What limits u, in a sentence; nothing where it is not known."""
+    shares = {c: metrics.get(f"sensor.error_budget.{c}.share_u") for c in _CAUSES}
+    if None in shares.values():
+        return []
+    ranked = sorted(shares, key=shares.get, reverse=True)
+    parts = [f"{_CAUSES[c]} ({100 * shares[c]:.0f} %" for c in ranked if shares[c] >= _LEAST]
+    little = [_CAUSES[c] for c in ranked if shares[c] < _LEAST]
+    rmse = metrics.get("sensor.outside_cores.rmse_u", metrics["sensor.rmse_u"])
+    text = f"u is off by {rmse:.2g} m/s rms, limited by " + "), then ".join(
+        [f"{parts[0]} of the mean square error", *parts[1:]]
+    )
+    return [f"{text})" + (f"; next to nothing by {' or '.join(little)}." if little else ".")]
 
 
 def _costs(metrics) -> list[str]:

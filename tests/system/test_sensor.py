@@ -15,11 +15,13 @@ import pytest
 import xarray as xr
 
 from lidar_mi import backscatter_chain, config, fringe_chain, sensor_chain
+from lidar_mi.assessment import sensor_report
 from lidar_mi.assessment.cores import Core
 from lidar_mi.assessment.report import page
 from lidar_mi.assessment.requirements import read_requirements
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run
+from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.retrieval.vortex_file import read_vortices
 
 # a coarse wake, single scattering, a CCD of a sixteenth of the pixels
@@ -84,7 +86,7 @@ def test_the_whole_chain(whole):
     assert metrics["sensor.doppler.pulses_per_second"] == 15 * 10 * 20
     report = (folder / "report.html").read_text()
     for text in ("flight control, from wind vectors, landing", "at most 2.5 m/s",
-                 "safe for eyes from", "2.1 s later", "The wind from both lidars"):  # fmt: skip
+                 "safe for eyes from", "2.1 s later", "u is off by", "The wind from both lidars"):  # fmt: skip
         assert text in report, text
     for name in ("fig19_lines_of_sight", "fig20_wind3d", "fig22_vortices"):
         assert (folder / "figures" / f"{name}.png").stat().st_size > 10_000
@@ -195,6 +197,32 @@ def test_errors_of_a_known_field():
     assert metrics["sensor.reduced_variance_v"] == pytest.approx(4)
     assert metrics["sensor.rmse_w"] == pytest.approx(1)
     assert metrics["sensor.outside_cores.rmse_w"] == 0
+
+
+@pytest.mark.parametrize(("amplitude", "noise"), [(0.0, 0.5), (1.0, 0.01)])
+def test_what_limits_u_is_found(amplitude, noise):
+    """An even u is limited by the noise of its lines, a u of 4 m waves by what lies between them."""
+    experiment = changed(sensor={"errors": {}})
+    y, z = np.arange(-54, 54.1, 1.0), np.arange(-34, 34.1, 1.0)
+    waves = amplitude * np.sin(2 * np.pi * z[:, None] / 4) * np.sin(2 * np.pi * y / 4)
+    fields = {"u": 2 + waves, "v": 0 * waves, "w": 0 * waves}
+    metres = {"units": "m"}
+    truth = xr.Dataset(
+        {n: (("z", "y"), f) for n, f in fields.items()},
+        coords={"y": ("y", y, metres), "z": ("z", z, metres)},
+    )
+    lines = scan_wind(truth, experiment.sensor.directions, experiment.doppler.lidar, noise, 1, 70.0)
+    crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), np.zeros(waves.shape, np.uint8)))
+    crossflow.attrs = {"template": 4, "stride": 1}
+    found = sensor_chain._combined(experiment, truth, lines, crossflow)
+    metrics = sensor_chain.budget_of_u(experiment, truth, lines, crossflow, found, [])
+    shares = {c: metrics[f"sensor.error_budget.{c}.share_u"]
+              for c in ("line_noise", "range_bin", "crossflow", "between_lines")}  # fmt: skip
+    limit, other = ("between_lines", "line_noise") if amplitude else ("line_noise", "between_lines")
+    assert shares[limit] > 0.9 and shares[other] < 0.1
+    assert abs(shares["range_bin"]) < 0.1
+    said = sensor_report._limit_of_u(metrics | {"sensor.rmse_u": 0.5})
+    assert f"limited by {sensor_report._CAUSES[limit]}" in said[0]
 
 
 def test_points_are_counted_as_each_table_means_them():
