@@ -209,7 +209,7 @@ def errors(found: xr.Dataset, cores) -> dict[str, float]:
 
     ``rmse_*``, ``bias_*`` (m/s), ``reduced_variance_*`` (1 where errors are as stated),
     ``coverage_68_*`` and ``coverage_95_*`` (share within 1 and 1.96 standard errors);
-    ``outside_cores.rmse_*`` beyond two core radii.
+    ``outside_cores.rmse_*`` beyond two core radii, and ``outside_cores.rms_*`` of the true wind there.
     """
     good = found["flag"].values == 0
     z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
@@ -229,8 +229,9 @@ def errors(found: xr.Dataset, cores) -> dict[str, float]:
             f"sensor.coverage_95_{name}": float((abs(reduced) < 1.96).mean()),
         }
         if (far & known).any():
-            rmse = float(np.sqrt((error[far & known] ** 2).mean()))
-            metrics[f"sensor.outside_cores.rmse_{name}"] = rmse
+            true = found[f"{name}_true"].values[far & known]
+            for key, values in (("rmse", error[far & known]), ("rms", true)):
+                metrics[f"sensor.outside_cores.{key}_{name}"] = float(np.sqrt((values**2).mean()))
     return metrics
 
 

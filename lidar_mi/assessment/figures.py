@@ -241,8 +241,9 @@ def _deviation_maps(found, source, reference):
             axis.set_facecolor("0.7")
         _image(row[0], error["speed"], f"{METHOD_NAMES[method]}: speed", "speed / m s$^{-1}$",
                extend="both", norm=TwoSlopeNorm(0, -limit, limit), cmap="RdBu_r")  # fmt: skip
+        turn = min(_upper(abs(error["direction"]), 0.99) or 1.0, np.pi)
         _image(row[1], error["direction"], f"{METHOD_NAMES[method]}: direction", "direction / rad",
-               norm=TwoSlopeNorm(0, -np.pi, np.pi), cmap="twilight_shifted")  # fmt: skip
+               extend="both", norm=TwoSlopeNorm(0, -turn, turn), cmap="PuOr_r")  # fmt: skip
     against = "the true wind" if reference is None else f"winds from {reference}"
     return figure, (
         f"Deviations of winds from {source} against {against}: speed (left) and direction "

@@ -313,11 +313,12 @@ def _noise(experiment, metrics) -> str:
               "readout": "read-out"}  # fmt: skip
     parts = ", ".join(
         f"{name} {metrics[f'detector.noise.{key}']:.2%}"
-        for key, name in causes.items() if metrics.get(f"detector.noise.{key}", 0) > 0
+        for key, name in causes.items() if metrics.get(f"detector.noise.{key}", 0) >= 5e-5
     )  # fmt: skip
+    signal = float(f"{metrics['detector.signal']:.3g}")
     return (
         f"{line}; detector {metrics['detector.noise.all']:.2%} with "
-        f"{metrics['detector.signal']:.3g} photoelectrons ({parts})."
+        f"{signal:.10g} photoelectrons ({parts or 'each below 0.01 %'})."
     )
 
 

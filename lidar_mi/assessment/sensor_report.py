@@ -258,6 +258,7 @@ def _numbers(metrics):
     rows = []
     for key, label, unit in (
         ("rmse_{}", "rms error", "m/s"), ("outside_cores.rmse_{}", "rms error beyond cores", "m/s"),
+        ("outside_cores.rms_{}", "the true wind itself there, rms", "m/s"),
         ("bias_{}", "bias", "m/s"), ("reduced_variance_{}", "variance of reduced errors", ""),
         ("coverage_68_{}", "within one standard error", ""),
         ("coverage_95_{}", "within 1.96 standard errors", ""),
