@@ -33,6 +33,9 @@ _COARSE, _FINE = (1.25, 8), (0.625, 5)
 _WEIGHED = (3,)
 # Divergence is first taken to have a tenth of the vorticity's standard deviation.
 _RATIO = 100.0
+# Divergence is taken to have 0.3 % of the standard deviation of vorticity, or more: images of weak
+# texture that show none do not say that there is none.
+_MOST_RATIO = 1e5
 # Width over which the prior's strength varies, over the template.
 _WIDTH = 0.5
 # Residuals beyond so many standard deviations pull no harder than these.
@@ -67,6 +70,8 @@ class Images(NamedTuple):
         Mean variance of the noise over its own at each pixel.
     stack : torch.Tensor, shape (images, z, y)
         The images, of one brightness.
+    white : torch.Tensor, shape (z, y)
+        Variance of white noise at each pixel, as far as it is known not to be texture.
     weighed : bool
         Whether noise holds the misfit at each place already.
     """
@@ -77,15 +82,17 @@ class Images(NamedTuple):
     noise: float
     trust: torch.Tensor
     stack: torch.Tensor
+    white: torch.Tensor
     weighed: bool = False
 
 
 class Linear(NamedTuple):
     """The images about a flow: what they say on its change.
 
-    `slope` (2, z, y) of the mean of the images carried to mid-time, `pull` the slope's weight in
-    the gradient, `weight` that of the slopes' products in the second derivative, `variance` of a
-    difference from the mean, `carried` the images at mid-time and `seen` where all of them are.
+    `slope` (2, z, y) of the mean of the images carried to mid-time, `pull` (2, z, y) down the
+    misfit's gradient, `weight` that of the slopes' products in the second derivative, `variance`
+    of a difference from the mean, `carried` the images at mid-time, of one brightness, and `seen`
+    where all of them are.
     """
 
     slope: torch.Tensor
@@ -167,9 +174,10 @@ class Prior(NamedTuple):
             for part, most in ((share, _LARGEST_DIVERGENCE), (1 - share, _LARGEST))
         )
         everywhere = math.log(everywhere)
+        most = _MOST_RATIO / float((1 / self.strength).mean())
         return self._replace(
             strength=self.strength * _bounded(*local, _LARGEST),
-            divergence=self.divergence * math.exp(self._step(everywhere)),
+            divergence=min(self.divergence * math.exp(self._step(everywhere)), most),
             ratio=self.ratio * beside,
             trend=(math.log(self.divergence), everywhere),
         )
@@ -229,7 +237,8 @@ def variational(
     Parameters
     ----------
     image1, image2 : torch.Tensor, shape (z, y)
-        On one device, where the result stays too. Brightness may differ by a factor and an offset.
+        On one device, where the result stays too. Brightness may differ by a factor and an offset,
+        which are found anew for every flow, from the air that all images see.
     template, search, stride : int
         Pixels, see `windows.Windows`: where vectors are wanted, and the range of the first
         correlation (see `multipass`); the template also sets the scale of the knots.
@@ -276,7 +285,8 @@ def variational(
         for turn in range(rounds):
             seen = _linear(images, knots, mesh, coefficients)
             if (spacing, rounds) == _FINE and turn in _WEIGHED:
-                images = _weighed(first, _linear(first, knots, mesh, coefficients), width)
+                plain = _linear(first, knots, mesh, coefficients)
+                images = _weighed(first, plain, width, noise is not None)
                 seen = _linear(images, knots, mesh, coefficients)
             root, coefficients = _step(seen, knots, mesh, coefficients, prior)
             if turn:
@@ -304,10 +314,13 @@ def _prepared(stack: Sequence[torch.Tensor], noise: float | torch.Tensor | None)
     )
     wide = max_pool2d((~usable).to(trust)[:, None], 7, stride=1, padding=3)[:, 0]
     time = torch.arange(len(stack), dtype=trust.dtype, device=trust.device)
-    return Images(spline, wide == 0, time - time.mean(), level, trust, images)
+    time = time - time.mean()
+    # what is estimated may be texture, until images were seen to differ by it
+    white = torch.zeros_like(trust) if noise is None else level**2 / trust
+    return Images(spline, wide == 0, time, level, trust, images, white)
 
 
-def _weighed(images: Images, seen: Linear, width: float) -> Images:
+def _weighed(images: Images, seen: Linear, width: float, known: bool) -> Images:
     """The images with noise as large, at each place and wave, as what they do not share.
 
     Where no flow of the splines explains the images there is more than their noise: structure
@@ -317,6 +330,8 @@ def _weighed(images: Images, seen: Linear, width: float) -> Images:
     rest = (seen.carried - seen.carried.mean(0)) * seen.seen
     free = (len(rest) - 1) * max(images.spline.passed, 1e-6)
     local = averaged(rest.square().sum(0) * images.trust / free, seen.seen, width)
+    if not known:
+        images = images._replace(white=local.clamp(max=images.noise**2) / images.trust)
     mean = float(local[seen.seen].mean()) if seen.seen.any() else 0.0
     level = max(images.noise**2, mean, 1e-30)
     local = local.clamp(min=max(images.noise**2, 0.5 * level))
@@ -366,7 +381,8 @@ def _linear(
     number = torch.arange(len(value), device=value.device)[:, None, None]
     usable = images.usable[number, at[0], at[1]] & images.spline.holds(z, y)
     seen = usable.all(0)
-    slope = torch.stack([slope_z.mean(0), slope_y.mean(0)])
+    value, gain = _of_one_brightness(value, images.trust * seen)
+    slope = torch.stack([(gain * slope_z).mean(0), (gain * slope_y).mean(0)])
     rest = (value - value.mean(0)) * images.trust.sqrt()
     free = (len(value) - 1) * max(images.spline.passed, 1e-6)
     misfit = rest.square().sum(0)
@@ -377,9 +393,28 @@ def _linear(
         variance = max(variance, float(level) / max(images.spline.passed, 1e-6))
     off = (misfit / (free * variance)).sqrt()
     trust = images.trust * (_ROBUST / off.clamp(min=_ROBUST)) * seen
-    pull = -(images.time[:, None, None] * (value - value.mean(0))).sum(0) * trust / variance
+    time = images.time[:, None, None]
+    pull = -(time * (value - value.mean(0))).sum(0) * slope
+    # less what noise alone pulls to where splines damp it
+    pull = (pull + (time * images.spline.locked(z, y)).mean(1) * images.white) * trust / variance
     weight = images.time.square().sum() * trust / (variance * images.spline.excess)
     return Linear(slope, pull, weight, variance, value, seen)
+
+
+def _of_one_brightness(
+    value: torch.Tensor, weight: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Carried images with one mean and contrast, and what each was multiplied by.
+
+    Of air that all images see, weighted as its noise deserves: bright air that enters a picture
+    changes its mean by little, but by more than the noise of dark air.
+    """
+    share = weight / weight.sum().clamp(min=1e-30)
+    value = value - (share * value).sum((1, 2), keepdim=True)
+    contrast = (share * value.square()).sum((1, 2), keepdim=True).sqrt()
+    # images come with nearly one contrast: what asks for more has none
+    gain = (contrast[:1] / contrast).nan_to_num(1.0).clamp(0.5, 2.0)
+    return gain * value, gain
 
 
 # Median of chi-square with n - 1 degrees of freedom, by the number n of images.
@@ -393,7 +428,7 @@ def _step(
     slope = seen.slope
     data = knots.form(seen.weight * slope[:, None] * slope, mesh)
     band = prior.band(knots)
-    gradient = knots.pulled(seen.pull * slope, mesh) - knots.apply(band, coefficients)
+    gradient = knots.pulled(seen.pull, mesh) - knots.apply(band, coefficients)
     root = knots.factor(data + band)
     return root, coefficients + knots.solve(root, gradient)
 

@@ -14,6 +14,8 @@ from lidar_mi.retrieval.windows import working
 # Pixels of mirrored image around each image. The spline's answer to the edge falls by 0.27 a
 # pixel, the filter's within a correlation length of the texture.
 _MARGIN = 24
+# Places within a pixel, along each axis, at which the variance of interpolated noise is known.
+_PLACES = 64
 # Rings of the power spectrum with fewer waves say too little about their mean.
 _RING_WAVES = 200
 
@@ -32,6 +34,9 @@ class Spline(NamedTuple):
         Variance of a displacement over what the slopes would allow, were they free of noise.
     gain : torch.Tensor, shape (rings,)
         Of the filter, by wavenumber in cycles per shorter side of the image.
+    locking : torch.Tensor, shape (2, places, places)
+        Half the slope along z and y of the variance that white noise of variance 1 has where the
+        spline is read, by the place's fractions of a pixel.
     """
 
     coefficients: torch.Tensor
@@ -39,6 +44,16 @@ class Spline(NamedTuple):
     passed: float
     excess: float
     gain: torch.Tensor
+    locking: torch.Tensor
+
+    def locked(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """Mean product of value and slope (2, ...) of white noise of variance 1 at places, px^-1.
+
+        A spline damps noise most half way between pixels: a misfit is less there, be the flow
+        right or not, and least squares would be pulled to such places.
+        """
+        row, column = ((p * _PLACES).round().long() % _PLACES for p in (z, y))
+        return self.locking[:, row, column]
 
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
         """A field on the images' pixels after the images' filter; it is zero beyond them."""
@@ -174,7 +189,8 @@ def band_limited(
     density, uncertainty = _ring_means(images if weight is None else images * weight, ring, sizes)
     if mismatch is not None:
         # rings that were stopped before stay stopped
-        floor = torch.where(mismatch.isfinite(), mismatch, density).clamp(min=1e-9 * density.max())
+        floor = torch.where(mismatch.isfinite(), mismatch, density)
+        floor = floor.clamp(min=max(1e-9 * float(density.max()), 1e-30))
     elif noise is None:
         # the lowest rings are low by chance as well: the mean of all that may be as low
         floor = (density * (1 + 2 * uncertainty)).min()
@@ -202,12 +218,30 @@ def band_limited(
     mean = images.mean((1, 2), keepdim=True)
     spectrum = torch.fft.rfft2(_extended(images - mean, sizes))
     for axis in frequency:
-        spectrum = spectrum / ((2 + torch.cos(2 * torch.pi * axis)) / 3)
+        gain = gain / ((2 + torch.cos(2 * torch.pi * axis)) / 3)
     smooth = torch.fft.irfft2(spectrum * gain, s=sizes) + mean
     smooth = smooth[:, : shape[0] + 2 * _MARGIN, : shape[1] + 2 * _MARGIN].contiguous()
     excess = power / told if told > 0 else 1.0
     passed /= sizes[0] * sizes[1]
-    return Spline(smooth, shape, passed, excess, response), float(level.sqrt())
+    locking = _locking(torch.fft.irfft2(gain.square(), s=sizes)[:4, :4])
+    return Spline(smooth, shape, passed, excess, response, locking), float(level.sqrt())
+
+
+def _locking(covariance: torch.Tensor) -> torch.Tensor:
+    """`Spline.locking` of coefficients whose noise has this covariance at lags 0 to 3 (4, 4)."""
+    place = torch.arange(_PLACES).to(covariance) / _PLACES
+    value, slope = (torch.stack(parts) for parts in _weights(place))
+    # sums over pairs of knots, by their lag; both signs of the lag at once
+    pairs = [[part[d:] * value[: 4 - d] for d in range(4)] for part in (value, slope)]
+    back = [[part[: 4 - d] * value[d:] for d in range(4)] for part in (value, slope)]
+    even, odd = (
+        torch.stack([
+            (a.sum(0) + b.sum(0)) / (2 if d == 0 else 1)
+            for d, (a, b) in enumerate(zip(*both))
+        ])
+        for both in zip(pairs, back)
+    )  # fmt: skip
+    return torch.stack([odd.T @ covariance @ even, even.T @ covariance @ odd])
 
 
 def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
