@@ -281,11 +281,19 @@ def _ring(frequency: list[torch.Tensor], shape: tuple[int, int]) -> torch.Tensor
 
 
 def _extended(images: torch.Tensor, sizes: list[int]) -> torch.Tensor:
-    """The images mirrored at their edges over the margin, the rest up to `sizes` as well."""
+    """Images of mean 0, mirrored at their edges, fading to 0 over the margin.
+
+    A Fourier transform goes on from the last pixel to the first. Were one side brighter than the
+    other, a filter that stops short waves would ring from that step into the image.
+    """
     for axis, size in zip((1, 2), sizes):
         n = images.shape[axis]
-        place = torch.arange(-_MARGIN, size - _MARGIN, device=images.device) % max(2 * n - 2, 1)
+        place = torch.arange(-_MARGIN, size - _MARGIN, device=images.device)
+        beyond = torch.maximum(-place, place - (n - 1)).clamp(0, _MARGIN).to(images)
+        fade = (1 + torch.cos(torch.pi * beyond / _MARGIN)) / 2
+        place = place % max(2 * n - 2, 1)
         images = images.index_select(axis, torch.minimum(place, (2 * n - 2 - place) % (2 * n)))
+        images = images * (fade[:, None] if axis == 1 else fade)
     return images
 
 

@@ -5,6 +5,8 @@ errors that are wrong by 15 %, a wrong block, band or derivative in the linear a
 is no arc, an aperture problem that is not admitted.
 """
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -17,6 +19,7 @@ from lidar_mi.retrieval.bound import displacement_bound
 from lidar_mi.retrieval.flow_spline import Axis, FlowSpline
 from lidar_mi.retrieval.quality import Flag
 from lidar_mi.retrieval.variational import _fitted, path, variational
+from lidar_mi.retrieval.warping import band_limited
 from lidar_mi.retrieval.wind import retrieve_wind
 from lidar_mi.retrieval.windows import Windows
 
@@ -140,6 +143,119 @@ def test_stripes_leave_one_direction_open():
     assert float((across / (zz + yy - across)).median()) < 0.3
     error = cosine * (found.dz - 0.4) + sine * (found.dy - 0.3)
     assert rms(error[~error.isnan()].numpy()) < 0.1
+
+
+def waves(seed, length):
+    """Texture of rms 1 at places (y, z) in px, of a correlation length in px."""
+    about = plane_waves(seed, length)
+    return lambda y, z: (texture(about, y * SPACING, z * SPACING) - 1) / 0.2
+
+
+def grid(rows, columns):
+    return np.meshgrid(np.arange(float(rows)), np.arange(float(columns)), indexing="ij")
+
+
+def test_known_noise_of_dark_air_beside_bright_is_used_and_not_misread():
+    """Air 20 times as bright goes out, so means and contrasts differ by more than the dark noise.
+
+    Levelled by these, or rung into by a step between the picture's ends, dark air errs by 1 px.
+    """
+    z, y = grid(80, 110)
+    pattern = waves(7, 4.0)
+    random = np.random.default_rng(7)
+    images, levels = [], []
+    for part in (-0.5, 0.5):
+        lateral = y - 1.7 * part
+        bright = 1 + 19 / (1 + np.exp(-(lateral - 70) / 3))
+        clean = bright * (1 + 0.03 * pattern(lateral, z - 0.4 * part))
+        levels.append(0.005 * bright)
+        images.append(torch.tensor(clean + levels[-1] * random.standard_normal(z.shape)))
+    found = variational(*images, noise=torch.tensor(levels[0]))
+    errors = torch.stack([found.dz - 0.4, found.dy - 1.7])
+    reduced = errors / found.covariance[:2].sqrt()
+    assert float(errors.square().mean().sqrt()) < 0.03
+    assert float(reduced.square().mean()) < 2
+    even = variational(*images, noise=float(np.mean(levels[0])))
+    other = torch.stack([even.dz - 0.4, even.dy - 1.7])
+    assert float(errors.square().mean()) < float(other.square().mean())
+
+
+@pytest.mark.parametrize("place", [(0.25, 0.0), (0.3, 0.6), (0.5, 0.1), (0.9, 0.75)])
+def test_what_noise_alone_pulls_is_that_of_drawn_noise(place):
+    """Mean product of value and slope over a million values of white noise: 0.0015 px^-1."""
+    random = torch.Generator().manual_seed(3)
+    noise = torch.randn(150, 90, 110, generator=random, dtype=torch.float64)
+    spline, _ = band_limited(noise, 0.0)
+    z = torch.arange(10.0, 80, dtype=torch.float64)[:, None] + place[0]
+    y = torch.arange(10.0, 100, dtype=torch.float64) + place[1]
+    value, *slopes = spline.sample(*(p.expand(150, 70, 90) for p in torch.broadcast_tensors(z, y)))
+    drawn = [float((value * slope).mean()) for slope in slopes]
+    told = spline.locked(z[:1, :1], y[None, :1]).flatten()
+    # places are read to 1/128 px, over which the slope changes by 0.02
+    assert drawn == pytest.approx(told.tolist(), abs=0.02)
+
+
+def test_noise_does_not_pull_displacements_to_whole_pixels():
+    """Fine texture that is weak in half the picture: the other half has the filter let noise pass.
+
+    Splines damp noise half way between pixels, which alone pulls displacements by 0.12 px.
+    """
+    z, y = grid(80, 110)
+    pattern = waves(3, 2.0)
+    strong = np.where(y < 55, 1.0, 0.15)
+    errors = []
+    for seed in (1, 2, 3):
+        random = np.random.default_rng(seed)
+        pair = [
+            torch.tensor(
+                strong * pattern(y - 0.4 * t, z - 0.4 * t) + 0.1 * random.standard_normal(z.shape)
+            )
+            for t in (-0.5, 0.5)
+        ]
+        found = variational(*pair, noise=0.1)
+        errors.append(torch.stack([found.dz, found.dy])[:, :, 60:] - 0.4)
+    assert float(torch.stack(errors).mean()) == pytest.approx(0, abs=0.03)
+
+
+def test_where_images_share_less_standard_errors_are_larger():
+    """In a patch one picture holds texture that the other does not."""
+    z, y = grid(90, 120)
+    pattern, other = waves(5, 3.0), waves(6, 3.0)
+    random = np.random.default_rng(5)
+    patch = np.exp(-(((z - 45) / 12) ** 2 + ((y - 35) / 12) ** 2) ** 2)
+    first, second = (
+        0.2 * pattern(y - 1.2 * t, z + 0.7 * t) + 0.01 * random.standard_normal(z.shape)
+        for t in (-0.5, 0.5)
+    )
+    second = second + 0.1 * patch * other(y, z)
+    found = variational(torch.tensor(first), torch.tensor(second), noise=0.01)
+    stderr = found.covariance[1].sqrt()
+    inside, outside = stderr[35:48, 25:38], stderr[:, 70:]
+    assert float(inside.median()) > 2 * float(outside.median())
+    # it errs there: by what is said, within a factor of two
+    error = (found.dy - 1.2)[35:48, 25:38]
+    assert float((error / inside).square().mean()) < 4
+
+
+def test_a_flow_that_diverges_everywhere_is_found():
+    """As of wind through the plane; the prior starts from ten times less divergence than vorticity."""
+    z, y = grid(80, 110)
+    pattern = waves(8, 3.0)
+    random = np.random.default_rng(8)
+    rate = 0.04
+    pair = []
+    for t in (-0.5, 0.5):
+        back = math.exp(-rate * t)
+        clean = 1 + 0.2 * pattern((y - 54.5) * back, (z - 39.5) * back)
+        pair.append(torch.tensor(clean + 0.02 * random.standard_normal(z.shape)))
+    found = variational(*pair, noise=0.02)
+    columns, rows = torch.arange(len(found.dy[0])), torch.arange(len(found.dy))
+    lead = Windows((80, 110)).lead + 3.5
+    error = found.dy - rate * (columns + lead - 54.5)
+    down = found.dz - rate * (rows[:, None] + lead - 39.5)
+    assert rms(error.numpy()) < 0.03
+    assert rms(down.numpy()) < 0.03
+    assert float((error.square() / found.covariance[1]).mean()) < 2
 
 
 # --- linear algebra against dense matrices
