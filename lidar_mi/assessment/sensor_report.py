@@ -221,7 +221,7 @@ def _limit_of_u(metrics) -> list[str]:
     if None in shares.values():
         return []
     ranked = sorted(shares, key=shares.get, reverse=True)
-    parts = [f"{_CAUSES[c]} ({100 * shares[c]:.0f} %" for c in ranked if shares[c] >= _LEAST]
+    parts = [f"{_CAUSES[c]} ({100 * min(shares[c], 1):.0f} %" for c in ranked if shares[c] >= _LEAST]
     little = [_CAUSES[c] for c in ranked if shares[c] < _LEAST]
     rmse = metrics.get("sensor.outside_cores.rmse_u", metrics["sensor.rmse_u"])
     text = f"u is off by {rmse:.2g} m/s rms, limited by " + "), then ".join(
