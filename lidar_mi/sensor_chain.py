@@ -31,7 +31,7 @@ from .instrument.fringe_camera import fringe_image
 from .retrieval.combine import combine
 from .retrieval.line_of_sight import COMPONENTS, wind_from_triples
 from .run_folder import Log, write_netcdf
-from .truth import find_file, make_truth
+from .truth import find_file, make_truth, moves_along
 
 LINES, WIND = "lines_of_sight.nc", "wind3d.nc"
 
@@ -134,9 +134,22 @@ def _crossflow(experiment, folder) -> xr.Dataset:
         return winds.sel(source=source, algorithm=experiment.sensor.method).load()
 
 
+def _seen_aslant(experiment) -> dict[str, float]:
+    """How `combine` is told that pictures show some of the motion along x."""
+    if not moves_along(experiment):
+        return {}
+    scan, platform = experiment.scan, experiment.platform
+    # the telescope's distance at mid-time
+    flown = (platform.speed - scan.follow) * platform.dt
+    distance = scan.range + scan.thickness / 2 - flown / 2
+    return {"distance": distance, "gate_speed": scan.follow}
+
+
 def _combined(experiment, truth, lines, crossflow) -> xr.Dataset:
     """The wind from the lines and from the pictures' wind, with the truth."""
-    found = combine(crossflow, lines, crossflow_std=experiment.sensor.crossflow_std)
+    found = combine(
+        crossflow, lines, crossflow_std=experiment.sensor.crossflow_std, **_seen_aslant(experiment)
+    )
     for name in COMPONENTS:
         at = {axis: found[axis] for axis in ("z", "y")}
         found[f"{name}_true"] = truth[name].interp(at).assign_attrs(
@@ -271,10 +284,12 @@ def budget_of_u(experiment, truth, lines, crossflow, found, cores) -> dict[str, 
             changed = changed.assign(v_los=read, v_los_std=("line", quiet))
         if "range_bin" in causes:
             changed = changed.assign(v_los=changed["v_los"] + short, range_bin=((), _SHORT))
-        flow, std = crossflow, experiment.sensor.crossflow_std
+        flow, settings = crossflow, _seen_aslant(experiment)
         if "crossflow" in causes:
-            flow, std = known, None
-        u = combine(flow, changed, crossflow_std=std)["u"].transpose("z", "y").values
+            flow, settings = known, {}
+        else:
+            settings["crossflow_std"] = experiment.sensor.crossflow_std
+        u = combine(flow, changed, **settings)["u"].transpose("z", "y").values
         return float(((u - true["u"])[chosen] ** 2).mean())
 
     if not chosen.any():

@@ -90,12 +90,17 @@ def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | 
     return Truth(rough, smooth, wind)
 
 
+def moves_along(experiment: Experiment) -> bool:
+    """Whether air moves along x between the pictures; a plane of air is the same all along it."""
+    return experiment.wake.turbine is not None or experiment.volume is not None
+
+
 def _carried(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> xr.DataArray:
     """A field after dt, in the frame that goes along with the gates."""
     v, w, dt = flow["v"], flow["w"], experiment.platform.dt
     if float(field.min()) == float(field.max()):
         return field
-    if experiment.wake.turbine is None and experiment.volume is None:
+    if not moves_along(experiment):
         return advect(field, v, w, dt)
     return advect(field, v, w, dt, u=flow["u"] - experiment.scan.follow)
 

@@ -50,7 +50,11 @@ class CombinedFlag(enum.IntFlag):
 
 
 class _Lines(NamedTuple):
-    """Lines of sight as sums over nodes of the grid: of row z and column y with weight."""
+    """Lines of sight as sums over nodes of the grid: of row z and column y with weight.
+
+    ``forward`` is the weight of u at the nodes: what the line sees of it, and what the images took
+    for v and w of it.
+    """
 
     direction: np.ndarray
     along: np.ndarray
@@ -58,6 +62,7 @@ class _Lines(NamedTuple):
     z: np.ndarray
     y: np.ndarray
     weight: np.ndarray
+    forward: np.ndarray
 
 
 class _Crossflow(NamedTuple):
@@ -82,6 +87,8 @@ def combine(
     u_std: float | None = None,
     u_length: float | None = None,
     u_power: float | None = None,
+    distance: float | None = None,
+    gate_speed: float = 0.0,
 ) -> xr.Dataset:
     """The wind (u, v, w) on the images' grid from both lidars.
 
@@ -108,6 +115,12 @@ def combine(
     u_power : float, optional
         u's standard deviation goes with this power of the shear of v and w about a place, and is
         ``u_std`` in the rms over the lines: 0 is even. Left out: averaged over 0, 0.5 and 1 likewise.
+    distance : float, optional
+        Of the images' plane x = const from the telescope, m: air that moves along x by dx while
+        their gates do not shifts by -y / distance dx, -z / distance dx in them, as oblique beams look
+        at it. Left out: images show no motion along x, as of air that is the same along it.
+    gate_speed : float
+        Of the images' gates over the ground along x, m/s; matters with ``distance``.
 
     Returns
     -------
@@ -138,13 +151,17 @@ def combine(
     field = _crossflow(crossflow, crossflow_std)
     z, y = (crossflow[axis].values.astype(float) for axis in ("z", "y"))
     lines, hull = _lines(scan, z, y)
+    slope = _slopes(z, y, distance)
+    # v and w where u is the gates' speed; what u is beyond that is seen along with them
+    field = field._replace(value=field.value - gate_speed * slope)
+    lines = _with_slopes(lines, slope)
     if window is None:
         window = _window(crossflow)
     elif not window >= 0:
         raise InputError(f"window: {window} m is not allowed; expected >= 0 m")
     tent = [_tent(axis, window) for axis in (z, y)]
 
-    forward, across = lines.direction[:, 0], lines.direction[:, 1:]
+    forward, across = lines.forward.sum(1), lines.direction[:, 1:]
     mean = np.einsum("lk,lkc->lc", lines.weight, field.value[lines.z, lines.y])
     residual = lines.along - (across * mean).sum(1)
     unseen = (lines.weight * ~field.good[lines.z, lines.y]).sum(1)
@@ -164,6 +181,10 @@ def combine(
         wind[chunk], covariance[chunk] = _posterior(
             chunk, field, lines, tent, found, strengths, residual, z, y
         )
+    wind[..., 1:] += slope * wind[..., :1]
+    turn = np.zeros((*good.shape, 3, 3)) + np.eye(3)
+    turn[..., 1:, 0] = slope
+    covariance = turn @ covariance @ turn.swapaxes(-1, -2)
     wind[~good, 1:] = np.nan
     covariance[~good, 1:] = covariance[~good, :, 1:] = np.nan
     flag = CombinedFlag.NO_CROSSFLOW * ~good + CombinedFlag.BEYOND_LINES * ~_inside(hull, z, y)
@@ -172,6 +193,21 @@ def combine(
         "lines_used": len(residual), "misfit": best.misfit,
         "u_std": best.std, "u_length": best.length, "u_power": best.power, "window": window,
     })  # fmt: skip
+
+
+def _slopes(z: np.ndarray, y: np.ndarray, distance: float | None) -> np.ndarray:
+    """By how much v and w of the images fall short for each m/s of u over the gates', (z, y, 2)."""
+    if distance is None:
+        return np.zeros((len(z), len(y), 2))
+    if not distance > 0:
+        raise InputError(f"distance: {distance} m is not allowed; expected more than 0 m")
+    return np.stack(np.meshgrid(y, z), -1) / distance
+
+
+def _with_slopes(lines: _Lines, slope: np.ndarray) -> _Lines:
+    """Lines where a part of u is among v and w of the images."""
+    more = np.einsum("lkc,lc->lk", slope[lines.z, lines.y], lines.direction[:, 1:])
+    return lines._replace(forward=lines.weight * (lines.direction[:, :1] + more))
 
 
 class _Choice(NamedTuple):
@@ -251,7 +287,9 @@ def _lines(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[_Lines, np.n
     row, column, weight = (np.concatenate(p, axis=1)[used] for p in zip(*parts))
     variance = scan["v_los_std"].values[used] ** 2
     middle = np.stack([scan["range"].values * direction[:, k] for k in (1, 2)], -1)
-    return _Lines(direction[used], along[used], variance, row, column, weight), middle[used]
+    direction = direction[used]
+    forward = weight * direction[:, :1]
+    return _Lines(direction, along[used], variance, row, column, weight, forward), middle[used]
 
 
 def _part(fraction, side):
@@ -358,12 +396,11 @@ def _statistics(
     extent = spacing * np.sqrt(len(residual))
     stds = np.geomspace(0.05, 10, _CHOICES) if std is None else [std]
     lengths = np.geomspace(spacing / 4, 2 * extent, _CHOICES) if length is None else [length]
-    along = np.outer(lines.direction[:, 0], lines.direction[:, 0])
     found, evidence = [], []
     for (power, strength), one_length in itertools.product(strengths.items(), lengths):
         correlations = _correlation(z, one_length), _correlation(y, one_length)
-        pull = (lines.weight * strength[lines.z, lines.y])[..., None]
-        shape = along * _between_lines(lines, pull, *correlations)
+        pull = (lines.forward * strength[lines.z, lines.y])[..., None]
+        shape = _between_lines(lines, pull, *correlations)
         for one_std in stds:
             factor = cho_factor(fixed + one_std**2 * shape, lower=True)
             square = float(residual @ cho_solve(factor, residual))
@@ -387,9 +424,9 @@ def _posterior(rows, field, lines, tent, choices, strengths, residual, z, y):
     for choice in choices:
         correlations = _correlation(z, choice.length), _correlation(y, choice.length)
         strength = choice.std * strengths[choice.power]
-        pull = (lines.weight * strength[lines.z, lines.y])[..., None]
+        pull = (lines.forward * strength[lines.z, lines.y])[..., None]
         (along,) = strength[rows, :, None] * _onto_nodes(rows, lines, pull, *correlations)
-        along = lines.direction[:, 0] * (_MEAN_STD**2 + along)
+        along = _MEAN_STD**2 * lines.forward.sum(1) + along
         both = np.concatenate([along[None], across])
         shape = both.shape
         whitened = solve_triangular(choice.factor[0], both.reshape(-1, shape[-1]).T, lower=True)

@@ -119,6 +119,46 @@ def test_generalised_least_squares_written_out(window, range_bin):
         np.testing.assert_allclose(covariance_at(found, z, y), expected, atol=1e-6)
 
 
+def test_images_that_see_motion_along_x():
+    """Images of v - (u - c) y / D and w - (u - c) z / D, and lines: least squares over all nodes."""
+    random = np.random.default_rng(5)
+    shape, distance, gates = (len(Z), len(Y)), 10.0, 1.7
+    flow = crossflow(random.normal(0, 3, shape), random.normal(0, 3, shape), 0.6, 0.3)
+    scan = lines(random.uniform([-2.6, -1.6], [2.6, 1.6], (8, 2)), random.normal(0, 3, 8), 0.4)
+    found = combine(
+        flow, scan, window=0.0, u_std=1.3, u_length=2.0, u_power=0.0, distance=distance, gate_speed=gates
+    )
+    zz, yy = (a.ravel() for a in np.meshgrid(Z, Y, indexing="ij"))
+    n, one = len(zz), np.eye(len(zz))
+    far = abs(zz[:, None] - zz) + abs(yy[:, None] - yy)
+    information = np.zeros((3 * n, 3 * n))
+    information[:n, :n] = np.linalg.inv(100.0**2 + 1.3**2 * np.exp(-far / 2.0))
+    # the images, node by node
+    both = np.linalg.inv(np.array([[0.36, 0.3 * 0.6 * 0.9], [0.3 * 0.6 * 0.9, 0.81]]))
+    see = np.zeros((2, n, 3 * n))
+    see[0] = np.hstack([-np.diag(yy / distance), one, 0 * one])
+    see[1] = np.hstack([-np.diag(zz / distance), 0 * one, one])
+    measured = np.stack([flow.v.values.ravel() - gates * yy / distance,
+                         flow.w.values.ravel() - gates * zz / distance])  # fmt: skip
+    data = np.einsum("anx,ab,bn->x", see, both, measured)
+    information += np.einsum("anx,ab,bny->xy", see, both, see)
+    for k in range(8):
+        d, (y, z) = scan.direction.values[k], float(scan.range[k]) * scan.direction.values[k, 1:]
+        hat = np.clip(1 - abs(y - yy), 0, None) * np.clip(1 - abs(z - zz), 0, None)
+        row = np.concatenate([d[0] * hat, d[1] * hat, d[2] * hat])
+        information += np.outer(row, row) / 0.16
+        data -= row * float(scan.v_los[k]) / 0.16
+    covariance = np.linalg.inv(information)
+    wind = (covariance @ data).reshape(3, *shape)
+    for index, name in enumerate("uvw"):
+        np.testing.assert_allclose(found[name], wind[index], atol=1e-6)
+    for z, y in ((0, 0), (2, 3), (4, 6)):
+        pick = [z * len(Y) + y + part * n for part in range(3)]
+        np.testing.assert_allclose(
+            covariance_at(found, z, y), covariance[np.ix_(pick, pick)], atol=1e-6
+        )
+
+
 def test_information_adds_up_node_by_node():
     """Independent nodes, a line through every one: J = J_images + d d^T / s^2 + J_u, 3 x 3."""
     random = np.random.default_rng(4)
@@ -399,6 +439,7 @@ LINES = lines(np.array([[0.3, 0.2], [1.0, 1.0]]), [1.0, 2.0], 0.5)
         (lambda: combine(FLOW, LINES, u_std=0), "u_std: 0 m/s"),
         (lambda: combine(FLOW, LINES, u_length=-2), "u_length: -2 m"),
         (lambda: combine(FLOW, LINES, u_power=-1), "u_power: -1"),
+        (lambda: combine(FLOW, LINES, distance=0), "distance: 0 m"),
         (lambda: combine(FLOW.assign_attrs(template=None).drop_attrs(), LINES), "crossflow"),
     ],
 )
