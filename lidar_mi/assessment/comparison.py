@@ -152,6 +152,12 @@ def draw_comparison(
     axes = figure.subplots(len(rows), 3, squeeze=False)
     limit = max(float(abs(wind["w_true"]).quantile(0.995)) for _, wind, _ in rows.values()) or 1.0
     speeds = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    errors = {
+        name: (wind["w"] - wind["w_true"]).where(wind["flag"] == 0)
+        for name, (_, wind, _) in rows.items()
+    }
+    largest = [float(abs(error).quantile(0.99)) for error in errors.values() if error.notnull().any()]
+    top = min(max(largest, default=0.0), limit) or limit
     for row, (name, (picture, wind, cores)) in zip(axes, rows.items()):
         low, high = (float(1e6 * picture.quantile(share)) for share in (0.002, 0.998))
         good, place = wind["flag"] == 0, {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"}
@@ -159,7 +165,7 @@ def draw_comparison(
             (1e6 * picture.sel(place), {"cmap": "cividis", "vmin": low, "vmax": high},
              f"{name}: picture", BACKSCATTER),
             (wind["w"].where(good), speeds, f"{name}: w found", _SPEED),
-            ((wind["w"] - wind["w_true"]).where(good), speeds, f"{name}: error of w", _SPEED),
+            (errors[name], speeds | {"vmin": -top, "vmax": top}, f"{name}: error of w", _SPEED),
         )  # fmt: skip
         for panel, (field, style, title, label) in zip(row, columns):
             y, z = field["y"].values, field["z"].values
@@ -175,7 +181,7 @@ def draw_comparison(
         panel.set_xlabel("y / m (port is left)")
     caption = (
         "Each variant's first picture, the vertical wind found by its first method (white: flagged "
-        "vectors), and its error, on one scale. Crosses: true cores."
+        "vectors), and its error; winds are on one scale, errors on another. Crosses: true cores."
     )
     plate = ("fig00_comparison", "The variants side by side", (figure, caption))
     return save_all(folder, [plate], log)
