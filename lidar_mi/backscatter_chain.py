@@ -33,6 +33,9 @@ from .truth import Flows, Truth, blur_by_beam, make_truth, read_flows
 # what winds are retrieved from behind a detector, beside the noise-free picture
 NOISY = "backscatter_noisy"
 
+# what no instrument has seen
+EXACT = ("extinction", "extinction_without_texture")
+
 # time of looking into the beams, s, where no sensor says another
 EXPOSURE = 10.0
 
@@ -195,6 +198,7 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
     would see), the rendered backscatter and, with a detector, the same with its noise.
     """
     settings, lidar = experiment.retrieval, experiment.lidar
+    blur = lidar.radius_at(plans[0].centre) / 2 if settings.blur == "beam" else settings.blur
     rendered = rendered_pairs(experiment, scans)
     images = {
         "extinction": [truth.image(k) for k in (0, 1)],
@@ -225,6 +229,8 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
                 method=method,
                 **window_settings(settings),
                 noise=level,
+                # the extinction itself has passed no instrument
+                blur=0.0 if source in EXACT else blur,
             )
             wind = wind.assign(
                 {name: (field.dims, field.data, field.attrs) for name, field in bound.items()}
@@ -266,7 +272,7 @@ def rendered_pairs(experiment: Experiment, scans) -> dict[str, tuple[list[xr.Dat
 
 def window_settings(settings) -> dict:
     """Window sizes and thresholds, as `retrieve_wind` takes them."""
-    return settings.model_dump(exclude={"methods", "error_budget"})
+    return settings.model_dump(exclude={"methods", "error_budget", "blur"})
 
 
 def texture_sweep(experiment: Experiment, flows: Flows, log) -> dict[str, float]:

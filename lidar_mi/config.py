@@ -192,6 +192,9 @@ class Retrieval(_Section):
     min_correlation: Number = Field(0.5, ge=-1, le=1)
     min_texture: Number = Field(0.01, ge=0)
     min_isotropy: Number = Field(0.2, ge=0, le=1)
+    blur: Literal["beam"] | Annotated[Length, Field(ge=0)] = Field(
+        0.0, description="standard deviation of what a beam averages over, undone by variational"
+    )
     error_budget: bool = Field(False, description="find winds without each cause of error, too")
 
     @model_validator(mode="after")

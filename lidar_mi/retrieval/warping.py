@@ -14,6 +14,9 @@ from lidar_mi.retrieval.windows import working
 # Pixels of mirrored image around each image. The spline's answer to the edge falls by 0.27 a
 # pixel, the filter's within a correlation length of the texture.
 _MARGIN = 24
+# Waves that blur lowered are raised by this at most: of more, the rims that the blur did not see
+# and what a spline loses between pixels is all there is.
+_SHARPEST = 4.0
 # Places within a pixel, along each axis, at which the variance of interpolated noise is known.
 _PLACES = 64
 # Rings of the power spectrum with fewer waves say too little about their mean.
@@ -34,6 +37,9 @@ class Spline(NamedTuple):
         Variance of a displacement over what the slopes would allow, were they free of noise.
     gain : torch.Tensor, shape (rings,)
         Of the filter, by wavenumber in cycles per shorter side of the image.
+    worth : float
+        Of what the slopes seem to tell, the share that they do: 1 but where blur was undone, which
+        makes the noise of short waves stronger.
     locking : torch.Tensor, shape (2, places, places)
         Half the slope along z and y of the variance that white noise of variance 1 has where the
         spline is read, by the place's fractions of a pixel.
@@ -44,6 +50,7 @@ class Spline(NamedTuple):
     passed: float
     excess: float
     gain: torch.Tensor
+    worth: float
     locking: torch.Tensor
 
     def locked(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
@@ -148,6 +155,7 @@ def band_limited(
     noise: float | None = None,
     mismatch: torch.Tensor | None = None,
     weight: torch.Tensor | None = None,
+    blur: float = 0.0,
 ) -> tuple[Spline, float]:
     """Splines through the images, after a filter that passes the texture and stops the noise.
 
@@ -171,6 +179,9 @@ def band_limited(
         60, 117-130), so that what it passes of the mismatch is as if it had been white.
     weight : torch.Tensor, shape (z, y), optional
         Of the pixels, for the texture's spectrum.
+    blur : float, optional
+        Standard deviation, px, of a Gaussian that blurred the images. It is undone by a Wiener
+        filter, S / (S + N / 2) / B with the Gaussian's transform B and S as it is in the images.
 
     Returns
     -------
@@ -205,14 +216,19 @@ def band_limited(
     response = texture / (texture + floor / 2 + tiny)
     # as if all noise were white and of this variance
     level = floor if mismatch is None else torch.as_tensor(noise**2).to(floor)
+    if blur:
+        wave = (torch.arange(len(response)).to(response) + 0.5) / min(shape)
+        sharper = torch.exp(2 * (torch.pi * blur * wave).square()).clamp(max=_SHARPEST)
+        response = torch.where(response > 0, (response * sharper).square(), 0.0)
     passed = response[ring]
     passed = float(passed[:, :1].sum() + 2 * passed[:, 1:].sum())
-    response = (response * (level / floor if mismatch is not None else 1.0)).sqrt()
-    gain = response[ring]
-    # the slopes' power with noise and filter, and what of it tells the displacement
-    power, told = (
+    white = level / floor if mismatch is not None else torch.ones_like(response)
+    gain = (response * white).sqrt()[ring]
+    # the slopes' power with noise and filter, what of it tells the displacement, and its variance
+    both = texture + floor / 2
+    power, told, spread = (
         float((radius**2 * gain**2 * spectrum[ring]).sum())
-        for spectrum in (texture + floor / 2, texture)
+        for spectrum in (both, texture, response * both)
     )
 
     mean = images.mean((1, 2), keepdim=True)
@@ -223,8 +239,9 @@ def band_limited(
     smooth = smooth[:, : shape[0] + 2 * _MARGIN, : shape[1] + 2 * _MARGIN].contiguous()
     excess = power / told if told > 0 else 1.0
     passed /= sizes[0] * sizes[1]
+    worth = told / spread if told > 0 else 1.0
     locking = _locking(torch.fft.irfft2(gain.square(), s=sizes)[:4, :4])
-    return Spline(smooth, shape, passed, excess, response, locking), float(level.sqrt())
+    return Spline(smooth, shape, passed, excess, (response * white).sqrt(), worth, locking), float(level.sqrt())
 
 
 def _locking(covariance: torch.Tensor) -> torch.Tensor:

@@ -70,7 +70,7 @@ METHODS: Mapping[str, Method] = {
     "variational": Method(
         variational,
         ("correlation", "normalised cross-correlation of the images carried to mid-time"),
-        ("min_correlation", "noise", "more"),
+        ("min_correlation", "noise", "more", "blur"),
         centred=True,
         local=False,
     ),
@@ -100,6 +100,7 @@ def retrieve_wind(
     min_isotropy: float = 0.2,
     noise: float | xr.DataArray | None = None,
     more: Sequence[xr.DataArray] = (),
+    blur: float = 0.0,
     median_size: int = 3,
     median_threshold: float = 2.0,
     median_epsilon: float = 0.1,
@@ -135,6 +136,9 @@ def retrieve_wind(
     more : sequence of xr.DataArray
         Further images on the same grid, each dt after the one before ("variational"): a burst,
         whose mid-time is the winds'.
+    blur : float
+        Standard deviation, m, of the Gaussian by which the instrument blurs the air, as a beam of
+        1/e^2 radius 2 `blur` does ("variational", which then sharpens; square pixels only).
     median_size, median_threshold, median_epsilon
         Normalised median test, see `quality.median_outliers`. Neighbours are taken half a
         template apart (or a stride, if that is more): closer ones share their pixels.
@@ -170,6 +174,7 @@ def retrieve_wind(
             f"or method {takes}"
         )
     windows = Windows(image1.shape, template, search, stride)
+    blurred = _blur_px(image1, blur)
     pixels1, pixels2 = (on_device(image, device) for image in (image1, image2))
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
@@ -178,7 +183,7 @@ def retrieve_wind(
     axes = tuple(image1[name].values.astype(float) for name in ("z", "y"))
     offered = {
         "min_correlation": min_correlation, "noise": noise, "axes": axes, "dt": dt,
-        "more": [on_device(image, device) for image in more],
+        "more": [on_device(image, device) for image in more], "blur": blurred,
     }  # fmt: skip
     options = {name: offered[name] for name in chosen.options}
     found = chosen.find(pixels1, pixels2, template, search, stride, **options)
@@ -206,6 +211,8 @@ def retrieve_wind(
         "median_threshold": median_threshold,
         "median_epsilon": median_epsilon,
     }
+    if blur and "blur" in options:
+        attributes["blur"] = blur
     if "min_correlation" in options:
         attributes["min_correlation"] = min_correlation
     return _dataset(image1, windows, found._replace(flag=flag), texture, attributes)
@@ -259,6 +266,19 @@ def wind_bound(
         for k, axis in enumerate(("z", "y"))
     }
     return xr.Dataset(found, coords)
+
+
+def _blur_px(image: xr.DataArray, blur: float) -> float:
+    """From m to px."""
+    if not 0 <= blur < np.inf:
+        raise InputError(f"blur: {blur!r} m is not allowed; expected a standard deviation >= 0")
+    z, y = (np.ptp(image[name].values) / (image.sizes[name] - 1) for name in ("z", "y"))
+    if blur and abs(z / y - 1) > 0.01:
+        raise InputError(
+            f"blur: not allowed with pixels of {y:g} m along y and {z:g} m along z; expected "
+            "square ones"
+        )
+    return float(blur / y)
 
 
 def _dataset(

@@ -10,8 +10,17 @@ import math
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
-from benchmarks.cases import DT, SPACING, origin, plane_waves, texture, vortex_pair_images
+from benchmarks.cases import (
+    DT,
+    SPACING,
+    data_array,
+    origin,
+    plane_waves,
+    texture,
+    vortex_pair_images,
+)
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.block_tridiagonal import factor
@@ -256,6 +265,44 @@ def test_a_flow_that_diverges_everywhere_is_found():
     assert rms(error.numpy()) < 0.03
     assert rms(down.numpy()) < 0.03
     assert float((error.square() / found.covariance[1]).mean()) < 2
+
+
+def blurred_errors(seed, noise, sigma):
+    """Errors in the cores, with and without `blur`, of pictures blurred after the air has moved."""
+    pair = vortex_pair_images(0.0, seed, correlation_length=2.0, columns=160, rows=100)
+    random = np.random.default_rng(seed)
+    pictures = [
+        image.copy(
+            data=gaussian_filter(image.values, sigma) + noise * random.standard_normal(image.shape)
+        )
+        for image in (pair.first, pair.second)
+    ]
+    errors = []
+    for blur in (0.0, sigma * SPACING):
+        wind = retrieve_wind(*pictures, DT, "variational", noise=noise, blur=blur, stride=2)
+        z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
+        true = velocity(pair.vortices, y, z)
+        core = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) < 6
+        errors.append([rms((wind[n].values - t)[m]) for m in (core, ~core) for n, t in zip("vw", true)])
+    return np.reshape(errors, (2, 2, 2))
+
+
+def test_blur_that_is_known_is_undone_in_the_cores():
+    """It commutes with shifts, not with what turns and shears; beyond the cores it costs little."""
+    plain, undone = blurred_errors(1, 0.01, 1.0)
+    assert (undone[0] < 0.85 * plain[0]).all()
+    assert (undone[1] < 0.08).all()
+
+
+@pytest.mark.parametrize(
+    ("blur", "columns", "message"),
+    [(-1.0, 1.0, "blur: -1.0 m"), (0.5, 1.5, "blur: not allowed with pixels of")],
+)
+def test_blur_that_cannot_be_is_named(blur, columns, message):
+    noise = np.random.default_rng(1).random((40, 50))
+    image = data_array(noise, columns * np.arange(50.0), np.arange(40.0))
+    with pytest.raises(InputError, match=message):
+        retrieve_wind(image, image, DT, "variational", blur=blur)
 
 
 # --- linear algebra against dense matrices
