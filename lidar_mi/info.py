@@ -153,9 +153,7 @@ def _study(folder: Path) -> Iterator[Section]:
     from .study import read_study
 
     name, records, metrics = read_study(folder)
-    rows = [("variant", *records), ("folder", *(
-        str(folder / key) if record else "not run" for key, record in records.items()
-    ))]  # fmt: skip
+    rows = [("variant", *(key if record else f"{key} (not run)" for key, record in records.items()))]
     settings = {key: flat(record["experiment"]) if record else {} for key, record in records.items()}
     done = {key: one for key, one in settings.items() if one}
     for key, values in differences(done).items():

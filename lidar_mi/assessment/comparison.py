@@ -131,10 +131,16 @@ def _three(value: float) -> str:
 
 
 def setting(value) -> str:
-    """An experiment's value as text; a dash: there is none."""
+    """An experiment's value as text, numbers to six digits; a dash: there is none."""
     if value is None:
         return "-"
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    if isinstance(value, list):
+        return ", ".join(map(setting, value))
+    number, blank, unit = str(value).partition(" ")
+    try:
+        return f"{float(number):.6g}{blank}{unit}"
+    except ValueError:
+        return str(value)
 
 
 def draw_comparison(
