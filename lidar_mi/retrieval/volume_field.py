@@ -8,6 +8,7 @@ import torch
 from torch.nn.functional import max_pool3d
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.warping import extended
 
 # Voxels of mirrored volume around each volume: the spline's answer to a face falls by 0.27 a voxel.
 _MARGIN = 12
@@ -213,21 +214,12 @@ def _band_limited(values: torch.Tensor, noise: float | None):
     told = float((steep * texture[shell]).sum())
     excess = float((steep * (texture + floor / 2)[shell]).sum()) / told if told > 0 else 1.0
 
-    spectrum = torch.fft.rfftn(_mirrored(values, sizes), dim=(1, 2, 3)) * gain
+    spectrum = torch.fft.rfftn(extended(values, sizes, _MARGIN), dim=(1, 2, 3)) * gain
     for axis in frequency:
         spectrum = spectrum / ((2 + torch.cos(2 * torch.pi * axis)) / 3)
     smooth = torch.fft.irfftn(spectrum, s=sizes, dim=(1, 2, 3))
     kept = smooth[:, : shape[0] + 2 * _MARGIN, : shape[1] + 2 * _MARGIN, : shape[2] + 2 * _MARGIN]
     return kept.contiguous(), float(floor.sqrt()), max(passed, 1e-6), excess
-
-
-def _mirrored(values: torch.Tensor, sizes: Sequence[int]) -> torch.Tensor:
-    """The volumes mirrored at their faces over the margin, the rest up to `sizes` as well."""
-    for axis, size in enumerate(sizes, 1):
-        n = values.shape[axis]
-        place = torch.arange(-_MARGIN, size - _MARGIN, device=values.device) % max(2 * n - 2, 1)
-        values = values.index_select(axis, torch.minimum(place, (2 * n - 2 - place) % (2 * n)))
-    return values
 
 
 def _shell_means(

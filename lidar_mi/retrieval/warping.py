@@ -232,7 +232,7 @@ def band_limited(
     )
 
     mean = images.mean((1, 2), keepdim=True)
-    spectrum = torch.fft.rfft2(_extended(images - mean, sizes))
+    spectrum = torch.fft.rfft2(extended(images - mean, sizes))
     for axis in frequency:
         gain = gain / ((2 + torch.cos(2 * torch.pi * axis)) / 3)
     smooth = torch.fft.irfft2(spectrum * gain, s=sizes) + mean
@@ -297,20 +297,26 @@ def _ring(frequency: list[torch.Tensor], shape: tuple[int, int]) -> torch.Tensor
     return (torch.hypot(*frequency) * min(shape)).long()
 
 
-def _extended(images: torch.Tensor, sizes: list[int]) -> torch.Tensor:
-    """Images of mean 0, mirrored at their edges, fading to 0 over the margin.
+def extended(images: torch.Tensor, sizes: Sequence[int], margin: int = _MARGIN) -> torch.Tensor:
+    """Images or volumes of mean 0, mirrored at their edges, fading to 0 over the margin.
 
     A Fourier transform goes on from the last pixel to the first. Were one side brighter than the
     other, a filter that stops short waves would ring from that step into the image.
+
+    Parameters
+    ----------
+    images : torch.Tensor, shape (number, ...)
+    sizes : sequence of int
+        Of the result along all axes but the first; `margin` pixels of it come before the image.
     """
-    for axis, size in zip((1, 2), sizes):
+    for axis, size in enumerate(sizes, 1):
         n = images.shape[axis]
-        place = torch.arange(-_MARGIN, size - _MARGIN, device=images.device)
-        beyond = torch.maximum(-place, place - (n - 1)).clamp(0, _MARGIN).to(images)
-        fade = (1 + torch.cos(torch.pi * beyond / _MARGIN)) / 2
+        place = torch.arange(-margin, size - margin, device=images.device)
+        beyond = torch.maximum(-place, place - (n - 1)).clamp(0, margin).to(images)
+        fade = (1 + torch.cos(torch.pi * beyond / margin)) / 2
         place = place % max(2 * n - 2, 1)
         images = images.index_select(axis, torch.minimum(place, (2 * n - 2 - place) % (2 * n)))
-        images = images * (fade[:, None] if axis == 1 else fade)
+        images = images * fade.reshape(-1, *[1] * (len(sizes) - axis))
     return images
 
 
