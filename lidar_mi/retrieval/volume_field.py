@@ -8,7 +8,7 @@ import torch
 from torch.nn.functional import max_pool3d
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.warping import extended
+from lidar_mi.retrieval.warping import extended, spline_weights
 
 # Voxels of mirrored volume around each volume: the spline's answer to a face falls by 0.27 a voxel.
 _MARGIN = 12
@@ -80,7 +80,7 @@ class Volumes(NamedTuple):
         sizes = self.coefficients.shape[1:]
         at = [p.clamp(0, n - 1) + _MARGIN - 1 for p, n in zip(place, self.shape)]
         low = [p.floor() for p in at]
-        x, z, y = (_weights(p - below) for p, below in zip(at, low))
+        x, z, y = (spline_weights(p - below) for p, below in zip(at, low))
         corner = (low[0].long() * sizes[1] + low[1].long()) * sizes[2] + low[2].long()
         flat = self.coefficients[number].reshape(-1)
         total = torch.zeros_like(at[0]).repeat(4, 1)
@@ -107,15 +107,6 @@ class Volumes(NamedTuple):
             inside &= (p >= 0) & (p <= n - 1)
         nearest = [p.round().long().clamp(0, n - 1) for p, n in zip(place, self.shape)]
         return inside & self.usable[number][tuple(nearest)]
-
-
-def _weights(t: torch.Tensor) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
-    """The four cubic B-splines over a cell, and their slopes, at the fraction t of the cell."""
-    s, t2 = 1 - t, t * t
-    s2 = s * s
-    value = [s2 * s / 6, 2 / 3 - t2 + t2 * t / 2, 2 / 3 - s2 + s2 * s / 2, t2 * t / 6]
-    slope = [-s2 / 2, t * (1.5 * t - 2), s * (2 - 1.5 * s), t2 / 2]
-    return value, slope
 
 
 def prepared(volumes: Sequence[torch.Tensor], noise: float | torch.Tensor | None = None) -> Volumes:

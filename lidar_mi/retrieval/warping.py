@@ -95,7 +95,7 @@ class Spline(NamedTuple):
             place.clamp(0, size - 1) + margin - 1 for place, size in zip((z, y), self.shape)
         )
         row, column = z.floor(), y.floor()
-        weight_z, weight_y = _weights(z - row), _weights(y - column)
+        weight_z, weight_y = spline_weights(z - row), spline_weights(y - column)
         first = torch.arange(images, device=z.device).view(-1, *[1] * (z.ndim - 1)) * height
         corner = (first + row.long()) * width + column.long()
         flat = self.coefficients.reshape(-1)
@@ -112,7 +112,7 @@ class Spline(NamedTuple):
         return tuple(total)
 
 
-def _weights(t: torch.Tensor) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+def spline_weights(t: torch.Tensor) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """The four cubic B-splines over a cell, and their slopes, at the fraction t of the cell."""
     s, t2 = 1 - t, t * t
     s2 = s * s
@@ -247,7 +247,7 @@ def band_limited(
 def _locking(covariance: torch.Tensor) -> torch.Tensor:
     """`Spline.locking` of coefficients whose noise has this covariance at lags 0 to 3 (4, 4)."""
     place = torch.arange(_PLACES).to(covariance) / _PLACES
-    value, slope = (torch.stack(parts) for parts in _weights(place))
+    value, slope = (torch.stack(parts) for parts in spline_weights(place))
     # sums over pairs of knots, by their lag; both signs of the lag at once
     pairs = [[part[d:] * value[: 4 - d] for d in range(4)] for part in (value, slope)]
     back = [[part[: 4 - d] * value[d:] for d in range(4)] for part in (value, slope)]
