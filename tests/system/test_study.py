@@ -232,8 +232,11 @@ def test_nearer_light_is_stronger(tmp_path):
     ratio = near["sensor.doppler.photons_per_direction"] / far["sensor.doppler.photons_per_direction"]
     assert ratio == pytest.approx((150 / 76) ** 2, rel=0.01)
     assert near["sensor.rmse_v_los"] < far["sensor.rmse_v_los"]
+    # what lines see of v and w is taken out of u, as well as so few pulses tell v and w
     for one in found.values():
-        assert one["sensor.rmse_u"] < 0.6 < one["sensor.triples.rmse_u"]
+        assert one["sensor.rmse_u"] < 0.5 * one["sensor.triples.rmse_u"], (
+            one["sensor.rmse_u"], one["sensor.triples.rmse_u"]
+        )  # fmt: skip
 
 
 @pytest.mark.slow
