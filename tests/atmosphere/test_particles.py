@@ -6,6 +6,7 @@ for oblate, radius of equal volume taken for another one, a size average or norm
 """
 
 import math
+import re
 from dataclasses import replace
 from importlib.resources import files
 
@@ -408,7 +409,7 @@ INDEX = ((GREEN, 1.5 + 0.01j),)
     "make, words",
     [
         (lambda: make_table("smoke", GREEN), "'smoke' is not known; expected one of continental"),
-        (lambda: make_table("spheres", 1.6e-6), "1600 nm .*'spheres'.* 355 to 1064 nm"),
+        (lambda: make_table("spheres", 1.6e-6), "1600 nm .*'spheres'.* 355 to 1550 nm"),
         (lambda: Aerosol("a", "t", replace(SIZES, sigma=0.9), INDEX), "sigma: 0.9"),
         (lambda: Aerosol("a", "t", replace(SIZES, median=-1.0), INDEX), "median: -1.0"),
         (lambda: Aerosol("a", "t", replace(SIZES, largest=1e-8), INDEX), "radii from"),
@@ -427,6 +428,50 @@ def test_bad_input(make, words):
 def test_refractive_index_is_linear_between_wavelengths():
     m = AEROSOLS["continental"].refractive_index((355e-9 + 532e-9) / 2)
     assert m == pytest.approx(1.53 + 0.0055j, rel=1e-12)
+
+
+# Hess, Koepke & Schult 1998 (OPAC), as ECMWF's aerosol optics code tabulates it: um, real, imaginary.
+# The dust-like component is called insoluble there; sea salt at 80 % humidity.
+OPAC = {
+    "spheres": (
+        (0.35, 1.53, 8e-3), (0.5, 1.53, 8e-3), (0.55, 1.53, 8e-3), (1.0, 1.52, 8e-3),
+        (1.25, 1.46, 8e-3), (1.5, 1.41, 8e-3), (1.75, 1.34, 8e-3),
+    ),
+    "continental": (
+        (0.35, 1.53, 5e-3), (0.5, 1.53, 5e-3), (0.55, 1.53, 6e-3), (1.0, 1.52, 1.55e-2),
+        (1.25, 1.51, 1.9e-2),
+    ),
+    "soot": (
+        (0.35, 1.75, 0.465), (0.4, 1.75, 0.46), (0.5, 1.75, 0.45), (0.55, 1.75, 0.44),
+        (1.0, 1.76, 0.44), (1.25, 1.76, 0.45),
+    ),
+    "sea_salt": (
+        (0.35, 1.364, 4.7e-8), (0.5, 1.356, 2.8e-9), (0.55, 1.354, 3.0e-9), (1.0, 1.345, 2.0e-5),
+        (1.25, 1.342, 5.3e-5),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "wavelength"),
+    [(name, w) for name in OPAC for w in (355e-9, 532e-9, 1064e-9)] + [("spheres", 1550e-9)],
+)
+def test_indices_are_the_published_ones(name, wavelength):
+    """Between OPAC's wavelengths linearly: real parts to 0.02 (dust falls between 1 and 1.25 um, where
+    its place is not known better), imaginary ones to 10 %, of salt to 1e-5."""
+    micrometres, real, imaginary = zip(*OPAC[name])
+    m = AEROSOLS[name].refractive_index(wavelength)
+    assert m.real == pytest.approx(np.interp(wavelength * 1e6, micrometres, real), abs=0.02)
+    expected = np.interp(wavelength * 1e6, micrometres, imaginary)
+    assert m.imag == pytest.approx(expected, rel=0.1, abs=1e-5 if name == "sea_salt" else 0)
+
+
+@pytest.mark.parametrize(("nm", "aerosol"), [(355, "spheres"), (532, "spheroids"), (1550, "spheroids")])
+def test_shipped_spheroids_have_the_index_of_dust(nm, aerosol):
+    """What a table says it was made of is what the aerosol has at that wavelength."""
+    said = re.search(r"m = ([\d.]+) \+ ([\d.]+)i", read_table(shipped("spheroids", nm)).provenance)
+    m = AEROSOLS[aerosol].refractive_index(nm * 1e-9)
+    assert complex(float(said[1]), float(said[2])) == pytest.approx(m, rel=1e-9)
 
 
 def test_missing_library_is_answered_with_the_line_to_type(monkeypatch):
