@@ -487,10 +487,13 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
 
 
 def _merged(data: dict, changes: dict) -> dict:
-    """``data`` with ``changes`` in it, section by section; neither is touched."""
+    """``data`` with ``changes`` in it, section by section; null: without. Neither is touched."""
     merged = copy.deepcopy(data)
     for key, value in changes.items():
         inner = merged.get(key)
+        if value is None and isinstance(inner, dict):
+            del merged[key]
+            continue
         both = isinstance(inner, dict) and isinstance(value, dict)
         merged[key] = _merged(inner, value) if both else copy.deepcopy(value)
     return merged

@@ -16,7 +16,7 @@ from .assessment.comparison import draw_comparison, page
 from .config import Experiment
 from .errors import InputError
 from .rendering import exr
-from .run_folder import IMAGES, Log, Notice, read_record, write
+from .run_folder import IMAGES, VOLUME, Log, Notice, read_record, write
 
 RECORD = "study.yaml"
 
@@ -65,9 +65,11 @@ def run(
     }
     log = Log(folder / "log.txt", notice)
     log(f"comparing {', '.join(variants)}")
+    # a variant without a wake has rings only, which the table compares
     rows = {
-        key: _pictures(folder / key, metrics[key]) for key, one in variants.items() if one.wake
-    }
+        key: _pictures(folder / key, VOLUME if one.volume else "wind.nc", metrics[key])
+        for key, one in variants.items() if one.wake
+    }  # fmt: skip
     drawn = draw_comparison(folder / "figures", rows, log) if rows else []
     merged = {f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()}
     html = page(name, settings, metrics, drawn)
@@ -120,12 +122,16 @@ def _of(variant: str, notice: Notice) -> Notice:
     return lambda text, share: notice(f"{variant}: {text}", share)
 
 
-def _pictures(folder: Path, metrics) -> tuple[xr.DataArray, xr.Dataset, list]:
-    """First picture as the instrument gives it, wind by the first method, places of true cores."""
+def _pictures(folder: Path, file: str, metrics) -> tuple[xr.DataArray, xr.Dataset, list]:
+    """First picture as the instrument gives it, wind by the first method, places of true cores.
+
+    Of winds in three dimensions the layer nearest to the first gate, whose picture it is.
+    """
     scan = exr.read_scan(folder / IMAGES[0])
-    with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
+    with xr.open_dataset(folder / file, engine="h5netcdf") as winds:
         source = winds["source"].values[-1]  # behind the detector, where there is one
-        wind = winds.sel(source=source).isel(algorithm=0).load()
+        wind = winds.sel(source=source).isel(algorithm=0)
+        wind = (wind.isel(x=0) if "x" in wind.dims else wind).load()
     sides = [f"wake.{side}_core" for side in ("port", "starboard")]
     cores = [(metrics[f"{one}.y"], metrics[f"{one}.z"]) for one in sides if f"{one}.y" in metrics]
     return scan["Y_noisy" if "Y_noisy" in scan else "Y"], wind, cores

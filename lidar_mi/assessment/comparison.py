@@ -1,6 +1,7 @@
 """Several variants of one experiment side by side: what differs, and what comes of it."""
 
 import base64
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -12,6 +13,7 @@ from matplotlib.figure import Figure
 
 from .. import __version__
 from .figures import BACKSCATTER, METHOD_NAMES, Drawn, save_all
+from .velocities import CENTRES, READERS
 
 _SPEED = "m s$^{-1}$"
 
@@ -21,11 +23,14 @@ _ROWS = (
     ("detector.signal", "photoelectrons of a pixel, median", ""),
     ("detector.noise.all", "noise of a pixel over its signal, median", ""),
     ("backscatter.multiple_scattering_fraction", "share of multiple scattering", ""),
+    ("{}.outside_cores.rmse_u", "rms error of u beyond two core radii", "m/s"),
     ("{}.outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
     ("{}.outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
     ("{}.valid_fraction", "share of valid vectors", ""),
+    ("true_wind.outside_cores.rms_u", "the true u itself, rms", "m/s"),
     ("true_wind.outside_cores.rms_v", "the true v itself, rms", "m/s"),
     ("true_wind.outside_cores.rms_w", "the true w itself, rms", "m/s"),
+    ("doppler.photons", "Doppler lidar: photons of a pulse", ""),
     ("sensor.outside_cores.rmse_u", "both lidars: rms error of u beyond two core radii", "m/s"),
     ("sensor.outside_cores.rmse_v", "both lidars: v", "m/s"),
     ("sensor.outside_cores.rmse_w", "both lidars: w", "m/s"),
@@ -41,6 +46,10 @@ _ROWS = (
     ("safety.scan_hazard_distance", "hazard distance of the whole scan, naked eye", "m"),
     ("safety.scan_power", "average power of the scan", "W"),
 )  # fmt: skip
+
+# of the Doppler lidar's readings of single pulses: measure of `velocity_metrics`, name
+_READINGS = (("bias", "bias"), ("std", "standard deviation"), ("found_fraction", "share read"))
+_SINGLE = re.compile(r"(doppler\.(\w+)\.centre_(\w+)\.averaged_1)\.found_fraction")
 
 
 def flat(settings: Mapping, prefix: str = "") -> dict[str, object]:
@@ -114,8 +123,22 @@ def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, s
             key = template.format(wind)
             values = [one.get(key) for one in metrics.values()]
             if any(value is not None for value in values):
-                shown = ["-" if value is None else _three(value) for value in values]
-                yield (f"{_named(wind)}: {label}" if wind else label), unit, shown
+                yield (f"{_named(wind)}: {label}" if wind else label), unit, _shown(values)
+    readings = dict.fromkeys(
+        found.groups() for one in metrics.values() for key in one if (found := _SINGLE.fullmatch(key))
+    )  # fmt: skip
+    for key, reader, centre in readings:
+        for measure, label in _READINGS:
+            values = [one.get(f"{key}.{measure}") for one in metrics.values()]
+            if any(value is not None for value in values):
+                title = f"{READERS.get(reader, reader)}, {CENTRES.get(centre, centre)}"
+                title = title.replace("$", "").replace("^2", "²")
+                unit = "" if measure == "found_fraction" else "m/s"
+                yield f"one pulse by {title}: {label}", unit, _shown(values)
+
+
+def _shown(values: Sequence[float | None]) -> list[str]:
+    return ["-" if value is None else _three(value) for value in values]
 
 
 def _named(wind: str) -> str:
@@ -187,7 +210,8 @@ def draw_comparison(
         panel.set_xlabel("y / m (port is left)")
     caption = (
         "Each variant's first picture, the vertical wind found by its first method (white: flagged "
-        "vectors), and its error; winds are on one scale, errors on another. Crosses: true cores."
+        "vectors), and its error; winds are on one scale, errors on another. Crosses: true cores. Of "
+        "several gates the first, of winds in three dimensions the layer nearest to it."
     )
     plate = ("fig00_comparison", "The variants side by side", (figure, caption))
     return save_all(folder, [plate], log)

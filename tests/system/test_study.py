@@ -11,10 +11,12 @@ from importlib.resources import files
 from pathlib import Path
 
 import pytest
+import xarray as xr
 import yaml
 from matplotlib.image import imread
 
-from lidar_mi import backscatter_chain, config, experiment, study
+from lidar_mi import backscatter_chain, config, experiment, fringe_chain, study, volume_chain
+from lidar_mi.assessment import comparison
 from lidar_mi.assessment.comparison import differences, flat
 from lidar_mi.errors import InputError
 from lidar_mi.info import sections
@@ -60,6 +62,9 @@ def test_null_takes_a_section_away(file):
     path = file(detector={}, variants={"dark": {"detector": None}, "lit": {}})
     found = config.load_variants(path)
     assert found["dark"].detector is None and found["lit"].detector is not None
+    # one that every experiment has is back at its defaults
+    found = config.load_variants(file(variants={"plain": {"retrieval": None}}))
+    assert found["plain"].retrieval.methods != ("cc",) and SMALL["retrieval"] == {"methods": ["cc"]}
 
 
 def test_overrides_count_for_all_or_for_one(file):
@@ -132,6 +137,72 @@ def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
     assert (folder / "near" / "image_t1.exr").stat().st_mtime_ns == before
     with pytest.raises(InputError, match="is no study's folder"):
         study.run("two", variants, tmp_path)
+
+
+VOLUME = {
+    "wake": {
+        "file": "wake_volume_40s.nc", "vortex_pair": None, "time": "40 s", "depth": "volume",
+        "x": "20 m", "spacing": "1 m",
+    },
+    "scan": {"range": "495 m", "thickness": "10 m", "gate_count": 10},
+    "render": {"samples_per_beam": 60, "max_order": 1},
+    "retrieval": None,
+    "volume": {"methods": ["correlation"], "stride": 4},
+}  # fmt: skip
+
+
+@pytest.mark.usefixtures("variant")
+def test_volumes_are_compared(file, tmp_path, monkeypatch):
+    """Their wind is another file with a layer more: drawn is the one nearest to the picture."""
+    monkeypatch.setattr(volume_chain, "draw_all", lambda *_: [])
+    drawn, draw = {}, study.draw_comparison
+    monkeypatch.setattr(
+        study, "draw_comparison", lambda folder, rows, log: drawn.update(rows) or draw(folder, rows, log)
+    )
+    metrics = study.run(
+        "two", config.load_variants(file(variants={"volume": VOLUME})), tmp_path / "out"
+    )
+    assert imread(tmp_path / "out" / "figures" / "fig00_comparison.png").std() > 0.05
+    with xr.open_dataset(tmp_path / "out/volume/wind_volume.nc", engine="h5netcdf") as found:
+        nearest = found.isel(source=0, algorithm=0).sel(x=495.0, method="nearest")
+        picture, wind, _ = drawn["volume"]
+        assert picture.dims == wind["w"].dims == ("z", "y")
+        assert float(wind["x"]) == float(nearest["x"]) and wind["w_true"].equals(nearest["w_true"])
+    table = {name: values for name, _, values in comparison.results(metrics)}
+    u = metrics["volume"]["backscatter.correlation.outside_cores.rmse_u"]
+    (shown,) = table["correlation: rms error of u beyond two core radii"]
+    assert float(shown) == pytest.approx(u, rel=5e-3)
+
+
+@pytest.mark.usefixtures("variant")
+def test_doppler_lidars_alone_are_compared(tmp_path, monkeypatch):
+    """The paper's two ranges, whose photons it gives: 2.4e7 from 56 m, 1.3e7 from 76 m."""
+    data = {
+        "name": "rings",
+        "doppler": {
+            "camera": {"pixel": "29.6 um", "width": 240, "height": 195}, "v_los": [0.0],
+            "photon_samples": 0, "ccd": {"full_well": 1e8, "bits": None},
+            "render": {"samples_per_pixel": 16},
+            "retrieval": {"methods": ["annular"], "averaged": [1], "images": 3, "slow_images": 0},
+        },
+        "variants": {
+            "near": {"doppler": {"lidar": {"range": "56 m"}}},
+            "far": {"doppler": {"lidar": {"range": "76 m"}}},
+        },
+    }  # fmt: skip
+    monkeypatch.setattr(fringe_chain.doppler_figures, "draw_all", lambda *_: [])
+    path = tmp_path / "rings.yaml"
+    path.write_text(yaml.safe_dump(data, sort_keys=False))
+    metrics = study.run("rings", config.load_variants(path), tmp_path / "out")
+    assert not (tmp_path / "out" / "figures").exists()
+    table = {name: values for name, _, values in comparison.results(metrics)}
+    photons = [float(text) for text in table["Doppler lidar: photons of a pulse"]]
+    assert photons == pytest.approx([2.4e7, 1.3e7], rel=0.03)
+    name = "one pulse by all rings, full model, centre known: standard deviation"
+    spread = [one["doppler.annular.centre_known.averaged_1.std"] for one in metrics.values()]
+    assert [float(text) for text in table[name]] == pytest.approx(spread, rel=5e-3)
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert f"<td>{name}</td>" in page and '<a href="near/report.html">' in page
 
 
 def test_info_on_a_study_that_was_stopped(tmp_path):
