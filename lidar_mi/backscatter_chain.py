@@ -198,7 +198,7 @@ def winds(experiment: Experiment, truth: Truth, plans, scans, log) -> xr.Dataset
     would see), the rendered backscatter and, with a detector, the same with its noise.
     """
     settings, lidar = experiment.retrieval, experiment.lidar
-    blur = lidar.radius_at(plans[0].centre) / 2 if settings.blur == "beam" else settings.blur
+    blur = known_blur(experiment, plans[0])
     rendered = rendered_pairs(experiment, scans)
     images = {
         "extinction": [truth.image(k) for k in (0, 1)],
@@ -268,6 +268,12 @@ def rendered_pairs(experiment: Experiment, scans) -> dict[str, tuple[list[xr.Dat
             for name, (pair, level) in pairs.items()
         }
     return pairs
+
+
+def known_blur(experiment: Experiment, plan: ScanPlan) -> float:
+    """Standard deviation (m) of the blur that `retrieval.blur` tells methods of."""
+    blur = experiment.retrieval.blur
+    return float(experiment.lidar.radius_at(plan.centre)) / 2 if blur == "beam" else blur
 
 
 def window_settings(settings) -> dict:

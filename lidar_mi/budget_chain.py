@@ -17,12 +17,15 @@ from .assessment.error_budget import (
 )
 from .assessment.report import Chapter
 from .atmosphere.advection import advect
-from .backscatter_chain import NOISY, rendered_pairs, scan_plans, window_settings
+from .backscatter_chain import NOISY, known_blur, rendered_pairs, scan_plans, window_settings
 from .config import Experiment
 from .rendering import exr
 from .retrieval.wind import retrieve_wind
 from .run_folder import IMAGES, Log
 from .truth import Truth, blur_by_beam, make_truth
+
+# Pictures of air as it is: a method that undoes the beam's blur has none to undo there.
+_SHARP = ("perfect", "beam_blur")
 
 
 def prepare(
@@ -75,6 +78,7 @@ def budgets(
     cores = find_cores(truth.wind) if cores is None else cores
     methods = experiment.retrieval.methods
     settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
+    blur = known_blur(experiment, scan_plans(experiment, truth)[0])
     sources = {"seen": "backscatter", "perfect": "extinction"}
     if experiment.detector:
         sources |= {"seen": NOISY, "detector_noise": "backscatter"}
@@ -88,7 +92,10 @@ def budgets(
                 wind = known.sel(source=source, algorithm=method)
                 winds[cause] = wind.assign_attrs(method=method, **settings)
             else:
-                winds[cause] = retrieve_wind(*pair, method=method, noise=noise, **settings)
+                undone = 0.0 if cause in _SHARP else blur
+                winds[cause] = retrieve_wind(
+                    *pair, method=method, noise=noise, blur=undone, **settings
+                )
         seen, perfect = winds.pop("seen"), winds.pop("perfect")
         stiff = moved_as_one(
             seen, pictures["seen"][0], blurred, truth.wind,

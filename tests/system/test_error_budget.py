@@ -10,9 +10,11 @@ import pytest
 import xarray as xr
 
 from lidar_mi import backscatter_chain, config
+from lidar_mi.assessment.errors import truth_at_vectors
 from lidar_mi.budget_chain import budgets
 from lidar_mi.experiment import run
 from lidar_mi.rendering import exr
+from lidar_mi.retrieval.wind import retrieve_wind
 from lidar_mi.run_folder import IMAGES
 from lidar_mi.truth import blur_by_beam, make_truth
 
@@ -76,6 +78,28 @@ def noise_free_scans(experiment, truth):
         s0 = image.expand_dims("gate") * 1e-3
         scans.append(xr.Dataset({"Y": image, "S0": s0, "S0_stderr": 1e-6 * s0}))
     return scans
+
+
+def test_blur_is_undone_where_there_is_some(tmp_path):
+    """`variational` is told of the beam's width, but not of air as it is: the winds are those of
+    `retrieve_wind` told the same."""
+    text = SMALL.replace("[multipass, cc]", "[variational]").replace("detector: {}\n", "")
+    (tmp_path / "told.yaml").write_text(text.replace("error_budget", "blur: beam, error_budget"))
+    experiment = config.load(tmp_path / "told.yaml")
+    truth = make_truth(experiment, tmp_path)
+    scans = noise_free_scans(experiment, truth)
+    budget = budgets(experiment, truth, scans, cores=[], flagged=True)["variational"]
+    settings = {"dt": 0.1, "method": "variational", "stride": 2}
+    level = backscatter_chain.apparent_noise(scans[0])
+    # half of the beam's 1/e^2 radius where the slab's middle is
+    width = float(experiment.lidar.radius_at(501.25)) / 2
+    seen = retrieve_wind(*(scan["Y"] for scan in scans), noise=level, blur=width, **settings)
+    blind = retrieve_wind(*(scan["Y"] for scan in scans), noise=level, **settings)
+    air = retrieve_wind(*(truth.image(k) for k in (0, 1)), noise=0.0, **settings)
+    for wind, key in ((seen, "rmse_v"), (air, "beam_blur.rmse_v")):
+        error = wind["v"] - truth_at_vectors(wind, truth.wind)["v"]
+        assert budget[key] == pytest.approx(float((error**2).mean()) ** 0.5, rel=0.05), key
+    assert abs(seen["v"] - blind["v"]).max() > 0.01
 
 
 def test_wind_that_changes_through_the_slab_is_a_cause(tmp_path):
