@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from .digits import fixed
 from .error_budget import CAUSES
 from .figures import METHOD_NAMES, Drawn, save_all
 from .report import Chapter, Tables
@@ -43,6 +44,10 @@ def _bars(metrics, methods):
     figure = Figure(figsize=(3.4 + 3.2 * len(methods), 1.9 + 0.5 * len(used)), layout="constrained")
     panels = figure.subplots(1, len(methods), sharey=True, squeeze=False)[0]
     rows = np.arange(len(used))[::-1]
+    least = min(
+        metrics.get(f"error_budget.{method}.{place}{cause}.share", 0.0)
+        for method in methods for place in _PLACES for cause in used
+    )  # fmt: skip
     bars = {}
     for panel, method in zip(panels, methods):
         title = []
@@ -68,7 +73,7 @@ def _bars(metrics, methods):
         panel.set_axisbelow(True)
         panel.xaxis.set_major_formatter(PercentFormatter(1.0))
         # what makes things many times worse must not flatten the others: its number stands there
-        panel.set_xlim(-0.35, 1.15)
+        panel.set_xlim(min(-0.35, 1.1 * max(least, -1)), 1.15)
     panels[0].set_yticks(rows, [CAUSES[cause] for cause in used])
     figure.legend(bars.values(), bars.keys(), loc="outside lower right", ncols=2, fontsize=9)
     return figure, (
@@ -100,11 +105,11 @@ def limit_sentence(metrics: Mapping[str, float], method: str) -> str:
         prefix, where = f"{prefix}outside_cores.", " beyond two core radii"
     shares = {cause: metrics[f"{prefix}{cause}.share"] for cause in causes}
     ranked = sorted(causes, key=shares.get, reverse=True)
-    parts = [f"{CAUSES[c]} ({100 * shares[c]:.0f} %" for c in ranked if shares[c] >= _LEAST][:3]
+    parts = [f"{CAUSES[c]} ({_percent(shares[c])}" for c in ranked if shares[c] >= _LEAST][:3]
     error = f"{_both(metrics, prefix):.2f} m/s"
     if not parts:
         return (
-            f"The wind by {name} is off by {error} rms{where}; no single cause has {100 * _LEAST:.0f} % "
+            f"The wind by {name} is off by {error} rms{where}; no single cause has {_percent(_LEAST)} "
             "of the mean square error."
         )
     text = (
@@ -146,8 +151,7 @@ def _table(metrics, method):
     def values(cause: str) -> list[str]:
         shown = []
         for place in _PLACES:
-            for key, style in (("rmse_v", "{:.3g}".format), ("rmse_w", "{:.3g}".format),
-                               ("share", _percent)):  # fmt: skip
+            for key, style in (("rmse_v", fixed), ("rmse_w", fixed), ("share", _percent)):
                 value = metrics.get(f"error_budget.{method}.{place}{cause}{key}")
                 shown.append("-" if value is None else style(value))
         return shown

@@ -1,32 +1,31 @@
 """Several variants of one experiment side by side: what differs, and what comes of it."""
 
-import base64
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
 
-import jinja2
 import xarray as xr
 import yaml
 from matplotlib.figure import Figure
 
 from .. import __version__
+from .digits import fixed, three
 from .figures import BACKSCATTER, METHOD_NAMES, Drawn, save_all
+from .report import embedded, template
 from .velocities import CENTRES, READERS
 
 _SPEED = "m s$^{-1}$"
 
 # rows of the comparison: key, name, unit; {} stands for a method's winds
 _ROWS = (
-    ("backscatter.mc_relative_error", "Monte Carlo noise of a pixel over its signal, median", ""),
+    ("backscatter.mc_relative_error", "Monte Carlo noise of a pixel over its signal, median", "%"),
     ("detector.signal", "photoelectrons of a pixel, median", ""),
-    ("detector.noise.all", "noise of a pixel over its signal, median", ""),
-    ("backscatter.multiple_scattering_fraction", "share of multiple scattering", ""),
+    ("detector.noise.all", "noise of a pixel over its signal, median", "%"),
+    ("backscatter.multiple_scattering_fraction", "share of multiple scattering", "%"),
     ("{}.outside_cores.rmse_u", "rms error of u beyond two core radii", "m/s"),
     ("{}.outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
     ("{}.outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
-    ("{}.valid_fraction", "share of valid vectors", ""),
+    ("{}.valid_fraction", "share of valid vectors", "%"),
     ("true_wind.outside_cores.rms_u", "the true u itself, rms", "m/s"),
     ("true_wind.outside_cores.rms_v", "the true v itself, rms", "m/s"),
     ("true_wind.outside_cores.rms_w", "the true w itself, rms", "m/s"),
@@ -40,7 +39,7 @@ _ROWS = (
     ("sensor.rmse_v_los", "rms error of a line-of-sight velocity", "m/s"),
     ("sensor.doppler.photons_per_direction", "Doppler lidar: photons of a direction", ""),
     ("sensor.doppler.hazard_distance", "Doppler lidar: hazard distance, naked eye", "m"),
-    ("safety.permissible_exposure", "permissible exposure by a pulse", "J/m^2"),
+    ("safety.permissible_exposure", "permissible exposure by a pulse", "J/m²"),
     ("safety.hazard_distance", "hazard distance of a beam, naked eye", "m"),
     ("safety.aided_hazard_distance", "hazard distance of a beam, binoculars", "m"),
     ("safety.scan_hazard_distance", "hazard distance of the whole scan, naked eye", "m"),
@@ -85,10 +84,6 @@ def page(
     metrics : mapping of variant to metrics
     drawn : sequence of Drawn
     """
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    template = environment.from_string(
-        files("lidar_mi.assessment").joinpath("comparison.html").read_text()
-    )
     changed = [
         (key, "", [setting(value) for value in values])
         for key, values in differences({key: flat(one) for key, one in settings.items()}).items()
@@ -97,13 +92,11 @@ def page(
         "Errors are those of valid vectors against the truth; an error near the true wind's own rms "
         "means no skill. A variant without a number has a dash."
     )
-    return template.render(
+    return template("comparison.html").render(
         name=name,
         version=__version__,
         variants=list(settings),
-        pictures=[
-            (one.title, one.caption, base64.b64encode(one.path.read_bytes()).decode()) for one in drawn
-        ],
+        pictures=[(one.title, one.caption, embedded(one.path)) for one in drawn],
         tables=[
             ("What comes of it", legend, list(results(metrics))),
             ("What differs", "In SI units; a dash: the variant has no such key.", changed),
@@ -118,12 +111,12 @@ def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, s
         key.removesuffix(".valid_fraction") for one in metrics.values() for key in one
         if key.startswith("backscatter") and key.endswith(".valid_fraction")
     )  # fmt: skip
-    for template, label, unit in _ROWS:
-        for wind in winds if "{}" in template else (None,):
-            key = template.format(wind)
+    for pattern, label, unit in _ROWS:
+        for wind in winds if "{}" in pattern else (None,):
+            key = pattern.format(wind)
             values = [one.get(key) for one in metrics.values()]
             if any(value is not None for value in values):
-                yield (f"{_named(wind)}: {label}" if wind else label), unit, _shown(values)
+                yield (f"{_named(wind)}: {label}" if wind else label), unit, _shown(values, unit)
     readings = dict.fromkeys(
         found.groups() for one in metrics.values() for key in one if (found := _SINGLE.fullmatch(key))
     )  # fmt: skip
@@ -132,25 +125,19 @@ def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, s
             values = [one.get(f"{key}.{measure}") for one in metrics.values()]
             if any(value is not None for value in values):
                 title = f"{READERS.get(reader, reader)}, {CENTRES.get(centre, centre)}"
-                title = title.replace("$", "").replace("^2", "²")
-                unit = "" if measure == "found_fraction" else "m/s"
-                yield f"one pulse by {title}: {label}", unit, _shown(values)
+                unit = "%" if measure == "found_fraction" else "m/s"
+                yield f"one pulse by {title}: {label}", unit, _shown(values, unit)
 
 
-def _shown(values: Sequence[float | None]) -> list[str]:
-    return ["-" if value is None else _three(value) for value in values]
+def _shown(values: Sequence[float | None], unit: str) -> list[str]:
+    style = {"m/s": fixed, "%": lambda share: three(100 * share)}.get(unit, three)
+    return ["-" if value is None else style(value) for value in values]
 
 
 def _named(wind: str) -> str:
     source, method = wind.split(".")
     title = METHOD_NAMES.get(method, method.replace("_", " "))
     return f"{title}, with the detector's noise" if source.endswith("noisy") else title
-
-
-def _three(value: float) -> str:
-    """Three digits, without an exponent where that is shorter."""
-    text = f"{value:.3g}"
-    return text if abs(value) >= 1e6 or 0 < abs(value) < 1e-3 else f"{float(text):.10g}"
 
 
 def setting(value) -> str:

@@ -17,9 +17,15 @@ from .errors import deviations, error_by_quality
 
 METHOD_NAMES = {
     "cc": "cross-correlation", "ws": "weight shift", "multipass": "multi-pass correlation",
-    "variational": "variational", "vortex_fit": "vortex fit",
+    "variational": "variational retrieval", "vortex_fit": "vortex fit",
 }  # fmt: skip
 
+SOURCE_NAMES = {
+    "backscatter": "backscatter", "backscatter_noisy": "backscatter with detector noise",
+    "extinction": "extinction", "extinction_blurred": "extinction blurred by the beam",
+    "extinction_without_texture": "extinction without texture",
+}  # fmt: skip
+"""What winds are retrieved from, as figures and tables call it."""
 
 BACKSCATTER = "apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$"
 
@@ -107,7 +113,8 @@ def save_all(folder: Path, plates, log: Callable) -> list[Drawn]:
         path = folder / f"{name}.png"
         temporary = path.with_name(f".{path.name}")
         try:
-            figure.savefig(temporary, dpi=110, format="png")
+            # panels of equal scales leave more room around them than any other page needs
+            figure.savefig(temporary, dpi=110, format="png", bbox_inches="tight", pad_inches=0.1)
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
@@ -176,6 +183,7 @@ def _overview(scans, found, cores, scale):
         "Left: the first backscatter picture. Right: the cross-flow wind found from it and the "
         f"second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are flagged, "
         "red crosses mark the true cores."
+        + (" Both without the detector's noise." if "Y_noisy" in scans[0] else "")
     )
 
 
@@ -319,7 +327,8 @@ def _picture_differences(truth, scans):
                norm=TwoSlopeNorm(0, -limit, limit), cmap="RdBu_r")  # fmt: skip
     return figure, (
         "Backscatter over its mean minus extinction over its mean: the beam's width rounds off "
-        "sharp structure, Monte Carlo noise adds grain."
+        "sharp structure, Monte Carlo noise adds grain, and a pulse that is long beside the slab "
+        "mixes in the air before and behind it."
     )
 
 
@@ -342,7 +351,8 @@ def _error_and_bound(found):
                     [float(np.sqrt(np.mean(values[used][g].astype(float) ** 2))) for g in groups]
                     for values in (bound, error)
                 )
-                axes.plot(least, rms, "o-", ms=4, label=f"{METHOD_NAMES[method]} from {source}")
+                label = f"{METHOD_NAMES[method]} from {SOURCE_NAMES[source]}"
+                axes.plot(least, rms, "o-", ms=4, label=label)
                 span += [min(least), max(least)]
         if not span:
             return None
@@ -382,7 +392,7 @@ def _error_by_texture(found, sweep):
             right.plot(
                 groups["isotropy"], groups["rmse"], marker=marker, ms=5,
                 ls="-" if method == "cc" else ":",
-                label=f"{method} from {source.replace('_', ' ')}",
+                label=f"{METHOD_NAMES[method]} from {SOURCE_NAMES[source]}",
             )  # fmt: skip
     right.set(
         xlabel="isotropy: weakest over strongest rms slope in a window",

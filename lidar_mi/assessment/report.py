@@ -2,7 +2,6 @@
 
 import base64
 import io
-import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
@@ -15,8 +14,9 @@ from PIL import Image
 
 from ..retrieval.vortex_fit import MEANING
 from .cores import Core
-from .figures import METHOD_NAMES, Drawn
-from .velocities import CENTRES, READERS
+from .digits import fixed, percent, three, with_error
+from .figures import METHOD_NAMES, SOURCE_NAMES, Drawn
+from .velocities import CENTRES, PEAK_READERS, READERS
 
 # rows of the table of results: key, name, unit
 _ROWS = (
@@ -30,7 +30,7 @@ _ROWS = (
     ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
     ("all.rmse_v", "rms error of v, flagged vectors too", "m/s"),
     ("all.rmse_w", "rms error of w, flagged vectors too", "m/s"),
-    ("valid_fraction", "share of valid vectors", ""),
+    ("valid_fraction", "share of valid vectors", "%"),
 )
 
 _DOPPLER_UNITS = {
@@ -39,7 +39,7 @@ _DOPPLER_UNITS = {
 }  # fmt: skip
 
 _VORTEX_UNITS = {
-    name: units.replace(" s-1", "/s").replace("m2", "m^2") for name, (units, _) in MEANING.items()
+    name: units.replace(" s-1", "/s").replace("m2", "m²") for name, (units, _) in MEANING.items()
 } | {"flow_error": "m/s"}
 
 
@@ -94,28 +94,33 @@ def page(
     warnings : sequence of str
         What a reader of the results must know.
     """
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    folder = files("lidar_mi.assessment")
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]
-        embedded = dict(zip(drawn, pool.map(lambda figure: _embedded(figure.path), drawn)))
-    template = environment.from_string(folder.joinpath("report.html").read_text())
-    return template.render(
+        pictures = dict(zip(drawn, pool.map(lambda figure: embedded(figure.path), drawn)))
+    return template("report.html").render(
         name=experiment.name,
         simulated=simulated(experiment, versions),
         resolved=resolved,
         metrics={key: _rounded(key, value) for key, value in metrics.items()},
         warnings=[text.rstrip(".") for text in warnings],
-        script=Markup(folder.joinpath("vector_map.js").read_text()),
+        script=Markup(files("lidar_mi.assessment").joinpath("vector_map.js").read_text()),
         chapters=[
             chapter._asdict()
-            | {"pictures": [(d.title, d.caption, embedded[d]) for d in chapter.drawn]}
+            | {"pictures": [(d.title, d.caption, pictures[d]) for d in chapter.drawn]}
             for chapter in chapters
         ],
     )
 
 
-def _embedded(path: Path) -> str:
+def template(name: str) -> jinja2.Template:
+    """One of the pages of this package; whatever is put into it is escaped."""
+    return jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined,
+        loader=jinja2.PackageLoader("lidar_mi.assessment", ""),
+    ).get_template(name)  # fmt: skip
+
+
+def embedded(path: Path) -> str:
     """A picture as the text that a page holds it by: lossless WebP, two thirds of its PNG."""
     part = io.BytesIO()
     with Image.open(path) as picture:
@@ -132,21 +137,23 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
         if wake.vortex_pair:
             pair = wake.vortex_pair
             flow = (
-                f"{pair.model.replace('_', ' ')} vortices, circulation {pair.circulation:g} m^2/s, "
+                f"{pair.model.replace('_', ' ')} vortices, circulation {pair.circulation:g} m²/s, "
                 f"separation {pair.separation:g} m, core radius {pair.core_radius:g} m"
             )
         elif wake.turbine:
             rotor = wake.turbine
             flow = (
                 f"wake of a turbine of {rotor.diameter:g} m, thrust coefficient {rotor.thrust:g}, in wind "
-                f"of {rotor.wind_speed:g} m/s with a turbulence of {rotor.turbulence:.0%}"
+                f"of {rotor.wind_speed:g} m/s with a turbulence of {percent(rotor.turbulence)}"
             )
         else:
             when = "" if wake.time is None else f" at {wake.time:g} s"
             flow = f"{wake.file}{when}, {wake.spacing:g} m grid"
         texture = "no texture added"
         if wake.texture.rms:
-            texture = f"texture of {wake.texture.rms:.0%} rms, {wake.texture.outer_scale:g} m"
+            texture = (
+                f"texture of {percent(wake.texture.rms)} rms, outer scale {wake.texture.outer_scale:g} m"
+            )
         rows.append(("wake", f"{flow}; {texture}"))
         platform = experiment.platform
         rows.append(("platform", f"{platform.speed:g} m/s, pictures {platform.dt:g} s apart"))
@@ -238,10 +245,11 @@ def doppler_chapter(doppler, metrics: dict[str, float], drawn: Sequence[Drawn]) 
         "A Doppler lidar sends its backscatter through an etalon onto a CCD; the wind along the "
         "line of sight follows from the radii of the rings."
     )
+    modes = metrics.get("doppler.speckle_modes")
+    speckle = f"speckle has {modes:.3g} modes a pixel" if modes else "there is no speckle"
     light = (
-        f"A pulse gives {metrics['doppler.photons']:.3g} photons from {doppler.lidar.range:g} m and "
-        f"{metrics['doppler.background_photons']:.3g} of sunlight; speckle has "
-        f"{metrics.get('doppler.speckle_modes', math.inf):.3g} modes a pixel, read-out "
+        f"A pulse gives {three(metrics['doppler.photons'])} photons from {doppler.lidar.range:g} m and "
+        f"{three(metrics['doppler.background_photons'])} of sunlight; {speckle}, read-out "
         f"{doppler.ccd.read_noise:g} photoelectrons of noise."
     )
     rings = (
@@ -254,9 +262,8 @@ def doppler_chapter(doppler, metrics: dict[str, float], drawn: Sequence[Drawn]) 
     numbers = Tables(
         heading="How good the line-of-sight winds are",
         legend="Winds that each method reads from noisy pictures, or from averages of several "
-        "(columns), over all speeds. CA: circular averaging; ML: midpoint lines; both, like the "
-        "Savitzky-Golay filter, give the innermost ring's radius in emitted and received light. "
-        "The bound (Cramer-Rao) is the least standard deviation without bias; its row says nothing "
+        f"(columns), over all speeds, with standard errors. {_abbreviations(doppler.retrieval.methods)}"
+        "The bound (Cramér-Rao) is the least standard deviation without bias; its row says nothing "
         "of any method.",
         tables=[
             _doppler_table(doppler.retrieval, centre, metrics)
@@ -264,6 +271,15 @@ def doppler_chapter(doppler, metrics: dict[str, float], drawn: Sequence[Drawn]) 
         ],
     )
     return Chapter("The Doppler lidar", [purpose, light, rings], drawn, numbers)
+
+
+def _abbreviations(methods: Sequence[str]) -> str:
+    """What the names of those methods mean that read the peaks of the innermost ring."""
+    names = {"ca": "CA: circular averaging", "ml": "ML: midpoint lines"}
+    used = [text for key, text in names.items() if any(m.partition("_")[0] == key for m in methods)]
+    if not set(methods) & set(PEAK_READERS):
+        return ""
+    return "; ".join([*used, "peaks are those of the innermost ring, emitted and received"]) + ". "
 
 
 def _doppler_table(settings, centre, metrics):
@@ -274,11 +290,11 @@ def _doppler_table(settings, centre, metrics):
             for n in settings.averaged:
                 key = f"doppler.{method}.centre_{centre}.averaged_{n}.{quantity}"
                 value, error = metrics.get(key), metrics.get(f"{key}_stderr")
-                text = "-" if value is None else f"{value:.3g}"
-                shown.append(text if error is None else f"{text} \u00b1 {error:.1g}")
-            rows.append((f"{READERS[method].replace('$^2$', '^2')}: {label}", "m/s", shown))
+                known = "-" if value is None else fixed(value)
+                shown.append(known if error is None else with_error(value, error))
+            rows.append((f"{READERS[method]}: {label}", "m/s", shown))
     key = f"doppler.bound.centre_{centre}.averaged_{{}}.std"
-    rows.append(("bound", "m/s", [f"{metrics[key.format(n)]:.3g}" for n in settings.averaged]))
+    rows.append(("bound", "m/s", [fixed(metrics[key.format(n)]) for n in settings.averaged]))
     heads = [f"{n} picture{'s' * (n > 1)}" for n in settings.averaged]
     return CENTRES[centre], heads, rows
 
@@ -294,9 +310,10 @@ def _tables(experiment, metrics):
             # what zero wind instead of the found one would be off by
             nothing = key.replace("rmse_", "rms_").removeprefix("all.")
             values.append(metrics.get(f"true_wind.{nothing}"))
-            shown = ["-" if value is None else f"{value:.3g}" for value in values]
+            scale = 100 if unit == "%" else 1
+            shown = ["-" if value is None else fixed(scale * value) for value in values]
             rows.append((label, unit, shown))
-        heads = [source.replace("_", " ") for source in sources]
+        heads = [SOURCE_NAMES[source] for source in sources]
         yield METHOD_NAMES[method], [*heads, "the true wind itself, rms"], rows
 
 
@@ -304,7 +321,7 @@ def _noise(experiment, metrics) -> str:
     """What the pictures' noise is made of, in one line."""
     line = (
         "Noise of the first picture, relative to a pixel's light (medians): simulation "
-        f"{metrics['backscatter.mc_relative_error']:.2%} "
+        f"{percent(metrics['backscatter.mc_relative_error'])} "
         f"({experiment.render.samples_per_beam} photons a beam)"
     )
     if not experiment.detector:
@@ -312,13 +329,12 @@ def _noise(experiment, metrics) -> str:
     causes = {"shot": "photons", "speckle": "speckle", "background": "sky", "dark": "dark current",
               "readout": "read-out"}  # fmt: skip
     parts = ", ".join(
-        f"{name} {metrics[f'detector.noise.{key}']:.2%}"
+        f"{name} {percent(metrics[f'detector.noise.{key}'])}"
         for key, name in causes.items() if metrics.get(f"detector.noise.{key}", 0) >= 5e-5
     )  # fmt: skip
-    signal = float(f"{metrics['detector.signal']:.3g}")
     return (
-        f"{line}; detector {metrics['detector.noise.all']:.2%} with "
-        f"{signal:.10g} photoelectrons ({parts or 'each below 0.01 %'})."
+        f"{line}; detector {percent(metrics['detector.noise.all'])} with "
+        f"{three(metrics['detector.signal'])} photoelectrons ({parts or 'each below 0.01 %'})."
     )
 
 
@@ -334,7 +350,7 @@ def _rounded(key: str, value: float) -> str:
     elif key.startswith("vortex.") and described:
         unit = described
     elif parent.endswith("_core"):
-        unit = "m^2/s" if name == "circulation" else "m"
+        unit = "m²/s" if name == "circulation" else "m"
     else:
         unit = {"timing": "s"}.get(parent, "")
     return f"{value:.4g} {unit}".strip()

@@ -158,6 +158,8 @@ def as_rows(findings: list[Finding]) -> list[tuple[str, str, str, str, str]]:
         name, unit = QUANTITIES[finding.quantity]
         verdict = {True: "pass", False: "fail", None: "not known"}[finding.passed]
         margin = "" if math.isnan(finding.margin) else f"{100 * finding.margin:+.0f} %"
+        # none has no sign
+        margin = "0 %" if margin in ("+0 %", "-0 %") else margin
         measured = _shown(finding.measured, unit) if not math.isnan(finding.measured) else ""
         rows.append((name, _required(finding, unit), measured, margin, verdict))
     return rows

@@ -10,6 +10,7 @@ from scipy import stats
 
 from ..retrieval.line_of_sight import COMPONENTS
 from .cores import Core
+from .digits import fixed, percent, three
 from .figures import Drawn, save_all
 from .report import Chapter, Tables
 from .requirements import as_rows, fulfilled, look_ahead
@@ -196,7 +197,7 @@ def sensor_chapter(
         numbers=Tables(
             "How good the wind from both lidars is",
             f"{metrics['sensor.lines_read']} of {metrics['sensor.lines']} lines of sight were read; "
-            f"{metrics['sensor.vectors']} vectors, {metrics['sensor.good_fraction']:.0%}, are good. "
+            f"{metrics['sensor.vectors']} vectors, {percent(metrics['sensor.good_fraction'])}, are good. "
             "Errors over standard errors have a variance of 1 where they are as stated; then 68 % "
             "lie within one standard error and 95 % within 1.96.",
             [_numbers(metrics)],
@@ -221,7 +222,7 @@ def _limit_of_u(metrics) -> list[str]:
     if None in shares.values():
         return []
     ranked = sorted(shares, key=shares.get, reverse=True)
-    parts = [f"{_CAUSES[c]} ({100 * min(shares[c], 1):.0f} %" for c in ranked if shares[c] >= _LEAST]
+    parts = [f"{_CAUSES[c]} ({percent(min(shares[c], 1))}" for c in ranked if shares[c] >= _LEAST]
     little = [_CAUSES[c] for c in ranked if shares[c] < _LEAST]
     rmse = metrics.get("sensor.outside_cores.rmse_u", metrics["sensor.rmse_u"])
     text = f"u is off by {rmse:.2g} m/s rms, limited by " + "), then ".join(
@@ -232,9 +233,9 @@ def _limit_of_u(metrics) -> list[str]:
 
 def _costs(metrics) -> list[str]:
     text = (
-        f"The Doppler lidar's directions take {_three(metrics['sensor.doppler.pulses_per_second'])} "
-        f"pulses a second, {_three(metrics['sensor.doppler.average_power'])} W of light, and give "
-        f"{metrics['sensor.doppler.photons_per_direction']:.2g} photons each."
+        f"The Doppler lidar's directions take {three(metrics['sensor.doppler.pulses_per_second'])} "
+        f"pulses a second, {three(metrics['sensor.doppler.average_power'])} W of light, and give "
+        f"{three(metrics['sensor.doppler.photons_per_direction'])} photons each."
     )
     safety = []
     for name, title in (("doppler", "Doppler"), ("backscatter", "backscatter")):
@@ -244,14 +245,9 @@ def _costs(metrics) -> list[str]:
         aided = metrics[f"sensor.{name}.aided_hazard_distance"]
         where = "where it leaves"
         if aided > 0:
-            where = f"from {_three(distance)} m on, with binoculars from {_three(aided)} m"
+            where = f"from {three(distance)} m on, with binoculars from {three(aided)} m"
         safety.append(f"The {title} lidar's beam is safe for eyes {where} (IEC 60825-1:2014).")
     return [text, *safety]
-
-
-def _three(value: float) -> str:
-    """Three digits, without an exponent."""
-    return f"{float(f'{value:.3g}'):.10g}"
 
 
 def _numbers(metrics):
@@ -260,10 +256,11 @@ def _numbers(metrics):
         ("rmse_{}", "rms error", "m/s"), ("outside_cores.rmse_{}", "rms error beyond cores", "m/s"),
         ("outside_cores.rms_{}", "the true wind itself there, rms", "m/s"),
         ("bias_{}", "bias", "m/s"), ("reduced_variance_{}", "variance of reduced errors", ""),
-        ("coverage_68_{}", "within one standard error", ""),
-        ("coverage_95_{}", "within 1.96 standard errors", ""),
+        ("coverage_68_{}", "within one standard error", "%"),
+        ("coverage_95_{}", "within 1.96 standard errors", "%"),
         ("triples.rmse_{}", "rms error, lines of sight alone", "m/s"),
     ):  # fmt: skip
         values = [metrics.get(f"sensor.{key.format(name)}") for name in (*COMPONENTS, "v_los")]
-        rows.append((label, unit, ["-" if v is None else f"{v:.3g}" for v in values]))
+        scale = 100 if unit == "%" else 1
+        rows.append((label, unit, ["-" if v is None else fixed(scale * v) for v in values]))
     return "Errors against the truth", ["u", "v", "w", "v_LOS"], rows

@@ -9,11 +9,14 @@ READERS = {
     "annular": "all rings, full model",
     "pixels": "all rings, every pixel",
     "ca": "CA, peak in r",
-    "ca_r2": "CA, peak in r$^2$",
+    "ca_r2": "CA, peak in r²",
     "ml": "ML, peak in r",
     "sg": "Savitzky-Golay, peak in r",
 }
 """What the methods are called in figures and tables."""
+
+PEAK_READERS = ("ca", "ca_r2", "ml", "sg")
+"""Those that read the peak of the innermost ring."""
 
 CENTRES = {"free": "centre found", "known": "centre known"}
 

@@ -9,7 +9,8 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from .cores import Core
-from .figures import BACKSCATTER, Drawn, save_all
+from .digits import fixed, percent
+from .figures import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES, Drawn, save_all
 from .report import Chapter, Tables
 
 _SPEED = "m s$^{-1}$"
@@ -131,10 +132,10 @@ def _errors(found):
             stated = wind[f"{name}_stderr"].where(good)
             for values, style, text in ((error, "-", "error"), (stated, "--", "as stated")):
                 level = np.sqrt((values**2).mean(("y", "z")))
-                profile.plot(found["x"], level, style, color=colour, label=f"{method}, {text}")
+                profile.plot(found["x"], level, style, color=colour, label=f"{METHOD_NAMES.get(method, method)}, {text}")
             reduced = (error / stated).values
             density.hist(np.clip(reduced[np.isfinite(reduced)], -5, 5), edges, density=True,
-                         histtype="step", color=colour, label=method)  # fmt: skip
+                         histtype="step", color=colour, label=METHOD_NAMES.get(method, method))  # fmt: skip
         profile.set(title=f"rms error of {name}", xlabel="x / m", ylabel=_SPEED, yscale="log")
         density.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
         density.set(title=f"errors of {name} over standard errors", xlabel="reduced error",
@@ -172,7 +173,7 @@ def volume_chapter(
     )
     noise = (
         "Noise of the simulation in a voxel, relative to its light (median): "
-        f"{metrics['backscatter.mc_relative_error']:.2%} ({experiment.render.samples_per_beam} "
+        f"{percent(metrics['backscatter.mc_relative_error'])} ({experiment.render.samples_per_beam} "
         f"photons a beam); {'with the noise of a detector' if experiment.detector else 'no detector'}."
     )
     numbers = Tables(
@@ -195,12 +196,15 @@ def _tables(experiment, metrics):
                 ("all.rmse_{}", "rms error, flagged vectors too", "m/s"),
                 ("bias_{}", "bias", "m/s"), ("stderr_{}", "rms standard error, as stated", "m/s"),
                 ("reduced_variance_{}", "variance of reduced errors", ""),
-                ("coverage_68_{}", "within one standard error", ""),
+                ("coverage_68_{}", "within one standard error", "%"),
             ):  # fmt: skip
                 values = [metrics.get(f"{source}.{method}.{key.format(n)}") for n in _COMPONENTS]
-                rows.append((label, unit, ["-" if v is None else f"{v:.3g}" for v in values]))
-            own = [f"{metrics[f'true_wind.rms_{name}']:.3g}" for name in _COMPONENTS]
+                scale = 100 if unit == "%" else 1
+                shown = ["-" if v is None else fixed(scale * v) for v in values]
+                rows.append((label, unit, shown))
+            own = [fixed(metrics[f"true_wind.rms_{name}"]) for name in _COMPONENTS]
             rows.append(("the true wind itself, rms", "m/s", own))
             share = metrics[f"{source}.{method}.valid_fraction"]
-            title = f"{source.replace('_', ' ')}, {method}: {share:.0%} of the vectors are good"
+            name = METHOD_NAMES.get(method, method)
+            title = f"{SOURCE_NAMES[source]}, {name}: {percent(share)} of the vectors are good"
             yield title, list(_COMPONENTS), rows

@@ -11,6 +11,7 @@ from matplotlib.patches import Circle
 
 from ..retrieval.vortex_fit import VortexPairFit
 from .cores import Core, ring_averages
+from .digits import fixed, percent, with_error
 from .figures import Drawn, save_all
 from .report import Chapter, Tables
 
@@ -24,8 +25,8 @@ _ROWS = (
         (f"{side}_{key}", f"{side}: {label}", unit)
         for side in ("port", "starboard")
         for key, label, unit in (
-            ("circulation_5_15", "circulation, mean over 5 to 15 m", "m^2/s"),
-            ("circulation", "circulation, far from the core", "m^2/s"),
+            ("circulation_5_15", "circulation, mean over 5 to 15 m", "m²/s"),
+            ("circulation", "circulation, far from the core", "m²/s"),
             ("core_radius", "core radius", "m"), ("y", "y", "m"), ("z", "z", "m"),
         )
     ),
@@ -238,8 +239,8 @@ def _verdict(metrics, name) -> str | None:
         for side in sides
     ]
     return (
-        f"From the {SOURCES[name]}, circulation is off by {shares[0]:.1%} (port) and "
-        f"{shares[1]:.1%} (starboard), places by {places[0]:.2f} and {places[1]:.2f} m."
+        f"From the {SOURCES[name]}, circulation is off by {percent(shares[0])} (port) and "
+        f"{percent(shares[1])} (starboard), places by {places[0]:.2f} and {places[1]:.2f} m."
     )
 
 
@@ -247,8 +248,4 @@ def _shown(metrics, key: str) -> str:
     value, stderr = metrics.get(key), metrics.get(f"{key}_stderr")
     if value is None:
         return "-"
-    if stderr is None:
-        return f"{value:.3g}"
-    # as many digits as the error has two of
-    digits = max(0, 1 - int(np.floor(np.log10(stderr)))) if stderr > 0 else 3
-    return f"{value:.{digits}f} \u00b1 {stderr:.{digits}f}"
+    return fixed(value) if stderr is None else with_error(value, stderr)

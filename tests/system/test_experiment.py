@@ -28,6 +28,7 @@ from scipy.stats import norm, qmc
 
 from lidar_mi import backscatter_chain, config, run_folder
 from lidar_mi import truth as truth_module
+from lidar_mi.assessment.digits import percent
 from lidar_mi.atmosphere.wake import read_wake
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run
@@ -343,11 +344,11 @@ def test_report_tells_the_numbers(demo):
     assert "wake_backscatter" in words and "seed: 1" in words
     for text in ("wake_slab_40s.nc at 40 s", "532 nm, 1 mJ", "mitsuba 3.", "64 photons a beam"):
         assert text in words
-    assert f"{demo.metrics['backscatter.cc.rmse_v']:.3g}" in words
+    assert f"{demo.metrics['backscatter.cc.rmse_v']:.3f}" in words
     assert f"backscatter.cc.rmse_v: {demo.metrics['backscatter.cc.rmse_v']:.4g} m/s" in words
-    assert f"wake.port_core.circulation: {demo.metrics['wake.port_core.circulation']:.4g} m^2/s" in words
+    assert f"wake.port_core.circulation: {demo.metrics['wake.port_core.circulation']:.4g} m²/s" in words
     assert f"{demo.metrics['true_wind.rms_v']:.3g}" in words and "no skill" in words
-    noise = f"simulation {demo.metrics['backscatter.mc_relative_error']:.2%} (64 photons a beam)"
+    noise = f"simulation {percent(demo.metrics['backscatter.mc_relative_error'])} (64 photons a beam)"
     assert noise in words and "no detector" in words
     assert "cross-correlation" in words and "weight shift" in words
 

@@ -19,6 +19,7 @@ from scipy import stats
 from scipy.constants import speed_of_light
 
 from lidar_mi import cli, config, experiment
+from lidar_mi.assessment.digits import with_error
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run
 from lidar_mi.fringe_chain import summed
@@ -223,9 +224,9 @@ def test_report_tells_the_numbers(small):
     page = (small[0] / "report.html").read_text()
     metrics = small[1]
     for n in (1, 9):
-        value = metrics[f"doppler.annular.centre_free.averaged_{n}.std"]
-        assert f"{value:.3g} \u00b1 " in page
-        assert f"{metrics[f'doppler.bound.centre_free.averaged_{n}.std']:.3g}" in page
+        key = f"doppler.annular.centre_free.averaged_{n}.std"
+        assert with_error(metrics[key], metrics[f"{key}_stderr"]) in page
+        assert f"{metrics[f'doppler.bound.centre_free.averaged_{n}.std']:.3f}" in page
     assert page.count("data:image/webp;base64,") == len(FIGURES)
     assert "backscatter lidar" not in page and "Savitzky-Golay" in page
 

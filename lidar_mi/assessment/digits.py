@@ -1,0 +1,36 @@
+"""How reports write numbers: as many digits as mean something."""
+
+import math
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_BLANK = "\N{NO-BREAK SPACE}"
+
+
+def fixed(value: float) -> str:
+    """Three digits, but no more than three decimals: for errors in a column, 0.122, -0.001, 11.2."""
+    size = abs(value)
+    decimals = min(3, max(0, 2 - math.floor(math.log10(size)))) if size > 0 else 0
+    # a number that is rounded to 0 has no sign
+    return f"{round(value, decimals) + 0.0:.{decimals}f}"
+
+
+def three(value: float) -> str:
+    """Three digits at most: 0.0044, 83800; powers of ten where there were more noughts than that."""
+    text = f"{value:.3g}"
+    if value and not 1e-4 <= abs(float(text)) < 1e6:
+        mantissa, exponent = f"{value:.2e}".split("e")
+        return f"{float(mantissa):g}{_BLANK}×{_BLANK}10{str(int(exponent)).translate(_SUPERSCRIPT)}"
+    return f"{float(text):.10g}"
+
+
+def percent(share: float) -> str:
+    """A share as per cent, two digits at most below 10 %: 0.43 %, 72 %, 100 %."""
+    value = 100 * share
+    text = f"{round(value) + 0}" if abs(value) >= 9.95 or value == 0 else f"{float(f'{value:.2g}'):.10g}"
+    return f"{text} %"
+
+
+def with_error(value: float, stderr: float) -> str:
+    """A value and its standard error, to the second digit of the error: 0.65 ± 0.12."""
+    digits = max(0, 1 - math.floor(math.log10(stderr))) if stderr > 0 else 3
+    return f"{value:.{digits}f}{_BLANK}±{_BLANK}{stderr:.{digits}f}"
