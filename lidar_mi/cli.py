@@ -82,7 +82,11 @@ def run(
     _out.print(f"report   {folder / 'report.html'}")
     _out.print(f"figures  {folder / 'figures'}")
     winds = "wind_volume.nc" if loaded.volume else "wind.nc"
-    for name, asked in ((winds, loaded.wake), ("v_los.nc", loaded.doppler)):
+    found = "sensor.rmse_u" in metrics
+    for name, asked in (
+        (winds, loaded.wake), ("v_los.nc", loaded.doppler), ("lines_of_sight.nc", loaded.sensor),
+        ("wind3d.nc", found),
+    ):  # fmt: skip
         if asked:
             _out.print(f"winds    {folder / name}")
     if "timing.vortex_s" in metrics:
@@ -446,9 +450,10 @@ class _progress:
         return self._notice
 
     def _notice(self, text: str, share: float | None) -> None:
+        # a full bar would stop clock and spinner, and what comes next goes on
         self.bars.update(
             self.task, description=text, total=None if share is None else 1.0,
-            completed=share or 0.0,
+            completed=min(share or 0.0, 0.999),
         )  # fmt: skip
         if text != self.last and (text.startswith("warning: ") or not _err.is_terminal):
             _err.print(text, markup=False, highlight=False, soft_wrap=True)
@@ -464,6 +469,8 @@ def _print_metrics(metrics: dict[str, float]) -> None:
         _print_doppler(metrics)
     if any(key.startswith("backscatter.") for key in metrics):
         _print_winds(metrics)
+    if "sensor.vectors" in metrics:
+        _print_sensor(metrics)
 
 
 def _print_doppler(metrics: dict[str, float]) -> None:
@@ -514,6 +521,28 @@ def _print_winds(metrics: dict[str, float]) -> None:
     table.add_row("true wind (rms)", "", *shown, "", style="dim")
     _out.print(table)
     _out.print("An error near the rms of the true wind means no skill: zero would be as good.")
+
+
+def _print_sensor(metrics: dict[str, float]) -> None:
+    """Rms errors of the wind from both lidars, beyond two core radii where there are any."""
+    far = any(key.startswith("sensor.outside_cores.") for key in metrics)
+    place = "outside_cores." if far else ""
+    table = Table(
+        title=f"rms error of the wind from both lidars{', beyond cores' if far else ''}, m/s",
+        title_justify="left",
+    )
+    for head in ("", "u", "v", "w"):
+        table.add_column(head, justify="right" if head else "left")
+    for label, key, style in (
+        ("both lidars", f"sensor.{place}rmse_", None),
+        ("lines of sight alone, all over", "sensor.triples.rmse_", None),
+        ("true wind (rms)", f"sensor.{place}rms_", "dim"),
+    ):
+        values = [metrics.get(f"{key}{name}") for name in "uvw"]
+        if any(value is not None for value in values):
+            shown = ["-" if value is None else f"{value:.2f}" for value in values]
+            table.add_row(label, *shown, style=style)
+    _out.print(table)
 
 
 def _print_rows(title: str, rows) -> None:
