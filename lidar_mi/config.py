@@ -19,7 +19,7 @@ from .instrument.fringe_camera import CCD, FringeCamera
 from .instrument.lidar import BackscatterLidar
 from .instrument.scan import Scan
 from .rendering.settings import FringeSettings, RenderSettings
-from .units import Circulation, Extinction, Frequency, Length, Number, Speed, Time, to_si
+from .units import Circulation, Extinction, Frequency, Length, Number, Speed, Time, Unit, to_si
 
 
 class _Section(BaseModel):
@@ -574,8 +574,45 @@ def _first_fault(error: ValidationError) -> str:
         return f"{field}: unknown key{hint} (allowed: {', '.join(allowed)})"
     if fault["type"] == "missing":
         return f"{field}: missing"
-    shown = f"{fault['input']!r}: " if fault["type"] != "value_error" else ""
-    return f"{field}: {shown}{message}" if field else message
+    if fault["type"] == "value_error":
+        return f"{field}: {message}" if field else message
+    value = fault["input"]
+    unit = _unit_at(fault["loc"])
+    shown = f"{value:g} {unit}".strip() if isinstance(value, float) else repr(value)
+    if fault["type"] in _LIMITS:
+        limit, words = _LIMITS[fault["type"]]
+        expected = f"{words} {fault['ctx'][limit]:g} {unit}".strip()
+    elif fault["type"].startswith("model_"):
+        expected = f"a section with keys out of {', '.join(_keys_at(fault['loc']))}"
+    elif fault["type"] == "string_pattern_mismatch":
+        expected = "letters, digits, _, . and -, a letter or digit first"
+    elif fault["type"] == "too_short":
+        expected = f"{fault['ctx']['min_length']} or more"
+    else:
+        expected = message.removeprefix("Input should be ")
+    return f"{field}: {shown} is not allowed; expected {expected}"
+
+
+_LIMITS = {
+    "greater_than": ("gt", "more than"), "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"), "less_than_equal": ("le", "at most"),
+}  # fmt: skip
+
+
+def _unit_at(location: tuple) -> str:
+    """The SI unit of the key at a location, empty if it has none."""
+    model, field = Experiment, None
+    for part in location:
+        if model and part in model.model_fields:
+            field = model.model_fields[part]
+            model = _section(field.annotation)
+    pending = [field.annotation, *field.metadata] if field else []
+    while pending:
+        part = pending.pop()
+        if isinstance(part, Unit):
+            return part.symbol
+        pending += (*get_args(part), *getattr(part, "__metadata__", ()))
+    return ""
 
 
 def _keys_at(location: tuple) -> list[str]:

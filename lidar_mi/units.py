@@ -7,6 +7,7 @@ except angles, which must say their unit (degrees and radians are too easily con
 
 import re
 import tokenize
+from dataclasses import dataclass
 from typing import Annotated
 
 import pint
@@ -20,6 +21,13 @@ _BAD_UNIT = (
     pint.PintError, tokenize.TokenError, ArithmeticError, AssertionError, AttributeError,
     SyntaxError, TypeError, ValueError,
 )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Unit:
+    """The SI unit that a key's values are in; stands in the annotations of its type."""
+
+    symbol: str
 
 
 def to_si(value, unit: str, example: str) -> float:
@@ -58,6 +66,7 @@ def _quantity(unit: str, example: str):
         float,
         BeforeValidator(lambda value: to_si(value, unit, example)),
         PlainSerializer(lambda value: f"{value!r} {unit}" if unit else value, when_used="json"),
+        Unit(unit),
     ]
 
 

@@ -44,11 +44,15 @@ class DopplerLidar(BaseModel):
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
-    wavelength: Length = Field(354.7e-9, gt=0, description="vacuum wavelength of the laser")
+    wavelength: Length = Field(
+        354.7e-9, ge=100e-9, le=20e-6, description="vacuum wavelength of the laser"
+    )
     pulse_energy: Energy = Field(0.07, gt=0, description="energy of a pulse")
-    pulse_duration: Time = Field(10e-9, ge=0, description="full width at half maximum of a pulse")
+    pulse_duration: Time = Field(
+        10e-9, ge=0, le=1e-3, description="full width at half maximum of a pulse"
+    )
     laser_width: Frequency = Field("100 MHz", gt=0, description="full width half maximum")
-    beam_radius: Length = Field(0.025, gt=0, description="of the outgoing beam")
+    beam_radius: Length = Field(0.025, gt=0, le=10, description="of the outgoing beam")
     divergence_full: Angle = Field("500 urad", ge=0, lt=0.5, description="full angle")
     telescope_area: Area = Field(0.13, gt=0, description="of the receiving telescope")
     fov_half: Angle = Field("1 mrad", gt=0, lt=0.5, description="field of view, half angle")

@@ -18,8 +18,12 @@ class BackscatterLidar(BaseModel):
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
-    wavelength: Length = Field(532e-9, gt=0, description="vacuum wavelength of the laser")
-    beam_radius: Length = Field(0.1, gt=0, description="1/e^2 radius of the beam at the aperture")
+    wavelength: Length = Field(
+        532e-9, ge=100e-9, le=20e-6, description="vacuum wavelength of the laser"
+    )
+    beam_radius: Length = Field(
+        0.1, gt=0, le=10, description="1/e^2 radius of the beam at the aperture"
+    )
     beam_cut: Length = Field(
         0.1, gt=0, allow_inf_nan=True, description="outer radius of the emitted beam; inf: uncut"
     )
@@ -30,8 +34,10 @@ class BackscatterLidar(BaseModel):
         (1.0, 1.0, 0.0, 0.0), description="Stokes vector (I, Q, U, V) about the horizontal axis"
     )
     pulse_energy: Energy = Field(1e-3, gt=0, description="energy of a pulse in one beam")
-    pulse_duration: Time = Field(0.0, ge=0, description="full width at half maximum of the pulse")
-    aperture_radius: Length = Field(0.5, gt=0, description="radius of the telescope")
+    pulse_duration: Time = Field(
+        0.0, ge=0, le=1e-3, description="full width at half maximum of the pulse"
+    )
+    aperture_radius: Length = Field(0.5, gt=0, le=10, description="radius of the telescope")
     fov_half: Angle = Field("5 mrad", gt=0, lt=0.5, description="field of view, half angle")
 
     @field_validator("stokes")
