@@ -314,7 +314,7 @@ def _tables(experiment, metrics):
             shown = ["-" if value is None else fixed(scale * value) for value in values]
             rows.append((label, unit, shown))
         heads = [SOURCE_NAMES[source] for source in sources]
-        yield METHOD_NAMES[method], [*heads, "the true wind itself, rms"], rows
+        yield METHOD_NAMES[method], [*heads, "true wind, rms"], rows
 
 
 def _noise(experiment, metrics) -> str:

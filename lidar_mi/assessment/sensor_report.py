@@ -176,8 +176,11 @@ def sensor_chapter(
     tables = [
         (
             f"{table.title}, {table.phase}: {verdicts[fulfilled(findings)]}",
-            ["required", "measured", "margin", "verdict"],
-            [(name, "", values) for name, *values in as_rows(findings)],
+            ["verdict", "measured", "required", "margin"],
+            [
+                (name, "", (verdict, measured, required, margin))
+                for name, required, measured, margin, verdict in as_rows(findings)
+            ],
         )
         for table, findings in judged
     ]
@@ -190,8 +193,8 @@ def sensor_chapter(
         verdict=Tables(
             "Whether it does what flight control asks for" if speed else "Whether it does what is asked for",
             "Errors of u, v, w are rms errors of good vectors beyond two core radii, those of v_LOS "
-            "rms errors of lines of sight. A margin is the distance from the limit, as a share of "
-            "it.",
+            "rms errors of lines of sight, in this run for all phases of flight. A margin is the "
+            "distance from the limit, as a share of it.",
             tables,
         ) if judged else None,
         numbers=Tables(

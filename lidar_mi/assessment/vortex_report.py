@@ -11,7 +11,7 @@ from matplotlib.patches import Circle
 
 from ..retrieval.vortex_fit import VortexPairFit
 from .cores import Core, ring_averages
-from .digits import fixed, percent, with_error
+from .digits import fixed, with_error
 from .figures import Drawn, save_all
 from .report import Chapter, Tables
 
@@ -239,8 +239,8 @@ def _verdict(metrics, name) -> str | None:
         for side in sides
     ]
     return (
-        f"From the {SOURCES[name]}, circulation is off by {percent(shares[0])} (port) and "
-        f"{percent(shares[1])} (starboard), places by {places[0]:.2f} and {places[1]:.2f} m."
+        f"From the {SOURCES[name]}, circulation is off by {100 * shares[0]:.1f} % (port) and "
+        f"{100 * shares[1]:.1f} % (starboard), places by {places[0]:.2f} and {places[1]:.2f} m."
     )
 
 
