@@ -1,5 +1,6 @@
 """The command line: ``lidar-mi run | render | retrieve | info | aerosol | rings | doctor``."""
 
+import difflib
 import sys
 from pathlib import Path
 from typing import Annotated
@@ -398,9 +399,11 @@ def _experiment_file(name: str) -> Path:
     candidate = shipped / (name if name.endswith(".yaml") else f"{name}.yaml")
     if path.parent == Path() and candidate.is_file():
         return candidate
+    names = sorted(p.stem for p in shipped.glob("*.yaml"))
+    close = difflib.get_close_matches(path.stem, names, 1)
+    hint = f"did you mean {close[0]}? Expected" if close else "expected"
     raise InputError(
-        f"{name}: no such file; expected an experiment file or one of "
-        + ", ".join(sorted(p.stem for p in shipped.glob("*.yaml")))
+        f"{name}: no such file; {hint} an experiment file or one of {', '.join(names)}"
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from .atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphere
 from .atmosphere.particles import AEROSOLS, Notice, aerosol_table
 from .atmosphere.scattering import describe, read_table
+from .atmosphere.wake import open_netcdf
 from .errors import InputError
 from .retrieval.vortex_file import read_vortices
 
@@ -123,13 +124,7 @@ def _picture(path: Path) -> Iterator[Section]:
 
 
 def _netcdf(path: Path) -> Iterator[Section]:
-    import xarray as xr
-
-    try:
-        data = xr.open_dataset(path, engine="h5netcdf", decode_times=False)
-    except Exception:  # noqa: BLE001 - whatever the format library says, it is unreadable
-        raise InputError(f"{path}: not a readable NetCDF-4 file") from None
-    with data:
+    with open_netcdf(path) as data:
         rows = []
         for name, variable in data.variables.items():
             shape = " x ".join(f"{d} {n}" for d, n in variable.sizes.items())

@@ -68,7 +68,10 @@ def prepare(
         tables = read_requirements()
     truth = true_wind(experiment, beside)
     # lines that leave the wake, bins that reach the telescope
-    wind_at(truth, _volumes(experiment))
+    try:
+        wind_at(truth, _volumes(experiment))
+    except InputError as error:
+        raise InputError(f"sensor.directions: {error}") from None
     fastest = experiment.platform.speed + float(np.sqrt(sum(truth[n] ** 2 for n in COMPONENTS)).max())
     limit = fringe_chain.ring_instrument(experiment.doppler).model.velocity_range / 2
     if fastest > limit:

@@ -14,7 +14,7 @@ from .atmosphere.extinction import extinction_from_speed, extinction_from_tracer
 from .atmosphere.texture import corrsin_obukhov
 from .atmosphere.turbine import TurbineWake, turbine_flow
 from .atmosphere.vortex import pair_wake, vortex_pair
-from .atmosphere.wake import centre, read_wake, resample
+from .atmosphere.wake import centre, check_nodes, read_wake, resample
 from .config import Experiment
 from .errors import InputError
 
@@ -172,8 +172,8 @@ def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
 
 def _axes(wake, key: str) -> list[np.ndarray]:
     """y and z of an analytic wake, about the scan's axis."""
-    axes = []
-    for name in ("width", "height"):
+    ends = {}
+    for axis, name in (("y", "width"), ("z", "height")):
         extent = getattr(getattr(wake, key), name)
         cells = round(extent / wake.spacing)
         if cells < 1 or abs(cells * wake.spacing - extent) > 1e-6 * extent:
@@ -181,8 +181,9 @@ def _axes(wake, key: str) -> list[np.ndarray]:
                 f"wake.{key}.{name}: {extent:g} m is not allowed; expected a multiple of "
                 f"wake.spacing = {wake.spacing:g} m"
             )
-        axes.append(np.linspace(-extent / 2, extent / 2, cells + 1))
-    return axes
+        ends[axis] = (-extent / 2, extent / 2, cells + 1)
+    check_nodes(wake.spacing, {axis: count for axis, (*_, count) in ends.items()})
+    return [np.linspace(*end) for end in ends.values()]
 
 
 def _extinction(flow, mapping, first, second) -> xr.DataArray:

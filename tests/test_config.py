@@ -178,6 +178,8 @@ FAULTS = [
     ("lidar.pulse_energy=-1 mJ", "lidar.pulse_energy: -0.001 J is not allowed; expected more than 0 J"),
     ("lidar.stokes=[1, 1, 1, 0]", "lidar.stokes: (1.0, 1.0, 1.0, 0.0) is not allowed; expected I"),
     ("scan.columns=0", "scan.columns: 0 is not allowed; expected at least 1"),
+    ("scan={aim: angles, columns: 100000, rows: 50000}",
+     "scan: columns, rows: 100000 x 50000 is not allowed; expected at most 1e+07 beams"),
     ("scan.range=.inf", "scan.range: inf m is not allowed; expected a finite number"),
     ("scan.azimuth_half=[0 deg, 6 deg]", "scan.azimuth_half.0: '0 deg' is not allowed; expected more than"),
     ("platform.dt=0 s", "platform.dt: 0 s is not allowed; expected more than 0 s"),

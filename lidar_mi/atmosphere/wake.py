@@ -1,5 +1,6 @@
 """Wake flows from files: read, check, refine, and put into the lidar's frame."""
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -17,7 +18,7 @@ _VARIABLES = {
     "u": ("m s-1", "velocity along the flight path"),
     "v": ("m s-1", "velocity across the flight path, positive to port"),
     "w": ("m s-1", "vertical velocity, positive upwards"),
-    "tracer": ("1", "exhaust tracer"),
+    "tracer": (None, "exhaust tracer"),  # any scale, any unit: its largest value is what counts
     "aerosol": ("1", "background aerosol relative to its mean"),
 }
 _REQUIRED = ("v", "w")
@@ -28,6 +29,8 @@ _FORMAT_ERRORS = (OSError, ValueError, TypeError, LookupError, RuntimeError, Att
 # Largest deviation of a step from the mean step, in steps: float32 axes a few kilometres from
 # their origin reach 5e-4.
 _UNEVEN = 1e-3
+
+_MOST_NODES = 10**8
 
 
 def parse_units(text: str) -> pint.Quantity:
@@ -63,7 +66,14 @@ def _scale_to(variable: xr.DataArray, target: str, name: str, path: Path) -> flo
         raise InputError(f"{path}: {name} has the unit {text!r}; {allowed}") from None
 
 
-def _open(path: Path) -> xr.Dataset:
+def open_netcdf(path: Path) -> xr.Dataset:
+    """A NetCDF-4 or NetCDF-3 file, its times as numbers, its values read when they are asked for.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, is no NetCDF, or is damaged.
+    """
     try:
         with path.open("rb") as file:
             magic = file.read(8)
@@ -232,14 +242,16 @@ def read_wake(
     Returns
     -------
     xarray.Dataset
-        float64 on dims (x, y, z), ascending, metres: u, v, w in m s^-1, tracer and aerosol
-        dimensionless, as far as the file has them. Scalar coordinate `time` in s if known.
+        float64 on dims (x, y, z), ascending, metres: u, v, w in m s^-1, the tracer in the file's
+        unit, aerosol dimensionless, as far as the file has them. Scalar coordinate `time` in s if
+        known.
 
     Raises
     ------
     InputError
         Naming file and variable: unreadable, missing, wrong dims or units, values that are not
-        finite, a tracer or aerosol that is asked for and negative somewhere, axes that are not uniform, a time or plane that is not there.
+        finite, a tracer or aerosol that is asked for and negative somewhere, axes that are not
+        uniform, a time or plane that is not there.
     """
     path = Path(path)
     table = _file_names(names, path)
@@ -249,8 +261,16 @@ def read_wake(
                 f"wake: variable {name!r} is not known; allowed: {', '.join(_VARIABLES)}"
             )
     asked = {*_REQUIRED, *require, *(n for n in (names or {}) if n in _VARIABLES)}
-    with _open(path) as data:
+    with open_netcdf(path) as data:
         return _read(data, table, asked, time, x, path)
+
+
+def _hint(name, table):
+    """How to say what a file calls a thing, for those who have not said anything of it."""
+    if table[name] != name:
+        return ""
+    none = f", or wake.extinction.{name}: null" if name in ("tracer", "aerosol") else ""
+    return f"; expected wake.names: {{{name}: its name there}}{none}"
 
 
 def _read(data, table, asked, time, x, path):
@@ -258,13 +278,13 @@ def _read(data, table, asked, time, x, path):
         if name in asked and table[name] not in data.data_vars:
             raise InputError(
                 f"{path}: variable {table[name]!r} ({name}) is missing; it has "
-                f"{', '.join(map(str, data.data_vars)) or 'none'}"
+                f"{', '.join(map(str, data.data_vars)) or 'none'}{_hint(name, table)}"
             )
     for name in ("y", "z"):
         if table[name] not in data.dims:
             raise InputError(
                 f"{path}: dimension {table[name]!r} ({name}) is missing; it has "
-                f"{', '.join(map(str, data.dims)) or 'none'}"
+                f"{', '.join(map(str, data.dims)) or 'none'}{_hint(name, table)}"
             )
     present = [name for name in _VARIABLES if table[name] in data.data_vars]
     spatial = {table[d]: d for d in ("x", "y", "z") if table[d] in data.dims}
@@ -308,7 +328,11 @@ def _read(data, table, asked, time, x, path):
     for name in present:
         variable = data[table[name]]
         unit, long_name = _VARIABLES[name]
-        scale = _scale_to(variable, unit, f"variable {table[name]!r}", path)
+        scale = 1.0
+        if unit is None:
+            unit = variable.attrs.get("units", "1")
+        else:
+            scale = _scale_to(variable, unit, f"variable {table[name]!r}", path)
         try:
             variable = variable.load()
         except _FORMAT_ERRORS as error:
@@ -325,6 +349,22 @@ def _read(data, table, asked, time, x, path):
     if seconds is not None:
         wake = wake.assign_coords(time=((), seconds, {"units": "s"}))
     return wake
+
+
+def check_nodes(spacing: float, counts: Mapping[str, int]) -> None:
+    """Whether as many nodes along each axis fit into memory, several fields of them.
+
+    Raises
+    ------
+    InputError
+        More than 1e8 nodes, 0.8 GB a field.
+    """
+    if math.prod(counts.values()) > _MOST_NODES:
+        counted = " x ".join(f"{count} ({name})" for name, count in counts.items())
+        raise InputError(
+            f"wake.spacing: {spacing:g} m is not allowed, it makes {counted} nodes; expected at most "
+            f"{_MOST_NODES:g} nodes"
+        )
 
 
 def resample(wake: xr.Dataset, spacing: float, axes: str = "yz") -> xr.Dataset:
@@ -350,7 +390,8 @@ def resample(wake: xr.Dataset, spacing: float, axes: str = "yz") -> xr.Dataset:
     Raises
     ------
     InputError
-        A spacing that is not positive or does not divide an extent, fewer than 4 nodes.
+        A spacing that is not positive, does not divide an extent or makes too many nodes, fewer
+        than 4 nodes.
     """
     if not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"wake.spacing: {spacing} m is not allowed; it must be > 0 m")
@@ -368,7 +409,9 @@ def resample(wake: xr.Dataset, spacing: float, axes: str = "yz") -> xr.Dataset:
                 f"wake.spacing: {spacing:g} m does not divide the extent of {name}, "
                 f"{extent:g} m; allowed: {extent:g} m over a whole number"
             )
-        nodes[name] = np.linspace(axis[0], axis[-1], cells + 1)
+        nodes[name] = (axis[0], axis[-1], cells + 1)
+    check_nodes(spacing, {d: nodes[d][2] if d in nodes else wake.sizes[d] for d in "xyz"})
+    nodes = {name: np.linspace(*ends) for name, ends in nodes.items()}
 
     fine = wake.drop_vars([*wake.data_vars, *axes]).assign_coords(
         {name: (name, values, {"units": "m"}) for name, values in nodes.items()}

@@ -170,7 +170,7 @@ def wind_at(wind: xr.Dataset, points: np.ndarray) -> np.ndarray:
         if low < nodes[0] - slack or high > nodes[-1] + slack:
             raise InputError(
                 f"wind: {axis} from {nodes[0]:g} to {nodes[-1]:g} m does not hold the lines of "
-                f"sight, which need {low:.1f} to {high:.1f} m"
+                f"sight, which need {low:.1f} to {high:.1f} m; expected smaller angles or more air"
             )
     values = np.stack([wind[n].transpose(*axes).values for n in ("u", "v", "w")], -1)
     grid = tuple(wind[axis].values.astype(float) for axis in axes)

@@ -5,9 +5,12 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from ..units import Angle, Length, Speed
+
+MOST_BEAMS = 10**7
+"""A picture of so many beams holds about 1 GB, with a layer for each order and its errors."""
 
 HalfAngle = Annotated[Angle, Field(gt=0, lt=math.pi / 2)]
 
@@ -43,6 +46,16 @@ class Scan(BaseModel):
     rows: int = Field(139, ge=1, description="beams up, with aim: angles")
     azimuth_half: tuple[HalfAngle, HalfAngle] = ("6.2 deg", "6.4 deg")
     elevation_half: tuple[HalfAngle, HalfAngle] = ("3.9 deg", "4.1 deg")
+
+    @model_validator(mode="after")
+    def _fits_into_memory(self):
+        count = self.columns * self.rows
+        if count > MOST_BEAMS:
+            raise ValueError(
+                f"columns, rows: {self.columns} x {self.rows} is not allowed; expected at most "
+                f"{MOST_BEAMS:g} beams"
+            )
+        return self
 
 
 @dataclass(frozen=True)

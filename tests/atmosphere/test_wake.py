@@ -222,7 +222,7 @@ def test_uneven_axes(write):
 
 
 def test_wrong_units(write):
-    for name, units in (("v", "K"), ("v", "banana"), ("y", "s"), ("time", "m"), ("tracer", "m")):
+    for name, units in (("v", "K"), ("v", "banana"), ("y", "s"), ("time", "m")):
         data = example()
         data[name].attrs["units"] = units
         fails(write(data), f"{name}", f"'{units}'", "allowed:", time=1.0)
@@ -232,6 +232,32 @@ def test_wrong_units(write):
     data = example()
     del data.tracer.attrs["units"]  # CF: dimensionless
     assert "tracer" in read_wake(write(data), time=1.0)
+
+
+def test_tracer_of_any_unit(write):
+    """Soot in kg m-3, as a solver writes it: taken as it is, for only its shape counts."""
+    data = example()
+    data["tracer"].values[:] *= 1e-9
+    data.tracer.attrs["units"] = "kg m-3"
+    wake, plain = read_wake(write(data), time=1.0), read_wake(write(example()), time=1.0)
+    assert wake.tracer.attrs["units"] == "kg m-3"
+    np.testing.assert_allclose(wake.tracer, plain.tracer * 1e-9, rtol=1e-12)
+
+
+def test_names_that_nobody_has_mapped(write):
+    """Whoever leaves wake.names out learns of it; whoever has used it needs no advice."""
+    data = example().rename(tracer="soot")
+    fails(write(data), "'tracer'", "soot; expected wake.names: {tracer: its name there}, or",
+          "wake.extinction.tracer: null", time=1.0, require=["tracer"])  # fmt: skip
+    fails(write(example().rename(y="span")), "'y'", "expected wake.names: {y: ", time=1.0)
+    with pytest.raises(InputError, match="it has [a-z, ]+$"):
+        read_wake(write(data), time=1.0, names={"tracer": "smoke"})
+
+
+def test_nodes_without_number(write):
+    wake = read_wake(write(example()), time=1.0)
+    with pytest.raises(InputError, match="wake.spacing: 1e-05 m is not allowed, it makes .* nodes"):
+        resample(wake, 1e-5)
 
 
 def test_text_is_not_a_velocity(write):
