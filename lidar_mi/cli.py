@@ -1,4 +1,4 @@
-"""The command line: ``lidar-mi run | render | retrieve | info | aerosol | rings | doctor``."""
+"""The command line: ``lidar-mi run | check | render | retrieve | info | aerosol | rings | doctor``."""
 
 import difflib
 import sys
@@ -92,6 +92,33 @@ def run(
             _out.print(f"winds    {folder / name}")
     if "timing.vortex_s" in metrics:
         _out.print(f"vortices {folder / 'vortex.json'}")
+
+
+@app.command(
+    epilog="Examples: `lidar-mi check wake_sensor` - `lidar-mi check my_wake.yaml --set "
+    "scan.range='200 m'`"
+)
+def check(
+    experiment: Annotated[str, typer.Argument(help="Experiment file, or the name of a shipped one.")],
+    set_: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the file, as for run."),
+    ] = None,
+) -> None:  # fmt: skip
+    """Say whether an experiment can be run, and in numbers what it will look at and with what.
+
+    Reads the wake, the scattering and the requirements as run does, and writes nothing.
+    """
+    from . import config
+    from .check import sections
+
+    path, changes = _experiment_file(experiment), list(set_ or [])
+    asked = config.load_variants(path, changes) or {"": config.load(path, changes)}
+    with _progress() as notice:
+        found = [section for one in asked.values() for section in sections(one, path.parent, notice)]
+    for title, rows in found:
+        _print_rows(title, rows)
+    _out.print("nothing wrong found", highlight=False)
 
 
 def _run_study(variants, out, path, overwrite, start) -> None:

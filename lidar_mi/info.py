@@ -63,6 +63,8 @@ def sections(
         yield from _folder(path)
     elif path.suffix in kinds:
         yield from kinds[path.suffix](path)
+    elif path.suffix in (".yaml", ".yml"):
+        raise InputError(f"{path}: an experiment, not a result; expected lidar-mi check {path}")
     else:
         raise InputError(
             f"{path}: unknown kind of file; expected .exr, .nc, .txt (scattering table), "

@@ -53,19 +53,14 @@ def prepare(
     InputError
         Lidars that do not look at the same air, a scan wider than the wake, a bad requirement table.
     """
-    sensor, lidar = experiment.sensor, experiment.doppler.lidar
+    lidar = experiment.doppler.lidar
     middle = experiment.scan.range + experiment.scan.thickness / 2
     if abs(lidar.range - middle) > lidar.range_bin / 2:
         raise InputError(
             f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected the slab of "
             f"scan, {middle - lidar.range_bin / 2:g} to {middle + lidar.range_bin / 2:g} m"
         )
-    tables = {}
-    if sensor.requirements:
-        tables = read_requirements(find_file(sensor.requirements, beside, "sensor.requirements"))
-    elif experiment.platform.speed:
-        # the paper's are those of flight control: nothing to ask of a platform that stands
-        tables = read_requirements()
+    tables = requirement_tables(experiment, beside)
     truth = true_wind(experiment, beside)
     # lines that leave the wake, bins that reach the telescope
     try:
@@ -80,6 +75,15 @@ def prepare(
             f"less than {limit:.0f} m/s with the wind, half an order of doppler.etalon"
         )
     return lambda folder, log: _run(experiment, truth, tables, folder, log)
+
+
+def requirement_tables(experiment: Experiment, beside: str | Path) -> dict:
+    """The tables that the sensor is held against, as `read_requirements` gives them."""
+    path = experiment.sensor.requirements
+    if path:
+        return read_requirements(find_file(path, beside, "sensor.requirements"))
+    # the paper's are those of flight control: nothing to ask of a platform that stands
+    return read_requirements() if experiment.platform.speed else {}
 
 
 def _volumes(experiment: Experiment) -> np.ndarray:

@@ -111,11 +111,11 @@ def test_version_in_a_fresh_process():
 def test_help_names_every_command(lidar_mi):
     code, out, _ = lidar_mi("--help")
     assert code == 0
-    for command in ("run", "render", "retrieve", "info", "aerosol", "doctor"):
+    for command in ("run", "check", "render", "retrieve", "info", "aerosol", "doctor"):
         assert re.search(rf"^│ {command} ", out, re.MULTILINE)
 
 
-@pytest.mark.parametrize("command", ["run", "render", "retrieve", "info", "aerosol", "doctor"])
+@pytest.mark.parametrize("command", ["run", "check", "render", "retrieve", "info", "aerosol", "doctor"])
 def test_help_teaches_by_example(lidar_mi, command):
     code, out, _ = lidar_mi(command, "--help")
     assert code == 0
@@ -163,6 +163,34 @@ def test_run_folder_is_named_after_the_experiment(there, lidar_mi, quick):
     code, _, err = lidar_mi("run", "tiny.yaml", "--set", "seed=2")
     assert code == 2 and "--overwrite" in err
     assert lidar_mi("run", "tiny.yaml", "--set", "seed=2", "--overwrite")[0] == 0
+
+
+def test_check_tells_what_a_run_would_do(there, lidar_mi):
+    """Numbers that follow from the file by hand; nothing is written."""
+    changes = ("scan.range=210 m", "platform.speed=70 m/s", "platform.dt=0.2 s")
+    before = files_in(there)
+    code, out, err = lidar_mi("check", "tiny.yaml", *(w for c in changes for w in ("--set", c)))
+    assert code == 0, err
+    said = words_of(out)
+    assert "beams 61 x 41, 0.5 m apart" in said  # 30 m x 20 m
+    assert "gates 1, from 210 to 212.5 m" in said
+    assert "warning time 3 s at 70 m/s" in said
+    assert "fastest wind windows follow 8.75 m/s, here" in said  # (16 - 8)/2 - 1/2 pixels in dt
+    assert "extinction 0.1 to 0.1 1/km" not in said and "texture, rms 10%" in said
+    assert files_in(there) == before
+
+
+def test_check_warns_of_winds_too_fast_to_follow(there, lidar_mi):
+    _, calm, _ = lidar_mi("check", "tiny.yaml")
+    _, fast, _ = lidar_mi("check", "tiny.yaml", "--set", "platform.dt=1 s")
+    assert "larger retrieval.search" in words_of(fast) and "larger" not in words_of(calm)
+
+
+def test_info_on_netcdf_3(there, lidar_mi):
+    """The wake reader takes it, so info must, too."""
+    xr.Dataset({"v": ("y", [1.0, 2.0], {"units": "m/s"})}).to_netcdf("old.nc", engine="scipy")
+    code, out, _ = lidar_mi("info", "old.nc")
+    assert code == 0 and "y 2" in out and "1 ... 2" in out
 
 
 def test_info_on_a_run_folder(demo, lidar_mi):
@@ -397,7 +425,11 @@ def bad(*arguments, says):
         bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0.1", "--layer", "G", "--spacing", "1",
             "-o", "none/w.nc", says=["none/w.nc", "none is no folder"]),
         bad("info", "none", says=["none", "no such file"]),
-        bad("info", "tiny.yaml", says=["tiny.yaml", "expected .exr, .nc, .txt", "run folder"]),
+        bad("info", "tiny.yaml", says=["tiny.yaml", "expected lidar-mi check tiny.yaml"]),
+        bad("info", "slab.xml", says=["slab.xml", "expected .exr, .nc, .txt", "run folder"]),
+        bad("check", "tiny.yaml", "--set", "wake.spacing=1 um", says=["wake.spacing", "1e+08 nodes"]),
+        bad("check", "wake_senor", says=["wake_senor: no such file", "did you mean wake_sensor?"]),
+        bad("check", "wake.yaml", says=["text.nc", "not NetCDF"]),
         bad("info", "smog", says=["smog", "no such file", "molecules", "spheroids"]),
         bad("info", "tiny.yaml", "--wavelength", "532 nm", says=["--wavelength", "tiny.yaml"]),
         bad("info", "dust", "--altitude", "1 km", says=["--altitude", "dust", "molecules"]),
