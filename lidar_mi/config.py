@@ -506,6 +506,10 @@ def _read(path: str | Path) -> dict:
         raise InputError(
             f"{path}: a Mitsuba scene, not an experiment; expected lidar-mi render {path}"
         )
+    if path.suffix in (".nc", ".nc4", ".cdf"):
+        raise InputError(
+            f"{path}: a wake, not an experiment; expected a YAML file that says wake: {{file: {path}}}"
+        )
     try:
         text = path.read_text()
     except OSError as error:
@@ -586,6 +590,8 @@ def _first_fault(error: ValidationError) -> str:
         expected = f"a section with keys out of {', '.join(_keys_at(fault['loc']))}"
     elif fault["type"] == "string_pattern_mismatch":
         expected = "letters, digits, _, . and -, a letter or digit first"
+    elif fault["type"] in ("tuple_type", "list_type"):
+        expected = "a list in brackets"
     elif fault["type"] == "too_short":
         expected = f"{fault['ctx']['min_length']} or more"
     else:

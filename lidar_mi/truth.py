@@ -237,9 +237,10 @@ def find_file(name: str, beside: str | Path, field: str) -> Path:
     for candidate in (Path(beside) / name, shipped / name):
         if candidate.is_file():
             return candidate
+    samples = sorted(p.name for p in shipped.glob("*.nc")) if field == "wake.file" else []
     raise InputError(
-        f"{field}: {name} not found; looked in {Path(beside).resolve()} and the shipped samples "
-        f"({', '.join(sorted(p.name for p in shipped.glob('*.nc')))})"
+        f"{field}: {name} not found; looked in {Path(beside).resolve()} and the shipped samples"
+        + (f" ({', '.join(samples)})" if samples else "")
     )
 
 

@@ -207,6 +207,7 @@ FAULTS = [
     ("wake.depth=line", "wake.depth: 'line' is not allowed; expected 'plane' or 'volume'"),
     ("retrieval.methods=[cc, xx]", "retrieval.methods.1: 'xx' is not allowed; expected 'cc', 'ws', 'multipass', 'variational' or 'vortex_fit'"),
     ("retrieval.methods=[]", "retrieval.methods: [] is not allowed; expected 1 or more"),
+    ("retrieval.methods=cc", "retrieval.methods: 'cc' is not allowed; expected a list in brackets"),
     ("name=a/b", "name: 'a/b' is not allowed; expected letters, digits"),
     ("name=..", "name: '..' is not allowed; expected letters, digits"),
     # not the right kind
@@ -298,6 +299,11 @@ def test_a_key_that_is_there_twice_is_a_fault(write):
         load(path)
     with pytest.raises(InputError, match="is not a YAML value"):
         load(write(), ["scan={range: 300 m, range: 400 m}"])
+
+
+def test_a_wake_is_no_experiment(tmp_path):
+    with pytest.raises(InputError, match=r"wake.nc: a wake, not .* wake: \{file: .*wake.nc\}$"):
+        load(tmp_path / "wake.nc")
 
 
 def test_a_scene_is_no_experiment(tmp_path):
