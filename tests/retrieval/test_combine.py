@@ -51,13 +51,13 @@ def lines(places, v_los, std, distance=10.0, range_bin=0.0):
     )  # fmt: skip
 
 
-def written_out(flow, scan, u_std, length, window, mean_std=100.0):
+def written_out(flow, scan, u_std, length, window, exponent, mean_std=100.0):
     """Information of everything that is known, as one big matrix over (u, v, w) of all nodes."""
     zz, yy = (a.ravel() for a in np.meshgrid(flow.z, flow.y, indexing="ij"))
     n = len(zz)
-    far = abs(zz[:, None] - zz) + abs(yy[:, None] - yy)
+    far = abs(zz[:, None] - zz) ** exponent + abs(yy[:, None] - yy) ** exponent
     prior = np.zeros((3 * n, 3 * n))
-    prior[:n, :n] = mean_std**2 + u_std**2 * np.exp(-far / length)
+    prior[:n, :n] = mean_std**2 + u_std**2 * np.exp(-far / length**exponent)
     overlap = np.eye(n)
     if window:
         overlap = (np.clip(1 - abs(zz[:, None] - zz) / window, 0, None)
@@ -96,9 +96,10 @@ def covariance_at(found, z, y):
     return matrix * np.outer(std, std)
 
 
+@pytest.mark.parametrize("exponent", [1.0, 2.0])
 @pytest.mark.parametrize("window", [0.0, 2.5])
 @pytest.mark.parametrize("range_bin", [0.0, 1.5])
-def test_generalised_least_squares_written_out(window, range_bin):
+def test_generalised_least_squares_written_out(window, range_bin, exponent):
     """35 nodes, 8 oblique lines between them, errors that differ and correlate."""
     random = np.random.default_rng(3)
     shape = (len(Z), len(Y))
@@ -108,8 +109,10 @@ def test_generalised_least_squares_written_out(window, range_bin):
     )  # fmt: skip
     places = random.uniform([-2.6, -1.6], [2.6, 1.6], (8, 2))
     scan = lines(places, random.normal(0, 3, 8), random.uniform(0.1, 2, 8), range_bin=range_bin)
-    found = combine(flow, scan, window=window, u_std=1.3, u_length=2.0, u_power=0.0)
-    wind, covariance, n = written_out(flow, scan, 1.3, 2.0, window)
+    found = combine(
+        flow, scan, window=window, u_std=1.3, u_length=2.0, u_power=0.0, u_exponent=exponent
+    )
+    wind, covariance, n = written_out(flow, scan, 1.3, 2.0, window, exponent)
     for index, name in enumerate("uvw"):
         np.testing.assert_allclose(found[name], wind[index], atol=1e-6)
     for z, y in ((0, 0), (2, 3), (4, 6), (1, 5)):
@@ -126,7 +129,8 @@ def test_images_that_see_motion_along_x():
     flow = crossflow(random.normal(0, 3, shape), random.normal(0, 3, shape), 0.6, 0.3)
     scan = lines(random.uniform([-2.6, -1.6], [2.6, 1.6], (8, 2)), random.normal(0, 3, 8), 0.4)
     found = combine(
-        flow, scan, window=0.0, u_std=1.3, u_length=2.0, u_power=0.0, distance=distance, gate_speed=gates
+        flow, scan, window=0.0, u_std=1.3, u_length=2.0, u_power=0.0, u_exponent=1.0,
+        distance=distance, gate_speed=gates,
     )
     zz, yy = (a.ravel() for a in np.meshgrid(Z, Y, indexing="ij"))
     n, one = len(zz), np.eye(len(zz))
@@ -167,7 +171,7 @@ def test_information_adds_up_node_by_node():
     flow = crossflow(random.normal(0, 3, shape), random.normal(0, 3, shape), 0.8, 0.4)
     # so short a length that u is its own at every node; its mean is what takes part in common
     scan = lines(places, random.normal(0, 3, len(places)), 0.5)
-    found = combine(flow, scan, window=0.0, u_std=1e3, u_length=1e-3, u_power=0.0)
+    found = combine(flow, scan, window=0.0, u_std=1e3, u_length=1e-3, u_power=0.0, u_exponent=1.0)
     images = np.linalg.inv(np.array([[0.64, 0.4 * 0.8 * 1.2], [0.4 * 0.8 * 1.2, 1.44]]))
     for z in range(len(Z)):
         for y in range(len(Y)):
@@ -233,7 +237,7 @@ def reduced_errors(known, draws):
 
 def test_errors_are_as_stated():
     """Statistics of u given: unit variance and coverage to 4 sigma of 40 draws x 12 nodes."""
-    reduced = reduced_errors({"u_std": 1.0, "u_length": 12.0, "u_power": 0.0}, 40)
+    reduced = reduced_errors({"u_std": 1.0, "u_length": 12.0, "u_power": 0.0, "u_exponent": 1.0}, 40)
     for values in reduced.transpose(1, 0, 2):
         count = values.size / 2  # nodes of a draw share the lines
         assert abs(values.mean()) < 4 / math.sqrt(count)
@@ -247,8 +251,11 @@ def test_errors_are_as_stated():
     ("draws", "coverage"), [(15, 0.12), pytest.param(200, 0.05, marks=pytest.mark.slow)]
 )
 def test_errors_are_as_stated_where_the_statistics_of_u_are_found(draws, coverage):
-    """As above, to 4 sigma; in the long test intervals hold what they say to 5 points."""
-    reduced = reduced_errors({}, draws)
+    """As above, to 4 sigma; in the long test intervals hold what they say to 5 points.
+
+    Whether u is rough or smooth is known here; test_combine_ensemble.py has flows of all kinds.
+    """
+    reduced = reduced_errors({"u_exponent": 1.0}, draws)
     for values in reduced.transpose(1, 0, 2):
         assert values.var() == pytest.approx(1, abs=4 * math.sqrt(4 / values.size))
         assert (abs(values) < 1).mean() == pytest.approx(0.683, abs=coverage)
@@ -346,7 +353,7 @@ def test_a_vortex_pair():
     for c in "vw":
         assert rms[c] < 1.01 * float(np.sqrt((((flow[c] - wind[c]) ** 2).where(inside)).mean()))
         # statistics of u that differ in what they say of v and w may add a little
-        assert float((found[f"{c}_stderr"] / flow[f"{c}_stderr"]).max()) < 1.01
+        assert float((found[f"{c}_stderr"] / flow[f"{c}_stderr"]).max()) < 1.03
 
 
 # flags
@@ -367,7 +374,7 @@ def test_where_images_gave_nothing_u_is_left():
     assert (((found.flag & CombinedFlag.NO_CROSSFLOW) > 0) == hole.transpose("z", "y")).all()
     assert found.v.where(hole, drop=True).isnull().all() and found.u.notnull().all()
     assert found.v_stderr.where(hole, drop=True).isnull().all()
-    known = {"u_std": 1.0, "u_length": 12.0, "u_power": 0.0}
+    known = {"u_std": 1.0, "u_length": 12.0, "u_power": 0.0, "u_exponent": 1.0}
     whole = combine(flow.assign(flag=0 * flow.flag), scan, **known)
     less = combine(spoiled, scan, **known)
     assert float(less.u_stderr.where(hole).mean()) > 1.02 * float(whole.u_stderr.where(hole).mean())
@@ -439,6 +446,7 @@ LINES = lines(np.array([[0.3, 0.2], [1.0, 1.0]]), [1.0, 2.0], 0.5)
         (lambda: combine(FLOW, LINES, u_std=0), "u_std: 0 m/s"),
         (lambda: combine(FLOW, LINES, u_length=-2), "u_length: -2 m"),
         (lambda: combine(FLOW, LINES, u_power=-1), "u_power: -1"),
+        (lambda: combine(FLOW, LINES, u_exponent=2.5), "u_exponent: 2.5"),
         (lambda: combine(FLOW, LINES, distance=0), "distance: 0 m"),
         (lambda: combine(FLOW.assign_attrs(template=None).drop_attrs(), LINES), "crossflow"),
     ],
