@@ -11,7 +11,7 @@ import xarray as xr
 from . import __version__
 from .assessment import figures
 from .assessment.cores import Core, find_cores, outside_cores
-from .assessment.errors import truth_at_vectors, wind_metrics
+from .assessment.errors import commonest_flag, truth_at_vectors, wind_metrics
 from .assessment.report import Chapter, backscatter_chapter
 from .assessment.vector_map import map_data
 from .config import Experiment
@@ -139,18 +139,12 @@ def _warn_of_wide_beams(experiment, truth, plans, log) -> None:
 
 def _warn_of_no_vectors(found: xr.Dataset, metrics, log) -> None:
     """Sources of rendered pictures that gave no valid vector, and which flags say why."""
-    meanings = found["flag"].attrs["flag_meanings"].split()
-    masks = found["flag"].attrs["flag_masks"]
     for source in (name for name in found["source"].values if name in ("backscatter", NOISY)):
         for method in found["algorithm"].values:
             if metrics[f"{source}.{method}.valid_fraction"] > 0:
                 continue
-            flags = found["flag"].sel(source=source, algorithm=method).values
-            shares = {text: ((flags & mask) != 0).mean() for text, mask in zip(meanings, masks)}
-            worst = max(shares, key=shares.get)
-            log.remark(
-                f"{source}, {method}: no vector is valid; {shares[worst]:.0%} have the flag {worst}"
-            )
+            flag = found["flag"].sel(source=source, algorithm=method)
+            log.remark(f"{source}, {method}: no vector is valid; {commonest_flag(flag)}")
 
 
 def pictures(experiment, plans, fields, air: Scatterer, folder: Path, log) -> list[xr.Dataset]:

@@ -530,27 +530,35 @@ def _print_doppler(metrics: dict[str, float]) -> None:
 
 def _print_winds(metrics: dict[str, float]) -> None:
     """Rms errors of the winds from every source, by every method."""
-    table = Table(title="rms error of the wind, valid vectors", title_justify="left")
-    for head in ("winds from", "method", "v / m/s", "w / m/s", "beyond cores v", "w", "valid"):
-        table.add_column(head, justify="left" if head in ("winds from", "method") else "right")
+    table = Table(
+        title="rms error of the wind in m/s, valid vectors (far: beyond two core radii)",
+        title_justify="left",
+    )
+    components = "uvw" if any(k.startswith("backscatter") and k.endswith(".rmse_u") for k in metrics) else "vw"
+    far = (f"far {name}" for name in components)
+    for head in ("winds from", "method", *components, *far, "valid"):
+        named = head in ("winds from", "method")
+        table.add_column(head, justify="left" if named else "right", no_wrap=named)
     names = [
         tuple(key.split(".")[:2]) for key in metrics
         if key.endswith(".valid_fraction") and not key.startswith("texture_sweep.")
     ]  # fmt: skip
     for source, method in names:
-        keys = ("rmse_v", "rmse_w", "outside_cores.rmse_v", "outside_cores.rmse_w")
-        values = [metrics.get(f"{source}.{method}.{key}") for key in keys]
+        values = [
+            metrics.get(f"{source}.{method}.{place}rmse_{name}")
+            for place in ("", "outside_cores.") for name in components
+        ]  # fmt: skip
         shown = ["-" if value is None else f"{value:.2f}" for value in values]
         valid = f"{metrics[f'{source}.{method}.valid_fraction']:.0%}"
         table.add_row(source.replace("_", " ").replace("extinction ", ""), method, *shown, valid)
     strength = [
-        metrics.get(f"true_wind.{key}")
-        for key in ("rms_v", "rms_w", "outside_cores.rms_v", "outside_cores.rms_w")
-    ]
+        metrics.get(f"true_wind.{place}rms_{name}")
+        for place in ("", "outside_cores.") for name in components
+    ]  # fmt: skip
     shown = ["-" if value is None else f"{value:.2f}" for value in strength]
-    table.add_row("true wind (rms)", "", *shown, "", style="dim")
+    table.add_row("true wind", "", *shown, "", style="dim")
     _out.print(table)
-    _out.print("An error near the rms of the true wind means no skill: zero would be as good.")
+    _out.print("An error near the rms of the true wind (last row) means no skill: zero would be as good.")
 
 
 def _print_sensor(metrics: dict[str, float]) -> None:

@@ -16,6 +16,7 @@ import xarray as xr
 
 from . import __version__, fringe_chain
 from .assessment.cores import find_cores, outside_cores
+from .assessment.errors import commonest_flag
 from .assessment.report import Chapter
 from .assessment.requirements import judge, read_requirements
 from .assessment.sensor_report import draw_all, sensor_chapter
@@ -116,9 +117,14 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
     else:
         write_netcdf(found, folder / WIND)
         metrics |= errors(found, cores)
+        if not metrics["sensor.vectors"]:
+            log.remark(f"no vector from both lidars is good; {commonest_flag(found['flag'])}")
         metrics |= budget_of_u(experiment, truth, lines, crossflow, found, cores)
     try:
-        metrics |= _triple_errors(wind_from_triples(lines), truth)
+        alone = _triple_errors(wind_from_triples(lines), truth)
+        if not alone:
+            raise InputError("no three lines beside each other could be read")
+        metrics |= alone
     except InputError as error:
         log.remark(f"no wind from lines of sight alone: {error}")
     metrics |= _costs(experiment)
@@ -128,7 +134,8 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
             if not math.isnan(row.margin):
                 key = f"sensor.{table.application}.{table.phase}.{row.quantity}.margin"
                 metrics[key] = row.margin
-    drawn = draw_all(folder / "figures", found, lines, cores, log)
+    shown = found if metrics["sensor.vectors"] else None
+    drawn = draw_all(folder / "figures", shown, lines, cores, log)
     metrics["timing.sensor_s"] = round(time.perf_counter() - start, 3)
     vectors = None if found is None else map_data(found, COMPONENTS, cores)
     return metrics, sensor_chapter(experiment, metrics, judged, drawn, vectors)

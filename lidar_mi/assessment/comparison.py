@@ -4,6 +4,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import xarray as xr
 import yaml
 from matplotlib.figure import Figure
@@ -173,7 +174,8 @@ def draw_comparison(
         for name, (_, wind, _) in rows.items()
     }
     largest = [float(abs(error).quantile(0.99)) for error in errors.values() if error.notnull().any()]
-    top = min(max(largest, default=0.0), limit) or limit
+    # one variant without skill must not hide the errors of those that have some
+    top = min(float(np.median(largest)) if largest else 0.0, limit) or limit
     for row, (name, (picture, wind, cores)) in zip(axes, rows.items()):
         low, high = (float(1e6 * picture.quantile(share)) for share in (0.002, 0.998))
         good, place = wind["flag"] == 0, {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"}
@@ -197,7 +199,7 @@ def draw_comparison(
         panel.set_xlabel("y / m (port is left)")
     caption = (
         "Each variant's first picture, the vertical wind found by its first method (white: flagged "
-        "vectors), and its error; winds are on one scale, errors on another. Crosses: true cores. Of "
+        "vectors), and its error; winds are on one scale, errors on another, that of the middle variant. Crosses: true cores. Of "
         "several gates the first, of winds in three dimensions the layer nearest to it."
     )
     plate = ("fig00_comparison", "The variants side by side", (figure, caption))

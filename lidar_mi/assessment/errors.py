@@ -5,6 +5,7 @@ import xarray as xr
 from scipy.interpolate import RectBivariateSpline
 
 from .cores import Core, outside_cores
+from .digits import percent
 
 
 def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
@@ -80,8 +81,8 @@ def _statistics(error: xr.Dataset, chosen: np.ndarray) -> dict[str, float]:
         values = error[name].values[chosen]
         statistics[f"rmse_{name}"] = float(np.sqrt(np.mean(values**2)))
         statistics[f"bias_{name}"] = float(np.mean(values))
-        for percent in (50, 90):
-            statistics[f"p{percent}_{name}"] = float(np.percentile(np.abs(values), percent))
+        for rank in (50, 90):
+            statistics[f"p{rank}_{name}"] = float(np.percentile(np.abs(values), rank))
     return statistics
 
 
@@ -109,3 +110,11 @@ def error_by_quality(
             quality: ("group", [float(np.median(values[g])) for g in groups]),
         }
     )
+
+
+def commonest_flag(flag: xr.DataArray) -> str:
+    """Which flag most vectors have, in words; ``flag`` has its CF attributes."""
+    meanings, masks = flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"])
+    shares = {text: float(((flag.values & mask) != 0).mean()) for text, mask in zip(meanings, masks)}
+    worst = max(shares, key=shares.get)
+    return f"{percent(shares[worst])} have the flag {worst}"

@@ -11,6 +11,7 @@ import numpy as np
 import xarray as xr
 from matplotlib.colors import Normalize, TwoSlopeNorm
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from .cores import Core
 from .errors import deviations, error_by_quality
@@ -140,7 +141,9 @@ def _image(axes, field: xr.DataArray, title: str, label: str, extend="neither", 
         y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
     )
     _frame(axes, y, z, title)
-    axes.figure.colorbar(mesh, ax=axes, label=label, pad=0.02, extend=extend)
+    bar = axes.figure.colorbar(mesh, ax=axes, label=label, pad=0.02, extend=extend)
+    # whole numbers, not what they have beyond one that stands elsewhere
+    bar.formatter.set_useOffset(False)
 
 
 def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale) -> None:
@@ -176,7 +179,7 @@ def _overview(scans, found, cores, scale):
     figure, axes = _sheet(1, 2)
     first = scans[0]["Y"] * 1e6
     _image(axes[0, 0], first, "backscatter, $t_1$", BACKSCATTER, "max",
-           norm=Normalize(0, _upper(first, 0.999)), cmap="cividis")  # fmt: skip
+           norm=_bright([first]), cmap="cividis")  # fmt: skip
     wind = found.sel(source="backscatter").isel(algorithm=0)
     _arrows(axes[0, 1], wind, cores, "wind from two such pictures", scale)
     return figure, (
@@ -190,9 +193,10 @@ def _overview(scans, found, cores, scale):
 def _extinction(truth):
     figure, axes = _sheet(1, 2)
     fields = [truth.image(k) * 1e3 for k in (0, 1)]
-    norm = Normalize(0, max(float(f.max()) for f in fields))
+    norm = _bright(fields)
     for k, field in enumerate(fields):
-        _image(axes[0, k], field, f"$t_{k + 1}$", "extinction / km$^{-1}$", norm=norm, cmap="cividis")
+        _image(axes[0, k], field, f"$t_{k + 1}$", "extinction / km$^{-1}$", "max", norm=norm,
+               cmap="cividis")  # fmt: skip
     return figure, (
         "Extinction coefficient of the slab at t1 and t2, averaged over the gate's depth. "
         "The difference in dt is hardly visible; the retrieval finds it."
@@ -259,6 +263,16 @@ def _deviation_maps(found, source, reference):
     )
 
 
+def _bright(fields) -> Normalize:
+    """From 0, or from the darkest pixels where nothing is dark, to the brightest.
+
+    Single bright pixels must not darken all others.
+    """
+    low = min(float(field.quantile(0.001)) for field in fields)
+    high = max(_upper(field, 0.999) for field in fields)
+    return Normalize(low if low > 0.3 * high else 0, high)
+
+
 def _upper(field: xr.DataArray, share: float) -> float:
     """The value that this share of a field's finite values does not exceed; 0 if there is none."""
     values = field.values[np.isfinite(field.values)]
@@ -267,8 +281,7 @@ def _upper(field: xr.DataArray, share: float) -> float:
 
 def _backscatter(scans):
     figure, axes = _sheet(1, 2)
-    # single bright pixels must not darken all others
-    norm = Normalize(0, max(_upper(s["Y"], 0.999) for s in scans) * 1e6)
+    norm = _bright([scan["Y"] * 1e6 for scan in scans])
     for k, scan in enumerate(scans):
         _image(axes[0, k], scan["Y"] * 1e6, f"$t_{k + 1}$", extend="max",
                label=BACKSCATTER, norm=norm, cmap="cividis")  # fmt: skip
@@ -371,6 +384,17 @@ def _error_and_bound(found):
     )
 
 
+def by_factors(axes) -> None:
+    """A logarithmic upward axis where values differ by more than a factor of 3, plain numbers on it."""
+    values = np.concatenate([np.ravel(line.get_ydata()).astype(float) for line in axes.lines] or [[]])
+    values = values[np.isfinite(values) & (values > 0)]
+    if values.size and values.max() > 3 * values.min():
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())
+
+
 def _error_by_texture(found, sweep):
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -381,7 +405,7 @@ def _error_by_texture(found, sweep):
         errors = [np.nan if error is None else error for error in errors]
         left.plot(levels, errors, marker=marker, label=name)
     left.set(
-        xlabel="sub-grid texture, rms / %", ylabel="rms error / m s$^{-1}$", yscale="log",
+        xlabel="sub-grid texture, rms / %", ylabel="rms error / m s$^{-1}$",
         title="cross-correlation from extinction, all vectors",
     )  # fmt: skip
     for source, marker in (("extinction", "o"), ("backscatter", "s"),
@@ -389,6 +413,8 @@ def _error_by_texture(found, sweep):
         for method in found["algorithm"].values:
             wind = found.sel(source=source, algorithm=method)
             groups = error_by_quality(wind, _truth_vectors(wind), "isotropy")
+            if not np.isfinite(groups["rmse"]).any():
+                continue
             right.plot(
                 groups["isotropy"], groups["rmse"], marker=marker, ms=5,
                 ls="-" if method == "cc" else ":",
@@ -396,12 +422,15 @@ def _error_by_texture(found, sweep):
             )  # fmt: skip
     right.set(
         xlabel="isotropy: weakest over strongest rms slope in a window",
-        ylabel="rms error of v and w / m s$^{-1}$", yscale="log",
+        ylabel="rms error of v and w / m s$^{-1}$",
         title="all vectors, in groups by their local isotropy",
     )  # fmt: skip
     for axes in (left, right):
-        axes.legend(fontsize=8)
+        by_factors(axes)
         axes.grid(alpha=0.3, which="both")
+    left.legend(fontsize=8)
+    # many lines: there is room below alone
+    right.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     return figure, (
         "Winds can only be as good as the structure that moves with them. Left: the extinction "
         "pair with more and less sub-grid texture. Right: this run's vectors, grouped by whether "

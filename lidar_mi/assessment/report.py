@@ -215,6 +215,8 @@ def backscatter_chapter(
             for core in cores
         )
         lead.append(f"The true flow holds {places}.")
+    else:
+        lead.append("No vortex is found in the true flow.")
     numbers = Tables(
         heading="How good the cross-flow winds are",
         legend="Valid vectors against the truth at their place and time. Columns: what the winds "
@@ -246,7 +248,7 @@ def doppler_chapter(doppler, metrics: dict[str, float], drawn: Sequence[Drawn]) 
         "line of sight follows from the radii of the rings."
     )
     modes = metrics.get("doppler.speckle_modes")
-    speckle = f"speckle has {modes:.3g} modes a pixel" if modes else "there is no speckle"
+    speckle = f"speckle has {three(modes)} modes a pixel" if modes else "there is no speckle"
     light = (
         f"A pulse gives {three(metrics['doppler.photons'])} photons from {doppler.lidar.range:g} m and "
         f"{three(metrics['doppler.background_photons'])} of sunlight; {speckle}, read-out "

@@ -62,7 +62,9 @@ def _scan(lines, cores):
             panel.plot(core.y, core.z, "+", color="crimson", ms=9)
         panel.set(title=title, aspect="equal", xlabel="y / m (port is left)", ylabel="z / m")
         figure.colorbar(dots, ax=panel, label=label, pad=0.02)
-    panels[0].set_xlim(place[:, 1].max() + 4, place[:, 1].min() - 4)
+    # at least as wide as high, also for lines above each other
+    middle, half = (place[:, 1].max() + place[:, 1].min()) / 2, np.ptp(place[:, 1:], axis=0).max() / 2
+    panels[0].set_xlim(middle + half + 4, middle - half - 4)
     return figure, (
         "Middles of the range bins; what the aircraft flies is part of the velocity. Black crosses: "
         "lines of sight whose rings could not be read. Red crosses: true cores."
@@ -78,16 +80,15 @@ def _maps(found, lines, cores):
     for row, name in zip(axes, COMPONENTS):
         true, value = found[f"{name}_true"], found[name].where(good)
         error = value - true
-        limit = _limit(np.concatenate([true.values.ravel(), value.values.ravel()]))
+        both = np.concatenate([true.values.ravel(), value.values.ravel()])
         columns = (
-            (true, limit, f"{name}, true"), (value, limit, f"{name}, found"),
-            (error, _limit(error.values), f"{name}, error"),
+            (true, _colours(both), f"{name}, true"), (value, _colours(both), f"{name}, found"),
+            (error, _colours(error.values), f"{name}, error"),
         )  # fmt: skip
-        for panel, (field, bound, title) in zip(row, columns):
+        for panel, (field, colours, title) in zip(row, columns):
             mesh = panel.pcolormesh(
-                y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True,
-                cmap="RdBu_r", vmin=-bound, vmax=bound,
-            )  # fmt: skip
+                y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **colours
+            )
             panel.set(title=title, aspect="equal")
             figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
             for core in cores:
@@ -139,9 +140,14 @@ def _uncertainty(found):
     )
 
 
-def _limit(values: np.ndarray) -> float:
-    known = np.abs(values[np.isfinite(values)])
-    return (float(np.quantile(known, 0.995)) if known.size else 0.0) or 1.0
+def _colours(values: np.ndarray) -> dict:
+    """Two-sided about 0, or of the values' own range where all of them point the same way."""
+    known = values[np.isfinite(values)]
+    low, high = np.quantile(known, (0.005, 0.995)) if known.size else (0.0, 0.0)
+    if low > 0 or high < 0:
+        return {"cmap": "viridis", "vmin": low, "vmax": high}
+    limit = (float(np.quantile(np.abs(known), 0.995)) if known.size else 0.0) or 1.0
+    return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
 
 
 def sensor_chapter(

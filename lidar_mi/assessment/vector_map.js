@@ -33,8 +33,11 @@
       shown.push({ label: "error of " + c.name, values: off, scale: errors, low: -top, high: top });
     }
     if (part.u) {
-      const top = highest(good(part.u.found), 0.995);
-      shown.push({ label: "u", values: part.u.found, scale: errors, low: -top, high: top });
+      // all one way: of its own range
+      const known = good(part.u.found).filter(u => u !== null), top = highest(known, 0.995);
+      const least = Math.min(...known), most = Math.max(...known), oneWay = least > 0 || most < 0;
+      shown.push({ label: "u", values: part.u.found, scale: oneWay ? speeds : errors,
+        low: oneWay ? least : -top, high: oneWay ? most : top });
     }
     shown.forEach((s, k) => choice.add(new Option(s.label, k)));
 
@@ -103,7 +106,7 @@
     function tell(k) {
       if (k === chosen || k < 0) return;
       chosen = k;
-      const number = value => value === null || value === undefined ? "\u2013" : value.toFixed(2);
+      const number = value => value === null || value === undefined ? "\u2013" : value.toFixed(2).replace("-0.00", "0.00");
       const reasons = Object.entries(data.flags).filter(([mask]) => data.flag[k] & mask).map(([, text]) => text);
       where.textContent = "y = " + data.y[k].toFixed(1) + " m, z = " + data.z[k].toFixed(1) + " m: " +
         (reasons.length ? "rejected, " + reasons.join(", ") : "good");

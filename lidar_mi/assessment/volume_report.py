@@ -6,11 +6,12 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
 from .cores import Core
 from .digits import fixed, percent
-from .figures import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES, Drawn, save_all
+from .figures import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES, Drawn, by_factors, save_all
 from .report import Chapter, Tables
 
 _SPEED = "m s$^{-1}$"
@@ -78,20 +79,20 @@ def _cuts(wind, cores):
 
 
 def _along_x(wind, cores):
-    figure = Figure(figsize=(17, 3.5), layout="compressed")
+    figure = Figure(figsize=(17, 5.4), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     cut = wind.sel(z=cores[0].z if cores else 0, method="nearest")
     for row, name in zip(axes, _COMPONENTS):
-        _row(row, cut, name, "y", "x")
+        _row(row, cut, name, "y", "x", stretch=2)
     for panel in axes[:-1].ravel():
         panel.set_xlabel("")
     return figure, (
-        f"The same from above, at z = {float(cut['z']):.1f} m, the height of a vortex: what no single "
-        "slab shows."
+        f"The same from above, at z = {float(cut['z']):.1f} m, the height of a vortex, x twice as "
+        "large as y: what no single slab shows."
     )
 
 
-def _row(panels, cut, name, across, up):
+def _row(panels, cut, name, across, up, stretch=1):
     true, value = cut[f"{name}_true"], cut[name].where(cut["flag"] == 0)
     error = value - true
     limit, small = _limit(true), _limit(error)
@@ -100,8 +101,10 @@ def _row(panels, cut, name, across, up):
         (panels[2], error, small, f"{name}, error"),
     ):  # fmt: skip
         mesh = _map(panel, field, across, up, "RdBu_r", -bound, bound)
-        panel.set_title(title)
-        panel.figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
+        panel.set(title=title, aspect=stretch)
+        bar = panel.figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
+        # few numbers beside low panels
+        bar.locator = MaxNLocator(7 if stretch == 1 else 3)
 
 
 def _map(panel, field, across, up, colours, low, high):
@@ -136,11 +139,13 @@ def _errors(found):
             reduced = (error / stated).values
             density.hist(np.clip(reduced[np.isfinite(reduced)], -5, 5), edges, density=True,
                          histtype="step", color=colour, label=METHOD_NAMES.get(method, method))  # fmt: skip
-        profile.set(title=f"rms error of {name}", xlabel="x / m", ylabel=_SPEED, yscale="log")
+        profile.set(title=f"rms error of {name}", xlabel="x / m", ylabel=_SPEED)
+        by_factors(profile)
         density.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
         density.set(title=f"errors of {name} over standard errors", xlabel="reduced error",
                     ylabel="density")  # fmt: skip
-    axes[0, 0].legend(fontsize="small")
+    # between the errors and the wind, of which v and w have much
+    axes[0, 1].legend(fontsize="small", loc="center")
     axes[1, 0].legend(fontsize="small")
     return figure, (
         "Top: rms errors of good vectors against the truth, gate by gate, the standard errors that "

@@ -39,6 +39,11 @@ def _stretched(field, stretch, reference, key):
     """1 - (1 - x)^stretch with x = field/reference."""
     largest = float(field.max())
     if reference is None:
+        if largest == 0:
+            raise InputError(
+                f"extinction.{key}: 0 everywhere, so there is nothing to see; expected some of it, or "
+                f"null for air without it"
+            )
         reference = largest
     if not (np.isfinite(reference) and reference > 0):
         raise InputError(

@@ -172,6 +172,21 @@ def test_lines_that_cannot_be_read_are_said_and_the_rest_is_shown(whole, tmp_pat
     assert "sensor.rmse_v_los" not in metrics
 
 
+@pytest.mark.usefixtures("variant")
+def test_two_lines_give_no_vector_and_that_is_said(whole, tmp_path, monkeypatch):
+    report, folder = again(
+        whole, tmp_path, monkeypatch,
+        lambda wind, lines: (wind, lines.assign(v_los=lines["v_los"].where(np.arange(15) % 14 == 0))),
+    )  # fmt: skip
+    assert "Warning: no vector from both lidars is good; 100 % have the flag beyond_lines" in report
+    assert "no wind from lines of sight alone: no three lines beside each other could" in report
+    # the scan and the vectors that were rejected, but no figures of nothing
+    assert "The scan of the Doppler lidar" in report and "2 of 15 lines of sight were read" in report
+    assert "How certain it is" not in report and '"beyond lines"' in report
+    with xr.open_dataset(folder / "wind3d.nc", engine="h5netcdf") as wind:
+        assert (wind["flag"].values != 0).all()
+
+
 def test_interpolation_is_exact_for_polynomials():
     nodes = np.cos(np.pi * (np.arange(9) + 0.5) / 9)
     places = np.array([-1.0, -0.3, nodes[4], 0.77])
