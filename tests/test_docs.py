@@ -23,6 +23,7 @@ import yaml
 from pydantic import BaseModel
 
 from lidar_mi import cli, config, truth, units
+from lidar_mi.assessment.requirements import read_requirements
 from lidar_mi.rendering.phase import scatterer
 
 ROOT = Path(__file__).parents[1]
@@ -269,13 +270,16 @@ def run_console(block, workplace, capsys):
 
 def check_yaml(block):
     data = yaml.safe_load(block.text)
-    if block.file:
+    if block.file and "requirements" in block.file:
+        Path(block.file).write_text(block.text)
+        assert read_requirements(block.file)
+    elif block.file:
         Path(block.file).write_text(block.text)
         for experiment in config.load_variants(block.file).values() or [config.load(block.file)]:
             truth.make_truth(experiment)
-        return
-    loaded = config.check({**BASE, **data}, block.place)
-    scatterer(loaded.scattering, wavelength=loaded.lidar.wavelength)  # finds the tables
+    else:
+        loaded = config.check({**BASE, **data}, block.place)
+        scatterer(loaded.scattering, wavelength=loaded.lidar.wavelength)  # finds the tables
 
 
 def check_xml(block):
