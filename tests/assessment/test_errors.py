@@ -9,6 +9,7 @@ import xarray as xr
 
 from lidar_mi.assessment.cores import Core
 from lidar_mi.assessment.errors import (
+    commonest_flag,
     deviations,
     direction,
     error_by_quality,
@@ -178,3 +179,9 @@ def test_error_by_quality_leaves_out_what_is_unknown():
     assert groups["rmse"].item() == 1 and groups["texture"].item() == 0.1
     none = winds([np.nan], [np.nan])
     assert error_by_quality(none, none, "texture").sizes["group"] == 0
+
+
+def test_the_commonest_flag_is_named():
+    attributes = {"flag_masks": np.array([1, 2, 4], np.uint8), "flag_meanings": "edge no_texture far"}
+    flag = xr.DataArray(np.array([[1, 3], [2, 6]], np.uint8), dims=("z", "y"), attrs=attributes)
+    assert commonest_flag(flag) == "75 % have the flag no_texture"

@@ -116,3 +116,10 @@ def test_negative_or_missing_values_are_refused(wake):
     wake["aerosol"] = -wake.aerosol
     with pytest.raises(InputError, match="aerosol.*minimum of -1.2"):
         extinction_from_tracer(wake)
+
+
+def test_a_wake_without_any_tracer_is_told():
+    wake = xr.Dataset({"tracer": ("y", np.zeros(4)), "aerosol": ("y", np.ones(4))})
+    with pytest.raises(InputError, match="extinction.tracer: 0 everywhere, so there is nothing to see"):
+        extinction_from_tracer(wake)
+    assert float(extinction_from_tracer(wake, tracer=None).max()) == pytest.approx(1e-4)
