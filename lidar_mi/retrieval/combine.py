@@ -31,8 +31,9 @@ _STDS = np.geomspace(0.05, 10, 16)
 _LENGTHS = 8
 # Powers of the cross-flow's shear that u's standard deviation may go with.
 _POWERS = (0.0, 0.5, 1.0)
-# Exponents of u's correlation: rough as turbulence, and smooth.
-_EXPONENTS = (1.0, 2.0)
+# Exponents of u's correlation, rough as turbulence and smooth, and how probable beforehand: lines
+# that do not tell must not make u smooth, which would be known everywhere.
+_EXPONENTS = {1.0: 10 / 11, 2.0: 1 / 11}
 # Number of such statistics that stand for all, as often as they are probable.
 _DRAWN = 16
 # How far v and w are from their mean where the images gave none, in standard deviations of the
@@ -121,7 +122,8 @@ def combine(
         ``u_std`` in the rms over the lines: 0 is even. Left out: averaged over 0, 0.5 and 1 likewise.
     u_exponent : float, optional
         a of u's correlation, exp(-(|dy|^a + |dz|^a) / length^a), above 0 and up to 2: 1 is rough, as
-        turbulence is, 2 smooth. Left out: averaged over 1 and 2 likewise.
+        turbulence is, 2 smooth. Left out: averaged over 1 and 2 likewise, 1 ten times as probable
+        beforehand.
     distance : float, optional
         Of the images' plane x = const from the telescope, m: air that moves along x by dx while
         their gates do not shifts by -y / distance dx, -z / distance dx in them, as oblique beams look
@@ -424,7 +426,7 @@ def _statistics(
     stds = _STDS if std is None else np.array([float(std)])
     extent = spacing * np.sqrt(len(residual))
     lengths = np.geomspace(spacing / 4, 2 * extent, _LENGTHS) if length is None else [length]
-    exponents = _EXPONENTS if exponent is None else (exponent,)
+    exponents = _EXPONENTS if exponent is None else {exponent: 1.0}
     pull = np.stack([lines.forward * s[lines.z, lines.y] for s in strengths.values()], -1)
     choices, shapes, evidence = [], [], []
     for one_exponent, one_length in itertools.product(exponents, lengths):
@@ -436,11 +438,12 @@ def _statistics(
                 evidence.append(-np.log(np.diag(factor[0])).sum() - square / 2)
                 shapes.append(shape)
                 choices.append(_Choice(
-                    float(one_std), float(one_length), float(power), float(one_exponent), 0.0, (),
+                    float(one_std), float(one_length), float(power), one_exponent, 0.0, (),
                     square / len(residual),
                 ))  # fmt: skip
     # steps of the standard deviation grow with it
-    share = np.exp(np.array(evidence) - max(evidence)) * [choice.std for choice in choices]
+    before = [choice.std * exponents[choice.exponent] for choice in choices]
+    share = np.exp(np.array(evidence) - max(evidence)) * before
     share /= share.sum()
     steps = (np.arange(_DRAWN) + 0.5) / _DRAWN
     drawn = np.searchsorted(np.cumsum(share), steps).clip(max=len(choices) - 1)

@@ -2,7 +2,8 @@
 
 Detects an estimate or a covariance that differs from generalised least squares written out over
 all nodes (1e-7), information that does not add up (1e-7), errors that are not what the covariance
-says (reduced errors and coverage over many draws, 4 sigma), a field without uncertainty where
+says (reduced errors and coverage over many draws, 4 sigma), errors of the platform that have another
+effect than the geometry says, a field without uncertainty where
 nothing was measured, and input that has no answer.
 """
 
@@ -15,7 +16,7 @@ import xarray as xr
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import DopplerLidar
-from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind
+from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors, scan_wind
 from lidar_mi.retrieval.combine import CombinedFlag, combine
 from lidar_mi.retrieval.line_of_sight import wind_from_triples
 
@@ -354,6 +355,45 @@ def test_a_vortex_pair():
         assert rms[c] < 1.01 * float(np.sqrt((((flow[c] - wind[c]) ** 2).where(inside)).mean()))
         # statistics of u that differ in what they say of v and w may add a little
         assert float((found[f"{c}_stderr"] / flow[f"{c}_stderr"]).max()) < 1.03
+
+
+# what the platform does not know
+
+
+def still_air(errors, seed, std=0.02):
+    """Wind of 3 m/s along x, even, lines from a platform at 70 m/s, images of next to no error."""
+    y, z = np.arange(-50, 50.1, 2.0), np.arange(-32, 32.1, 2.0)
+    flow = crossflow(0.0, 0.0, 0.01, 0.0, y, z)
+    wind = flow[["v", "w"]].assign(u=3 + 0 * flow.v)
+    directions = DopplerScan(azimuth_half="16 deg", elevation_half="10 deg")
+    lidar = DopplerLidar(range="150 m")
+    return flow, scan_wind(wind, directions, lidar, std, seed, 70.0, PlatformErrors(**errors))
+
+
+def test_an_error_of_the_attitude_is_not_in_the_stated_errors():
+    """Yaw by e tilts u by e (V - u) / D along y, to 1 %: lines cannot tell it from wind. What is stated
+    stays far below."""
+    flow, scan = still_air({"yaw": "5 mrad"}, 1)
+    found = combine(flow, scan)
+    inside = found.flag == 0
+    tilt = found.u.where(inside).mean("z").polyfit("y", 1, skipna=True).polyfit_coefficients[0]
+    assert float(tilt) == pytest.approx(5e-3 * 67 / 150, rel=0.01 + 3 * 0.02 / math.sqrt(63) / 0.06)
+    rim = inside & (abs(found.y) > 30)
+    wrong = float(abs(found.u - 3).where(rim).mean())
+    assert wrong > 4 * float(found.u_stderr.where(rim).mean())
+
+
+def test_jitter_of_the_lines_is_taken_for_a_scatter_of_u():
+    """5 mrad rms of every line's own, 0.05 m/s of velocity, unknown to its stated 0.02 m/s: the scatter
+    is found, and is in the stated errors, which are above the true ones then (3 draws)."""
+    square, stated = [], []
+    for seed in range(3):
+        found = combine(*still_air({"jitter": "5 mrad"}, seed))
+        quiet = combine(*still_air({}, seed))
+        inside = found.flag == 0
+        square.append(float((((found.u - 3) / found.u_stderr) ** 2).where(inside).mean()))
+        stated.append(float((found.u_stderr / quiet.u_stderr).where(inside).mean()))
+    assert max(square) < 1.3 and min(stated) > 3
 
 
 # flags
