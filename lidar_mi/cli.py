@@ -580,7 +580,8 @@ def _print_sensor(metrics: dict[str, float]) -> None:
         if any(value is not None for value in values):
             shown = ["-" if value is None else f"{value:.2f}" for value in values]
             table.add_row(label, *shown, style=style)
-    _out.print(table)
+    if table.rows:
+        _out.print(table)
 
 
 def _print_rows(title: str, rows) -> None:

@@ -38,12 +38,12 @@ def _variable(wake, name, key):
 def _stretched(field, stretch, reference, key):
     """1 - (1 - x)^stretch with x = field/reference."""
     largest = float(field.max())
+    if largest == 0 and not reference:
+        raise InputError(
+            f"extinction.{key}: 0 everywhere, so there is nothing to see; expected some of it, or "
+            "null for air without it"
+        )
     if reference is None:
-        if largest == 0:
-            raise InputError(
-                f"extinction.{key}: 0 everywhere, so there is nothing to see; expected some of it, or "
-                f"null for air without it"
-            )
         reference = largest
     if not (np.isfinite(reference) and reference > 0):
         raise InputError(

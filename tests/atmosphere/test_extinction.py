@@ -122,4 +122,7 @@ def test_a_wake_without_any_tracer_is_told():
     wake = xr.Dataset({"tracer": ("y", np.zeros(4)), "aerosol": ("y", np.ones(4))})
     with pytest.raises(InputError, match="extinction.tracer: 0 everywhere, so there is nothing to see"):
         extinction_from_tracer(wake)
+    # of two times, of which neither has any
+    with pytest.raises(InputError, match="0 everywhere"):
+        extinction_from_tracer(wake, reference=0.0)
     assert float(extinction_from_tracer(wake, tracer=None).max()) == pytest.approx(1e-4)
