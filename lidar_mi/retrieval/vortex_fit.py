@@ -401,6 +401,8 @@ def fit_pixels(
     if not bool(contrast > 1e-9 * scale) or not bool(pair[1][finite].std() > 0):
         return _no_fit(profile, "an image is constant")
     pair = pair / contrast
+    if isinstance(noise, torch.Tensor):
+        noise = noise.double() * _understated(noise / contrast, pair)
     level = _typical(noise, pair[0].square())
     if level is not None:
         level /= float(contrast)
@@ -438,6 +440,17 @@ def fit_pixels(
         best, covariance, profile, chi2, match, error.variance**0.5 / dt,
         mean_length(error) * spacing, z, y,
     )  # fmt: skip
+
+
+def _understated(noise: torch.Tensor, pair: torch.Tensor) -> float:
+    """By how much more than a map says the pictures vary from pixel to pixel, at least 1.
+
+    Errors estimated from a few photons know nothing of the rare ones that none of them was. With too
+    low a noise the filter takes what is left of it for texture and passes all of it.
+    """
+    said = float(noise[torch.isfinite(noise)].double().square().mean().sqrt())
+    _, seen = band_limited(pair)
+    return max(1.0, seen / said) if said > 0 else 1.0
 
 
 def _typical(noise: float | torch.Tensor | None, contrast: torch.Tensor) -> float | None:
@@ -571,9 +584,11 @@ class _Builder:
         vertical, lateral = torch.meshgrid(*places, indexing="ij")
         variance = torch.full_like(lateral, 2 * noise**2)
         if isinstance(self.map, torch.Tensor):
-            # the filter carries noise a few pixels on
-            known = torch.nn.functional.max_pool2d(filled(self.map.double())[None], 9, 1, 4)[0]
-            variance = 2 * (known[step // 2 :: step, step // 2 :: step] / self.contrast) ** 2
+            # the filter carries noise a few pixels on, and of few photons no pixel knows its own
+            known = torch.nn.functional.avg_pool2d(
+                filled(self.map.double())[None].square(), 9, 1, 4, count_include_pad=False
+            )[0]
+            variance = 2 * known[step // 2 :: step, step // 2 :: step] / self.contrast**2
         floor = 2 * _INTERPOLATION**2
         whole = spline if blur or noise == 0 else self.unfiltered
         return _Images(
@@ -760,8 +775,7 @@ def _flow_error(found: Solution, shortest: float) -> FlowError:
 def _covariance(found: Solution, error: FlowError, excess: float) -> np.ndarray:
     """Covariance (10, 10): H^-1 M H^-1 with the noise's and the flow error's spread M of the force."""
     misfit, weight = found.misfit, found.weight
-    columns = misfit.jacobian.flatten(1)
-    spread = (columns * (weight**2 * misfit.variance).flatten()) @ columns.T * excess
+    spread = _noise_spread(found, error) * excess
     jacobian, slope = misfit.jacobian, misfit.slope
     if weight.ndim == 2:
         weight, jacobian, slope = weight[None], jacobian[:, None], slope[:, None]
@@ -777,6 +791,25 @@ def _covariance(found: Solution, error: FlowError, excess: float) -> np.ndarray:
         left = _step_left(found)
         covariance = covariance + torch.outer(left, left)
     return covariance.cpu().numpy()
+
+
+def _noise_spread(found: Solution, error: FlowError) -> torch.Tensor:
+    """Covariance of the force that noise makes: as the noise is said to be, or larger as it is seen.
+
+    Seen, each residual stands for its own variance (White 1980, Econometrica 48, 817), whatever
+    pixels are noisier than they are said to be.
+    """
+    misfit, weight = found.misfit, found.weight
+    columns = misfit.jacobian.flatten(1)
+    moved = error.variance * misfit.slope.square().sum(0)
+    share = (misfit.residual.square() / (misfit.scatter + moved)).where(misfit.seen, 0.0)
+    said, seen = (
+        (columns * (weight**2 * part).flatten()) @ columns.T
+        for part in (misfit.variance, misfit.variance * share)
+    )
+    scale = found.normal.diagonal()
+    more = float((seen.diagonal() / scale).sum() / (said.diagonal() / scale).sum())
+    return seen if more > 1 else said
 
 
 def _step_left(found: Solution) -> torch.Tensor:

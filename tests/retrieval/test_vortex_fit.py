@@ -15,6 +15,7 @@ from benchmarks.cases import data_array, origin, plane_waves, texture, vortex_pa
 from lidar_mi import config
 from lidar_mi.atmosphere.vortex import Vortex, velocity, vortex_pair
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval import vortex_fit
 from lidar_mi.retrieval.quality import Flag
 from lidar_mi.retrieval.vortex_fit import (
     VortexPairFit,
@@ -300,6 +301,76 @@ def test_missing_pixels_and_a_map_of_the_noise():
     assert (np.abs(found.parameters - vector(*uneven())) < 5 * stderr).all()
     # the starboard vortex is where the noise is
     assert stderr[4] > 1.5 * stderr[0]
+
+
+def test_a_map_that_says_too_little():
+    """Half of the noise that there is: what the filter takes for texture would be noise, which draws
+    displacements to where splines damp it. Twice ten parameters within errors for the whole."""
+    reduced = []
+    for seed in (1, 2):
+        pair = vortex_pair_images(0.06, seed=seed, vortices=uneven(), **SMALL)
+        half = pair.first.copy(data=np.full(pair.first.shape, 0.03))
+        found = fit_vortices(pair.first, pair.second, DT, noise=half, frozen=True)
+        assert found.success, found.reasons
+        assert found.chi2 == pytest.approx(1.0, abs=0.1)
+        reduced.append((found.parameters - vector(*uneven())) / np.sqrt(np.diag(found.covariance)))
+    assert np.sqrt(np.mean(np.square(reduced))) < 1.8 and np.abs(reduced).max() < 4
+
+
+def test_noise_that_lies_in_one_place():
+    """Around one core four times that of elsewhere, said to be even: residuals tell, and the errors of
+    that vortex are of the size that it is off by (3.5 times too small by what is said alone)."""
+    reduced = []
+    for seed in (1, 2, 3):
+        pair = vortex_pair_images(0.0, seed=seed, vortices=uneven(), **SMALL)
+        y, z = np.meshgrid(pair.first["y"], pair.first["z"])
+        noise = np.where(np.hypot(y - 13, z - 1) < 7, 0.04, 0.01)
+        rng = np.random.default_rng([seed, 7])
+        images = [i + noise * rng.standard_normal(noise.shape) for i in (pair.first, pair.second)]
+        level = float(np.sqrt((noise**2).mean()))
+        found = fit_vortices(*images, DT, noise=level, frozen=True)
+        assert found.success, found.reasons
+        off = found.parameters - vector(*uneven())
+        reduced.append((off / np.sqrt(np.diag(found.covariance)))[:4])
+    assert np.sqrt(np.mean(np.square(reduced))) < 2.4
+
+
+@pytest.mark.parametrize("standard_errors", [0.7, 1.5])
+@pytest.mark.parametrize("index", [0, 1, 3, 8])
+def test_a_fit_that_stops_short_is_believed_within_its_errors(monkeypatch, index, standard_errors):
+    """The last step missed by so many standard errors of one parameter, as if derivatives had been too
+    noisy to find it: below one it is believed and counted as an error, above it is not."""
+    true = vector(*uneven(), mean=(1.0, -0.5))
+    y, z = (np.arange(n) * 2.0 - (n - 1) for n in (33, 23))
+    v, w = wind(torch.as_tensor(true), *(torch.as_tensor(a) for a in np.meshgrid(y, z)), "lamb_oseen")
+    noise = 0.3 * np.random.default_rng(6).standard_normal((2, *v.shape))
+    stderr = data_array(np.full(v.shape, 0.3), y, z)
+    vectors = xr.Dataset({
+        "v": data_array(v.numpy() + noise[0], y, z), "w": data_array(w.numpy() + noise[1], y, z),
+        "v_stderr": stderr, "w_stderr": stderr,
+    })  # fmt: skip
+    whole = fit_vortices_to_wind(vectors)
+    assert whole.success
+    errors = np.sqrt(np.diag(whole.covariance))
+    fit, runs = vortex_fit.fit, []
+
+    def stopped(evaluate, parameters, limits, flow_variance, iterations, tolerance):
+        found = fit(evaluate, parameters, limits, flow_variance, 30, 1e-8)
+        runs.append(iterations)
+        if iterations == 30:  # the starts
+            return found
+        short = found.parameters.clone()
+        short[index] += standard_errors * errors[index]
+        return fit(evaluate, short, limits, flow_variance, 0, tolerance)
+
+    monkeypatch.setattr(vortex_fit, "fit", stopped)
+    found = fit_vortices_to_wind(vectors)
+    assert len(runs) > 3
+    off = (found.parameters - whole.parameters)[index] / errors[index]
+    assert off == pytest.approx(standard_errors, abs=0.05)
+    assert ("did not converge" in found.reasons) == (standard_errors > 1)
+    grown = np.sqrt(found.covariance[index, index]) / errors[index]
+    assert grown == pytest.approx(np.hypot(1, standard_errors), rel=0.12)
 
 
 def test_nothing_is_made_up():
