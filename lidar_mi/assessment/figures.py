@@ -390,7 +390,7 @@ def by_factors(axes) -> None:
     values = values[np.isfinite(values) & (values > 0)]
     if values.size and values.max() > 3 * values.min():
         axes.set_yscale("log")
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
         axes.yaxis.set_major_formatter("{x:g}")
         axes.yaxis.set_minor_formatter(NullFormatter())
 

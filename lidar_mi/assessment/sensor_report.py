@@ -194,7 +194,10 @@ def sensor_chapter(
         vectors = {"title": "The wind from both lidars, vector by vector"} | vectors
     return Chapter(
         title="Both lidars as one sensor",
-        lead=[purpose, warning, *_limit_of_u(metrics), *_costs(metrics)],
+        lead=[
+            purpose, warning, *_limit_of_u(metrics), *_not_stated(experiment.sensor.errors),
+            *_costs(metrics),
+        ],
         drawn=drawn,
         verdict=Tables(
             "Whether it does what flight control asks for" if speed else "Whether it does what is asked for",
@@ -222,13 +225,15 @@ _CAUSES = {
     "line_noise": "the noise of the rings",
     "range_bin": "averaging along the range bin",
     "crossflow": "errors of v and w",
+    "pointing": "errors of attitude and pointing",
 }
 
 
 def _limit_of_u(metrics) -> list[str]:
     """What limits u, in a sentence; nothing where it is not known."""
-    shares = {c: metrics.get(f"sensor.error_budget.{c}.share_u") for c in _CAUSES}
-    if None in shares.values():
+    keys = {c: f"sensor.error_budget.{c}.share_u" for c in _CAUSES}
+    shares = {c: metrics[key] for c, key in keys.items() if key in metrics}
+    if not shares:
         return []
     ranked = sorted(shares, key=shares.get, reverse=True)
     parts = [f"{_CAUSES[c]} ({percent(min(shares[c], 1))}" for c in ranked if shares[c] >= _LEAST]
@@ -238,6 +243,16 @@ def _limit_of_u(metrics) -> list[str]:
         [f"{parts[0]} of the mean square error", *parts[1:]]
     )
     return [f"{text})" + (f"; next to nothing by {' or '.join(little)}." if little else ".")]
+
+
+def _not_stated(errors) -> list[str]:
+    """That errors of the platform are there, and not in what is stated."""
+    if errors == type(errors)():
+        return []
+    return [
+        "The platform's attitude, pointing or speed is not what it is taken for (sensor.errors). Standard "
+        "errors do not know of this: what turns all lines alike is on top of them."
+    ]
 
 
 def _costs(metrics) -> list[str]:
