@@ -249,10 +249,11 @@ def _not_stated(errors) -> list[str]:
     """That errors of the platform are there, and not in what is stated."""
     if errors == type(errors)():
         return []
-    return [
+    text = (
         "The platform's attitude, pointing or speed is not what it is taken for (sensor.errors). Standard "
         "errors do not know of this: what turns all lines alike is on top of them."
-    ]
+    )
+    return [text]
 
 
 def _costs(metrics) -> list[str]:

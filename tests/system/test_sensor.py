@@ -214,10 +214,15 @@ def test_errors_of_a_known_field():
     assert metrics["sensor.outside_cores.rmse_w"] == 0 and metrics["sensor.outside_cores.rms_u"] == 5
 
 
-@pytest.mark.parametrize(("amplitude", "noise"), [(0.0, 0.5), (1.0, 0.01)])
-def test_what_limits_u_is_found(amplitude, noise):
-    """An even u is limited by the noise of its lines, a u of 4 m waves by what lies between them."""
-    experiment = changed(sensor={"errors": {}})
+@pytest.mark.parametrize(
+    ("amplitude", "noise", "errors", "limit"),
+    [(0.0, 0.5, {}, "line_noise"), (1.0, 0.01, {}, "between_lines"),
+     (0.0, 0.01, {"yaw": "20 mrad"}, "pointing")],
+)  # fmt: skip
+def test_what_limits_u_is_found(amplitude, noise, errors, limit):
+    """An even u is limited by the noise of its lines, or by a yaw that is not known; a u of 4 m waves
+    by what lies between them."""
+    experiment = changed(sensor={"errors": errors})
     y, z = np.arange(-54, 54.1, 1.0), np.arange(-34, 34.1, 1.0)
     waves = amplitude * np.sin(2 * np.pi * z[:, None] / 4) * np.sin(2 * np.pi * y / 4)
     fields = {"u": 2 + waves, "v": 0 * waves, "w": 0 * waves}
@@ -226,18 +231,52 @@ def test_what_limits_u_is_found(amplitude, noise):
         {n: (("z", "y"), f) for n, f in fields.items()},
         coords={"y": ("y", y, metres), "z": ("z", z, metres)},
     )
-    lines = scan_wind(truth, experiment.sensor.directions, experiment.doppler.lidar, noise, 1, 70.0)
+    lines = scan_wind(truth, experiment.sensor.directions, experiment.doppler.lidar, noise, 1, 70.0,
+                      experiment.sensor.errors)  # fmt: skip
     crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), np.zeros(waves.shape, np.uint8)))
     crossflow.attrs = {"template": 4, "stride": 1}
     found = sensor_chain._combined(experiment, truth, lines, crossflow)
     metrics = sensor_chain.budget_of_u(experiment, truth, lines, crossflow, found, [])
-    shares = {c: metrics[f"sensor.error_budget.{c}.share_u"]
-              for c in ("line_noise", "range_bin", "crossflow", "between_lines")}  # fmt: skip
-    limit, other = ("between_lines", "line_noise") if amplitude else ("line_noise", "between_lines")
+    causes = ["line_noise", "range_bin", "crossflow", "between_lines", *(["pointing"] if errors else [])]
+    shares = {c: metrics[f"sensor.error_budget.{c}.share_u"] for c in causes}
+    other = "line_noise" if amplitude else "between_lines"
     assert shares[limit] > 0.9 and shares[other] < 0.1
     assert abs(shares["range_bin"]) < 0.1
     said = sensor_report._limit_of_u(metrics | {"sensor.rmse_u": 0.5})
     assert f"limited by {sensor_report._CAUSES[limit]}" in said[0]
+
+
+@pytest.mark.slow
+def test_the_share_of_noise_is_between_what_draws_and_the_lines_say():
+    """Mean square error less that without noise, over 8 draws: no less than the variance of u over the
+    draws (less 3 sigma), as the estimate also gains by knowing that noise is gone; no more than one
+    line's variance."""
+    experiment, noise = changed(), 0.4
+    y, z = np.arange(-54, 54.1, 2.0), np.arange(-34, 34.1, 2.0)
+    waves = np.sin(2 * np.pi * z[:, None] / 40) * np.sin(2 * np.pi * y / 60)
+    metres = {"units": "m"}
+    truth = xr.Dataset(
+        {n: (("z", "y"), f) for n, f in {"u": waves, "v": 0 * waves, "w": 0 * waves}.items()},
+        coords={"y": ("y", y, metres), "z": ("z", z, metres)},
+    )
+    crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), np.zeros(waves.shape, np.uint8)))
+    crossflow.attrs = {"template": 2, "stride": 1}
+    directions = experiment.sensor.directions.model_copy(update={"columns": 9, "rows": 7})
+    experiment = experiment.model_copy(
+        update={"sensor": experiment.sensor.model_copy(update={"directions": directions})}
+    )
+    winds, gained = [], []
+    for seed in range(8):
+        lines = scan_wind(truth, directions, experiment.doppler.lidar, noise, seed, 70.0)
+        found = sensor_chain._combined(experiment, truth, lines, crossflow)
+        metrics = sensor_chain.budget_of_u(experiment, truth, lines, crossflow, found, [])
+        good = found["flag"].values == 0
+        full = ((found["u"] - found["u_true"]).values[good] ** 2).mean()
+        gained.append(full - metrics["sensor.error_budget.line_noise.rmse_u"] ** 2)
+        assert metrics["sensor.error_budget.line_noise.share_u"] == pytest.approx(gained[-1] / full)
+        winds.append(found["u"].values[good])
+    scatter = np.var(winds, axis=0, ddof=1).mean()
+    assert scatter - 3 * np.std(gained) / math.sqrt(8) < np.mean(gained) < noise**2, (scatter, gained)
 
 
 def test_points_are_counted_as_each_table_means_them():
