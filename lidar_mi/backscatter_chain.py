@@ -256,9 +256,10 @@ def rendered_pairs(experiment: Experiment, scans) -> dict[str, tuple[list[xr.Dat
         noisy = np.hypot(noise, scans[0]["Y_noise_std"])
         pairs[NOISY] = [scan["Y_noisy"] for scan in scans], noisy
     if experiment.scan.aim == "angles":
-        # the noise has no structure to interpolate: its level goes along
+        # the noise has no structure to interpolate: its level goes along, the rms, as few pixels have
+        # most of it where photons are few
         pairs = {
-            name: (resample_pair(*pair, experiment.wake.spacing), float(level.median()))
+            name: (resample_pair(*pair, experiment.wake.spacing), float((level**2).mean() ** 0.5))
             for name, (pair, level) in pairs.items()
         }
     return pairs
