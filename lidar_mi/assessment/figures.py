@@ -90,8 +90,6 @@ def draw_all(
     )  # fmt: skip
     if (drawn := _error_and_bound(found)) is not None:
         plates += (("fig12b_error_and_bound", "Errors and what the noise allows", drawn),)
-    if "Y_noisy" in scans[0]:
-        plates += (("fig13_detector", "What the detector reads", _detected(scans, found, cores, scale)),)
     if "depolarization" in scans[0]:
         plates += (("fig14_depolarization", "Linear depolarisation ratio", _product(
             scans[0], "depolarization", "linear depolarisation ratio",
@@ -177,16 +175,19 @@ def _truth_vectors(wind: xr.Dataset) -> xr.Dataset:
 
 def _overview(scans, found, cores, scale):
     figure, axes = _sheet(1, 2)
-    first = scans[0]["Y"] * 1e6
-    _image(axes[0, 0], first, "backscatter, $t_1$", BACKSCATTER, "max",
-           norm=_bright([first]), cmap="cividis")  # fmt: skip
-    wind = found.sel(source="backscatter").isel(algorithm=0)
+    detected = "Y_noisy" in scans[0]
+    first = scans[0]["Y_noisy" if detected else "Y"] * 1e6
+    norm = _span(first) if detected else _bright([first])
+    _image(axes[0, 0], first, "backscatter, $t_1$", BACKSCATTER, "both" if detected else "max",
+           norm=norm, cmap="cividis")  # fmt: skip
+    source = "backscatter_noisy" if detected else "backscatter"
+    wind = found.sel(source=source).isel(algorithm=0)
     _arrows(axes[0, 1], wind, cores, "wind from two such pictures", scale)
+    noise = " with photon, sky, dark and speckle noise of one pulse a beam" if detected else ""
     return figure, (
-        "Left: the first backscatter picture. Right: the cross-flow wind found from it and the "
-        f"second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are flagged, "
-        "red crosses mark the true cores."
-        + (" Both without the detector's noise." if "Y_noisy" in scans[0] else "")
+        f"Left: the first backscatter picture{noise}. Right: the cross-flow wind found from it and "
+        f"the second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are "
+        "flagged, red crosses mark the true cores."
     )
 
 
@@ -232,7 +233,7 @@ def _retrieved(found, source, cores, scale):
     figure, axes = _sheet(1, max(2, found.sizes["algorithm"]))
     _retrieved_into(axes[0], found, source, cores, scale)
     return figure, (
-        f"Winds retrieved from the {source} pair, unfiltered: grey vectors are flagged, red "
+        f"Winds retrieved from the rendered {source} pair, unfiltered: grey vectors are flagged, red "
         "crosses mark the true cores."
     )
 
@@ -287,21 +288,7 @@ def _backscatter(scans):
                label=BACKSCATTER, norm=norm, cmap="cividis")  # fmt: skip
     return figure, (
         "Rendered backscatter, normalised for range, gate length and the environment's "
-        "transmittance."
-    )
-
-
-def _detected(scans, found, cores, scale):
-    figure, axes = _sheet(1, 2)
-    noisy = scans[0]["Y_noisy"] * 1e6
-    _image(axes[0, 0], noisy, "$t_1$ with the detector's noise", extend="both", cmap="cividis",
-           label=BACKSCATTER, norm=_span(noisy))  # fmt: skip
-    wind = found.sel(source="backscatter_noisy").isel(algorithm=0)
-    name = METHOD_NAMES[str(wind["algorithm"].values)]
-    _arrows(axes[0, 1], wind, cores, f"{name}, with noise", scale)
-    return figure, (
-        "The backscatter picture with photon, sky, dark and speckle noise of one pulse a beam, and "
-        "the wind found in two of them."
+        "transmittance; without the noise of a detector."
     )
 
 
