@@ -446,7 +446,9 @@ def _understated(noise: torch.Tensor, pair: torch.Tensor) -> float:
     """By how much more than a map says the pictures vary from pixel to pixel, at least 1.
 
     Errors estimated from a few photons know nothing of the rare ones that none of them was. With too
-    low a noise the filter takes what is left of it for texture and passes all of it.
+    low a noise the filter takes what is left of it for texture and passes all of it. Texture down to
+    single pixels counts as noise here, which costs little: in pictures 150 m ahead noise comes out half
+    as large again, and chi2 at 0.4, with the errors of the parameters as they were.
     """
     said = float(noise[torch.isfinite(noise)].double().square().mean().sqrt())
     _, seen = band_limited(pair)
