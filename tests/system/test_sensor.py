@@ -310,7 +310,7 @@ def test_bad_descriptions_are_named(sections, message):
     ("sections", "start"),
     [
         ({"doppler": {"lidar": {"range": "56 m"}}}, "doppler.lidar.range: 56 m is not allowed with"),
-        ({"sensor": {"directions": {"azimuth_half": "25 deg"}}}, "wind: y from -54.5 to 54.5 m"),
+        ({"sensor": {"directions": {"azimuth_half": "25 deg"}}}, "sensor.directions: wind: y from"),
         ({"sensor": {"requirements": "mine.yaml"}}, "sensor.requirements: mine.yaml not found"),
         ({"platform": {"speed": "1200 m/s"}}, "platform.speed: 1200 m/s is not allowed with sensor"),
     ],
