@@ -244,6 +244,8 @@ def test_what_limits_u_is_found(amplitude, noise, errors, limit):
     assert abs(shares["range_bin"]) < 0.1
     said = sensor_report._limit_of_u(metrics | {"sensor.rmse_u": 0.5})
     assert f"limited by {sensor_report._CAUSES[limit]}" in said[0]
+    # standard errors do not hold them
+    assert bool(sensor_report._not_stated(experiment.sensor.errors)) == bool(errors)
 
 
 @pytest.mark.slow
