@@ -166,7 +166,7 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
         rows.append(("backscatter lidar", f"{beam}; {detector}"))
         air, render = experiment.scattering, experiment.render
         light = (
-            f"scattering by {air.aerosol or air.phase.replace('_', ' ')}, orders up to "
+            f"scattering by {air.aerosol or air.table or air.phase.replace('_', ' ')}, orders up to "
             f"{render.max_order}, {render.samples_per_beam} photons a beam, {render.variant}"
         )
         rows.append(("light", light))
