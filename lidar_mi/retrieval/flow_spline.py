@@ -164,26 +164,26 @@ class FlowSpline:
 
     def factor(self, band: torch.Tensor) -> Factor:
         """Factor of the matrix of a quadratic form, band of shape (2, 2, 7, Z, 4, Y)."""
-        knots, columns = self.z.knots, self._blocks * _REACH
-        n = 2 * knots
-        # (y, shift y, component, z, component, z)
-        full = band.new_zeros(columns, 4, 2, knots, 2, knots + 2 * _REACH)
-        for shift in range(2 * _REACH + 1):
-            place = full[: self.y.knots].diagonal(shift, 3, 5)
-            place.copy_(band[:, :, shift].permute(4, 3, 0, 1, 2))
-        full = full[..., _REACH:-_REACH].reshape(columns, 4, n, n)
+        knots, n = self.z.knots, 2 * self.z.knots
+        band = pad(band, (0, self._blocks * _REACH - self.y.knots)).unflatten(-1, (-1, _REACH))
+        # (block, y, component, z, y, component, z), what is below the diagonal alone
+        shape = _REACH, 2, knots, _REACH, 2, knots
+        diagonal = band.new_zeros(self._blocks, *shape)
+        below = band.new_zeros(self._blocks - 1, *shape)
+        for shift in range(-_REACH, _REACH + 1):
+            rows = slice(max(0, -shift), knots - max(0, shift))
+            # (block, y, shift y, z, component, component) to (.., component there, component here, z)
+            part = band[:, :, _REACH + shift, rows].permute(4, 5, 3, 1, 0, 2)
+            here, next_ = (blocks.diagonal(-shift, 3, 6) for blocks in (diagonal, below))
+            for p in range(_REACH):
+                for q in range(_REACH):
+                    if q >= p:
+                        here[:, q, :, p] = part[:, p, q - p]
+                    if q <= p:
+                        next_[:, q, :, p] = part[:-1, p, _REACH + q - p]
         # knots that only fill up the last block
-        full[self.y.knots :, 0] = torch.eye(n, dtype=band.dtype, device=band.device)
-        full = full.unflatten(0, (self._blocks, _REACH))
-        diagonal = full.new_zeros(self._blocks, _REACH, n, _REACH, n)
-        below = full.new_zeros(self._blocks - 1, _REACH, n, _REACH, n)
-        for p in range(_REACH):
-            for q in range(_REACH):
-                if q >= p:
-                    diagonal[:, p, :, q] = full[:, p, q - p]
-                    below[:, p, :, q] = full[:-1, q, _REACH + p - q].mT
-                else:
-                    diagonal[:, p, :, q] = full[:, q, p - q].mT
+        filling = self._blocks * _REACH - self.y.knots
+        diagonal.reshape(self._blocks, _REACH * n, -1)[-1].diagonal()[(_REACH - filling) * n :] = 1
         side = _REACH * n
         return factor(
             diagonal.reshape(-1, side, side), below.reshape(-1, side, side)
@@ -198,27 +198,28 @@ class FlowSpline:
 
     def covariance(self, root: Factor) -> torch.Tensor:
         """The inverse within the band, all shifts: (2, 2, 7, Z, 7, Y)."""
-        diagonal, below = root.inverse()
-        knots, n = self.z.knots, 2 * self.z.knots
-        diagonal = diagonal.reshape(-1, _REACH, n, _REACH, n)
-        below = below.reshape(-1, _REACH, n, _REACH, n)
-        columns = self._blocks * _REACH
-        full = diagonal.new_zeros(columns, 2 * _REACH + 1, n, n).unflatten(
-            0, (self._blocks, _REACH)
+        knots = self.z.knots
+        diagonal, below = (
+            blocks.reshape(-1, _REACH, 2, knots, _REACH, 2, knots) for blocks in root.inverse()
         )
-        for p in range(_REACH):
-            for q in range(_REACH):
-                full[:, p, _REACH + q - p] = diagonal[:, p, :, q]
-                if p <= q:
-                    # knot 3 (k + 1) + p against 3 k + q: 3 + p - q further
-                    full[:-1, q, 2 * _REACH + p - q] = below[:, p, :, q].mT
-                    full[1:, p, q - p] = below[:, p, :, q]
-        full = full.reshape(columns, 2 * _REACH + 1, 2, knots, 2, knots)[: self.y.knots]
-        band = full.new_zeros(2, 2, 2 * _REACH + 1, knots, 2 * _REACH + 1, self.y.knots)
+        band = diagonal.new_zeros(2, 2, 2 * _REACH + 1, knots, 2 * _REACH + 1, self._blocks, _REACH)
         for shift in range(-_REACH, _REACH + 1):
-            # from (y, shift y, component, component, z)
-            part = full.diagonal(shift, 3, 5).permute(2, 3, 4, 1, 0)
-            band[:, :, _REACH + shift, max(0, -shift) : knots - max(0, shift)] = part
+            rows = slice(max(0, -shift), knots - max(0, shift))
+            # (component, component, z, shift y, block, y)
+            part = band[:, :, _REACH + shift, rows]
+            # (y, y, component, component, z, block)
+            here = diagonal.diagonal(shift, 3, 6).permute(1, 3, 2, 4, 5, 0)
+            back = below.diagonal(shift, 3, 6).permute(1, 3, 2, 4, 5, 0)
+            ahead = below.diagonal(-shift, 3, 6).permute(3, 1, 4, 2, 5, 0)
+            for p in range(_REACH):
+                for q in range(_REACH):
+                    part[..., _REACH + q - p, :, p] = here[p, q]
+                    if q >= p:
+                        # 3 (k + 1) + p against 3 k + q
+                        part[..., q - p, 1:, p] = back[p, q]
+                    if q <= p:
+                        part[..., 2 * _REACH + q - p, :-1, p] = ahead[p, q]
+        band = band.flatten(-2)[..., : self.y.knots]
         return band
 
     def apply(self, band: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:

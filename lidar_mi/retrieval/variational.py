@@ -28,9 +28,9 @@ from lidar_mi.retrieval.warping import (
 from lidar_mi.retrieval.windows import Windows, image_pair, working
 
 # Rounds of flow and evidence on coarse and on fine knots, whose spacing is this over the template.
-_COARSE, _FINE = (1.25, 8), (0.625, 5)
+_COARSE, _FINE = (1.25, 6), (0.5, 4)
 # Rounds on fine knots before which noise is taken from what the images do not share.
-_WEIGHED = (3,)
+_WEIGHED = (2,)
 # Divergence is first taken to have a tenth of the vorticity's standard deviation.
 _RATIO = 100.0
 # Divergence is taken to have 0.3 % of the standard deviation of vorticity, or more: images of weak
@@ -236,7 +236,7 @@ def variational(
     largest evidence: the energy of vorticity and of divergence is as large as the prior
     expects, of what the images tell (MacKay 1992, Neural Comput. 4, 415-447). So the flow is smoothed
     little in cores and strongly around them. Solved by Gauss-Newton steps from a coarse
-    correlation, first on knots 1.25 templates apart, then 0.625.
+    correlation, first on knots 1.25 templates apart, then 0.5.
 
     Parameters
     ----------
@@ -297,7 +297,8 @@ def variational(
                 images = _weighed(first, plain, width, noise is not None)
                 seen = _linear(images, knots, mesh, coefficients)
             root, coefficients = _step(seen, knots, mesh, coefficients, prior)
-            if turn:
+            # the first flow on coarse knots is nothing to learn from
+            if turn or (spacing, rounds) == _FINE:
                 prior = prior.improved(knots, coefficients, root)
         flow = knots.field(coefficients, mesh)
     seen = _linear(images, knots, mesh, coefficients)
@@ -339,7 +340,12 @@ def _weighed(images: Images, seen: Linear, width: float, known: bool) -> Images:
     """
     rest = (seen.carried - seen.carried.mean(0)) * seen.seen
     free = (len(rest) - 1) * max(images.spline.passed, 1e-6)
-    local = averaged(rest.square().sum(0) * images.trust / free, seen.seen, width)
+    # what counts is the misfit where slopes are steep, and there it is largest (White 1980,
+    # Econometrica 48, 817-838)
+    steep = seen.slope.square().sum(0)
+    steep = steep + 1e-3 * steep.mean() + 1e-30
+    local = averaged(rest.square().sum(0) * images.trust * steep / free, seen.seen, width)
+    local = local / averaged(steep, seen.seen, width)
     if not known:
         images = images._replace(white=local.clamp(max=images.noise**2) / images.trust)
     mean = float(local[seen.seen].mean()) if seen.seen.any() else 0.0

@@ -43,8 +43,9 @@ def test_stripes_leave_their_own_direction_open():
     assert correlation.median() < -0.9 and correlation.max() < -0.6
     one = wave(0.6, 0.6)
     zz, yy, zy = displacement_bound(one, one, 1e-6, 16)
-    # but for the image's edge, nothing at all is known along the stripes
-    assert (zz[15:-15, 15:-15].sqrt() > 1e-4).all()
+    # but for the image's edge, nothing at all is known along the stripes; across them a window of
+    # 16 px tells sqrt(2) noise / (rms slope sqrt(256)), a fifth of the noise
+    assert (zz[15:-15, 15:-15].sqrt() > 30e-6).all()
 
 
 @pytest.mark.parametrize("noise", [0.01, 0.03, 0.06])

@@ -226,6 +226,43 @@ def test_noise_does_not_pull_displacements_to_whole_pixels():
     assert float(torch.stack(errors).mean()) == pytest.approx(0, abs=0.03)
 
 
+@pytest.mark.parametrize("length", [2.5, 4.0, 7.0])
+def test_waves_are_read_between_pixels_as_they_are(length):
+    """A spline through pixels would lose a quarter of a wave of 2.5 px half way between them."""
+    z, y = grid(90, 100)
+    # that go on where they are mirrored at the edges
+    down, across = (math.pi / (n - 1) * round(2 * (n - 1) / length) for n in (90, 100))
+    image = torch.tensor(np.cos(down * z) + np.cos(across * y))
+    spline, _ = band_limited(image[None], 0.0)
+    at = [torch.tensor(part[25:65, 25:75] + off) for part, off in ((z, 0.5), (y, 0.25))]
+    value, slope_z, slope_y = (part[0] for part in spline.sample(*(p[None] for p in at)))
+    # of each wave 1.5 % at 2 px, falling with the fourth power of its length; what fades beyond the
+    # edges reaches in by some tenths of a per cent
+    most = 0.03 * (2 / length) ** 4 + 0.006
+    assert float((value - torch.cos(down * at[0]) - torch.cos(across * at[1])).abs().max()) < most
+    # slopes fall short a power sooner
+    for slope, wave, place in ((slope_z, down, at[0]), (slope_y, across, at[1])):
+        error = slope + wave * torch.sin(wave * place)
+        assert float(error.abs().max()) < wave * (0.1 * (2 / length) ** 3 + 0.006)
+
+
+@pytest.mark.parametrize("moved", [0.7, 1.35])
+def test_short_waves_do_not_pull_displacements_to_whole_pixels(moved):
+    """Texture down to waves of 2 px; read by a cubic spline through pixels, 0.7 became 0.76."""
+    z, y = grid(80, 110)
+    random = np.random.default_rng(11)
+    vector = random.uniform(-3.0, 3.0, (400, 2))
+    phase = random.uniform(0, 2 * math.pi, 400)
+
+    def pattern(z, y):
+        return sum(np.cos(a * z + b * y + c) for (a, b), c in zip(vector, phase)) / 14
+
+    pair = [torch.tensor(pattern(z, y - moved * t)) for t in (-0.5, 0.5)]
+    found = variational(*pair, noise=0.02)
+    assert float(found.dy.mean()) == pytest.approx(moved, abs=0.01)
+    assert float(found.dz.mean()) == pytest.approx(0, abs=0.01)
+
+
 def test_where_images_share_less_standard_errors_are_larger():
     """In a patch one picture holds texture that the other does not."""
     z, y = grid(90, 120)
@@ -291,7 +328,7 @@ def test_blur_that_is_known_is_undone_in_the_cores():
     """It commutes with shifts, not with what turns and shears; beyond the cores it costs little."""
     plain, undone = blurred_errors(1, 0.01, 1.0)
     assert (undone[0] < 0.85 * plain[0]).all()
-    assert (undone[1] < 0.08).all()
+    assert (undone[1] < 1.5 * plain[1]).all()
 
 
 @pytest.mark.parametrize(
