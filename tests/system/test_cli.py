@@ -492,7 +492,7 @@ def test_bad_input_in_a_fresh_process(there):
     assert done.returncode == 2
     assert done.stdout == ""
     (line,) = done.stderr.splitlines()
-    assert line.startswith("lidar-mi: tiny.yaml: scan.range: -5.0")
+    assert line == "lidar-mi: tiny.yaml: scan.range: -5 m is not allowed; expected more than 0 m"
 
 
 def test_a_missing_argument_is_a_usage_error(lidar_mi):
