@@ -232,11 +232,14 @@ def velocities(
         coords={
             "algorithm": list(settings.methods),
             "centre": list(settings.centre),
-            "averaged": list(settings.averaged),
+            "averaged": ("averaged", list(settings.averaged), {
+                "units": "1", "long_name": "pictures of an average"}),
             "v_los": ("v_los", list(speeds), {"units": "m s-1", "long_name": "true wind"}),
             "coordinate": list(ring_peaks.COORDINATES),
-            "piece": list(PIECES),
+            "piece": ("piece", list(PIECES), {
+                "units": "1", "long_name": "half width of the fitted piece in radii"}),
         },
+        attrs={"Conventions": "CF-1.11", "title": "Line-of-sight winds read from rings"},
     )  # fmt: skip
 
 

@@ -119,6 +119,8 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
     if not path.parent.is_dir():
         raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
     packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
+    # CF 2.5.1: no missing values in coordinate variables
+    packed |= {name: {"_FillValue": None} for name in data.coords if name in data.dims}
     write(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=packed))
 
 

@@ -24,13 +24,14 @@ from .assessment.vector_map import map_data
 from .backscatter_chain import NOISY
 from .config import Experiment
 from .errors import InputError
-from .instrument.budget import pulse_budget
+from .instrument.budget import pulse_budget, pulses_for_error
 from .instrument.doppler import photons
 from .instrument.doppler_scan import PlatformErrors, scan_wind, sight_volumes, wind_at
 from .instrument.eye_safety import assess_pulses
 from .instrument.fringe_camera import fringe_image
+from .instrument.scan import plan_scans
 from .retrieval.combine import combine
-from .retrieval.line_of_sight import COMPONENTS, wind_from_triples
+from .retrieval.line_of_sight import COMPONENTS, wind_from_neighbours, wind_from_triples
 from .run_folder import Log, write_netcdf
 from .truth import find_file, make_truth, moves_along
 
@@ -38,6 +39,8 @@ LINES, WIND = "lines_of_sight.nc", "wind3d.nc"
 
 # Speeds at which pictures without noise are made; those between are interpolated (Chebyshev).
 _NODES = 7
+# Lines of sight of a least-squares vector of the Doppler lidar alone: one and those around it.
+_AROUND = 9
 # What counts as no error and no length in a budget of errors, m/s and m.
 _SURE, _SHORT = 0.01, 0.1
 # First number of the lines' pictures, which make their random streams.
@@ -121,13 +124,14 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
             log.remark(f"no vector from both lidars is good; {commonest_flag(found['flag'])}")
         metrics |= budget_of_u(experiment, truth, lines, crossflow, found, cores)
     try:
-        alone = _triple_errors(wind_from_triples(lines), truth)
+        alone = _errors_alone("triples", wind_from_triples(lines), truth)
         if not alone:
             raise InputError("no three lines beside each other could be read")
-        metrics |= alone
+        around = wind_from_neighbours(lines, min(_AROUND, lines.sizes["line"]))
+        metrics |= alone | _errors_alone("neighbours", around, truth)
     except InputError as error:
         log.remark(f"no wind from lines of sight alone: {error}")
-    metrics |= _costs(experiment)
+    metrics |= _costs(experiment, truth) | _pulses_needed(experiment, tables, lines)
     judged = [(table, judge(table, measured(experiment, metrics, table))) for table in tables.values()]
     for table, findings in judged:
         for row in findings:
@@ -169,6 +173,9 @@ def _combined(experiment, truth, lines, crossflow) -> xr.Dataset:
         found[f"{name}_true"] = truth[name].interp(at).assign_attrs(
             units="m s-1", long_name=f"true {name}, mean over the slab"
         )
+    ahead = {"units": "m", "long_name": "distance ahead of the first picture's telescope", "axis": "X"}
+    found["x"] = (), experiment.scan.range + experiment.scan.thickness / 2, ahead
+    found = found.set_coords("x")
     found.attrs |= {
         "title": f"Wind from both lidars of the experiment {experiment.name}",
         "source": f"lidar-mi {__version__}",
@@ -344,15 +351,15 @@ def _line_errors(lines: xr.Dataset) -> dict[str, float]:
     return metrics
 
 
-def _triple_errors(triples: xr.Dataset, truth: xr.Dataset) -> dict[str, float]:
+def _errors_alone(key: str, found: xr.Dataset, truth: xr.Dataset) -> dict[str, float]:
     """What the Doppler lidar alone would say."""
-    good = triples["flag"] == 0
+    good = found["flag"] == 0
     metrics = {}
     for name in COMPONENTS:
-        true = truth[name].interp(z=triples["z"], y=triples["y"])
-        error = (triples[name] - true).values[good.values]
+        true = truth[name].interp(z=found["z"], y=found["y"])
+        error = (found[name] - true).values[good.values]
         if error.size:
-            metrics[f"sensor.triples.rmse_{name}"] = float(np.sqrt((error**2).mean()))
+            metrics[f"sensor.{key}.rmse_{name}"] = float(np.sqrt((error**2).mean()))
     return metrics
 
 
@@ -378,8 +385,19 @@ def measured(experiment: Experiment, metrics: dict[str, float], table) -> dict[s
     }  # fmt: skip
 
 
-def _costs(experiment: Experiment) -> dict[str, float]:
-    """Pulses, power and hazard distances of both beams."""
+def _pulses_needed(experiment: Experiment, tables, lines: xr.Dataset) -> dict[str, int]:
+    """Pulses a direction takes for the least error of v_LOS that is asked for; nothing if none is."""
+    rows = (row for table in tables.values() for row in table.rows)
+    limits = [r.maximum for r in rows if r.quantity == "error_v_los" and math.isfinite(r.maximum)]
+    stated = lines["v_los_std"].values[np.isfinite(lines["v_los"].values)]
+    if not limits or not stated.size:
+        return {}
+    one = math.sqrt(experiment.sensor.pulses * float((stated**2).mean()))
+    return {"sensor.doppler.pulses_needed": pulses_for_error(one, min(limits))}
+
+
+def _costs(experiment: Experiment, truth: xr.Dataset) -> dict[str, float]:
+    """Pulses, power and hazard distances of both lidars; of the backscatter lidar one pulse a beam."""
     sensor, doppler, lidar = experiment.sensor, experiment.doppler.lidar, experiment.lidar
     far = float(sensor.directions.ranges(doppler).max()) + doppler.range_bin / 2
     directions = sensor.directions.columns * sensor.directions.rows
@@ -390,6 +408,16 @@ def _costs(experiment: Experiment) -> dict[str, float]:
         "sensor.doppler.average_power": budget.average_power,
         "sensor.doppler.beams": budget.beams,
         "sensor.doppler.photons_per_direction": budget.photons_per_direction,
+    }
+    plan = plan_scans(experiment.scan, truth["y"].values, truth["z"].values, (0.0,))[0]
+    pictures = pulse_budget(
+        len(plan.y) * len(plan.z), 1 / experiment.platform.dt, 1, lidar.pulse_energy,
+        float((plan.ranges()[-1] + plan.gate_length() / 2).max()),
+    )  # fmt: skip
+    metrics |= {
+        "sensor.backscatter.pulses_per_second": pictures.pulses_per_second,
+        "sensor.backscatter.average_power": pictures.average_power,
+        "sensor.backscatter.beams": pictures.beams,
     }
     beams = {"doppler": (doppler, doppler.beam_radius, sensor.pulses * rate)}
     # a pulse of no duration has no limit of exposure

@@ -144,6 +144,14 @@ def budget_chapter(
         tables=[_table(metrics, method) for method in methods],
     )
     lead = [limit_sentence(metrics, method) for method in methods]
+    known = {method: _causes(metrics, method) for method in methods}
+    whole = [METHOD_NAMES[m] for m, causes in known.items() if causes and "window" not in causes]
+    if whole:
+        lead.append(
+            "There is no window, no shear within one and no straight path to take away for "
+            f"{' and '.join(whole)}, fitted to whole pictures along curved paths: how smooth the flow is "
+            "belongs to the method itself."
+        )
     return Chapter("What limits the cross-flow wind", lead, drawn, numbers)
 
 

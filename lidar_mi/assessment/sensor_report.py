@@ -257,10 +257,12 @@ def _not_stated(errors) -> list[str]:
 
 
 def _costs(metrics) -> list[str]:
+    needed = metrics.get("sensor.doppler.pulses_needed")
     text = (
-        f"The Doppler lidar's directions take {three(metrics['sensor.doppler.pulses_per_second'])} "
-        f"pulses a second, {three(metrics['sensor.doppler.average_power'])} W of light, and give "
-        f"{three(metrics['sensor.doppler.photons_per_direction'])} photons each."
+        f"The Doppler lidar's directions take {_rate(metrics, 'doppler')}, and give "
+        f"{three(metrics['sensor.doppler.photons_per_direction'])} photons each"
+        + (f"; the error of v_LOS that is asked for takes {needed} of them a direction." if needed else ".")
+        + f" The pictures take {_rate(metrics, 'backscatter')}."
     )
     safety = []
     for name, title in (("doppler", "Doppler"), ("backscatter", "backscatter")):
@@ -271,8 +273,21 @@ def _costs(metrics) -> list[str]:
         where = "where it leaves"
         if aided > 0:
             where = f"from {three(distance)} m on, with binoculars from {three(aided)} m"
-        safety.append(f"The {title} lidar's beam is safe for eyes {where} (IEC 60825-1:2014).")
+        limit = three(metrics[f"sensor.{name}.permissible_exposure"])
+        safety.append(
+            f"The {title} lidar's beam is safe for eyes {where}: {limit} J/m² of each pulse are "
+            "permissible (IEC 60825-1:2014)."
+        )
     return [text, *safety]
+
+
+def _rate(metrics, name: str) -> str:
+    """Pulses a second of all directions of a lidar, what they carry, how many must be there at once."""
+    rate, power, beams = (
+        metrics[f"sensor.{name}.{key}"] for key in ("pulses_per_second", "average_power", "beams")
+    )
+    at_once = f", {beams} directions at a time" if beams > 1 else ""
+    return f"{three(rate)} pulses a second{at_once}, {three(power)} W of light"
 
 
 def _numbers(metrics):
@@ -283,7 +298,8 @@ def _numbers(metrics):
         ("bias_{}", "bias", "m/s"), ("reduced_variance_{}", "variance of reduced errors", ""),
         ("coverage_68_{}", "within one standard error", "%"),
         ("coverage_95_{}", "within 1.96 standard errors", "%"),
-        ("triples.rmse_{}", "rms error, lines of sight alone", "m/s"),
+        ("triples.rmse_{}", "rms error, lines of sight alone, in threes", "m/s"),
+        ("neighbours.rmse_{}", "rms error, the same, up to nine by least squares", "m/s"),
     ):  # fmt: skip
         values = [metrics.get(f"sensor.{key.format(name)}") for name in (*COMPONENTS, "v_los")]
         scale = 100 if unit == "%" else 1

@@ -360,6 +360,15 @@ def test_nothing_to_name_is_said():
     assert "no vector is valid" in limit_sentence({}, "cc")
 
 
+def test_what_a_method_has_not_is_said():
+    """A fit of whole pictures has no window, and so no row for what happens within one."""
+    with_window = described(beam_blur=0.2, window=0.1)
+    without = {k.replace(".cc.", ".variational."): v for k, v in described(beam_blur=0.2).items()}
+    *_, last = budget_chapter(with_window | without, ["cc", "variational"], []).lead
+    assert last.startswith("There is no window") and "cross-correlation" not in last
+    assert len(budget_chapter(with_window, ["cc"], []).lead) == 1
+
+
 def test_a_chapter_without_vectors_has_no_figure_and_dashes(tmp_path):
     assert draw_all(tmp_path, {}, ["cc"], None) == []
     chapter = budget_chapter({}, ["cc"], [])

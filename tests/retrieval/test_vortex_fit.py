@@ -438,13 +438,14 @@ def simulated(texture_rms, noise):
 
 
 def test_simulated_wake_with_texture():
-    """Circulation to 5 % and places to 0.5 m; the file says 440 and 438 m^2/s, y = +-23.4 m."""
+    """Circulation to 5 % and places to 0.5 m; the file says 440 and 438 m^2/s, y = +-23.4 m, z = -0.5 m."""
     truth, found = simulated(0.1, 0.01)
     assert found.success
     values = {name: q.value for name, q in found.quantities.items()}
     assert values["port_circulation_5_15"] == pytest.approx(440, rel=0.05)
     assert values["starboard_circulation_5_15"] == pytest.approx(-438, rel=0.05)
     assert (values["port_y"], values["starboard_y"]) == pytest.approx((23.4, -23.4), abs=0.5)
+    assert (values["port_z"], values["starboard_z"]) == pytest.approx((-0.5, -0.5), abs=0.5)
     assert found.chi2 > 1.5
     model = found.wind(truth.wind.y.values[None, :], truth.wind.z.values[:, None])
     for name in ("v", "w"):
