@@ -92,9 +92,12 @@ def _doppler(asked: Experiment) -> Section:
 
 def _sensor(asked: Experiment, beside) -> Section:
     sensor, tables = asked.sensor, sensor_chain.requirement_tables(asked, beside)
-    count = sensor.directions.columns * sensor.directions.rows
+    columns, rows = sensor.directions.columns, sensor.directions.rows
+    count = columns * rows
+    # a run tells the rest
+    flat = "; all in one plane: no wind from both" if min(columns, rows) == 1 else ""
     return "both as one sensor", [
-        ("lines of sight", f"{count}, {sensor.pulses} pulses each"),
+        ("lines of sight", f"{count}, {sensor.pulses} pulses each{flat}"),
         ("pulses a second", f"{count * sensor.pulses * sensor.slabs_per_second:g}"),
         ("v and w from", sensor.method),
         ("held against", ", ".join(" ".join(key) for key in tables) or "no requirements"),

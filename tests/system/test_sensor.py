@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi import backscatter_chain, config, fringe_chain, sensor_chain
+from lidar_mi import backscatter_chain, check, config, fringe_chain, sensor_chain
 from lidar_mi.assessment import sensor_report
 from lidar_mi.assessment.cores import Core
 from lidar_mi.assessment.report import page
@@ -353,3 +353,11 @@ def test_what_does_not_go_together_is_said_ahead(sections, start):
     with pytest.raises(InputError) as error:
         sensor_chain.prepare(changed(**sections), ".")
     assert str(error.value).startswith(start) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("columns", "rows", "told"), [(5, 3, False), (5, 1, True), (1, 3, True)])
+def test_a_check_tells_of_lines_in_one_plane(columns, rows, told):
+    directions = {"columns": columns, "rows": rows}
+    _, ((_, lines), *_) = check._sensor(changed(sensor={"directions": directions}), ".")
+    assert lines.startswith(f"{columns * rows}, 20 pulses each")
+    assert ("in one plane: no wind" in lines) == told
