@@ -21,8 +21,9 @@ app = typer.Typer(
     rich_markup_mode="markdown",
 )
 
-_out = Console()
-_err = Console(stderr=True)
+# names in files and folders may hold brackets and colons: they are no markup
+_out = Console(markup=False, emoji=False)
+_err = Console(stderr=True, markup=False, emoji=False)
 
 _VARIANT_HELP = "Mitsuba variant, such as llvm_ad_mono_polarized or cuda_ad_mono."
 Variant = Annotated[str | None, typer.Option("-m", "--variant", help=_VARIANT_HELP)]
@@ -265,11 +266,11 @@ def info(
     folder = Path(what)
     if folder.is_dir():
         if reason := failure(folder):
-            _out.print(f"failed: {reason}", markup=False, soft_wrap=True)
+            _out.print(f"failed: {reason}", soft_wrap=True)
         elif (folder / RECORD).is_file():
             if not (folder / "metrics.json").is_file():
                 _out.print("unfinished: no metrics.json yet; run it again to go on")
-            _out.print(f"more of a variant: lidar-mi info {folder}/VARIANT", markup=False, soft_wrap=True)
+            _out.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)
         elif (folder / "metrics.json").is_file():
             _print_metrics(json.loads((folder / "metrics.json").read_text()))
         else:
@@ -403,7 +404,7 @@ def main() -> None:
 
 
 def _fail(message: str, code: int = 2) -> None:
-    _err.print(f"lidar-mi: {message}", style="red", markup=False, highlight=False, soft_wrap=True)
+    _err.print(f"lidar-mi: {message}", style="red", highlight=False, soft_wrap=True)
     sys.exit(code)
 
 
@@ -471,8 +472,8 @@ class _progress:
 
     def __enter__(self):
         self.bars = Progress(
-            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(),
-            console=_err, transient=True, disable=not _err.is_terminal,
+            SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(),
+            TimeElapsedColumn(), console=_err, transient=True, disable=not _err.is_terminal,
         )  # fmt: skip
         self.bars.start()
         self.task = self.bars.add_task("starting", total=None)
@@ -486,7 +487,7 @@ class _progress:
             completed=min(share or 0.0, 0.999),
         )  # fmt: skip
         if text != self.last and (text.startswith("warning: ") or not _err.is_terminal):
-            _err.print(text, markup=False, highlight=False, soft_wrap=True)
+            _err.print(text, highlight=False, soft_wrap=True)
         self.last = text
 
     def __exit__(self, *_):

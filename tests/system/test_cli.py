@@ -186,6 +186,20 @@ def test_check_warns_of_winds_too_fast_to_follow(there, lidar_mi):
     assert "larger retrieval.search" in words_of(fast) and "larger" not in words_of(calm)
 
 
+def test_names_are_no_markup(there, lidar_mi):
+    """Brackets and colons in files, folders and units stay as they are."""
+    unit = {"units": "m/s", "long_name": "[/b] wind [m/s] :cloud:"}
+    (there / "[b]x").mkdir()
+    xr.Dataset({"v": ("y", [1.0, 2.0], unit)}, attrs={"title": "[red]x[/u]"}).to_netcdf(
+        "[b]x/own.nc", engine="h5netcdf"
+    )
+    code, out, err = lidar_mi("info", "[b]x/own.nc")
+    assert code == 0, err
+    assert "[red]x[/u]" in out
+    code, _, err = lidar_mi("run", "tiny.yaml", "-o", "[b]x")
+    assert code == 2 and "[b]x: is no run folder" in err and "Traceback" not in err
+
+
 def test_info_on_netcdf_3(there, lidar_mi):
     """The wake reader takes it, so info must, too."""
     xr.Dataset({"v": ("y", [1.0, 2.0], {"units": "m/s"})}).to_netcdf("old.nc", engine="scipy")
