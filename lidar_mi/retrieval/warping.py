@@ -15,23 +15,24 @@ from lidar_mi.retrieval.windows import working
 # pixel, the filter's within a correlation length of the texture.
 _MARGIN = 24
 # Nodes of the spline in a pixel, along each axis: the images' shortest waves are then four nodes long
-# or more, which a cubic spline reads anywhere to 1.5 %; between pixels it would lose them.
+# or more, of which a cubic spline loses 2.8 % at most. Through pixels it would lose all of them half way
+# between, and turn the phase of longer ones: displacements of texture near 2 px were off by 0.09 px.
 _FINER = 2
 # Waves that blur lowered are raised by this at most: of more, the rims that the blur did not see
 # and what a spline loses between pixels is all there is.
 _SHARPEST = 4.0
-# Places within a pixel, along each axis, at which the variance of interpolated noise is known.
+# Places between two nodes, along each axis, at which the variance of interpolated noise is known.
 _PLACES = 64
 # Rings of the power spectrum with fewer waves say too little about their mean.
 _RING_WAVES = 200
 
 
 class Spline(NamedTuple):
-    """Cubic B-spline through the pixels of images.
+    """Cubic B-spline through images, on nodes half a pixel apart.
 
     Attributes
     ----------
-    coefficients : torch.Tensor, shape (images, z + 2 margin, y + 2 margin)
+    coefficients : torch.Tensor, shape (images, 2 z + 4 margin, 2 y + 4 margin)
     shape : (int, int)
         Of the images, (z, y).
     passed : float
@@ -45,7 +46,7 @@ class Spline(NamedTuple):
         makes the noise of short waves stronger.
     locking : torch.Tensor, shape (2, places, places)
         Half the slope along z and y of the variance that white noise of variance 1 has where the
-        spline is read, by the place's fractions of a pixel.
+        spline is read, by the place's fractions of a node's distance.
     """
 
     coefficients: torch.Tensor
@@ -59,8 +60,9 @@ class Spline(NamedTuple):
     def locked(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
         """Mean product of value and slope (2, ...) of white noise of variance 1 at places, px^-1.
 
-        A spline damps noise most half way between pixels: a misfit is less there, be the flow
-        right or not, and least squares would be pulled to such places.
+        A spline damps noise most half way between its nodes: a misfit is less there, be the flow
+        right or not, and least squares would be pulled to such places. With nodes on pixels that
+        was 0.38 px^-1 and up to 0.1 px; it is 0.03 px^-1 on nodes half a pixel apart.
         """
         row, column = ((p * _FINER * _PLACES).round().long() % _PLACES for p in (z, y))
         return self.locking[:, row, column]
@@ -166,9 +168,6 @@ def band_limited(
     all filters applied to both images of a pair before their differences are squared, the one
     with the least variance of the displacement (a wave k tells k^2 S of it, against a variance of
     4 S N + 2 N^2, so its weight S / (2 S + N) is the square of this filter but for a factor).
-    Without it a spline would damp the noise where images are read half way between pixels and
-    not where they are read at pixels, which pulls displacements to whole numbers.
-
     Parameters
     ----------
     images : torch.Tensor, shape (images, z, y)

@@ -228,7 +228,7 @@ def test_noise_does_not_pull_displacements_to_whole_pixels():
 
 @pytest.mark.parametrize("length", [2.5, 4.0, 7.0])
 def test_waves_are_read_between_pixels_as_they_are(length):
-    """A spline through pixels would lose a quarter of a wave of 2.5 px half way between them."""
+    """A spline through pixels would lose a third of a wave of 2.5 px half way between them."""
     z, y = grid(90, 100)
     # that go on where they are mirrored at the edges
     down, across = (math.pi / (n - 1) * round(2 * (n - 1) / length) for n in (90, 100))
@@ -236,8 +236,8 @@ def test_waves_are_read_between_pixels_as_they_are(length):
     spline, _ = band_limited(image[None], 0.0)
     at = [torch.tensor(part[25:65, 25:75] + off) for part, off in ((z, 0.5), (y, 0.25))]
     value, slope_z, slope_y = (part[0] for part in spline.sample(*(p[None] for p in at)))
-    # of each wave 1.5 % at 2 px, falling with the fourth power of its length; what fades beyond the
-    # edges reaches in by some tenths of a per cent
+    # half way between nodes 2.8 % at 2 px, falling with the fourth power of the length; what fades
+    # beyond the edges reaches in by some tenths of a per cent
     most = 0.03 * (2 / length) ** 4 + 0.006
     assert float((value - torch.cos(down * at[0]) - torch.cos(across * at[1])).abs().max()) < most
     # slopes fall short a power sooner
@@ -248,7 +248,7 @@ def test_waves_are_read_between_pixels_as_they_are(length):
 
 @pytest.mark.parametrize("moved", [0.7, 1.35])
 def test_short_waves_do_not_pull_displacements_to_whole_pixels(moved):
-    """Texture down to waves of 2 px; read by a cubic spline through pixels, 0.7 became 0.76."""
+    """Texture down to waves of 2 px; read by a cubic spline through pixels, 0.7 became 0.77."""
     z, y = grid(80, 110)
     random = np.random.default_rng(11)
     vector = random.uniform(-3.0, 3.0, (400, 2))
