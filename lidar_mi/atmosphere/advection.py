@@ -9,7 +9,7 @@ from lidar_mi.errors import InputError
 # Cells of edge values put around a plane or a volume, so that the spline's response to the edge (it falls
 # by 0.43 a cell) and air that blows in find the edge value.
 _MARGIN = 12
-# Of the splines; a cubic one would lose twice as much of waves of two to four cells.
+# Of the splines; cubic ones would lose four times as much of a wave of three cells, nine times of four.
 _ORDER = 5
 
 
