@@ -70,8 +70,6 @@ class Images(NamedTuple):
         Mean variance of the noise over its own at each pixel.
     stack : torch.Tensor, shape (images, z, y)
         The images, of one brightness.
-    white : torch.Tensor, shape (z, y)
-        Variance of white noise at each pixel, as far as it is known not to be texture.
     blur : float
         Standard deviation of the Gaussian that blurred the images, px.
     weighed : bool
@@ -84,7 +82,6 @@ class Images(NamedTuple):
     noise: float
     trust: torch.Tensor
     stack: torch.Tensor
-    white: torch.Tensor
     blur: float
     weighed: bool = False
 
@@ -295,7 +292,7 @@ def variational(
             seen = _linear(images, knots, mesh, coefficients)
             if (spacing, rounds) == _FINE and turn in _WEIGHED:
                 plain = _linear(first, knots, mesh, coefficients)
-                images = _weighed(first, plain, width, noise is not None)
+                images = _weighed(first, plain, width)
                 seen = _linear(images, knots, mesh, coefficients)
             root, coefficients = _step(seen, knots, mesh, coefficients, prior)
             # the first flow on coarse knots is nothing to learn from
@@ -327,12 +324,10 @@ def _prepared(
     wide = max_pool2d((~usable).to(trust)[:, None], 7, stride=1, padding=3)[:, 0]
     time = torch.arange(len(stack), dtype=trust.dtype, device=trust.device)
     time = time - time.mean()
-    # what is estimated may be texture, until images were seen to differ by it
-    white = torch.zeros_like(trust) if noise is None else level**2 / trust
-    return Images(spline, wide == 0, time, level, trust, images, white, blur)
+    return Images(spline, wide == 0, time, level, trust, images, blur)
 
 
-def _weighed(images: Images, seen: Linear, width: float, known: bool) -> Images:
+def _weighed(images: Images, seen: Linear, width: float) -> Images:
     """The images with noise as large, at each place and wave, as what they do not share.
 
     Where no flow of the splines explains the images there is more than their noise: structure
@@ -347,8 +342,6 @@ def _weighed(images: Images, seen: Linear, width: float, known: bool) -> Images:
     steep = steep + 1e-3 * steep.mean() + 1e-30
     local = averaged(rest.square().sum(0) * images.trust * steep / free, seen.seen, width)
     local = local / averaged(steep, seen.seen, width)
-    if not known:
-        images = images._replace(white=local.clamp(max=images.noise**2) / images.trust)
     mean = float(local[seen.seen].mean()) if seen.seen.any() else 0.0
     level = max(images.noise**2, mean, 1e-30)
     local = local.clamp(min=max(images.noise**2, 0.5 * level))
@@ -412,8 +405,6 @@ def _linear(
     trust = images.trust * (_ROBUST / off.clamp(min=_ROBUST)) * seen
     time = images.time[:, None, None]
     pull = -(time * (value - value.mean(0))).sum(0) * slope
-    # less what noise alone pulls to where splines damp it
-    pull = pull + (time * images.spline.locked(z, y)).mean(1) * images.white
     told = images.spline.worth * trust / variance
     weight = images.time.square().sum() * told / images.spline.excess
     return Linear(slope, told * pull, weight, variance, value, seen)

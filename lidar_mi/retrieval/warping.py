@@ -21,8 +21,6 @@ _FINER = 2
 # Waves that blur lowered are raised by this at most: of more, the rims that the blur did not see
 # and what a spline loses between pixels is all there is.
 _SHARPEST = 4.0
-# Places between two nodes, along each axis, at which the variance of interpolated noise is known.
-_PLACES = 64
 # Rings of the power spectrum with fewer waves say too little about their mean.
 _RING_WAVES = 200
 
@@ -44,9 +42,6 @@ class Spline(NamedTuple):
     worth : float
         Of what the slopes seem to tell, the share that they do: 1 but where blur was undone, which
         makes the noise of short waves stronger.
-    locking : torch.Tensor, shape (2, places, places)
-        Half the slope along z and y of the variance that white noise of variance 1 has where the
-        spline is read, by the place's fractions of a node's distance.
     """
 
     coefficients: torch.Tensor
@@ -55,17 +50,6 @@ class Spline(NamedTuple):
     excess: float
     gain: torch.Tensor
     worth: float
-    locking: torch.Tensor
-
-    def locked(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        """Mean product of value and slope (2, ...) of white noise of variance 1 at places, px^-1.
-
-        A spline damps noise most half way between its nodes: a misfit is less there, be the flow
-        right or not, and least squares would be pulled to such places. With nodes on pixels that
-        was 0.38 px^-1 and up to 0.1 px; it is 0.03 px^-1 on nodes half a pixel apart.
-        """
-        row, column = ((p * _FINER * _PLACES).round().long() % _PLACES for p in (z, y))
-        return self.locking[:, row, column]
 
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
         """A field on the images' pixels after the images' filter; it is zero beyond them."""
@@ -243,25 +227,7 @@ def band_limited(
     excess = power / told if told > 0 else 1.0
     passed /= sizes[0] * sizes[1]
     worth = told / spread if told > 0 else 1.0
-    locking = _FINER * _locking(_refined(gain.square(), sizes)[:4, :4])
-    return Spline(smooth, shape, passed, excess, (response * white).sqrt(), worth, locking), float(level.sqrt())
-
-
-def _locking(covariance: torch.Tensor) -> torch.Tensor:
-    """`Spline.locking` of coefficients whose noise has this covariance at lags 0 to 3 (4, 4)."""
-    place = torch.arange(_PLACES).to(covariance) / _PLACES
-    value, slope = (torch.stack(parts) for parts in spline_weights(place))
-    # sums over pairs of knots, by their lag; both signs of the lag at once
-    pairs = [[part[d:] * value[: 4 - d] for d in range(4)] for part in (value, slope)]
-    back = [[part[: 4 - d] * value[d:] for d in range(4)] for part in (value, slope)]
-    even, odd = (
-        torch.stack([
-            (a.sum(0) + b.sum(0)) / (2 if d == 0 else 1)
-            for d, (a, b) in enumerate(zip(*both))
-        ])
-        for both in zip(pairs, back)
-    )  # fmt: skip
-    return torch.stack([odd.T @ covariance @ even, even.T @ covariance @ odd])
+    return Spline(smooth, shape, passed, excess, (response * white).sqrt(), worth), float(level.sqrt())
 
 
 def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
