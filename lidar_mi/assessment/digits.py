@@ -1,6 +1,7 @@
 """How reports write numbers: as many digits as mean something."""
 
 import math
+from collections.abc import Sequence
 
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 _BLANK = "\N{NO-BREAK SPACE}"
@@ -34,3 +35,9 @@ def with_error(value: float, stderr: float) -> str:
     """A value and its standard error, to the second digit of the error: 0.65 ± 0.12."""
     digits = max(0, 1 - math.floor(math.log10(stderr))) if stderr > 0 else 3
     return f"{value:.{digits}f}{_BLANK}±{_BLANK}{stderr:.{digits}f}"
+
+
+def in_row(values: Sequence[float | None], unit: str) -> list[str]:
+    """Errors, or shares with the unit %, as `fixed`; a dash where there is none."""
+    scale = 100 if unit == "%" else 1
+    return ["-" if value is None else fixed(scale * value) for value in values]

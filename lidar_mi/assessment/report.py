@@ -14,7 +14,7 @@ from PIL import Image
 
 from ..retrieval.vortex_fit import MEANING
 from .cores import Core
-from .digits import fixed, percent, three, with_error
+from .digits import fixed, in_row, percent, three, with_error
 from .figures import METHOD_NAMES, SOURCE_NAMES, Drawn
 from .velocities import CENTRES, PEAK_READERS, READERS
 
@@ -312,9 +312,7 @@ def _tables(experiment, metrics):
             # what zero wind instead of the found one would be off by
             nothing = key.replace("rmse_", "rms_").removeprefix("all.")
             values.append(metrics.get(f"true_wind.{nothing}"))
-            scale = 100 if unit == "%" else 1
-            shown = ["-" if value is None else fixed(scale * value) for value in values]
-            rows.append((label, unit, shown))
+            rows.append((label, unit, in_row(values, unit)))
         heads = [SOURCE_NAMES[source] for source in sources]
         yield METHOD_NAMES[method], [*heads, "true wind, rms"], rows
 

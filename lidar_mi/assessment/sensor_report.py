@@ -10,7 +10,7 @@ from scipy import stats
 
 from ..retrieval.line_of_sight import COMPONENTS
 from .cores import Core
-from .digits import fixed, percent, three
+from .digits import in_row, percent, three
 from .figures import Drawn, save_all
 from .report import Chapter, Tables
 from .requirements import as_rows, fulfilled, look_ahead
@@ -302,6 +302,5 @@ def _numbers(metrics):
         ("neighbours.rmse_{}", "rms error, the same, up to nine by least squares", "m/s"),
     ):  # fmt: skip
         values = [metrics.get(f"sensor.{key.format(name)}") for name in (*COMPONENTS, "v_los")]
-        scale = 100 if unit == "%" else 1
-        rows.append((label, unit, ["-" if v is None else fixed(scale * v) for v in values]))
+        rows.append((label, unit, in_row(values, unit)))
     return "Errors against the truth", ["u", "v", "w", "v_LOS"], rows

@@ -10,7 +10,7 @@ from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
 from .cores import Core
-from .digits import fixed, percent
+from .digits import fixed, in_row, percent
 from .figures import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES, Drawn, by_factors, save_all
 from .report import Chapter, Tables
 
@@ -204,9 +204,7 @@ def _tables(experiment, metrics):
                 ("coverage_68_{}", "within one standard error", "%"),
             ):  # fmt: skip
                 values = [metrics.get(f"{source}.{method}.{key.format(n)}") for n in _COMPONENTS]
-                scale = 100 if unit == "%" else 1
-                shown = ["-" if v is None else fixed(scale * v) for v in values]
-                rows.append((label, unit, shown))
+                rows.append((label, unit, in_row(values, unit)))
             own = [fixed(metrics[f"true_wind.rms_{name}"]) for name in _COMPONENTS]
             rows.append(("the true wind itself, rms", "m/s", own))
             share = metrics[f"{source}.{method}.valid_fraction"]

@@ -29,8 +29,8 @@ from lidar_mi.retrieval.windows import Windows, image_pair, working
 
 # Rounds of flow and evidence on coarse and on fine knots, whose spacing is this over the template.
 _COARSE, _FINE = (1.25, 6), (0.5, 4)
-# Rounds on fine knots before which noise is taken from what the images do not share.
-_WEIGHED = (2,)
+# Round on fine knots before which noise is taken from what the images do not share.
+_WEIGHED = 2
 # Divergence is first taken to have a tenth of the vorticity's standard deviation.
 _RATIO = 100.0
 # Divergence is taken to have 0.3 % of the standard deviation of vorticity, or more: images of weak
@@ -276,27 +276,25 @@ def variational(
     for other in stack[1:]:
         image_pair(image1, other)
     windows = Windows(tuple(image1.shape), template, search, stride)
-    first = images = _prepared(stack, noise, blur)
-    width = _MISFIT_WIDTH * template
+    images = _prepared(stack, noise, blur)
     shape, like = windows.shape, images.spline.coefficients[:0]
     grid = Grid(shape, 0.0, like)
     flow, _ = first_pass(image1, image2, windows, grid)
     pixels = tuple(torch.arange(n, dtype=like.dtype, device=like.device) for n in shape)
     prior = None
-    for spacing, rounds in (_COARSE, _FINE):
+    for fine, (spacing, rounds) in enumerate((_COARSE, _FINE)):
         knots = FlowSpline(*(Axis(n, max(2.0, spacing * template)) for n in shape))
         mesh = knots.mesh(*pixels)
         coefficients = _fitted(flow, mesh)
         prior = _prior_on(knots, coefficients, prior, _WIDTH * template, like)
         for turn in range(rounds):
             seen = _linear(images, knots, mesh, coefficients)
-            if (spacing, rounds) == _FINE and turn in _WEIGHED:
-                plain = _linear(first, knots, mesh, coefficients)
-                images = _weighed(first, plain, width)
+            if fine and turn == _WEIGHED:
+                images = _weighed(images, seen, _MISFIT_WIDTH * template)
                 seen = _linear(images, knots, mesh, coefficients)
             root, coefficients = _step(seen, knots, mesh, coefficients, prior)
             # the first flow on coarse knots is nothing to learn from
-            if turn or (spacing, rounds) == _FINE:
+            if turn or fine:
                 prior = prior.improved(knots, coefficients, root)
         flow = knots.field(coefficients, mesh)
     seen = _linear(images, knots, mesh, coefficients)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from lidar_mi.assessment.digits import fixed, percent, three, with_error
+from lidar_mi.assessment.digits import fixed, in_row, percent, three, with_error
 
 BLANK = "\N{NO-BREAK SPACE}"
 
@@ -55,3 +55,8 @@ def test_what_is_written_is_what_is_meant():
         number = three(value).replace(BLANK, "").replace("×10", "e")
         number = number.translate(str.maketrans("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789"))
         assert float(number) == pytest.approx(value, rel=5.1e-3)
+
+
+def test_rows_show_shares_in_per_cent_and_what_is_missing_as_a_dash():
+    assert in_row([0.6827, None], "%") == ["68.3", "-"]
+    assert in_row([0.1224, None, -0.0006], "m/s") == ["0.122", "-", "-0.001"]
