@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import torch
 from kornia.filters import spatial_gradient
+from scipy.special import chdtri
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval import windows as geometry
@@ -167,6 +168,15 @@ def uncertain(covariance: torch.Tensor, limit: float = 0.5) -> torch.Tensor:
     """
     zz, yy, zy = covariance
     return (zz + yy) / 2 + torch.hypot((zz - yy) / 2, zy) > limit**2
+
+
+def misfit_variance(misfit: torch.Tensor, number: int) -> float:
+    """Variance of white noise from its sums of squares about the mean of `number` values each.
+
+    Their median over that of chi-square with number - 1 degrees of freedom: a few places where
+    more than noise differs change it little. 0 without any sum.
+    """
+    return float(misfit.median()) / chdtri(number - 1, 0.5) if misfit.numel() else 0.0
 
 
 def non_finite(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:

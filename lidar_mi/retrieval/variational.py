@@ -16,7 +16,7 @@ from lidar_mi.retrieval.block_tridiagonal import Factor
 from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.flow_spline import Axis, FlowSpline, Mesh
 from lidar_mi.retrieval.multipass import Grid, first_pass, window_sums
-from lidar_mi.retrieval.quality import Flag, check_between, non_finite
+from lidar_mi.retrieval.quality import Flag, check_between, misfit_variance, non_finite
 from lidar_mi.retrieval.warping import (
     Spline,
     averaged,
@@ -395,10 +395,10 @@ def _linear(
     free = (len(value) - 1) * max(images.spline.passed, 1e-6)
     misfit = rest.square().sum(0)
     # what no flow explains counts as noise: images are never taken to be better than they fit
-    level = misfit[seen].median() / _MEDIAN[min(len(value), len(_MEDIAN) - 1)] if seen.any() else 0.0
+    level = misfit_variance(misfit[seen], len(value))
     variance = max(images.noise**2, 1e-30)
     if not images.weighed:
-        variance = max(variance, float(level) / max(images.spline.passed, 1e-6))
+        variance = max(variance, level / max(images.spline.passed, 1e-6))
     off = (misfit / (free * variance)).sqrt()
     trust = images.trust * (_ROBUST / off.clamp(min=_ROBUST)) * seen
     time = images.time[:, None, None]
@@ -422,10 +422,6 @@ def _of_one_brightness(
     # images come with nearly one contrast: what asks for more has none
     gain = (contrast[:1] / contrast).nan_to_num(1.0).clamp(0.5, 2.0)
     return gain * value, gain
-
-
-# Median of chi-square with n - 1 degrees of freedom, by the number n of images.
-_MEDIAN = (1.0, 1.0, 0.4549, 1.3863, 2.3660, 3.3567, 4.3515, 5.3481)
 
 
 def _step(

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 
 from lidar_mi.retrieval.flow_spline import Axis
-from lidar_mi.retrieval.quality import Flag
+from lidar_mi.retrieval.quality import Flag, misfit_variance
 from lidar_mi.retrieval.volume_correlation import SLAB, settled
 from lidar_mi.retrieval.volume_field import Volumes
 from lidar_mi.retrieval.volume_windows import (
@@ -48,8 +48,6 @@ _DAMPING = 0.05
 _DRAWS, _FINAL_DRAWS = 4, 16
 # Conjugate gradients end at this residual over the first one, or after so many steps.
 _TOLERANCE, _LOOSE, _STEPS = 1e-2, 1e-1, 60
-# Median of chi-square with n - 1 degrees of freedom, by the number n of volumes.
-_MEDIAN = (1.0, 1.0, 0.4549, 1.3863, 2.3660, 3.3567, 4.3515, 5.3481)
 
 _VALUE = (0, 0, 0)
 _SLOPES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
@@ -281,8 +279,7 @@ def _linear(images: Volumes, voxels: Knots, mesh: Knots, coefficients, time) -> 
         seen[here] = known.all(0)
         carried[:, *here] = value
     # what no flow explains counts as noise: volumes are never taken to be better than they fit
-    median = _MEDIAN[min(len(time), len(_MEDIAN) - 1)]
-    found = float(misfit[seen].median()) / median / images.passed if bool(seen.any()) else 0.0
+    found = misfit_variance(misfit[seen], len(time)) / images.passed
     variance = max(images.noise**2, found, 1e-12)
     off = (misfit / ((len(time) - 1) * images.passed * variance)).sqrt()
     trust = _ROBUST / off.clamp(min=_ROBUST) * seen / variance

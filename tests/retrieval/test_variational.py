@@ -27,7 +27,7 @@ from lidar_mi.retrieval.block_tridiagonal import factor
 from lidar_mi.retrieval.bound import displacement_bound
 from lidar_mi.retrieval.flow_spline import Axis, FlowSpline
 from lidar_mi.retrieval.quality import Flag
-from lidar_mi.retrieval.variational import _fitted, path, variational
+from lidar_mi.retrieval.variational import _fitted, _linear, _prepared, path, variational
 from lidar_mi.retrieval.warping import band_limited
 from lidar_mi.retrieval.wind import retrieve_wind
 from lidar_mi.retrieval.windows import Windows
@@ -120,6 +120,21 @@ def test_a_burst_tells_more_than_a_pair_and_unlike_brightness_costs_nothing():
     assert float((three.covariance[1] / pair.covariance[1]).median()) < 0.6
     other = variational(first, 3 * second + 1, noise=0.05)
     assert float((other.dy - pair.dy).abs().max()) < 0.03
+
+
+@pytest.mark.parametrize(("number", "spread"), [(2, 0.028), (3, 0.016), (20, 0.0075)])
+def test_noise_of_a_burst_is_what_still_images_differ_by(number, spread):
+    """The variance to 4 times its relative spread over textures and noises of 12 seeds."""
+    random = np.random.default_rng(8)
+    z, y = (SPACING * np.arange(n) for n in (80, 90))
+    still = texture(plane_waves(8, 3.0), *np.meshgrid(y, z))
+    stack = [torch.tensor(still + 0.05 * random.standard_normal(still.shape)) for _ in range(number)]
+    # told too little noise, the fit has to take it from the misfit
+    images = _prepared(stack, 0.02, 0.0)
+    knots = FlowSpline(*(Axis(n, 10.0) for n in still.shape))
+    mesh = knots.mesh(*(torch.arange(n, dtype=torch.float64) for n in still.shape))
+    found = _linear(images, knots, mesh, torch.zeros(knots.shape, dtype=torch.float64))
+    assert found.variance == pytest.approx(0.05**2, rel=4 * spread)
 
 
 def test_bright_and_missing_pixels_spoil_little():
