@@ -29,7 +29,10 @@ from lidar_mi.rendering.phase import scatterer
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 EXPERIMENTS = tuple(f"docs/experiments/{page.name}" for page in (DOCS / "experiments").glob("*.md"))
-PAGES = ("README.md", "docs/theory.md", "docs/user_guide.md", "docs/plugins.md", *EXPERIMENTS)
+PAGES = (
+    "README.md", "docs/theory.md", "docs/accuracy.md", "docs/user_guide.md", "docs/plugins.md",
+    *EXPERIMENTS,
+)  # fmt: skip
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
 OPTIONAL = (config.VortexPair, config.Turbine, config.Part)
