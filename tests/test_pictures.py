@@ -1,7 +1,7 @@
 """Pictures of every kind become the same numbers, and `lidar-mi rings` measures them.
 
 Detects: a kind of file that is read with other values, upside down or not at all, a layer or
-colour that is taken for another, files that end in a traceback, and a bias figure that shows none.
+colour that is taken for another, and files that end in a traceback.
 """
 
 import sys
@@ -9,12 +9,9 @@ import sys
 import numpy as np
 import OpenEXR
 import pytest
-import ring_reference as reference
 from PIL import Image
-from test_ring_model import ring_model
 
 from lidar_mi import cli
-from lidar_mi.assessment.ring_figures import draw_peak_bias, peak_bias
 from lidar_mi.errors import InputError
 from lidar_mi.pictures import read_picture
 
@@ -85,13 +82,3 @@ def test_the_command(tmp_path, values, monkeypatch, capsys):
     assert np.asarray(Image.open("rings_rings.png")).std() > 10
     code, _, err = call("rings", "even.png")
     assert code == 2 and err.startswith("lidar-mi: even.png: ") and err.count("\n") == 1
-
-
-def test_bias_figure():
-    """-8 to -31 m/s over r, a tenth of a m/s over r^2; and the figure is drawn."""
-    air = ring_model()
-    laser = ring_model(temperatures=(), harmonics=reference.harmonics(None))
-    pieces = np.array([0.15, 0.35])
-    assert peak_bias(air, laser, "r", pieces) == pytest.approx([-8.2, -29.6], abs=1.0)
-    assert np.abs(peak_bias(air, laser, "r2", pieces)).max() < 0.2
-    assert len(draw_peak_bias(air, laser).axes) == 3

@@ -165,17 +165,6 @@ def as_rows(findings: list[Finding]) -> list[tuple[str, str, str, str, str]]:
     return rows
 
 
-def as_text(table: RequirementTable, findings: list[Finding]) -> str:
-    """A judged table for the terminal, in columns, without a newline at its end."""
-    head = ("property", "required", "measured", "margin", "verdict")
-    rows = [head, *as_rows(findings)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(head))]
-    lines = [f"{table.title} ({table.phase})"]
-    for row in rows:
-        lines.append("  ".join(cell.ljust(width) for cell, width in zip(row, widths)).rstrip())
-    return "\n".join(lines)
-
-
 def _section(data, place: str) -> Mapping:
     if not isinstance(data, dict) or not data:
         raise InputError(f"{place}: {data!r} is not allowed; expected a section with keys")

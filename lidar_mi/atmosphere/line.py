@@ -108,19 +108,6 @@ class Line:
         return replace(self, sigmas=np.hypot(self.sigmas, sigma))
 
 
-def doppler_shift(v_los, wavelength: float):
-    """Frequency shift 2 v_LOS / wavelength of backscattered light, Hz.
-
-    Parameters
-    ----------
-    v_los : array
-        Speed along the line of sight, m/s; positive when the scatterer approaches.
-    wavelength : float
-        m, in vacuum.
-    """
-    return 2 * np.asarray(v_los, float) / wavelength
-
-
 def laser_line(wavelength: float, laser_width: float) -> Line:
     """The emitted line: one Gaussian of full width ``laser_width`` (Hz) at half maximum."""
     _check("laser_width", laser_width, laser_width >= 0, "0 Hz or more")

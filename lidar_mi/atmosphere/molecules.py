@@ -204,7 +204,7 @@ def molecular_scattering(
         albedo=(45 + 10 * seen) / (45 + 10 * whole),
         backscatter=extinction * per_extinction,
         lidar_ratio=1 / per_extinction,
-        depolarization=6 * seen / (45 + 7 * seen),
+        depolarization=depolarization_factor(king, band),
         depolarization_ratio=3 * seen / (45 + 4 * seen),
     )
 

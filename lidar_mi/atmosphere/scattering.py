@@ -13,7 +13,7 @@ a1 averages to one over the sphere of directions.
 """
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -116,14 +116,6 @@ class ScatteringTable:
         """The elements at other angles (degrees), shape (..., 6), linear between the nodes."""
         angle = np.asarray(angle, float)
         return np.stack([np.interp(angle, self.angle, row) for row in self.elements.T], axis=-1)
-
-    def with_extinction(self, extinction: float) -> "ScatteringTable":
-        """The same particles at another number: `extinction` in m^-1."""
-        if not (math.isfinite(extinction) and extinction > 0):
-            raise InputError(
-                f"{self.name}: extinction {extinction!r} m^-1 is not allowed; it must be > 0"
-            )
-        return replace(self, number_density=extinction / self.extinction_cross_section)
 
 
 def _moments(angle, a1):

@@ -126,7 +126,7 @@ def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
     if etalon.coatings is None:
         reflectivity = etalon.reflectivity
         return Mirrors(reflectivity, 1 - reflectivity - etalon.absorption, 0.0)
-    r, t, _ = _mirror_amplitudes(etalon, wavelength, np.array(1.0), 0.0, "s")
+    r, t = _mirror_amplitudes(etalon, wavelength, np.array(1.0), 0.0, "s")
     transmittance = float(abs(t) ** 2)
     if not transmittance >= _LEAST_TRANSMITTANCE:
         raise InputError(
@@ -270,18 +270,9 @@ def coated_transmission(
         Of the angle inside the gap; frequency less that of the laser, Hz.
     polarization : {"s", "p"}
     """
-    r, t, _ = _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization)
+    r, t = _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization)
     round_trip = _round_trip(etalon, wavelength, cosine, offset)
     return abs(t**2 / (1 - r**2 * round_trip)) ** 2
-
-
-def coated_reflection(
-    etalon: Etalon, wavelength: float, cosine, offset=0.0, polarization: str = "s"
-):
-    """Reflectance that belongs to `coated_transmission`."""
-    r, t, outside = _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization)
-    round_trip = _round_trip(etalon, wavelength, cosine, offset)
-    return abs(outside + t**2 * r * round_trip / (1 - r**2 * round_trip)) ** 2
 
 
 def _round_trip(etalon, wavelength, cosine, offset):
@@ -297,7 +288,7 @@ def _less_whole_orders(centre, gap, wavelength, cosine, offset):
 
 
 def _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization):
-    """Of one mirror: reflection in the gap, transmission, reflection in the plate.
+    """Of one mirror: reflection in the gap, transmission.
 
     Characteristic matrices of the layers (Macleod 2010, Thin-Film Optical Filters, chap. 2) for
     fields as exp(-i omega t), normalised so that |t|^2 is the transmitted share of the power.
@@ -329,6 +320,4 @@ def _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization):
         )  # fmt: skip
     common = gap * a + gap * plate * b + c + plate * d
     inside = (gap * a + gap * plate * b - c - plate * d) / common
-    # The same stack entered from the plate: a and d change places
-    outside = (plate * d + gap * plate * b - c - gap * a) / common
-    return inside, 2 * np.sqrt(gap * plate) / common, outside
+    return inside, 2 * np.sqrt(gap * plate) / common

@@ -136,6 +136,19 @@ def fringe_image(
     return (passed * (photons / total)).reshape(*speeds.shape, camera.height, camera.width)
 
 
+def doppler_shift(v_los, wavelength: float):
+    """Frequency shift 2 v_LOS / wavelength of backscattered light, Hz.
+
+    Parameters
+    ----------
+    v_los : array
+        Speed along the line of sight, m/s; positive when the scatterer approaches.
+    wavelength : float
+        m, in vacuum.
+    """
+    return 2 * np.asarray(v_los, float) / wavelength
+
+
 def ring_radii(camera: FringeCamera, etalon: Etalon, wavelength: float, v_los=0.0) -> np.ndarray:
     """Radii of the fringes' peaks that fit into the half diagonal of the image, pixels, rising.
 
@@ -148,7 +161,7 @@ def ring_radii(camera: FringeCamera, etalon: Etalon, wavelength: float, v_los=0.
     """
     reach = math.hypot(camera.width, camera.height) / 2 * camera.pixel
     cosines = cosine_inside(etalon, camera.cosine(np.array([0, reach**2])))
-    offset = 2 * v_los / wavelength
+    offset = doppler_shift(v_los, wavelength)
     first, last = fractional_order(etalon, wavelength, cosines, offset)
     orders = np.arange(math.floor(first), last, -1)
     # the order falls in proportion to the cosine in the gap
@@ -226,7 +239,7 @@ def _passed(camera, etalon, line, speeds, subsamples):
         falloff = camera.illumination(squared)
         light += float(falloff.sum())
         for image, speed in zip(passed, speeds, strict=True):
-            offset = 2 * speed / line.wavelength
+            offset = doppler_shift(speed, line.wavelength)
             order = fractional_order(etalon, line.wavelength, cosine, offset)
             image += series(amplitudes, torch.from_numpy(order)) * torch.from_numpy(falloff)
     return passed, light

@@ -31,10 +31,6 @@ class Factor(NamedTuple):
             middle[k] = middle[k] - self.ratio[k].T @ middle[k + 1]
         return torch.stack(middle)
 
-    def log_determinant(self) -> float:
-        """ln det A."""
-        return 2 * float(sum(root.diagonal().log().sum() for root in self.diagonal))
-
     def inverse(self) -> tuple[torch.Tensor, torch.Tensor]:
         """The blocks of A's inverse on the diagonal (blocks, n, n) and below (blocks - 1, n, n).
 

@@ -154,37 +154,3 @@ def velocity_from_radii(
     """
     square = [(r * pixel / focal_length) ** 2 for r in (received, emitted)]
     return speed_of_light / 2 * (np.sqrt((1 + square[0]) / (1 + square[1])) - 1)
-
-
-def paper_velocity(
-    received: np.ndarray,
-    emitted: np.ndarray,
-    focal_length: float,
-    pixel: float,
-    *,
-    method: str = "ca",
-    coordinate: str = "r",
-    centre: tuple[float, float] | None = None,
-    piece: float = PIECE,
-) -> float:
-    """v_LOS of one received picture by the paper's chain, m/s.
-
-    Parameters
-    ----------
-    received, emitted : arrays, shape (height, width)
-        Picture of the backscatter and of the laser itself.
-    focal_length, pixel : float
-        m.
-    method : {"ca", "ml", "sg"}
-        Way to the radius; the centre is found by midpoint lines for ``ml``, else by CA.
-    coordinate : {"r", "r2"}
-        As `ring_radius`.
-    centre : (float, float), optional
-        (x, y) where it is known, px.
-    """
-    way = "ml" if method == "ml" else "ca"
-    radii = [
-        ring_radius(image, centre or find_centre(image, way), method, coordinate, piece=piece)
-        for image in (received, emitted)
-    ]
-    return velocity_from_radii(*radii, focal_length, pixel)

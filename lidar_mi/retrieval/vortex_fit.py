@@ -15,7 +15,7 @@ from kornia.filters import gaussian_blur2d
 
 from lidar_mi.atmosphere.vortex import Vortex
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.checks import checked_image, checked_pair, on_device, positive
+from lidar_mi.retrieval.checks import checked_pair, on_device, positive
 from lidar_mi.retrieval.displacement import Displacement
 from lidar_mi.retrieval.flow_error import FlowError, flow_error, mean_length, spread_of
 from lidar_mi.retrieval.quality import Flag, filled, non_finite
@@ -883,57 +883,3 @@ def _checked_fit(
 def _check_profile(profile) -> None:
     if profile not in PROFILES:
         raise InputError(f"profile: {profile!r} is not one of {', '.join(PROFILES)}")
-
-
-def pair_bound(
-    image: xr.DataArray,
-    pair: tuple[Vortex, Vortex],
-    dt: float,
-    noise: float,
-    mean_wind: tuple[float, float] = (0.0, 0.0),
-) -> np.ndarray:
-    """Cramer-Rao bound of a pair's parameters from an image pair.
-
-    No unbiased estimate from two images of unknown texture and white noise has a smaller
-    covariance than (sum J J^T)^-1 2 noise^2, J the derivative of the difference of the
-    images with respect to the parameters.
-
-    Parameters
-    ----------
-    image : DataArray, dims (z, y)
-        Free of noise, at mid-time.
-    pair : (Vortex, Vortex)
-        Port, starboard; of one profile.
-    dt : float
-        s.
-    noise : float
-        Standard deviation of each image's noise, > 0, in the image's unit.
-    mean_wind : (float, float)
-        m s^-1.
-
-    Returns
-    -------
-    ndarray, shape (10, 10)
-        In the order of `vortex_model.PARAMETERS`.
-    """
-    image, dt = checked_image("image", image), positive("dt", dt)
-    if not (np.isfinite(noise) and noise > 0):
-        raise InputError(f"noise: {noise!r} is not a standard deviation > 0")
-    profile = pair[0].model
-    theta = [p for o in pair for p in (o.circulation, np.log(o.core_radius), o.y, o.z)]
-    theta = torch.tensor([*theta, *mean_wind], dtype=torch.float64)
-    spline, _ = band_limited(torch.as_tensor(image.values.astype(float))[None], 0.0)
-    z, y = (image[name].values.astype(float) for name in ("z", "y"))
-    vertical, lateral = (torch.as_tensor(a) for a in np.meshgrid(z, y, indexing="ij"))
-    steps = [float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (y, z)]
-    rows, columns = (vertical - z[0]) / steps[1], (lateral - y[0]) / steps[0]
-    _, slope_z, slope_y = (part[0] for part in spline.sample(rows[None], columns[None]))
-    slope = torch.stack([slope_y / steps[0], slope_z / steps[1]])
-    total = 0
-    for time in (-dt / 2, dt / 2):
-        middle, _ = carried(theta, lateral, vertical, time, profile)
-        total = total + path_sensitivity(theta, middle, slope, time, profile).flatten(1) * np.sign(time)
-    normal = total @ total.T
-    scale = normal.diagonal().sqrt()
-    inverse = torch.linalg.inv(normal / scale / scale[:, None]) / scale / scale[:, None]
-    return (2 * noise**2 * inverse).numpy()

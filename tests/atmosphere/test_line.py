@@ -17,7 +17,6 @@ from scipy import constants, integrate, stats
 from lidar_mi.atmosphere.line import (
     Line,
     backscatter_line,
-    doppler_shift,
     laser_line,
     rayleigh,
     rayleigh_brillouin,
@@ -48,15 +47,6 @@ def test_widths_of_the_papers_air():
 
 def test_rayleigh_line_is_the_doppler_shift_of_a_maxwellian():
     assert rayleigh_width(WAVELENGTH, TEMPERATURE) == pytest.approx(2.354820 * THERMAL, rel=1e-6)
-
-
-@pytest.mark.parametrize("v", [-300.0, 1.0, 300.0])
-def test_doppler_shift(v):
-    """Light of a moving mirror, nu (1 + v/c) / (1 - v/c): up when it approaches, 5.64 MHz a m/s."""
-    beta = v / constants.c
-    exact = constants.c / WAVELENGTH * 2 * beta / (1 - beta)
-    assert doppler_shift(v, WAVELENGTH) == pytest.approx(exact, rel=1.1 * abs(beta))
-    assert doppler_shift(v, WAVELENGTH) / v == pytest.approx(5.64e6, rel=5e-4)
 
 
 @pytest.mark.parametrize("altitude", [0.0, 8500.0, 30e3])

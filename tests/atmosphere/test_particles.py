@@ -386,7 +386,8 @@ def test_named_aerosol_comes_from_the_shipped_table_only_at_its_wavelength(monke
 def test_aerosol_in_air():
     """A tenth per kilometre of spheroids in sea-level air: coefficients add, and depolarised and
     polarised backscatter each add too (Tesche et al. 2009, eq. 4)."""
-    aerosol = particles.aerosol_table("spheroids", GREEN).with_extinction(1e-4)
+    aerosol = particles.aerosol_table("spheroids", GREEN)
+    aerosol = replace(aerosol, number_density=1e-4 / aerosol.extinction_cross_section)
     air = molecular_table(GREEN)
     both = mix([aerosol, air], [aerosol.extinction, air.extinction])
     assert both.extinction == pytest.approx(1e-4 + 1.316e-5, rel=1e-4)

@@ -46,9 +46,6 @@ def test_derived_numbers_in_closed_form():
     assert table.asymmetry == pytest.approx(g, abs=2e-4)  # interpolation on 0.25 degrees
     assert table.extinction == pytest.approx(1e-4, rel=1e-12)
     assert table.backscatter == pytest.approx(1e-4 / table.lidar_ratio, rel=1e-12)
-    thinner = table.with_extinction(2e-5)
-    assert thinner.extinction == pytest.approx(2e-5, rel=1e-12)
-    assert thinner.lidar_ratio == table.lidar_ratio
 
 
 def test_asymmetry_converges_with_the_angles():
@@ -156,7 +153,6 @@ def broken(column, row, value):
         (lambda: haze(number_density=math.inf), "number_density: inf"),
         (lambda: replace(haze(), angle=haze().angle[::-1]), "rising from 0 to 180"),
         (lambda: replace(haze(), elements=haze().elements[:, :5]), "N x 6"),
-        (lambda: haze().with_extinction(0.0), "extinction 0.0"),
         (lambda: rayleigh_table(0.6, 532e-9, 1e-31), "depolarization: 0.6"),
         (lambda: mix([haze()], [1.0, 2.0]), "1 tables and 2 extinctions"),
         (lambda: mix([haze()], [0.0]), "not all zero"),

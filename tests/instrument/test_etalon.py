@@ -18,7 +18,6 @@ from lidar_mi.atmosphere.line import backscatter_line, laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import (
     Etalon,
-    coated_reflection,
     coated_transmission,
     finesse,
     fractional_order,
@@ -174,21 +173,11 @@ def test_coated_etalon_by_another_code(layers, angle, polarization):
     etalon = coated(layers, index=1.2)
     stacks = [whole_stack(etalon, angle, offset, polarization) for offset in OFFSETS]
     arguments = (etalon, WAVELENGTH, math.cos(angle), OFFSETS, polarization)
-    through, back = coated_transmission(*arguments), coated_reflection(*arguments)
+    through = coated_transmission(*arguments)
     np.testing.assert_allclose(through, [s["T"] for s in stacks], atol=2e-9)
-    np.testing.assert_allclose(back, [s["R"] for s in stacks], atol=2e-9)
-    # what is left is what that code finds absorbed in the layers
+    # one of the stacks absorbs
     lost = [sum(tmm.absorp_in_each_layer(s)[1:-1]) for s in stacks]
-    np.testing.assert_allclose(1 - through - back, lost, atol=2e-9)
     assert (max(lost) > 1e-3) == (layers is ODD)
-
-
-@pytest.mark.parametrize("polarization", ["s", "p"])
-def test_energy_is_conserved_by_lossless_coatings(polarization):
-    cosine, offset = np.cos(np.linspace(0, 0.5, 50))[:, None], np.linspace(-12e9, 12e9, 60)
-    arguments = (coated((*ODD[:2], (2.3, 35e-9), ODD[3])), WAVELENGTH, cosine, offset, polarization)
-    total = coated_transmission(*arguments) + coated_reflection(*arguments)
-    np.testing.assert_allclose(total, 1, atol=1e-12)
 
 
 @pytest.mark.parametrize("polarization", ["s", "p"])
@@ -255,7 +244,7 @@ def test_coating_that_does_not_transmit():
     "call, words",
     [
         (lambda: coated_transmission(ETALON, WAVELENGTH, 1.0), "etalon.coatings: null"),
-        (lambda: coated_reflection(coated(ODD), WAVELENGTH, 1, 0, "x"), "'x'.* expected s or p"),
+        (lambda: coated_transmission(coated(ODD), WAVELENGTH, 1, 0, "x"), "'x'.* expected s or p"),
         (
             lambda: harmonics(Etalon(reflectivity=0.999999), WAVELENGTH),
             "0.999999 need .* harmonics",

@@ -16,7 +16,14 @@ from scipy import constants, stats
 from lidar_mi.atmosphere.line import backscatter_line, laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon
-from lidar_mi.instrument.fringe_camera import CCD, FringeCamera, expose, fringe_image, ring_radii
+from lidar_mi.instrument.fringe_camera import (
+    CCD,
+    FringeCamera,
+    doppler_shift,
+    expose,
+    fringe_image,
+    ring_radii,
+)
 
 WAVELENGTH = 354.7e-9
 AIR = backscatter_line(WAVELENGTH, 232.9, 33154.0, aerosol_share=0.1)
@@ -34,6 +41,15 @@ def ideal(**changes):
 
 
 # rings
+
+
+@pytest.mark.parametrize("v", [-300.0, 1.0, 300.0])
+def test_doppler_shift(v):
+    """Light of a moving mirror, nu (1 + v/c) / (1 - v/c): up when it approaches, 5.64 MHz a m/s."""
+    beta = v / constants.c
+    exact = constants.c / WAVELENGTH * 2 * beta / (1 - beta)
+    assert doppler_shift(v, WAVELENGTH) == pytest.approx(exact, rel=1.1 * abs(beta))
+    assert doppler_shift(v, WAVELENGTH) / v == pytest.approx(5.64e6, rel=5e-4)
 
 
 def test_radii_of_the_default_instrument():

@@ -368,7 +368,6 @@ def test_block_tridiagonal_is_its_dense_matrix():
     right = torch.randn(4, 5, 2, generator=random, dtype=torch.float64)
     solution = torch.linalg.solve(dense, right.reshape(20, 2))
     torch.testing.assert_close(root.solve(right).reshape(20, 2), solution)
-    assert root.log_determinant() == pytest.approx(float(torch.logdet(dense)))
     inverse = torch.linalg.inv(dense)
     own, under = root.inverse()
     for k in range(4):
