@@ -167,7 +167,7 @@ def render(
     epilog="Example: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc`"
 )
 def retrieve(
-    first: Annotated[Path, typer.Argument(help="Image at t1: EXR, TIFF, PNG or BMP.")],
+    first: Annotated[Path, typer.Argument(help="Image at t1: EXR, TIFF, PNG, BMP, JPEG or FITS.")],
     second: Annotated[Path, typer.Argument(help="Image at t2.")],
     *,
     more: Annotated[list[Path] | None, typer.Argument(
@@ -180,7 +180,9 @@ def retrieve(
     template: Annotated[int, typer.Option(help="Template size, pixels.")] = 8,
     search: Annotated[int, typer.Option(help="Search region, pixels.")] = 16,
     stride: Annotated[int, typer.Option(help="Step between vectors, pixels.")] = 1,
-    layer: Annotated[str, typer.Option(help="Layer of the EXR files.")] = "Y",
+    layer: Annotated[
+        str | None, typer.Option(help="Layer of the EXR files. Default: Y, or the only one.")
+    ] = None,
     spacing: Annotated[
         float | None, typer.Option(help="Pixel spacing in m, for files without axes.")
     ] = None,
@@ -192,18 +194,14 @@ def retrieve(
     device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
 ) -> None:  # fmt: skip
     """Find the cross-flow wind (v, w) in any two images of the same air."""
-    from .rendering.scene import read_image, read_noise
-    from .retrieval.images import on_one_grid, read_picture
+    from .pictures import read_image, read_noise
+    from .retrieval.images import on_one_grid
     from .retrieval.wind import retrieve_wind
     from .run_folder import write_netcdf
 
-    images = [
-        read_image(path, layer, spacing)
-        if path.suffix.lower() == ".exr" else read_picture(path, spacing)
-        for path in (first, second, *(more or []))
-    ]  # fmt: skip
+    images = [read_image(path, layer, spacing) for path in (first, second, *(more or []))]
     pair = on_one_grid(*images[:2])
-    if noise is None and first.suffix.lower() == ".exr":
+    if noise is None:
         noise = read_noise(first, layer, spacing)
         if noise is not None and pair[0] is not images[0]:
             # noise has no structure to interpolate: its level goes along
@@ -343,7 +341,7 @@ def aerosol(
     "--centre 479.5 389.5 -o frame_rings.png`"
 )
 def rings(
-    image: Annotated[Path, typer.Argument(help="EXR, PNG, TIFF, JPEG or FITS image.")],
+    image: Annotated[Path, typer.Argument(help="EXR, PNG, TIFF, BMP, JPEG or FITS image.")],
     centre: Annotated[
         tuple[float, float] | None,
         typer.Option(help="Where the rings' centre is known: x to the right, y down, pixels from "

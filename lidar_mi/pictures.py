@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 from .errors import InputError
 from .rendering.exr import read_layers
@@ -11,7 +12,7 @@ FITS = (".fits", ".fit", ".fts")
 
 
 def read_picture(path: str | Path, layer: str | None = None) -> np.ndarray:
-    """Picture of an EXR, PNG, TIFF, JPEG or FITS file, float64, (height, width), top row first.
+    """Picture of an EXR, PNG, TIFF, BMP, JPEG or FITS file, float64, (height, width), top row first.
 
     Colours are averaged, transparency is left out. Values are those of the file: 8 or 16 bit
     numbers, floats. A FITS image is taken as it is stored, first row first.
@@ -28,15 +29,75 @@ def read_picture(path: str | Path, layer: str | None = None) -> np.ndarray:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected an EXR, PNG, TIFF, JPEG or FITS image")
-    suffix = path.suffix.lower()
-    if suffix == ".exr":
+        raise InputError(f"{path}: no such file; expected an EXR, PNG, TIFF, BMP, JPEG or FITS image")
+    if _is_exr(path):
         picture = _exr(path, layer)
     elif layer is not None:
         raise InputError(f"layer: {layer!r} is not allowed for {path}; only EXR files have layers")
     else:
-        picture = _fits(path) if suffix in FITS else _image(path)
+        picture = _fits(path) if path.suffix.lower() in FITS else _image(path)
     return np.array(picture, dtype=float)
+
+
+def read_image(
+    path: str | Path, layer: str | None = None, spacing: float | None = None
+) -> xr.DataArray:
+    """A picture as `read_picture` gives it, as an image (z, y), ascending, in metres.
+
+    The top row has the largest z and the left column the largest y. Axes come from the header
+    attributes ``y`` and ``z`` that the EXR files of our scans carry; for other files ``spacing``
+    (m, from pixel to pixel) puts the picture's middle at zero.
+
+    Raises
+    ------
+    InputError
+        As `read_picture`; no axes and no spacing above 0.
+    """
+    if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
+        raise InputError(f"{path}: spacing: {spacing} m is not allowed; expected a number above 0")
+    pixels = read_picture(path, layer)
+    rows, columns = pixels.shape
+    header = read_layers(path)[0] if _is_exr(path) else {}
+    if spacing is not None:
+        y, z = ((np.arange(n) - (n - 1) / 2) * spacing for n in (columns, rows))
+    elif {"y", "z"} <= set(header) and len(header["y"]) == columns and len(header["z"]) == rows:
+        y, z = np.asarray(header["y"], float), np.asarray(header["z"], float)
+    else:
+        raise InputError(
+            f"{path}: no axes y and z for {columns} x {rows} pixels; expected them in the header "
+            "of an EXR file, or --spacing in m"
+        )
+    metres = {"units": "m"}
+    axes = {"z": ("z", z, metres), "y": ("y", y, metres)}
+    return xr.DataArray(pixels[::-1, ::-1].copy(), axes, ("z", "y"), layer)
+
+
+def read_noise(
+    path: str | Path, layer: str | None = None, spacing: float | None = None
+) -> xr.DataArray | None:
+    """Standard deviation of an image's noise, as `read_image` gives the image; None if unsaid.
+
+    For ``Y`` and ``Y_noisy`` of our scans: the light transport's standard error and, with a
+    detector, its noise. For any other layer: the one of the same name with ``_stderr``.
+    """
+    if not _is_exr(path):
+        return None
+    layers, layer = read_layers(path)[1], layer or "Y"
+    transport = {"gate000.S0", "gate000.S0_stderr", "Y"}
+    if layer in ("Y", "Y_noisy") and transport <= set(layers):
+        signal, stderr, scaled = (
+            read_image(path, name, spacing) for name in ("gate000.S0", "gate000.S0_stderr", "Y")
+        )
+        noise = (scaled * stderr / signal.where(signal > 0)).fillna(0.0)
+        if layer == "Y_noisy" and "Y_noise_std" in layers:
+            noise = np.hypot(noise, read_image(path, "Y_noise_std", spacing))
+        return noise
+    known = f"{layer}_stderr"
+    return read_image(path, known, spacing) if known in layers else None
+
+
+def _is_exr(path: str | Path) -> bool:
+    return Path(path).suffix.lower() == ".exr"
 
 
 def _exr(path, layer):

@@ -1,4 +1,4 @@
-"""Mitsuba scene files with our plugins, and images from any EXR file."""
+"""Mitsuba scene files with our plugins."""
 
 import re
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import xarray as xr
 
 from .. import __version__
 from ..errors import InputError
-from .exr import label_scan, read_layers, unpack, write_fringes, write_scan
+from .exr import label_scan, unpack, write_fringes, write_scan
 from .fringes import render_picture
 from .variant import use_variant
 
@@ -130,61 +130,6 @@ def _as_dataset(image: np.ndarray, names: list[str], sensor) -> xr.Dataset:
             variables, coords={"gate": np.arange(gates), "y": y, "z": z}, attrs=attributes
         )
     )
-
-
-def read_image(path: str | Path, layer: str = "Y", spacing: float | None = None) -> xr.DataArray:
-    """One layer of any EXR file as an image (z, y), ascending, in metres.
-
-    Axes come from the header attributes ``y`` and ``z`` that our scans carry; for other files
-    ``spacing`` (m) puts the image's middle at zero.
-
-    Raises
-    ------
-    InputError
-        Unreadable file, no such layer, or no axes and no spacing.
-    """
-    header, layers = read_layers(path)
-    if layer not in layers:
-        raise InputError(
-            f"{path}: layer {layer!r} is not there; expected one of {', '.join(sorted(layers))}"
-        )
-    pixels = layers[layer][::-1, ::-1].astype(np.float64)
-    rows, columns = pixels.shape
-    if spacing is not None:
-        if not spacing > 0:
-            raise InputError(f"spacing: {spacing} m is not allowed; expected a number above 0")
-        y, z = ((np.arange(n) - (n - 1) / 2) * spacing for n in (columns, rows))
-    elif {"y", "z"} <= set(header) and len(header["y"]) == columns and len(header["z"]) == rows:
-        y, z = np.asarray(header["y"], float), np.asarray(header["z"], float)
-    else:
-        raise InputError(
-            f"{path}: header has no axes y and z for {columns} x {rows} pixels; "
-            "expected them, or --spacing in m"
-        )
-    metres = {"units": "m"}
-    return xr.DataArray(
-        pixels, {"z": ("z", z, metres), "y": ("y", y, metres)}, ("z", "y"), layer
-    )
-
-
-def read_noise(path: str | Path, layer: str = "Y", spacing: float | None = None):
-    """Standard deviation of the noise of a layer, as `read_image` gives the layer; None if unsaid.
-
-    For ``Y`` and ``Y_noisy`` of our scans: the light transport's standard error and, with a
-    detector, its noise. For any other layer: the one of the same name with ``_stderr``.
-    """
-    layers = read_layers(path)[1]
-    transport = {"gate000.S0", "gate000.S0_stderr", "Y"}
-    if layer in ("Y", "Y_noisy") and transport <= set(layers):
-        signal, stderr, scaled = (
-            read_image(path, name, spacing) for name in ("gate000.S0", "gate000.S0_stderr", "Y")
-        )
-        noise = (scaled * stderr / signal.where(signal > 0)).fillna(0.0)
-        if layer == "Y_noisy" and "Y_noise_std" in layers:
-            noise = np.hypot(noise, read_image(path, "Y_noise_std", spacing))
-        return noise
-    known = f"{layer}_stderr"
-    return read_image(path, known, spacing) if known in layers else None
 
 
 def _reason(error: Exception) -> str:

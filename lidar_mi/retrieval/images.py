@@ -1,51 +1,10 @@
 """Bring images onto one regular (y, z) grid before they are compared."""
 
-from pathlib import Path
-
 import numpy as np
 import xarray as xr
-from PIL import Image, UnidentifiedImageError
 from scipy.interpolate import RectBivariateSpline
 
 from lidar_mi.errors import InputError
-
-# Modes of the imaging library that are one number a pixel.
-_GREY = ("1", "L", "I", "F", "I;16", "I;16B", "I;16L")
-
-
-def read_picture(path: str | Path, spacing: float | None) -> xr.DataArray:
-    """A grey TIFF, PNG or BMP picture as an image (z, y), ascending, in metres.
-
-    As everywhere, the top row has the largest z and the left column the largest y; the picture's
-    middle is at zero. Values are as the file holds them, of 8, 16 or 32 bits.
-
-    Parameters
-    ----------
-    path : str or Path
-    spacing : float
-        From pixel to pixel, m.
-
-    Raises
-    ------
-    InputError
-        Unreadable file, colours, or no spacing above 0.
-    """
-    if spacing is None or not (np.isfinite(spacing) and spacing > 0):
-        raise InputError(f"{path}: spacing: {spacing} m is not allowed; expected a number above 0")
-    try:
-        with Image.open(path) as picture:
-            mode, pixels = picture.mode, np.asarray(picture, dtype=float)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such file; expected EXR, TIFF, PNG or BMP") from None
-    except (UnidentifiedImageError, OSError, ValueError):
-        raise InputError(f"{path}: not a readable picture; expected EXR, TIFF, PNG or BMP") from None
-    if mode not in _GREY:
-        raise InputError(f"{path}: colours ({mode}) are not allowed; expected a grey picture")
-    axes = {
-        name: (name, (np.arange(n) - (n - 1) / 2) * spacing, {"units": "m"})
-        for name, n in zip(("z", "y"), pixels.shape)
-    }
-    return xr.DataArray(pixels[::-1, ::-1].copy(), axes, ("z", "y"))
 
 
 def resample(image: xr.DataArray, y: np.ndarray, z: np.ndarray) -> xr.DataArray:

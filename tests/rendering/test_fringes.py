@@ -19,7 +19,7 @@ from lidar_mi.instrument.etalon import Etalon, coated_transmission
 from lidar_mi.instrument.fringe_camera import FringeCamera, fringe_image
 from lidar_mi.rendering.exr import read_fringes, read_layers, write_fringes
 from lidar_mi.rendering.fringes import render_fringes, scene_dict
-from lidar_mi.rendering.scene import read_image, render_file
+from lidar_mi.rendering.scene import render_file
 from lidar_mi.rendering.settings import FringeSettings
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -172,7 +172,7 @@ def test_scene_file_that_ships_renders(tmp_path, estimator):
     assert back["S0"].shape == (780, 960) and np.array_equal(back["S0"], picture["S0"])
     assert back.attrs["scene"] == "fringes.xml" and back.attrs["lens"] == "surfaces"
     assert back.attrs["v_los"] == 40 and back.attrs["samples_per_pixel"] == 4
-    assert read_image(out, "S0", 1.0).shape == (780, 960)
+    assert read_layers(out)[1]["S0"].shape == (780, 960)
     # annular averages, equal steps of r^2: rings are evenly spaced there
     y, x = np.mgrid[:780, :960]
     r2 = (x - 479.5) ** 2 + (y - 389.5) ** 2
