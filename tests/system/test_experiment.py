@@ -9,6 +9,7 @@ import base64
 import gc
 import io
 import json
+import re
 from contextlib import contextmanager
 from html.parser import HTMLParser
 from importlib.resources import files
@@ -152,6 +153,20 @@ def test_the_record_is_enough_to_repeat_the_run(demo):
     assert record["experiment"]["seed"] == 1
     assert {"lidar-mi", "python", "mitsuba", "drjit", "numpy", "torch"} <= set(record["versions"])
     assert len(record["files"]["wake.file"]) == 64  # SHA-256
+
+
+def test_the_record_is_an_experiment_file(demo):
+    assert config.load(demo.folder / "experiment.yaml") == demo.experiment
+    changed = config.load(demo.folder / "experiment.yaml", ["seed=7"])
+    assert changed.seed == 7 and changed.wake == demo.experiment.wake
+
+
+def test_every_variable_of_the_winds_is_in_the_user_guide(demo):
+    guide = (Path(__file__).parents[2] / "docs" / "user_guide.md").read_text()
+    table = guide[guide.index("`wind.nc`, CF") :].partition("`source`:")[0]
+    listed = set(re.findall(r"`(\w+)`", "".join(re.findall(r"(?m)^\|([^|]*)\|", table))))
+    with xr.open_dataset(demo.folder / "wind.nc") as winds:
+        assert listed == set(winds.data_vars)
 
 
 def test_the_wake_is_read_once(tmp_path, monkeypatch):
