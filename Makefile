@@ -1,5 +1,5 @@
 # Everything runs from .venv, which the first target that needs it sets up.
-# ARGS goes to the command behind a target: make test ARGS="tests/test_llvm.py -x"
+# ARGS goes to the command behind a target: make test ARGS="tests/system/test_llvm.py -x"
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-all bench validate docs lint clean

@@ -11,17 +11,17 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.cores import Core
-from lidar_mi.assessment.error_budget import CAUSES
-from lidar_mi.backscatter_chain import scan_plans
-from lidar_mi.budget_chain import budgets
-from lidar_mi.config import Experiment
+from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.metrics.error_budget import CAUSES
+from lidar_mi.experiment.stages.backscatter import scan_plans
+from lidar_mi.experiment.stages.error_budget import budgets
+from lidar_mi.experiment.schema import Experiment
 from lidar_mi.instrument.detector import noisy_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.wind import METHODS
-from lidar_mi.truth import Truth
+from lidar_mi.retrieval.velocimetry.wind import METHODS
+from lidar_mi.experiment.truth import Truth
 
 from .cases import CIRCULATION, CORE_RADIUS, DT, SEPARATION, SPACING, Pair, vortex_pair_images
 from .report import Comparison, row

@@ -7,12 +7,12 @@ from pathlib import Path
 import mitsuba as mi
 import xarray as xr
 
-from lidar_mi.config import Experiment, load
+from lidar_mi.experiment.schema import Experiment, load
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans, scene_dict
 from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.truth import make_truth
+from lidar_mi.experiment.truth import make_truth
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,10 @@ versions are installed.
 
 __version__ = "0.1.0"
 
-from .llvm import select_llvm as _select_llvm
+from lidar_mi.system.llvm import select_llvm as _select_llvm
 
 _select_llvm()
 
-from .plugins import register as _register
+from lidar_mi.plugins import register as _register
 
 _register()

@@ -36,7 +36,7 @@ find_python() {
 }
 
 # Says which LLVM would be used (0), what to install (3), or why DRJIT_LIBLLVM_PATH is bad (4).
-judge_llvm() { "$python" -P lidar_mi/llvm.py; }
+judge_llvm() { "$python" -P lidar_mi/system/llvm.py; }
 
 provide_llvm() {
     status=0
@@ -44,7 +44,7 @@ provide_llvm() {
     case $status in
         0) return ;;
         3) ;;
-        *) die "${said:-lidar_mi/llvm.py could not run}" ;;
+        *) die "${said:-lidar_mi/system/llvm.py could not run}" ;;
     esac
     command -v apt-get >/dev/null || die "$said"
     if [ "$(id -u)" = 0 ]; then

@@ -16,7 +16,7 @@ from scipy.constants import Boltzmann
 
 from lidar_mi.errors import InputError
 
-from .scattering import ScatteringTable, rayleigh_table
+from lidar_mi.atmosphere.scattering import ScatteringTable, rayleigh_table
 
 BANDS = ("cabannes", "rayleigh")
 

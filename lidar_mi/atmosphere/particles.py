@@ -19,7 +19,7 @@ from scipy.integrate import quad
 
 from lidar_mi.errors import InputError
 
-from .scattering import ScatteringTable, read_table
+from lidar_mi.atmosphere.scattering import ScatteringTable, read_table
 
 Notice = Callable[[str, float | None], None]
 """Called with what is done and the share that is finished."""

@@ -14,8 +14,8 @@ from scipy.fft import next_fast_len
 
 from lidar_mi.errors import InputError
 
-from .texture import gaussian_field
-from .vortex import LAMB_OSEEN_CONSTANT
+from lidar_mi.atmosphere.texture import gaussian_field
+from lidar_mi.atmosphere.vortex import LAMB_OSEEN_CONSTANT
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 from scipy import constants
 
-from ..errors import InputError
+from lidar_mi.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from ..errors import InputError
-from ..units import (
+from lidar_mi.errors import InputError
+from lidar_mi.units import (
     Angle,
     Area,
     Backscatter,
@@ -20,9 +20,14 @@ from ..units import (
     SpectralRadiance,
     Time,
 )
-from .detector import gate_duration, photons_per_energy, spatial_modes, temporal_modes
-from .etalon import Etalon, harmonics, series
-from .fringe_camera import FringeCamera
+from lidar_mi.instrument.detector import (
+    gate_duration,
+    photons_per_energy,
+    spatial_modes,
+    temporal_modes,
+)
+from lidar_mi.instrument.etalon import Etalon, harmonics, series
+from lidar_mi.instrument.fringe_camera import FringeCamera
 
 
 class DopplerLidar(BaseModel):

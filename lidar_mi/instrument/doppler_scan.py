@@ -13,10 +13,10 @@ from scipy import constants
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
-from ..errors import InputError
-from ..units import Angle, Speed
-from .doppler import DopplerLidar
-from .scan import HalfAngle
+from lidar_mi.errors import InputError
+from lidar_mi.units import Angle, Speed
+from lidar_mi.instrument.doppler import DopplerLidar
+from lidar_mi.instrument.scan import HalfAngle
 
 # nodes of the quadrature over range bin, pulse and beam: exact for winds of degree 15, 5 and 5
 _BIN, _PULSE, _BEAM = 8, 3, 3

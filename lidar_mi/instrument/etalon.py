@@ -18,8 +18,8 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy import constants
 from scipy.optimize import brentq
 
-from ..errors import InputError
-from ..units import Length, Number
+from lidar_mi.errors import InputError
+from lidar_mi.units import Length, Number
 
 POLARIZATIONS = ("s", "p")
 # Less than this and a mirror is taken for opaque: even lossless, no pulse would be seen through it.

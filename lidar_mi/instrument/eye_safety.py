@@ -12,7 +12,7 @@ from typing import Literal
 
 from scipy import optimize
 
-from ..errors import InputError
+from lidar_mi.errors import InputError
 
 Rule = Literal["single pulse", "average", "repeated pulses"]
 

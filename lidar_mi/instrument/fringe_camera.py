@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..errors import InputError
-from ..units import Frequency, Length, Number, Time
-from .etalon import Etalon, cosine_inside, fractional_order, harmonics, series
+from lidar_mi.errors import InputError
+from lidar_mi.units import Frequency, Length, Number, Time
+from lidar_mi.instrument.etalon import Etalon, cosine_inside, fractional_order, harmonics, series
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 # Two Gauss-Legendre points average a pixel to fourth order.

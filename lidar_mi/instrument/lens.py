@@ -10,7 +10,7 @@ corners, evenly to all sides.
 import numpy as np
 from scipy.optimize import least_squares
 
-from ..errors import InputError
+from lidar_mi.errors import InputError
 
 # thickness, and distance of the stop from the front, in focal lengths
 THICKNESS = 0.02

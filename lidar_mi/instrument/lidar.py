@@ -5,7 +5,7 @@ import math
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from ..units import Angle, Energy, Length, Time
+from lidar_mi.units import Angle, Energy, Length, Time
 
 
 class BackscatterLidar(BaseModel):

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import xarray as xr
 
-from ..errors import InputError
+from lidar_mi.errors import InputError
 
 _ORDER = re.compile(r"order\d+\.S0")
 

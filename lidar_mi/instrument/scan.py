@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from ..units import Angle, Length, Speed
+from lidar_mi.units import Angle, Length, Speed
 
 MOST_BEAMS = 10**7
 """A picture of so many beams holds about 1 GB, with a layer for each order and its errors."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .scan import ScanPlan
+from lidar_mi.instrument.scan import ScanPlan
 
 
 def apparent_backscatter(s0, plan: ScanPlan, aperture_area: float, environment: float):

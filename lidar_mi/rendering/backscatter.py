@@ -8,14 +8,14 @@ import mitsuba as mi
 import numpy as np
 import xarray as xr
 
-from .. import __version__
-from ..errors import InputError
-from ..instrument.lidar import BackscatterLidar
-from ..instrument.scan import ScanPlan
-from ..instrument.signal import apparent_backscatter
-from .exr import label_scan, unpack
-from .phase import Molecules
-from .settings import RenderSettings
+from lidar_mi import __version__
+from lidar_mi.errors import InputError
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.signal import apparent_backscatter
+from lidar_mi.io.exr import label_scan, unpack
+from lidar_mi.rendering.phase import Molecules
+from lidar_mi.rendering.settings import RenderSettings
 
 MOST_CELLS = 1e8  # of an extended plane: 0.8 GB
 

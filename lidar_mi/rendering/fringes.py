@@ -8,14 +8,14 @@ import mitsuba as mi
 import numpy as np
 import xarray as xr
 
-from .. import __version__
-from ..atmosphere.line import Line
-from ..errors import InputError
-from ..instrument.etalon import Etalon
-from ..instrument.fringe_camera import FringeCamera
-from ..instrument.lens import singlet
-from .exr import label_fringes
-from .settings import FringeSettings
+from lidar_mi import __version__
+from lidar_mi.atmosphere.line import Line
+from lidar_mi.errors import InputError
+from lidar_mi.instrument.etalon import Etalon
+from lidar_mi.instrument.fringe_camera import FringeCamera
+from lidar_mi.instrument.lens import singlet
+from lidar_mi.io.exr import label_fringes
+from lidar_mi.rendering.settings import FringeSettings
 
 # from the stop to the etalon, m: any distance that leaves room for a lens
 _ETALON_AT = 0.05

@@ -7,10 +7,10 @@ from typing import NamedTuple
 import mitsuba as mi
 import numpy as np
 
-from ..atmosphere.molecules import molecular_scattering, molecular_table
-from ..atmosphere.particles import Notice, aerosol_table
-from ..atmosphere.scattering import ScatteringTable, mix, rayleigh_table, read_table
-from ..errors import InputError
+from lidar_mi.atmosphere.molecules import molecular_scattering, molecular_table
+from lidar_mi.atmosphere.particles import Notice, aerosol_table
+from lidar_mi.atmosphere.scattering import ScatteringTable, mix, rayleigh_table, read_table
+from lidar_mi.errors import InputError
 
 
 class Scatterer(NamedTuple):
@@ -55,7 +55,7 @@ def scatterer(
 
     Parameters
     ----------
-    scattering : lidar_mi.config.Scattering
+    scattering : lidar_mi.experiment.schema.Scattering
         Its own albedo stands over that of the scatterers.
     beside : path
         Folder in which tables are looked for.

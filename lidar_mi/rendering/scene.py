@@ -8,11 +8,11 @@ import mitsuba as mi
 import numpy as np
 import xarray as xr
 
-from .. import __version__
-from ..errors import InputError
-from .exr import label_scan, unpack, write_fringes, write_scan
-from .fringes import render_picture
-from .variant import use_variant
+from lidar_mi import __version__
+from lidar_mi.errors import InputError
+from lidar_mi.io.exr import label_scan, unpack, write_fringes, write_scan
+from lidar_mi.rendering.fringes import render_picture
+from lidar_mi.rendering.variant import use_variant
 
 
 def render_file(

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from ..units import Length
+from lidar_mi.units import Length
 
 VARIANTS = tuple(
     f"{backend}_ad_{colour}"

@@ -2,9 +2,9 @@
 
 import mitsuba as mi
 
-from ..errors import InputError
-from ..llvm import require_llvm
-from .settings import VARIANTS
+from lidar_mi.errors import InputError
+from lidar_mi.system.llvm import require_llvm
+from lidar_mi.rendering.settings import VARIANTS
 
 
 def use_variant(name: str) -> None:

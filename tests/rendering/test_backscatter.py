@@ -14,7 +14,7 @@ import xarray as xr
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans
-from lidar_mi.rendering.exr import read_scan, write_scan
+from lidar_mi.io.exr import read_scan, write_scan
 from lidar_mi.rendering.settings import RenderSettings
 
 pytestmark = pytest.mark.usefixtures("variant")

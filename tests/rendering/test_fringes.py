@@ -17,7 +17,7 @@ from lidar_mi.atmosphere.line import Line, backscatter_line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon, coated_transmission
 from lidar_mi.instrument.fringe_camera import FringeCamera, fringe_image
-from lidar_mi.rendering.exr import read_fringes, read_layers, write_fringes
+from lidar_mi.io.exr import read_fringes, read_layers, write_fringes
 from lidar_mi.rendering.fringes import render_fringes, scene_dict
 from lidar_mi.rendering.scene import render_file
 from lidar_mi.rendering.settings import FringeSettings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi import config
+from lidar_mi.experiment import schema as config
 from lidar_mi.atmosphere.molecules import molecular_table
 from lidar_mi.atmosphere.particles import aerosol_table
 from lidar_mi.errors import InputError
@@ -17,7 +17,7 @@ from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import molecules, scatterer
 from lidar_mi.rendering.settings import RenderSettings
-from lidar_mi.truth import make_truth
+from lidar_mi.experiment.truth import make_truth
 
 WAVELENGTH, MOLECULES, AROUND = 532e-9, 7e-5, 1e-4
 AXIS = np.arange(-4.0, 4.5, 0.5)

@@ -10,7 +10,7 @@ import pytest
 from lidar_mi.atmosphere.molecules import molecular_scattering
 from lidar_mi.atmosphere.particles import aerosol_table
 from lidar_mi.atmosphere.scattering import write_table
-from lidar_mi.config import Scattering
+from lidar_mi.experiment.schema import Scattering
 from lidar_mi.errors import InputError
 from lidar_mi.rendering.phase import scatterer, table_files
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lidar_mi import config, experiment
+from lidar_mi.experiment import schema as config, run as experiment
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 

@@ -18,9 +18,10 @@ import OpenEXR
 import pytest
 import xarray as xr
 
-from lidar_mi import backscatter_chain, cli
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+from lidar_mi.cli import app as cli
 from lidar_mi.atmosphere.scattering import read_table
-from lidar_mi.rendering.exr import read_layers, read_scan
+from lidar_mi.io.exr import read_layers, read_scan
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 
@@ -75,7 +76,7 @@ def quick(monkeypatch):
 
 def shell(*arguments, **options):
     return subprocess.run(
-        [sys.executable, "-m", "lidar_mi.cli", *map(str, arguments)],
+        [sys.executable, "-m", "lidar_mi.cli.app", *map(str, arguments)],
         capture_output=True, text=True, timeout=120, check=False, **options,
     )  # fmt: skip
 
@@ -520,7 +521,7 @@ def test_ctrl_c_stops_cleanly_and_the_run_goes_on(there):
     slow = ["run", "tiny.yaml", "-o", "run", "--set", "render.samples_per_beam=50000",
             "--set", "render.samples_per_pass=20000"]  # fmt: skip
     with subprocess.Popen(
-        [sys.executable, "-m", "lidar_mi.cli", *slow], text=True,
+        [sys.executable, "-m", "lidar_mi.cli.app", *slow], text=True,
         stdout=subprocess.PIPE, stderr=subprocess.PIPE,
         # a shell's background job inherits ignored interrupts
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509

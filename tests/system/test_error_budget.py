@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi import backscatter_chain, config
-from lidar_mi.assessment.errors import truth_at_vectors
-from lidar_mi.budget_chain import budgets
-from lidar_mi.experiment import run
-from lidar_mi.rendering import exr
-from lidar_mi.retrieval.wind import retrieve_wind
-from lidar_mi.run_folder import IMAGES
-from lidar_mi.truth import blur_by_beam, make_truth
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+from lidar_mi.experiment import schema as config
+from lidar_mi.assessment.metrics.errors import truth_at_vectors
+from lidar_mi.experiment.stages.error_budget import budgets
+from lidar_mi.experiment.run import run
+from lidar_mi.io import exr
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.experiment.run_folder import IMAGES
+from lidar_mi.experiment.truth import blur_by_beam, make_truth
 
 SMALL = """
 name: small

@@ -27,24 +27,25 @@ from scipy import ndimage
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import norm, qmc
 
-from lidar_mi import backscatter_chain, config, run_folder
-from lidar_mi import truth as truth_module
-from lidar_mi.assessment.digits import percent
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+from lidar_mi.experiment import schema as config, run_folder
+from lidar_mi.experiment import truth as truth_module
+from lidar_mi.assessment.report.digits import percent
 from lidar_mi.atmosphere.wake import read_wake
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import run
+from lidar_mi.experiment.run import run
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans
-from lidar_mi.rendering.exr import read_scan
+from lidar_mi.io.exr import read_scan
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.images import on_one_grid
-from lidar_mi.retrieval.vortex_file import read_vortices
-from lidar_mi.retrieval.vortex_fit import fit_vortices
-from lidar_mi.retrieval.wind import retrieve_wind
-from lidar_mi.run_folder import IMAGES
-from lidar_mi.truth import blur_by_beam, make_truth
+from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
+from lidar_mi.io.vortex_file import read_vortices
+from lidar_mi.retrieval.vortices.fit import fit_vortices
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.experiment.run_folder import IMAGES
+from lidar_mi.experiment.truth import blur_by_beam, make_truth
 
 SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
 SCENES = Path(str(files("lidar_mi.scenes")))

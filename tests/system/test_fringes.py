@@ -18,13 +18,14 @@ import xarray as xr
 from scipy import stats
 from scipy.constants import speed_of_light
 
-from lidar_mi import cli, config, experiment
-from lidar_mi.assessment.digits import with_error
+from lidar_mi.cli import app as cli
+from lidar_mi.experiment import schema as config, run as experiment
+from lidar_mi.assessment.report.digits import with_error
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import run
-from lidar_mi.fringe_chain import summed
+from lidar_mi.experiment.run import run
+from lidar_mi.experiment.stages.fringes import summed
 from lidar_mi.instrument.fringe_camera import CCD, expose
-from lidar_mi.rendering.exr import read_fringes
+from lidar_mi.io.exr import read_fringes
 
 # a quarter of the default camera's pixels see the same four rings
 CAMERA = {"width": 480, "height": 390, "pixel": "14.8 um"}
@@ -73,7 +74,7 @@ def found(small):
 @pytest.fixture
 def quick(monkeypatch):
     """Without what only the small experiment is asked for."""
-    monkeypatch.setattr("lidar_mi.assessment.doppler_figures.draw_all", lambda *_: [])
+    monkeypatch.setattr("lidar_mi.assessment.figures.doppler.draw_all", lambda *_: [])
 
 
 QUICK = {"photon_samples": 0, "v_los": [0], "render": {"samples_per_pixel": 2},
@@ -266,8 +267,8 @@ def test_another_experiment_is_refused_or_replaces(tmp_path, quick):
 
 
 def test_both_lidars_in_one_experiment(tmp_path, quick, monkeypatch):
-    monkeypatch.setattr("lidar_mi.backscatter_chain.figures.draw_all", lambda *_: [])
-    monkeypatch.setattr("lidar_mi.backscatter_chain.TEXTURE_SWEEP", ())
+    monkeypatch.setattr("lidar_mi.experiment.stages.backscatter.figures.draw_all", lambda *_: [])
+    monkeypatch.setattr("lidar_mi.experiment.stages.backscatter.TEXTURE_SWEEP", ())
     both = config.check({
         "name": "both",
         "wake": {"vortex_pair": {"width": "40 m", "height": "30 m", "separation": "15 m"},

@@ -4,7 +4,7 @@ import io
 
 from rich.console import Console
 
-from lidar_mi import cli
+from lidar_mi.cli import app as cli
 
 
 def test_the_clock_goes_on_after_a_step_is_done(monkeypatch):

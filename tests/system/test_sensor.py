@@ -14,15 +14,20 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi import backscatter_chain, check, config, fringe_chain, sensor_chain
-from lidar_mi.assessment import sensor_report
-from lidar_mi.assessment.cores import Core
-from lidar_mi.assessment.report import page
-from lidar_mi.assessment.requirements import read_requirements
+from lidar_mi.experiment.stages import (
+    backscatter as backscatter_chain,
+    fringes as fringe_chain,
+    sensor as sensor_chain,
+)
+from lidar_mi.experiment import check, schema as config
+from lidar_mi.assessment.report import sensor as sensor_report
+from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.report.page import page
+from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import run
+from lidar_mi.experiment.run import run
 from lidar_mi.instrument.doppler_scan import scan_wind
-from lidar_mi.retrieval.vortex_file import read_vortices
+from lidar_mi.io.vortex_file import read_vortices
 
 # a coarse wake, single scattering, a CCD of a sixteenth of the pixels
 SMALL = {
@@ -161,7 +166,7 @@ def again(whole, tmp_path, monkeypatch, spoil):
     monkeypatch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
     monkeypatch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
     monkeypatch.setattr(fringe_chain, "prepare", lambda _: lambda *_: ({}, None))
-    monkeypatch.setattr("lidar_mi.experiment.report.page", lambda *a: page(*without(a)))
+    monkeypatch.setattr("lidar_mi.experiment.run.report.page", lambda *a: page(*without(a)))
     run(changed(), tmp_path / "run")
     return (tmp_path / "run" / "report.html").read_text(), tmp_path / "run"
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from lidar_mi import doctor, llvm
+from lidar_mi.system import doctor, llvm
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.skipif(
 # "good_llvm" is a file: there as long as the pretended machine has a suitable LLVM.
 PYTHON = """#!/bin/sh
 case "$*" in
-    *lidar_mi/llvm.py*)
+    *lidar_mi/system/llvm.py*)
         if [ -e "$STATE/good_llvm" ]; then echo /usr/lib/libLLVM.so.19.1; exit 0; fi
         echo "libLLVM: found none; sudo apt install libllvm19"; exit 3 ;;
     "-m venv "*)

@@ -15,12 +15,17 @@ import xarray as xr
 import yaml
 from matplotlib.image import imread
 
-from lidar_mi import backscatter_chain, config, experiment, fringe_chain, study, volume_chain
-from lidar_mi.assessment import comparison
-from lidar_mi.assessment.comparison import differences, flat
-from lidar_mi.assessment.digits import three
+from lidar_mi.experiment.stages import (
+    backscatter as backscatter_chain,
+    fringes as fringe_chain,
+    volume as volume_chain,
+)
+from lidar_mi.experiment import schema as config, run as experiment, study
+from lidar_mi.assessment.report import comparison
+from lidar_mi.assessment.report.comparison import differences, flat
+from lidar_mi.assessment.report.digits import three
 from lidar_mi.errors import InputError
-from lidar_mi.info import sections
+from lidar_mi.experiment.info import sections
 
 SCENES = Path(str(files("lidar_mi.scenes"))).resolve()
 PAIR = {"circulation": 150, "separation": 16, "core_radius": 2, "width": 30, "height": 20}

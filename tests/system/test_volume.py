@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi import config, volume_chain
+from lidar_mi.experiment import schema as config
+from lidar_mi.experiment.stages import volume as volume_chain
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import run
+from lidar_mi.experiment.run import run
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 

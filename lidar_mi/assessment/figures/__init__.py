@@ -1,0 +1,1 @@
+"""Figures, from data sets to PNG."""

@@ -1,0 +1,1 @@
+"""Numbers from estimate and truth, one function each."""

@@ -1,0 +1,329 @@
+"""What limits the wind: how much better it would be without each cause of error in turn.
+
+Causes that act on the pictures are taken out of them and the wind is found again; those that lie in
+what a vector means are taken out of the truth it is compared with.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+import xarray as xr
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import ndimage
+
+from lidar_mi.assessment.metrics.cores import Core, outside_cores
+from lidar_mi.assessment.metrics.errors import truth_at_vectors
+
+CAUSES = {
+    "detector_noise": "noise of the detector",
+    "monte_carlo": "noise of the simulation",
+    "beam_blur": "width of the beam",
+    "slab": "what the slab's mean wind does not carry",
+    "window": "averaging over the window",
+    "shear": "shear within the window",
+    "time_step": "curved paths in the time step",
+    "method": "the method itself",
+}
+"""Causes of error by key, and how they are called."""
+
+Pair = Sequence[xr.DataArray]
+
+# Methods that compare windows as they are, shifted: a vector is the mean chord over one.
+_BOXES = ("cc", "ws")
+
+
+def picture_unit(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, float]:
+    """Gain and offset that make the air's extinction the rendered pictures.
+
+    By least squares over both pictures, weighted by 1 / `noise`^2 (standard errors of the rendered
+    ones). The offset is light that a pulse longer than the gate brings from the air around it.
+    """
+    x, y, s = (np.concatenate([i.values.ravel() for i in pair]) for pair in (blurred, rendered, noise))
+    if np.ptp(x) < 1e-9 * np.abs(x).max():
+        return float(y.mean() / x.mean()), 0.0
+    weight = 1 / s if (s > 0).all() else np.ones_like(s)
+    gain, offset = np.polyfit(x / np.abs(x).max(), y, 1, w=weight / weight.max())
+    return float(gain / np.abs(x).max()), float(offset)
+
+
+def pictures_without(
+    seen: Pair,
+    blurred: Pair,
+    sharp: Pair,
+    rendered: Pair | None = None,
+    carried: Pair | None = None,
+) -> dict[str, Pair]:
+    """Pictures without one cause of error each, all else as it fell.
+
+    Noise is not drawn anew: that of the detector is what it added to the rendered picture, that of
+    the simulation what the rendered picture differs from the blurred air by. So two cases differ by
+    the cause alone and not by chance. The detector's noise stays what it was in the picture it was
+    drawn for, though its photons follow the signal: where blur takes 20 % of it, noise is 10 % off.
+    What the blur leaves out of the light transport (multiple scattering, extinction within the
+    slab: 0.5 % of the signal in the paper's case, nearly even) goes with the simulation's noise.
+
+    Parameters
+    ----------
+    seen : two xr.DataArray, dims (z, y)
+        Pictures with all noise.
+    blurred, sharp : pair
+        The air as beams of their width see it without noise, and as it is; in the unit of `seen`.
+    rendered : pair, optional
+        Without the noise of a detector; left out: there is none.
+    carried : pair, optional
+        As `blurred`, of air that the slab's mean wind has carried as a whole.
+
+    Returns
+    -------
+    dict
+        Pairs by cause: `monte_carlo`, `beam_blur`, with `rendered` `detector_noise`, with
+        `carried` `slab`.
+    """
+    found = {} if rendered is None else {"detector_noise": list(rendered)}
+    found["monte_carlo"] = _plus_difference(blurred, seen, rendered or seen)
+    found["beam_blur"] = _plus_difference(seen, sharp, blurred)
+    if carried is not None:
+        found["slab"] = _plus_difference(seen, carried, blurred)
+    return found
+
+
+def _plus_difference(base: Pair, more: Pair, less: Pair) -> list[xr.DataArray]:
+    """base + more - less; all lie on one grid, whose coordinates may differ in their last digits."""
+    return [a.copy(data=a.values + (b.values - c.values)) for a, b, c in zip(base, more, less)]
+
+
+def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.ndarray, np.ndarray]:
+    """Mean wind over dt of the air whose way has its middle at given places.
+
+    Straight displacements between two pictures see the chord of a curved path. In a solid rotation
+    at the rate a it is the wind at the chord's middle times tan(a dt / 2) / (a dt / 2).
+
+    Parameters
+    ----------
+    truth : xr.Dataset
+        v, w (m s^-1) on (z, y); the flow stands still over dt. Beyond the field its edge holds.
+    y, z : arrays
+        Middles between where the air is at either picture, m.
+    dt : float
+        s.
+    steps : int
+        Runge-Kutta steps (4th order) in dt / 2.
+
+    Returns
+    -------
+    v, w : arrays
+        m s^-1; NaN where the place is.
+    """
+    axes = [truth[name].values for name in ("z", "y")]
+    spacing = np.array([axis[1] - axis[0] for axis in axes])[:, None]
+    # in nodes and nodes per second, along z and y
+    speeds = [
+        ndimage.spline_filter(truth[name].transpose("z", "y").values / h, mode="mirror")
+        for name, h in zip(("w", "v"), spacing)
+    ]
+    place = np.stack([z, y]).astype(float)
+    known = np.isfinite(place).all(0)
+    middle = place = (place[:, known] - np.array([axis[0] for axis in axes])[:, None]) / spacing
+
+    def wind(here):
+        return np.stack([
+            ndimage.map_coordinates(speed, here, prefilter=False, mode="nearest")
+            for speed in speeds
+        ])  # fmt: skip
+
+    def moved(here, time):
+        h = time / steps
+        for _ in range(steps):
+            k1 = wind(here)
+            k2 = wind(here + h / 2 * k1)
+            k3 = wind(here + h / 2 * k2)
+            k4 = wind(here + h * k3)
+            here = here + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return here
+
+    # each turn leaves 1 - cos of the angle that the air turns by in dt / 2
+    for _ in range(4):
+        before, after = moved(middle, -dt / 2), moved(middle, dt / 2)
+        middle = middle + place - (before + after) / 2
+    chord = np.full((2, *known.shape), np.nan)
+    chord[:, known] = (moved(middle, dt / 2) - moved(middle, -dt / 2)) * spacing / dt
+    return chord[1], chord[0]
+
+
+def window_mean(truth: xr.Dataset, template: int, method: str) -> xr.Dataset | None:
+    """The true wind as a method's windows average it; None for a method that has none.
+
+    Parameters
+    ----------
+    truth : xr.Dataset
+        v, w on (z, y), with the pictures' spacing.
+    template : int
+        Size of a window, px.
+    method : str
+        "cc", "ws": the mean over the template. "multipass": a Gaussian of a third of the template
+        (the value of a weighted affine fit in its middle).
+    """
+    if method == "multipass":
+        smooth = {
+            name: truth[name].copy(
+                data=ndimage.gaussian_filter(truth[name].values, template / 3, mode="nearest")
+            )
+            for name in ("v", "w")
+        }
+        return xr.Dataset(smooth)
+    if method not in _BOXES:
+        return None
+    axes = {name: sliding_window_view(truth[name].values, template).mean(1) for name in ("z", "y")}
+    windows = {
+        name: sliding_window_view(truth[name].transpose("z", "y").values, (template, template))
+        for name in ("v", "w")
+    }
+    return xr.Dataset({n: (("z", "y"), w.mean((2, 3))) for n, w in windows.items()}, axes)
+
+
+def moved_as_one(
+    found: xr.Dataset,
+    seen: Pair,
+    blurred: Pair,
+    truth: xr.Dataset,
+    retrieve: Callable[[Pair, int], xr.Dataset],
+) -> xr.Dataset | None:
+    """The wind found where the air of every window moves as one, by the window's mean wind.
+
+    Shear deforms what a window holds, so that its two pictures do not match at any shift. Here every
+    window's search region is a picture of its own, all of them laid side by side: the second shows
+    the blurred air of the first, carried by the mean wind over the template, and what the second
+    picture seen has besides its own blurred air.
+
+    Parameters
+    ----------
+    found : xr.Dataset
+        From `retrieve_wind`; its attributes say method, template, search, stride and dt.
+    seen, blurred : pair
+        See `pictures_without`.
+    truth : xr.Dataset
+        v, w on (z, y).
+    retrieve : callable
+        Finds the wind in a pair by found's method, with windows so many pixels apart.
+
+    Returns
+    -------
+    xr.Dataset or None
+        `found` with other v and w; None for a method whose windows depend on each other.
+    """
+    if found.attrs["method"] not in _BOXES:
+        return None
+    template, search, stride, dt = (found.attrs[n] for n in ("template", "search", "stride", "dt"))
+    mean = truth_at_vectors(found, window_mean(truth, template, found.attrs["method"]))
+    regions = sliding_window_view(np.zeros(seen[0].shape), (search, search))[::stride, ::stride]
+    places = []
+    for axis, (name, component) in enumerate((("z", "w"), ("y", "v"))):
+        spacing = float(seen[0][name][1] - seen[0][name][0])
+        start = np.arange(regions.shape[axis]) * stride
+        start = start[:, None] if axis == 0 else start[None, :]
+        pixel = np.arange(search)[:, None] if axis == 0 else np.arange(search)[None, :]
+        shift = np.nan_to_num(mean[component].values) * dt / spacing
+        place = (start - shift)[:, :, None, None] + pixel
+        places.append(np.broadcast_to(place, regions.shape))
+    carried = ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
+
+    def cut(image):
+        return sliding_window_view(image, (search, search))[::stride, ::stride]
+
+    rest = cut(seen[1].values - blurred[1].values)
+    pair = [_side_by_side(blocks, seen[0]) for blocks in (cut(seen[0].values), carried + rest)]
+    wind = retrieve(pair, search)
+    return found.assign({name: (("z", "y"), wind[name].values) for name in ("v", "w")})
+
+
+def _side_by_side(blocks: np.ndarray, like: xr.DataArray) -> xr.DataArray:
+    """Blocks (rows, columns, z, y) as one image with the pixels of another."""
+    image = blocks.transpose(0, 2, 1, 3).reshape(
+        blocks.shape[0] * blocks.shape[2], blocks.shape[1] * blocks.shape[3]
+    )
+    axes = {}
+    for name, size in zip(("z", "y"), image.shape):
+        spacing = float(like[name][1] - like[name][0])
+        axes[name] = (name, np.arange(size) * spacing, {"units": "m"})
+    return xr.DataArray(image, axes, ("z", "y"))
+
+
+def error_budget(
+    found: xr.Dataset,
+    without: Mapping[str, xr.Dataset],
+    truth: xr.Dataset,
+    cores: Sequence[Core],
+    perfect: xr.Dataset | None = None,
+    flagged: bool = False,
+) -> dict[str, float]:
+    """Errors of a wind with all causes of error, and without each of them in turn.
+
+    The share of a cause is 1 - (rms error without it)^2 / (rms error with it)^2. Shares need not add
+    up to 1: causes act together, and one alone may even help (noise smooths what adapts to it),
+    which makes its share negative.
+
+    Parameters
+    ----------
+    found : xr.Dataset
+        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`; its attributes say method, template and dt.
+    without : mapping of xr.Dataset
+        The same from `pictures_without`, by cause, and from `moved_as_one` as `shear`.
+    truth : xr.Dataset
+        v, w on (z, y).
+    cores : sequence of Core
+    perfect : xr.Dataset, optional
+        The same from the air as it is, without noise or blur: the cause `method` is how that
+        deviates from the truth.
+    flagged : bool
+        Take every vector that has a displacement, not those without a flag alone.
+
+    Returns
+    -------
+    dict
+        Flat. `rmse_v`, `rmse_w` (m s^-1) with all causes; `CAUSE.rmse_v`, `.rmse_w` without it;
+        `CAUSE.share_v`, `.share_w`, and `.share` of both together; the same of vectors beyond two
+        core radii as `outside_cores....`; `vectors`, their number. Always the same vectors: those
+        of `found` that all cases found. Empty where there are none.
+    """
+    method, template, dt = (found.attrs[name] for name in ("method", "template", "dt"))
+    here = truth_at_vectors(found, truth)
+    errors = {"": _difference(found, here)}
+    for cause, wind in without.items():
+        errors[cause] = _difference(wind, truth_at_vectors(wind, truth))
+    averaged = window_mean(truth, template, method)
+    if averaged is not None:
+        errors["window"] = _difference(found, truth_at_vectors(found, averaged))
+    if method in _BOXES:
+        places = (found[name].values for name in ("y_vector", "z_vector"))
+        errors["time_step"] = _difference(found, dict(zip("vw", chord_wind(truth, *places, dt))))
+    if perfect is not None:
+        bias = _difference(perfect, truth_at_vectors(perfect, truth))
+        errors["method"] = errors[""] - bias
+    chosen = np.logical_and.reduce([np.isfinite(e).all(0) for e in errors.values()])
+    if not flagged:
+        chosen &= found["flag"].values == 0
+    far = chosen & outside_cores(found["y_vector"].values, found["z_vector"].values, list(cores))
+    metrics = _shares(errors, chosen)
+    if cores:
+        metrics |= {f"outside_cores.{key}": x for key, x in _shares(errors, far).items()}
+    return metrics
+
+
+def _difference(wind, true) -> np.ndarray:
+    return np.stack([np.asarray(wind[n], float) - np.asarray(true[n], float) for n in ("v", "w")])
+
+
+def _shares(errors: Mapping[str, np.ndarray], chosen: np.ndarray) -> dict[str, float]:
+    if not chosen.any():
+        return {}
+    square = {cause: (e[:, chosen] ** 2).mean(1) for cause, e in errors.items()}
+    full = square.pop("")
+    metrics = {"vectors": int(chosen.sum())}
+    metrics |= {f"rmse_{name}": float(value**0.5) for name, value in zip("vw", full)}
+    for cause, rest in square.items():
+        metrics |= {f"{cause}.rmse_{name}": float(value**0.5) for name, value in zip("vw", rest)}
+        if (full > 0).all():
+            parts = 1 - rest / full
+            metrics |= {f"{cause}.share_{name}": float(x) for name, x in zip("vw", parts)}
+            metrics[f"{cause}.share"] = float(1 - rest.sum() / full.sum())
+    return metrics

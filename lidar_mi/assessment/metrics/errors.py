@@ -1,0 +1,120 @@
+"""Errors of retrieved winds against the truth."""
+
+import numpy as np
+import xarray as xr
+from scipy.interpolate import RectBivariateSpline
+
+from lidar_mi.assessment.metrics.cores import Core, outside_cores
+from lidar_mi.assessment.report.digits import percent
+
+
+def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
+    """The true wind where and when each retrieved vector belongs, NaN where it has no place.
+
+    Parameters
+    ----------
+    wind : xr.Dataset
+        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`: coordinates y_vector, z_vector.
+    truth : xr.Dataset
+        v, w (m s^-1) on (z, y); its flow is taken to stand still over dt. Cubic interpolation.
+    """
+    axes = {name: truth[name].values for name in ("z", "y")}
+    places = {name: wind[f"{name}_vector"].values for name in axes}
+    known = np.ones(wind["v"].shape, bool)
+    for name, axis in axes.items():
+        known &= (places[name] >= axis[0]) & (places[name] <= axis[-1])
+    found = {}
+    for name in ("v", "w"):
+        spline = RectBivariateSpline(*axes.values(), truth[name].transpose("z", "y").values, s=0)
+        values = np.full(known.shape, np.nan)
+        values[known] = spline.ev(places["z"][known], places["y"][known])
+        found[name] = (wind["v"].dims, values, wind[name].attrs)
+    return xr.Dataset(found)
+
+
+def direction(v, w):
+    """Direction of the cross-flow wind, radians from +y towards +z."""
+    return np.arctan2(w, v)
+
+
+def deviations(wind: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
+    """Differences wind - reference of v, w, speed (m s^-1) and direction (rad, within +-pi)."""
+    turned = direction(wind["v"], wind["w"]) - direction(reference["v"], reference["w"])
+    return xr.Dataset(
+        {
+            "v": wind["v"] - reference["v"],
+            "w": wind["w"] - reference["w"],
+            "speed": np.hypot(wind["v"], wind["w"]) - np.hypot(reference["v"], reference["w"]),
+            "direction": (turned + np.pi) % (2 * np.pi) - np.pi,
+        }
+    )
+
+
+def wind_metrics(wind: xr.Dataset, truth: xr.Dataset, cores: list[Core]) -> dict[str, float]:
+    """Errors of one retrieval, as flat keys.
+
+    ``rmse_*``, ``bias_*``, ``p50_*`` and ``p90_*`` (percentiles of the absolute error) of v, w,
+    speed (m s^-1) and direction (rad, weighted by nothing) over valid vectors (flag 0);
+    ``outside_cores.*`` the same beyond two core radii, ``all.*`` over every vector that has a
+    displacement, flagged or not; ``valid_fraction`` and ``found_fraction`` of all vectors.
+    """
+    error = deviations(wind, truth)
+    known = np.isfinite(error["v"].values) & np.isfinite(error["w"].values)
+    valid = known & (wind["flag"].values == 0)
+    far = outside_cores(wind["y_vector"].values, wind["z_vector"].values, cores)
+    metrics = {
+        "valid_fraction": float(valid.mean()),
+        "found_fraction": float(known.mean()),
+        **_statistics(error, valid),
+    }
+    if cores:
+        metrics |= {f"outside_cores.{k}": x for k, x in _statistics(error, valid & far).items()}
+    metrics |= {f"all.{k}": x for k, x in _statistics(error, known).items()}
+    return metrics
+
+
+def _statistics(error: xr.Dataset, chosen: np.ndarray) -> dict[str, float]:
+    if not chosen.any():
+        return {}
+    statistics = {}
+    for name in ("v", "w", "speed", "direction"):
+        values = error[name].values[chosen]
+        statistics[f"rmse_{name}"] = float(np.sqrt(np.mean(values**2)))
+        statistics[f"bias_{name}"] = float(np.mean(values))
+        for rank in (50, 90):
+            statistics[f"p{rank}_{name}"] = float(np.percentile(np.abs(values), rank))
+    return statistics
+
+
+def error_by_quality(
+    wind: xr.Dataset, truth: xr.Dataset, quality: str, bins: int = 12
+) -> xr.Dataset:
+    """How the error depends on what a window holds: rms error of v and w in bins of a quality.
+
+    All vectors with a displacement, flagged or not, in ``bins`` groups of equal number. Returns
+    ``rmse`` (m s^-1, both components together), ``valid`` (share of unflagged vectors) and the
+    median of ``quality`` ("texture", relative slope per pixel, or "isotropy") of each group, dim
+    ``group``.
+    """
+    error = deviations(wind, truth)
+    square = (error["v"] ** 2 + error["w"] ** 2).values / 2
+    known = np.isfinite(square) & np.isfinite(wind[quality].values)
+    order = np.argsort(wind[quality].values[known])
+    values = wind[quality].values[known][order]
+    groups = [g for g in np.array_split(np.arange(len(order)), bins) if len(g)]
+    square, flag = square[known][order], wind["flag"].values[known][order]
+    return xr.Dataset(
+        {
+            "rmse": ("group", [float(np.sqrt(square[g].mean())) for g in groups]),
+            "valid": ("group", [float((flag[g] == 0).mean()) for g in groups]),
+            quality: ("group", [float(np.median(values[g])) for g in groups]),
+        }
+    )
+
+
+def commonest_flag(flag: xr.DataArray) -> str:
+    """Which flag most vectors have, in words; ``flag`` has its CF attributes."""
+    meanings, masks = flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"])
+    shares = {text: float(((flag.values & mask) != 0).mean()) for text, mask in zip(meanings, masks)}
+    worst = max(shares, key=shares.get)
+    return f"{percent(shares[worst])} have the flag {worst}"

@@ -1,0 +1,230 @@
+"""Whether a sensor does what flight control asks of it: requirement tables, judged row by row."""
+
+import difflib
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import yaml
+
+from lidar_mi.errors import InputError
+from lidar_mi.units import to_si
+
+PAPER = files("lidar_mi.assessment.metrics") / "requirements.yaml"
+"""The paper's table 1."""
+
+QUANTITIES: Mapping[str, tuple[str, str]] = {
+    "range": ("range", "m"),
+    "points_per_slab": ("points per slab", ""),
+    "slabs_per_second": ("slabs per second", "Hz"),
+    "slab_depth": ("slab depth", "m"),
+    "error_v_los": ("error of line-of-sight velocity", "m/s"),
+    "error_u": ("error of u", "m/s"),
+    "error_v": ("error of v", "m/s"),
+    "error_w": ("error of w", "m/s"),
+}
+"""Rows that a requirement table may have: name, what it is and its SI unit."""
+
+_LIMITS = {"min": "minimum", "max": "maximum", "max_of_range": "share"}
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One row of a table, SI: from ``minimum`` to ``maximum``, and to ``share`` of the range."""
+
+    quantity: str
+    minimum: float = 0.0
+    maximum: float = math.inf
+    share: float = math.inf
+
+
+@dataclass(frozen=True)
+class RequirementTable:
+    """What one application asks for in one phase of flight."""
+
+    application: str
+    title: str
+    phase: str
+    rows: tuple[Requirement, ...]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One row, judged.
+
+    Attributes
+    ----------
+    quantity : str
+        A key of `QUANTITIES`.
+    minimum, maximum : float
+        What is required at the measured range; NaN if that takes a range and there is none.
+    measured : float
+        NaN: not known.
+    passed : bool or None
+        None: cannot be told, as something is not known.
+    margin : float
+        Distance from the nearer limit as a share of it: 0.2 is 20 % better than required, -0.2 20 %
+        worse; NaN if it cannot be told.
+    """
+
+    quantity: str
+    minimum: float
+    maximum: float
+    measured: float
+    passed: bool | None
+    margin: float
+
+
+def read_requirements(path: str | Path = PAPER) -> dict[tuple[str, str], RequirementTable]:
+    """Requirement tables by (application, phase of flight), from a YAML file like the shipped one.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, a row or a limit that is not known, a value with a wrong unit.
+    """
+    try:
+        data = yaml.safe_load(Path(str(path)).read_text())
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; expected a requirement table") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        reason = " ".join(str(getattr(error, "problem", None) or error).split())
+        raise InputError(f"{path}: not valid YAML ({reason})") from None
+    tables = {}
+    for application, phases in _section(data, str(path)).items():
+        place = f"{path}: {application}"
+        phases = dict(_section(phases, place))
+        title = phases.pop("title", application)
+        for phase, rows in phases.items():
+            inside = f"{place}.{phase}"
+            found = tuple(_row(inside, *row) for row in _section(rows, inside).items())
+            tables[application, phase] = RequirementTable(application, str(title), phase, found)
+    return tables
+
+
+def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list[Finding]:
+    """A sensor against a table, row by row.
+
+    Parameters
+    ----------
+    table : RequirementTable
+    measured : mapping
+        What the sensor does, SI, by names of `QUANTITIES`; None, NaN or left out: not known. Names
+        without a row in the table are not judged.
+
+    Raises
+    ------
+    InputError
+        An unknown name, or a value that no sensor has.
+    """
+    for name, value in measured.items():
+        _known(name, "measured")
+        if value is not None and (value < 0 or math.isinf(value)):
+            unit = QUANTITIES[name][1]
+            raise InputError(f"measured.{name}: {value} {unit} is not allowed; expected >= 0 {unit}")
+    values = {name: math.nan if value is None else float(value) for name, value in measured.items()}
+    distance = values.get("range", math.nan)
+    return [_judged(row, values.get(row.quantity, math.nan), distance) for row in table.rows]
+
+
+def fulfilled(findings: list[Finding]) -> bool | None:
+    """Whether all rows pass; None if none fails but some cannot be told."""
+    results = {finding.passed for finding in findings}
+    if False in results:
+        return False
+    return None if None in results else True
+
+
+def look_ahead(distance: float, speed: float) -> float:
+    """Time until the aircraft is where it has measured, s: range over air speed; inf at rest.
+
+    Raises
+    ------
+    InputError
+        A negative distance or speed.
+    """
+    for name, value, unit in (("range", distance, "m"), ("speed", speed, "m/s")):
+        if not value >= 0:
+            raise InputError(f"{name}: {value} {unit} is not allowed; expected >= 0 {unit}")
+    return distance / speed if speed else math.inf
+
+
+def as_rows(findings: list[Finding]) -> list[tuple[str, str, str, str, str]]:
+    """Findings as text: property, required, measured, margin, verdict."""
+    rows = []
+    for finding in findings:
+        name, unit = QUANTITIES[finding.quantity]
+        verdict = {True: "pass", False: "fail", None: "not known"}[finding.passed]
+        margin = "" if math.isnan(finding.margin) else f"{100 * finding.margin:+.0f} %"
+        # none has no sign
+        margin = "0 %" if margin in ("+0 %", "-0 %") else margin
+        measured = _shown(finding.measured, unit) if not math.isnan(finding.measured) else ""
+        rows.append((name, _required(finding, unit), measured, margin, verdict))
+    return rows
+
+
+def _section(data, place: str) -> Mapping:
+    if not isinstance(data, dict) or not data:
+        raise InputError(f"{place}: {data!r} is not allowed; expected a section with keys")
+    return data
+
+
+def _known(name: str, place: str) -> None:
+    if name in QUANTITIES:
+        return
+    close = difflib.get_close_matches(str(name), QUANTITIES, 1)
+    hint = f"; did you mean {close[0]}?" if close else ""
+    raise InputError(f"{place}.{name}: unknown row{hint} (allowed: {', '.join(QUANTITIES)})")
+
+
+def _row(place: str, quantity: str, limits) -> Requirement:
+    _known(quantity, place)
+    unit = QUANTITIES[quantity][1]
+    place = f"{place}.{quantity}"
+    found = {}
+    for limit, value in _section(limits, place).items():
+        if limit not in _LIMITS:
+            raise InputError(f"{place}.{limit}: unknown limit (allowed: {', '.join(_LIMITS)})")
+        try:
+            number = to_si(value, "" if limit == "max_of_range" else unit, f"10 {unit}".strip())
+        except ValueError as error:
+            raise InputError(f"{place}.{limit}: {error}") from None
+        if not (number > 0 and math.isfinite(number)):
+            raise InputError(f"{place}.{limit}: {value!r} is not allowed; expected more than 0")
+        found[_LIMITS[limit]] = number
+    row = Requirement(quantity, **found)
+    if row.minimum > row.maximum:
+        raise InputError(f"{place}: min above max is not allowed")
+    if unit != "m" and math.isfinite(row.share):
+        raise InputError(f"{place}.max_of_range: not allowed; only lengths compare with a range")
+    return row
+
+
+def _judged(row: Requirement, measured: float, distance: float) -> Finding:
+    of_range = row.share * distance if math.isfinite(row.share) else math.inf
+    # min() would lose a NaN
+    maximum = of_range if math.isnan(of_range) else min(row.maximum, of_range)
+    margins = []
+    if row.minimum > 0:
+        margins.append(measured / row.minimum - 1)
+    if not math.isinf(maximum):
+        margins.append(1 - measured / maximum)
+    unknown = math.isnan(measured) or math.isnan(maximum)
+    margin = math.nan if unknown else min(margins, default=math.inf)
+    passed = None if unknown else row.minimum <= measured <= maximum
+    return Finding(row.quantity, row.minimum, maximum, measured, passed, margin)
+
+
+def _required(finding: Finding, unit: str) -> str:
+    if math.isnan(finding.maximum):
+        return "share of the range"
+    low, high = _shown(finding.minimum, unit), _shown(finding.maximum, unit)
+    if math.isinf(finding.maximum):
+        return f"at least {low}"
+    return f"{finding.minimum:.4g} to {high}" if finding.minimum > 0 else f"at most {high}"
+
+
+def _shown(value: float, unit: str) -> str:
+    return f"{value:.3g} {unit}".strip() if value < 1000 else f"{value:.0f} {unit}".strip()

@@ -1,0 +1,64 @@
+"""Vectors as data for the report's interactive map."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.metrics.cores import Core
+
+# A map about as dense as fingers and screens can tell apart.
+_COLUMNS = 55
+
+
+def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core]) -> dict:
+    """Every n-th vector with its truth, standard error and flag, ready for JSON.
+
+    Parameters
+    ----------
+    wind : xr.Dataset, dims (z, y)
+        ``NAME`` and ``NAME_true`` of every component, m/s, v and w among them; ``NAME_stderr`` where
+        there are any; ``flag`` with its CF attributes. Vectors stand at y_vector, z_vector or, where
+        these are missing, at the nodes.
+    components : sequence of str
+    cores : sequence of Core
+        True vortices.
+
+    Returns
+    -------
+    dict
+        Lists of equal length for all vectors, row by row from below; numbers that are not are None.
+    """
+    every = max(1, round(wind.sizes["y"] / _COLUMNS))
+    thin = wind.isel(z=slice(every // 2, None, every), y=slice(every // 2, None, every))
+    thin = thin.transpose("z", "y", ...)
+    shape = thin.sizes["z"], thin.sizes["y"]
+
+    def numbers(name: str) -> list[float | None]:
+        values = np.broadcast_to(thin[name].transpose("z", "y", ..., missing_dims="ignore"), shape)
+        return [round(float(v), 3) if np.isfinite(v) else None for v in values.ravel()]
+
+    place = {}
+    for axis in ("y", "z"):
+        node = np.meshgrid(thin["y"], thin["z"])[0 if axis == "y" else 1]
+        at = thin[f"{axis}_vector"].values if f"{axis}_vector" in thin.variables else node
+        place[axis] = [round(float(p), 2) for p in np.where(np.isfinite(at), at, node).ravel()]
+    flag = thin["flag"].attrs
+    meanings = [text.replace("_", " ") for text in flag["flag_meanings"].split()]
+    step = every * float(wind["y"][1] - wind["y"][0]) if wind.sizes["y"] > 1 else 1.0
+    return {
+        **place,
+        "step": step,
+        "components": [
+            {
+                "name": name,
+                "found": numbers(name),
+                "true": numbers(f"{name}_true"),
+                "stderr": numbers(f"{name}_stderr") if f"{name}_stderr" in thin else None,
+            }
+            for name in components
+        ],
+        "flag": [int(bits) for bits in thin["flag"].values.ravel()],
+        "flags": {str(int(mask)): text for mask, text in zip(np.ravel(flag["flag_masks"]), meanings)},
+        "cores": [[round(core.y, 2), round(core.z, 2)] for core in cores],
+    }

@@ -1,0 +1,1 @@
+"""The only room that sees all: what an experiment is, and running it."""

@@ -1,0 +1,113 @@
+"""What an experiment will do, before it does it: checked as a run would, and told in numbers."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lidar_mi.experiment.stages import backscatter as backscatter_chain, sensor as sensor_chain
+from lidar_mi.experiment import run as experiment
+from lidar_mi.assessment.metrics.requirements import look_ahead
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.info import Section
+from lidar_mi.instrument.doppler import photons
+from lidar_mi.experiment.run_folder import Notice
+from lidar_mi.experiment.truth import make_truth
+
+
+def sections(
+    asked: Experiment, beside: str | Path = ".", notice: Notice = lambda text, share: None
+) -> Iterator[Section]:
+    """Titled tables of what an experiment looks at, and with what; nothing is written.
+
+    Parameters
+    ----------
+    asked : Experiment
+    beside : path
+        Folder in which files named by the experiment are looked for first.
+    notice : callable
+        Told what is running.
+
+    Raises
+    ------
+    InputError
+        Whatever a run would refuse before it starts.
+    """
+    experiment.prepare(asked, beside, notice)
+    if asked.wake:
+        yield from _backscatter(asked, beside)
+    if asked.doppler:
+        yield _doppler(asked)
+    if asked.sensor:
+        yield _sensor(asked, beside)
+
+
+def _backscatter(asked: Experiment, beside) -> Iterator[Section]:
+    truth = make_truth(asked, beside)
+    wind, (air, _) = truth.wind, truth.extinction
+    rows = [(axis, _span(wind[axis].values, "m")) for axis in ("y", "z")]
+    rows += [(name, _span(wind[name].values, "m/s")) for name in ("u", "v", "w") if name in wind]
+    rows.append(("extinction", _span(1e3 * air.values, "1/km")))
+    rows.append(("texture, rms", f"{asked.wake.texture.rms:.0%}"))
+    title = asked.wake.file or ("vortex_pair" if asked.wake.vortex_pair else "turbine")
+    yield f"{asked.name}: the air in the gates ({title}, about the scan's axis)", rows
+
+    scan, lidar, platform = asked.scan, asked.lidar, asked.platform
+    plan = backscatter_chain.scan_plans(asked, truth)[0]
+    pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
+    rows = [
+        ("wavelength", f"{1e9 * lidar.wavelength:g} nm"),
+        ("beams", f"{plan.y.size} x {plan.z.size}, {pixel:.3g} m apart"),
+        ("beam's 1/e^2 radius there", f"{float(lidar.radius_at(plan.centre)):.3g} m"),
+        ("gates", f"{scan.gate_count}, from {plan.gate_start:g} to {plan.gate_stop:g} m"),
+        ("warning time", _warning(plan.gate_start, platform.speed)),
+        ("photons", f"{asked.render.samples_per_beam} a beam, orders 1 to {asked.render.max_order}"),
+        ("time between the pictures", f"{platform.dt:g} s"),
+    ]
+    if not asked.volume:
+        rows += _displacements(asked, wind, pixel)
+    yield "backscatter lidar", rows
+
+
+def _displacements(asked: Experiment, wind, pixel: float) -> list[tuple[str, str]]:
+    """The fastest wind beside the fastest that windows of this size can follow, per axis."""
+    settings = asked.retrieval
+    reach = ((settings.search - settings.template) // 2 - 0.5) * pixel / asked.platform.dt
+    fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
+    rows = [("methods", ", ".join(settings.methods))]
+    if {"cc", "ws"} & set(settings.methods):
+        verdict = "" if fastest <= reach else "; larger retrieval.search or smaller platform.dt"
+        rows.append(("fastest wind windows follow", f"{reach:.3g} m/s, here {fastest:.3g}{verdict}"))
+    return rows
+
+
+def _doppler(asked: Experiment) -> Section:
+    lidar = asked.doppler.lidar
+    return "Doppler lidar", [
+        ("wavelength", f"{1e9 * lidar.wavelength:g} nm"),
+        ("range bin", f"{lidar.range_bin:g} m about {lidar.range:g} m"),
+        ("photons of a pulse", f"{photons(lidar):.3g}"),
+        ("methods", ", ".join(asked.doppler.retrieval.methods)),
+    ]
+
+
+def _sensor(asked: Experiment, beside) -> Section:
+    sensor, tables = asked.sensor, sensor_chain.requirement_tables(asked, beside)
+    columns, rows = sensor.directions.columns, sensor.directions.rows
+    count = columns * rows
+    # a run tells the rest
+    flat = "; all in one plane: no wind from both" if min(columns, rows) == 1 else ""
+    return "both as one sensor", [
+        ("lines of sight", f"{count}, {sensor.pulses} pulses each{flat}"),
+        ("pulses a second", f"{count * sensor.pulses * sensor.slabs_per_second:g}"),
+        ("v and w from", sensor.method),
+        ("held against", ", ".join(" ".join(key) for key in tables) or "no requirements"),
+    ]
+
+
+def _warning(distance: float, speed: float) -> str:
+    return f"{look_ahead(distance, speed):.3g} s at {speed:g} m/s" if speed else "at rest"
+
+
+def _span(values: np.ndarray, unit: str) -> str:
+    return f"{values.min():.4g} to {values.max():.4g} {unit}"

@@ -1,0 +1,204 @@
+"""What a file, a folder of results or a named scatterer holds, as titled tables of text."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lidar_mi.atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphere
+from lidar_mi.atmosphere.particles import AEROSOLS, Notice, aerosol_table
+from lidar_mi.atmosphere.scattering import describe, read_table
+from lidar_mi.atmosphere.wake import open_netcdf
+from lidar_mi.errors import InputError
+from lidar_mi.io.vortex_file import read_vortices
+
+MOLECULES = "molecules"
+
+Section = tuple[str, list[tuple[str, ...]]]
+"""A title and rows of equal length."""
+
+
+def sections(
+    what: str, wavelength: float | None = None, altitude: float | None = None,
+    notice: Notice = lambda text, share: None,
+) -> Iterator[Section]:  # fmt: skip
+    """Describe a file, a folder of a run or a study, a named aerosol or the molecules of air.
+
+    Parameters
+    ----------
+    what : str
+        Path of an EXR or NetCDF file, a scattering table, a run folder or a study's; or a name.
+    wavelength : float, optional
+        m, of a named scatterer; default 532 nm.
+    altitude : float, optional
+        m in the standard atmosphere, of molecules; default 0.
+
+    Raises
+    ------
+    InputError
+        Nothing of this name, not readable, or an option that does not apply to it.
+    """
+    path = Path(what)
+    named = not path.exists() and (what in AEROSOLS or what == MOLECULES)
+    if wavelength is not None and not named:
+        raise InputError(f"--wavelength: not allowed with {what}; expected a named scatterer")
+    if altitude is not None and (not named or what != MOLECULES):
+        raise InputError(f"--altitude: not allowed with {what}; expected {MOLECULES}")
+    kinds = {
+        ".exr": _picture, ".nc": _netcdf, ".nc4": _netcdf, ".cdf": _netcdf, ".txt": _table_file,
+        ".json": _vortices,
+    }  # fmt: skip
+    if named:
+        wavelength = wavelength or 532e-9
+        if what == MOLECULES:
+            yield from _molecules(wavelength, altitude or 0.0)
+        else:
+            yield _scatterer(what, aerosol_table(what, wavelength, notice))
+    elif not path.exists():
+        raise InputError(
+            f"{what}: no such file; expected .exr, .nc, .txt, .json, a run folder, {MOLECULES} or one "
+            f"of the aerosols {', '.join(AEROSOLS)}"
+        )
+    elif path.is_dir():
+        yield from _folder(path)
+    elif path.suffix in kinds:
+        yield from kinds[path.suffix](path)
+    elif path.suffix in (".yaml", ".yml"):
+        raise InputError(f"{path}: an experiment, not a result; expected lidar-mi check {path}")
+    else:
+        raise InputError(
+            f"{path}: unknown kind of file; expected .exr, .nc, .txt (scattering table), "
+            ".json (vortex pairs) or a run folder"
+        )
+
+
+def _vortices(path: Path) -> Iterator[Section]:
+    for name, fit in read_vortices(path).items():
+        rows = [
+            (quantity.long_name, f"{quantity.value:.4g} \u00b1 {quantity.stderr:.2g}", quantity.units)
+            for quantity in fit.quantities.values()
+        ]
+        yield f"{path}: vortex pair, {name}, {fit.profile.replace('_', ' ')}", rows
+
+
+def _scatterer(title: str, table) -> Section:
+    return title, list(describe(table).items())
+
+
+def _table_file(path: Path) -> Iterator[Section]:
+    yield _scatterer(str(path), read_table(path))
+
+
+def _molecules(wavelength: float, altitude: float) -> Iterator[Section]:
+    """The whole band of Rayleigh scattering beside the line that a narrow receiver sees."""
+    pressure, temperature = standard_atmosphere(altitude)
+    bands = [molecular_scattering(wavelength, pressure, temperature, band) for band in BANDS]
+    rows = [("", *(f"{band} {kind}" for band, kind in zip(BANDS, ("line", "band"))))]
+    for label, name, unit in (
+        ("extinction coefficient", "extinction", "m^-1"),
+        ("single-scattering albedo", "albedo", ""),
+        ("backscatter coefficient", "backscatter", "m^-1 sr^-1"),
+        ("lidar ratio", "lidar_ratio", "sr"),
+        ("linear depolarisation ratio at 180 degrees", "depolarization_ratio", ""),
+        ("depolarisation of natural light at 90 degrees", "depolarization", ""),
+        ("extinction cross-section", "cross_section", "m^2 per molecule"),
+        ("King factor", "king_factor", ""),
+        ("number density", "number_density", "m^-3"),
+    ):
+        rows.append((label, *(f"{getattr(band, name):.5g} {unit}".strip() for band in bands)))
+    title = (
+        f"dry air at {wavelength * 1e9:g} nm, {altitude:g} m: {pressure / 100:.5g} hPa, "
+        f"{temperature:.5g} K"
+    )
+    yield title, rows
+
+
+def _picture(path: Path) -> Iterator[Section]:
+    from lidar_mi.io import exr
+
+    header, layers = exr.read_layers(path)
+    rows = []
+    for name, pixels in sorted(layers.items()):
+        span = f"{np.nanmin(pixels):.4g} ... {np.nanmax(pixels):.4g}"
+        rows.append((name, f"{pixels.shape[1]} x {pixels.shape[0]}", str(pixels.dtype), span))
+    yield f"{path}: {len(layers)} layers", rows
+    yield "header", [(key, _short(value)) for key, value in sorted(header.items())]
+
+
+def _netcdf(path: Path) -> Iterator[Section]:
+    with open_netcdf(path) as data:
+        rows = []
+        for name, variable in data.variables.items():
+            shape = " x ".join(f"{d} {n}" for d, n in variable.sizes.items())
+            span = ""
+            if variable.dtype.kind in "fiu" and variable.size:
+                span = f"{float(variable.min()):.4g} ... {float(variable.max()):.4g}"
+            rows.append((str(name), shape, span, str(variable.attrs.get("units", ""))))
+        yield str(path), rows
+        yield "attributes", [(key, _short(value)) for key, value in data.attrs.items()]
+
+
+def _folder(folder: Path) -> Iterator[Section]:
+    from lidar_mi.experiment.study import RECORD
+
+    yield from _study(folder) if (folder / RECORD).is_file() else _run_folder(folder)
+
+
+def _study(folder: Path) -> Iterator[Section]:
+    """What differs between a study's variants, and what came of it, one column a variant."""
+    from lidar_mi.assessment.report.comparison import differences, flat, results, setting
+    from lidar_mi.experiment.study import read_study
+
+    name, records, metrics = read_study(folder)
+    rows = [("variant", *(key if record else f"{key} (not run)" for key, record in records.items()))]
+    settings = {key: flat(record["experiment"]) if record else {} for key, record in records.items()}
+    done = {key: one for key, one in settings.items() if one}
+    for key, values in differences(done).items():
+        shown = dict(zip(done, map(setting, values)))
+        rows.append((key, *(shown.get(variant, "-") for variant in records)))
+    yield f"{folder}: study {name}", rows
+    found = [(f"{label} / {unit}" if unit else label, *values) for label, unit, values in results(metrics)]
+    if found:
+        yield "what comes of it", [("", *metrics), *found]
+    yield _files(folder, beside=records)
+
+
+def _run_folder(folder: Path) -> Iterator[Section]:
+    from lidar_mi.experiment.run_folder import read_record
+
+    record = read_record(folder)
+    experiment = record["experiment"]
+    yield f"{folder}: experiment {experiment.get('name')}", [
+        (key, _short(value)) for key, value in _asked_first(experiment)
+    ]
+    yield "versions", [(name, str(number)) for name, number in record["versions"].items()]
+    yield _files(folder)
+
+
+def _files(folder: Path, beside: Iterable[str] = ()) -> Section:
+    """Files in a folder, without those in some of its folders."""
+    paths = {path.relative_to(folder): path for path in sorted(folder.rglob("*")) if path.is_file()}
+    return "files", [
+        (str(name), f"{path.stat().st_size / 1e6:.2f} MB")
+        for name, path in paths.items() if name.parts[0] not in beside
+    ]  # fmt: skip
+
+
+def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
+    """The keys of an experiment that tell one from another at a glance, as far as it has them."""
+    for key in (
+        "seed", "wake.file", "wake.time", "wake.second", "wake.texture.rms", "platform.speed",
+        "platform.dt", "scan.range", "scan.thickness", "scan.gates", "scan.gate_count",
+        "lidar.wavelength", "scattering.phase", "scattering.aerosol", "render.variant",
+        "render.samples_per_beam", "render.max_order", "retrieval.methods",
+    ):  # fmt: skip
+        value = experiment
+        for part in key.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        if value is not None:
+            yield key, ", ".join(value) if isinstance(value, list) else value
+
+
+def _short(value) -> str:
+    text = " ".join(str(value).split())
+    return text if len(text) <= 70 else f"{text[:67]}..."

@@ -1,0 +1,83 @@
+"""From the fringe-imaging instrument and the air to what ring analysis needs to know of them.
+
+The only place that sees both the instrument's room and the retrieval's.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from lidar_mi.atmosphere.line import Line, backscatter_line
+from lidar_mi.atmosphere.molecules import standard_atmosphere
+from lidar_mi.errors import InputError
+from lidar_mi.instrument.doppler import DopplerLidar
+from lidar_mi.instrument.etalon import Etalon, harmonics
+from lidar_mi.instrument.fringe_camera import CCD, FringeCamera
+from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
+
+# Around the expected temperature: five nodes hold harmonics of air to 1e-4 of the ring contrast.
+TEMPERATURE_NODES = (0.75, 0.875, 1.0, 1.125, 1.25)
+
+
+def ring_model(
+    etalon: Etalon,
+    camera: FringeCamera,
+    line: Line | Callable[[float], Line],
+    temperatures: Sequence[float] = (),
+) -> RingModel:
+    """The rings of a line, as the retrieval takes them.
+
+    Parameters
+    ----------
+    line : Line, or function of the temperature (K) that returns one
+        Of air at rest, or of the laser.
+    temperatures : sequence of float
+        K, ascending; with them ``line`` is a function and the temperature a parameter of the fit.
+
+    Raises
+    ------
+    InputError
+        A mirror that does not transmit, lines of different wavelengths.
+    """
+    if callable(line) != (len(temperatures) > 0):
+        raise InputError("line: expected a Line, or a function of the temperature and temperatures")
+    lines = [line(float(t)) for t in temperatures] if callable(line) else [line]
+    wavelength = lines[0].wavelength
+    if any(other.wavelength != wavelength for other in lines):
+        raise InputError("line: expected one wavelength at all temperatures")
+    rows = [harmonics(etalon, wavelength, one) for one in lines]
+    table = np.zeros((len(rows), max(map(len, rows))), complex)
+    for row, values in zip(table, rows):
+        row[: len(values)] = values
+    diagonal2 = (camera.width**2 + camera.height**2) / 4 * camera.pixel**2
+    return RingModel(
+        shape=(camera.height, camera.width),
+        centre=camera.centre_pixel,
+        pixel=camera.pixel,
+        focal_length=camera.focal_length,
+        wavelength=wavelength,
+        order_at_centre=etalon.order_at_centre(wavelength),
+        harmonics=table,
+        temperatures=temperatures,
+        falloff=2 * diagonal2 / camera.illumination_radius**2,
+    )
+
+
+def air_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> RingModel:
+    """Rings of the backscatter at the lidar's altitude, within a quarter of the temperature there."""
+    pressure, temperature = standard_atmosphere(lidar.altitude)
+
+    def line(kelvin: float) -> Line:
+        return backscatter_line(
+            lidar.wavelength, kelvin, pressure, lidar.laser_width, lidar.aerosol_share,
+            lidar.line_shape,
+        )  # fmt: skip
+
+    return ring_model(etalon, camera, line, temperature * np.array(TEMPERATURE_NODES))
+
+
+def pixel_noise(ccd: CCD, modes: float = math.inf) -> PixelNoise:
+    """The CCD's noise; a digitiser's step adds its twelfth to the variance."""
+    step = 0.0 if ccd.bits is None else ccd.gain
+    return PixelNoise(math.hypot(ccd.read_noise, step / math.sqrt(12)), modes)

@@ -1,0 +1,158 @@
+"""What limits the cross-flow wind of an experiment: found again without each cause of error."""
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.report.error_budget import budget_chapter, draw_all
+from lidar_mi.assessment.metrics.cores import Core, find_cores
+from lidar_mi.assessment.metrics.error_budget import (
+    error_budget,
+    moved_as_one,
+    picture_unit,
+    pictures_without,
+)
+from lidar_mi.assessment.report.page import Chapter
+from lidar_mi.atmosphere.advection import advect
+from lidar_mi.experiment.stages.backscatter import (
+    NOISY,
+    known_blur,
+    rendered_pairs,
+    scan_plans,
+    window_settings,
+)
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.io import exr
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.experiment.run_folder import IMAGES, Log
+from lidar_mi.experiment.truth import Truth, blur_by_beam, make_truth
+
+# Pictures of air as it is: a method that undoes the beam's blur has none to undo there.
+_SHARP = ("perfect", "beam_blur")
+
+
+def prepare(
+    experiment: Experiment, beside: str | Path
+) -> Callable[[Path, Log], tuple[dict[str, float], Chapter]]:
+    """What it returns reads the pictures that the backscatter chain leaves in the folder."""
+    truth = make_truth(experiment, beside)
+    return lambda folder, log: _run(experiment, truth, folder, log)
+
+
+def _run(experiment, truth, folder, log) -> tuple[dict[str, float], Chapter]:
+    start = time.perf_counter()
+    log("finding what limits the wind")
+    scans = [exr.read_scan(folder / name) for name in IMAGES]
+    with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
+        known = winds.load()
+    methods = experiment.retrieval.methods
+    metrics = {
+        f"error_budget.{method}.{key}": value
+        for method, budget in budgets(experiment, truth, scans, log.bar, known).items()
+        for key, value in budget.items()
+    }
+    drawn = draw_all(folder / "figures", metrics, methods, log)
+    metrics["timing.error_budget_s"] = round(time.perf_counter() - start, 3)
+    return metrics, budget_chapter(metrics, methods, drawn)
+
+
+def budgets(
+    experiment: Experiment,
+    truth: Truth,
+    scans,
+    progress: Callable[[str, float], None] = lambda text, share: None,
+    known: xr.Dataset | None = None,
+    cores: Sequence[Core] | None = None,
+    flagged: bool = False,
+) -> dict[str, dict[str, float]]:
+    """`error_budget` of every method of an experiment, by method.
+
+    Parameters
+    ----------
+    scans : the two rendered scans
+    progress : callable, optional
+        Told what is done, and its share.
+    known : xr.Dataset, optional
+        Winds that need not be found again, from `lidar_mi.experiment.stages.backscatter.winds`.
+    cores, flagged : optional
+        See `error_budget`; cores left out: those of the true wind.
+    """
+    pictures, blurred = _pictures(experiment, truth, scans)
+    cores = find_cores(truth.wind) if cores is None else cores
+    methods = experiment.retrieval.methods
+    settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
+    blur = known_blur(experiment, scan_plans(experiment, truth)[0])
+    sources = {"seen": "backscatter", "perfect": "extinction"}
+    if experiment.detector:
+        sources |= {"seen": NOISY, "detector_noise": "backscatter"}
+    found = {}
+    for index, method in enumerate(methods):
+        progress(f"finding what limits {method}", index / len(methods))
+        winds = {}
+        for cause, (pair, noise) in pictures.items():
+            source = sources.get(cause)
+            if known is not None and source:
+                wind = known.sel(source=source, algorithm=method)
+                winds[cause] = wind.assign_attrs(method=method, **settings)
+            else:
+                undone = 0.0 if cause in _SHARP else blur
+                winds[cause] = retrieve_wind(
+                    *pair, method=method, noise=noise, blur=undone, **settings
+                )
+        seen, perfect = winds.pop("seen"), winds.pop("perfect")
+        stiff = moved_as_one(
+            seen, pictures["seen"][0], blurred, truth.wind,
+            lambda pair, stride, method=method: retrieve_wind(
+                *pair, method=method, **settings | {"stride": stride}
+            ),
+        )  # fmt: skip
+        winds |= {} if stiff is None else {"shear": stiff}
+        found[method] = error_budget(seen, winds, truth.wind, cores, perfect, flagged)
+    return found
+
+
+def _pictures(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataArray]]:
+    """Pictures and their noise: as they are seen, without each cause, and of the air as it is.
+
+    Beside them the air as beams see it.
+    """
+    rendered = rendered_pairs(experiment, scans)
+    pair, noise = rendered["backscatter"]
+    seen, level = rendered.get(NOISY, (pair, noise))
+    gain = offset = None
+
+    def as_seen(images, blurred=True):
+        """Extinction as the lidar would see it without noise, on the pictures' grid."""
+        depth = experiment.scan.thickness / experiment.scan.gate_count
+        if blurred:
+            images = [
+                blur_by_beam(image, experiment.lidar, plan.centre, depth)
+                for image, plan in zip(images, scan_plans(experiment, truth))
+            ]
+        if experiment.scan.aim == "angles":
+            images = [image.interp(y=pair[0]["y"], z=pair[0]["z"]) for image in images]
+        return images if gain is None else [gain * image + offset for image in images]
+
+    air = [truth.image(k) for k in (0, 1)]
+    noises = [xr.zeros_like(image) + noise for image in pair]
+    gain, offset = picture_unit(as_seen(air), pair, noises)
+    carried = None
+    if truth.extinction[0].sizes["x"] > 1 or experiment.wake.second != "advect":
+        moved = advect(air[0], truth.wind["v"], truth.wind["w"], experiment.platform.dt)
+        carried = as_seen([air[0], moved])
+    sharp = as_seen(air, blurred=False)
+    blurred = as_seen(air)
+    without = pictures_without(
+        seen, blurred, sharp, pair if experiment.detector else None, carried
+    )
+    # without the simulation's noise the detector's is left, if there is one
+    counts = np.sqrt(np.maximum(level**2 - noise**2, 0)) if experiment.detector else 0.0
+    levels = {"detector_noise": noise, "monte_carlo": counts}
+    return {
+        "seen": (seen, level),
+        "perfect": (sharp, 0.0),
+        **{cause: (images, levels.get(cause, level)) for cause, images in without.items()},
+    }, blurred

@@ -1,0 +1,301 @@
+"""The truth of an experiment: flow and extinction at both times, in the lidar's frame."""
+
+import math
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from scipy import constants, integrate, stats
+
+from lidar_mi.atmosphere.advection import advect
+from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
+from lidar_mi.atmosphere.texture import corrsin_obukhov
+from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
+from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
+from lidar_mi.atmosphere.wake import centre, check_nodes, read_wake, resample
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.errors import InputError
+
+Flows = tuple[xr.Dataset, xr.Dataset | None]
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the lidar looks at, in the lidar's frame at t1 (metres, m^-1, m s^-1).
+
+    ``extinction`` and ``smooth`` (without sub-grid texture) hold the fields at t1 and t2, dims
+    (x, y, z); ``wind`` has v, w on (z, y), averaged over the depth of the first gate.
+    """
+
+    extinction: tuple[xr.DataArray, xr.DataArray]
+    smooth: tuple[xr.DataArray, xr.DataArray]
+    wind: xr.Dataset
+
+    def image(self, which: int, smooth: bool = False) -> xr.DataArray:
+        """Extinction averaged over depth as an image (z, y): what an ideal lidar would see."""
+        field = (self.smooth if smooth else self.extinction)[which]
+        return _slab_mean(field, self.wind.attrs["gates"])
+
+
+def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | None = None) -> Truth:
+    """The flow and the extinction at both times, on the scan's grid, in the lidar's frame.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    beside : path
+        Folder in which the wake's file is looked for first.
+    flows : optional
+        From `read_flows` of an experiment that differs in extinction and texture alone.
+    """
+    first, second = flows or read_flows(experiment, beside)
+    mapping = experiment.wake.extinction
+    smooth1 = _extinction(first, mapping, first, second)
+    if second is None:
+        flow = first
+        smooth2 = _carried(smooth1, flow, experiment)
+    else:
+        flow = (first + second) / 2
+        smooth2 = _extinction(second, mapping, first, second)
+    texture = experiment.wake.texture
+    if texture.rms > 0:
+        x = first["x"].values if first.sizes["x"] > 1 else None
+        factor = corrsin_obukhov(
+            first["y"].values, first["z"].values, texture.rms, texture.outer_scale,
+            experiment.seed, x=x,
+        )  # fmt: skip
+        if x is None:
+            factor = factor.expand_dims(x=first["x"].values)
+        factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
+        if second is None:
+            rough1 = smooth1 * factor
+            rough2 = _carried(rough1, flow, experiment)
+        else:
+            rough1 = smooth1 * factor
+            rough2 = smooth2 * _carried(factor, flow, experiment)
+    else:
+        rough1, rough2 = smooth1, smooth2
+    # winds are retrieved from the first gate
+    depth = experiment.scan.thickness / experiment.scan.gate_count
+    gates = (experiment.scan.range, experiment.scan.range + depth)
+    components = [name for name in ("u", "v", "w") if name in flow]
+    wind = xr.Dataset({name: _slab_mean(flow[name], gates) for name in components})
+    wind.attrs["gates"] = gates
+    rough, smooth = (
+        tuple(field.copy(data=field.values + mapping.molecules) for field in pair)
+        for pair in ((rough1, rough2), (smooth1, smooth2))
+    )
+    return Truth(rough, smooth, wind)
+
+
+def moves_along(experiment: Experiment) -> bool:
+    """Whether air moves along x between the pictures; a plane of air is the same all along it."""
+    return experiment.wake.turbine is not None or experiment.volume is not None
+
+
+def _carried(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> xr.DataArray:
+    """A field after dt, in the frame that goes along with the gates."""
+    v, w, dt = flow["v"], flow["w"], experiment.platform.dt
+    if float(field.min()) == float(field.max()):
+        return field
+    if not moves_along(experiment):
+        return advect(field, v, w, dt)
+    return advect(field, v, w, dt, u=flow["u"] - experiment.scan.follow)
+
+
+def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
+    """The flow at t1 and, if it is a state of its own, at t2, centred and refined."""
+    wake = experiment.wake
+    gate_middle = experiment.scan.range + experiment.scan.thickness / 2
+    if wake.vortex_pair:
+        pair = wake.vortex_pair
+        axes = _axes(wake, "vortex_pair")
+        vortices = vortex_pair(
+            pair.circulation, pair.separation, pair.core_radius, model=pair.model
+        )
+        return pair_wake(vortices, *axes, x=gate_middle), None
+    if wake.turbine:
+        return _turbine(experiment, gate_middle), None
+    mapping = wake.extinction
+    # what the extinction is made from goes by our names from here on, and must be in the file
+    needed = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
+    needed = {n: t for n, t in needed.items() if t and mapping.source == "tracer"}
+    names = wake.names | {n: t for n, t in needed.items() if t != n}
+    path = find_file(wake.file, beside, "wake.file")
+    if wake.second != "advect" and wake.time is not None:
+        passed = wake.second - wake.time
+        if abs(passed - experiment.platform.dt) > 1e-3 * experiment.platform.dt:
+            raise InputError(
+                f"wake.second: {wake.second:g} s is not allowed; expected platform.dt = "
+                f"{experiment.platform.dt:g} s after wake.time = {wake.time:g} s"
+            )
+    flows = []
+    for when in (wake.time, None if wake.second == "advect" else wake.second):
+        if flows and when is None:
+            return flows[0], None
+        plane = wake.x if wake.depth == "plane" else None
+        flow = read_wake(path, when, names, plane, require=needed)
+        if wake.depth == "plane" and flow.sizes["x"] > 1:
+            places = flow["x"].values
+            raise InputError(
+                f"wake.x: missing; {path.name} has {len(places)} planes, expected one of "
+                f"{places[0]:g} to {places[-1]:g} m (or wake.depth: volume)"
+            )
+        y, z = wake.centre or (None, None)
+        axes = "xyz" if experiment.volume else "yz"
+        flow = centre(resample(flow, wake.spacing, axes), y, z).drop_vars("time", errors="ignore")
+        middle = wake.x if wake.x is not None else float(flow["x"].mean())
+        flows.append(flow.assign_coords(x=flow["x"] - middle + gate_middle))
+    return flows[0], flows[1]
+
+
+def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
+    """Wind behind a turbine on planes that hold the gates and the air that blows through them."""
+    wake, turbine, scan = experiment.wake, experiment.wake.turbine, experiment.scan
+    mean = TurbineWake(
+        **turbine.model_dump(
+            include={"diameter", "thrust", "tip_speed_ratio", "wind_speed", "growth", "hub_core"}
+        ),
+        downstream=turbine.downstream or gate_middle,
+    )
+    # what comes in at an end must not reach the gates: the wake's air moves at 0 to the full wind
+    fastest = max(abs(scan.follow), abs(turbine.wind_speed - scan.follow))
+    margin = fastest * experiment.platform.dt + 2 * wake.spacing
+    half = math.ceil((scan.thickness / 2 + margin) / wake.spacing)
+    x = gate_middle + wake.spacing * np.arange(-half, half + 1)
+    return turbine_flow(
+        mean, x, *_axes(wake, "turbine"), turbine.turbulence, turbine.outer_scale, experiment.seed
+    )
+
+
+def _axes(wake, key: str) -> list[np.ndarray]:
+    """y and z of an analytic wake, about the scan's axis."""
+    ends = {}
+    for axis, name in (("y", "width"), ("z", "height")):
+        extent = getattr(getattr(wake, key), name)
+        cells = round(extent / wake.spacing)
+        if cells < 1 or abs(cells * wake.spacing - extent) > 1e-6 * extent:
+            raise InputError(
+                f"wake.{key}.{name}: {extent:g} m is not allowed; expected a multiple of "
+                f"wake.spacing = {wake.spacing:g} m"
+            )
+        ends[axis] = (-extent / 2, extent / 2, cells + 1)
+    check_nodes(wake.spacing, {axis: count for axis, (*_, count) in ends.items()})
+    return [np.linspace(*end) for end in ends.values()]
+
+
+def _extinction(flow, mapping, first, second) -> xr.DataArray:
+    """Extinction of one state, scaled by the largest value of both."""
+    limits = {"background": mapping.background, "maximum": mapping.maximum}
+    states = [s for s in (first, second) if s is not None]
+    if mapping.source == "speed":
+        fastest = max(float(np.hypot(s["v"], s["w"]).max()) for s in states)
+        field = extinction_from_speed(flow, **limits, stretch=mapping.stretch, reference=fastest)
+    else:
+        # an analytic flow carries neither: then the background is all there is
+        tracer = "tracer" if mapping.tracer and "tracer" in flow else None
+        aerosol = "aerosol" if mapping.aerosol and "aerosol" in flow else None
+        if tracer is None and aerosol is None:
+            field = xr.full_like(flow["v"], mapping.background)
+            field.attrs = {"long_name": "extinction coefficient", "units": "m-1"}
+            return field.transpose("x", "y", "z")
+        densest = max(float(s[tracer].max()) for s in states) if tracer else None
+        field = extinction_from_tracer(
+            flow, **limits, stretch=mapping.stretch, tracer=tracer, aerosol=aerosol,
+            reference=densest,
+        )  # fmt: skip
+    return field.transpose("x", "y", "z")
+
+
+def _slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
+    """Mean over the depth of planar gates, (z, y); linear between planes, as the renderer's grid."""
+    x = field["x"].values
+    weights = np.ones(1)
+    if len(x) > 1:
+        half = (x[1] - x[0]) / 2
+        first, last = x[0] - half, x[-1] + half
+        if gates[0] < first - 1e-6 or gates[1] > last + 1e-6:
+            raise InputError(
+                f"scan.thickness: gates from {gates[0]:g} to {gates[1]:g} m reach beyond the wake, "
+                f"whose planes fill {first:g} to {last:g} m; expected gates inside"
+            )
+        nodes = np.unique([*gates, *x[(x > gates[0]) & (x < gates[1])]])
+        hats = [np.interp(nodes, x, plane) for plane in np.eye(len(x))]
+        weights = integrate.trapezoid(hats, nodes) / (gates[1] - gates[0])
+    image = (field * xr.DataArray(weights, dims="x")).sum("x").transpose("z", "y")
+    image.attrs = field.attrs
+    for axis in ("y", "z"):
+        image[axis].attrs["units"] = "m"
+    return image
+
+
+def find_file(name: str, beside: str | Path, field: str) -> Path:
+    """A file named by an experiment: as given, beside the experiment, or shipped."""
+    shipped = Path(str(files("lidar_mi.scenes")))
+    for candidate in (Path(beside) / name, shipped / name):
+        if candidate.is_file():
+            return candidate
+    samples = sorted(p.name for p in shipped.glob("*.nc")) if field == "wake.file" else []
+    raise InputError(
+        f"{field}: {name} not found; looked in {Path(beside).resolve()} and the shipped samples"
+        + (f" ({', '.join(samples)})" if samples else "")
+    )
+
+
+def blur_by_beam(
+    image: xr.DataArray, lidar, distance: float, depth: float = 0.0
+) -> xr.DataArray:
+    """An image seen by beams of finite width, aimed at its nodes, at a distance.
+
+    Between nodes the air varies linearly, as the renderer's grid does. A beam is a Gaussian with
+    the variance per axis of its truncated aperture plus its divergence, so a node k spacings away
+    weighs g(k+1) - 2 g(k) + g(k-1), where g(x) is the mean of max(0, x + sigma X) for normal X.
+    The spacing adds 1/6 px^2 to the Gaussian's variance: for 0.5 m and the paper's beam, two
+    thirds more. Oblique beams also smear the plane over the gate's ``depth`` (m), along the way
+    they take through it; a pulse weighs the gate's middle more than its ends. What is left out
+    costs less than 0.1 % of a pixel on textured air: the aperture's truncation beyond its
+    variance, and that smear where ``depth`` is 0 (500 m, gates of 2.5 m; at 150 m it is wider
+    than the beam).
+    """
+    metres = lidar.radius_at(distance) / 2
+    steps, weights = _depths(lidar, depth)
+    total = 0.0
+    for step, weight in zip(steps, weights):
+        values = image.values
+        for axis, name in enumerate(image.dims):
+            matrix = _beam_weights(image[name].values, 1 + step / distance, metres)
+            values = np.moveaxis(np.tensordot(matrix, values, (1, axis)), 0, axis)
+        total = total + weight * values
+    return image.copy(data=total)
+
+
+def _depths(lidar, depth: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places along a gate from its middle, m, and their shares of the light from within it."""
+    if not depth > 0:
+        return np.zeros(1), np.ones(1)
+    nodes, weights = np.polynomial.legendre.leggauss(6)
+    nodes = nodes * depth / 2
+    if lidar.pulse_duration > 0:
+        # ranges are off by the place in the pulse, FWHM of a Gaussian
+        spread = lidar.pulse_duration * constants.c / 2 / np.sqrt(8 * np.log(2))
+        ends = [stats.norm.cdf((end - nodes) / spread) for end in (depth / 2, -depth / 2)]
+        weights = weights * (ends[0] - ends[1])
+    return nodes, weights / weights.sum()
+
+
+def _beam_weights(axis: np.ndarray, stretch: float, metres: float) -> np.ndarray:
+    """Weights (places, nodes) of an axis' nodes in beams at ``stretch`` times their places."""
+    spacing = float(axis[1] - axis[0])
+    sigma = metres / spacing
+    places = (axis * stretch - axis[0]) / spacing
+    reach = int(np.ceil(6 * sigma + np.abs(places - np.arange(len(axis))).max())) + 1
+    x = np.arange(-reach - 1, len(axis) + reach + 1) - places[:, None]
+    g = x * stats.norm.cdf(x / sigma) + sigma * stats.norm.pdf(x / sigma)
+    weights = np.diff(g, 2)
+    # beyond the plane its edge holds
+    inside = weights[:, reach:-reach].copy()
+    inside[:, 0] += weights[:, :reach].sum(1)
+    inside[:, -1] += weights[:, -reach:].sum(1)
+    return inside

@@ -1,0 +1,226 @@
+"""Pictures as OpenEXR files: one file a scan, one layer a gate and Stokes component.
+
+A scan's file shows what the pilot sees: top row = largest z, left column = largest y. Layers are
+``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate (and
+``gate000.order1.S0``, ... where orders of scattering were told apart), and ``Y``, the apparent
+backscatter of the first gate, so that any viewer shows something at once. Of a run,
+``gate000.depolarization`` and ``gate000.multiple_scattering_fraction`` with their ``_stderr`` stand
+beside them, and with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``, ``Y_noisy`` and
+``Y_noise_std``. Everything else
+(beam positions, gates, instrument, units, seed, version) is in typed header attributes. A fringe
+camera's file has the layers ``S0`` ... ``S3``, ``S0_stderr`` and ``Y``, seen as the camera sees it.
+"""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import xarray as xr
+
+from lidar_mi.errors import InputError
+
+QUANTITIES = ("S0", "S1", "S2", "S3", "S0_stderr")
+_MEANING = {
+    "S0": "received energy over emitted pulse energy",
+    "S1": "Stokes Q about the horizontal axis, over emitted pulse energy",
+    "S2": "Stokes U about the horizontal axis, over emitted pulse energy",
+    "S3": "Stokes V, over emitted pulse energy",
+    "S0_stderr": "Monte Carlo standard error of S0",
+}
+_LAYER = re.compile(r"gate(\d+)\.(.+)$")
+# header entries that describe the file, not the scan
+_STRUCTURE = {
+    "channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio",
+    "screenWindowCenter", "screenWindowWidth", "type", "tiles", "name", "version", "chunkCount",
+}  # fmt: skip
+
+
+def write_scan(path: str | Path, scan: xr.Dataset) -> None:
+    """Write a scan: S0 ... S3, S0_stderr with dims (gate, z, y), and Y with dims (z, y).
+
+    The file is written under a temporary name and renamed, so that no broken file is left. Values
+    are float32. Attributes of the dataset become header attributes: float, int, text, and lists of
+    floats keep their type.
+    """
+    path = Path(path)
+    pilot = scan.transpose("gate", "z", "y").sortby(["z", "y"], ascending=False)
+    channels = {name: pilot[name].transpose("z", "y").values for name in _pictures(pilot)}
+    for gate in range(pilot.sizes["gate"]):
+        for quantity in _quantities(pilot):
+            channels[f"gate{gate:03d}.{quantity}"] = pilot[quantity].values[gate]
+    # ascending, whatever the order in the dataset
+    axes = {axis: pilot[axis].values[::-1] for axis in ("y", "z")}
+    _write(path, axes | scan.attrs, channels)
+
+
+def write_fringes(path: str | Path, picture: xr.Dataset) -> None:
+    """Write the picture of a fringe camera: S0 ... S3, S0_stderr with dims (y, x), y downwards.
+
+    ``Y`` is S0 once more, so that any viewer shows the rings. Files, values and attributes as in
+    `write_scan`.
+    """
+    layers = {name: picture[name].transpose("y", "x").values for name in QUANTITIES}
+    _write(Path(path), picture.attrs, layers | {"Y": layers["S0"]})
+
+
+def read_fringes(path: str | Path) -> xr.Dataset:
+    """Read a picture written by `write_fringes`; the round trip is exact in float32.
+
+    Raises
+    ------
+    InputError
+        Not an EXR file, or one without our layers.
+    """
+    header, layers = read_layers(path)
+    if not {*QUANTITIES, "Y"} <= set(layers):
+        raise InputError(
+            f"{path}: layers {', '.join(sorted(layers)) or 'none'} are not a picture of a fringe "
+            f"camera; expected {', '.join(QUANTITIES)} and Y"
+        )
+    return label_fringes({name: layers[name] for name in QUANTITIES}, header)
+
+
+def label_fringes(layers: dict[str, np.ndarray], attributes: dict) -> xr.Dataset:
+    """Layers (height, width) of a fringe camera with names, units and pixel numbers as axes."""
+    rows, columns = layers["S0"].shape
+    picture = xr.Dataset(
+        {name: (("y", "x"), values) for name, values in layers.items()},
+        coords={"y": np.arange(rows), "x": np.arange(columns)},
+        attrs=attributes,
+    )
+    for name, text in _MEANING.items():
+        if name in picture:
+            text = text.replace("emitted pulse energy", "the energy sent through the stop")
+            picture[name].attrs = {"long_name": text, "units": "1"}
+    picture["x"].attrs = {"long_name": "pixels to the right of the leftmost", "units": "1"}
+    picture["y"].attrs = {"long_name": "pixels down from the topmost", "units": "1"}
+    return picture
+
+
+def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> None:
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    for key, value in attributes.items():
+        header[key] = value.astype(np.float32) if isinstance(value, np.ndarray) else value
+    channels = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in channels.items()}
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        OpenEXR.File(header, channels).write(str(temporary))
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
+    """Header attributes and all layers of any EXR file, rows from the top.
+
+    Raises
+    ------
+    InputError
+        There is no such file, or it is no readable EXR.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected an OpenEXR image")
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            header = {k: v for k, v in file.header().items() if k not in _STRUCTURE}
+            layers = {k: np.array(c.pixels) for k, c in file.channels().items()}
+    except (RuntimeError, ValueError):  # no OpenEXR file; one that is cut off
+        raise InputError(f"{path}: not a readable OpenEXR image") from None
+    return header, layers
+
+
+def read_scan(path: str | Path) -> xr.Dataset:
+    """Read a scan written by `write_scan`, y and z ascending; the round trip is exact in float32.
+
+    Raises
+    ------
+    InputError
+        Not an EXR file, or one without our layers or axes.
+    """
+    header, layers = read_layers(path)
+    gates: dict[int, dict[str, np.ndarray]] = {}
+    for name, pixels in layers.items():
+        if match := _LAYER.match(name):
+            gates.setdefault(int(match[1]), {})[match[2]] = pixels
+    complete = gates and all(set(QUANTITIES) <= set(layer) for layer in gates.values())
+    if not complete or "Y" not in layers or not {"y", "z"} <= set(header):
+        raise InputError(
+            f"{path}: layers {', '.join(sorted(layers)) or 'none'} are not a lidar scan; expected "
+            "Y and gate000.S0 ... gate000.S3, gate000.S0_stderr, with header attributes y and z"
+        )
+    y, z = (np.asarray(header.pop(axis), float) for axis in ("y", "z"))
+    rows, columns = layers["Y"].shape
+    if (len(z), len(y)) != (rows, columns):
+        raise InputError(
+            f"{path}: header axes of {len(y)} x {len(z)} values do not fit the image of "
+            f"{columns} x {rows} pixels"
+        )
+    variables = {
+        quantity: (
+            ("gate", "z", "y"),
+            np.stack([gates[g][quantity][::-1, ::-1] for g in sorted(gates)]),
+        )
+        for quantity in gates[min(gates)]
+    }
+    for name, pixels in layers.items():
+        if not _LAYER.match(name):
+            variables[name] = (("z", "y"), pixels[::-1, ::-1])
+    return label_scan(
+        xr.Dataset(variables, coords={"gate": sorted(gates), "y": y, "z": z}, attrs=header)
+    )
+
+
+def _quantities(scan: xr.Dataset) -> list[str]:
+    """What a scan holds of every gate."""
+    return [name for name, variable in scan.data_vars.items() if "gate" in variable.dims]
+
+
+def _pictures(scan: xr.Dataset) -> list[str]:
+    """What a scan holds once: Y, and Y_noisy with its standard deviation behind a detector."""
+    return [name for name, variable in scan.data_vars.items() if set(variable.dims) == {"z", "y"}]
+
+
+def unpack(image: np.ndarray, names: list[str], gates: int) -> dict[str, tuple]:
+    """A rendered tensor (rows from the top, y falling) as variables on (gate, z, y), ascending."""
+    rows, columns, _ = image.shape
+    values = image.reshape(rows, columns, gates, len(names))[::-1, ::-1]
+    return {
+        name: (("gate", "z", "y"), values[..., k].transpose(2, 0, 1))
+        for k, name in enumerate(names)
+    }
+
+
+def label_scan(scan: xr.Dataset) -> xr.Dataset:
+    """The same scan with CF names and units on its variables."""
+    meaning = _MEANING | {
+        "S1_stderr": "Monte Carlo standard error of S1",
+        "S0_S1_correlation": "correlation of the Monte Carlo errors of S0 and S1",
+        "depolarization": "linear depolarisation ratio",
+        "depolarization_stderr": "standard error of the linear depolarisation ratio",
+        "multiple_scattering_fraction": "share of light scattered more than once",
+        "multiple_scattering_fraction_stderr": "standard error of the share of light scattered "
+        "more than once",
+        "S0_noisy": "S0 with the detector's noise",
+        "S0_noise_std": "standard deviation of the noise of S0_noisy",
+    }
+    for name in _quantities(scan):
+        order = name.removeprefix("order").removesuffix(".S0")
+        text = meaning.get(name, f"S0 of scattering order {order}")
+        if scan.attrs.get(f"{name}_is_bound"):
+            text = f"upper bound of the {text}"
+        scan[name].attrs = {"long_name": text, "units": "1"}
+    once = {
+        "Y": "apparent backscatter of the first gate",
+        "Y_noisy": "apparent backscatter with the detector's noise",
+        "Y_noise_std": "standard deviation of the noise of Y_noisy",
+    }
+    for name in _pictures(scan):
+        scan[name].attrs = {"long_name": once.get(name, name), "units": "m-1 sr-1"}
+    scan["y"].attrs = {"long_name": "distance to port", "units": "m", "axis": "Y"}
+    scan["z"].attrs = {
+        "long_name": "height above the beam axis", "units": "m", "axis": "Z", "positive": "up",
+    }  # fmt: skip
+    return scan

@@ -1,0 +1,153 @@
+"""Reading pictures of any common kind into an array of light."""
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.io.exr import read_layers
+
+FITS = (".fits", ".fit", ".fts")
+
+
+def read_picture(path: str | Path, layer: str | None = None) -> np.ndarray:
+    """Picture of an EXR, PNG, TIFF, BMP, JPEG or FITS file, float64, (height, width), top row first.
+
+    Colours are averaged, transparency is left out. Values are those of the file: 8 or 16 bit
+    numbers, floats. A FITS image is taken as it is stored, first row first.
+
+    Parameters
+    ----------
+    layer : str, optional
+        Of an EXR file. Default: Y, or the only one, or the mean of R, G and B.
+
+    Raises
+    ------
+    InputError
+        No such file, one that cannot be read, or no such layer.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; expected an EXR, PNG, TIFF, BMP, JPEG or FITS image")
+    if _is_exr(path):
+        picture = _exr(path, layer)
+    elif layer is not None:
+        raise InputError(f"layer: {layer!r} is not allowed for {path}; only EXR files have layers")
+    else:
+        picture = _fits(path) if path.suffix.lower() in FITS else _image(path)
+    return np.array(picture, dtype=float)
+
+
+def read_image(
+    path: str | Path, layer: str | None = None, spacing: float | None = None
+) -> xr.DataArray:
+    """A picture as `read_picture` gives it, as an image (z, y), ascending, in metres.
+
+    The top row has the largest z and the left column the largest y. Axes come from the header
+    attributes ``y`` and ``z`` that the EXR files of our scans carry; for other files ``spacing``
+    (m, from pixel to pixel) puts the picture's middle at zero.
+
+    Raises
+    ------
+    InputError
+        As `read_picture`; no axes and no spacing above 0.
+    """
+    if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
+        raise InputError(f"{path}: spacing: {spacing} m is not allowed; expected a number above 0")
+    pixels = read_picture(path, layer)
+    rows, columns = pixels.shape
+    header = read_layers(path)[0] if _is_exr(path) else {}
+    if spacing is not None:
+        y, z = ((np.arange(n) - (n - 1) / 2) * spacing for n in (columns, rows))
+    elif {"y", "z"} <= set(header) and len(header["y"]) == columns and len(header["z"]) == rows:
+        y, z = np.asarray(header["y"], float), np.asarray(header["z"], float)
+    else:
+        raise InputError(
+            f"{path}: no axes y and z for {columns} x {rows} pixels; expected them in the header "
+            "of an EXR file, or --spacing in m"
+        )
+    metres = {"units": "m"}
+    axes = {"z": ("z", z, metres), "y": ("y", y, metres)}
+    return xr.DataArray(pixels[::-1, ::-1].copy(), axes, ("z", "y"), layer)
+
+
+def read_noise(
+    path: str | Path, layer: str | None = None, spacing: float | None = None
+) -> xr.DataArray | None:
+    """Standard deviation of an image's noise, as `read_image` gives the image; None if unsaid.
+
+    For ``Y`` and ``Y_noisy`` of our scans: the light transport's standard error and, with a
+    detector, its noise. For any other layer: the one of the same name with ``_stderr``.
+    """
+    if not _is_exr(path):
+        return None
+    layers, layer = read_layers(path)[1], layer or "Y"
+    transport = {"gate000.S0", "gate000.S0_stderr", "Y"}
+    if layer in ("Y", "Y_noisy") and transport <= set(layers):
+        signal, stderr, scaled = (
+            read_image(path, name, spacing) for name in ("gate000.S0", "gate000.S0_stderr", "Y")
+        )
+        noise = (scaled * stderr / signal.where(signal > 0)).fillna(0.0)
+        if layer == "Y_noisy" and "Y_noise_std" in layers:
+            noise = np.hypot(noise, read_image(path, "Y_noise_std", spacing))
+        return noise
+    known = f"{layer}_stderr"
+    return read_image(path, known, spacing) if known in layers else None
+
+
+def _is_exr(path: str | Path) -> bool:
+    return Path(path).suffix.lower() == ".exr"
+
+
+def _exr(path, layer):
+    layers = read_layers(path)[1]
+    if layer is not None:
+        if layer not in layers:
+            raise InputError(
+                f"{path}: layer {layer!r} is not there; expected one of {', '.join(sorted(layers))}"
+            )
+        return layers[layer]
+    if "Y" in layers or len(layers) == 1:
+        return layers.get("Y", next(iter(layers.values())))
+    if {"R", "G", "B"} <= set(layers):
+        return np.mean([layers[name] for name in "RGB"], axis=0)
+    raise InputError(f"{path}: expected a layer to be named, one of {', '.join(sorted(layers))}")
+
+
+def _fits(path):
+    try:
+        from astropy.io import fits
+    except ImportError:
+        raise InputError(
+            f"{path}: FITS files need the library astropy: pip install 'lidar-mi[fits]'"
+        ) from None
+    try:
+        with fits.open(path, memmap=False) as parts:
+            found = [part.data for part in parts if part.is_image and part.data is not None]
+    except (OSError, ValueError, TypeError) as error:
+        raise InputError(f"{path}: no readable FITS file ({_short(error)})") from None
+    if not found or found[0].squeeze().ndim != 2:
+        shape = " x ".join(map(str, found[0].shape)) if found else "none"
+        raise InputError(f"{path}: its first image is {shape}; expected one of two dimensions")
+    return found[0].squeeze()
+
+
+def _image(path):
+    from PIL import Image
+
+    try:
+        with Image.open(path) as file:
+            if file.mode in ("P", "CMYK", "YCbCr", "HSV", "LAB"):
+                file = file.convert("RGB")
+            bands, picture = file.getbands(), np.asarray(file)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: no readable image ({_short(error)})") from None
+    if picture.ndim == 2:
+        return picture
+    colours = [k for k, band in enumerate(bands) if band != "A"]
+    return picture[..., colours].mean(-1)
+
+
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:120]

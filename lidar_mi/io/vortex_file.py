@@ -1,0 +1,107 @@
+"""Vortex pairs as a small JSON file: what a controller reads to know the wind ahead anywhere."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.vortices.fit import VortexPairFit
+from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile
+
+FORMAT = "lidar-mi vortex pairs 1"
+
+_FRAME = (
+    "y to port, z up, m, from the telescope's axis; circulation > 0 turns from +y towards +z; "
+    "parameters in SI units, log_radius the natural logarithm of the core radius in m; "
+    "wind at mid-time of the two images"
+)
+_NUMBERS = ("chi2", "correlation", "flow_error", "flow_error_length")
+
+
+def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about: str) -> None:
+    """Write fits by name, with their covariance and derived quantities; numbers that are not: null.
+
+    Parameters
+    ----------
+    path : path
+    fits : mapping of str to VortexPairFit
+    about
+        What else the file says of itself, such as ``source``.
+    """
+    data = {"format": FORMAT, **about, "frame": _FRAME, "parameters": list(PARAMETERS)}
+    data["fits"] = {name: _as_data(fit) for name, fit in fits.items()}
+    Path(path).write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+def _as_data(fit: VortexPairFit) -> dict:
+    return {
+        "success": fit.success,
+        "reasons": list(fit.reasons),
+        "profile": fit.profile,
+        "parameters": [_number(p) for p in fit.parameters],
+        "covariance": [[_number(c) for c in row] for row in fit.covariance],
+        **{name: _number(getattr(fit, name)) for name in _NUMBERS},
+        "quantities": {
+            name: {
+                "value": _number(q.value), "stderr": _number(q.stderr), "units": q.units,
+                "long_name": q.long_name,
+            }
+            for name, q in fit.quantities.items()
+        },
+    }  # fmt: skip
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def read_vortices(path: str | Path) -> dict[str, VortexPairFit]:
+    """Fits by name, as `write_vortices` wrote them; `VortexPairFit.wind` gives the wind anywhere.
+
+    Raises
+    ------
+    InputError
+        Not readable, another format, or a covariance that is none.
+    """
+    path = Path(path)
+    try:
+        data = json.loads(path.read_text())
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; expected a file of vortex pairs") from None
+    except ValueError:
+        raise InputError(f"{path}: not JSON; expected a file of vortex pairs") from None
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        raise InputError(f"{path}: not a file of vortex pairs; expected the format {FORMAT!r}")
+    if not isinstance(data.get("fits"), dict):
+        raise InputError(f"{path}: fits: missing; expected fits by name")
+    return {name: _from_data(fit, f"{path}: fits.{name}") for name, fit in data["fits"].items()}
+
+
+def _from_data(data: dict, where: str) -> VortexPairFit:
+    try:
+        parameters = np.array(data["parameters"], dtype=float)
+        covariance = np.array(data["covariance"], dtype=float)
+        numbers = [math.nan if data[name] is None else float(data[name]) for name in _NUMBERS]
+        profile, reasons = data["profile"], tuple(map(str, data["reasons"]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{where}: {type(error).__name__} {error}; expected parameters, covariance, profile, "
+            f"reasons, {', '.join(_NUMBERS)}"
+        ) from None
+    size = len(PARAMETERS)
+    if parameters.shape != (size,) or covariance.shape != (size, size):
+        raise InputError(
+            f"{where}: {parameters.shape} parameters with {covariance.shape} covariances; expected "
+            f"{size} and {size} x {size}"
+        )
+    if profile not in get_args(Profile):
+        raise InputError(f"{where}.profile: {profile!r} is not one of {', '.join(get_args(Profile))}")
+    if not reasons:
+        known = np.isfinite(parameters).all() and np.isfinite(covariance).all()
+        if not known or not np.allclose(covariance, covariance.T):
+            raise InputError(f"{where}.covariance: not symmetric and finite; expected that of a fit")
+    return VortexPairFit(parameters, covariance, profile, *numbers, reasons)

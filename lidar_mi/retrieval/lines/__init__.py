@@ -1,0 +1,1 @@
+"""Lines of sight to wind vectors, and both lidars combined."""

@@ -1,0 +1,1 @@
+"""Line-of-sight speed from ring images."""

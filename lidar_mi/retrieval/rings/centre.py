@@ -1,0 +1,191 @@
+"""Where the rings' centre is: from gradients, by circular averaging, by midpoint lines.
+
+Coordinates are pixels, x to the right and y down, from the top left pixel's centre.
+"""
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.peak_fit import peak
+
+
+def gradient_centre(image) -> tuple[float, float]:
+    """Point that the lines along all gradients pass closest by, to about a pixel.
+
+    The gradient of rings points to or from their centre wherever a pixel lies, so that every
+    edge votes and no ring needs to be found or closed: least squares of the distances between the
+    point and the lines, weighted by the squared gradient (Parthasarathy 2012, Nature Methods 9,
+    724), here of the smoothed picture. Noise of white pixels draws the point toward the
+    picture's middle, by its share of the squared gradient: below 0.1 % for the paper's 1.3e7
+    photons.
+
+    Parameters
+    ----------
+    image : array or tensor, shape (height, width)
+        Finite.
+
+    Returns
+    -------
+    (float, float)
+        (x, y); may lie outside.
+
+    Raises
+    ------
+    InputError
+        A picture without gradients, or with all of them along one direction.
+    """
+    image = torch.as_tensor(image)
+    block = max(1, min(image.shape) // 192)
+    rows, columns = (size // block for size in image.shape)
+    coarse = image[: rows * block, : columns * block].reshape(rows, block, columns, block)
+    coarse = gaussian_filter(coarse.mean((1, 3)).cpu().numpy().astype(float), 2.0)
+    # the filter invents what lies beyond the rim
+    rim = 5
+    slope_y, slope_x = (part[rim:-rim, rim:-rim] for part in np.gradient(coarse))
+    y, x = np.mgrid[rim : rows - rim, rim : columns - rim].astype(float)
+    # n = (-slope_y, slope_x) is across the gradient: n . (p - c) = 0 on each line
+    normal = np.stack([-slope_y.ravel(), slope_x.ravel()])
+    across = (normal * np.stack([x.ravel(), y.ravel()])).sum(0)
+    matrix = normal @ normal.T
+    size = np.linalg.eigvalsh(matrix)
+    if not size[0] > 1e-3 * size[1]:
+        raise InputError("image: its gradients have no common centre; expected rings")
+    centre = np.linalg.solve(matrix, normal @ across)
+    return tuple(float(v) for v in centre * block + (block - 1) / 2)
+
+
+def circular_average(image: np.ndarray, centre: tuple[float, float]) -> tuple:
+    """Mean over circles about ``centre``, 1 px apart: the paper's circular averaging (CA).
+
+    Every pixel counts at the two radii next to its own, in proportion.
+
+    Returns
+    -------
+    radius, mean, weight : arrays
+        px; the value's unit; pixels that took part. Radii of weight 0 are left out.
+    """
+    height, width = image.shape
+    x, y = np.arange(width) - centre[0], np.arange(height) - centre[1]
+    r = np.hypot(x[None, :], y[:, None]).ravel()
+    low = r.astype(np.intp)
+    upper = r - low
+    value = np.asarray(image, float).ravel()
+    weight, total = np.zeros((2, low.max() + 2))
+    for index, share in ((low, 1 - upper), (low + 1, upper)):
+        weight += np.bincount(index, share, len(weight))
+        total += np.bincount(index, share * value, len(weight))
+    seen = weight > 0
+    return np.flatnonzero(seen).astype(float), total[seen] / weight[seen], weight[seen]
+
+
+def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[float, float]:
+    """Centre about which the circular average has the most contrast: the paper's CA.
+
+    The contrast, the variance of the averages over all pixels, falls with the square of the
+    distance to the centre: averages about another point smear the rings. Its top is found by
+    Newton's method, on differences over 1 px.
+
+    Parameters
+    ----------
+    image : array, shape (height, width)
+    start : (float, float)
+        Within about a third of a ring's width.
+
+    Raises
+    ------
+    InputError
+        A contrast without a top: no rings about one centre.
+    """
+    # variances do not depend on an offset; sums of squares lose least without one
+    image = np.asarray(image, float) - np.mean(image)
+
+    def contrast(*place):
+        _, mean, weight = circular_average(image, place)
+        return float(weight @ mean**2)
+
+    x, y = start
+    for _ in range(20):
+        middle, corner = contrast(x, y), contrast(x + 1, y + 1)
+        right, left = contrast(x + 1, y), contrast(x - 1, y)
+        below, above = contrast(x, y + 1), contrast(x, y - 1)
+        slope = np.array([right - left, below - above]) / 2
+        mixed = corner - right - below + middle
+        curve = np.array([
+            [right + left - 2 * middle, mixed], [mixed, below + above - 2 * middle],
+        ])  # fmt: skip
+        # where the contrast is not yet a hill's top, uphill
+        hill = np.linalg.eigvalsh(curve)[1] < 0
+        step = -np.linalg.solve(curve, slope) if hill else 2 * np.sign(slope)
+        x, y = np.array([x, y]) + step.clip(-2, 2)
+        if hill and np.hypot(*step) < 0.01:
+            return float(x), float(y)
+    raise InputError("image: averages over circles have no best centre; expected rings")
+
+
+def midpoint_points(
+    image: np.ndarray, centre: tuple[float, float], radius: float, half_width: float,
+    bands: int = 24,
+) -> np.ndarray:
+    """Crests of one ring along lines across it, left and right and above and below.
+
+    Lines are bands of rows (columns) within half a radius of the centre; along each, a Gaussian
+    fitted within ``half_width`` of where the ring of ``radius`` should be gives the crest.
+
+    Returns
+    -------
+    array (2, 2, bands, 2)
+        Direction (along x, along y), side (before, behind the centre), band, and (x, y) in px.
+        NaN where the line leaves the picture or has no crest.
+    """  # fmt: skip
+    found = np.full((2, 2, bands, 2), np.nan)
+    for direction in range(2):
+        # lines along x of the picture, or along y of it: the same on the transposed picture
+        lines = image if direction == 0 else image.T
+        along, across = centre if direction == 0 else centre[::-1]
+        edges = across + np.linspace(-radius / 2, radius / 2, bands + 1)
+        for band in range(bands):
+            rows = slice(*np.clip(np.round(edges[band : band + 2]), 0, len(lines)).astype(int))
+            if rows.stop - rows.start < 1:
+                continue
+            place = (rows.start + rows.stop - 1) / 2
+            values = lines[rows].mean(0)
+            half = np.sqrt(radius**2 - (place - across) ** 2)
+            for side, sign in enumerate((-1, 1)):
+                low = round(along + sign * half - half_width)
+                high = round(along + sign * half + half_width) + 1
+                if low < 0 or high > len(values) or high - low < 5:
+                    continue
+                x = np.arange(low, high, dtype=float)
+                try:
+                    point = peak(x, values[low:high], x.mean(), half_width), place
+                except InputError:
+                    continue
+                found[direction, side, band] = point if direction == 0 else point[::-1]
+    return found
+
+
+def midpoint_line_centre(
+    image: np.ndarray, start: tuple[float, float], radius: float, half_width: float
+) -> tuple[float, float]:
+    """Centre from the midpoints of a ring's chords: the paper's midpoint lines (ML).
+
+    The midpoints of all chords along x lie on the line x = x_c, those of chords along y on
+    y = y_c; the lines are the means of the midpoints.
+
+    Raises
+    ------
+    InputError
+        No chord along one of the directions lies in the picture.
+    """
+    for _ in range(2):
+        points = midpoint_points(image, start, radius, half_width)
+        middle = points.mean(1)
+        if not all(np.isfinite(middle[k, :, k]).any() for k in range(2)):
+            raise InputError(
+                f"image: no chord of a ring of {radius:.0f} px about ({start[0]:.0f}, "
+                f"{start[1]:.0f}) px; expected a ring within the picture"
+            )
+        start = tuple(float(np.nanmean(middle[k, :, k])) for k in range(2))
+    return start

@@ -1,0 +1,1 @@
+"""Displacement and wind from images or volumes."""

@@ -1,0 +1,1 @@
+"""Vortex parameters from images or wind vectors."""

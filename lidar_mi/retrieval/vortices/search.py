@@ -1,0 +1,114 @@
+"""Where to start a fit of two vortices: every pair of places on a grid is tried.
+
+For given places and core radius the wind is linear in the circulations and the mean wind, so each
+pair's best circulations and misfit follow in closed form from sums over the observations.
+"""
+
+from typing import NamedTuple
+
+import torch
+
+from lidar_mi.retrieval.vortices.model import Profile, turning, wind
+
+# Places tried for each vortex, and core radii as shares of the shorter side of the region.
+_PLACES = 700
+_RADII = (0.03, 0.08)
+
+
+class Observations(NamedTuple):
+    """Components of the wind seen at places: value = along . wind + noise, tensors of shape (n,).
+
+    Attributes
+    ----------
+    y, z : torch.Tensor
+        m.
+    along : torch.Tensor, shape (2, n)
+        The component seen, times whatever makes it the value's unit.
+    value : torch.Tensor
+    weight : torch.Tensor
+        1 / variance, up to a factor.
+    """
+
+    y: torch.Tensor
+    z: torch.Tensor
+    along: torch.Tensor
+    value: torch.Tensor
+    weight: torch.Tensor
+
+
+def starting_points(seen: Observations, count: int, profile: Profile) -> torch.Tensor:
+    """Parameters (up to `count`, 10) of pairs that explain most of what is seen, best first.
+
+    Vortices turn in opposite directions and are at least three core radii apart. Of each
+    neighbourhood only the best pair is taken.
+    """
+    low, high = (torch.stack([seen.y, seen.z]).aminmax(dim=1))
+    sides = (high - low).tolist()
+    step = (sides[0] * sides[1] / _PLACES) ** 0.5
+    axes = [
+        torch.linspace(float(a), float(b), max(2, round(side / step))).to(seen.y)
+        for a, b, side in zip(low, high, sides)
+    ]
+    place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
+    apart = torch.cdist(place, place)
+    root = seen.weight.sqrt()
+    plain = torch.linalg.qr((seen.along * root).T)[0]
+
+    def without_mean_wind(values):
+        return values - plain @ (plain.T @ values)
+
+    value = without_mean_wind(seen.value * root)
+    found = []
+    for share in _RADII:
+        radius = share * min(sides)
+        columns = without_mean_wind(_swirls(seen, root, place, radius, profile))
+        normal, wanted = columns.T @ columns, columns.T @ value
+        gain, first, second = _explained(normal, wanted)
+        gain = torch.where((first > 0) & (second < 0) & (apart > 3 * radius), gain, 0.0)
+        for p, q in _peaks(gain, apart, count, 2.5 * step):
+            vortices = [
+                torch.cat([amplitude[p, q][None], radius_log[None], place[at]])
+                for amplitude, at, radius_log in (
+                    (first, p, value.new_tensor(radius).log()),
+                    (second, q, value.new_tensor(radius).log()),
+                )
+            ]
+            found.append((float(gain[p, q]), torch.cat([*vortices, value.new_zeros(2)])))
+    found.sort(key=lambda pair: -pair[0])
+    return torch.stack([_with_mean_wind(theta, seen, root, profile) for _, theta in found[:count]]) \
+        if found else value.new_empty(0, 10)
+
+
+def _swirls(seen: Observations, root, place, radius: float, profile: Profile) -> torch.Tensor:
+    """What is seen of vortices of unit circulation at each place, (n, places)."""
+    dy, dz = (seen[axis][:, None] - place[:, axis] for axis in (0, 1))
+    value, _ = turning((dy**2 + dz**2) / radius**2, profile)
+    across = seen.along[1][:, None] * dy - seen.along[0][:, None] * dz
+    return root[:, None] * across * value / (2 * torch.pi * radius**2)
+
+
+def _explained(normal, wanted):
+    """Misfit that every pair of columns explains, and the amplitudes of both."""
+    power = normal.diagonal()
+    determinant = power[:, None] * power - normal**2
+    determinant = torch.where(determinant > 1e-6 * power[:, None] * power, determinant, torch.inf)
+    first = (wanted[:, None] * power - wanted * normal) / determinant
+    second = first.T
+    return first * wanted[:, None] + second * wanted, first, second
+
+
+def _peaks(gain, apart, count: int, distance: float):
+    """The best pairs, none with both places within a distance of a better one's."""
+    for _ in range(count):
+        p, q = divmod(int(gain.argmax()), gain.shape[1])
+        if not gain[p, q] > 0:
+            return
+        yield p, q
+        gain = gain.masked_fill((apart[p] < distance)[:, None] & (apart[q] < distance), 0.0)
+
+
+def _with_mean_wind(theta, seen: Observations, root, profile: Profile) -> torch.Tensor:
+    """The parameters with the mean wind that fits the rest best."""
+    left = seen.value - (seen.along * wind(theta, seen.y, seen.z, profile)).sum(0)
+    mean = torch.linalg.lstsq((seen.along * root).T, (left * root)[:, None]).solution[:, 0]
+    return torch.cat([theta[:8], mean])

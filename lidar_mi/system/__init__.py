@@ -1,0 +1,1 @@
+"""The machine: its LLVM, and what it can run."""

@@ -1,0 +1,134 @@
+"""The report as a page. Detects names that become markup, a map whose numbers are not the wind's, and
+(in a browser, where there is one) a map that tells nothing when it is pointed at."""
+
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidar_mi.experiment import schema as config
+from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.figures.backscatter import Drawn
+from lidar_mi.assessment.report.page import Chapter, Tables, page
+from lidar_mi.assessment.report.vector_map import map_data
+
+EVIL = "</script><script>alert(1)</script>&\"'"
+
+
+def some_wind(columns=6, rows=4):
+    y, z = np.arange(columns) * 2.0 - 5, np.arange(rows) * 2.0
+    vertical, lateral = np.meshgrid(z, y, indexing="ij")
+    fields = {"v": 1.0 + 0 * lateral, "w": lateral / 4, "u": vertical}
+    data = xr.Dataset(
+        {name: (("z", "y"), field) for name, field in fields.items()}, {"z": z, "y": y}
+    )
+    for name in fields:
+        data[f"{name}_true"] = data[name] - 0.5
+        data[f"{name}_stderr"] = 0 * data[name] + 0.25
+    flag = np.zeros((rows, columns), np.uint8)
+    flag[0, 0], flag[1, 2] = 3, 2
+    about = {"flag_masks": np.array([1, 2], np.uint8), "flag_meanings": "no_crossflow beyond_lines"}
+    data["flag"] = ("z", "y"), flag, about
+    return data
+
+
+def some_page(**chapter):
+    experiment = config.check(
+        {"name": "x", "wake": {"file": f"{EVIL}.nc"}, "scattering": {"phase": "rayleigh"}}, "x"
+    )
+    numbers = Tables(EVIL, EVIL, [(EVIL, [EVIL], [(EVIL, EVIL, [EVIL])])])
+    chapter = {"title": EVIL, "lead": [EVIL], "drawn": [], "numbers": numbers} | chapter
+    return page(
+        experiment, f"file: {EVIL}", {EVIL: EVIL}, {f"a.{EVIL}": 1.0}, [Chapter(**chapter)], [EVIL]
+    )
+
+
+class Tags(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.scripts, self.words = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+
+    def handle_data(self, data):
+        (self.scripts if self.tags and self.tags[-1] == "script" else self.words).append(data)
+
+    def handle_endtag(self, tag):
+        self.tags.append(f"/{tag}")
+
+
+def test_names_are_never_markup(tmp_path):
+    from PIL import Image
+
+    Image.new("RGB", (4, 4)).save(tmp_path / "a.png")
+    wind = some_wind()
+    wind["flag"].attrs["flag_meanings"] = "no_crossflow " + EVIL.replace(" ", "")
+    vectors = {"title": EVIL} | map_data(wind, ("u", "v", "w"), [])
+    text = some_page(
+        vectors=vectors, drawn=[Drawn(tmp_path / "a.png", EVIL, EVIL)],
+        verdict=Tables(EVIL, EVIL, []),
+    )  # fmt: skip
+    assert "alert(1)" in text and "<script>alert" not in text
+    found = Tags(text)
+    # the data and the program, nothing else
+    assert found.tags.count("script") == 2
+    assert json.loads(found.scripts[0])["title"] == EVIL
+    assert sum(EVIL in word for word in found.words) >= 10
+
+
+def test_the_map_holds_the_wind():
+    wind = some_wind()
+    data = map_data(wind, ("u", "v", "w"), [Core(1.234, 2.0, 3.0, 400.0)])
+    assert [part["name"] for part in data["components"]] == ["u", "v", "w"]
+    # row by row from below
+    at = data["y"].index(3.0) + 6
+    assert (data["y"][at], data["z"][at]) == (3.0, 2.0)
+    u, _, w = data["components"]
+    assert (u["found"][at], u["true"][at], u["stderr"][at]) == (2.0, 1.5, 0.25)
+    assert w["found"][at] == 0.75
+    assert data["flag"][0] == 3 and data["flag"][8] == 2 and sum(map(bool, data["flag"])) == 2
+    assert data["flags"] == {"1": "no crossflow", "2": "beyond lines"}
+    assert data["cores"] == [[1.23, 2.0]] and data["step"] == 2.0
+
+
+def test_the_map_takes_what_a_retrieval_leaves_out():
+    """No standard errors, no number at some places, vectors beside their nodes, too many of them."""
+    wind = some_wind(220, 9).drop_vars(["u", "u_true", "u_stderr", "v_stderr"])
+    wind["v"][4, 30] = np.nan
+    wind["w_stderr"][:] = np.nan
+    wind["y_vector"] = ("z", "y"), np.broadcast_to(wind["y"].values + 0.25, wind["v"].shape).copy()
+    data = map_data(wind, ("v", "w"), [])
+    v, w = data["components"]
+    assert v["stderr"] is None and set(w["stderr"]) == {None}
+    assert len(data["y"]) == 55 * 2 and data["step"] == 8.0
+    assert min(data["y"]) == -5 + 2 * 2.0 + 0.25
+    text = json.dumps(data, allow_nan=False)
+    assert len(text) < 10_000 and None in v["found"] + w["stderr"]
+
+
+BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not BROWSER, reason="no Chromium here")
+def test_a_browser_draws_the_map_and_tells_of_a_vector(tmp_path):
+    vectors = {"title": "wind"} | map_data(some_wind(), ("u", "v", "w"), [Core(1.0, 0.0, 1.0, 9.0)])
+    path = tmp_path / "report.html"
+    path.write_text(some_page(vectors=vectors))
+    done = subprocess.run(
+        [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", path.as_uri()],
+        capture_output=True, text=True, timeout=120, check=True,
+    )  # fmt: skip
+    dom = done.stdout
+    assert '<p class="where">y = 1.0 m, z = 4.0 m: good</p>' in dom
+    rows = re.search("<tbody>(<tr><td>u.*?)</tbody>", dom)[1]
+    assert "<td>u</td><td>4.00</td><td>3.50</td><td>0.50</td><td>0.25</td>" in rows
+    assert "<td>w</td><td>0.25</td><td>-0.25</td><td>0.50</td><td>0.25</td>" in rows
+    assert dom.count("<option") == 5 and '<div class="map">' in dom

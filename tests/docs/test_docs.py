@@ -1,0 +1,416 @@
+"""The documents say what the program does.
+
+Detects: a plugin reference that is not the docstrings', a key of the experiment file that the user
+guide lacks or gives another unit, default or limit, a command, scene, experiment or piece of Python
+that does not run as printed, a message that reads otherwise, a link to nowhere, a formula whose
+braces do not match.
+"""
+
+import copy
+import re
+import runpy
+import shlex
+import sys
+import typing
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import annotated_types
+import numpy as np
+import pytest
+import yaml
+from pydantic import BaseModel
+
+from lidar_mi.cli import app as cli
+from lidar_mi.experiment import schema as config, truth
+from lidar_mi import units
+from lidar_mi.assessment.metrics.requirements import read_requirements
+from lidar_mi.rendering.phase import scatterer
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+EXPERIMENTS = tuple(f"docs/experiments/{page.name}" for page in (DOCS / "experiments").glob("*.md"))
+PAGES = (
+    "README.md", "docs/theory.md", "docs/accuracy.md", "docs/user_guide.md", "docs/plugins.md",
+    *EXPERIMENTS,
+)  # fmt: skip
+BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
+# sections that an experiment need not have
+OPTIONAL = (config.VortexPair, config.Turbine, config.Part)
+# what makes a printed run small; nothing else of it changes
+SMALLER = ("wake.spacing=1 m", "render.samples_per_beam=2", "retrieval.stride=8")
+
+
+# --- the plugin reference -------------------------------------------------------------------
+
+
+def test_plugin_reference_is_up_to_date():
+    script = runpy.run_path(str(DOCS / "make_plugin_reference.py"))
+    written = (DOCS / "plugins.md").read_text()
+    assert script["page"]() == written, "run: python docs/make_plugin_reference.py"
+
+
+@pytest.mark.parametrize(
+    ("docstring", "message"),
+    [
+        ("Title\n-----\n\n.. note:: beware", "into Markdown: '.. note:: beware'"),
+        ("Title\n-----\n\nsee :func:`x`", "unknown role"),
+        ("== ==\na  b\n== ==", "table without head or end"),
+        ("==== ==\na    b\n==== ==\nlonger b\n==== ==", "across a column's edge"),
+    ],
+)
+def test_plugin_reference_does_not_guess(docstring, message):
+    script = runpy.run_path(str(DOCS / "make_plugin_reference.py"))
+    with pytest.raises(ValueError, match=re.escape(message)):
+        script["section"](docstring)
+
+
+# --- the experiment file --------------------------------------------------------------------
+
+
+def leaves(model=config.Experiment, path=()):
+    """Every key of an experiment file: dotted name, section's model, field."""
+    for name, field in model.model_fields.items():
+        section = next((t for t in _parts(field.annotation) if _is_model(t)), None)
+        if section is None or section in OPTIONAL:
+            yield ".".join((*path, name)), model, field
+        if section is not None:
+            yield from leaves(section, (*path, name))
+
+
+def _is_model(kind):
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _parts(annotation):
+    """An annotation and everything nested in it."""
+    yield annotation
+    for part in (*typing.get_args(annotation), *getattr(annotation, "__metadata__", ())):
+        yield from _parts(part)
+
+
+def _unit(field):
+    """The SI unit that a field's values are in, None if it takes no quantity."""
+    kinds = {
+        typing.get_args(kind)[1]: unit
+        for kind, unit in (
+            (units.Length, "m"), (units.Angle, "rad"), (units.Speed, "m/s"), (units.Time, "s"),
+            (units.Energy, "J"), (units.Extinction, "1/m"), (units.Circulation, "m²/s"),
+            (units.Frequency, "Hz"), (units.SpectralRadiance, "W/m³/sr"),
+            (units.Backscatter, "1/m/sr"), (units.Area, "m²"),
+            (units.Number, None),
+        )
+    }  # fmt: skip
+    for part in (*_parts(field.annotation), *field.metadata):
+        for kind, unit in kinds.items():
+            if part is kind:
+                return unit
+    return None
+
+
+def documented():
+    """Rows of the guide's tables of keys: key to (unit, default, allowed)."""
+    rows = {}
+    for line in (DOCS / "user_guide.md").read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 5 and re.fullmatch(r"`[a-z_.]+`", cells[0]):
+            assert cells[0][1:-1] not in rows, f"{cells[0]} twice"
+            rows[cells[0][1:-1]] = cells[1:4]
+    return rows
+
+
+def test_every_key_is_documented_and_no_other():
+    assert set(documented()) == {name for name, _, _ in leaves()}
+
+
+@pytest.mark.parametrize(("name", "model", "field"), [pytest.param(*x, id=x[0]) for x in leaves()])
+def test_key_has_the_documented_unit_default_and_limits(name, model, field):
+    unit, default, allowed = documented()[name]
+    expected = _unit(field)
+    assert unit == (expected or "")
+    if default == "required":
+        assert field.is_required()
+    else:
+        assert _value(name, model, yaml.safe_load(default.strip("`"))) == _value(name, model)
+    for part in (*_parts(field.annotation), *field.metadata):
+        for sign, kind, attribute in (
+            (">", annotated_types.Gt, "gt"), ("≥", annotated_types.Ge, "ge"),
+            ("<", annotated_types.Lt, "lt"), ("≤", annotated_types.Le, "le"),
+        ):  # fmt: skip
+            if isinstance(part, kind):
+                limit = getattr(part, attribute)
+                shown = str(limit) if isinstance(limit, int) else f"{limit:.5g}"
+                assert re.search(rf"{sign} {re.escape(shown)}(?![\d.]*\d)", allowed), shown
+        if typing.get_origin(part) is typing.Literal and not name.endswith("render.variant"):
+            for option in typing.get_args(part):
+                assert f"`{option}`" in allowed
+
+
+def _value(name, model, *given):
+    """A key's value in a valid experiment that gives it, or else leaves it to its default."""
+    *parents, key = name.split(".")
+    if model in OPTIONAL:
+        whole = {"phase": "rayleigh", "share": 1.0} if model is config.Part else {}
+        return getattr(model.model_validate(whole | dict(zip([key], given))), key)
+    data = copy.deepcopy(BASE)
+    if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors
+        data |= {"doppler": {}, "retrieval": {"methods": ["variational"]}}
+    if name.split(".")[0] == "volume":  # it needs air in three dimensions
+        data["wake"] |= {"file": "wake_volume_40s.nc", "depth": "volume"}
+        data["scan"] = {"gate_count": 24}
+    section = data
+    for parent in parents:
+        section = section.setdefault(parent, {})
+    if name in ("wake.file", "wake.time"):  # without them this experiment is none
+        return given[0] if given else model.model_fields[key].default
+    section |= zip([key], given)
+    found = config.check(data, "base")
+    for part in name.split("."):
+        found = getattr(found, part)
+    return found
+
+
+def test_variants_are_documented():
+    allowed = documented()["render.variant"][2]
+    named = set(re.findall(r"`([a-z_]+)`", allowed))
+    field = next(f for n, _, f in leaves() if n == "render.variant")
+    for variant in typing.get_args(field.annotation):
+        backend = re.match(r"[a-z]+_ad_", variant)[0]
+        assert {backend, variant.removeprefix(backend)} <= named
+
+
+# --- what is printed runs -------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Block:
+    """A code block of a page."""
+
+    page: str
+    line: int
+    language: str
+    text: str
+
+    @property
+    def place(self):
+        return f"{self.page}:{self.line}"
+
+    @property
+    def file(self):
+        """The file's name, where the first line is a comment that gives one."""
+        match = re.match(r"(?:# |<!-- )([\w.]+\.(?:yaml|xml))(?: -->)?\n", self.text)
+        return match and match[1]
+
+
+def blocks(page):
+    lines = (ROOT / page).read_text().splitlines()
+    start = None
+    for number, line in enumerate(lines):
+        if line.startswith("```"):
+            if start is None:
+                start = number
+            else:
+                text = "\n".join(lines[start + 1 : number]) + "\n"
+                yield Block(page, start + 2, lines[start][3:].strip(), text)
+                start = None
+    assert start is None, f"{page}: block of line {start} is not closed"
+
+
+@pytest.fixture
+def workplace(tmp_path, monkeypatch):
+    """A folder to work in that looks like the project's from the outside."""
+    for name in ("scenes", "Makefile"):
+        (tmp_path / name).symlink_to(ROOT / name)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def command(line, capsys, extra=()):
+    """Run a ``lidar-mi`` command line here; exit code and what it said on stderr."""
+    arguments = shlex.split(line, comments=True)
+    assert Path(arguments[0]).name == "lidar-mi"
+    before, sys.argv = sys.argv, ["lidar-mi", *arguments[1:], *extra]
+    capsys.readouterr()
+    try:
+        cli.main()
+        code = 0
+    except SystemExit as stop:
+        code = stop.code or 0
+    finally:
+        sys.argv = before
+    return code, capsys.readouterr().err
+
+
+def run_shell(block, capsys):
+    for line in block.text.splitlines():
+        words = shlex.split(line, comments=True)
+        if not words:
+            continue
+        if words[0] == "make":
+            targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+            assert set(words[1:]) <= set(targets), f"{block.place}: {line}"
+        elif words[0] == ".":
+            assert words[1] == ".venv/bin/activate"
+        elif words[1] == "doctor":
+            assert words[2:] == []  # it starts a process for every variant; it has its own tests
+        else:
+            small = [w for key in SMALLER for w in ("--set", key)] if words[1] == "run" else ()
+            code, said = command(line, capsys, small)
+            assert code == 0, f"{block.place}: {line}\n{said}"
+
+
+def run_console(block, workplace, capsys):
+    """Commands after ``$`` are refused with exactly the line below them."""
+    for question, answer in re.findall(r"^\$ (.+)\n(?!\$)(.+)\n", block.text, re.MULTILINE):
+        code, said = command(question, capsys)
+        assert code == 2, f"{block.place}: {question}\n{said}"
+        said = said.splitlines()[-1]
+        said = said.replace(str(files("lidar_mi.scenes")), "<shipped>")
+        said = said.replace(str(ROOT / "scenes"), "<shipped>")
+        said = said.replace(str(workplace.resolve()), "<folder>")
+        assert said == answer, f"{block.place}: {question}"
+    assert block.text.count("$ ") * 2 == len(block.text.splitlines()), block.place
+
+
+def check_yaml(block):
+    data = yaml.safe_load(block.text)
+    if block.file and "requirements" in block.file:
+        Path(block.file).write_text(block.text)
+        assert read_requirements(block.file)
+    elif block.file:
+        Path(block.file).write_text(block.text)
+        for experiment in config.load_variants(block.file).values() or [config.load(block.file)]:
+            truth.make_truth(experiment)
+    else:
+        loaded = config.check({**BASE, **data}, block.place)
+        scatterer(loaded.scattering, wavelength=loaded.lidar.wavelength)  # finds the tables
+
+
+def check_xml(block):
+    import mitsuba as mi
+
+    if block.file:
+        Path(block.file).write_text(block.text)
+        mi.load_string(block.text)
+        return
+    # a piece of a scene: what it refers to stands before it
+    air = '<medium type="homogeneous" id="environment"/>'
+    mi.load_string(f'<scene version="3.0.0">{air if "environment" in block.text else ""}'
+                   f"{block.text}</scene>")  # fmt: skip
+
+
+@pytest.mark.usefixtures("variant")
+@pytest.mark.parametrize("pages", [["docs/theory.md"], ["docs/user_guide.md", "README.md"]])
+def test_what_is_printed_runs(pages, workplace, capsys):
+    """Block by block, as a reader would: files written by one are there for the next.
+
+    Of the README, which names files of the reader's own, command lines are run by no test: see
+    `test_command_lines_are_understood`.
+    """
+    import mitsuba as mi
+
+    for block in (block for page in pages for block in blocks(page)):
+        if block.language == "sh":
+            if block.page != "README.md":
+                run_shell(block, capsys)
+        elif block.language == "console":
+            run_console(block, workplace, capsys)
+        elif block.language == "yaml":
+            check_yaml(block)
+        elif block.language == "xml":
+            mi.set_variant("llvm_ad_mono_polarized")
+            mi.set_log_level(mi.LogLevel.Error)
+            check_xml(block)
+        elif block.language == "python":
+            file = str(ROOT / block.page)
+            code = compile("\n" * (block.line - 1) + block.text, file, "exec")
+            exec(code, {"__name__": "__docs__"})  # noqa: S102 - that is the test
+        else:
+            assert block.language == "math", f"{block.place}: {block.language!r}"
+
+
+@pytest.mark.usefixtures("variant")
+def test_plugin_examples_load(workplace):
+    """XML and Python of the plugin reference; a table of the shipped ones stands in for the named."""
+    import mitsuba as mi
+
+    table = np.loadtxt(ROOT / "scenes" / "aerosol_spheroids_532nm.txt")
+    Path("spheroids_532nm.txt").write_text(
+        (ROOT / "scenes" / "aerosol_spheroids_532nm.txt").read_text()
+    )
+    found = list(blocks("docs/plugins.md"))
+    assert len(found) >= 6
+    for block in found:
+        if block.language == "xml":
+            text = re.sub(r"^<(\w+) ", r'<\1 version="3.0.0" ', block.text)
+            assert mi.load_string(text) is not None
+        else:
+            assert block.language == "python"
+            assert mi.load_dict(eval(block.text, {"mi": mi, "table": table})) is not None
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_command_lines_are_understood(page):
+    """Options and commands that a page prints exist, also where the test above does not run them."""
+    import typer
+
+    group = typer.main.get_command(cli.app)
+    for block in blocks(page):
+        if block.language != "sh":
+            continue
+        for line in block.text.splitlines():
+            words = shlex.split(line, comments=True)
+            if words and Path(words[0]).name == "lidar-mi":
+                known = group.commands[words[1]]
+                known.make_context(words[1], list(words[2:]))
+
+
+# --- links and formulas ---------------------------------------------------------------------
+
+
+def prose(page):
+    """A page without its code blocks."""
+    return re.sub(r"^```.*?^```$", "", (ROOT / page).read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
+def anchors(page):
+    headings = re.findall(r"^#+ (.+)$", prose(page), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", h.lower()).replace(" ", "-") for h in headings}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_relative_links_lead_somewhere(page):
+    links = re.findall(r"\[([^\]]+)\]\(([^)\s]+)\)", prose(page))
+    assert links
+    for text, target in links:
+        if re.match(r"https?:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        file = ((ROOT / page).parent / path).resolve() if path else ROOT / page
+        assert file.exists(), f"{page}: {target}"
+        if anchor:
+            assert anchor in anchors(str(file.relative_to(ROOT))), f"{page}: {target}"
+        if file.suffix == ".py":
+            name = text.strip("`").rpartition(".")[2]
+            assert re.search(rf"^\s*(?:def|class) {name}\b", file.read_text(), re.MULTILINE), (
+                f"{page}: {text} is not in {path}"
+            )
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_formulas_are_whole(page):
+    text = (ROOT / page).read_text()
+    display = re.findall(r"^```math\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    inline = []
+    for paragraph in re.split(r"\n\s*\n", re.sub(r"`[^`\n]*`", "", prose(page))):
+        assert paragraph.count("$") % 2 == 0, f"{page}: {paragraph[:80]}"
+        inline += re.findall(r"\$([^$]+)\$", paragraph)
+    for formula in (*display, *inline):
+        bare = formula.replace(r"\{", "").replace(r"\}", "")
+        assert bare.count("{") == bare.count("}"), f"{page}: {formula}"
+        assert len(re.findall(r"\\left\b", bare)) == len(re.findall(r"\\right\b", bare)), formula
+        begun, ended = (re.findall(rf"\\{w}{{(\w+)}}", bare) for w in ("begin", "end"))
+        assert sorted(begun) == sorted(ended), formula
+    # Markdown takes the backslash off these, unless they stand in a block
+    assert not [f for f in inline if re.search(r"\\[,;!\\{}]", f)]

@@ -1,0 +1,62 @@
+"""The documentation as a site.
+
+Detects a page that the site lists but does not have, or has but does not list, a picture or link
+that leads nowhere, a formula that is left as its source, and styled letters that browsers would
+draw plain.
+"""
+
+import importlib.util
+import re
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+NEEDED = ("sphinx", "myst_parser", "furo", "latex2mathml")
+missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
+with_sphinx = pytest.mark.skipif(bool(missing), reason=f"no {', '.join(missing)}: extra docs")
+
+
+def listed(page):
+    """Pages in the tables of contents of a page and those it lists."""
+    tables = re.findall(r"^```\{toctree\}\n(?::.*\n)*\n([^`]+)```$", page.read_text(), re.MULTILINE)
+    for name in " ".join(tables).split():
+        below = page.parent / f"{name}.md"
+        yield below
+        yield from listed(below)
+
+
+def test_every_page_is_listed_and_there():
+    found = sorted(listed(DOCS / "index.md"))
+    assert found == sorted(set(DOCS.rglob("*.md")) - {DOCS / "index.md"})
+
+
+def test_pictures_are_there():
+    for page in DOCS.rglob("*.md"):
+        for picture in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page.read_text()):
+            assert (page.parent / picture).is_file(), f"{page.name}: {picture}"
+
+
+@with_sphinx
+def test_formulas_become_mathml():
+    mathml = runpy.run_path(str(DOCS / "conf.py"))["_mathml"]
+    drawn = mathml(r"\mathbf x = \mathcal T \boldsymbol\epsilon^2", "inline")
+    assert "<mi>\U0001d431</mi>" in drawn and "<mi>\U0001d4af</mi>" in drawn
+    assert "\U0001d750" in drawn and "<msup>" in drawn and "mathvariant" not in drawn
+
+
+@pytest.mark.slow
+@with_sphinx
+def test_site_is_built_without_a_warning(tmp_path):
+    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d",
+               str(tmp_path / "doctrees"), str(DOCS), str(tmp_path / "site")]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    theory = (tmp_path / "site" / "theory.html").read_text()
+    assert theory.count("<math ") > 500 and "merror" not in theory
+    # no script or style from elsewhere: it opens offline
+    for page in (tmp_path / "site").glob("*.html"):
+        assert not re.search(r'(?:src|href)="https?://[^"]+\.(?:js|css)', page.read_text())
