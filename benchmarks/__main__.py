@@ -11,9 +11,16 @@ from . import report
 from .measure import fresh_process
 
 COMPARISONS = (
-    "estimators", "dense", "transient", "velocimetry", "methods", "rendered", "renderer", "fringes",
+    "estimators",
+    "dense",
+    "transient",
+    "velocimetry",
+    "methods",
+    "rendered",
+    "renderer",
+    "fringes",
     "rings",
-)  # fmt: skip
+)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -54,9 +54,16 @@ def _time_of_gates(profile, one, repeats):
     found = in_turns({"profile": task(profile), "one": task(one)}, repeats)
     times = {name: [s for s, _ in turns] for name, turns in found.items()}
     return [
-        row("as many gated photons in one gate", "time, 500 gates (left) and one", "s",
-            times["profile"], times["one"], "lower", "what more gates cost"),
-    ]  # fmt: skip
+        row(
+            "as many gated photons in one gate",
+            "time, 500 gates (left) and one",
+            "s",
+            times["profile"],
+            times["one"],
+            "lower",
+            "what more gates cost",
+        )
+    ]
 
 
 def _scene(phase, albedo, fov, gates, count, beams):
@@ -78,27 +85,28 @@ def _scene(phase, albedo, fov, gates, count, beams):
                 "directions": mi.TensorXf(same),
                 "laser": {"type": "laser", "beam_cut": 100.0, "divergence_full_mrad": 2.0},
                 "film": {
-                    "type": "hdrfilm", "width": width, "height": width,
-                    "pixel_format": "luminance", "rfilter": {"type": "box"},
+                    "type": "hdrfilm",
+                    "width": width,
+                    "height": width,
+                    "pixel_format": "luminance",
+                    "rfilter": {"type": "box"},
                 },
                 "sampler": {"type": "independent"},
             },
             "slab": {
-                "type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": medium,
+                "type": "cube",
+                "to_world": place,
+                "bsdf": {"type": "null"},
+                "interior": medium,
             },
         }
-    )  # fmt: skip
+    )
 
 
 def _rows(case, scene, repeats, gated_photons, analog_photons):
-    analog = mi.load_dict(
-        {"type": "gated_volpath", "estimator": "analog", "max_order": ORDERS}
-    )
+    analog = mi.load_dict({"type": "gated_volpath", "estimator": "analog", "max_order": ORDERS})
     gates = scene.sensors()[0].gate_count
-    sides = {
-        "gated": (scene.integrator(), gated_photons),
-        "analog": (analog, analog_photons),
-    }
+    sides = {"gated": (scene.integrator(), gated_photons), "analog": (analog, analog_photons)}
 
     def task(integrator, photons):
         return lambda turn: np.array(
@@ -114,13 +122,24 @@ def _rows(case, scene, repeats, gated_photons, analog_photons):
             float(np.median(photons * image.var(0, ddof=1) / mean**2)) for image in images
         ]
         times[name] = [s / (photons * len(images[0])) for s, _ in found[name]]
-    products = {
-        name: [1e9 * v * t for v, t in zip(variances[name], times[name])] for name in sides
-    }
+    products = {name: [1e9 * v * t for v, t in zip(variances[name], times[name])] for name in sides}
     return [
         row(case, "relative variance", "", variances["gated"], variances["analog"], "lower"),
-        row(case, "time of one photon", "ns", [1e9 * t for t in times["gated"]],
-            [1e9 * t for t in times["analog"]], "lower"),
-        row(case, "variance x time", "ns", products["gated"], products["analog"], "lower",
-            "ratio of efficiencies"),
-    ]  # fmt: skip
+        row(
+            case,
+            "time of one photon",
+            "ns",
+            [1e9 * t for t in times["gated"]],
+            [1e9 * t for t in times["analog"]],
+            "lower",
+        ),
+        row(
+            case,
+            "variance x time",
+            "ns",
+            products["gated"],
+            products["analog"],
+            "lower",
+            "ratio of efficiencies",
+        ),
+    ]

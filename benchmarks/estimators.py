@@ -18,9 +18,7 @@ from .scans import paper_scan, set_extinction
 BRIGHTEST, DARKEST = 0.01, 0.1
 
 
-def compare(
-    repeats: int = 5, photons: int = 64, columns: int = 219, rows: int = 139
-) -> Comparison:
+def compare(repeats: int = 5, photons: int = 64, columns: int = 219, rows: int = 139) -> Comparison:
     """Both estimators at peak and at environment extinction, homogeneous and in the wake."""
     scan = paper_scan(columns, rows)
     scene = scan.scene()
@@ -97,13 +95,33 @@ def _rows(
     lines = [
         row(case, "photons for one that counts", "", [1.0], one_in, "lower", expected),
         row(case, "relative variance of one photon", "", ours, other, "lower"),
-        row(case, "photons a beam for 1 %", "", need, [v / 1e-4 for v in other], "lower",
-            "gated: at least 2, for a standard error"),
-        row(case, "time of one photon", "ns", [1e9 * t for t in time],
-            [1e9 * t for t in other_time], "lower"),
-        row(case, "variance x time of one photon", "ns", [1e9 * v * t for v, t in zip(ours, time)],
-            [1e9 * v * t for v, t in zip(other, other_time)], "lower", "ratio of efficiencies"),
-    ]  # fmt: skip
+        row(
+            case,
+            "photons a beam for 1 %",
+            "",
+            need,
+            [v / 1e-4 for v in other],
+            "lower",
+            "gated: at least 2, for a standard error",
+        ),
+        row(
+            case,
+            "time of one photon",
+            "ns",
+            [1e9 * t for t in time],
+            [1e9 * t for t in other_time],
+            "lower",
+        ),
+        row(
+            case,
+            "variance x time of one photon",
+            "ns",
+            [1e9 * v * t for v, t in zip(ours, time)],
+            [1e9 * v * t for v, t in zip(other, other_time)],
+            "lower",
+            "ratio of efficiencies",
+        ),
+    ]
     # do both mean the same, and are the reported standard errors those over the seeds?
     total = np.mean([image[chosen, 0].mean() for _, image in analog]) / mean.mean() - 1
     error = np.sqrt(np.mean(other) / (photons * len(analog) * chosen.sum()))
@@ -115,7 +133,5 @@ def _rows(
         for images in (gated, analog):
             seen = np.var([image[chosen, 0] for _, image in images], axis=0, ddof=1).mean()
             honest.append(seen / np.mean([image[chosen, 4] ** 2 for _, image in images]))
-        lines.append(
-            row(case, "variance over seeds / reported", "", honest[:1], honest[1:])
-        )
+        lines.append(row(case, "variance over seeds / reported", "", honest[:1], honest[1:]))
     return lines

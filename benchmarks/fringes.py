@@ -26,14 +26,14 @@ WAVELENGTH, LIGHT = 354.7e-9, 299_792_458.0
 FORWARD = (
     ("forward, the line folded in, ideal lens", {"estimator": "forward"}),
     ("forward, frequencies drawn, ideal lens", {"estimator": "forward", "line_shape": "sampled"}),
-    ("photon by photon, frequencies drawn, real lens",
-     {"estimator": "analog", "line_shape": "sampled", "lens": "singlet"}),
-)  # fmt: skip
+    (
+        "photon by photon, frequencies drawn, real lens",
+        {"estimator": "analog", "line_shape": "sampled", "lens": "singlet"},
+    ),
+)
 
 
-def compare(
-    repeats: int = 5, width: int = 960, height: int = 780, samples: int = 16
-) -> Comparison:
+def compare(repeats: int = 5, width: int = 960, height: int = 780, samples: int = 16) -> Comparison:
     """Paths per second, time at equal noise, velocity lost in single precision."""
     use_variant(VARIANT)
     pressure, temperature = standard_atmosphere(8500.0)
@@ -73,20 +73,45 @@ def compare(
     other_noise = float(np.std((first - second)[bright] / (first + second)[bright])) * 2**0.5
     case = "from the camera"
     lines += [
-        row(case, "paths per second", "million",
+        row(
+            case,
+            "paths per second",
+            "million",
             [1e-6 * paths / s for s, _ in found["ours"]],
-            [1e-6 * paths / s for s, _ in found["path"]], "higher", "other: Mitsuba's path"),
-        row(case, f"noise of a pixel at {samples} paths", "%",
-            [100 * n for n in noise], [100 * other_noise], "lower"),
-        row(case, "time for 0.1 % noise", "s",
+            [1e-6 * paths / s for s, _ in found["path"]],
+            "higher",
+            "other: Mitsuba's path",
+        ),
+        row(
+            case,
+            f"noise of a pixel at {samples} paths",
+            "%",
+            [100 * n for n in noise],
+            [100 * other_noise],
+            "lower",
+        ),
+        row(
+            case,
+            "time for 0.1 % noise",
+            "s",
             [s * (n / 1e-3) ** 2 for (s, _), n in zip(found["ours"], noise)],
-            [s * (other_noise / 1e-3) ** 2 for s, _ in found["path"]], "lower", "extrapolated"),
-    ]  # fmt: skip
+            [s * (other_noise / 1e-3) ** 2 for s, _ in found["path"]],
+            "lower",
+            "extrapolated",
+        ),
+    ]
     ours, other = velocity_errors(etalon, camera)
-    lines.append(row(
-        "single precision", "velocity lost in the phase, rms", "m/s", [ours], [other], "lower",
-        "other: whole orders left in",
-    ))  # fmt: skip
+    lines.append(
+        row(
+            "single precision",
+            "velocity lost in the phase, rms",
+            "m/s",
+            [ours],
+            [other],
+            "lower",
+            "other: whole orders left in",
+        )
+    )
     return Comparison(
         f"Fringes ({width} x {height} pixels, {VARIANT}) against plain ways to them",
         "lidar-mi",
@@ -112,9 +137,12 @@ def plain_forward(
     x, y = camera.centre_pixel
     size = camera.height, camera.width
     picture, _, _ = np.histogram2d(
-        y + radius * np.sin(turn), x + radius * np.cos(turn), size,
-        [(-0.5, n - 0.5) for n in size], weights=passed,
-    )  # fmt: skip
+        y + radius * np.sin(turn),
+        x + radius * np.cos(turn),
+        size,
+        [(-0.5, n - 0.5) for n in size],
+        weights=passed,
+    )
     return picture / paths
 
 

@@ -47,7 +47,9 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
             note = f"{min(seconds):.3f} s"
             lines.append(row(case, name, "m/s", [mean[0]], [mean[1]], note=note))
     return Comparison(
-        title, *sides, tuple(lines),
+        title,
+        *sides,
+        tuple(lines),
         (
             (
                 f"Rms error of v, mean over {repeats} textures; the case of the other table of "
@@ -60,7 +62,7 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
                 "as they come."
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def ours(method: str) -> Callable[[Pair], Field]:

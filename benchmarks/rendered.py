@@ -13,15 +13,15 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.error_budget import CAUSES
+from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.backscatter import scan_plans
 from lidar_mi.experiment.stages.error_budget import budgets
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.truth import Truth
 from lidar_mi.instrument.detector import noisy_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.velocimetry.wind import METHODS
-from lidar_mi.experiment.truth import Truth
 
 from .cases import CIRCULATION, CORE_RADIUS, DT, SEPARATION, SPACING, Pair, vortex_pair_images
 from .report import Comparison, row
@@ -29,15 +29,23 @@ from .report import Comparison, row
 ENERGIES = (1e-3, 10e-3, 100e-3)
 EXTINCTION = 1e-3
 SHORT = {
-    "detector_noise": "detector", "monte_carlo": "simulation", "beam_blur": "beam",
-    "window": "window", "shear": "shear", "time_step": "paths", "method": "method",
-}  # fmt: skip
+    "detector_noise": "detector",
+    "monte_carlo": "simulation",
+    "beam_blur": "beam",
+    "window": "window",
+    "shear": "shear",
+    "time_step": "paths",
+    "method": "method",
+}
 
 
 def compare(
-    repeats: int = 5, columns: int = 219, rows: int = 139, samples: int = 64,
+    repeats: int = 5,
+    columns: int = 219,
+    rows: int = 139,
+    samples: int = 64,
     methods: Sequence[str] = tuple(METHODS),
-) -> Comparison:  # fmt: skip
+) -> Comparison:
     """Errors and shares averaged over as many textures as ``repeats``."""
     title = f"Wind from rendered pictures of {columns} x {rows} beams, all methods"
     found = {}
@@ -54,9 +62,12 @@ def compare(
             ]
             level = float((noisy[0]["Y_noise_std"] / noisy[0]["Y"]).median())
             limits = budgets(
-                experiment.model_copy(update={"lidar": lidar}), truth, noisy, cores=cores,
+                experiment.model_copy(update={"lidar": lidar}),
+                truth,
+                noisy,
+                cores=cores,
                 flagged=True,
-            )  # fmt: skip
+            )
             found.setdefault(energy, []).append((level, limits))
     lines = []
     for energy, turns in found.items():
@@ -68,11 +79,20 @@ def compare(
                 for key in turns[0][1][method]
             }
             lines.append(
-                row(case, f"lidar-mi {method}", "m/s", [mean["rmse_v"]],
-                    [mean["outside_cores.rmse_v"]], note=shares(mean))
-            )  # fmt: skip
+                row(
+                    case,
+                    f"lidar-mi {method}",
+                    "m/s",
+                    [mean["rmse_v"]],
+                    [mean["outside_cores.rmse_v"]],
+                    note=shares(mean),
+                )
+            )
     return Comparison(
-        title, "everywhere", "beyond 2 core radii", tuple(lines),
+        title,
+        "everywhere",
+        "beyond 2 core radii",
+        tuple(lines),
         (
             f"Rms error of v, mean over {repeats} textures, no vector left out; default settings.",
             (
@@ -82,7 +102,7 @@ def compare(
                 "paths in the time step; the method on perfect pictures. They need not add up."
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def shares(metrics: dict[str, float]) -> str:
@@ -112,8 +132,11 @@ def sensor(pair: Pair, samples: int, methods: Sequence[str]) -> Experiment:
         name="rendered",
         wake={
             "vortex_pair": {
-                "circulation": CIRCULATION, "separation": SEPARATION, "core_radius": CORE_RADIUS,
-                "width": extent[0], "height": extent[1],
+                "circulation": CIRCULATION,
+                "separation": SEPARATION,
+                "core_radius": CORE_RADIUS,
+                "width": extent[0],
+                "height": extent[1],
             },
             "spacing": SPACING,
         },
@@ -122,7 +145,7 @@ def sensor(pair: Pair, samples: int, methods: Sequence[str]) -> Experiment:
         scattering={"phase": "aerosol", "aerosol": "spheroids"},
         render={"samples_per_beam": samples, "max_order": 1},
         retrieval={"methods": tuple(methods)},
-    )  # fmt: skip
+    )
 
 
 def pictures(experiment: Experiment, truth: Truth, seed: int) -> list[xr.Dataset]:
@@ -136,7 +159,5 @@ def pictures(experiment: Experiment, truth: Truth, seed: int) -> list[xr.Dataset
     ]
     background = experiment.wake.extinction.background
     return list(
-        render_scans(
-            solids, plans, experiment.lidar, background, *air, experiment.render, seed
-        )
+        render_scans(solids, plans, experiment.lidar, background, *air, experiment.render, seed)
     )

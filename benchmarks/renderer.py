@@ -51,8 +51,13 @@ def compare(
         (
             row(start, "first scan, nothing compiled before", "s", [s[0] for s in cold]),
             row(start, "first scan, kernels cached on disk", "s", [s[0] for s in cached]),
-            row(start, "second scan (t2)", "s", [s[1] for s in cold],
-                note="moved telescope, other air: compiles nothing"),
+            row(
+                start,
+                "second scan (t2)",
+                "s",
+                [s[1] for s in cold],
+                note="moved telescope, other air: compiles nothing",
+            ),
             row(each, "photons per second", "million", rate),
             row(each, "time of the scan", "s", warm["seconds"]),
             row(scan, "photons a beam", "", [float(warm["need"])]),
@@ -60,10 +65,15 @@ def compare(
             row(scan, "time of the scan", "s", warm["need_seconds"]),
             row(space, "before rendering", "GB", [1e-9 * few[0]]),
             row(space, f"{photons} photons a beam", "GB", [1e-9 * few[1]]),
-            row(space, f"{many} photons a beam", "GB", [1e-9 * most[1]],
-                note=f"{1e-6 * many * columns * rows:.0f} million photons, in passes"),
+            row(
+                space,
+                f"{many} photons a beam",
+                "GB",
+                [1e-9 * most[1]],
+                note=f"{1e-6 * many * columns * rows:.0f} million photons, in passes",
+            ),
         ),
-    )  # fmt: skip
+    )
 
 
 def first_scans(columns: int, rows: int, photons: int) -> list[float]:

@@ -75,7 +75,9 @@ def row(
     if better and ours and other:
         turns = max(len(ours), len(other))
         left, right = (v * turns if len(v) == 1 else v for v in (ours, other))
-        pairs = zip(right, left, strict=True) if better == "lower" else zip(left, right, strict=True)
+        pairs = (
+            zip(right, left, strict=True) if better == "lower" else zip(left, right, strict=True)
+        )
         ratios = [a / b for a, b in pairs]
         ratio = median(ratios)
         spread = (min(ratios), max(ratios)) if turns > 1 else None

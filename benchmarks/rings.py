@@ -57,12 +57,33 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780) -> Comparison
         "annular fit",
         "other",
         (
-            row(case, "pictures a second", "", speed["annular"], speed["flat"], "higher",
-                "other: 2-D fit"),
-            row(case, "pictures a second", "", speed["annular"], speed["scipy"], "higher",
-                "other: scipy, one picture at a time"),
-            row(case, "rms error of v_LOS", "m/s", [rms], [bound], "",
-                f"{ANNULAR} pictures; other: Cramer-Rao bound"),
+            row(
+                case,
+                "pictures a second",
+                "",
+                speed["annular"],
+                speed["flat"],
+                "higher",
+                "other: 2-D fit",
+            ),
+            row(
+                case,
+                "pictures a second",
+                "",
+                speed["annular"],
+                speed["scipy"],
+                "higher",
+                "other: scipy, one picture at a time",
+            ),
+            row(
+                case,
+                "rms error of v_LOS",
+                "m/s",
+                [rms],
+                [bound],
+                "",
+                f"{ANNULAR} pictures; other: Cramer-Rao bound",
+            ),
             row(case, "largest difference of v_LOS to the 2-D fit", "m/s", [away["flat"]]),
             row(case, "largest difference of v_LOS to scipy's fit", "m/s", [away["scipy"]]),
         ),
@@ -72,7 +93,7 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780) -> Comparison
                 "the 2-D fit starts from the annular one, scipy's from 5 m/s and 1 px beside the truth."
             ),
         ),
-    )  # fmt: skip
+    )
 
 
 def scipy_fit(image: torch.Tensor, model: RingModel, noise) -> float:

@@ -8,11 +8,11 @@ import mitsuba as mi
 import xarray as xr
 
 from lidar_mi.experiment.schema import Experiment, load
+from lidar_mi.experiment.truth import make_truth
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans, scene_dict
 from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.experiment.truth import make_truth
 
 
 @dataclass(frozen=True)
@@ -63,9 +63,7 @@ def paper_scan(columns: int = 219, rows: int = 139) -> PaperScan:
     flown = experiment.platform.speed * experiment.platform.dt
     plans = plan_scans(experiment.scan, y.values, z.values, (0.0, flown))
     fields = [
-        extrude(
-            field.isel(x=0).sel(y=y, z=z).transpose("z", "y"), plans[0], experiment.lidar
-        )
+        extrude(field.isel(x=0).sel(y=y, z=z).transpose("z", "y"), plans[0], experiment.lidar)
         for field in truth.extinction
     ]
     return PaperScan(experiment, tuple(fields), tuple(plans))

@@ -38,9 +38,7 @@ NOISE = 0.01
 LONGEST = 1 << 22
 
 
-def compare(
-    repeats: int = 5, columns: int = 219, rows: int = 139, samples: int = 64
-) -> Comparison:
+def compare(repeats: int = 5, columns: int = 219, rows: int = 139, samples: int = 64) -> Comparison:
     """Noise, time and truth of both; ``samples``: a beam, where the noise is measured."""
     title = f"Single scattering against mitransient, one gate, {NOISE:.0%} standard error"
     sides = ("lidar-mi", "mitransient")
@@ -107,21 +105,59 @@ def _case(case, peer, extinction, repeats, columns, rows, samples):
     other_error = math.sqrt(other_variance / (sum(weights) * repeats))
     time, other_time = scan.sample_seconds
     return [
-        row(case, "value / lidar equation - 1", "%", [100 * (value - 1)],
-            [100 * (other_value - 1)], note=f"+- {100 * error:.2g} and {100 * other_error:.2g}"),
+        row(
+            case,
+            "value / lidar equation - 1",
+            "%",
+            [100 * (value - 1)],
+            [100 * (other_value - 1)],
+            note=f"+- {100 * error:.2g} and {100 * other_error:.2g}",
+        ),
         row(case, "relative variance of one sample", "", [variance], [other_variance], "lower"),
-        row(case, "samples a beam for 1 %", "", [need], [other_need], "lower",
-            "lidar-mi: at least 2"),
-        row(case, "time of one sample in a scan", "ns", [1e9 * t for t in time],
-            [1e9 * t for t in other_time], "lower"),
-        row(case, "variance x time of one sample", "ns", [1e9 * variance * t for t in time],
-            [1e9 * other_variance * t for t in other_time], "lower", "ratio of efficiencies"),
-        row(case, "one beam to 1 %", "s", seconds,
-            [t * other_need / at_once for t in other_seconds], "lower",
-            "lidar-mi: the time to start a kernel"),
-        row(case, f"scan of {beams} beams to 1 %", "s", scan.need_seconds,
-            [t * other_need * beams for t in other_time], "lower"),
-    ]  # fmt: skip
+        row(
+            case,
+            "samples a beam for 1 %",
+            "",
+            [need],
+            [other_need],
+            "lower",
+            "lidar-mi: at least 2",
+        ),
+        row(
+            case,
+            "time of one sample in a scan",
+            "ns",
+            [1e9 * t for t in time],
+            [1e9 * t for t in other_time],
+            "lower",
+        ),
+        row(
+            case,
+            "variance x time of one sample",
+            "ns",
+            [1e9 * variance * t for t in time],
+            [1e9 * other_variance * t for t in other_time],
+            "lower",
+            "ratio of efficiencies",
+        ),
+        row(
+            case,
+            "one beam to 1 %",
+            "s",
+            seconds,
+            [t * other_need / at_once for t in other_seconds],
+            "lower",
+            "lidar-mi: the time to start a kernel",
+        ),
+        row(
+            case,
+            f"scan of {beams} beams to 1 %",
+            "s",
+            scan.need_seconds,
+            [t * other_need * beams for t in other_time],
+            "lower",
+        ),
+    ]
 
 
 def _scans(peer, extinction, repeats, columns, rows, samples) -> _Scan:
@@ -201,8 +237,11 @@ def lidar_equation(extinction: float, cosine: np.ndarray) -> np.ndarray:
 def _air(extinction: float) -> dict:
     def medium(sigma_t):
         return {
-            "type": "homogeneous", "sigma_t": sigma_t, "albedo": 1.0, "phase": {"type": "rayleigh"}
-        }  # fmt: skip
+            "type": "homogeneous",
+            "sigma_t": sigma_t,
+            "albedo": 1.0,
+            "phase": {"type": "rayleigh"},
+        }
 
     def box(near, far):
         place = mi.ScalarTransform4f().translate([(near + far) / 2, 0, 0])

@@ -60,15 +60,22 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
     cases = {
         # of its four correlations the one with the smallest error each
         "8 px windows: cc 8 in 16 | extended search 8 in 16": (
-            (8, 16), lambda: extended_search(pair, 8, 16, "linear")),
+            (8, 16),
+            lambda: extended_search(pair, 8, 16, "linear"),
+        ),
         "8 px windows: cc 8 in 16 | window deformation 32, 16, 8, 8": (
-            (8, 16), lambda: window_deformation(pair, (32, 16, 8, 8), (8, 4, 2, 1))),
+            (8, 16),
+            lambda: window_deformation(pair, (32, 16, 8, 8), (8, 4, 2, 1)),
+        ),
         "16 px windows: cc 16 in 24 | one pass 16": (
-            (16, 24), lambda: extended_search(pair, 16, 16, "circular")),
+            (16, 24),
+            lambda: extended_search(pair, 16, 16, "circular"),
+        ),
         "16 px windows: cc 16 in 24 | window deformation 32, 16, 16, 16, 16": (
             (16, 24),
-            lambda: window_deformation(pair, (32, 16, 16, 16, 16), (16, 8, 4, 2, 1))),
-    }  # fmt: skip
+            lambda: window_deformation(pair, (32, 16, 16, 16, 16), (16, 8, 4, 2, 1)),
+        ),
+    }
     lines = []
     for case, (windows, theirs) in cases.items():
         found = in_turns(
@@ -83,9 +90,16 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
         share = f"{vectors} vectors both have"
         for (where, component), (left, right) in errors.items():
             lines.append(
-                row(case, f"rms error of {component}, {where}", "m/s", [left], [right], "lower",
-                    share)
-            )  # fmt: skip
+                row(
+                    case,
+                    f"rms error of {component}, {where}",
+                    "m/s",
+                    [left],
+                    [right],
+                    "lower",
+                    share,
+                )
+            )
             share = ""
         per_vector = [
             [1e6 * seconds / field.dz.size for seconds, field in found[side]]
@@ -170,9 +184,7 @@ def wind_errors(pair: Pair, ours: Field, other: Field) -> tuple[dict, int]:
     the number of vectors.
     """
     first = max(ours.start, other.start)
-    size = [
-        min(int(f.start - first) + f.dz.shape[axis] for f in (ours, other)) for axis in (0, 1)
-    ]
+    size = [min(int(f.start - first) + f.dz.shape[axis] for f in (ours, other)) for axis in (0, 1)]
     place = [
         float(pair.first[name][0]) + (first + np.arange(n)) * SPACING
         for name, n in zip(("z", "y"), size)

@@ -18,12 +18,12 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 from lidar_mi.experiment import schema as config
+from lidar_mi.experiment.truth import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, scene_dict
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.experiment.truth import make_truth
 
 LIDAR = BackscatterLidar(divergence_full="3 mrad")  # 0.38 m rms at 500 m, on nodes of 0.5 m
 ENVIRONMENT = 1e-4
@@ -83,12 +83,22 @@ def error(found: xr.DataArray, truth: xr.DataArray) -> float:
 def draw(truth, guess, found, path) -> None:
     figure = Figure(figsize=(15, 4), layout="compressed")
     for axes, field, name in zip(
-        figure.subplots(1, 3), (truth, guess, found),
-        ("true air", f"as seen: error {error(guess, truth):.1%}",
-         f"recovered: error {error(found, truth):.1%}"),
-    ):  # fmt: skip
-        mesh = axes.pcolormesh(field["y"], field["z"], field * 1e3, vmin=0, cmap="cividis",
-                               vmax=1e3 * float(truth.quantile(0.995)))  # fmt: skip
+        figure.subplots(1, 3),
+        (truth, guess, found),
+        (
+            "true air",
+            f"as seen: error {error(guess, truth):.1%}",
+            f"recovered: error {error(found, truth):.1%}",
+        ),
+    ):
+        mesh = axes.pcolormesh(
+            field["y"],
+            field["z"],
+            field * 1e3,
+            vmin=0,
+            cmap="cividis",
+            vmax=1e3 * float(truth.quantile(0.995)),
+        )
         axes.set(title=name, xlabel="y / m (port is left)", ylabel="z / m", aspect="equal")
         axes.invert_xaxis()
         figure.colorbar(mesh, ax=axes, label="extinction / km$^{-1}$", extend="max")
@@ -110,8 +120,10 @@ def main() -> None:
     truth = port_vortex(32, 24)
     guess, found, misfits = recover(truth, options.steps, options.photons)
     draw(truth, guess, found, options.out)
-    print(f"lidar-mi {lidar_mi.__version__}: misfit {misfits[0]:.2e} -> {misfits[-1]:.2e}, error "
-          f"{error(guess, truth):.1%} -> {error(found, truth):.1%}, {options.out}")  # fmt: skip
+    print(
+        f"lidar-mi {lidar_mi.__version__}: misfit {misfits[0]:.2e} -> {misfits[-1]:.2e}, error "
+        f"{error(guess, truth):.1%} -> {error(found, truth):.1%}, {options.out}"
+    )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,5 @@
 """The one exception a user should ever see for bad input, and what lies under others."""
 
-
 from collections.abc import Iterator
 
 

@@ -18,9 +18,15 @@ UNITS = pint.UnitRegistry()
 _TEXT = re.compile(r"""([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan))\s*([^\n,;#"']*)""")
 # what pint raises, and what reaches us through it from Python's tokenizer and arithmetic
 _BAD_UNIT = (
-    pint.PintError, tokenize.TokenError, ArithmeticError, AssertionError, AttributeError,
-    SyntaxError, TypeError, ValueError,
-)  # fmt: skip
+    pint.PintError,
+    tokenize.TokenError,
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+)
 
 
 @dataclass(frozen=True)

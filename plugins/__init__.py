@@ -24,9 +24,17 @@ from . import (
 )
 
 PLUGINS = (
-    laser, scanning_lidar, gated_volpath, mueller, rayleigh_polarized,
-    spectral_line, plane_waves, etalon, ccd, fringes,
-)  # fmt: skip
+    laser,
+    scanning_lidar,
+    gated_volpath,
+    mueller,
+    rayleigh_polarized,
+    spectral_line,
+    plane_waves,
+    etalon,
+    ccd,
+    fringes,
+)
 
 _following_variants = False
 

@@ -131,7 +131,9 @@ def define():
                 fail(NAME, "reflectivity", self.reflectivity, "a number between 0 and 1")
             passed = 1 - self.reflectivity
             if not passed - self.absorption > LEAST_PASSED:
-                fail(NAME, "absorption", self.absorption, f"less than 1 - reflectivity = {passed:g}")
+                fail(
+                    NAME, "absorption", self.absorption, f"less than 1 - reflectivity = {passed:g}"
+                )
             per_hertz = float(2 * self.index * self.gap / SPEED_OF_LIGHT + 2 * delay)
             self.free_spectral_range = 1 / per_hertz
             self.m_fraction = dr.opaque(mi.Float, self.order - round(self.order))
@@ -197,8 +199,10 @@ def define():
             sine2 = sine2 / self.index**2
             cosine = dr.sqrt(1 - sine2)
             # order (1 - cosine), without the difference of two large numbers
-            return self.m_fraction - self.m_order * (sine2 / (1 + cosine)) + (
-                offset * self.m_orders_per_hertz * cosine
+            return (
+                self.m_fraction
+                - self.m_order * (sine2 / (1 + cosine))
+                + (offset * self.m_orders_per_hertz * cosine)
             )
 
         def matrices(self, sine2, offset, defects, reflects=True):
@@ -305,9 +309,13 @@ def define():
 
             return mi.mueller.rotate_mueller_basis(
                 matrix,
-                arriving, axis(arriving), mi.mueller.stokes_basis(arriving),
-                leaving, axis(leaving), mi.mueller.stokes_basis(leaving),
-            )  # fmt: skip
+                arriving,
+                axis(arriving),
+                mi.mueller.stokes_basis(arriving),
+                leaving,
+                axis(leaving),
+                mi.mueller.stokes_basis(leaving),
+            )
 
         def eval(self, ctx, si, wo, active=True):
             return mi.Spectrum(0)

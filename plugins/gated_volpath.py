@@ -144,9 +144,11 @@ def define():
             """Means of passes, attached to the scene's parameters, and their places in the image."""
             if self.estimator != "gated" or self.max_order > 1:
                 fail(
-                    NAME, "gradients", f"{self.estimator}, max_order {self.max_order}",
+                    NAME,
+                    "gradients",
+                    f"{self.estimator}, max_order {self.max_order}",
                     "the gated estimator with max_order 1",
-                )  # fmt: skip
+                )
             sensor, seed, photons = self._prepare(scene, sensor, seed, spp)
             gates = sensor.gate_count
             for first, count, start, now, _ in self._passes(sensor, photons):
@@ -326,9 +328,11 @@ def _check_blends(scene, sensor):
         part = medium and first_unpolarized_in_blend(medium)
         if part is not None:
             fail(
-                NAME, "blendphase", part.class_name(),
+                NAME,
+                "blendphase",
+                part.class_name(),
                 "phase functions that all know polarisation, such as mueller, or none that does",
-            )  # fmt: skip
+            )
 
 
 def _check_gate_meets_medium(scene, sensor):
@@ -347,4 +351,6 @@ def _check_gate_meets_medium(scene, sensor):
         spans.append((float(box.distance(position)), float(max(corners))))
     if not any(first <= far and last >= near for first, last in spans):
         where = ", ".join(f"{a:g} to {b:g} m" for a, b in spans) or "nowhere"
-        fail(NAME, "gates", f"{near:g} to {far:g} m", f"ranges with a medium (there is one: {where})")
+        fail(
+            NAME, "gates", f"{near:g} to {far:g} m", f"ranges with a medium (there is one: {where})"
+        )

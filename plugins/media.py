@@ -154,9 +154,17 @@ def coefficients(medium, mei, channel, active):
 
 
 def transmittance(
-    air, medium, origin, direction, distance, channel, wavelengths, rng, active,
+    air,
+    medium,
+    origin,
+    direction,
+    distance,
+    channel,
+    wavelengths,
+    rng,
+    active,
     differentiable=False,
-):  # fmt: skip
+):
     """Unbiased estimate of the transmittance along a straight line, and the medium at its end.
 
     Homogeneous media in closed form; others by residual ratio tracking (Novak et al. 2014, ACM TOG
@@ -168,9 +176,17 @@ def transmittance(
     where = rng.next_float32(active) * distance if differentiable else mi.Float(-1)
     with dr.suspend_grad():
         value, end, between = _walk(
-            air, medium, dr.detach(origin), dr.detach(direction), dr.detach(distance), where,
-            channel, wavelengths, rng, active,
-        )  # fmt: skip
+            air,
+            medium,
+            dr.detach(origin),
+            dr.detach(direction),
+            dr.detach(distance),
+            where,
+            channel,
+            wavelengths,
+            rng,
+            active,
+        )
     if differentiable:
         mei = interaction(between, origin + direction * where, direction, wavelengths)
         inside = active & (between != None)

@@ -94,9 +94,16 @@ class Lidar:
         home = dr.normalize(photon.aperture - (photon.origin + photon.direction * closure))
         volume = (high - low) / (1 - dr.dot(photon.direction, home))
         total = self._connect(
-            photon, photon.rng, photon.origin, photon.direction, closure, medium, photon.stokes,
-            volume, (path > 0) & (closure > 0),
-        )  # fmt: skip
+            photon,
+            photon.rng,
+            photon.origin,
+            photon.direction,
+            closure,
+            medium,
+            photon.stokes,
+            volume,
+            (path > 0) & (closure > 0),
+        )
         if split:
             _add(by_order, total[0], cell * max_order)
         if max_order == 1:
@@ -119,9 +126,16 @@ class Lidar:
         active = flight > 0
         while dr.hint(active, label="scattering orders"):
             out, medium = transmittance(
-                self.air, medium, position, direction, flight, self.channel, self.wavelengths,
-                rng, active,
-            )  # fmt: skip
+                self.air,
+                medium,
+                position,
+                direction,
+                flight,
+                self.channel,
+                self.wavelengths,
+                rng,
+                active,
+            )
             active &= medium != None
             position = mi.Point3f(position + direction * flight)
             mei = interaction(medium, position, direction, self.wavelengths)
@@ -275,9 +289,7 @@ class Lidar:
         sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
         return axes.to_world(mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - below))
 
-    def _connect(
-        self, photon, rng, position, direction, distance, medium, stokes, volume, active
-    ):  # fmt: skip
+    def _connect(self, photon, rng, position, direction, distance, medium, stokes, volume, active):
         """Scatter at ``distance`` along a flight, where the path closes: Stokes vector about e_h.
 
         ``volume``: width of the gate (as whole path) times d(distance)/d(path).
@@ -285,9 +297,17 @@ class Lidar:
         vertex = position + direction * distance
         active = active & self.sensor.in_field_of_view(photon.axes, vertex - photon.aperture)
         out, medium = transmittance(
-            self.air, medium, position, direction, distance, self.channel, self.wavelengths,
-            rng, active, self.differentiable,
-        )  # fmt: skip
+            self.air,
+            medium,
+            position,
+            direction,
+            distance,
+            self.channel,
+            self.wavelengths,
+            rng,
+            active,
+            self.differentiable,
+        )
         mei = interaction(medium, vertex, direction, self.wavelengths)
         active = active & (medium != None)
         scattering, _ = coefficients(medium, mei, self.channel, active)
@@ -300,9 +320,17 @@ class Lidar:
         wo = back / distance
         active = active & self.sensor.in_field_of_view(photon.axes, -back)
         home, _ = transmittance(
-            self.air, medium, mei.p, wo, distance, self.channel, self.wavelengths, rng, active,
+            self.air,
+            medium,
+            mei.p,
+            wo,
+            distance,
+            self.channel,
+            self.wavelengths,
+            rng,
+            active,
             self.differentiable,
-        )  # fmt: skip
+        )
         weight = weight * home * self.area * -dr.dot(wo, photon.axes.n) / (distance * distance)
         received, _ = self._scatter(medium, mei, stokes, wo, active)
         if not mi.is_polarized:
@@ -336,9 +364,16 @@ class Lidar:
         while dr.hint(active, label="scattering orders"):
             began = mi.Bool(active)
             flight, medium, active = collision(
-                self.air, medium, position, direction, 2 * high - travelled, self.channel,
-                self.wavelengths, rng, active,
-            )  # fmt: skip
+                self.air,
+                medium,
+                position,
+                direction,
+                2 * high - travelled,
+                self.channel,
+                self.wavelengths,
+                rng,
+                active,
+            )
             position = mi.Point3f(position + direction * flight)
             travelled += flight
             mei = interaction(medium, position, direction, self.wavelengths)

@@ -98,9 +98,11 @@ def define():
                 sine, cosine = dr.sincos(dr.two_pi * sample.y)
                 disc = mi.Point2f(radius * cosine, radius * sine)
             sine2 = dr.squared_norm(disc)
-            share = mi.Float(1) if self.even else dr.exp(
-                -2 * sine2 * sine2 / ((1 - sine2) * self.m_scale2)
-            )  # fmt: skip
+            share = (
+                mi.Float(1)
+                if self.even
+                else dr.exp(-2 * sine2 * sine2 / ((1 - sine2) * self.m_scale2))
+            )
             local = mi.Vector3f(-dr.sqrt(1 - sine2), disc.x, disc.y)
             return dr.normalize(self.m_pose @ local), share, mi.Float(self.m_drawn)
 

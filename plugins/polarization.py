@@ -19,9 +19,7 @@ def horizontal_axis(direction):
     vertical = length < 1e-6
     scale = dr.rcp(dr.select(vertical, 1, length))
     return dr.select(
-        vertical,
-        mi.Vector3f(0, 1, 0),
-        mi.Vector3f(-direction.y * scale, direction.x * scale, 0),
+        vertical, mi.Vector3f(0, 1, 0), mi.Vector3f(-direction.y * scale, direction.x * scale, 0)
     )
 
 
@@ -58,9 +56,7 @@ def rotate_from_scattering_plane(incident, scattered, elements):
     length = dr.norm(normal)
     defined = length > 1e-6
     normal = dr.select(
-        defined,
-        normal * dr.rcp(dr.select(defined, length, 1)),
-        mi.coordinate_system(incident)[0],
+        defined, normal * dr.rcp(dr.select(defined, length, 1)), mi.coordinate_system(incident)[0]
     )
     plane = mi.Spectrum(0)
     plane[0, 0], plane[0, 1] = a1, b1

@@ -130,9 +130,14 @@ def test_an_angle_must_say_its_unit(text):
 
 def test_written_quantities_are_read_again_exactly():
     one = Quantities(
-        length=0.1 + 0.2, angle="6.2 deg", speed=1 / 3, time=1e-9, energy="0.07 J",
-        extinction="1.8 / km", number=1e-30,
-    )  # fmt: skip
+        length=0.1 + 0.2,
+        angle="6.2 deg",
+        speed=1 / 3,
+        time=1e-9,
+        energy="0.07 J",
+        extinction="1.8 / km",
+        number=1e-30,
+    )
     text = one.model_dump(mode="json")
     assert text["angle"].endswith(" rad") and text["extinction"].endswith(" 1/m")
     assert Quantities(**text) == one

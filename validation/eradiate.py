@@ -28,7 +28,9 @@ def reference(python: str | None, scale: int) -> dict:
 def provenance(python: str | None = None) -> str:
     """Where Eradiate's numbers come from."""
     if python is not None:
-        return "Eradiate's numbers were made beside this page, by `validation/eradiate_reference.py`."
+        return (
+            "Eradiate's numbers were made beside this page, by `validation/eradiate_reference.py`."
+        )
     stored = json.loads(STORED.read_text())
     versions = ", ".join(f"{name} {number}" for name, number in stored["versions"].items())
     return (

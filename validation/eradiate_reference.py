@@ -57,9 +57,7 @@ def table(rows: np.ndarray) -> dict:
     nodes = np.unique(np.cos(np.radians(np.linspace(0, 180, 3601))).astype(np.float32))
     angle = np.degrees(np.arccos(nodes.astype(float)))
     a1, a2, a3, a4, b1, b2 = (np.interp(angle, rows[:, 0], column) for column in rows[:, 1:].T)
-    columns = {
-        "nodes": nodes, "m11": a1, "m22": a2, "m33": a3, "m44": a4, "m12": b1, "m34": b2,
-    }  # fmt: skip
+    columns = {"nodes": nodes, "m11": a1, "m22": a2, "m33": a3, "m44": a4, "m12": b1, "m34": b2}
     text = {key: ", ".join(f"{v:.12g}" for v in values) for key, values in columns.items()}
     return {"type": "tabphase_polarized", **text}
 
@@ -118,10 +116,13 @@ def steady_state(name: str, order: int, photons: int, seed: int) -> dict:
             "type": "scene",
             "sun": {"type": "polarized_sun"},
             "slab": {
-                "type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": medium,
+                "type": "cube",
+                "to_world": place,
+                "bsdf": {"type": "null"},
+                "interior": medium,
             },
         }
-    )  # fmt: skip
+    )
     integrator = mi.load_dict({"type": "volpath", "max_depth": order + 1, "rr_depth": 1000})
     batch, sums, squares, count = 1_000_000, np.zeros(2), np.zeros(2), 0
     for k in range(-(-photons // batch)):
@@ -136,7 +137,9 @@ def steady_state(name: str, order: int, photons: int, seed: int) -> dict:
         light, _, _ = integrator.sample(scene, sampler, ray, None, mi.Bool(True))
         onward = -ray.d
         axis = dr.normalize(mi.Vector3f(0, 1, 0) - onward * onward.y)
-        light = mi.mueller.rotate_stokes_basis(onward, mi.mueller.stokes_basis(onward), axis) @ light
+        light = (
+            mi.mueller.rotate_stokes_basis(onward, mi.mueller.stokes_basis(onward), axis) @ light
+        )
         weight = 2 * np.pi * (1 - np.cos(CONE)) * np.array(cosine, float)
         stokes = np.stack([np.array(light[row, 0][0], float) for row in (0, 1)]) * weight
         sums, squares, count = sums + stokes.sum(1), squares + (stokes**2).sum(1), count + batch

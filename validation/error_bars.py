@@ -24,12 +24,22 @@ def _draw(place, scores):
     lowest = min(0.5 / (0.2 * z.size) for z in scores.values())
     middle = (edges[1:] + edges[:-1]) / 2
     with figures.figure(place) as axis:
-        axis.plot(middle, np.exp(-(middle**2) / 2) / math.sqrt(2 * math.pi),
-                  color=figures.REFERENCE, label="normal")  # fmt: skip
+        axis.plot(
+            middle,
+            np.exp(-(middle**2) / 2) / math.sqrt(2 * math.pi),
+            color=figures.REFERENCE,
+            label="normal",
+        )
         for number, (name, z) in enumerate(scores.items()):
             density, _ = np.histogram(np.clip(z, -4.99, 4.99), edges, density=True)
-            axis.plot(middle, np.where(density > 0, density, np.nan), "." if number % 2 else "x",
-                      color=f"C{number}", markersize=5, label=name)  # fmt: skip
+            axis.plot(
+                middle,
+                np.where(density > 0, density, np.nan),
+                "." if number % 2 else "x",
+                color=f"C{number}",
+                markersize=5,
+                label=name,
+            )
         axis.set(yscale="log", ylim=(lowest, 1), xlabel="z-score", ylabel="density")
         axis.legend(frameon=False, fontsize=8)
 
@@ -45,13 +55,31 @@ def single_scattering(effort):
     # means over so many photons are normal but for a few parts in their number
     slack = 4 / photons
     rows = [
-        Row(f"mean square of {z.size} z-scores", "lidar equation", 1.0, (z**2).mean(),
-            math.sqrt(2 / z.size), slack),
-        Row("mean z-score", "lidar equation", 0.0, z.mean(), 1 / math.sqrt(z.size),
-            1e-5 * (truth / found["S0_stderr"]).mean()),
-        Row("share of beams beyond 3 sigmas", "normal distribution", 0.0027,
-            (np.abs(z) > 3).mean(), math.sqrt(0.0027 / z.size), 0.0027 * 10 * slack),
-    ]  # fmt: skip
+        Row(
+            f"mean square of {z.size} z-scores",
+            "lidar equation",
+            1.0,
+            (z**2).mean(),
+            math.sqrt(2 / z.size),
+            slack,
+        ),
+        Row(
+            "mean z-score",
+            "lidar equation",
+            0.0,
+            z.mean(),
+            1 / math.sqrt(z.size),
+            1e-5 * (truth / found["S0_stderr"]).mean(),
+        ),
+        Row(
+            "share of beams beyond 3 sigmas",
+            "normal distribution",
+            0.0027,
+            (np.abs(z) > 3).mean(),
+            math.sqrt(0.0027 / z.size),
+            0.0027 * 10 * slack,
+        ),
+    ]
     return Check(
         "Single scattering, beam by beam",
         f"219 x 139 beams over 12.4 by 7.8 degrees, {photons} photons each, slab of 0.02 / m, gate of "
@@ -79,9 +107,14 @@ def multiple_scattering(effort):
         excess = ((value - value.mean(0)) ** 4).mean(0) / value.var(0) ** 2 - 1
         sigma = np.sqrt((excess / seeds).mean() / ratio.size)
         rows.append(
-            Row(f"{name}: variance over seeds / stated, ten gates", f"{seeds} seeds", 1.0,
-                ratio.mean(), sigma)
-        )  # fmt: skip
+            Row(
+                f"{name}: variance over seeds / stated, ten gates",
+                f"{seeds} seeds",
+                1.0,
+                ratio.mean(),
+                sigma,
+            )
+        )
         scores[name] = ((value - value.mean(0)) / error).ravel() * math.sqrt(seeds / (seeds - 1))
     place = effort.folder / "z_scores_dense.png"
     _draw(place, scores)
@@ -105,9 +138,13 @@ def rare_paths(effort):
     for number, (name, phase) in enumerate(phases.items()):
         shapes = {"slab": layer(490, 512, medium(1.8e-3, phase), ENVIRONMENT)}
         loaded = scene(
-            (500, 502.5), shapes, size, integrator={"max_order": 4},
-            environment=medium(1e-4, phase), **SCAN,
-        )  # fmt: skip
+            (500, 502.5),
+            shapes,
+            size,
+            integrator={"max_order": 4},
+            environment=medium(1e-4, phase),
+            **SCAN,
+        )
         one, two = (render(loaded, 420 + 2 * number + k, photons) for k in (0, 1))
         difference = one["S0"] - two["S0"]
         stated = one["S0_stderr"] ** 2 + two["S0_stderr"] ** 2
@@ -118,11 +155,21 @@ def rare_paths(effort):
         ratio = seen.mean() / said.mean()
         noise = (seen - ratio * said).std() / math.sqrt(seen.size) / said.mean()
         rows += [
-            Row(f"{name}: variance of differences / stated", f"{seen.size} pairs of beams", 1.0,
-                ratio, noise),
-            Row(f"{name}: mean difference over its error", "two seeds", 0.0,
-                difference.sum() / math.sqrt(stated.sum()), 1.0),
-        ]  # fmt: skip
+            Row(
+                f"{name}: variance of differences / stated",
+                f"{seen.size} pairs of beams",
+                1.0,
+                ratio,
+                noise,
+            ),
+            Row(
+                f"{name}: mean difference over its error",
+                "two seeds",
+                0.0,
+                difference.sum() / math.sqrt(stated.sum()),
+                1.0,
+            ),
+        ]
     place = effort.folder / "z_scores_thin.png"
     _draw(place, scores)
     return Check(

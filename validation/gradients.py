@@ -39,9 +39,10 @@ def derivatives(effort):
     low, high = (LOW, -20.0, -20.0), (HIGH, 20.0, 20.0)
     volume = np.broadcast_to(VALUES, (2, 2, 10))
     loaded = scene(
-        (EDGES[0], EDGES[1]), {"slab": box(low, high, grid(volume, low, high))},
+        (EDGES[0], EDGES[1]),
+        {"slab": box(low, high, grid(volume, low, high))},
         gate_kind="spherical",
-    )  # fmt: skip
+    )
     parameters = mi.traverse(loaded)
     scale = 1 / signal(VALUES)
     slopes = []
@@ -60,9 +61,16 @@ def derivatives(effort):
         step = 1e-5 * (np.arange(10) == k)
         expected = scale * (signal(VALUES + step) - signal(VALUES - step)) / 2e-5
         rows.append(
-            Row(f"d ln S / d E, plane of cells at {centre:g} m", "central differences of the lidar equation",
-                expected, got[k], error[k], 2e-5 * np.abs(expected).max() + 1e-4, "m")
-        )  # fmt: skip
+            Row(
+                f"d ln S / d E, plane of cells at {centre:g} m",
+                "central differences of the lidar equation",
+                expected,
+                got[k],
+                error[k],
+                2e-5 * np.abs(expected).max() + 1e-4,
+                "m",
+            )
+        )
     return Check(
         "Extinction grid",
         "Relative change of the signal of a gate from 500 to 508 m with the extinction of each of ten "

@@ -74,9 +74,13 @@ def compared(name, found, truth, bias=TRUNCATION):
     """Two rows: the sum over everything, and each beam and gate within its own error."""
     value, error = found["S0"], found["S0_stderr"]
     total = Row(
-        f"{name}: rendered over expected", EQUATION, 1.0, value.sum() / truth.sum(),
-        math.sqrt((error**2).sum()) / truth.sum(), bias,
-    )  # fmt: skip
+        f"{name}: rendered over expected",
+        EQUATION,
+        1.0,
+        value.sum() / truth.sum(),
+        math.sqrt((error**2).sum()) / truth.sum(),
+        bias,
+    )
     return [total, spread(name, EQUATION, (value - truth) / error)]
 
 
@@ -111,9 +115,12 @@ def profile_through_layers(effort):
         "core": layer(350, 416.25, medium(2e-2), outer, 1000.0),
     }
     loaded = scene(
-        (edges[0], edges[-1]), shapes, environment=medium(1e-3), gate_count=len(edges) - 1,
+        (edges[0], edges[-1]),
+        shapes,
+        environment=medium(1e-3),
+        gate_count=len(edges) - 1,
         gate_kind="spherical",
-    )  # fmt: skip
+    )
     found = render(loaded, 20, 400_000 * effort.scale)
     truth = layered(edges, steps)[:, None, None]
     place = effort.folder / "lidar_equation_profile.png"
@@ -124,8 +131,9 @@ def profile_through_layers(effort):
         top.set_ylabel("received / emitted energy")
         top.legend(frameon=False)
         bottom.axhspan(-2, 2, color="0.92")
-        bottom.plot(middle, ((found["S0"] - truth) / found["S0_stderr"]).ravel(), ".",
-                    color=figures.OURS)  # fmt: skip
+        bottom.plot(
+            middle, ((found["S0"] - truth) / found["S0_stderr"]).ravel(), ".", color=figures.OURS
+        )
         bottom.set(xlabel="range, m", ylabel="deviation, sigmas", ylim=(-5, 5))
     return Check(
         "Profile through nested layers",
@@ -157,9 +165,10 @@ def valley_of_extinction(effort):
             return secant * 1e-3 * (5 * 7 + 60 * 4 + x + x**2 / 20)
 
         truth = equation(
-            np.multiply.outer(edges, secant), lambda r, s=secant: 1e-3 * (1 + (r / s - 465) / 10),
+            np.multiply.outer(edges, secant),
+            lambda r, s=secant: 1e-3 * (1 + (r / s - 465) / 10),
             depth,
-        )  # fmt: skip
+        )
         rows += compared(name, found, truth, 5e-5)
     return Check(
         "Valley of extinction on a grid",
@@ -184,18 +193,21 @@ def phase_functions(effort):
     cases = {
         "isotropic": ({"type": "isotropic"}, 1 / (4 * math.pi), "1 / 4 pi"),
         "Henyey-Greenstein g = 0.7": (
-            {"type": "hg", "g": 0.7}, 0.51 / (4 * math.pi * 1.7**3),
+            {"type": "hg", "g": 0.7},
+            0.51 / (4 * math.pi * 1.7**3),
             "Henyey & Greenstein 1941",
         ),
         "Rayleigh, depolarisation factor 0.028": (
             {"type": "rayleigh_polarized", "depolarization": delta},
-            (1.5 * dipole + 1 - dipole) / (4 * math.pi), "Hansen & Travis 1974, eq. 2.15",
+            (1.5 * dipole + 1 - dipole) / (4 * math.pi),
+            "Hansen & Travis 1974, eq. 2.15",
         ),
         "spheroids (table)": (
-            {"type": "mueller", "table": mi.TensorXf(table)}, a1[-1] / norm,
+            {"type": "mueller", "table": mi.TensorXf(table)},
+            a1[-1] / norm,
             "the table, by the trapezoidal rule",
         ),
-    }  # fmt: skip
+    }
     rows = []
     for name, (phase, expected, reference) in cases.items():
         loaded = scene((500, 520), {"slab": layer(500, 520, medium(1e-2, phase))})
@@ -203,10 +215,15 @@ def phase_functions(effort):
         unit = layered([500, 520], [(0, 1e-12), (500, 1e-2)])[0] / RAYLEIGH
         rows.append(
             Row(
-                f"{name}: phase function at 180 degrees", reference, expected,
-                found["S0"].item() / unit, found["S0_stderr"].item() / unit, 2e-5 * expected, "1/sr",
+                f"{name}: phase function at 180 degrees",
+                reference,
+                expected,
+                found["S0"].item() / unit,
+                found["S0_stderr"].item() / unit,
+                2e-5 * expected,
+                "1/sr",
             )
-        )  # fmt: skip
+        )
     return Check(
         "Phase functions in backscatter",
         "Rendered signal over the lidar equation's factor: what the scatterer itself contributes.",
@@ -234,9 +251,11 @@ def depolarisation(effort):
                 Row(
                     f"{kind} ratio, depolarisation factor {delta:g}",
                     "D / (2 - D), circular 2 d / (1 - d) of the linear one (Mishchenko & Hovenier 1995)",
-                    expected, got.item(), tolerance=1e-5,
+                    expected,
+                    got.item(),
+                    tolerance=1e-5,
                 )
-            )  # fmt: skip
+            )
     table = _table_of_spheroids()
     phase = {"type": "mueller", "table": mi.TensorXf(table)}
     loaded = scene((500, 520), {"slab": layer(500, 520, medium(1e-3, phase))}, laser=laser)
@@ -245,10 +264,13 @@ def depolarisation(effort):
     a1, a2 = table[-1, 1:3]
     rows.append(
         Row(
-            "linear ratio of the spheroids", "(a1 - a2) / (a1 + a2) of the last line of the table",
-            (a1 - a2) / (a1 + a2), got.item(), tolerance=1e-5,
+            "linear ratio of the spheroids",
+            "(a1 - a2) / (a1 + a2) of the last line of the table",
+            (a1 - a2) / (a1 + a2),
+            got.item(),
+            tolerance=1e-5,
         )
-    )  # fmt: skip
+    )
     return Check(
         "Depolarisation in backscatter",
         "I and Q of a photon are fully correlated here, so the ratio has no noise. Light returns up to "

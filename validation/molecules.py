@@ -21,21 +21,36 @@ def cross_sections(effort):
     ):
         wavelength = nanometres * 1e-9
         rows += [
-            Row(f"cross-section at {nanometres} nm", paper, square_centimetres,
-                molecules.cross_section(wavelength) * 1e4, tolerance=2e-4 * square_centimetres,
-                unit="cm2"),
-            Row(f"King factor at {nanometres} nm", paper, king, molecules.king_factor(wavelength),
-                tolerance=0.6e-5),
-        ]  # fmt: skip
+            Row(
+                f"cross-section at {nanometres} nm",
+                paper,
+                square_centimetres,
+                molecules.cross_section(wavelength) * 1e4,
+                tolerance=2e-4 * square_centimetres,
+                unit="cm2",
+            ),
+            Row(
+                f"King factor at {nanometres} nm",
+                paper,
+                king,
+                molecules.king_factor(wavelength),
+                tolerance=0.6e-5,
+            ),
+        ]
     for micrometres in (0.25, 0.30, 0.40, 0.55, 0.70, 0.85):
         square = micrometres**2
         fit = 1.0455996 - 341.29061 / square - 0.90230850 * square
         fit /= 1 + 0.0027059889 / square - 85.968563 * square
         rows.append(
-            Row(f"cross-section at {micrometres:g} um", "fit of Bodhaine et al. 1999, eq. 29",
-                fit * 1e-28, molecules.cross_section(micrometres * 1e-6) * 1e4,
-                tolerance=2e-4 * fit * 1e-28, unit="cm2")
-        )  # fmt: skip
+            Row(
+                f"cross-section at {micrometres:g} um",
+                "fit of Bodhaine et al. 1999, eq. 29",
+                fit * 1e-28,
+                molecules.cross_section(micrometres * 1e-6) * 1e4,
+                tolerance=2e-4 * fit * 1e-28,
+                unit="cm2",
+            )
+        )
     return Check(
         "Cross-sections and King factors",
         "Published numbers have four digits and the fit 0.01 %; constants of nature have moved by less.",
@@ -50,10 +65,17 @@ def refraction(effort):
         square = micrometres**-2
         edlen = 1e-8 * (8342.13 + 2406030 / (130 - square) + 15997 / (38.9 - square))
         rows.append(
-            Row(f"refractivity at {1e3 * micrometres:g} nm, 300 ppm CO2", "Edlen 1966", edlen,
-                molecules.refractive_index(micrometres * 1e-6, 300e-6) - 1, tolerance=2e-4 * edlen)
-        )  # fmt: skip
-    return Check("Refractive index", "Two fits to different measurements agree to 2e-4.", tuple(rows))
+            Row(
+                f"refractivity at {1e3 * micrometres:g} nm, 300 ppm CO2",
+                "Edlen 1966",
+                edlen,
+                molecules.refractive_index(micrometres * 1e-6, 300e-6) - 1,
+                tolerance=2e-4 * edlen,
+            )
+        )
+    return Check(
+        "Refractive index", "Two fits to different measurements agree to 2e-4.", tuple(rows)
+    )
 
 
 def depolarisation(effort):
@@ -63,22 +85,46 @@ def depolarisation(effort):
         air = molecules.molecular_scattering(532e-9, band=band)
         delta, ratio = air.depolarization, air.depolarization_ratio
         rows += [
-            Row(f"{band}: depolarisation ratio at 532 nm", "Behrendt & Nakamura 2002", published, ratio,
-                tolerance=0.02 * published),
-            Row(f"{band}: depolarisation ratio", "D / (2 - D)", delta / (2 - delta), ratio,
-                tolerance=1e-9),
-        ]  # fmt: skip
+            Row(
+                f"{band}: depolarisation ratio at 532 nm",
+                "Behrendt & Nakamura 2002",
+                published,
+                ratio,
+                tolerance=0.02 * published,
+            ),
+            Row(
+                f"{band}: depolarisation ratio",
+                "D / (2 - D)",
+                delta / (2 - delta),
+                ratio,
+                tolerance=1e-9,
+            ),
+        ]
     gamma = delta / (2 - delta)
     rows += [
-        Row("rayleigh: lidar ratio", "Chandrasekhar 1950: 8 pi / 3 (1 + 2 g) / (1 + g)",
-            8 * math.pi / 3 * (1 + 2 * gamma) / (1 + gamma), air.lidar_ratio, tolerance=1e-9,
-            unit="sr"),
-        Row("backscatter of the Cabannes line over the band", "She 2001", 0.975,
+        Row(
+            "rayleigh: lidar ratio",
+            "Chandrasekhar 1950: 8 pi / 3 (1 + 2 g) / (1 + g)",
+            8 * math.pi / 3 * (1 + 2 * gamma) / (1 + gamma),
+            air.lidar_ratio,
+            tolerance=1e-9,
+            unit="sr",
+        ),
+        Row(
+            "backscatter of the Cabannes line over the band",
+            "She 2001",
+            0.975,
             molecules.molecular_scattering(532e-9, band="cabannes").backscatter / air.backscatter,
-            tolerance=0.002),
-        Row("King factor of the band's depolarisation factor", "(6 + 3 D) / (6 - 7 D)",
-            (6 + 3 * delta) / (6 - 7 * delta), air.king_factor, tolerance=1e-9),
-    ]  # fmt: skip
+            tolerance=0.002,
+        ),
+        Row(
+            "King factor of the band's depolarisation factor",
+            "(6 + 3 D) / (6 - 7 D)",
+            (6 + 3 * delta) / (6 - 7 * delta),
+            air.king_factor,
+            tolerance=1e-9,
+        ),
+    ]
     return Check(
         "Depolarisation of backscatter",
         "Behrendt & Nakamura used slightly other King factors: 2 %.",
@@ -93,14 +139,32 @@ def density(effort):
         "Air at sea level",
         "Standard atmosphere, 288.15 K and 1013.25 hPa.",
         (
-            Row("Loschmidt's constant", "CODATA 2018", 2.686780111e25,
-                molecules.number_density(101325.0, 273.15), tolerance=1e18, unit="1/m3"),
-            Row("number density", "Bodhaine et al. 1999", 2.546899e25, air.number_density,
-                tolerance=2e-5 * 2.546899e25, unit="1/m3"),
-            Row("extinction at 532 nm", "5.167e-27 cm2 times 2.546899e19 / cm3", 1.31598e-5,
-                air.extinction, tolerance=3e-4 * 1.316e-5, unit="1/m"),
+            Row(
+                "Loschmidt's constant",
+                "CODATA 2018",
+                2.686780111e25,
+                molecules.number_density(101325.0, 273.15),
+                tolerance=1e18,
+                unit="1/m3",
+            ),
+            Row(
+                "number density",
+                "Bodhaine et al. 1999",
+                2.546899e25,
+                air.number_density,
+                tolerance=2e-5 * 2.546899e25,
+                unit="1/m3",
+            ),
+            Row(
+                "extinction at 532 nm",
+                "5.167e-27 cm2 times 2.546899e19 / cm3",
+                1.31598e-5,
+                air.extinction,
+                tolerance=3e-4 * 1.316e-5,
+                unit="1/m",
+            ),
         ),
-    )  # fmt: skip
+    )
 
 
 CHECKS = (cross_sections, refraction, depolarisation, density)

@@ -93,27 +93,41 @@ def _compare(case, label, effort):
     for number, (estimator, photons) in enumerate(RENDERED.items()):
         by_order, i, q = rendered(case, estimator, 100 + number, photons * effort.scale)
         pictures[estimator] = by_order, i, q
-        rows.append(difference(f"{estimator}: all gates and orders", i.sum(1),
-                               other[..., 0].sum((1, 2))))  # fmt: skip
-        rows += [
-            difference(f"{estimator}: order {k + 1}, all gates", by_order[..., k].sum(1),
-                       other[:, :, k, 0].sum(1))
-            for k in range(ORDERS)
-        ]  # fmt: skip
-        rows.append(difference(f"{estimator}: last gate, all orders", i[:, -1],
-                               other[:, -1, :, 0].sum(1)))  # fmt: skip
         rows.append(
-            spread(f"{estimator}: gate by gate", REFERENCE, scores(i, other[..., 0].sum(2)), BATCHES)
+            difference(f"{estimator}: all gates and orders", i.sum(1), other[..., 0].sum((1, 2)))
+        )
+        rows += [
+            difference(
+                f"{estimator}: order {k + 1}, all gates",
+                by_order[..., k].sum(1),
+                other[:, :, k, 0].sum(1),
+            )
+            for k in range(ORDERS)
+        ]
+        rows.append(
+            difference(f"{estimator}: last gate, all orders", i[:, -1], other[:, -1, :, 0].sum(1))
+        )
+        rows.append(
+            spread(
+                f"{estimator}: gate by gate", REFERENCE, scores(i, other[..., 0].sum(2)), BATCHES
+            )
         )
         if case.asymmetry is None:
             ratio = depolarisation(i, q)
             expected = depolarisation(*np.moveaxis(other.sum(2), -1, 0))
-            rows.append(difference(f"{estimator}: depolarisation ratio, last gate", ratio[:, -1],
-                                   expected[:, -1]))  # fmt: skip
             rows.append(
-                spread(f"{estimator}: depolarisation, gate by gate", REFERENCE,
-                       scores(ratio, expected), BATCHES)
-            )  # fmt: skip
+                difference(
+                    f"{estimator}: depolarisation ratio, last gate", ratio[:, -1], expected[:, -1]
+                )
+            )
+            rows.append(
+                spread(
+                    f"{estimator}: depolarisation, gate by gate",
+                    REFERENCE,
+                    scores(ratio, expected),
+                    BATCHES,
+                )
+            )
     caption = _draw_orders(effort.folder / f"orders_{label}.png", case, pictures["gated"][0], other)
     drawn = [(f"orders_{label}.png", caption)]
     if case.asymmetry is None:
@@ -132,8 +146,9 @@ def _draw_orders(place, case, ours, other):
             colour = f"C{k}"
             lower = np.maximum(expected - 2 * other_error, 1e-14)
             axis.plot(range_, expected, color=colour, linewidth=0.8, alpha=0.6)
-            axis.fill_between(range_, lower, expected + 2 * other_error, color=colour, alpha=0.35,
-                              linewidth=0)  # fmt: skip
+            axis.fill_between(
+                range_, lower, expected + 2 * other_error, color=colour, alpha=0.35, linewidth=0
+            )
             axis.errorbar(range_, got, 2 * error, fmt=".", color=colour, label=f"order {k + 1}")
         axis.plot(range_, other[..., 0].sum(2).mean(0), color=figures.REFERENCE, label="sum")
         axis.set(yscale="log", xlabel="range, m", ylabel="received / emitted energy")
@@ -146,8 +161,13 @@ def _draw_depolarisation(place, case, pictures, other):
     range_ = (np.array(case.gates[1:]) + case.gates[:-1]) / 2
     expected, error = mean_and_error(depolarisation(*np.moveaxis(other.sum(2), -1, 0)))
     with figures.figure(place) as axis:
-        axis.fill_between(range_, expected - 2 * error, expected + 2 * error, color="0.75",
-                          label="independent simulation, 2 sigma")  # fmt: skip
+        axis.fill_between(
+            range_,
+            expected - 2 * error,
+            expected + 2 * error,
+            color="0.75",
+            label="independent simulation, 2 sigma",
+        )
         for (estimator, (_, i, q)), colour, shift in zip(
             pictures.items(), (figures.OURS, figures.OTHER), (-0.7, 0.7)
         ):
@@ -164,8 +184,9 @@ def molecules(effort):
         "Dense slab of molecules",
         "Extinction 0.02 / m, albedo 1, Rayleigh scattering of light polarised along e_h; Gaussian beam "
         "of 0.1 m radius and 1 mrad half divergence, telescope 0.5 m, field of view 50 mrad half.",
-        rows, drawn,
-    )  # fmt: skip
+        rows,
+        drawn,
+    )
 
 
 def forward_peak(effort):
@@ -174,8 +195,9 @@ def forward_peak(effort):
     return Check(
         "Dense slab of forward scatterers",
         "The same with Henyey-Greenstein g = 0.7, albedo 0.95, field of view 20 mrad half.",
-        rows, drawn,
-    )  # fmt: skip
+        rows,
+        drawn,
+    )
 
 
 def majorants(effort):
@@ -190,8 +212,13 @@ def majorants(effort):
             RAYLEIGH, "gated", 200 + factor, 640_000 * effort.scale, grid(values, low, high), 32
         )
         name = f"majorant x {factor}"
-        rows.append(difference(f"{name}: all gates, orders above one", by_order[..., 1:].sum((1, 2)),
-                               other[:, :, 1:, 0].sum((1, 2))))  # fmt: skip
+        rows.append(
+            difference(
+                f"{name}: all gates, orders above one",
+                by_order[..., 1:].sum((1, 2)),
+                other[:, :, 1:, 0].sum((1, 2)),
+            )
+        )
         rows.append(spread(f"{name}: gate by gate", REFERENCE, scores(i, other[..., 0].sum(2)), 32))
     return Check(
         "Any majorant",
@@ -207,29 +234,43 @@ def sharpness(effort):
         mean, error = mean_and_error(reference(case, PHOTONS[case] * effort.scale)[..., 0].sum(2))
         rows.append(
             Row(
-                f"{name}: largest standard error of the reference in a gate", "at most 1 %", 0.0,
-                (error / mean).max(), tolerance=0.01,
+                f"{name}: largest standard error of the reference in a gate",
+                "at most 1 %",
+                0.0,
+                (error / mean).max(),
+                tolerance=0.01,
             )
-        )  # fmt: skip
+        )
     # by hand: the beam's single scattering, all of it in view
     case = replace(RAYLEIGH, divergence_half=1e-9, fov_half=0.2)
     found = np.stack([simulate(case, 20_000, 1, 500 + k)[0][:, 0, 0] for k in range(BATCHES)])
     range_ = (np.arange(500, 600, 0.01) + 0.005).reshape(10, -1)
     expected = (
-        0.02 * 3 / (8 * math.pi) * math.pi * 0.25 * np.exp(-0.04 * (range_ - 500)) / range_**2 * 0.01
+        0.02
+        * 3
+        / (8 * math.pi)
+        * math.pi
+        * 0.25
+        * np.exp(-0.04 * (range_ - 500))
+        / range_**2
+        * 0.01
     ).sum(1)
     got, error = mean_and_error(found)
     rows.append(
         Row(
-            "the reference's own single scattering, all gates", "lidar equation", expected.sum(),
-            got.sum(), mean_and_error(found.sum(1))[1], 1e-5 * expected.sum(),
+            "the reference's own single scattering, all gates",
+            "lidar equation",
+            expected.sum(),
+            got.sum(),
+            mean_and_error(found.sum(1))[1],
+            1e-5 * expected.sum(),
         )
-    )  # fmt: skip
-    rows.append(spread("the same, gate by gate", "lidar equation", (got - expected) / error, BATCHES))
+    )
+    rows.append(
+        spread("the same, gate by gate", "lidar equation", (got - expected) / error, BATCHES)
+    )
     return Check(
-        "The reference itself",
-        f"What agreement within {SIGMAS} sigmas means above.",
-        tuple(rows),
+        "The reference itself", f"What agreement within {SIGMAS} sigmas means above.", tuple(rows)
     )
 
 

@@ -112,14 +112,22 @@ def spread(name: str, reference: str, z, batches: float = math.inf) -> Row:
         expected = freedom / (freedom - 2)
         fourth = 3 * freedom**2 / ((freedom - 2) * (freedom - 4))
     sigma = math.sqrt((fourth - expected**2) / z.size)
-    return Row(f"{name}: mean square of {z.size} z-scores", reference, expected, (z**2).mean(), sigma)
+    return Row(
+        f"{name}: mean square of {z.size} z-scores", reference, expected, (z**2).mean(), sigma
+    )
 
 
 def show(check: Check, console: Console) -> None:
     """Print a check as a table."""
     table = Table(title=check.title, title_justify="left", title_style="bold")
-    for name, justify in (("", "left"), ("expected", "right"), ("got", "right"),
-                          ("sigma", "right"), ("deviation", "right"), ("", "left")):  # fmt: skip
+    for name, justify in (
+        ("", "left"),
+        ("expected", "right"),
+        ("got", "right"),
+        ("sigma", "right"),
+        ("deviation", "right"),
+        ("", "left"),
+    ):
         table.add_column(name, justify=justify)
     for row in check.rows:
         verdict = "ok" if row.passed else "[bold red]FAILS[/bold red]"

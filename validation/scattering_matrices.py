@@ -59,25 +59,36 @@ def laws(effort):
             np.interp(theta, angle, a1) * np.sin(np.radians(theta)) / 2, np.radians(theta)
         )
         rows.append(
-            Row(f"{name}: mean of a1 over the sphere", "normalisation", 1.0,
-                mean, tolerance=1e-3)
-        )  # fmt: skip
+            Row(f"{name}: mean of a1 over the sphere", "normalisation", 1.0, mean, tolerance=1e-3)
+        )
         smallest = np.linalg.eigvalsh(coherency(elements))[:, 0] / a1
         rows.append(
-            Row(f"{name}: most negative eigenvalue of the coherency matrix over a1",
-                "0 or more: Cloude 1989; Hovenier & van der Mee 1996", 0.0,
-                min(0.0, smallest.min()), tolerance=1e-6)
-        )  # fmt: skip
+            Row(
+                f"{name}: most negative eigenvalue of the coherency matrix over a1",
+                "0 or more: Cloude 1989; Hovenier & van der Mee 1996",
+                0.0,
+                min(0.0, smallest.min()),
+                tolerance=1e-6,
+            )
+        )
         ends = [
-            (a2[0] - a3[0]) / a1[0], b1[0] / a1[0], b2[0] / a1[0], (a2[-1] + a3[-1]) / a1[-1],
-            b1[-1] / a1[-1], b2[-1] / a1[-1], (a4[-1] - a1[-1] + 2 * a2[-1]) / a1[-1],
-        ]  # fmt: skip
+            (a2[0] - a3[0]) / a1[0],
+            b1[0] / a1[0],
+            b2[0] / a1[0],
+            (a2[-1] + a3[-1]) / a1[-1],
+            b1[-1] / a1[-1],
+            b2[-1] / a1[-1],
+            (a4[-1] - a1[-1] + 2 * a2[-1]) / a1[-1],
+        ]
         rows.append(
             largest(
                 f"{name}: worst relation between elements at 0 and 180 degrees",
-                "van de Hulst 1957, sect. 5.2; Mishchenko & Hovenier 1995", ends, 0.0, 2e-6,
+                "van de Hulst 1957, sect. 5.2; Mishchenko & Hovenier 1995",
+                ends,
+                0.0,
+                2e-6,
             )
-        )  # fmt: skip
+        )
     return Check(
         "Laws that hold for every collection of particles",
         "Worst values over the 361 angles of each shipped table (seven digits are written). The "
@@ -124,9 +135,7 @@ def polydisperse(effective_radius):
         extinction += area * q.q_ext
         scattering += area * q.q_sca
         forward += area * q.q_sca * q.g
-        elements += (
-            area * q.q_sca * np.stack([f.f11, f.f22, f.f33, f.f44, f.f12, f.f34], axis=1)
-        )
+        elements += area * q.q_sca * np.stack([f.f11, f.f22, f.f33, f.f44, f.f12, f.f34], axis=1)
     return extinction, scattering, forward / scattering, elements / scattering
 
 
@@ -138,22 +147,49 @@ def published(effort):
         extinction, scattering, asymmetry, elements = polydisperse(radius)
         name = f"r_eff {radius:g} um"
         rows += [
-            Row(f"{name}: extinction cross-section", reference, case["extinction"], extinction,
-                tolerance=1e-3 * case["extinction"], unit="um2"),
-            Row(f"{name}: scattering cross-section", reference, case["scattering"], scattering,
-                tolerance=1e-3 * case["scattering"], unit="um2"),
-            Row(f"{name}: asymmetry parameter", reference, case["asymmetry"], asymmetry,
-                tolerance=1e-3),
-        ]  # fmt: skip
+            Row(
+                f"{name}: extinction cross-section",
+                reference,
+                case["extinction"],
+                extinction,
+                tolerance=1e-3 * case["extinction"],
+                unit="um2",
+            ),
+            Row(
+                f"{name}: scattering cross-section",
+                reference,
+                case["scattering"],
+                scattering,
+                tolerance=1e-3 * case["scattering"],
+                unit="um2",
+            ),
+            Row(
+                f"{name}: asymmetry parameter",
+                reference,
+                case["asymmetry"],
+                asymmetry,
+                tolerance=1e-3,
+            ),
+        ]
         table = np.array(case["elements"])
         for k, element in enumerate(ELEMENTS):
             rows.append(
-                largest(f"{name}: {element} over a1, 19 angles", reference,
-                        elements[:, k] / elements[:, 0] - table[:, k + 1] / table[:, 1], 0.0, 3e-3)
-                if k else
-                largest(f"{name}: a1, relative, 19 angles", reference,
-                        elements[:, 0] / table[:, 1] - 1, 0.0, 3e-3)
-            )  # fmt: skip
+                largest(
+                    f"{name}: {element} over a1, 19 angles",
+                    reference,
+                    elements[:, k] / elements[:, 0] - table[:, k + 1] / table[:, 1],
+                    0.0,
+                    3e-3,
+                )
+                if k
+                else largest(
+                    f"{name}: a1, relative, 19 angles",
+                    reference,
+                    elements[:, 0] / table[:, 1] - 1,
+                    0.0,
+                    3e-3,
+                )
+            )
     _draw(drawn, *polydisperse(1.0)[3:], np.array(POLYDISPERSE[1.0]["elements"]))
     return Check(
         "Published table of randomly oriented spheroids",
@@ -222,15 +258,19 @@ def prolate(effort):
         [[-5.0941 + 24.402j, -1.9425 + 1.9971j], [-1.1521 - 3.0977j, -6.9323 + 24.748j]]
     )
     z = phase_matrix(s[None])[0]
-    rows = [largest("rustmatrix: amplitude matrix, 4 complex numbers", paper, abs(s - expected), 0.0,
-                    1e-3)]  # fmt: skip
+    rows = [
+        largest(
+            "rustmatrix: amplitude matrix, 4 complex numbers", paper, abs(s - expected), 0.0, 1e-3
+        )
+    ]
     rows += [
         Row(f"rustmatrix: {name} in a fixed orientation", paper, value, got, tolerance=0.01)
         for name, value, got in zip(
             ("Z11", "Z22", "Z33", "Z44", "Z12", "Z34"),
-            (650.3172, 631.6323, 635.2768, 643.1738, -17.9846, -34.7730), z,
+            (650.3172, 631.6323, 635.2768, 643.1738, -17.9846, -34.7730),
+            z,
         )
-    ]  # fmt: skip
+    ]
     witness = "rustmatrix, quadrature over orientations"
     for radius, elongation in ((0.169e-6, 3.0), (0.423e-6, 2.0)):
         x, index = 2 * math.pi * radius / GREEN, 1.53 + 0.008j
@@ -244,18 +284,35 @@ def prolate(effort):
         name = f"prolate {elongation:g} to 1, x = {x:.2f}"
         expected = extinction / (2 * math.pi / GREEN) ** 2
         rows.append(
-            Row(f"{name}: extinction cross-section", witness, 1e12 * expected,
-                1e12 * table.extinction_cross_section, tolerance=1e-5 * 1e12 * expected, unit="um2")
-        )  # fmt: skip
+            Row(
+                f"{name}: extinction cross-section",
+                witness,
+                1e12 * expected,
+                1e12 * table.extinction_cross_section,
+                tolerance=1e-5 * 1e12 * expected,
+                unit="um2",
+            )
+        )
         rows.append(
-            largest(f"{name}: a1, relative, 7 angles", witness,
-                    got[:, 0] * scale / elements[:, 0] - 1, 0.0, 1e-4)
-        )  # fmt: skip
+            largest(
+                f"{name}: a1, relative, 7 angles",
+                witness,
+                got[:, 0] * scale / elements[:, 0] - 1,
+                0.0,
+                1e-4,
+            )
+        )
         rows += [
-            largest(f"{name}: {element} over a1, 7 angles", witness,
-                    got[:, k] / got[:, 0], elements[:, k] / elements[:, 0], 1e-4)
-            for k, element in enumerate(ELEMENTS) if k
-        ]  # fmt: skip
+            largest(
+                f"{name}: {element} over a1, 7 angles",
+                witness,
+                got[:, k] / got[:, 0],
+                elements[:, k] / elements[:, 0],
+                1e-4,
+            )
+            for k, element in enumerate(ELEMENTS)
+            if k
+        ]
     return Check(
         "Prolate spheroids by another solver",
         "The published amplitude matrix (prolate, 2 to 1, x of equal area 10, index 1.5 + 0.02i) makes "
@@ -292,16 +349,40 @@ def spheres(effort):
         name, reference = f"r {radius * 1e6:g} um, index {index:.3g}", "miepython"
         ratio = 4 * math.pi * extinction / backward
         rows += [
-            Row(f"{name}: extinction cross-section", reference, extinction * area,
-                1e12 * table.extinction_cross_section, tolerance=1e-7 * extinction * area, unit="um2"),
-            Row(f"{name}: albedo", reference, scattering / extinction, table.albedo, tolerance=1e-7),
-            Row(f"{name}: lidar ratio", reference, ratio, table.lidar_ratio, tolerance=1e-7 * ratio,
-                unit="sr"),
-            Row(f"{name}: asymmetry parameter", reference, asymmetry, table.asymmetry,
-                tolerance=3e-4),
-            largest(f"{name}: six elements over a1(0), 361 angles", reference,
-                    table.elements / expected[0, 0], expected / expected[0, 0], 1e-7),
-        ]  # fmt: skip
+            Row(
+                f"{name}: extinction cross-section",
+                reference,
+                extinction * area,
+                1e12 * table.extinction_cross_section,
+                tolerance=1e-7 * extinction * area,
+                unit="um2",
+            ),
+            Row(
+                f"{name}: albedo", reference, scattering / extinction, table.albedo, tolerance=1e-7
+            ),
+            Row(
+                f"{name}: lidar ratio",
+                reference,
+                ratio,
+                table.lidar_ratio,
+                tolerance=1e-7 * ratio,
+                unit="sr",
+            ),
+            Row(
+                f"{name}: asymmetry parameter",
+                reference,
+                asymmetry,
+                table.asymmetry,
+                tolerance=3e-4,
+            ),
+            largest(
+                f"{name}: six elements over a1(0), 361 angles",
+                reference,
+                table.elements / expected[0, 0],
+                expected / expected[0, 0],
+                1e-7,
+            ),
+        ]
     return Check(
         "Spheres",
         "Tables of one size against Lorenz-Mie theory by another program. The mean cosine is that of "
@@ -323,10 +404,14 @@ def small_spheroids(effort):
         expected = 3 * gamma / (45 + 4 * gamma)
         got = one_size(radius, index, elongation).depolarization_ratio
         rows.append(
-            Row(f"length over width {elongation:g}: linear depolarisation ratio",
-                "Rayleigh limit (Bohren & Huffman 1983, eqs. 5.32-5.33)", expected, got,
-                tolerance=3e-3 * expected)
-        )  # fmt: skip
+            Row(
+                f"length over width {elongation:g}: linear depolarisation ratio",
+                "Rayleigh limit (Bohren & Huffman 1983, eqs. 5.32-5.33)",
+                expected,
+                got,
+                tolerance=3e-3 * expected,
+            )
+        )
     return Check(
         "Small spheroids",
         "Radius 2 nm at 532 nm: size parameter 0.024, whose square is what the closed form leaves out.",
@@ -339,16 +424,32 @@ def shipped(effort):
     table = read_table(str(files("lidar_mi.scenes") / "aerosol_droplets_532nm.txt"))
     area = math.pi * 7 * 8 / 1.5**2  # mean r^2 of r^6 exp(-1.5 r)
     rows = [
-        Row("droplets: lidar ratio", "18.8 +- 0.8 sr (O'Connor et al. 2004)", 18.8,
-            table.lidar_ratio, tolerance=0.8, unit="sr"),
-        Row("droplets: extinction efficiency", "2.05 to 2.20: twice the area and the edge's part", 2.125,
-            1e12 * table.extinction_cross_section / area, tolerance=0.075),
-    ]  # fmt: skip
+        Row(
+            "droplets: lidar ratio",
+            "18.8 +- 0.8 sr (O'Connor et al. 2004)",
+            18.8,
+            table.lidar_ratio,
+            tolerance=0.8,
+            unit="sr",
+        ),
+        Row(
+            "droplets: extinction efficiency",
+            "2.05 to 2.20: twice the area and the edge's part",
+            2.125,
+            1e12 * table.extinction_cross_section / area,
+            tolerance=0.075,
+        ),
+    ]
     table = read_table(str(files("lidar_mi.scenes") / "aerosol_continental_532nm.txt"))
     rows.append(
-        Row("water-soluble: single-scattering albedo", "0.962 at 550 nm (OPAC, Hess et al. 1998)", 0.962,
-            table.albedo, tolerance=0.002)
-    )  # fmt: skip
+        Row(
+            "water-soluble: single-scattering albedo",
+            "0.962 at 550 nm (OPAC, Hess et al. 1998)",
+            0.962,
+            table.albedo,
+            tolerance=0.002,
+        )
+    )
     return Check(
         "Shipped tables against what is known of such particles",
         "Cloud C.1 of Deirmendjian 1969 and OPAC's dry water-soluble aerosol.",

@@ -23,8 +23,19 @@ ORDERS = 8
 EXTINCTION, THICKNESS, NEAR = 0.1, 10.0, 500.0
 
 
-def returned(effort, estimator, phase, seed, albedo=0.9, orders=ORDERS, cone=0.2, near=NEAR,
-             aperture=250.0, stop=600.0, photons=2_000_000):  # fmt: skip
+def returned(
+    effort,
+    estimator,
+    phase,
+    seed,
+    albedo=0.9,
+    orders=ORDERS,
+    cone=0.2,
+    near=NEAR,
+    aperture=250.0,
+    stop=600.0,
+    photons=2_000_000,
+):
     """Batches of what the slab returns: quantity to (batches,)."""
     shapes = {
         "slab": layer(near, near + THICKNESS, medium(EXTINCTION, phase, albedo), half_width=1e4)
@@ -71,6 +82,7 @@ def source_functions(albedo, orders, thickness=1.0, cells=1000):
 
 def leaving(source, edge, cosine):
     """Power that leaves through the surface at directions steeper than ``cosine``, by order."""
+
     # integral of exp(-t / mu) dmu from cosine to 1 is E_2(t) - cosine E_2(t / cosine)
     def outward(t):
         within = -expn(3, t)
@@ -87,12 +99,24 @@ def isotropic(effort):
     for seed, estimator in enumerate(("gated", "analog")):
         found = returned(effort, estimator, "isotropic", 300 + seed)
         rows += [
-            compared(f"{estimator}: order {k + 1}", found[f"order{k + 1}.S0"], value,
-                     "Milne's integral equation", tolerance=2e-5 * value)
+            compared(
+                f"{estimator}: order {k + 1}",
+                found[f"order{k + 1}.S0"],
+                value,
+                "Milne's integral equation",
+                tolerance=2e-5 * value,
+            )
             for k, value in enumerate(expected)
-        ]  # fmt: skip
-        rows.append(compared(f"{estimator}: sum", found["S0"], expected.sum(),
-                             "Milne's integral equation", tolerance=2e-5 * expected.sum()))  # fmt: skip
+        ]
+        rows.append(
+            compared(
+                f"{estimator}: sum",
+                found["S0"],
+                expected.sum(),
+                "Milne's integral equation",
+                tolerance=2e-5 * expected.sum(),
+            )
+        )
     return Check(
         "Isotropic scattering, order by order",
         "Albedo 0.9, a cone of 0.2 rad about the normal. The reference is exact but for the size of "
@@ -110,18 +134,37 @@ def energy(effort):
     direct = math.exp(-1)
     grazing = everything.sum() - seen.sum()
     rows = [
-        Row("the reference: reflected and transmitted", "conservation of energy", 1.0,
-            everything.sum() + below.sum() + direct, tolerance=1e-6)
-    ]  # fmt: skip
+        Row(
+            "the reference: reflected and transmitted",
+            "conservation of energy",
+            1.0,
+            everything.sum() + below.sum() + direct,
+            tolerance=1e-6,
+        )
+    ]
     for seed, (estimator, photons) in enumerate({"gated": 2_000_000, "analog": 4_000_000}.items()):
-        found = returned(effort, estimator, "isotropic", 310 + seed, albedo=1.0, orders=orders,
-                         cone=cone, near=100.0, aperture=1000.0, stop=550.0, photons=photons)  # fmt: skip
+        found = returned(
+            effort,
+            estimator,
+            "isotropic",
+            310 + seed,
+            albedo=1.0,
+            orders=orders,
+            cone=cone,
+            near=100.0,
+            aperture=1000.0,
+            stop=550.0,
+            photons=photons,
+        )
         rows.append(
             compared(
-                f"{estimator}: rendered reflection + rest", found["S0"] + grazing + below.sum() + direct,
-                1.0, "conservation of energy", tolerance=1e-5,
+                f"{estimator}: rendered reflection + rest",
+                found["S0"] + grazing + below.sum() + direct,
+                1.0,
+                "conservation of energy",
+                tolerance=1e-5,
             )
-        )  # fmt: skip
+        )
     return Check(
         "Conservation of energy",
         "Albedo 1, isotropic scattering, 40 orders, a field of view of 80 degrees half angle. What the "
@@ -149,14 +192,25 @@ def eradiate(effort):
     for number, (name, case) in enumerate(stored["cases"].items()):
         polarised = case["phase"] in ("rayleigh", "spheroids")
         for offset, estimator in enumerate(("gated", "analog")):
-            found = returned(effort, estimator, phases[case["phase"]], 320 + 2 * number + offset,
-                             orders=case["max_order"], albedo=stored["albedo"],
-                             cone=stored["cone_half_angle"])  # fmt: skip
+            found = returned(
+                effort,
+                estimator,
+                phases[case["phase"]],
+                320 + 2 * number + offset,
+                orders=case["max_order"],
+                albedo=stored["albedo"],
+                cone=stored["cone_half_angle"],
+            )
             for k, component in enumerate("IQ" if polarised else "I"):
                 rows.append(
-                    compared(f"{name}, {estimator}: {component}", found[f"S{k}"],
-                             case["stokes"][k], label, case["stderr"][k])
-                )  # fmt: skip
+                    compared(
+                        f"{name}, {estimator}: {component}",
+                        found[f"S{k}"],
+                        case["stokes"][k],
+                        label,
+                        case["stderr"][k],
+                    )
+                )
     return Check(
         "Polarised slabs",
         "Albedo 0.9, light polarised along e_h, a cone of 0.2 rad. Eradiate does not depolarise where a "

@@ -104,7 +104,9 @@ def advect(
             f"advection.field: dims {tuple(field.dims)} are not allowed; (y, z) or (x, y, z) are"
         )
     if u is not None and "x" not in dims:
-        raise InputError("advection.u: not allowed for a plane (y, z); expected a field on (x, y, z)")
+        raise InputError(
+            "advection.u: not allowed for a plane (y, z); expected a field on (x, y, z)"
+        )
     velocity = {"y": ("v", v), "z": ("w", w)}
     if u is not None:
         velocity = {"x": ("u", u), **velocity}
@@ -133,10 +135,12 @@ def advect(
         component.transpose(*order).values.astype(float).reshape(shape) / spacing[axis]
         for axis, (_, component) in velocity.items()
     ]
-    moved = np.stack([
-        _sampler(piece)(_departures(speed, dt, int(steps)))
-        for piece, *speed in zip(pieces, *speeds)
-    ])  # fmt: skip
+    moved = np.stack(
+        [
+            _sampler(piece)(_departures(speed, dt, int(steps)))
+            for piece, *speed in zip(pieces, *speeds)
+        ]
+    )
     if pieces.min() >= 0:
         moved = np.maximum(moved, 0.0)
     result = field.transpose(*order).astype(float)

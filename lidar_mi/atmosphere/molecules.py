@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.constants import Boltzmann
 
-from lidar_mi.errors import InputError
-
 from lidar_mi.atmosphere.scattering import ScatteringTable, rayleigh_table
+from lidar_mi.errors import InputError
 
 BANDS = ("cabannes", "rayleigh")
 

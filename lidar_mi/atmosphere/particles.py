@@ -17,9 +17,8 @@ from importlib.resources import files
 import numpy as np
 from scipy.integrate import quad
 
-from lidar_mi.errors import InputError
-
 from lidar_mi.atmosphere.scattering import ScatteringTable, read_table
+from lidar_mi.errors import InputError
 
 Notice = Callable[[str, float | None], None]
 """Called with what is done and the share that is finished."""
@@ -180,8 +179,11 @@ class Aerosol:
 # Koepke & Schult 1998, Bull. Am. Meteorol. Soc. 79, 831), rounded. OPAC calls the dust-like one
 # insoluble; at 1.55 um it has 1.396.
 _DUST_LIKE = (
-    (355e-9, 1.53 + 0.008j), (532e-9, 1.53 + 0.008j), (1064e-9, 1.52 + 0.008j),
-    (1250e-9, 1.46 + 0.008j), (1550e-9, 1.40 + 0.008j),
+    (355e-9, 1.53 + 0.008j),
+    (532e-9, 1.53 + 0.008j),
+    (1064e-9, 1.52 + 0.008j),
+    (1250e-9, 1.46 + 0.008j),
+    (1550e-9, 1.40 + 0.008j),
 )
 _WATER_SOLUBLE = ((355e-9, 1.53 + 0.005j), (532e-9, 1.53 + 0.006j), (1064e-9, 1.52 + 0.017j))
 _SOOT = ((355e-9, 1.75 + 0.46j), (532e-9, 1.75 + 0.44j), (1064e-9, 1.75 + 0.44j))
@@ -249,7 +251,7 @@ AEROSOLS: dict[str, Aerosol] = {
             number_density=8.3e9,
         ),
     )
-}  # fmt: skip
+}
 
 
 def aerosol(name: str) -> Aerosol:
@@ -268,9 +270,15 @@ def aerosol(name: str) -> Aerosol:
 
 
 def changed(
-    name: str, wavelength: float, new_name: str | None = None, *, index: complex | None = None,
-    elongation: float | None = None, number_density: float | None = None, **sizes: float | None,
-) -> Aerosol:  # fmt: skip
+    name: str,
+    wavelength: float,
+    new_name: str | None = None,
+    *,
+    index: complex | None = None,
+    elongation: float | None = None,
+    number_density: float | None = None,
+    **sizes: float | None,
+) -> Aerosol:
     """A named aerosol with some of its numbers changed; what is None stays.
 
     Parameters
@@ -315,8 +323,12 @@ def changed(
         raise InputError(
             f"name: {new_name} is not allowed for a changed {name!r}; expected a name of its own"
         )
-    return replace(particles, name=new_name, source=f"made from {name!r} by changing "
-                   f"{', '.join(changes)}", **changes)  # fmt: skip
+    return replace(
+        particles,
+        name=new_name,
+        source=f"made from {name!r} by changing {', '.join(changes)}",
+        **changes,
+    )
 
 
 def aerosol_table(

@@ -186,9 +186,12 @@ def check(table: ScatteringTable) -> None:
     _worst(label, angle, "|a2 - b1| above a1 - b1", np.abs(a2 - b1) - (a1 - b1), a1)
     _worst(label, angle, "|a2 + b1| above a1 + b1", np.abs(a2 + b1) - (a1 + b1), a1)
     _worst(
-        label, angle, "(a3 + a4)^2 + 4 b2^2 above (a1 + a2)^2 - 4 b1^2",
-        (a3 + a4) ** 2 + 4 * b2**2 - (a1 + a2) ** 2 + 4 * b1**2, 8 * a1**2,
-    )  # fmt: skip
+        label,
+        angle,
+        "(a3 + a4)^2 + 4 b2^2 above (a1 + a2)^2 - 4 b1^2",
+        (a3 + a4) ** 2 + 4 * b2**2 - (a1 + a2) ** 2 + 4 * b1**2,
+        8 * a1**2,
+    )
     relations = {
         "a2 = a3 at 0 degrees": (a2[0] - a3[0], a1[0]),
         "b1 = 0 at 0 degrees": (b1[0], a1[0]),
@@ -277,9 +280,15 @@ def read_table(path: str | Path) -> ScatteringTable:
     name, wavelength, cross_section, albedo, number_density, provenance = values
     try:
         return ScatteringTable(
-            name, wavelength, numbers[:, 0], numbers[:, 1:], cross_section, albedo,
-            number_density, provenance,
-        )  # fmt: skip
+            name,
+            wavelength,
+            numbers[:, 0],
+            numbers[:, 1:],
+            cross_section,
+            albedo,
+            number_density,
+            provenance,
+        )
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -325,9 +334,15 @@ def rayleigh_table(
         axis=1,
     )
     return ScatteringTable(
-        name, wavelength, angle, elements, extinction_cross_section, albedo, number_density,
+        name,
+        wavelength,
+        angle,
+        elements,
+        extinction_cross_section,
+        albedo,
+        number_density,
         provenance,
-    )  # fmt: skip
+    )
 
 
 def mix(tables, extinctions, name: str = "mixture") -> ScatteringTable:
@@ -384,9 +399,15 @@ def mix(tables, extinctions, name: str = "mixture") -> ScatteringTable:
         f"{w:.4g} m^-1 {table.name}" for w, table in zip(extinctions, tables, strict=True)
     )
     return ScatteringTable(
-        name, wavelength, angle, elements, extinction / number, sum(scattering) / extinction,
-        number, f"mixture of {parts}",
-    )  # fmt: skip
+        name,
+        wavelength,
+        angle,
+        elements,
+        extinction / number,
+        sum(scattering) / extinction,
+        number,
+        f"mixture of {parts}",
+    )
 
 
 def describe(table: ScatteringTable) -> dict[str, str]:

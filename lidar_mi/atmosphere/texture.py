@@ -13,12 +13,7 @@ _LARGEST_GRID = 30_000_000
 def _spacing(name, values):
     values = np.asarray(values, dtype=float)
     steps = np.diff(values)
-    if (
-        values.ndim != 1
-        or values.size < 2
-        or steps[0] <= 0
-        or np.ptp(steps) > 1e-3 * steps[0]
-    ):
+    if values.ndim != 1 or values.size < 2 or steps[0] <= 0 or np.ptp(steps) > 1e-3 * steps[0]:
         raise InputError(
             f"texture.{name}: axis of shape {values.shape} is not usable; allowed: 1-D, "
             "ascending, equally spaced, 2 nodes or more"
@@ -27,9 +22,12 @@ def _spacing(name, values):
 
 
 def gaussian_field(
-    shape: tuple[int, ...], spacing: tuple[float, ...], outer_scale: float, seed: int,
+    shape: tuple[int, ...],
+    spacing: tuple[float, ...],
+    outer_scale: float,
+    seed: int,
     slope: float = 5 / 3,
-) -> np.ndarray:  # fmt: skip
+) -> np.ndarray:
     """Periodic Gaussian random field, isotropic, with line spectra that fall with k^-slope.
 
     The spectral density is (k^2 + k0^2)^(-(slope + d - 1)/2) in d dimensions, k0 = 2 pi/L: its

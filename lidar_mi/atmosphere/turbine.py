@@ -12,10 +12,9 @@ import xarray as xr
 from scipy import integrate
 from scipy.fft import next_fast_len
 
-from lidar_mi.errors import InputError
-
 from lidar_mi.atmosphere.texture import gaussian_field
 from lidar_mi.atmosphere.vortex import LAMB_OSEEN_CONSTANT
+from lidar_mi.errors import InputError
 
 
 @dataclass(frozen=True)
@@ -66,15 +65,22 @@ class TurbineWake:
     hub_core: float
 
     def __post_init__(self):
-        for name, unit in (("diameter", " m"), ("wind_speed", " m/s"), ("growth", ""),
-                           ("downstream", " m"), ("hub_core", " m")):  # fmt: skip
+        for name, unit in (
+            ("diameter", " m"),
+            ("wind_speed", " m/s"),
+            ("growth", ""),
+            ("downstream", " m"),
+            ("hub_core", " m"),
+        ):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0):
                 raise InputError(f"turbine.{name}: {value}{unit} is not allowed; expected above 0")
         if not 0 < self.thrust < 1:
             raise InputError(f"turbine.thrust: {self.thrust} is not allowed; expected 0 to 1")
         if not (math.isfinite(self.tip_speed_ratio) and self.tip_speed_ratio != 0):
-            raise InputError(f"turbine.tip_speed_ratio: {self.tip_speed_ratio} is not allowed; not 0")
+            raise InputError(
+                f"turbine.tip_speed_ratio: {self.tip_speed_ratio} is not allowed; not 0"
+            )
         if self.thrust > 8 * self._relative_width**2:
             widest = (math.sqrt(self.thrust / 8) - self._initial_width) / self.growth
             raise InputError(
@@ -118,8 +124,11 @@ class TurbineWake:
         # the integrand falls like a Gaussian of sigma
         momentum, _ = integrate.quad(
             lambda r: self.axial_speed(r) * r * self._profile(r) * 2 * math.pi * r,
-            0, 12 * self.width, limit=400, points=[self.hub_core, self.width],
-        )  # fmt: skip
+            0,
+            12 * self.width,
+            limit=400,
+            points=[self.hub_core, self.width],
+        )
         return torque / momentum
 
     def axial_speed(self, r):
@@ -180,7 +189,9 @@ def isotropic_turbulence(x, y, z, outer_scale: float, seed: int) -> np.ndarray:
         field = potential[component]
         return (field[tuple(high)] - field[tuple(low)]) / (2 * step[along])
 
-    gusts = np.stack([slope((k + 2) % 3, (k + 1) % 3) - slope((k + 1) % 3, (k + 2) % 3) for k in range(3)])
+    gusts = np.stack(
+        [slope((k + 2) % 3, (k + 1) % 3) - slope((k + 1) % 3, (k + 2) % 3) for k in range(3)]
+    )
     gusts -= gusts.mean((1, 2, 3), keepdims=True)
     return gusts / math.sqrt((gusts**2).mean())
 
@@ -220,8 +231,11 @@ def turbine_flow(
         added *= np.exp(-(r**2) / (2 * wake.width**2))
         gusts = isotropic_turbulence(*axes.values(), outer_scale, seed)
         flow += wake.wind_speed * np.hypot(ambient, added) * gusts
-    titles = {"u": "velocity along the wind", "v": "velocity across the wind, positive to the left",
-              "w": "vertical velocity, positive upwards"}  # fmt: skip
+    titles = {
+        "u": "velocity along the wind",
+        "v": "velocity across the wind, positive to the left",
+        "w": "vertical velocity, positive upwards",
+    }
     return xr.Dataset(
         {
             name: (tuple(axes), field, {"units": "m s-1", "long_name": titles[name]})

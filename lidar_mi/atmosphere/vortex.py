@@ -221,11 +221,7 @@ def pair_wake(vortices: Sequence[Vortex], y, z, x: float = 0.0) -> xr.Dataset:
     }
     return xr.Dataset(
         {
-            name: (
-                ("x", "y", "z"),
-                data[None],
-                {"units": "m s-1", "long_name": long_names[name]},
-            )
+            name: (("x", "y", "z"), data[None], {"units": "m s-1", "long_name": long_names[name]})
             for name, data in (("u", np.zeros_like(v)), ("v", v), ("w", w))
         },
         coords={

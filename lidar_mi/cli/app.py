@@ -45,27 +45,33 @@ def _top(
     "`lidar-mi run my.yaml -o outputs/calm --set wake.texture.rms=0 --set seed=7`"
 )
 def run(
-    experiment: Annotated[str, typer.Argument(help="Experiment file, or the name of a shipped one.")],
+    experiment: Annotated[
+        str, typer.Argument(help="Experiment file, or the name of a shipped one.")
+    ],
     variant: Variant = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Run folder. Default: outputs/NAME.")
     ] = None,
     set_: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the file, as often as "
-                     "needed: --set scan.range='400 m'."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Change a key of the file, as often as needed: --set scan.range='400 m'.",
+        ),
     ] = None,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a run of a different experiment.")
     ] = False,
-) -> None:  # fmt: skip
+) -> None:
     """Run an experiment, start to end.
 
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
     A run that was stopped goes on with the images it has.
     """
-    from lidar_mi.experiment import schema as config, study
     from lidar_mi.experiment import run as chain
+    from lidar_mi.experiment import schema as config
+    from lidar_mi.experiment import study
 
     path, changes = _experiment_file(experiment), list(set_ or [])
     variants = config.load_variants(path, changes)
@@ -86,9 +92,11 @@ def run(
     winds = "wind_volume.nc" if loaded.volume else "wind.nc"
     found = "sensor.rmse_u" in metrics
     for name, asked in (
-        (winds, loaded.wake), ("v_los.nc", loaded.doppler), ("lines_of_sight.nc", loaded.sensor),
+        (winds, loaded.wake),
+        ("v_los.nc", loaded.doppler),
+        ("lines_of_sight.nc", loaded.sensor),
         ("wind3d.nc", found),
-    ):  # fmt: skip
+    ):
         if asked:
             _out.print(f"winds    {folder / name}")
     if "timing.vortex_s" in metrics:
@@ -100,12 +108,14 @@ def run(
     "scan.range='200 m'`"
 )
 def check(
-    experiment: Annotated[str, typer.Argument(help="Experiment file, or the name of a shipped one.")],
+    experiment: Annotated[
+        str, typer.Argument(help="Experiment file, or the name of a shipped one.")
+    ],
     set_: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the file, as for run."),
     ] = None,
-) -> None:  # fmt: skip
+) -> None:
     """Say whether an experiment can be run, and in numbers what it will look at and with what.
 
     Reads the wake, the scattering and the requirements as run does, and writes nothing.
@@ -116,7 +126,9 @@ def check(
     path, changes = _experiment_file(experiment), list(set_ or [])
     asked = config.load_variants(path, changes) or {"": config.load(path, changes)}
     with _progress() as notice:
-        found = [section for one in asked.values() for section in sections(one, path.parent, notice)]
+        found = [
+            section for one in asked.values() for section in sections(one, path.parent, notice)
+        ]
     for title, rows in found:
         _print_rows(title, rows)
     _out.print("nothing wrong found", highlight=False)
@@ -157,26 +169,36 @@ def render(
     path = out or scene.with_suffix(".exr")
     with _progress() as notice:
         render_file(
-            scene, path, variant or "llvm_ad_mono_polarized", samples, seed,
-            _definitions(define or []), lambda share: notice(f"rendering {scene.name}", share),
-        )  # fmt: skip
+            scene,
+            path,
+            variant or "llvm_ad_mono_polarized",
+            samples,
+            seed,
+            _definitions(define or []),
+            lambda share: notice(f"rendering {scene.name}", share),
+        )
     _out.print(f"image    {path}")
 
 
-@app.command(
-    epilog="Example: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc`"
-)
+@app.command(epilog="Example: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc`")
 def retrieve(
     first: Annotated[Path, typer.Argument(help="Image at t1: EXR, TIFF, PNG, BMP, JPEG or FITS.")],
     second: Annotated[Path, typer.Argument(help="Image at t2.")],
     *,
-    more: Annotated[list[Path] | None, typer.Argument(
-        help="Further images of a burst, each dt after the one before (variational).")] = None,
+    more: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Further images of a burst, each dt after the one before (variational)."
+        ),
+    ] = None,
     dt: Annotated[float, typer.Option(help="Time between the images, s.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="NetCDF file.")] = Path("wind.nc"),
-    method: Annotated[str, typer.Option(
-        help="cc (cross-correlation), ws (weight shift), multipass, variational or vortex_fit.")]
-        = "cc",
+    method: Annotated[
+        str,
+        typer.Option(
+            help="cc (cross-correlation), ws (weight shift), multipass, variational or vortex_fit."
+        ),
+    ] = "cc",
     template: Annotated[int, typer.Option(help="Template size, pixels.")] = 8,
     search: Annotated[int, typer.Option(help="Search region, pixels.")] = 16,
     stride: Annotated[int, typer.Option(help="Step between vectors, pixels.")] = 1,
@@ -188,16 +210,19 @@ def retrieve(
     ] = None,
     noise: Annotated[
         float | None,
-        typer.Option(min=0, help="Standard deviation of the images' noise. Default: what our EXR "
-                     "files say, else estimated."),
+        typer.Option(
+            min=0,
+            help="Standard deviation of the images' noise. Default: what our EXR "
+            "files say, else estimated.",
+        ),
     ] = None,
     device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
-) -> None:  # fmt: skip
+) -> None:
     """Find the cross-flow wind (v, w) in any two images of the same air."""
+    from lidar_mi.experiment.run_folder import write_netcdf
     from lidar_mi.io.images import read_image, read_noise
     from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
     from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
-    from lidar_mi.experiment.run_folder import write_netcdf
 
     images = [read_image(path, layer, spacing) for path in (first, second, *(more or []))]
     pair = on_one_grid(*images[:2])
@@ -207,9 +232,16 @@ def retrieve(
             # noise has no structure to interpolate: its level goes along
             noise = float(noise.median())
     wind = retrieve_wind(
-        *pair, dt=dt, method=method, template=template, search=search, stride=stride,
-        device=device, noise=noise, more=images[2:],
-    )  # fmt: skip
+        *pair,
+        dt=dt,
+        method=method,
+        template=template,
+        search=search,
+        stride=stride,
+        device=device,
+        noise=noise,
+        more=images[2:],
+    )
     write_netcdf(wind, out)
     valid = float((wind["flag"] == 0).mean())
     if "fit" in wind.attrs:
@@ -224,7 +256,9 @@ def _print_vortices(wind) -> None:
     for name in (n for n in wind.data_vars if f"{n}_stderr" in wind and not wind[n].dims):
         value, stderr = float(wind[name]), float(wind[f"{name}_stderr"])
         rows.append((name, f"{value:.2f} +- {stderr:.2f} {wind[name].attrs['units']}"))
-    _print_rows(f"vortex pair, {wind.attrs['profile'].replace('_', ' ')} ({wind.attrs['fit']})", rows)
+    _print_rows(
+        f"vortex pair, {wind.attrs['profile'].replace('_', ' ')} ({wind.attrs['fit']})", rows
+    )
 
 
 @app.command(
@@ -233,14 +267,20 @@ def _print_vortices(wind) -> None:
     "--altitude '8500 m'`"
 )
 def info(
-    what: Annotated[str, typer.Argument(
-        help="EXR, NetCDF or scattering-table file (.txt), folder of a run or of variants, or a name: molecules, "
-             "spheroids, spheres, continental, sea_salt, dust, droplets, soot.")],
-    wavelength: Annotated[str | None, typer.Option(
-        help="Of a named scatterer. Default: 532 nm.")] = None,
-    altitude: Annotated[str | None, typer.Option(
-        help="Of molecules, in the standard atmosphere. Default: 0 m.")] = None,
-) -> None:  # fmt: skip
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="EXR, NetCDF or scattering-table file (.txt), folder of a run or of variants, or a name: molecules, "
+            "spheroids, spheres, continental, sea_salt, dust, droplets, soot."
+        ),
+    ],
+    wavelength: Annotated[
+        str | None, typer.Option(help="Of a named scatterer. Default: 532 nm.")
+    ] = None,
+    altitude: Annotated[
+        str | None, typer.Option(help="Of molecules, in the standard atmosphere. Default: 0 m.")
+    ] = None,
+) -> None:
     """Say what a file or a folder of results holds, or how an aerosol or air scatters.
 
     Of scatterers: extinction and backscatter coefficient and the number of particles they go with,
@@ -255,10 +295,12 @@ def info(
     with _progress() as notice:
         found = list(
             sections(
-                what, _quantity("--wavelength", wavelength, "m", "532 nm"),
-                _quantity("--altitude", altitude, "m", "8500 m"), notice,
+                what,
+                _quantity("--wavelength", wavelength, "m", "532 nm"),
+                _quantity("--altitude", altitude, "m", "8500 m"),
+                notice,
             )
-        )  # fmt: skip
+        )
     for title, rows in found:
         _print_rows(title, rows)
     folder = Path(what)
@@ -281,32 +323,62 @@ def info(
     "-o smoke.txt`. In an experiment: `scattering: {phase: table, table: smoke.txt}`"
 )
 def aerosol(
-    start: Annotated[str, typer.Argument(
-        metavar="AEROSOL", help="The aerosol to start from: spheroids, spheres, continental, "
-        "sea_salt, dust, droplets, soot.")],
+    start: Annotated[
+        str,
+        typer.Argument(
+            metavar="AEROSOL",
+            help="The aerosol to start from: spheroids, spheres, continental, "
+            "sea_salt, dust, droplets, soot.",
+        ),
+    ],
     wavelength: Annotated[str, typer.Option(help="Vacuum wavelength.")] = "532 nm",
-    out: Annotated[Path | None, typer.Option(
-        "-o", "--out", help="Table to write. Default: aerosol_NAME_NNNnm.txt.")] = None,
-    name: Annotated[str | None, typer.Option(
-        help="Name of the new aerosol; needed when something below is changed.")] = None,
-    index: Annotated[str | None, typer.Option(
-        help="Refractive index, such as 1.53+0.008i; the imaginary part absorbs.")] = None,
-    elongation: Annotated[float | None, typer.Option(
-        help="Length over width of prolate spheroids in random orientation; 1 = spheres.")] = None,
-    radius: Annotated[str | None, typer.Option(
-        help="Median radius of a log-normal, mode of a modified gamma distribution; of the "
-        "sphere of equal volume, such as '0.2 um'.")] = None,
-    sigma: Annotated[float | None, typer.Option(
-        help="Geometric standard deviation of a log-normal distribution, above 1.")] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", help="Table to write. Default: aerosol_NAME_NNNnm.txt."),
+    ] = None,
+    name: Annotated[
+        str | None,
+        typer.Option(help="Name of the new aerosol; needed when something below is changed."),
+    ] = None,
+    index: Annotated[
+        str | None,
+        typer.Option(help="Refractive index, such as 1.53+0.008i; the imaginary part absorbs."),
+    ] = None,
+    elongation: Annotated[
+        float | None,
+        typer.Option(
+            help="Length over width of prolate spheroids in random orientation; 1 = spheres."
+        ),
+    ] = None,
+    radius: Annotated[
+        str | None,
+        typer.Option(
+            help="Median radius of a log-normal, mode of a modified gamma distribution; of the "
+            "sphere of equal volume, such as '0.2 um'."
+        ),
+    ] = None,
+    sigma: Annotated[
+        float | None,
+        typer.Option(help="Geometric standard deviation of a log-normal distribution, above 1."),
+    ] = None,
     smallest: Annotated[str | None, typer.Option(help="Smallest radius.")] = None,
-    largest: Annotated[str | None, typer.Option(
-        help="Largest radius. Time and memory grow steeply with it for spheroids; beyond a size "
-        "parameter (circumference over wavelength) of about 24 they are refused.")] = None,
-    number_density: Annotated[str | None, typer.Option(
-        help="Particles that go with the table, such as '2e8 / m^3'.")] = None,
-    nodes: Annotated[int | None, typer.Option(
-        min=2, help="Sizes to average over. Default: 128 (spheroids), 10000 (spheres).")] = None,
-) -> None:  # fmt: skip
+    largest: Annotated[
+        str | None,
+        typer.Option(
+            help="Largest radius. Time and memory grow steeply with it for spheroids; beyond a size "
+            "parameter (circumference over wavelength) of about 24 they are refused."
+        ),
+    ] = None,
+    number_density: Annotated[
+        str | None, typer.Option(help="Particles that go with the table, such as '2e8 / m^3'.")
+    ] = None,
+    nodes: Annotated[
+        int | None,
+        typer.Option(
+            min=2, help="Sizes to average over. Default: 128 (spheroids), 10000 (spheres)."
+        ),
+    ] = None,
+) -> None:
     """Make the scattering table of an aerosol: a named one, or one changed to taste.
 
     The table holds the six elements of the scattering matrix over angle (T-matrix method for
@@ -320,12 +392,17 @@ def aerosol(
 
     metres = _quantity("--wavelength", wavelength, "m", "532 nm")
     particles = changed(
-        start, metres, name, index=_index(index), elongation=elongation, sigma=sigma,
+        start,
+        metres,
+        name,
+        index=_index(index),
+        elongation=elongation,
+        sigma=sigma,
         radius=_quantity("--radius", radius, "m", "0.2 um"),
         smallest=_quantity("--smallest", smallest, "m", "0.03 um"),
         largest=_quantity("--largest", largest, "m", "1.5 um"),
         number_density=_quantity("--number-density", number_density, "1/m^3", "2e8 / m^3"),
-    )  # fmt: skip
+    )
     path = out or Path(f"aerosol_{particles.name}_{metres * 1e9:.0f}nm.txt")
     if not path.parent.is_dir():
         raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
@@ -344,8 +421,10 @@ def rings(
     image: Annotated[Path, typer.Argument(help="EXR, PNG, TIFF, BMP, JPEG or FITS image.")],
     centre: Annotated[
         tuple[float, float] | None,
-        typer.Option(help="Where the rings' centre is known: x to the right, y down, pixels from "
-                     "the middle of the top left one. Default: found."),
+        typer.Option(
+            help="Where the rings' centre is known: x to the right, y down, pixels from "
+            "the middle of the top left one. Default: found."
+        ),
     ] = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Picture (PNG). Default: IMAGE_rings.png.")
@@ -356,12 +435,12 @@ def rings(
     saturation: Annotated[
         float | None, typer.Option(help="Value from which on a pixel is full.")
     ] = None,
-) -> None:  # fmt: skip
+) -> None:
     """Measure the rings of an etalon in any image: centre, radii, orders, quality of the fit."""
     from lidar_mi.assessment.figures.rings import draw_rings
+    from lidar_mi.experiment.run_folder import write
     from lidar_mi.io.images import read_picture
     from lidar_mi.retrieval.rings.analysis import analyse, describe
-    from lidar_mi.experiment.run_folder import write
 
     path = out or Path(f"{image.stem}_rings.png")
     if not path.parent.is_dir():
@@ -470,9 +549,14 @@ class _progress:
 
     def __enter__(self):
         self.bars = Progress(
-            SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(),
-            TimeElapsedColumn(), console=_err, transient=True, disable=not _err.is_terminal,
-        )  # fmt: skip
+            SpinnerColumn(),
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            TimeElapsedColumn(),
+            console=_err,
+            transient=True,
+            disable=not _err.is_terminal,
+        )
         self.bars.start()
         self.task = self.bars.add_task("starting", total=None)
         self.last = None
@@ -481,9 +565,11 @@ class _progress:
     def _notice(self, text: str, share: float | None) -> None:
         # a full bar would stop clock and spinner, and what comes next goes on
         self.bars.update(
-            self.task, description=text, total=None if share is None else 1.0,
+            self.task,
+            description=text,
+            total=None if share is None else 1.0,
             completed=min(share or 0.0, 0.999),
-        )  # fmt: skip
+        )
         if text != self.last and (text.startswith("warning: ") or not _err.is_terminal):
             _err.print(text, highlight=False, soft_wrap=True)
         self.last = text
@@ -504,7 +590,9 @@ def _print_metrics(metrics: dict[str, float]) -> None:
 
 def _print_doppler(metrics: dict[str, float]) -> None:
     """Standard deviation and bias of every method, for every number of pictures averaged."""
-    cases = [key.split(".")[1:4] for key in metrics if key.startswith("doppler.") and "averaged" in key]
+    cases = [
+        key.split(".")[1:4] for key in metrics if key.startswith("doppler.") and "averaged" in key
+    ]
     rows = dict.fromkeys((method, centre) for method, centre, _ in cases)
     numbers = sorted({int(averaged.removeprefix("averaged_")) for *_, averaged in cases})
     table = Table(
@@ -518,8 +606,9 @@ def _print_doppler(metrics: dict[str, float]) -> None:
     for method, centre in rows:
         keys = [
             f"doppler.{method}.{centre}.averaged_{number}.{name}"
-            for number in numbers for name in ("std", "bias")
-        ]  # fmt: skip
+            for number in numbers
+            for name in ("std", "bias")
+        ]
         shown = ["-" if key not in metrics else f"{metrics[key]:.3f}" for key in keys]
         style = "dim" if method == "bound" else None
         name = "(bound)" if method == "bound" else method
@@ -533,31 +622,40 @@ def _print_winds(metrics: dict[str, float]) -> None:
         title="rms error of the wind in m/s, valid vectors (far: beyond two core radii)",
         title_justify="left",
     )
-    components = "uvw" if any(k.startswith("backscatter") and k.endswith(".rmse_u") for k in metrics) else "vw"
+    components = (
+        "uvw"
+        if any(k.startswith("backscatter") and k.endswith(".rmse_u") for k in metrics)
+        else "vw"
+    )
     far = (f"far {name}" for name in components)
     for head in ("winds from", "method", *components, *far, "valid"):
         named = head in ("winds from", "method")
         table.add_column(head, justify="left" if named else "right", no_wrap=named)
     names = [
-        tuple(key.split(".")[:2]) for key in metrics
+        tuple(key.split(".")[:2])
+        for key in metrics
         if key.endswith(".valid_fraction") and not key.startswith("texture_sweep.")
-    ]  # fmt: skip
+    ]
     for source, method in names:
         values = [
             metrics.get(f"{source}.{method}.{place}rmse_{name}")
-            for place in ("", "outside_cores.") for name in components
-        ]  # fmt: skip
+            for place in ("", "outside_cores.")
+            for name in components
+        ]
         shown = ["-" if value is None else f"{value:.2f}" for value in values]
         valid = f"{metrics[f'{source}.{method}.valid_fraction']:.0%}"
         table.add_row(source.replace("_", " ").replace("extinction ", ""), method, *shown, valid)
     strength = [
         metrics.get(f"true_wind.{place}rms_{name}")
-        for place in ("", "outside_cores.") for name in components
-    ]  # fmt: skip
+        for place in ("", "outside_cores.")
+        for name in components
+    ]
     shown = ["-" if value is None else f"{value:.2f}" for value in strength]
     table.add_row("true wind", "", *shown, "", style="dim")
     _out.print(table)
-    _out.print("An error near the rms of the true wind (last row) means no skill: zero would be as good.")
+    _out.print(
+        "An error near the rms of the true wind (last row) means no skill: zero would be as good."
+    )
 
 
 def _print_sensor(metrics: dict[str, float]) -> None:

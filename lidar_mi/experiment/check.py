@@ -5,14 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_mi.experiment.stages import backscatter as backscatter_chain, sensor as sensor_chain
-from lidar_mi.experiment import run as experiment
 from lidar_mi.assessment.metrics.requirements import look_ahead
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.info import Section
-from lidar_mi.instrument.doppler import photons
 from lidar_mi.experiment.run_folder import Notice
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+from lidar_mi.experiment.stages import sensor as sensor_chain
 from lidar_mi.experiment.truth import make_truth
+from lidar_mi.instrument.doppler import photons
 
 
 def sections(
@@ -61,7 +62,10 @@ def _backscatter(asked: Experiment, beside) -> Iterator[Section]:
         ("beam's 1/e^2 radius there", f"{float(lidar.radius_at(plan.centre)):.3g} m"),
         ("gates", f"{scan.gate_count}, from {plan.gate_start:g} to {plan.gate_stop:g} m"),
         ("warning time", _warning(plan.gate_start, platform.speed)),
-        ("photons", f"{asked.render.samples_per_beam} a beam, orders 1 to {asked.render.max_order}"),
+        (
+            "photons",
+            f"{asked.render.samples_per_beam} a beam, orders 1 to {asked.render.max_order}",
+        ),
         ("time between the pictures", f"{platform.dt:g} s"),
     ]
     if not asked.volume:
@@ -77,7 +81,9 @@ def _displacements(asked: Experiment, wind, pixel: float) -> list[tuple[str, str
     rows = [("methods", ", ".join(settings.methods))]
     if {"cc", "ws"} & set(settings.methods):
         verdict = "" if fastest <= reach else "; larger retrieval.search or smaller platform.dt"
-        rows.append(("fastest wind windows follow", f"{reach:.3g} m/s, here {fastest:.3g}{verdict}"))
+        rows.append(
+            ("fastest wind windows follow", f"{reach:.3g} m/s, here {fastest:.3g}{verdict}")
+        )
     return rows
 
 

@@ -19,9 +19,11 @@ Section = tuple[str, list[tuple[str, ...]]]
 
 
 def sections(
-    what: str, wavelength: float | None = None, altitude: float | None = None,
+    what: str,
+    wavelength: float | None = None,
+    altitude: float | None = None,
     notice: Notice = lambda text, share: None,
-) -> Iterator[Section]:  # fmt: skip
+) -> Iterator[Section]:
     """Describe a file, a folder of a run or a study, a named aerosol or the molecules of air.
 
     Parameters
@@ -45,9 +47,13 @@ def sections(
     if altitude is not None and (not named or what != MOLECULES):
         raise InputError(f"--altitude: not allowed with {what}; expected {MOLECULES}")
     kinds = {
-        ".exr": _picture, ".nc": _netcdf, ".nc4": _netcdf, ".cdf": _netcdf, ".txt": _table_file,
+        ".exr": _picture,
+        ".nc": _netcdf,
+        ".nc4": _netcdf,
+        ".cdf": _netcdf,
+        ".txt": _table_file,
         ".json": _vortices,
-    }  # fmt: skip
+    }
     if named:
         wavelength = wavelength or 532e-9
         if what == MOLECULES:
@@ -75,7 +81,11 @@ def sections(
 def _vortices(path: Path) -> Iterator[Section]:
     for name, fit in read_vortices(path).items():
         rows = [
-            (quantity.long_name, f"{quantity.value:.4g} \u00b1 {quantity.stderr:.2g}", quantity.units)
+            (
+                quantity.long_name,
+                f"{quantity.value:.4g} \u00b1 {quantity.stderr:.2g}",
+                quantity.units,
+            )
             for quantity in fit.quantities.values()
         ]
         yield f"{path}: vortex pair, {name}, {fit.profile.replace('_', ' ')}", rows
@@ -150,14 +160,21 @@ def _study(folder: Path) -> Iterator[Section]:
     from lidar_mi.experiment.study import read_study
 
     name, records, metrics = read_study(folder)
-    rows = [("variant", *(key if record else f"{key} (not run)" for key, record in records.items()))]
-    settings = {key: flat(record["experiment"]) if record else {} for key, record in records.items()}
+    rows = [
+        ("variant", *(key if record else f"{key} (not run)" for key, record in records.items()))
+    ]
+    settings = {
+        key: flat(record["experiment"]) if record else {} for key, record in records.items()
+    }
     done = {key: one for key, one in settings.items() if one}
     for key, values in differences(done).items():
         shown = dict(zip(done, map(setting, values)))
         rows.append((key, *(shown.get(variant, "-") for variant in records)))
     yield f"{folder}: study {name}", rows
-    found = [(f"{label} / {unit}" if unit else label, *values) for label, unit, values in results(metrics)]
+    found = [
+        (f"{label} / {unit}" if unit else label, *values)
+        for label, unit, values in results(metrics)
+    ]
     if found:
         yield "what comes of it", [("", *metrics), *found]
     yield _files(folder, beside=records)
@@ -168,9 +185,10 @@ def _run_folder(folder: Path) -> Iterator[Section]:
 
     record = read_record(folder)
     experiment = record["experiment"]
-    yield f"{folder}: experiment {experiment.get('name')}", [
-        (key, _short(value)) for key, value in _asked_first(experiment)
-    ]
+    yield (
+        f"{folder}: experiment {experiment.get('name')}",
+        [(key, _short(value)) for key, value in _asked_first(experiment)],
+    )
     yield "versions", [(name, str(number)) for name, number in record["versions"].items()]
     yield _files(folder)
 
@@ -180,18 +198,33 @@ def _files(folder: Path, beside: Iterable[str] = ()) -> Section:
     paths = {path.relative_to(folder): path for path in sorted(folder.rglob("*")) if path.is_file()}
     return "files", [
         (str(name), f"{path.stat().st_size / 1e6:.2f} MB")
-        for name, path in paths.items() if name.parts[0] not in beside
-    ]  # fmt: skip
+        for name, path in paths.items()
+        if name.parts[0] not in beside
+    ]
 
 
 def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
     """The keys of an experiment that tell one from another at a glance, as far as it has them."""
     for key in (
-        "seed", "wake.file", "wake.time", "wake.second", "wake.texture.rms", "platform.speed",
-        "platform.dt", "scan.range", "scan.thickness", "scan.gates", "scan.gate_count",
-        "lidar.wavelength", "scattering.phase", "scattering.aerosol", "render.variant",
-        "render.samples_per_beam", "render.max_order", "retrieval.methods",
-    ):  # fmt: skip
+        "seed",
+        "wake.file",
+        "wake.time",
+        "wake.second",
+        "wake.texture.rms",
+        "platform.speed",
+        "platform.dt",
+        "scan.range",
+        "scan.thickness",
+        "scan.gates",
+        "scan.gate_count",
+        "lidar.wavelength",
+        "scattering.phase",
+        "scattering.aerosol",
+        "render.variant",
+        "render.samples_per_beam",
+        "render.max_order",
+        "retrieval.methods",
+    ):
         value = experiment
         for part in key.split("."):
             value = value.get(part) if isinstance(value, dict) else None

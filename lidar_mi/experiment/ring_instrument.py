@@ -70,9 +70,13 @@ def air_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> Ring
 
     def line(kelvin: float) -> Line:
         return backscatter_line(
-            lidar.wavelength, kelvin, pressure, lidar.laser_width, lidar.aerosol_share,
+            lidar.wavelength,
+            kelvin,
+            pressure,
+            lidar.laser_width,
+            lidar.aerosol_share,
             lidar.line_shape,
-        )  # fmt: skip
+        )
 
     return ring_model(etalon, camera, line, temperature * np.array(TEMPERATURE_NODES))
 

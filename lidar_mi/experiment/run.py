@@ -9,19 +9,17 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lidar_mi import __version__
-from lidar_mi.experiment.stages import (
-    backscatter as backscatter_chain,
-    error_budget as budget_chain,
-    fringes as fringe_chain,
-    sensor as sensor_chain,
-    volume as volume_chain,
-    vortices as vortex_chain,
-)
-from lidar_mi.experiment import schema as config
 from lidar_mi.assessment.report import page as report
-from lidar_mi.experiment.schema import Experiment
 from lidar_mi.errors import is_interrupt
+from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.run_folder import Log, Notice, claim, read_record, write
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+from lidar_mi.experiment.stages import error_budget as budget_chain
+from lidar_mi.experiment.stages import fringes as fringe_chain
+from lidar_mi.experiment.stages import sensor as sensor_chain
+from lidar_mi.experiment.stages import volume as volume_chain
+from lidar_mi.experiment.stages import vortices as vortex_chain
 
 
 def run(

@@ -12,19 +12,26 @@ import xarray as xr
 import yaml
 
 from lidar_mi import __version__
+from lidar_mi.errors import InputError
 from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.errors import InputError
-from lidar_mi.rendering.phase import table_files
 from lidar_mi.experiment.truth import find_file
+from lidar_mi.rendering.phase import table_files
 
 IMAGES = ("image_t1.exr", "image_t2.exr")
 VOLUME = "wind_volume.nc"
 PICTURES = (*IMAGES, "fringes_*.exr")
 RESULTS = (
-    "wind.nc", "v_los.nc", "lines_of_sight.nc", "wind3d.nc", VOLUME, "vortex.json",
-    "metrics.json", "report.html", "log.txt",
-)  # fmt: skip
+    "wind.nc",
+    "v_los.nc",
+    "lines_of_sight.nc",
+    "wind3d.nc",
+    VOLUME,
+    "vortex.json",
+    "metrics.json",
+    "report.html",
+    "log.txt",
+)
 
 # other versions of these may give other pictures
 RENDERED_BY = ("lidar-mi", "mitsuba", "drjit")

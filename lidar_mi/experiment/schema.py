@@ -254,9 +254,11 @@ class Doppler(_Section):
     """The fringe-imaging Doppler lidar and the winds along its line of sight."""
 
     v_los: tuple[Speed, ...] = Field(
-        ("50 m/s", "-300 m/s", "-100 m/s", "0 m/s", "300 m/s"), min_length=1, max_length=100,
+        ("50 m/s", "-300 m/s", "-100 m/s", "0 m/s", "300 m/s"),
+        min_length=1,
+        max_length=100,
         description="positive: the air approaches; figures show the first",
-    )  # fmt: skip
+    )
     lidar: DopplerLidar = DopplerLidar()
     etalon: Etalon = Etalon()
     camera: FringeCamera = FringeCamera()
@@ -358,15 +360,21 @@ class Experiment(_Section):
             return self
         wake, scan = self.wake, self.scan
         if wake is None or (wake.depth != "volume" and wake.turbine is None):
-            raise ValueError("volume: not allowed without a wake in three dimensions; expected "
-                             "wake.depth: volume")  # fmt: skip
+            raise ValueError(
+                "volume: not allowed without a wake in three dimensions; expected "
+                "wake.depth: volume"
+            )
         if wake.second != "advect":
-            raise ValueError(f"wake.second: {wake.second:g} s is not allowed with volume; expected advect")
+            raise ValueError(
+                f"wake.second: {wake.second:g} s is not allowed with volume; expected advect"
+            )
         if self.sensor or self.retrieval != Retrieval():
             key = "sensor" if self.sensor else "retrieval"
             raise ValueError(f"{key}: not allowed with volume, which finds the wind in its stead")
         if scan.gates != "planar":
-            raise ValueError(f"scan.gates: {scan.gates} is not allowed with volume; expected planar")
+            raise ValueError(
+                f"scan.gates: {scan.gates} is not allowed with volume; expected planar"
+            )
         if scan.gate_count < self.volume.template:
             raise ValueError(
                 f"scan.gate_count: {scan.gate_count} is not allowed with volume; expected at least "
@@ -395,7 +403,11 @@ class Experiment(_Section):
     @model_validator(mode="after")
     def _molecules_beside_particles(self):
         phase = self.scattering.phase
-        if self.wake and self.wake.extinction.molecules and phase in ("isotropic", "henyey_greenstein"):
+        if (
+            self.wake
+            and self.wake.extinction.molecules
+            and phase in ("isotropic", "henyey_greenstein")
+        ):
             raise ValueError(
                 f"wake.extinction.molecules: not allowed with scattering.phase {phase}, which knows no "
                 "polarisation; expected 0"
@@ -481,7 +493,9 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
     for name, changes in variants.items():
         place = f"{path}: variants.{name}"
         if not re.fullmatch(NAME, str(name)):
-            raise InputError(f"{place}: not allowed; expected a name of letters, digits, _, . and -")
+            raise InputError(
+                f"{place}: not allowed; expected a name of letters, digits, _, . and -"
+            )
         if not isinstance(changes, dict):
             raise InputError(f"{place}: {changes!r} is not allowed; expected keys to change")
         if "name" in changes:
@@ -554,7 +568,9 @@ def dump(experiment: Experiment) -> str:
     Without the sections of a lidar that it does not have.
     """
     unused = {"wake", *BACKSCATTER} if experiment.wake is None else set()
-    unused |= {name for name in ("doppler", "sensor", "volume") if getattr(experiment, name) is None}
+    unused |= {
+        name for name in ("doppler", "sensor", "volume") if getattr(experiment, name) is None
+    }
     data = experiment.model_dump(mode="json", exclude=unused)
     return yaml.safe_dump(data, sort_keys=False)
 
@@ -610,9 +626,11 @@ def _first_fault(error: ValidationError) -> str:
 
 
 _LIMITS = {
-    "greater_than": ("gt", "more than"), "greater_than_equal": ("ge", "at least"),
-    "less_than": ("lt", "less than"), "less_than_equal": ("le", "at most"),
-}  # fmt: skip
+    "greater_than": ("gt", "more than"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "at most"),
+}
 
 
 def _unit_at(location: tuple) -> str:

@@ -11,12 +11,13 @@ from pathlib import Path
 import xarray as xr
 import yaml
 
-from lidar_mi.experiment import schema as config, run as experiment
 from lidar_mi.assessment.report.comparison import draw_comparison, page
-from lidar_mi.experiment.schema import Experiment
 from lidar_mi.errors import InputError
-from lidar_mi.io import exr
+from lidar_mi.experiment import run as experiment
+from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.run_folder import IMAGES, VOLUME, Log, Notice, read_record, write
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.io import exr
 
 RECORD = "study.yaml"
 
@@ -60,16 +61,15 @@ def run(
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
     record = yaml.safe_dump({"name": name, "variants": list(variants)}, sort_keys=False)
     write(folder / RECORD, lambda path: path.write_text(record))
-    metrics = {
-        key: one(folder / key, overwrite, _of(key, notice)) for key, one in ready.items()
-    }
+    metrics = {key: one(folder / key, overwrite, _of(key, notice)) for key, one in ready.items()}
     log = Log(folder / "log.txt", notice)
     log(f"comparing {', '.join(variants)}")
     # a variant without a wake has rings only, which the table compares
     rows = {
         key: _pictures(folder / key, VOLUME if one.volume else "wind.nc", metrics[key])
-        for key, one in variants.items() if one.wake
-    }  # fmt: skip
+        for key, one in variants.items()
+        if one.wake
+    }
     drawn = draw_comparison(folder / "figures", rows, log) if rows else []
     merged = {f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()}
     html = page(name, settings, metrics, drawn)
@@ -104,7 +104,9 @@ def read_study(
         record = yaml.safe_load((folder / RECORD).read_text())
         name, variants = str(record["name"]), [str(key) for key in record["variants"]]
     except (OSError, yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError):
-        raise InputError(f"{folder / RECORD}: not written by a study; expected its folder") from None
+        raise InputError(
+            f"{folder / RECORD}: not written by a study; expected its folder"
+        ) from None
     started = {key: (folder / key / "experiment.yaml").is_file() for key in variants}
     records = {key: read_record(folder / key) if started[key] else None for key in variants}
     metrics = {}

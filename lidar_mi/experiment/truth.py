@@ -15,8 +15,8 @@ from lidar_mi.atmosphere.texture import corrsin_obukhov
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
 from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
 from lidar_mi.atmosphere.wake import centre, check_nodes, read_wake, resample
-from lidar_mi.experiment.schema import Experiment
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema import Experiment
 
 Flows = tuple[xr.Dataset, xr.Dataset | None]
 
@@ -39,7 +39,9 @@ class Truth:
         return _slab_mean(field, self.wind.attrs["gates"])
 
 
-def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | None = None) -> Truth:
+def make_truth(
+    experiment: Experiment, beside: str | Path = ".", flows: Flows | None = None
+) -> Truth:
     """The flow and the extinction at both times, on the scan's grid, in the lidar's frame.
 
     Parameters
@@ -63,9 +65,13 @@ def make_truth(experiment: Experiment, beside: str | Path = ".", flows: Flows | 
     if texture.rms > 0:
         x = first["x"].values if first.sizes["x"] > 1 else None
         factor = corrsin_obukhov(
-            first["y"].values, first["z"].values, texture.rms, texture.outer_scale,
-            experiment.seed, x=x,
-        )  # fmt: skip
+            first["y"].values,
+            first["z"].values,
+            texture.rms,
+            texture.outer_scale,
+            experiment.seed,
+            x=x,
+        )
         if x is None:
             factor = factor.expand_dims(x=first["x"].values)
         factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
@@ -203,9 +209,13 @@ def _extinction(flow, mapping, first, second) -> xr.DataArray:
             return field.transpose("x", "y", "z")
         densest = max(float(s[tracer].max()) for s in states) if tracer else None
         field = extinction_from_tracer(
-            flow, **limits, stretch=mapping.stretch, tracer=tracer, aerosol=aerosol,
+            flow,
+            **limits,
+            stretch=mapping.stretch,
+            tracer=tracer,
+            aerosol=aerosol,
             reference=densest,
-        )  # fmt: skip
+        )
     return field.transpose("x", "y", "z")
 
 
@@ -244,9 +254,7 @@ def find_file(name: str, beside: str | Path, field: str) -> Path:
     )
 
 
-def blur_by_beam(
-    image: xr.DataArray, lidar, distance: float, depth: float = 0.0
-) -> xr.DataArray:
+def blur_by_beam(image: xr.DataArray, lidar, distance: float, depth: float = 0.0) -> xr.DataArray:
     """An image seen by beams of finite width, aimed at its nodes, at a distance.
 
     Between nodes the air varies linearly, as the renderer's grid does. A beam is a Gaussian with

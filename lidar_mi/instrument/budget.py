@@ -66,10 +66,12 @@ def pulse_budget(
         A number that is not positive.
     """
     for name, value in (
-        ("directions", directions), ("slabs_per_second", slabs_per_second),
-        ("pulses_per_direction", pulses_per_direction), ("pulse_energy", pulse_energy),
+        ("directions", directions),
+        ("slabs_per_second", slabs_per_second),
+        ("pulses_per_direction", pulses_per_direction),
+        ("pulse_energy", pulse_energy),
         ("farthest", farthest),
-    ):  # fmt: skip
+    ):
         if not (value > 0 and math.isfinite(value)):
             raise InputError(f"{name}: {value} is not allowed; expected more than 0")
     rate = directions * slabs_per_second * pulses_per_direction

@@ -14,10 +14,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy import constants, special
 
 from lidar_mi.errors import InputError
-from lidar_mi.units import Frequency, Length, Number, SpectralRadiance
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.signal import apparent_backscatter
+from lidar_mi.units import Frequency, Length, Number, SpectralRadiance
 
 
 class Detector(BaseModel):

@@ -8,6 +8,14 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.detector import (
+    gate_duration,
+    photons_per_energy,
+    spatial_modes,
+    temporal_modes,
+)
+from lidar_mi.instrument.etalon import Etalon, harmonics, series
+from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.units import (
     Angle,
     Area,
@@ -20,14 +28,6 @@ from lidar_mi.units import (
     SpectralRadiance,
     Time,
 )
-from lidar_mi.instrument.detector import (
-    gate_duration,
-    photons_per_energy,
-    spatial_modes,
-    temporal_modes,
-)
-from lidar_mi.instrument.etalon import Etalon, harmonics, series
-from lidar_mi.instrument.fringe_camera import FringeCamera
 
 
 class DopplerLidar(BaseModel):

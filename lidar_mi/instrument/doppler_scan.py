@@ -14,9 +14,9 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from lidar_mi.errors import InputError
-from lidar_mi.units import Angle, Speed
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.scan import HalfAngle
+from lidar_mi.units import Angle, Speed
 
 # nodes of the quadrature over range bin, pulse and beam: exact for winds of degree 15, 5 and 5
 _BIN, _PULSE, _BEAM = 8, 3, 3

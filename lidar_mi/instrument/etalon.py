@@ -61,9 +61,11 @@ class Etalon(BaseModel):
 
     gap: Length = Field(13.7e-3, gt=0, description="distance of the mirrors")
     order_fraction: Number | None = Field(
-        0.5, ge=0, lt=1,
+        0.5,
+        ge=0,
+        lt=1,
         description="fractional order at the centre, to which the gap is tuned; null: as it comes",
-    )  # fmt: skip
+    )
     index: Number = Field(1.0, ge=1, le=4, description="refractive index in the gap")
     reflectivity: Number = Field(0.70, gt=0, lt=1, description="of each mirror")
     absorption: Number = Field(0.0, ge=0, lt=1, description="share of the light lost in a mirror")
@@ -72,9 +74,10 @@ class Etalon(BaseModel):
     )
     bow: Length = Field(0.0, ge=0, description="gap in the middle less gap at the rim")
     coatings: tuple[Layer, ...] | None = Field(
-        None, min_length=1,
+        None,
+        min_length=1,
         description="(index, thickness) from plate to gap, instead of reflectivity and absorption",
-    )  # fmt: skip
+    )
     plate_index: Number = Field(1.476, ge=1, le=4, description="of the plates; fused silica")
 
     @model_validator(mode="after")
@@ -315,9 +318,11 @@ def _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization):
         phase = wavenumber * index * slope * layer.thickness
         cos, sin = np.cos(phase), -1j * np.sin(phase)
         a, b, c, d = (
-            a * cos + b * eta * sin, a * sin / eta + b * cos,
-            c * cos + d * eta * sin, c * sin / eta + d * cos,
-        )  # fmt: skip
+            a * cos + b * eta * sin,
+            a * sin / eta + b * cos,
+            c * cos + d * eta * sin,
+            c * sin / eta + d * cos,
+        )
     common = gap * a + gap * plate * b + c + plate * d
     inside = (gap * a + gap * plate * b - c - plate * d) / common
     return inside, 2 * np.sqrt(gap * plate) / common

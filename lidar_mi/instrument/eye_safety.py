@@ -237,8 +237,9 @@ def hazard_distance(
     _positive("energy", energy, " J")
     _positive("beam_radius", beam_radius, " m")
     for name, value, unit in (
-        ("divergence_full", divergence_full, "rad"), ("extinction", extinction, "1/m"),
-    ):  # fmt: skip
+        ("divergence_full", divergence_full, "rad"),
+        ("extinction", extinction, "1/m"),
+    ):
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"{name}: {value} {unit} is not allowed; expected >= 0 {unit}")
 

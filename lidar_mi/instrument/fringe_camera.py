@@ -12,8 +12,8 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from lidar_mi.errors import InputError
-from lidar_mi.units import Frequency, Length, Number, Time
 from lidar_mi.instrument.etalon import Etalon, cosine_inside, fractional_order, harmonics, series
+from lidar_mi.units import Frequency, Length, Number, Time
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 # Two Gauss-Legendre points average a pixel to fourth order.
@@ -39,9 +39,11 @@ class FringeCamera(BaseModel):
         None, description="(x, y) of the rings in pixels; default: the middle of the image"
     )
     illumination_radius: Length = Field(
-        math.inf, gt=0, allow_inf_nan=True,
+        math.inf,
+        gt=0,
+        allow_inf_nan=True,
         description="1/e^2 radius of the light on the CCD; inf: even light",
-    )  # fmt: skip
+    )
 
     @property
     def centre_pixel(self) -> tuple[float, float]:

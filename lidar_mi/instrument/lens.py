@@ -37,9 +37,7 @@ def fused_silica_index(wavelength: float) -> float:
     return float(np.sqrt(1 + (strengths * square / (square - resonances**2)).sum()))
 
 
-def singlet(
-    focal_length: float, wavelength: float, stop_radius: float, field: float
-) -> np.ndarray:
+def singlet(focal_length: float, wavelength: float, stop_radius: float, field: float) -> np.ndarray:
     """An aspheric singlet without spherical aberration, coma and distortion.
 
     Parameters
@@ -85,11 +83,13 @@ def singlet(
 
     def lens(shape):
         front, back, conic, distance = shape
-        return np.array([
-            [0, 0, STOP_DISTANCE, 1],
-            [1 / front, conic, THICKNESS, index],
-            [1 / back, 0, distance, 1],
-        ])  # fmt: skip
+        return np.array(
+            [
+                [0, 0, STOP_DISTANCE, 1],
+                [1 / front, conic, THICKNESS, index],
+                [1 / back, 0, distance, 1],
+            ]
+        )
 
     def aberrations(shape):
         across, along = trace(lens(shape), *pupil, 0.0)
@@ -102,9 +102,13 @@ def singlet(
 
     power = 1 / (index - 1)
     solved = least_squares(
-        aberrations, [0.85 * power, -0.15 * power, -0.5, 1.0], x_scale=[1, 1, 1, 0.01],
-        xtol=1e-15, ftol=1e-15, gtol=1e-15,
-    )  # fmt: skip
+        aberrations,
+        [0.85 * power, -0.15 * power, -0.5, 1.0],
+        x_scale=[1, 1, 1, 0.01],
+        xtol=1e-15,
+        ftol=1e-15,
+        gtol=1e-15,
+    )
     return lens(solved.x) * np.array([focal_length, 1, focal_length, 1])
 
 

@@ -100,7 +100,9 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(
         {
             "depolarization": (
-                dims, ratio, {"long_name": "linear depolarisation ratio", "units": "1"}
+                dims,
+                ratio,
+                {"long_name": "linear depolarisation ratio", "units": "1"},
             ),
             "depolarization_stderr": (
                 dims,
@@ -113,7 +115,7 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
             ),
         },
         coords=coords,
-    )  # fmt: skip
+    )
 
 
 def multiple_scattering_fraction(

@@ -32,9 +32,20 @@ _MEANING = {
 _LAYER = re.compile(r"gate(\d+)\.(.+)$")
 # header entries that describe the file, not the scan
 _STRUCTURE = {
-    "channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio",
-    "screenWindowCenter", "screenWindowWidth", "type", "tiles", "name", "version", "chunkCount",
-}  # fmt: skip
+    "channels",
+    "compression",
+    "dataWindow",
+    "displayWindow",
+    "lineOrder",
+    "pixelAspectRatio",
+    "screenWindowCenter",
+    "screenWindowWidth",
+    "type",
+    "tiles",
+    "name",
+    "version",
+    "chunkCount",
+}
 
 
 def write_scan(path: str | Path, scan: xr.Dataset) -> None:
@@ -221,6 +232,9 @@ def label_scan(scan: xr.Dataset) -> xr.Dataset:
         scan[name].attrs = {"long_name": once.get(name, name), "units": "m-1 sr-1"}
     scan["y"].attrs = {"long_name": "distance to port", "units": "m", "axis": "Y"}
     scan["z"].attrs = {
-        "long_name": "height above the beam axis", "units": "m", "axis": "Z", "positive": "up",
-    }  # fmt: skip
+        "long_name": "height above the beam axis",
+        "units": "m",
+        "axis": "Z",
+        "positive": "up",
+    }
     return scan

@@ -29,7 +29,9 @@ def read_picture(path: str | Path, layer: str | None = None) -> np.ndarray:
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected an EXR, PNG, TIFF, BMP, JPEG or FITS image")
+        raise InputError(
+            f"{path}: no such file; expected an EXR, PNG, TIFF, BMP, JPEG or FITS image"
+        )
     if _is_exr(path):
         picture = _exr(path, layer)
     elif layer is not None:

@@ -47,12 +47,14 @@ def _as_data(fit: VortexPairFit) -> dict:
         **{name: _number(getattr(fit, name)) for name in _NUMBERS},
         "quantities": {
             name: {
-                "value": _number(q.value), "stderr": _number(q.stderr), "units": q.units,
+                "value": _number(q.value),
+                "stderr": _number(q.stderr),
+                "units": q.units,
                 "long_name": q.long_name,
             }
             for name, q in fit.quantities.items()
         },
-    }  # fmt: skip
+    }
 
 
 def _number(value: float) -> float | None:
@@ -99,9 +101,13 @@ def _from_data(data: dict, where: str) -> VortexPairFit:
             f"{size} and {size} x {size}"
         )
     if profile not in get_args(Profile):
-        raise InputError(f"{where}.profile: {profile!r} is not one of {', '.join(get_args(Profile))}")
+        raise InputError(
+            f"{where}.profile: {profile!r} is not one of {', '.join(get_args(Profile))}"
+        )
     if not reasons:
         known = np.isfinite(parameters).all() and np.isfinite(covariance).all()
         if not known or not np.allclose(covariance, covariance.T):
-            raise InputError(f"{where}.covariance: not symmetric and finite; expected that of a fit")
+            raise InputError(
+                f"{where}.covariance: not symmetric and finite; expected that of a fit"
+            )
     return VortexPairFit(parameters, covariance, profile, *numbers, reasons)

@@ -103,7 +103,13 @@ def render_scans(
         return
     scene = mi.load_dict(
         scene_dict(
-            extinctions[chosen[0]], plans[chosen[0]], lidar, environment, phase, albedo, settings,
+            extinctions[chosen[0]],
+            plans[chosen[0]],
+            lidar,
+            environment,
+            phase,
+            albedo,
+            settings,
             molecules,
         )
     )
@@ -192,11 +198,7 @@ def scene_dict(
             "type": "cube",
             "to_world": place @ mi.ScalarTransform4f().translate(0.5).scale(0.5),
             "bsdf": {"type": "null"},
-            "interior": {
-                "type": "heterogeneous",
-                "sigma_t": volume(extinction),
-                **within,
-            },
+            "interior": {"type": "heterogeneous", "sigma_t": volume(extinction), **within},
             "exterior": {"type": "ref", "id": "environment"},
         },
     }

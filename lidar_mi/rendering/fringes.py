@@ -19,7 +19,9 @@ from lidar_mi.rendering.settings import FringeSettings
 
 # from the stop to the etalon, m: any distance that leaves room for a lens
 _ETALON_AT = 0.05
-_UNITS = "Stokes: received energy over the energy sent through the stop; frequencies: Hz; lengths: m"
+_UNITS = (
+    "Stokes: received energy over the energy sent through the stop; frequencies: Hz; lengths: m"
+)
 
 
 def render_fringes(

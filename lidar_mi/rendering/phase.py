@@ -48,9 +48,11 @@ def molecules(extinction: float, wavelength: float, band: str = "cabannes") -> M
 
 
 def scatterer(
-    scattering, beside: str | Path = ".", wavelength: float = 532e-9,
+    scattering,
+    beside: str | Path = ".",
+    wavelength: float = 532e-9,
     notice: Notice = lambda text, share: None,
-) -> Scatterer:  # fmt: skip
+) -> Scatterer:
     """How the air of an experiment scatters.
 
     Parameters

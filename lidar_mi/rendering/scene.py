@@ -126,9 +126,7 @@ def _as_dataset(image: np.ndarray, names: list[str], sensor) -> xr.Dataset:
         "fov_half": float(np.arctan(sensor.m_fov_tan[0])),
     }
     return label_scan(
-        xr.Dataset(
-            variables, coords={"gate": np.arange(gates), "y": y, "z": z}, attrs=attributes
-        )
+        xr.Dataset(variables, coords={"gate": np.arange(gates), "y": y, "z": z}, attrs=attributes)
     )
 
 

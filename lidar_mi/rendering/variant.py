@@ -3,8 +3,8 @@
 import mitsuba as mi
 
 from lidar_mi.errors import InputError
-from lidar_mi.system.llvm import require_llvm
 from lidar_mi.rendering.settings import VARIANTS
+from lidar_mi.system.llvm import require_llvm
 
 
 def use_variant(name: str) -> None:

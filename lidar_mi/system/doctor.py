@@ -219,12 +219,7 @@ def _attempt(code: str, *arguments: str, timeout: float = 180.0) -> tuple[bool, 
     command = [sys.executable, "-P", "-c", code, *arguments]
     try:
         done = subprocess.run(
-            command,
-            check=False,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout,
+            command, check=False, capture_output=True, text=True, errors="replace", timeout=timeout
         )
     except subprocess.TimeoutExpired:
         return False, f"no answer within {timeout:.0f} s"

@@ -65,9 +65,7 @@ def test_volumes_turn_about_any_axis():
         return np.exp(-((x - 2) ** 2 + y**2 + (z + 1) ** 2) / (2 * 1.8**2))
 
     angle = 0.5
-    moved = advect(
-        volume(blob(x, y, z)), volume(1.2), volume(angle * x), 1.0, u=volume(-angle * z)
-    )
+    moved = advect(volume(blob(x, y, z)), volume(1.2), volume(angle * x), 1.0, u=volume(-angle * z))
     c, s = np.cos(angle), np.sin(angle)
     exact = volume(blob(c * x + s * z, y - 1.2, -s * x + c * z))
     # departure points off by r angle^3 / (6 4^2) = 0.0013 r of 5 m, against the steepest slope;
@@ -136,7 +134,7 @@ def test_vortex_flow_conserves_mass_and_variance_of_resolved_texture():
     spectrum = np.fft.fft2(texture.values)
     k = np.fft.fftfreq(121)
     spectrum[np.hypot(k[:, None], k[None, :]) > 0.25] = 0
-    window = np.exp(-((texture.y**2 + texture.z**2) / 14**2) ** 2)
+    window = np.exp(-(((texture.y**2 + texture.z**2) / 14**2) ** 2))
     start = texture.copy(data=np.fft.ifft2(spectrum).real) * window
     once = advect(start, wake.v, wake.w, 0.1)
     assert float(once.sum() / start.sum()) == pytest.approx(1, abs=2e-3)
@@ -212,7 +210,10 @@ def test_bad_input():
         (lambda: advect(f.rename(y="a"), v, w, 0.1), "advection.field"),
         (lambda: advect(f, v[:50], w, 0.1), "advection.v"),
         (lambda: advect(f, v, w.assign_coords(z=w.z + 1), 0.1), "advection.w"),
-        (lambda: advect(f.where(f < 0.5), v, w, 0.1), "advection.field: not finite at .* of .* places"),
+        (
+            lambda: advect(f.where(f < 0.5), v, w, 0.1),
+            "advection.field: not finite at .* of .* places",
+        ),
         (lambda: advect(f[::-1], v[::-1], w[::-1], 0.1), "advection.y"),
         (lambda: advect(f[:3], v[:3], w[:3], 0.1), "advection.y: axis of 3"),
     ):

@@ -120,7 +120,9 @@ def test_negative_or_missing_values_are_refused(wake):
 
 def test_a_wake_without_any_tracer_is_told():
     wake = xr.Dataset({"tracer": ("y", np.zeros(4)), "aerosol": ("y", np.ones(4))})
-    with pytest.raises(InputError, match="extinction.tracer: 0 everywhere, so there is nothing to see"):
+    with pytest.raises(
+        InputError, match="extinction.tracer: 0 everywhere, so there is nothing to see"
+    ):
         extinction_from_tracer(wake)
     # of two times, of which neither has any
     with pytest.raises(InputError, match="0 everywhere"):

@@ -12,11 +12,7 @@ from lidar_mi.errors import InputError
 
 @pytest.mark.parametrize(
     "wavelength, square_centimetres, king",
-    [
-        (355e-9, 2.759e-26, 1.05289),
-        (532e-9, 5.167e-27, 1.04899),
-        (1064e-9, 3.127e-28, 1.04721),
-    ],
+    [(355e-9, 2.759e-26, 1.05289), (532e-9, 5.167e-27, 1.04899), (1064e-9, 3.127e-28, 1.04721)],
 )
 def test_laser_wavelengths(wavelength, square_centimetres, king):
     assert molecules.cross_section(wavelength) * 1e4 == pytest.approx(square_centimetres, rel=2e-4)

@@ -74,8 +74,7 @@ def test_sphere_of_bohren_and_huffman(scatrs):
 
 
 @pytest.mark.parametrize(
-    "radius, m",
-    [(0.05e-6, 1.75 + 0.44j), (0.4e-6, 1.53 + 0.008j), (2e-6, 1.334 + 1e-9j)],
+    "radius, m", [(0.05e-6, 1.75 + 0.44j), (0.4e-6, 1.53 + 0.008j), (2e-6, 1.334 + 1e-9j)]
 )
 def test_table_of_one_sphere_against_miepython(scatrs, radius, m):
     """Through the whole of make_table, so cross-section, albedo and normalisation count too."""
@@ -200,10 +199,7 @@ def test_published_amplitude_matrix_of_a_prolate_spheroid(rustmatrix):
         radius=9.63711, wavelength=2 * math.pi, m=1.5 + 0.02j, axis_ratio=0.5, ddelt=1e-6, ndgs=4
     )
     s = amplitudes(spheroid, 56.0, 65.0, (114.0, 128.0), 145.0, 52.0)
-    expected = [
-        [-5.0941 + 24.402j, -1.9425 + 1.9971j],
-        [-1.1521 - 3.0977j, -6.9323 + 24.748j],
-    ]
+    expected = [[-5.0941 + 24.402j, -1.9425 + 1.9971j], [-1.1521 - 3.0977j, -6.9323 + 24.748j]]
     np.testing.assert_allclose(s, expected, atol=6e-4)
     published = [650.3172, 631.6323, 635.2768, 643.1738, -17.9846, -34.7730]
     np.testing.assert_allclose(phase_matrix(s[None])[0], published, atol=6e-3)
@@ -435,22 +431,37 @@ def test_refractive_index_is_linear_between_wavelengths():
 # The dust-like component is called insoluble there; sea salt at 80 % humidity.
 OPAC = {
     "spheres": (
-        (0.35, 1.53, 8e-3), (0.5, 1.53, 8e-3), (0.55, 1.53, 8e-3), (1.0, 1.52, 8e-3),
-        (1.25, 1.46, 8e-3), (1.5, 1.41, 8e-3), (1.75, 1.34, 8e-3),
+        (0.35, 1.53, 8e-3),
+        (0.5, 1.53, 8e-3),
+        (0.55, 1.53, 8e-3),
+        (1.0, 1.52, 8e-3),
+        (1.25, 1.46, 8e-3),
+        (1.5, 1.41, 8e-3),
+        (1.75, 1.34, 8e-3),
     ),
     "continental": (
-        (0.35, 1.53, 5e-3), (0.5, 1.53, 5e-3), (0.55, 1.53, 6e-3), (1.0, 1.52, 1.55e-2),
+        (0.35, 1.53, 5e-3),
+        (0.5, 1.53, 5e-3),
+        (0.55, 1.53, 6e-3),
+        (1.0, 1.52, 1.55e-2),
         (1.25, 1.51, 1.9e-2),
     ),
     "soot": (
-        (0.35, 1.75, 0.465), (0.4, 1.75, 0.46), (0.5, 1.75, 0.45), (0.55, 1.75, 0.44),
-        (1.0, 1.76, 0.44), (1.25, 1.76, 0.45),
+        (0.35, 1.75, 0.465),
+        (0.4, 1.75, 0.46),
+        (0.5, 1.75, 0.45),
+        (0.55, 1.75, 0.44),
+        (1.0, 1.76, 0.44),
+        (1.25, 1.76, 0.45),
     ),
     "sea_salt": (
-        (0.35, 1.364, 4.7e-8), (0.5, 1.356, 2.8e-9), (0.55, 1.354, 3.0e-9), (1.0, 1.345, 2.0e-5),
+        (0.35, 1.364, 4.7e-8),
+        (0.5, 1.356, 2.8e-9),
+        (0.55, 1.354, 3.0e-9),
+        (1.0, 1.345, 2.0e-5),
         (1.25, 1.342, 5.3e-5),
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(
@@ -467,7 +478,9 @@ def test_indices_are_the_published_ones(name, wavelength):
     assert m.imag == pytest.approx(expected, rel=0.1, abs=1e-5 if name == "sea_salt" else 0)
 
 
-@pytest.mark.parametrize(("nm", "aerosol"), [(355, "spheres"), (532, "spheroids"), (1550, "spheroids")])
+@pytest.mark.parametrize(
+    ("nm", "aerosol"), [(355, "spheres"), (532, "spheroids"), (1550, "spheroids")]
+)
 def test_shipped_spheroids_have_the_index_of_dust(nm, aerosol):
     """What a table says it was made of is what the aerosol has at that wavelength."""
     said = re.search(r"m = ([\d.]+) \+ ([\d.]+)i", read_table(shipped("spheroids", nm)).provenance)

@@ -25,7 +25,9 @@ def slope(k, power, low, high):
 def mean_line_spectra(shape, spacing, outer, seeds):
     for axis in range(len(shape)):
         pairs = [
-            line_spectrum(gaussian_field(shape, (spacing,) * len(shape), outer, seed), axis, spacing)
+            line_spectrum(
+                gaussian_field(shape, (spacing,) * len(shape), outer, seed), axis, spacing
+            )
             for seed in range(seeds)
         ]
         yield pairs[0][0], np.mean([power for _, power in pairs], axis=0)

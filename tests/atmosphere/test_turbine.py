@@ -20,8 +20,15 @@ from lidar_mi.atmosphere.turbine import (
 )
 from lidar_mi.errors import InputError
 
-CASE = {"diameter": 50.0, "thrust": 0.75, "tip_speed_ratio": 7.0, "wind_speed": 8.0,
-        "growth": 0.035, "downstream": 150.0, "hub_core": 3.0}  # fmt: skip
+CASE = {
+    "diameter": 50.0,
+    "thrust": 0.75,
+    "tip_speed_ratio": 7.0,
+    "wind_speed": 8.0,
+    "growth": 0.035,
+    "downstream": 150.0,
+    "hub_core": 3.0,
+}
 
 
 def wake(**changes):
@@ -157,8 +164,12 @@ def test_turbulence_in_the_wake_has_its_intensity():
         wide = np.arange(-120, 120.5, 4.0)
         gusts = turbine_flow(one, np.arange(4) * 4.0, wide, wide, ambient, 8.0, seed)
         gusts = gusts.u - one.axial_speed(np.hypot(gusts.y, gusts.z))
-        squares.append([float((gusts.sel(y=0, z=0) ** 2).mean()),
-                        float((gusts.sel(y=slice(90, 120)) ** 2).mean())])  # fmt: skip
+        squares.append(
+            [
+                float((gusts.sel(y=0, z=0) ** 2).mean()),
+                float((gusts.sel(y=slice(90, 120)) ** 2).mean()),
+            ]
+        )
     rms = np.sqrt(np.mean(squares, 0)) / one.wind_speed
     assert rms[0] == pytest.approx(middle, rel=4 / math.sqrt(2 * 30 * 2))
     assert rms[1] == pytest.approx(ambient, rel=0.05)

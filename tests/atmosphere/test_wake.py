@@ -86,9 +86,7 @@ def test_any_order_of_dimensions_and_descending_axes(write):
 
 def test_names_are_mapped(write):
     data = example().rename(v="V_wind", y="lateral", time="age")
-    wake = read_wake(
-        write(data), time=1.0, names={"v": "V_wind", "y": "lateral", "time": "age"}
-    )
+    wake = read_wake(write(data), time=1.0, names={"v": "V_wind", "y": "lateral", "time": "age"})
     np.testing.assert_allclose(wake.v, expected(1.0), rtol=1e-12)
 
 
@@ -189,7 +187,11 @@ def test_values_that_are_not_finite(write):
     data.v[1, 2, 3, 4] = np.nan
     data.v[1, 2, 4, 0] = np.inf
     fails(
-        write(data), "'v'", "not finite at 2 of 90 places", "x = 2.5 m, y = 0.5 m, z = 8 m", time=1.1
+        write(data),
+        "'v'",
+        "not finite at 2 of 90 places",
+        "x = 2.5 m, y = 0.5 m, z = 8 m",
+        time=1.1,
     )
     np.testing.assert_allclose(read_wake(write(data), time=1.0).v, expected(1.0), rtol=1e-12)
     data = example()
@@ -247,8 +249,14 @@ def test_tracer_of_any_unit(write):
 def test_names_that_nobody_has_mapped(write):
     """Whoever leaves wake.names out learns of it; whoever has used it needs no advice."""
     data = example().rename(tracer="soot")
-    fails(write(data), "'tracer'", "soot; expected wake.names: {tracer: its name there}, or",
-          "wake.extinction.tracer: null", time=1.0, require=["tracer"])  # fmt: skip
+    fails(
+        write(data),
+        "'tracer'",
+        "soot; expected wake.names: {tracer: its name there}, or",
+        "wake.extinction.tracer: null",
+        time=1.0,
+        require=["tracer"],
+    )
     fails(write(example().rename(y="span")), "'y'", "expected wake.names: {y: ", time=1.0)
     with pytest.raises(InputError, match="it has [a-z, ]+$"):
         read_wake(write(data), time=1.0, names={"tracer": "smoke"})

@@ -79,9 +79,15 @@ def test_json_holds_every_row_and_no_nan(tmp_path):
     first, second = content["comparisons"]["one"], content["comparisons"]["two"]
     assert first["notes"] == ["note"] and first["other"] == "they"
     assert first["rows"][0] == {
-        "case": "a", "quantity": "time", "unit": "s", "ours": 1.0, "other": 3.0, "ratio": 3.0,
-        "ratio_range": None, "note": "remark",
-    }  # fmt: skip
+        "case": "a",
+        "quantity": "time",
+        "unit": "s",
+        "ours": 1.0,
+        "other": 3.0,
+        "ratio": 3.0,
+        "ratio_range": None,
+        "note": "remark",
+    }
     assert first["rows"][1]["ours"] is None
     assert second["rows"] == [] and second["reason"] == "skipped: pip install x"
 
@@ -92,8 +98,19 @@ def test_table_shows_case_sides_ratio_and_range():
     row = report.row("some air", "time", "s", [1.0, 2.0], [700.0, 246900.0], "lower", "remark")
     report.show(report.Comparison("Title", "we", "they", (row,), ("a note",)), console)
     text = out.getvalue()
-    for part in ("Title", "some air", "time, s", "we", "they", "1.5", "124,000", "62,100",
-                 "700 ... 123,000", "remark", "a note"):  # fmt: skip
+    for part in (
+        "Title",
+        "some air",
+        "time, s",
+        "we",
+        "they",
+        "1.5",
+        "124,000",
+        "62,100",
+        "700 ... 123,000",
+        "remark",
+        "a note",
+    ):
         assert part in text
     report.show(report.Comparison("Alone", "we", "", (row,)), console)
     assert "ratio" not in out.getvalue().split("Alone")[1]
@@ -182,9 +199,14 @@ def test_share_of_analog_photons_is_the_gates_optical_depth(variant):
     assert mean.other == pytest.approx(1, abs=4 * float(mean.note.removeprefix("+- ")))
     assert 0 < float(mean.note.removeprefix("+- ")) < 0.02
     # variance and time together are the efficiency
-    parts = [found[case, name] for name in (
-        "relative variance of one photon", "time of one photon", "variance x time of one photon"
-    )]  # fmt: skip
+    parts = [
+        found[case, name]
+        for name in (
+            "relative variance of one photon",
+            "time of one photon",
+            "variance x time of one photon",
+        )
+    ]
     assert parts[2].other == pytest.approx(parts[0].other * parts[1].other, rel=0.5)
     assert len({name for name, _ in found}) == 4
 

@@ -22,19 +22,24 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from lidar_mi.cli import app as cli
-from lidar_mi.experiment import schema as config, truth
 from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
+from lidar_mi.cli import app as cli
+from lidar_mi.experiment import schema as config
+from lidar_mi.experiment import truth
 from lidar_mi.rendering.phase import scatterer
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 EXPERIMENTS = tuple(f"docs/experiments/{page.name}" for page in (DOCS / "experiments").glob("*.md"))
 PAGES = (
-    "README.md", "docs/theory.md", "docs/accuracy.md", "docs/user_guide.md", "docs/plugins.md",
+    "README.md",
+    "docs/theory.md",
+    "docs/accuracy.md",
+    "docs/user_guide.md",
+    "docs/plugins.md",
     *EXPERIMENTS,
-)  # fmt: skip
+)
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
 OPTIONAL = (config.VortexPair, config.Turbine, config.Part)
@@ -95,13 +100,20 @@ def _unit(field):
     kinds = {
         typing.get_args(kind)[1]: unit
         for kind, unit in (
-            (units.Length, "m"), (units.Angle, "rad"), (units.Speed, "m/s"), (units.Time, "s"),
-            (units.Energy, "J"), (units.Extinction, "1/m"), (units.Circulation, "m²/s"),
-            (units.Frequency, "Hz"), (units.SpectralRadiance, "W/m³/sr"),
-            (units.Backscatter, "1/m/sr"), (units.Area, "m²"),
+            (units.Length, "m"),
+            (units.Angle, "rad"),
+            (units.Speed, "m/s"),
+            (units.Time, "s"),
+            (units.Energy, "J"),
+            (units.Extinction, "1/m"),
+            (units.Circulation, "m²/s"),
+            (units.Frequency, "Hz"),
+            (units.SpectralRadiance, "W/m³/sr"),
+            (units.Backscatter, "1/m/sr"),
+            (units.Area, "m²"),
             (units.Number, None),
         )
-    }  # fmt: skip
+    }
     for part in (*_parts(field.annotation), *field.metadata):
         for kind, unit in kinds.items():
             if part is kind:
@@ -135,9 +147,11 @@ def test_key_has_the_documented_unit_default_and_limits(name, model, field):
         assert _value(name, model, yaml.safe_load(default.strip("`"))) == _value(name, model)
     for part in (*_parts(field.annotation), *field.metadata):
         for sign, kind, attribute in (
-            (">", annotated_types.Gt, "gt"), ("≥", annotated_types.Ge, "ge"),
-            ("<", annotated_types.Lt, "lt"), ("≤", annotated_types.Le, "le"),
-        ):  # fmt: skip
+            (">", annotated_types.Gt, "gt"),
+            ("≥", annotated_types.Ge, "ge"),
+            ("<", annotated_types.Lt, "lt"),
+            ("≤", annotated_types.Le, "le"),
+        ):
             if isinstance(part, kind):
                 limit = getattr(part, attribute)
                 shown = str(limit) if isinstance(limit, int) else f"{limit:.5g}"
@@ -296,8 +310,9 @@ def check_xml(block):
         return
     # a piece of a scene: what it refers to stands before it
     air = '<medium type="homogeneous" id="environment"/>'
-    mi.load_string(f'<scene version="3.0.0">{air if "environment" in block.text else ""}'
-                   f"{block.text}</scene>")  # fmt: skip
+    mi.load_string(
+        f'<scene version="3.0.0">{air if "environment" in block.text else ""}{block.text}</scene>'
+    )
 
 
 @pytest.mark.usefixtures("variant")

@@ -51,8 +51,18 @@ def test_formulas_become_mathml():
 @pytest.mark.slow
 @with_sphinx
 def test_site_is_built_without_a_warning(tmp_path):
-    command = [sys.executable, "-m", "sphinx", "-q", "-W", "--keep-going", "-d",
-               str(tmp_path / "doctrees"), str(DOCS), str(tmp_path / "site")]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "sphinx",
+        "-q",
+        "-W",
+        "--keep-going",
+        "-d",
+        str(tmp_path / "doctrees"),
+        str(DOCS),
+        str(tmp_path / "site"),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     theory = (tmp_path / "site" / "theory.html").read_text()

@@ -5,8 +5,8 @@ from importlib.resources import files
 
 import pytest
 
-from lidar_mi.experiment.schema import Experiment, check, dump, load
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema import Experiment, check, dump, load
 
 LEAST = "name: least\nwake: {file: wake.nc}\n"
 
@@ -28,8 +28,10 @@ def test_least_experiment_has_the_papers_values(write):
     assert experiment.lidar.wavelength == pytest.approx(532e-9)
     assert experiment.lidar.fov_half == pytest.approx(5e-3)
     assert (experiment.scan.aim, experiment.scan.range, experiment.scan.thickness) == (
-        "grid", 500, 2.5,
-    )  # fmt: skip
+        "grid",
+        500,
+        2.5,
+    )
     assert experiment.wake.second == "advect" and experiment.wake.spacing == 0.5
     assert experiment.wake.extinction.background == pytest.approx(1e-4)
     assert experiment.wake.extinction.maximum == pytest.approx(1.8e-3)
@@ -80,8 +82,11 @@ def test_vortex_pair_in_place_of_a_file(write):
     experiment = load(write("name: a\nwake: {vortex_pair: {circulation: 400, separation: 40 m}}"))
     pair = experiment.wake.vortex_pair
     assert (pair.model, pair.circulation, pair.separation, pair.core_radius) == (
-        "lamb_oseen", 400, 40, 3,
-    )  # fmt: skip
+        "lamb_oseen",
+        400,
+        40,
+        3,
+    )
     assert experiment.wake.file is None
 
 
@@ -144,18 +149,31 @@ FAULTS = [
     ("platfrm.speed=1", "platfrm: unknown key; did you mean platform?"),
     ("wake.extinction.sorce=x", "wake.extinction.sorce: unknown key; did you mean source?"),
     ("scan.zzz=1", "scan.zzz: unknown key (allowed: aim, range, "),
-    ("scattering={phase: mixture, parts: [{phase: molecules, shar: 1}]}",
-     "scattering.parts.0.shar: unknown key; did you mean share? (allowed: aerosol, band, "),
-    ("scattering={phase: mixture, parts: [{phase: hg, share: 1}]}",
-     "scattering.parts.0.phase: 'hg' is not allowed; expected 'rayleigh', 'molecules', 'aerosol' or"),
-    ("scattering={phase: mixture, parts: [{phase: aerosol, share: 1}]}",
-     "scattering.parts.0: aerosol: None is not allowed with phase aerosol"),
-    ("scattering={phase: mixture, parts: [{phase: molecules}]}", "scattering.parts.0.share: missing"),
-    ("scattering={phase: mixture, parts: [{phase: molecules, share: 0}]}",
-     "scattering.parts.0.share: 0 is not allowed; expected more than 0"),
+    (
+        "scattering={phase: mixture, parts: [{phase: molecules, shar: 1}]}",
+        "scattering.parts.0.shar: unknown key; did you mean share? (allowed: aerosol, band, ",
+    ),
+    (
+        "scattering={phase: mixture, parts: [{phase: hg, share: 1}]}",
+        "scattering.parts.0.phase: 'hg' is not allowed; expected 'rayleigh', 'molecules', 'aerosol' or",
+    ),
+    (
+        "scattering={phase: mixture, parts: [{phase: aerosol, share: 1}]}",
+        "scattering.parts.0: aerosol: None is not allowed with phase aerosol",
+    ),
+    (
+        "scattering={phase: mixture, parts: [{phase: molecules}]}",
+        "scattering.parts.0.share: missing",
+    ),
+    (
+        "scattering={phase: mixture, parts: [{phase: molecules, share: 0}]}",
+        "scattering.parts.0.share: 0 is not allowed; expected more than 0",
+    ),
     ("scattering={phase: mixture}", "scattering: parts: None is not allowed with phase mixture"),
-    ("scattering={parts: [{phase: molecules, share: 1}]}",
-     "scattering: parts: 1 parts is not allowed with phase rayleigh"),
+    (
+        "scattering={parts: [{phase: molecules, share: 1}]}",
+        "scattering: parts: 1 parts is not allowed with phase rayleigh",
+    ),
     ("wake.vortex_pair.gamma=1", "wake.vortex_pair.gamma: unknown key (allowed: model, "),
     # wrong units
     ("lidar.beam_radius=5 s", "lidar.beam_radius: '5 s' is not allowed; expected a quantity in m"),
@@ -168,44 +186,90 @@ FAULTS = [
     ("wake.centre=[1 m]", "wake.centre.1: missing"),
     # out of range
     ("lidar.beam_radius=-1 m", "lidar.beam_radius: -1 m is not allowed; expected more than 0 m"),
-    ("lidar.aperture_radius=0", "lidar.aperture_radius: 0 m is not allowed; expected more than 0 m"),
+    (
+        "lidar.aperture_radius=0",
+        "lidar.aperture_radius: 0 m is not allowed; expected more than 0 m",
+    ),
     # metres where nanometres were meant, seconds where nanoseconds were
     ("lidar.wavelength=532", "lidar.wavelength: 532 m is not allowed; expected at most 2e-05 m"),
-    ("doppler={lidar: {wavelength: 355 mm}}",
-     "doppler.lidar.wavelength: 0.355 m is not allowed; expected at most 2e-05 m"),
-    ("lidar.pulse_duration=5", "lidar.pulse_duration: 5 s is not allowed; expected at most 0.001 s"),
-    ("lidar.aperture_radius=150", "lidar.aperture_radius: 150 m is not allowed; expected at most 10"),
-    ("lidar.pulse_energy=-1 mJ", "lidar.pulse_energy: -0.001 J is not allowed; expected more than 0 J"),
+    (
+        "doppler={lidar: {wavelength: 355 mm}}",
+        "doppler.lidar.wavelength: 0.355 m is not allowed; expected at most 2e-05 m",
+    ),
+    (
+        "lidar.pulse_duration=5",
+        "lidar.pulse_duration: 5 s is not allowed; expected at most 0.001 s",
+    ),
+    (
+        "lidar.aperture_radius=150",
+        "lidar.aperture_radius: 150 m is not allowed; expected at most 10",
+    ),
+    (
+        "lidar.pulse_energy=-1 mJ",
+        "lidar.pulse_energy: -0.001 J is not allowed; expected more than 0 J",
+    ),
     ("lidar.stokes=[1, 1, 1, 0]", "lidar.stokes: (1.0, 1.0, 1.0, 0.0) is not allowed; expected I"),
     ("scan.columns=0", "scan.columns: 0 is not allowed; expected at least 1"),
-    ("scan={aim: angles, columns: 100000, rows: 50000}",
-     "scan: columns, rows: 100000 x 50000 is not allowed; expected at most 1e+07 beams"),
+    (
+        "scan={aim: angles, columns: 100000, rows: 50000}",
+        "scan: columns, rows: 100000 x 50000 is not allowed; expected at most 1e+07 beams",
+    ),
     ("scan.range=.inf", "scan.range: inf m is not allowed; expected a finite number"),
-    ("scan.azimuth_half=[0 deg, 6 deg]", "scan.azimuth_half.0: '0 deg' is not allowed; expected more than"),
+    (
+        "scan.azimuth_half=[0 deg, 6 deg]",
+        "scan.azimuth_half.0: '0 deg' is not allowed; expected more than",
+    ),
     ("platform.dt=0 s", "platform.dt: 0 s is not allowed; expected more than 0 s"),
     ("platform.speed=-1 m/s", "platform.speed: -1 m/s is not allowed; expected at least 0 m/s"),
     ("wake.spacing=0 m", "wake.spacing: 0 m is not allowed; expected more than 0 m"),
     ("wake.spacing=.nan", "wake.spacing: nan m is not allowed; expected"),
     ("wake.texture.rms=-0.1", "wake.texture.rms: -0.1 is not allowed; expected at least"),
-    ("wake.extinction.stretch=0.5", "wake.extinction.stretch: 0.5 is not allowed; expected at least 1"),
-    ("wake.extinction.background=-1", "wake.extinction.background: -1 1/m is not allowed; expected at least 0"),
-    ("scattering.depolarization=0.5", "scattering.depolarization: 0.5 is not allowed; expected less than"),
+    (
+        "wake.extinction.stretch=0.5",
+        "wake.extinction.stretch: 0.5 is not allowed; expected at least 1",
+    ),
+    (
+        "wake.extinction.background=-1",
+        "wake.extinction.background: -1 1/m is not allowed; expected at least 0",
+    ),
+    (
+        "scattering.depolarization=0.5",
+        "scattering.depolarization: 0.5 is not allowed; expected less than",
+    ),
     ("scattering.asymmetry=1", "scattering.asymmetry: 1 is not allowed; expected less than 1"),
     ("scattering.albedo=1.1", "scattering.albedo: 1.1 is not allowed; expected at most 1"),
     ("render.samples_per_beam=1", "render.samples_per_beam: 1 is not allowed; expected at least 2"),
-    ("render.samples_per_pass=0", "render.samples_per_pass: 0 is not allowed; expected at least 1024"),
+    (
+        "render.samples_per_pass=0",
+        "render.samples_per_pass: 0 is not allowed; expected at least 1024",
+    ),
     ("render.max_order=65", "render.max_order: 65 is not allowed; expected at most 64"),
     ("retrieval.template=1", "retrieval.template: 1 is not allowed; expected at least 2"),
     ("retrieval.stride=0", "retrieval.stride: 0 is not allowed; expected at least 1"),
-    ("retrieval.min_correlation=2", "retrieval.min_correlation: 2 is not allowed; expected at most 1"),
+    (
+        "retrieval.min_correlation=2",
+        "retrieval.min_correlation: 2 is not allowed; expected at most 1",
+    ),
     ("seed=-1", "seed: -1 is not allowed; expected at least 0"),
     ("seed=1.5", "seed: 1.5 is not allowed; expected a valid integer"),
     # not among the choices
-    ("render.variant=scalar_rgb", "render.variant: 'scalar_rgb' is not allowed; expected 'llvm_ad_mono"),
-    ("render.estimator=magic", "render.estimator: 'magic' is not allowed; expected 'gated' or 'analog'"),
-    ("scan.gates=conical", "scan.gates: 'conical' is not allowed; expected 'planar' or 'spherical'"),
+    (
+        "render.variant=scalar_rgb",
+        "render.variant: 'scalar_rgb' is not allowed; expected 'llvm_ad_mono",
+    ),
+    (
+        "render.estimator=magic",
+        "render.estimator: 'magic' is not allowed; expected 'gated' or 'analog'",
+    ),
+    (
+        "scan.gates=conical",
+        "scan.gates: 'conical' is not allowed; expected 'planar' or 'spherical'",
+    ),
     ("wake.depth=line", "wake.depth: 'line' is not allowed; expected 'plane' or 'volume'"),
-    ("retrieval.methods=[cc, xx]", "retrieval.methods.1: 'xx' is not allowed; expected 'cc', 'ws', 'multipass', 'variational' or 'vortex_fit'"),
+    (
+        "retrieval.methods=[cc, xx]",
+        "retrieval.methods.1: 'xx' is not allowed; expected 'cc', 'ws', 'multipass', 'variational' or 'vortex_fit'",
+    ),
     ("retrieval.methods=[]", "retrieval.methods: [] is not allowed; expected 1 or more"),
     ("retrieval.methods=cc", "retrieval.methods: 'cc' is not allowed; expected a list in brackets"),
     ("name=a/b", "name: 'a/b' is not allowed; expected letters, digits"),
@@ -214,7 +278,10 @@ FAULTS = [
     ("wake=3", "wake: 3 is not allowed; expected a section with keys out of file, vortex_pair, "),
     ("lidar=", "lidar: None is not allowed; expected a section with keys out of wavelength, "),
     ("wake.texture.rms=", "wake.texture.rms: None is not allowed; expected a quantity"),
-    ("render.samples_per_beam=many", "render.samples_per_beam: 'many' is not allowed; expected a valid"),
+    (
+        "render.samples_per_beam=many",
+        "render.samples_per_beam: 'many' is not allowed; expected a valid",
+    ),
     # values that exclude each other
     ("wake.vortex_pair={}", "wake: expected one of file, vortex_pair and turbine"),
     ("wake.file=null", "wake: expected one of file, vortex_pair and turbine"),

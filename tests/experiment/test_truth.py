@@ -7,8 +7,8 @@ import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import norm, qmc
 
-from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.experiment.truth import blur_by_beam
+from lidar_mi.instrument.lidar import BackscatterLidar
 
 
 def gate_mean(image, lidar, distance, depth, photons=512):

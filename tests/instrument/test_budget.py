@@ -38,7 +38,9 @@ def test_echoes_that_just_fit():
     assert pulse_budget(100, 10.0, 1, 1e-3, c / 2 / 999.9).beams == 2
 
 
-@pytest.mark.parametrize(("one", "required", "pulses"), [(11.2, 2.5, 21), (2.0, 0.5, 16), (0.4, 0.5, 1)])
+@pytest.mark.parametrize(
+    ("one", "required", "pulses"), [(11.2, 2.5, 21), (2.0, 0.5, 16), (0.4, 0.5, 1)]
+)
 def test_pulses_for_an_error(one, required, pulses):
     assert pulses_for_error(one, required) == pulses
 

@@ -36,9 +36,13 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 LIDAR = BackscatterLidar()
 # nothing but the Poisson noise of the signal, every photon counted
 IDEAL = Detector(
-    optics_efficiency=1, quantum_efficiency=1, excess_noise_factor=1, dark_rate=0, sky_radiance=0,
+    optics_efficiency=1,
+    quantum_efficiency=1,
+    excess_noise_factor=1,
+    dark_rate=0,
+    sky_radiance=0,
     speckle=False,
-)  # fmt: skip
+)
 GATE = 5 / 299_792_458  # 2.5 m
 DRAWS = 100_000
 
@@ -302,15 +306,19 @@ def test_exponential_gain():
         ({"sky_radiance": 3e5, "excess_noise_factor": 1.5}, 1826.6, 2739.9),
         (
             {
-                "sky_radiance": 3e5, "excess_noise_factor": 1.5, "speckle": True,
-                "speckle_modes": 50.0, "dark_rate": 500 / GATE, "readout_noise": 30.0,
+                "sky_radiance": 3e5,
+                "excess_noise_factor": 1.5,
+                "speckle": True,
+                "speckle_modes": 50.0,
+                "dark_rate": 500 / GATE,
+                "readout_noise": 30.0,
                 "quantum_efficiency": 0.5,
             },
             500 + 413.3 + 500,
             1.5 * (500 + 413.3 + 500) + 500**2 / 50 + 900,
         ),
     ],
-)  # fmt: skip
+)
 def test_mean_and_variance_of_every_noise(changes, mean, variance):
     """Also that the estimate is unbiased and its standard deviation is the stated one."""
     found = read(1000, ideal(**changes), seed=6)
@@ -364,11 +372,15 @@ def a_scan(gates=2, polarized=1, count=60):
             "y": np.linspace(-55, 55, count + 10),
         },
         attrs={
-            "gate_start": 500.0, "gate_stop": 500 + 2.5 * gates, "gate_kind": "planar",
-            "gate_count": gates, "environment_extinction": 1e-4, "polarized": polarized,
+            "gate_start": 500.0,
+            "gate_stop": 500 + 2.5 * gates,
+            "gate_kind": "planar",
+            "gate_count": gates,
+            "environment_extinction": 1e-4,
+            "polarized": polarized,
             "samples_per_beam": 64,
         },
-    )  # fmt: skip
+    )
 
 
 def test_noisy_scan_beside_the_clean_one():
@@ -441,9 +453,11 @@ def test_noise_budget_of_a_homogeneous_scan():
 
 def test_units_of_the_description():
     detector = Detector(
-        dark_rate="2 MHz", sky_radiance="100 mW/m^2/sr/nm", filter_bandwidth="0.3 nm",
+        dark_rate="2 MHz",
+        sky_radiance="100 mW/m^2/sr/nm",
+        filter_bandwidth="0.3 nm",
         line_width="90 MHz",
-    )  # fmt: skip
+    )
     assert detector.dark_rate == pytest.approx(2e6)
     assert detector.sky_radiance == pytest.approx(1e8)
     assert detector.filter_bandwidth == pytest.approx(3e-10)

@@ -58,9 +58,13 @@ def test_beam_and_gate_of_the_paper():
 
 def test_units_at_the_edge():
     lidar = DopplerLidar(
-        wavelength="532 nm", pulse_energy="1 mJ", telescope_area="1300 cm^2",
-        backscatter="3.104e-3 / km / sr", extinction="0.027 / km", laser_width="0.1 GHz",
-    )  # fmt: skip
+        wavelength="532 nm",
+        pulse_energy="1 mJ",
+        telescope_area="1300 cm^2",
+        backscatter="3.104e-3 / km / sr",
+        extinction="0.027 / km",
+        laser_width="0.1 GHz",
+    )
     assert photons(lidar) == pytest.approx(photons(LIDAR) * 532 / 354.7 / 70, rel=1e-12)
 
 
@@ -156,8 +160,10 @@ def test_modes_in_space():
 
 def test_field_of_view_cuts_the_spot():
     narrow, wide = (DopplerLidar(fov_half=f) for f in ("0.5 mrad", "5 mrad"))
-    found = [speckle_modes(lidar, FringeCamera(width=9, height=7), ETALON, AIR) for lidar in
-             (narrow, wide)]  # fmt: skip
+    found = [
+        speckle_modes(lidar, FringeCamera(width=9, height=7), ETALON, AIR)
+        for lidar in (narrow, wide)
+    ]
     assert found[1] / found[0] == pytest.approx((0.039 / 0.028) ** 2, rel=5e-3)
 
 

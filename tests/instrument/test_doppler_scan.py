@@ -72,12 +72,15 @@ def test_one_direction_looks_ahead():
 def test_signs_of_attitude():
     """Yaw to port turns the axis to +y, pitch nose up to +z, roll lifts what is to port."""
     ahead, port = np.array([[1.0, 0, 0]]), np.array([[0.0, 1, 0]])
-    assert np.allclose(pointed(ahead, PlatformErrors(yaw="90 mrad")),
-                       [[math.cos(0.09), math.sin(0.09), 0]])  # fmt: skip
-    assert np.allclose(pointed(ahead, PlatformErrors(pitch="90 mrad")),
-                       [[math.cos(0.09), 0, math.sin(0.09)]])  # fmt: skip
-    assert np.allclose(pointed(port, PlatformErrors(roll="90 mrad")),
-                       [[0, math.cos(0.09), math.sin(0.09)]])  # fmt: skip
+    assert np.allclose(
+        pointed(ahead, PlatformErrors(yaw="90 mrad")), [[math.cos(0.09), math.sin(0.09), 0]]
+    )
+    assert np.allclose(
+        pointed(ahead, PlatformErrors(pitch="90 mrad")), [[math.cos(0.09), 0, math.sin(0.09)]]
+    )
+    assert np.allclose(
+        pointed(port, PlatformErrors(roll="90 mrad")), [[0, math.cos(0.09), math.sin(0.09)]]
+    )
 
 
 def test_jitter_has_its_size_and_no_mean():
@@ -159,7 +162,9 @@ def test_a_vortex_by_random_points():
     random = np.random.default_rng(5)
     for line, middle, mean in zip(lines, ranges, found):
         r = middle + random.uniform(-5, 5, 40_000)
-        r = r + random.standard_normal(len(r)) * constants.c / 2 * 10e-9 / math.sqrt(8 * math.log(2))
+        r = r + random.standard_normal(len(r)) * constants.c / 2 * 10e-9 / math.sqrt(
+            8 * math.log(2)
+        )
         share = np.exp(-2 * 2.7e-5 * r) / r**2
         share /= share.sum()
         across = np.cross(line, [0, 0, 1.0])
@@ -179,11 +184,12 @@ def test_a_field_in_three_dimensions():
     gx, gy, gz = np.meshgrid(x, y, z, indexing="ij")
     wind = xr.Dataset(
         {
-            "u": (("x", "y", "z"), 0.1 * gx), "v": (("x", "y", "z"), 0.2 * gy + 1),
+            "u": (("x", "y", "z"), 0.1 * gx),
+            "v": (("x", "y", "z"), 0.2 * gy + 1),
             "w": (("x", "y", "z"), gz - 0.3 * gx),
         },
         coords={"x": x, "y": y, "z": z},
-    )  # fmt: skip
+    )
     found = scan_wind(wind, SCAN, LIDAR, 0.0, 1)
     lines, ranges = SCAN.directions(), SCAN.ranges(LIDAR)
     points, weights = sight_volumes(lines, ranges, LIDAR)

@@ -81,10 +81,19 @@ def test_the_exposures_of_a_lidar():
 
 @pytest.mark.parametrize(
     ("wavelength", "times"),
-    [(266, [1e-9]), (305, [1e-9, 10]), (355, [1e-9, 10, 1e3]), (532, [5e-6, 10]),
-     (440, [10, 100]), (900, [5e-6, 10]), (1064, [13e-6, 10]), (1450, [1e-9, 1e-3, 10]),
-     (1550, [1e-9, 10]), (3000, [1e-9, 1e-7, 10])],
-)  # fmt: skip
+    [
+        (266, [1e-9]),
+        (305, [1e-9, 10]),
+        (355, [1e-9, 10, 1e3]),
+        (532, [5e-6, 10]),
+        (440, [10, 100]),
+        (900, [5e-6, 10]),
+        (1064, [13e-6, 10]),
+        (1450, [1e-9, 1e-3, 10]),
+        (1550, [1e-9, 10]),
+        (3000, [1e-9, 1e-7, 10]),
+    ],
+)
 def test_ranges_of_time_meet(wavelength, times):
     """The standard's rounded constants leave steps of at most 6 % (18 t^(3/4) at 5 us: 1.9e-3)."""
     for t in times:
@@ -194,7 +203,9 @@ def test_exposure_is_the_mean_over_the_aperture():
     x = (np.arange(800) + 0.5) / 800 * 2 * half - half
     inside = x[:, None] ** 2 + x[None, :] ** 2 < half**2
     for radius in (2e-3, 5e-3, 0.1):
-        beam = 2 / (math.pi * radius**2) * np.exp(-2 * (x[:, None] ** 2 + x[None, :] ** 2) / radius**2)
+        beam = (
+            2 / (math.pi * radius**2) * np.exp(-2 * (x[:, None] ** 2 + x[None, :] ** 2) / radius**2)
+        )
         assert exposure_at(0.0, 3.0, radius, 1e-3, 2 * half) == pytest.approx(
             3 * beam[inside].mean(), rel=2e-3
         )

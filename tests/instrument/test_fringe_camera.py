@@ -196,8 +196,12 @@ def assert_moments(values, mean, variance, sigmas=4):
 
 @pytest.mark.parametrize(
     "modes, law",
-    [(math.inf, stats.poisson(32)), (1.0, stats.nbinom(1, 1 / 33)), (10.0, stats.nbinom(10, 10 / 42))],
-)  # fmt: skip
+    [
+        (math.inf, stats.poisson(32)),
+        (1.0, stats.nbinom(1, 1 / 33)),
+        (10.0, stats.nbinom(10, 10 / 42)),
+    ],
+)
 def test_light_is_poisson_and_speckled_light_negative_binomial(modes, law, chi_square_p):
     counts = expose(flat(32), IDEAL, seed=2, modes=modes)[0].numpy().ravel()
     assert chi_square_p(counts, law) > 1e-3

@@ -62,9 +62,11 @@ def test_paths_to_the_focus_are_equally_long(lens):
         heights = [1e3 * start, 0.98e3 * start]
         # parallel light enters at its height; the second surface is where the way is shortest
         best = minimize(
-            lambda h, s=start: length([1e3 * s, h[0]], s), heights[1:], method="Nelder-Mead",
+            lambda h, s=start: length([1e3 * s, h[0]], s),
+            heights[1:],
+            method="Nelder-Mead",
             options={"xatol": 1e-7, "fatol": 1e-10},
-        )  # fmt: skip
+        )
         found.append(best.fun)
     assert np.ptp(found) < 0.01 * 0.3547
 

@@ -56,8 +56,7 @@ def assert_spread(values, expected):
 
 
 @pytest.mark.parametrize(
-    "matrix_ratio, expected",
-    [(1.0, 0.0), (0.0, 1.0), (0.5, 1 / 3), (-1.0, math.nan)],
+    "matrix_ratio, expected", [(1.0, 0.0), (0.0, 1.0), (0.5, 1 / 3), (-1.0, math.nan)]
 )
 def test_depolarization_of_known_light(matrix_ratio, expected):
     """Spheres keep the polarisation, complete depolarisation leaves halves in both channels."""
@@ -129,10 +128,14 @@ def a_scan(**attrs):
         {name: (("gate", "z", "y"), np.full(shape, v, np.float32)) for name, v in values.items()},
         coords={"gate": [0, 1], "z": np.arange(3.0), "y": np.arange(4.0)},
         attrs={
-            "stokes_emitted": [1.0, 1.0, 0.0, 0.0], "polarized": 1, "samples_per_beam": 128,
-            "gate_count": 2, "estimator": "gated",
-        } | attrs,
-    )  # fmt: skip
+            "stokes_emitted": [1.0, 1.0, 0.0, 0.0],
+            "polarized": 1,
+            "samples_per_beam": 128,
+            "gate_count": 2,
+            "estimator": "gated",
+        }
+        | attrs,
+    )
 
 
 def test_image_with_the_bound():
@@ -228,7 +231,9 @@ def test_bound_of_the_fraction_is_never_below_its_spread(share):
     scan = with_orders(a_scan(), share)
     scan["S0_stderr"] = scan["S0"] * (single + multiple).std()
     bound = multiple_scattering_image(scan)["multiple_scattering_fraction_stderr"].values
-    assert (bound > (multiple / (single + multiple)).std() * (1 - 4 / math.sqrt(2 * EXPERIMENTS))).all()
+    assert (
+        bound > (multiple / (single + multiple)).std() * (1 - 4 / math.sqrt(2 * EXPERIMENTS))
+    ).all()
 
 
 def test_fraction_needs_orders():

@@ -38,9 +38,7 @@ def make_scan(gates=2, rows=5, columns=7, seed=0, **attributes):
     y, z = 0.5 * np.arange(columns) - 1.5, 0.25 * np.arange(rows) - 60.0
     return label_scan(
         xr.Dataset(
-            variables,
-            {"gate": np.arange(gates), "y": y, "z": z},
-            attrs=ATTRIBUTES | attributes,
+            variables, {"gate": np.arange(gates), "y": y, "z": z}, attrs=ATTRIBUTES | attributes
         )
     )
 
@@ -147,8 +145,11 @@ class TestTools:
                 pytest.skip(f"{tool} is not installed (Debian package {package})")
             return subprocess.run(
                 [tool, *arguments, str(tmp_path / "scan.exr")],
-                capture_output=True, text=True, check=True, timeout=60,
-            ).stdout  # fmt: skip
+                capture_output=True,
+                text=True,
+                check=True,
+                timeout=60,
+            ).stdout
 
         return run
 

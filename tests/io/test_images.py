@@ -72,9 +72,15 @@ def test_files_that_are_none(tmp_path, values):
 
 @pytest.mark.parametrize(
     ("suffix", "kind"),
-    [("png", np.uint8), ("bmp", np.uint8), ("tif", np.uint8), ("png", np.uint16),
-     ("tif", np.uint16), ("tif", np.float32)],
-)  # fmt: skip
+    [
+        ("png", np.uint8),
+        ("bmp", np.uint8),
+        ("tif", np.uint8),
+        ("png", np.uint16),
+        ("tif", np.uint16),
+        ("tif", np.float32),
+    ],
+)
 def test_values_and_axes_survive(tmp_path, suffix, kind):
     values = (np.arange(12).reshape(3, 4) * 20).astype(kind)
     if kind is np.uint16:

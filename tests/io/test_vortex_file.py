@@ -33,7 +33,9 @@ def test_what_is_read_is_what_was_written(tmp_path, profile):
         np.testing.assert_array_equal(read["images"].wind(y, z)[name], field)
     assert read["images"].quantities == fit.quantities and read["images"].success
     assert np.isnan(read["images"].chi2)
-    assert read["vectors"].reasons == ("nothing turns",) and np.isnan(read["vectors"].parameters).all()
+    assert (
+        read["vectors"].reasons == ("nothing turns",) and np.isnan(read["vectors"].parameters).all()
+    )
     # anyone's JSON reader takes it, and finds numbers with units
     data = json.loads((tmp_path / "vortex.json").read_text(), parse_constant=pytest.fail)
     said = data["fits"]["images"]["quantities"]["port_circulation"]
@@ -53,18 +55,21 @@ def test_what_is_no_file_of_pairs_is_named(tmp_path):
     matrix = some_pair().covariance.tolist()
     matrix[0][1] += 1.0
     for text, message in (
-        (None, "No such file"), ("{", "not JSON"), ("[]", "not a file of vortex pairs"),
+        (None, "No such file"),
+        ("{", "not JSON"),
+        ("[]", "not a file of vortex pairs"),
         ('{"format": "lidar-mi vortex pairs 1"}', "fits: missing"),
-    ):  # fmt: skip
+    ):
         if text is not None:
             path.write_text(text)
         with pytest.raises(InputError, match=message):
             read_vortices(path)
     for changes, message in (
-        ({"parameters": [1.0]}, "expected 10 and 10 x 10"), ({"chi2": "much"}, "expected parameters"),
+        ({"parameters": [1.0]}, "expected 10 and 10 x 10"),
+        ({"chi2": "much"}, "expected parameters"),
         ({"profile": "rankine"}, "fits.images.profile: 'rankine'"),
         ({"covariance": matrix}, "fits.images.covariance: not symmetric"),
-    ):  # fmt: skip
+    ):
         changed(path, **changes)
         with pytest.raises(InputError) as error:
             read_vortices(path)

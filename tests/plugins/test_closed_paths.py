@@ -25,9 +25,12 @@ CASES = [
 def way(distance, budget, fov, offset, room):
     """Telescope at the origin; the vertex along +z."""
     return Way(
-        mi.Vector3f(0, 0, 1), mi.Float(distance), mi.Float(budget),
-        mi.Float(np.tan((fov + offset) / 2)), mi.Float(room),
-    )  # fmt: skip
+        mi.Vector3f(0, 0, 1),
+        mi.Float(distance),
+        mi.Float(budget),
+        mi.Float(np.tan((fov + offset) / 2)),
+        mi.Float(room),
+    )
 
 
 @pytest.mark.parametrize("case", CASES)

@@ -49,7 +49,9 @@ def phase(sine, offset=0.0, gap=GAP, index=1.0):
     sine, offset = np.longdouble(sine), np.longdouble(offset)
     frequency = np.longdouble(LIGHT) / np.longdouble(WAVELENGTH) + offset
     cosine = np.sqrt(1 - (sine / index) ** 2)
-    order = 2 * np.longdouble(index) * np.longdouble(gap) * cosine * frequency / np.longdouble(LIGHT)
+    order = (
+        2 * np.longdouble(index) * np.longdouble(gap) * cosine * frequency / np.longdouble(LIGHT)
+    )
     return 2 * np.pi * (order - np.round(order)).astype(float)
 
 
@@ -175,8 +177,13 @@ def test_coating_that_absorbs():
     assert (through[0] + back[0] < 0.99).all()
 
 
-LINE = {"type": "spectral_line", "weights": "0.2, 0.5, 0.3", "offsets": "0, -1.1e9, 1.6e9",
-        "sigmas": "42e6, 0.9e9, 1.4e9", "v_los": 80.0}  # fmt: skip
+LINE = {
+    "type": "spectral_line",
+    "weights": "0.2, 0.5, 0.3",
+    "offsets": "0, -1.1e9, 1.6e9",
+    "sigmas": "42e6, 0.9e9, 1.4e9",
+    "v_los": 80.0,
+}
 
 
 @pytest.mark.parametrize("kind", ["reflectivity", "coating"])

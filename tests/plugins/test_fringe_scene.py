@@ -30,11 +30,13 @@ LINE = {
 }
 ETALON = {"type": "etalon", "gap": 13.7e-3, "order_fraction": 0.5, "surface_rms": 2e-9}
 # an aplanatic singlet; the last test says how good it is
-LENS = np.array([
-    [0, 0, 1e-3, 1],
-    [0.1629729661, -0.7745795419, 6e-3, 1.476119988],
-    [-1.142295699, 0, 0.296438162, 1],
-])  # fmt: skip
+LENS = np.array(
+    [
+        [0, 0, 1e-3, 1],
+        [0.1629729661, -0.7745795419, 6e-3, 1.476119988],
+        [-1.142295699, 0, 0.296438162, 1],
+    ]
+)
 
 
 def plates(to_world=None, **parameters):
@@ -46,27 +48,33 @@ def plates(to_world=None, **parameters):
 
 def scene(
     size=(96, 78), pixel=74e-6, estimator="camera", source=None, line=None, shapes=None, **camera
-):  # fmt: skip
+):
     """Default: the usual field on large pixels."""
     if shapes is None:
         shapes = {"plates": plates(**ETALON, line={"type": "ref", "id": "line"})}
-    return mi.load_dict({
-        "type": "scene",
-        "integrator": {"type": "fringes", "estimator": estimator},
-        "line": LINE | (line or {}),
-        "source": {"type": "plane_waves", "line": {"type": "ref", "id": "line"}} | (source or {}),
-        **shapes,
-        "sensor": {
-            "type": "ccd",
-            "focal_length": FOCAL,
-            "pixel": pixel,
-            "stop_radius": STOP,
-            "film": {
-                "type": "hdrfilm", "width": size[0], "height": size[1], "rfilter": {"type": "box"},
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": "fringes", "estimator": estimator},
+            "line": LINE | (line or {}),
+            "source": {"type": "plane_waves", "line": {"type": "ref", "id": "line"}}
+            | (source or {}),
+            **shapes,
+            "sensor": {
+                "type": "ccd",
+                "focal_length": FOCAL,
+                "pixel": pixel,
+                "stop_radius": STOP,
+                "film": {
+                    "type": "hdrfilm",
+                    "width": size[0],
+                    "height": size[1],
+                    "rfilter": {"type": "box"},
+                },
+                **camera,
             },
-            **camera,
-        },
-    })  # fmt: skip
+        }
+    )
 
 
 def sampled():
@@ -106,7 +114,7 @@ def _curve(cosine, v_los, reflectivity):
 
 def rings(
     size=(96, 78), pixel=74e-6, centre=None, v_los=0.0, field=0.016, radius=np.inf, nodes=4, **more
-):  # fmt: skip
+):
     """Share of the source's energy on each pixel: its solid angle, and what the etalon lets pass."""
     points, weights = np.polynomial.legendre.leggauss(nodes)
     centre = centre or ((size[0] - 1) / 2, (size[1] - 1) / 2)
@@ -338,10 +346,16 @@ def test_coated_plates_polarise_along_the_ring(estimator, centre, stokes_index):
         "bsdf": thin,
     }
     loaded = scene(
-        size=(32, 32), pixel=2.5e-3, estimator=estimator, shapes={"plates": wide},
-        source={"field_half_mrad": 900.0}, line={"sigmas": "0, 0"}, stop_radius=1e-4,
-        centre_x=centre[0], centre_y=centre[1],
-    )  # fmt: skip
+        size=(32, 32),
+        pixel=2.5e-3,
+        estimator=estimator,
+        shapes={"plates": wide},
+        source={"field_half_mrad": 900.0},
+        line={"sigmas": "0, 0"},
+        stop_radius=1e-4,
+        centre_x=centre[0],
+        centre_y=centre[1],
+    )
     paths = 256 if estimator == "camera" else 4096
     stokes, error = render(loaded, spp=paths, seed=8)
     x, y = np.meshgrid(*((np.arange(96) - 1) / 3 - c for c in centre))
@@ -400,9 +414,7 @@ def test_frequencies_follow_the_line():
     offset = np.array(line.sample(draw(), mi.Point2f(draw(), draw())), float)
 
     def cumulative(nu):
-        return sum(
-            w * stats.norm.cdf(nu, o + 2 * 120 / WAVELENGTH, s) for w, o, s in GAUSSIANS
-        )
+        return sum(w * stats.norm.cdf(nu, o + 2 * 120 / WAVELENGTH, s) for w, o, s in GAUSSIANS)
 
     assert stats.kstest(offset, cumulative).pvalue > 1e-3
 
@@ -559,9 +571,7 @@ def test_passes_and_seeds():
         assert len(seen) > 10 and seen[-1][0] == seen[-1][1]
         noise = np.sqrt(2 * (error**2).sum())
         assert parts[0].sum() == pytest.approx(whole[0].sum(), abs=4 * noise)
-        assert np.std(parts[0] - whole[0]) == pytest.approx(
-            np.sqrt(2 * (error**2).mean()), rel=0.1
-        )
+        assert np.std(parts[0] - whole[0]) == pytest.approx(np.sqrt(2 * (error**2).mean()), rel=0.1)
 
 
 @pytest.mark.parametrize(
@@ -569,10 +579,16 @@ def test_passes_and_seeds():
     [
         (lambda: scene(lens=mi.TensorXf(np.ones(7))), "ccd.lens: 'shape .7,.*' is not allowed"),
         (lambda: scene(lens="nowhere.txt"), "ccd.lens: 'nowhere.txt' is not allowed"),
-        (lambda: scene(lens=mi.TensorXf(np.array([[0, 0, 0.1, 1.5], [1, 0, 0.3, 1.0]]).ravel())),
-         "ccd.lens: .*expected a plane stop first"),
-        (lambda: scene(lens=mi.TensorXf(np.array([[0, 0, 0.1, 1], [1e-3, 0, 0.3, 1.0]]).ravel())),
-         "ccd.lens: 'light misses a surface' is not allowed"),
+        (
+            lambda: scene(lens=mi.TensorXf(np.array([[0, 0, 0.1, 1.5], [1, 0, 0.3, 1.0]]).ravel())),
+            "ccd.lens: .*expected a plane stop first",
+        ),
+        (
+            lambda: scene(
+                lens=mi.TensorXf(np.array([[0, 0, 0.1, 1], [1e-3, 0, 0.3, 1.0]]).ravel())
+            ),
+            "ccd.lens: 'light misses a surface' is not allowed",
+        ),
         (lambda: scene(pixel=0.0), "ccd.pixel"),
         (lambda: scene(stop_radius=-1.0), "ccd.stop_radius"),
         (lambda: scene(centre_x=float("nan")), "ccd.centre_x"),
@@ -582,14 +598,28 @@ def test_passes_and_seeds():
         (lambda: mi.load_dict({"type": "plane_waves"}), "plane_waves.line: 0 is not allowed"),
         (lambda: scene(estimator="both"), "fringes.estimator: 'both' is not allowed"),
         (lambda: mi.render(scene(), spp=1), "fringes.sample_count: 1 is not allowed"),
-        (lambda: mi.render(mi.load_dict({
-            "type": "scene", "integrator": {"type": "fringes"}, "s": {"type": "perspective"},
-        })), "fringes.sensor: .* expected a sensor of type 'ccd'"),
-        (lambda: mi.render(mi.load_dict({
-            "type": "scene", "integrator": {"type": "fringes"}, "s": {"type": "ccd"},
-        })), "fringes.source: .* expected an emitter of type 'plane_waves'"),
+        (
+            lambda: mi.render(
+                mi.load_dict(
+                    {
+                        "type": "scene",
+                        "integrator": {"type": "fringes"},
+                        "s": {"type": "perspective"},
+                    }
+                )
+            ),
+            "fringes.sensor: .* expected a sensor of type 'ccd'",
+        ),
+        (
+            lambda: mi.render(
+                mi.load_dict(
+                    {"type": "scene", "integrator": {"type": "fringes"}, "s": {"type": "ccd"}}
+                )
+            ),
+            "fringes.source: .* expected an emitter of type 'plane_waves'",
+        ),
     ],
-)  # fmt: skip
+)
 def test_wrong_scenes_are_named(build, message):
     with pytest.raises((RuntimeError, ValueError)) as error:
         build()

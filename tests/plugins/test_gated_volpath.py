@@ -185,9 +185,10 @@ class TestVariants:
                 sigma[colour] = 1e-3
                 medium = world.homogeneous(0.0) | {"sigma_t": {"type": "rgb", "value": sigma}}
                 scene = world.scene(
-                    world.lidar((1, 1), (500.0, 502.5), {"wavelength": wavelength},
-                                environment=medium)
-                )  # fmt: skip
+                    world.lidar(
+                        (1, 1), (500.0, 502.5), {"wavelength": wavelength}, environment=medium
+                    )
+                )
                 signal = world.render(scene)[0][0, 0, 0, 0]
                 assert (signal > 1e-11) == (channel == colour)
 
@@ -201,13 +202,17 @@ class TestPasses:
         pictures = [
             world.render(
                 scan(
-                    world, size, (500.0, 505.0), gate_count=gates,
+                    world,
+                    size,
+                    (500.0, 505.0),
+                    gate_count=gates,
                     integrator={"estimator": estimator, "samples_per_pass": n},
                 ),
-                seed=3, spp=samples,
+                seed=3,
+                spp=samples,
             )
             for n in (1 << 22, at_once)
-        ]  # fmt: skip
+        ]
         (whole, whole_error), (parts, parts_error) = pictures
         assert parts == pytest.approx(whole, rel=2e-6, abs=1e-6 * whole[:, 0].mean())
         assert parts_error == pytest.approx(whole_error, rel=1e-4)
@@ -334,10 +339,14 @@ class TestSeeds:
         """4 sigma on correlations of 2500 equal beams."""
         scene = world.scene(
             world.lidar(
-                (50, 50), (500.0, 502.5), environment=world.homogeneous(1e-3),
-                gate_kind="spherical", fov_half_mrad=0.5, **SCAN,
+                (50, 50),
+                (500.0, 502.5),
+                environment=world.homogeneous(1e-3),
+                gate_kind="spherical",
+                fov_half_mrad=0.5,
+                **SCAN,
             )
-        )  # fmt: skip
+        )
         a, b = (world.render(scene, seed=s, spp=64)[0][0, 0].ravel() for s in (8, 9))
         for one, two in [(a, b), (a[1:], a[:-1]), (a[50:], a[:-50]), (a[1:], b[:-1])]:
             assert abs(np.corrcoef(one, two)[0, 1]) < 4 / math.sqrt(one.size)
@@ -355,10 +364,11 @@ class TestOpaqueTargets:
             world.lidar((8, 3), (500.0, 502.5), environment=world.ENVIRONMENT, **SCAN),
             {"estimator": estimator},
             environment=world.homogeneous(1e-4),
-            slab=world.box([490, -65, -45], [510, 65, 45], world.homogeneous(0.1),
-                           world.ENVIRONMENT),
+            slab=world.box(
+                [490, -65, -45], [510, 65, 45], world.homogeneous(0.1), world.ENVIRONMENT
+            ),
             wall=wall,
-        )  # fmt: skip
+        )
 
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
     @pytest.mark.parametrize("x", [300.0, 495.0])

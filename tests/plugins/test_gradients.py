@@ -18,9 +18,11 @@ SHAPE = (5, 6, 4)
 BASE = 0.05 * np.random.default_rng(1).uniform(0.5, 1.5, SHAPE)
 # spherical gate inside the slab, 3 x 2 beams
 VIEW = {
-    "azimuth_min_deg": -0.15, "azimuth_max_deg": 0.15,
-    "elevation_min_deg": -0.1, "elevation_max_deg": 0.1,
-}  # fmt: skip
+    "azimuth_min_deg": -0.15,
+    "azimuth_max_deg": 0.15,
+    "elevation_min_deg": -0.1,
+    "elevation_max_deg": 0.1,
+}
 WEIGHTS = np.random.default_rng(2).uniform(0.5, 1.5, (2, 3))
 DIRECTION = 0.2 * BASE * np.random.default_rng(3).uniform(-0.5, 1.5, SHAPE)
 

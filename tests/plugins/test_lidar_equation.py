@@ -233,9 +233,15 @@ class TestGates:
         angles = {"azimuth_min_deg": -40.0, "azimuth_max_deg": 40.0, "elevation_max_deg": 20.0}
         for kind in ("spherical", "planar"):
             scene = world.scene(
-                world.lidar((41, 5), (300.0, 310.0), gate_kind=kind, gate_count=2,
-                            environment=world.homogeneous(2e-3), **angles),
-            )  # fmt: skip
+                world.lidar(
+                    (41, 5),
+                    (300.0, 310.0),
+                    gate_kind=kind,
+                    gate_count=2,
+                    environment=world.homogeneous(2e-3),
+                    **angles,
+                )
+            )
             stokes, error = world.render(scene, seed=6, spp=2 * photons)
             scale = secants(scene, (5, 41)) if kind == "planar" else np.ones((5, 41))
             edges = np.array([300, 305, 310])[:, None, None] * scale
@@ -288,13 +294,17 @@ class TestGates:
         extinction = 0.5 if analog else 1e-4  # deep penetration, or photons enough
         scene = world.scene(
             world.lidar(
-                (2, 2) if analog else (6, 6), (497.5, 502.5), {"pulse_duration": duration}, gate_count=gates,
-                azimuth_min_deg=-0.5, azimuth_max_deg=0.5,
+                (2, 2) if analog else (6, 6),
+                (497.5, 502.5),
+                {"pulse_duration": duration},
+                gate_count=gates,
+                azimuth_min_deg=-0.5,
+                azimuth_max_deg=0.5,
             )
             | {"elevation_min_deg": -0.5, "elevation_max_deg": 0.5},
             {"estimator": estimator},
             slab=world.box([500, -65, -45], [530, 65, 45], world.homogeneous(extinction)),
-        )  # fmt: skip
+        )
         samples = 400_000 if analog else gates * photons
         stokes, error = world.render(scene, seed=10, spp=samples)
         profile, spread = stokes[:, 0].mean((1, 2)), np.sqrt((error**2).sum((1, 2))) / error[0].size

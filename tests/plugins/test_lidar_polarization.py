@@ -32,17 +32,21 @@ def scan(world, emitted, phase, environment=None, **parameters):
             (500.0, 502.5),
             {"stokes": stokes, "divergence_full_mrad": 0.0},
             environment=world.ENVIRONMENT,
-            **({
-                "azimuth_min_deg": -40.0,
-                "azimuth_max_deg": 40.0,
-                "elevation_min_deg": -30.0,
-                "elevation_max_deg": 30.0,
-            } | parameters),
+            **(
+                {
+                    "azimuth_min_deg": -40.0,
+                    "azimuth_max_deg": 40.0,
+                    "elevation_min_deg": -30.0,
+                    "elevation_max_deg": 30.0,
+                }
+                | parameters
+            ),
         ),
         environment=world.homogeneous(1e-4, environment or phase),
-        slab=world.box([480, -600, -600], [520, 600, 600], world.homogeneous(1e-3, phase),
-                       world.ENVIRONMENT),
-    )  # fmt: skip
+        slab=world.box(
+            [480, -600, -600], [520, 600, 600], world.homogeneous(1e-3, phase), world.ENVIRONMENT
+        ),
+    )
     return world.render(scene, seed=1, spp=256)[0]
 
 
@@ -95,9 +99,14 @@ def test_phase_functions_without_polarisation_depolarise_completely(world, phase
 def test_each_medium_scatters_by_its_own_phase_function(world):
     """Two gates, one in the isotropic environment, one in the Rayleigh slab."""
     stokes = scan(
-        world, (1, 1, 0, 0), "rayleigh_polarized", "isotropic",
-        gate_start=400.0, gate_stop=500.0, gate_count=5,
-    )  # fmt: skip
+        world,
+        (1, 1, 0, 0),
+        "rayleigh_polarized",
+        "isotropic",
+        gate_start=400.0,
+        gate_stop=500.0,
+        gate_count=5,
+    )
     assert (stokes[:4, 1:] == 0).all() and (stokes[:4, 0] > 0).all()
     assert stokes[4, 1] == pytest.approx(stokes[4, 0], rel=1e-4)
 

@@ -57,8 +57,10 @@ def lines():
 
 
 def walk(air, origin, direction, distance):
-    points = [type_(np.ascontiguousarray(a.T)) for type_, a in
-              ((mi.Point3f, origin), (mi.Vector3f, direction))]  # fmt: skip
+    points = [
+        type_(np.ascontiguousarray(a.T))
+        for type_, a in ((mi.Point3f, origin), (mi.Vector3f, direction))
+    ]
     rng = mi.PCG32(size=LINES)
     value, _ = transmittance(
         air, mi.MediumPtr(None), *points, mi.Float(distance), 0, mi.Color0f(), rng, mi.Bool(True)

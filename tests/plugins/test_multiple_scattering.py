@@ -123,12 +123,17 @@ def test_environment_and_slab_scatter_together(world):
     pictures = []
     for estimator, samples in (("gated", 300_000), ("analog", 1_500_000)):
         scene = world.scene(
-            world.lidar((1, 1), (490.0, 515.0), environment=world.ENVIRONMENT, gate_count=5,
-                        fov_half_mrad=30.0),
+            world.lidar(
+                (1, 1),
+                (490.0, 515.0),
+                environment=world.ENVIRONMENT,
+                gate_count=5,
+                fov_half_mrad=30.0,
+            ),
             {"estimator": estimator, "max_order": 4, "orders": True},
             environment=environment,
             slab=world.box((495.0, -40.0, -40.0), (510.0, 40.0, 40.0), slab, world.ENVIRONMENT),
-        )  # fmt: skip
+        )
         pictures.append(gates(scene, spp=samples, seed=3))
     gated, analog = pictures
     z = (gated[:, 0] - analog[:, 0]) / np.hypot(gated[:, 4], analog[:, 4])

@@ -15,9 +15,15 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 BACKSCATTER = 3 / (8 * math.pi)
 WORLD_DIRECTIONS = [
-    (1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, -1),
-    (0.99, 0.1, -0.06), (1, -2, 3), (-1, -1, 0.2),
-]  # fmt: skip
+    (1, 0, 0),
+    (-1, 0, 0),
+    (0, 1, 0),
+    (0, 0, 1),
+    (0, 0, -1),
+    (0.99, 0.1, -0.06),
+    (1, -2, 3),
+    (-1, -1, 0.2),
+]
 
 
 def phase(depolarization=0.0):

@@ -114,9 +114,12 @@ def test_xml_and_dictionary_give_the_same_picture_in_every_variant(world, scene_
     """Back and forth between variants, in one process."""
     pictures = {}
     for name in (
-        "llvm_ad_mono_polarized", "llvm_ad_rgb", "llvm_ad_spectral_polarized",
-        "llvm_ad_mono_polarized", "llvm_ad_rgb",
-    ):  # fmt: skip
+        "llvm_ad_mono_polarized",
+        "llvm_ad_rgb",
+        "llvm_ad_spectral_polarized",
+        "llvm_ad_mono_polarized",
+        "llvm_ad_rgb",
+    ):
         mi.set_variant(name)
         from_xml, _ = world.render(mi.load_file(str(scene_file)), seed=1)
         from_dict, _ = world.render(same_scene(world), seed=1)

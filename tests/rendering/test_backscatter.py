@@ -13,8 +13,8 @@ import xarray as xr
 
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
-from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.io.exr import read_scan, write_scan
+from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.settings import RenderSettings
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -259,9 +259,16 @@ class TestScans:
         fields = list(self.fields(plans))
         _, second = render(fields, plans)
         (alone,) = render_scans(
-            fields, plans, BackscatterLidar(), ENVIRONMENT, RAYLEIGH, 1.0,
-            RenderSettings(max_order=1), 1, scans=[1],
-        )  # fmt: skip
+            fields,
+            plans,
+            BackscatterLidar(),
+            ENVIRONMENT,
+            RAYLEIGH,
+            1.0,
+            RenderSettings(max_order=1),
+            1,
+            scans=[1],
+        )
         for name in ("S0", "S1", "S2", "S3", "S0_stderr", "Y"):
             assert np.array_equal(alone[name], second[name])
         assert alone.attrs["telescope_position"] == 15
@@ -304,10 +311,17 @@ class TestScans:
         settings = RenderSettings(max_order=1, samples_per_beam=30)
         scans = list(
             render_scans(
-                list(self.fields(plans)), plans, lidar, ENVIRONMENT, RAYLEIGH, 1.0, settings, 5,
+                list(self.fields(plans)),
+                plans,
+                lidar,
+                ENVIRONMENT,
+                RAYLEIGH,
+                1.0,
+                settings,
+                5,
                 progress=lambda *call: calls.append(call),
             )
-        )  # fmt: skip
+        )
         for k, scan in enumerate(scans):
             assert scan["S0"].dims == ("gate", "z", "y") and scan["S0"].shape == (3, 7, 11)
             assert np.array_equal(scan["y"], Y[::20]) and np.array_equal(scan["z"], Z[::20])

@@ -108,9 +108,12 @@ def test_coatings_reach_the_scene():
             coated_transmission(
                 etalon, WAVELENGTH, camera.cosine(camera.radius_squared((x, y))), 0.0, which
             )
-            for x in nodes for y in nodes for which in "sp"
-        ], axis=0,
-    )  # fmt: skip
+            for x in nodes
+            for y in nodes
+            for which in "sp"
+        ],
+        axis=0,
+    )
     z = z_scores(picture, expected * cosine_fourth(camera))
     assert abs(z.mean()) < 4 / math.sqrt(z.size)
     assert z.var() < 1 + 5 * math.sqrt(2 / z.size)
@@ -164,9 +167,14 @@ def test_scene_file_that_ships_renders(tmp_path, estimator):
     out = tmp_path / "fringes.exr"
     shares = []
     picture = render_file(
-        SCENE, out, "llvm_ad_mono", 4, 3,
-        {"estimator": estimator, "v_los": "40", "lens": "fringes_lens.txt"}, shares.append,
-    )  # fmt: skip
+        SCENE,
+        out,
+        "llvm_ad_mono",
+        4,
+        3,
+        {"estimator": estimator, "v_los": "40", "lens": "fringes_lens.txt"},
+        shares.append,
+    )
     assert shares[-1] == 1
     back = read_fringes(out)
     assert back["S0"].shape == (780, 960) and np.array_equal(back["S0"], picture["S0"])
@@ -197,9 +205,7 @@ def test_lens_and_field_fit_any_camera():
     assert source.field_half > math.atan(corner / 0.5)
     assert sensor.lens.shape == (3, 4) and sensor.lens[-1, 2] == pytest.approx(0.494, abs=1e-3)
     sample = [mi.Float(np.float32(np.random.default_rng(k).random(1000))) for k in range(2)]
-    _, direction, weight = sensor.sample_towards_scene(
-        mi.Point2f(95.5, 77.5), mi.Point2f(*sample)
-    )
+    _, direction, weight = sensor.sample_towards_scene(mi.Point2f(95.5, 77.5), mi.Point2f(*sample))
     assert np.mean(np.array(weight) > 0) > 0.8
     assert np.all(np.array(source.radiance(-direction)) == 1)
 

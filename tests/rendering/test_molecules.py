@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.experiment import schema as config
 from lidar_mi.atmosphere.molecules import molecular_table
 from lidar_mi.atmosphere.particles import aerosol_table
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import schema as config
+from lidar_mi.experiment.truth import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import molecules, scatterer
 from lidar_mi.rendering.settings import RenderSettings
-from lidar_mi.experiment.truth import make_truth
 
 WAVELENGTH, MOLECULES, AROUND = 532e-9, 7e-5, 1e-4
 AXIS = np.arange(-4.0, 4.5, 0.5)
@@ -28,10 +28,19 @@ def scans(fields, settings, **air):
     lidar = BackscatterLidar(fov_half="20 mrad", divergence_full="0.1 mrad")
     solid = [extrude(field, plans[0], lidar) for field in fields]
     scattering = config.Scattering(phase="aerosol", aerosol="spheroids")
-    return list(render_scans(
-        solid, plans, lidar, AROUND + MOLECULES, *scatterer(scattering, wavelength=WAVELENGTH),
-        settings, 1, molecules=molecules(MOLECULES, WAVELENGTH), **air,
-    ))  # fmt: skip
+    return list(
+        render_scans(
+            solid,
+            plans,
+            lidar,
+            AROUND + MOLECULES,
+            *scatterer(scattering, wavelength=WAVELENGTH),
+            settings,
+            1,
+            molecules=molecules(MOLECULES, WAVELENGTH),
+            **air,
+        )
+    )
 
 
 @pytest.mark.usefixtures("variant")
@@ -42,13 +51,18 @@ def test_backscatter_is_the_sum_of_both():
     """
     extinctions = (5e-4, 2e-3)
     fields = [
-        xr.DataArray(np.full((len(AXIS),) * 2, value + MOLECULES), {"z": AXIS, "y": AXIS}, ("z", "y"))
+        xr.DataArray(
+            np.full((len(AXIS),) * 2, value + MOLECULES), {"z": AXIS, "y": AXIS}, ("z", "y")
+        )
         for value in extinctions
     ]
     per = [aerosol_table("spheroids", WAVELENGTH), molecular_table(WAVELENGTH, band="cabannes")]
     found = scans(fields, RenderSettings(samples_per_beam=256, max_order=1))
     for scan, value in zip(found, extinctions):
-        beta = value * per[0].backscatter_per_extinction + MOLECULES * per[1].backscatter_per_extinction
+        beta = (
+            value * per[0].backscatter_per_extinction
+            + MOLECULES * per[1].backscatter_per_extinction
+        )
         depth = 2 * (value + MOLECULES) * 2.5
         middle = scan["Y"].sel(y=slice(-2, 2), z=slice(-2, 2))
         expected = beta * -np.expm1(-depth) / depth
@@ -70,10 +84,17 @@ def test_light_is_depolarised_by_particles_alone():
 
 
 def experiment(**extinction):
-    return config.check({
-        "name": "air",
-        "wake": {"vortex_pair": {"width": 20, "height": 20}, "spacing": 0.5, "extinction": extinction},
-    }, "air")  # fmt: skip
+    return config.check(
+        {
+            "name": "air",
+            "wake": {
+                "vortex_pair": {"width": 20, "height": 20},
+                "spacing": 0.5,
+                "extinction": extinction,
+            },
+        },
+        "air",
+    )
 
 
 def test_molecules_have_no_texture():
@@ -86,9 +107,12 @@ def test_molecules_have_no_texture():
 
 def test_unpolarised_particles_have_no_molecules_beside():
     data = {
-        "name": "air", "wake": {"vortex_pair": {}, "extinction": {"molecules": 7e-5}},
+        "name": "air",
+        "wake": {"vortex_pair": {}, "extinction": {"molecules": 7e-5}},
         "scattering": {"phase": "isotropic"},
-    }  # fmt: skip
+    }
     with pytest.raises(InputError) as error:
         config.check(data, "air")
-    assert "wake.extinction.molecules: not allowed with scattering.phase isotropic" in str(error.value)
+    assert "wake.extinction.molecules: not allowed with scattering.phase isotropic" in str(
+        error.value
+    )

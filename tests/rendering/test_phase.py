@@ -10,8 +10,8 @@ import pytest
 from lidar_mi.atmosphere.molecules import molecular_scattering
 from lidar_mi.atmosphere.particles import aerosol_table
 from lidar_mi.atmosphere.scattering import write_table
-from lidar_mi.experiment.schema import Scattering
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema import Scattering
 from lidar_mi.rendering.phase import scatterer, table_files
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -32,15 +32,9 @@ def backscatter(dictionary):
     [
         (Scattering(), 3 / (8 * np.pi)),
         # Delta = (1 - D) / (1 + D / 2) of the dipole part
-        (
-            Scattering(depolarization=0.2),
-            (0.8 / 1.1 * 1.5 + 0.3 / 1.1) / (4 * np.pi),
-        ),
+        (Scattering(depolarization=0.2), (0.8 / 1.1 * 1.5 + 0.3 / 1.1) / (4 * np.pi)),
         (Scattering(phase="isotropic"), 1 / (4 * np.pi)),
-        (
-            Scattering(phase="henyey_greenstein", asymmetry=0.6),
-            (1 - 0.36) / (4 * np.pi * 1.6**3),
-        ),
+        (Scattering(phase="henyey_greenstein", asymmetry=0.6), (1 - 0.36) / (4 * np.pi * 1.6**3)),
     ],
 )
 def test_phase_function_at_180_degrees(scattering, expected):
@@ -79,8 +73,11 @@ def matrix(dictionary, cosine):
     mei.sh_frame = mi.Frame3f(0, 0, -1)
     wo = mi.Vector3f(float(np.sqrt(1 - cosine**2)), 0, -cosine)
     value, _ = mi.load_dict(dictionary).eval_pdf(mi.PhaseFunctionContext(), mei, wo)
-    return 4 * np.pi * np.array([[np.array(value[i, j]).ravel()[0] for j in range(4)]
-                                 for i in range(4)])  # fmt: skip
+    return (
+        4
+        * np.pi
+        * np.array([[np.array(value[i, j]).ravel()[0] for j in range(4)] for i in range(4)])
+    )
 
 
 def test_molecules_are_those_of_the_wavelength():
@@ -111,14 +108,15 @@ def test_a_mixture_is_weighted_by_scattering_coefficient(cosine):
     weight = 3 * soot.albedo / (3 * soot.albedo + 1)
     expected = weight * matrix(soot.phase, cosine) + (1 - weight) * matrix(molecules.phase, cosine)
     # molecules are a table of one degree here: 8e-5 of a1
-    np.testing.assert_allclose(
-        matrix(mixture.phase, cosine), expected, atol=2e-4 * expected[0, 0]
-    )
+    np.testing.assert_allclose(matrix(mixture.phase, cosine), expected, atol=2e-4 * expected[0, 0])
 
 
 def test_tables_of_a_mixture_are_found(tmp_path):
     write_table(aerosol_table("dust", 532e-9), tmp_path / "dust.txt")
-    parts = [{"phase": "molecules", "share": 1}, {"phase": "table", "table": "dust.txt", "share": 1}]
+    parts = [
+        {"phase": "molecules", "share": 1},
+        {"phase": "table", "table": "dust.txt", "share": 1},
+    ]
     mixture = Scattering.model_validate({"phase": "mixture", "parts": parts})
     found = {"scattering.parts.1.table": (tmp_path / "dust.txt").resolve()}
     assert table_files(mixture, tmp_path) == found

@@ -31,7 +31,9 @@ def test_a_variant_that_cannot_run_here_says_so(variant):
     try:
         use_variant("cuda_ad_mono_polarized")
     except InputError as error:
-        assert str(error).startswith("variant: cuda_ad_mono_polarized cannot run here: no NVIDIA GPU")
+        assert str(error).startswith(
+            "variant: cuda_ad_mono_polarized cannot run here: no NVIDIA GPU"
+        )
         assert "\n" not in str(error)
         assert mi.variant() == variant
     else:

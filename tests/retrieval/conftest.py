@@ -69,9 +69,5 @@ def axes(columns, rows, spacing=0.5):
 @pytest.fixture(scope="session")
 def synthetic():
     return SimpleNamespace(
-        texture=texture,
-        lamb_oseen=lamb_oseen,
-        origin=origin,
-        data_array=data_array,
-        axes=axes,
+        texture=texture, lamb_oseen=lamb_oseen, origin=origin, data_array=data_array, axes=axes
     )

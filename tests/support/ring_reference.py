@@ -35,8 +35,16 @@ def profile(sigma, count=2**14):
     return order, total
 
 
-def picture(v_los=0.0, photons=2.4e7, centre=None, temperature=TEMPERATURE, shape=SHAPE,
-            pixel=PIXEL, background=0.0, radius=np.inf):  # fmt: skip
+def picture(
+    v_los=0.0,
+    photons=2.4e7,
+    centre=None,
+    temperature=TEMPERATURE,
+    shape=SHAPE,
+    pixel=PIXEL,
+    background=0.0,
+    radius=np.inf,
+):
     """Mean electrons of every pixel, averaged over its area by two points each way.
 
     ``radius`` is the 1/e^2 radius of the light on the camera, m.
@@ -81,7 +89,9 @@ def information(mean, read_noise, modes):
     kernel = norm.pdf(x[:, None] - k, scale=read_noise)
 
     def density(mu):
-        counts = poisson.pmf(k, mu) if np.isinf(modes) else nbinom.pmf(k, modes, modes / (modes + mu))
+        counts = (
+            poisson.pmf(k, mu) if np.isinf(modes) else nbinom.pmf(k, modes, modes / (modes + mu))
+        )
         return kernel @ counts
 
     step = 1e-3 * mean

@@ -18,9 +18,9 @@ import OpenEXR
 import pytest
 import xarray as xr
 
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
-from lidar_mi.cli import app as cli
 from lidar_mi.atmosphere.scattering import read_table
+from lidar_mi.cli import app as cli
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
 from lidar_mi.io.exr import read_layers, read_scan
 
 SCENES = Path(str(files("lidar_mi.scenes")))
@@ -77,8 +77,12 @@ def quick(monkeypatch):
 def shell(*arguments, **options):
     return subprocess.run(
         [sys.executable, "-m", "lidar_mi.cli.app", *map(str, arguments)],
-        capture_output=True, text=True, timeout=120, check=False, **options,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+        **options,
+    )
 
 
 def words_of(text):
@@ -116,7 +120,9 @@ def test_help_names_every_command(lidar_mi):
         assert re.search(rf"^│ {command} ", out, re.MULTILINE)
 
 
-@pytest.mark.parametrize("command", ["run", "check", "render", "retrieve", "info", "aerosol", "doctor"])
+@pytest.mark.parametrize(
+    "command", ["run", "check", "render", "retrieve", "info", "aerosol", "doctor"]
+)
 def test_help_teaches_by_example(lidar_mi, command):
     code, out, _ = lidar_mi(command, "--help")
     assert code == 0
@@ -143,9 +149,17 @@ def test_examples_of_the_help_can_be_typed(there, lidar_mi, quick):
 
 def test_run_writes_where_it_is_told_and_says_so(there, lidar_mi, quick):
     code, out, err = lidar_mi(
-        "run", "tiny.yaml", "-o", "here", "--set", "seed=5", "--set", "retrieval.stride=2",
-        "-m", "llvm_ad_mono",
-    )  # fmt: skip
+        "run",
+        "tiny.yaml",
+        "-o",
+        "here",
+        "--set",
+        "seed=5",
+        "--set",
+        "retrieval.stride=2",
+        "-m",
+        "llvm_ad_mono",
+    )
     assert code == 0
     assert "here/report.html" in out and "here/wind.nc" in out
     assert "rendering scan 2 of 2" in err and "done" in err
@@ -211,8 +225,18 @@ def test_info_on_netcdf_3(there, lidar_mi):
 def test_info_on_a_run_folder(demo, lidar_mi):
     code, out, _ = lidar_mi("info", demo.folder)
     assert code == 0
-    for word in ("wake_backscatter", "mitsuba", "wind.nc", "image_t2.exr", "figures/fig08",
-                 "scan.range", "500.0 m", "scan.gate_count", "seed", "spheroids"):  # fmt: skip
+    for word in (
+        "wake_backscatter",
+        "mitsuba",
+        "wind.nc",
+        "image_t2.exr",
+        "figures/fig08",
+        "scan.range",
+        "500.0 m",
+        "scan.gate_count",
+        "seed",
+        "spheroids",
+    ):
         assert word in out
     assert f"{demo.metrics['backscatter.cc.rmse_v']:.2f}" in out
     assert f"{demo.metrics['true_wind.rms_w']:.2f}" in out and "no skill" in out
@@ -249,10 +273,14 @@ def test_info_on_named_scatterers(lidar_mi):
         code, out, _ = lidar_mi("info", name)
         assert code == 0
         for shown in (
-            "532 nm", f"{table.extinction:.4g} m^-1", f"{table.backscatter:.4g} m^-1 sr^-1",
-            f"{table.lidar_ratio:.4g} sr", f"{table.albedo:.5g}", "2e+08 m^-3",
+            "532 nm",
+            f"{table.extinction:.4g} m^-1",
+            f"{table.backscatter:.4g} m^-1 sr^-1",
+            f"{table.lidar_ratio:.4g} sr",
+            f"{table.albedo:.5g}",
+            "2e+08 m^-3",
             f"{table.depolarization_ratio:.4g}",
-        ):  # fmt: skip
+        ):
             assert shown in out
     code, out, _ = lidar_mi("info", "molecules")
     assert code == 0 and "1.049 " in out and "5.1673e-31" in out and "1013.2 hPa" in out
@@ -268,9 +296,23 @@ def test_aerosol_writes_a_table_that_info_reads(there, lidar_mi):
     assert (table.name, table.wavelength) == ("soot", pytest.approx(355e-9))
     assert f"{table.lidar_ratio:.4g} sr" in out and "300 sizes" in words_of(out)
     code, out, _ = lidar_mi(
-        "aerosol", "spheres", "--name", "smoke", "--index", "1.6+0.02i", "--radius", "0.1 um",
-        "--sigma", 1.6, "--number-density", "1e9 / m^3", "--nodes", 200, "-o", "smoke.txt",
-    )  # fmt: skip
+        "aerosol",
+        "spheres",
+        "--name",
+        "smoke",
+        "--index",
+        "1.6+0.02i",
+        "--radius",
+        "0.1 um",
+        "--sigma",
+        1.6,
+        "--number-density",
+        "1e9 / m^3",
+        "--nodes",
+        200,
+        "-o",
+        "smoke.txt",
+    )
     assert code == 0
     smoke = read_table("smoke.txt")
     assert (smoke.name, smoke.number_density) == ("smoke", 1e9)
@@ -296,14 +338,33 @@ def test_doctor_ends_as_its_findings_say(lidar_mi):
 
 def test_render_fills_in_the_scene(there, lidar_mi):
     code, out, _ = lidar_mi(
-        "render", "slab.xml", "-s", 8, "-D", "range=485", "-D", "stop=487.5", "--seed", 3,
-        "-m", "llvm_ad_mono", "-o", "near.exr",
-    )  # fmt: skip
+        "render",
+        "slab.xml",
+        "-s",
+        8,
+        "-D",
+        "range=485",
+        "-D",
+        "stop=487.5",
+        "--seed",
+        3,
+        "-m",
+        "llvm_ad_mono",
+        "-o",
+        "near.exr",
+    )
     assert code == 0 and "near.exr" in out
     scan = read_scan(there / "near.exr")
     assert scan.sizes == {"gate": 1, "z": 17, "y": 21}
-    attributes = {"gate_start": 485.0, "gate_stop": 487.5, "samples_per_beam": 8, "seed": 3,
-                  "variant": "llvm_ad_mono", "max_order": 1, "estimator": "gated"}  # fmt: skip
+    attributes = {
+        "gate_start": 485.0,
+        "gate_stop": 487.5,
+        "samples_per_beam": 8,
+        "seed": 3,
+        "variant": "llvm_ad_mono",
+        "max_order": 1,
+        "estimator": "gated",
+    }
     assert {key: scan.attrs[key] for key in attributes} == attributes
     # 6.2 and 3.9 degrees, in the middle of the gate
     assert scan["y"].values[-1] == pytest.approx(486.25 * np.tan(np.radians(6.2)), rel=1e-5)
@@ -349,9 +410,22 @@ def test_retrieve_takes_any_picture_with_a_spacing(there, lidar_mi):
     for name, picture in (("a", noise[5:45, 5:55]), ("b", noise[4:44, 7:57])):
         OpenEXR.File({}, {"G": np.ascontiguousarray(picture)}).write(f"{name}.exr")
     code, *_ = lidar_mi(
-        "retrieve", "a.exr", "b.exr", "--dt", 0.5, "--layer", "G", "--spacing", 0.25,
-        "--stride", 3, "--method", "cc", "-o", "w.nc",
-    )  # fmt: skip
+        "retrieve",
+        "a.exr",
+        "b.exr",
+        "--dt",
+        0.5,
+        "--layer",
+        "G",
+        "--spacing",
+        0.25,
+        "--stride",
+        3,
+        "--method",
+        "cc",
+        "-o",
+        "w.nc",
+    )
     assert code == 0
     with xr.open_dataset("w.nc") as wind:
         valid = (wind["flag"] == 0).values
@@ -362,8 +436,12 @@ def test_retrieve_takes_any_picture_with_a_spacing(there, lidar_mi):
 
 def test_retrieve_brings_scans_by_angles_onto_one_grid(there, lidar_mi):
     assert lidar_mi("render", "slab.xml", "-s", 4, "-o", "far.exr")[0] == 0
-    assert lidar_mi("render", "slab.xml", "-s", 4, "-D", "range=485", "-D", "stop=487.5",
-                    "-o", "near.exr")[0] == 0  # fmt: skip
+    assert (
+        lidar_mi(
+            "render", "slab.xml", "-s", 4, "-D", "range=485", "-D", "stop=487.5", "-o", "near.exr"
+        )[0]
+        == 0
+    )
     code, *_ = lidar_mi(
         "retrieve", "far.exr", "near.exr", "--dt", 0.1, "--template", 4, "--search", 8, "-o", "w.nc"
     )
@@ -385,16 +463,40 @@ def bad(*arguments, says):
 @pytest.mark.parametrize(
     "arguments, says",
     [
-        bad("run", "tiny.yaml", "--set", "lidar.bean_radius=1",
-            says=["lidar.bean_radius", "unknown key", "beam_radius"]),
-        bad("run", "tiny.yaml", "--set", "lidar.beam_radius=3 s",
-            says=["lidar.beam_radius", "'3 s'", "quantity in m"]),
-        bad("run", "tiny.yaml", "--set", "lidar.beam_radius=-0.1 m",
-            says=["lidar.beam_radius", "-0.1 m", "more than 0 m"]),
-        bad("run", "tiny.yaml", "--set", "scan.aim=angles", "--set", "scan.columns=0",
-            says=["scan.columns", "0", "at least 1"]),
+        bad(
+            "run",
+            "tiny.yaml",
+            "--set",
+            "lidar.bean_radius=1",
+            says=["lidar.bean_radius", "unknown key", "beam_radius"],
+        ),
+        bad(
+            "run",
+            "tiny.yaml",
+            "--set",
+            "lidar.beam_radius=3 s",
+            says=["lidar.beam_radius", "'3 s'", "quantity in m"],
+        ),
+        bad(
+            "run",
+            "tiny.yaml",
+            "--set",
+            "lidar.beam_radius=-0.1 m",
+            says=["lidar.beam_radius", "-0.1 m", "more than 0 m"],
+        ),
+        bad(
+            "run",
+            "tiny.yaml",
+            "--set",
+            "scan.aim=angles",
+            "--set",
+            "scan.columns=0",
+            says=["scan.columns", "0", "at least 1"],
+        ),
         bad("run", "tiny.yaml", "--set", "no_equals", says=["no_equals", "KEY=VALUE"]),
-        bad("run", "tiny.yaml", "--set", "retrieval.search=60", says=["search", "60 px", "41 x 61"]),
+        bad(
+            "run", "tiny.yaml", "--set", "retrieval.search=60", says=["search", "60 px", "41 x 61"]
+        ),
         bad("run", "tiny.yaml", "-m", "llvm_mono", says=["render.variant", "llvm_mono", "llvm_ad"]),
         bad("run", "slab.xml", says=["slab.xml", "scene", "lidar-mi render slab.xml"]),
         bad("run", "tiny.yaml", "--set", "scan.range=1e9", says=["scan.range", "100000"]),
@@ -414,36 +516,139 @@ def bad(*arguments, says):
         bad("render", "slab.xml", "-o", "none/a.exr", says=["none is no folder"]),
         bad("render", "radius.xml", says=["laser.beam_radius", "-0.1", "above 0"]),
         bad("render", "unknown.xml", says=["unknown.xml", "bean_radius"]),
-        bad("render", "misses.xml", "-D", "range=600", "-D", "stop=602",
-            says=["gates", "600", "499.5"]),
+        bad(
+            "render",
+            "misses.xml",
+            "-D",
+            "range=600",
+            "-D",
+            "stop=602",
+            says=["gates", "600", "499.5"],
+        ),
         bad("render", "no_beams.xml", says=["film", "0 x 17", "1 x 1"]),
         bad("render", "camera.xml", says=["camera.xml", "scanning_lidar"]),
         bad("render", "path.xml", says=["path.xml", "gated_volpath"]),
         bad("retrieve", "none.exr", "rgb.exr", "--dt", "0.1", says=["none.exr", "no such file"]),
         bad("retrieve", "text.exr", "rgb.exr", "--dt", "0.1", says=["text.exr", "OpenEXR"]),
         bad("retrieve", "cut.exr", "cut.exr", "--dt", "0.1", says=["cut.exr", "OpenEXR"]),
-        bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0.1", "--layer", "Y",
-            says=["rgb.exr", "'Y'", "B, G, R"]),
-        bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0.1", "--layer", "G",
-            says=["rgb.exr", "axes", "--spacing"]),
-        bad("retrieve", "rgb.exr", "wide.exr", "--dt", "0.1", "--layer", "G", "--spacing", "1",
-            says=["21 x 17", "31 x 17"]),
-        bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0", "--layer", "G", "--spacing", "1",
-            says=["dt", "0"]),
-        bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0.1", "--layer", "G", "--spacing", "-1",
-            says=["spacing", "-1"]),
-        bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0.1", "--layer", "G", "--spacing", "1",
-            "--method", "piv", says=["method", "piv", "cc, ws"]),
-        bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0.1", "--layer", "G", "--spacing", "1",
-            "--search", "9", says=["search", "9", "template + 2"]),
-        bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0.1", "--layer", "G", "--spacing", "1",
-            "--device", "abacus", says=["device", "abacus"]),
-        bad("retrieve", "rgb.exr", "rgb.exr", "--dt", "0.1", "--layer", "G", "--spacing", "1",
-            "-o", "none/w.nc", says=["none/w.nc", "none is no folder"]),
+        bad(
+            "retrieve",
+            "rgb.exr",
+            "rgb.exr",
+            "--dt",
+            "0.1",
+            "--layer",
+            "Y",
+            says=["rgb.exr", "'Y'", "B, G, R"],
+        ),
+        bad(
+            "retrieve",
+            "rgb.exr",
+            "rgb.exr",
+            "--dt",
+            "0.1",
+            "--layer",
+            "G",
+            says=["rgb.exr", "axes", "--spacing"],
+        ),
+        bad(
+            "retrieve",
+            "rgb.exr",
+            "wide.exr",
+            "--dt",
+            "0.1",
+            "--layer",
+            "G",
+            "--spacing",
+            "1",
+            says=["21 x 17", "31 x 17"],
+        ),
+        bad(
+            "retrieve",
+            "rgb.exr",
+            "rgb.exr",
+            "--dt",
+            "0",
+            "--layer",
+            "G",
+            "--spacing",
+            "1",
+            says=["dt", "0"],
+        ),
+        bad(
+            "retrieve",
+            "rgb.exr",
+            "rgb.exr",
+            "--dt",
+            "0.1",
+            "--layer",
+            "G",
+            "--spacing",
+            "-1",
+            says=["spacing", "-1"],
+        ),
+        bad(
+            "retrieve",
+            "rgb.exr",
+            "rgb.exr",
+            "--dt",
+            "0.1",
+            "--layer",
+            "G",
+            "--spacing",
+            "1",
+            "--method",
+            "piv",
+            says=["method", "piv", "cc, ws"],
+        ),
+        bad(
+            "retrieve",
+            "rgb.exr",
+            "rgb.exr",
+            "--dt",
+            "0.1",
+            "--layer",
+            "G",
+            "--spacing",
+            "1",
+            "--search",
+            "9",
+            says=["search", "9", "template + 2"],
+        ),
+        bad(
+            "retrieve",
+            "rgb.exr",
+            "rgb.exr",
+            "--dt",
+            "0.1",
+            "--layer",
+            "G",
+            "--spacing",
+            "1",
+            "--device",
+            "abacus",
+            says=["device", "abacus"],
+        ),
+        bad(
+            "retrieve",
+            "rgb.exr",
+            "rgb.exr",
+            "--dt",
+            "0.1",
+            "--layer",
+            "G",
+            "--spacing",
+            "1",
+            "-o",
+            "none/w.nc",
+            says=["none/w.nc", "none is no folder"],
+        ),
         bad("info", "none", says=["none", "no such file"]),
         bad("info", "tiny.yaml", says=["tiny.yaml", "expected lidar-mi check tiny.yaml"]),
         bad("info", "slab.xml", says=["slab.xml", "expected .exr, .nc, .txt", "run folder"]),
-        bad("check", "tiny.yaml", "--set", "wake.spacing=1 um", says=["wake.spacing", "1e+08 nodes"]),
+        bad(
+            "check", "tiny.yaml", "--set", "wake.spacing=1 um", says=["wake.spacing", "1e+08 nodes"]
+        ),
         bad("check", "wake_senor", says=["wake_senor: no such file", "did you mean wake_sensor?"]),
         bad("check", "wake.yaml", says=["text.nc", "not NetCDF"]),
         bad("info", "smog", says=["smog", "no such file", "molecules", "spheroids"]),
@@ -464,7 +669,7 @@ def bad(*arguments, says):
         bad("info", ".", says=["no experiment.yaml", "run folder"]),
         bad("info", "foreign", says=["foreign/experiment.yaml", "run folder"]),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_one_line_and_leaves_nothing(there, lidar_mi, arguments, says):
     for name in ("text.nc", "text.exr"):
         (there / name).write_text("neither NetCDF nor OpenEXR")
@@ -484,9 +689,12 @@ def test_bad_input_is_one_line_and_leaves_nothing(there, lidar_mi, arguments, sa
         ("unknown", radius, radius.replace("beam_radius", "bean_radius")),
         ("misses", '<ref id="environment" name="medium"/>', ""),
         ("no_beams", 'name="width" value="21"', 'name="width" value="0"'),
-        ("path", re.search(r"<integrator.*</integrator>", scene, re.DOTALL)[0],
-         '<integrator type="volpath"/>'),
-    ):  # fmt: skip
+        (
+            "path",
+            re.search(r"<integrator.*</integrator>", scene, re.DOTALL)[0],
+            '<integrator type="volpath"/>',
+        ),
+    ):
         assert old in scene
         (there / f"{name}.xml").write_text(scene.replace(old, new))
     (there / "camera.xml").write_text('<scene version="3.0.0"><sensor type="perspective"/></scene>')
@@ -518,14 +726,24 @@ def test_a_missing_argument_is_a_usage_error(lidar_mi):
 
 def test_ctrl_c_stops_cleanly_and_the_run_goes_on(there):
     """In the middle of rendering, where Dr.Jit puts its own exception in the interrupt's place."""
-    slow = ["run", "tiny.yaml", "-o", "run", "--set", "render.samples_per_beam=50000",
-            "--set", "render.samples_per_pass=20000"]  # fmt: skip
+    slow = [
+        "run",
+        "tiny.yaml",
+        "-o",
+        "run",
+        "--set",
+        "render.samples_per_beam=50000",
+        "--set",
+        "render.samples_per_pass=20000",
+    ]
     with subprocess.Popen(
-        [sys.executable, "-m", "lidar_mi.cli.app", *slow], text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        [sys.executable, "-m", "lidar_mi.cli.app", *slow],
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         # a shell's background job inherits ignored interrupts
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
-    ) as process:  # fmt: skip
+    ) as process:
         seen = []
         for line in process.stderr:
             seen.append(line)
@@ -552,22 +770,33 @@ def tool(name, package):
 def test_exrheader_reads_the_pictures(demo):
     done = subprocess.run(
         [tool("exrheader", "openexr"), demo.folder / "image_t2.exr"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     for line in (
-        "gate000.S0, 32-bit floating-point", "gate000.S3, 32-bit", "gate000.S0_stderr, 32-bit",
-        "Y, 32-bit floating-point", "compression (type compression): zip",
-        "wavelength (type float): 5.32e-07", "gate_start (type float): 485", "seed (type int): 65537",
-        'gate_kind (type string): "planar"', "y (type floatvector)", "(0 0) - (218 138)",
-    ):  # fmt: skip
+        "gate000.S0, 32-bit floating-point",
+        "gate000.S3, 32-bit",
+        "gate000.S0_stderr, 32-bit",
+        "Y, 32-bit floating-point",
+        "compression (type compression): zip",
+        "wavelength (type float): 5.32e-07",
+        "gate_start (type float): 485",
+        "seed (type int): 65537",
+        'gate_kind (type string): "planar"',
+        "y (type floatvector)",
+        "(0 0) - (218 138)",
+    ):
         assert line in done.stdout
 
 
 def test_iinfo_reads_the_pictures(demo):
     done = subprocess.run(
         [tool("iinfo", "openimageio-tools"), "-v", demo.folder / "image_t1.exr"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     channels = len(read_layers(demo.folder / "image_t1.exr")[1])
     assert re.search(rf"219 x +139, {channels} channel, float openexr", done.stdout)
     assert "gate_stop: 502.5" in done.stdout
@@ -576,10 +805,17 @@ def test_iinfo_reads_the_pictures(demo):
 def test_oiiotool_sees_the_same_values(demo):
     """An independent reader: largest apparent backscatter and the mean."""
     done = subprocess.run(
-        [tool("oiiotool", "openimageio-tools"), demo.folder / "image_t1.exr", "--ch", "Y",
-         "--printstats"],
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
+        [
+            tool("oiiotool", "openimageio-tools"),
+            demo.folder / "image_t1.exr",
+            "--ch",
+            "Y",
+            "--printstats",
+        ],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
     picture = read_scan(demo.folder / "image_t1.exr")["Y"].values
     for name, value in (("Max", picture.max()), ("Avg", picture.mean(dtype=float))):
         shown = float(re.search(rf"Stats {name}: ([\d.e+-]+)", done.stdout)[1])

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
-from lidar_mi.experiment import schema as config
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
-from lidar_mi.experiment.stages.error_budget import budgets
+from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.run import run
+from lidar_mi.experiment.run_folder import IMAGES
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+from lidar_mi.experiment.stages.error_budget import budgets
+from lidar_mi.experiment.truth import blur_by_beam, make_truth
 from lidar_mi.io import exr
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
-from lidar_mi.experiment.run_folder import IMAGES
-from lidar_mi.experiment.truth import blur_by_beam, make_truth
 
 SMALL = """
 name: small
@@ -51,7 +51,9 @@ def test_a_weak_pulse_is_what_limits(ran):
             cause: metrics[f"error_budget.{method}.{cause}.share"]
             for cause in ("detector_noise", "monte_carlo", "beam_blur", "window", "method")
         }
-        assert max(share, key=share.get) == "detector_noise" and share["detector_noise"] > 0.5, share
+        assert max(share, key=share.get) == "detector_noise" and share["detector_noise"] > 0.5, (
+            share
+        )
         # the same vectors as everywhere in the run
         count = metrics[f"backscatter_noisy.{method}.valid_fraction"]
         assert 0 < metrics[f"error_budget.{method}.vectors"] <= round(count * 33 * 17)

@@ -27,35 +27,44 @@ from scipy import ndimage
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import norm, qmc
 
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
-from lidar_mi.experiment import schema as config, run_folder
-from lidar_mi.experiment import truth as truth_module
 from lidar_mi.assessment.report.digits import percent
 from lidar_mi.atmosphere.wake import read_wake
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import run_folder
+from lidar_mi.experiment import schema as config
+from lidar_mi.experiment import truth as truth_module
 from lidar_mi.experiment.run import run
+from lidar_mi.experiment.run_folder import IMAGES
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+from lidar_mi.experiment.truth import blur_by_beam, make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
-from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.io.exr import read_scan
+from lidar_mi.io.vortex_file import read_vortices
+from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
-from lidar_mi.io.vortex_file import read_vortices
-from lidar_mi.retrieval.vortices.fit import fit_vortices
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
-from lidar_mi.experiment.run_folder import IMAGES
-from lidar_mi.experiment.truth import blur_by_beam, make_truth
+from lidar_mi.retrieval.vortices.fit import fit_vortices
 
 SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
 SCENES = Path(str(files("lidar_mi.scenes")))
 
 FIGURES = {
-    "fig00_overview", "fig05_extinction", "fig06_wind_from_extinction", "fig07_deviation_from_truth",
-    "fig08_backscatter", "fig09_backscatter_against_extinction", "fig10_wind_from_backscatter",
-    "fig11_deviation_from_extinction_winds", "fig12_error_by_texture",
-    "fig12b_error_and_bound", "fig14_depolarization", "fig15_multiple_scattering",
-}  # fmt: skip
+    "fig00_overview",
+    "fig05_extinction",
+    "fig06_wind_from_extinction",
+    "fig07_deviation_from_truth",
+    "fig08_backscatter",
+    "fig09_backscatter_against_extinction",
+    "fig10_wind_from_backscatter",
+    "fig11_deviation_from_extinction_winds",
+    "fig12_error_by_texture",
+    "fig12b_error_and_bound",
+    "fig14_depolarization",
+    "fig15_multiple_scattering",
+}
 STATISTICS = [
     f"{statistic}_{name}"
     for statistic in ("rmse", "bias", "p50", "p90")
@@ -107,8 +116,12 @@ def write_wake(path, tracer, v=10.0, w=5.0, x=None):
     if x is not None:
         axes = {"x": x, **axes}
     grid = np.meshgrid(*axes.values(), indexing="ij")
-    fields = {"v": (v, "m s-1"), "w": (w, "m s-1"), "aerosol": (1.0, "1"),
-              "tracer": (tracer(*grid), "1")}  # fmt: skip
+    fields = {
+        "v": (v, "m s-1"),
+        "w": (w, "m s-1"),
+        "aerosol": (1.0, "1"),
+        "tracer": (tracer(*grid), "1"),
+    }
     data = xr.Dataset(
         {
             name: (tuple(axes), np.broadcast_to(values, grid[0].shape).copy(), {"units": unit})
@@ -141,9 +154,15 @@ def leftovers(folder):
 def test_everything_a_run_leaves(demo):
     names = {str(p.relative_to(demo.folder)) for p in demo.folder.rglob("*") if p.is_file()}
     assert names == {
-        "experiment.yaml", "image_t1.exr", "image_t2.exr", "wind.nc", "metrics.json",
-        "report.html", "log.txt", *(f"figures/{name}.png" for name in FIGURES),
-    }  # fmt: skip
+        "experiment.yaml",
+        "image_t1.exr",
+        "image_t2.exr",
+        "wind.nc",
+        "metrics.json",
+        "report.html",
+        "log.txt",
+        *(f"figures/{name}.png" for name in FIGURES),
+    }
     log = (demo.folder / "log.txt").read_text().splitlines()
     assert "seed 1" in log[0] and log[-1].endswith("done")
 
@@ -184,8 +203,14 @@ def test_the_wake_is_read_once(tmp_path, monkeypatch):
 
 def test_progress_names_every_step_and_stays_within_bounds(demo):
     texts = " | ".join(text for text, _ in demo.told)
-    for step in ("reading the wake", "rendering scan 1 of 2", "rendering scan 2 of 2",
-                 "retrieving winds from backscatter", "drawing", "done"):  # fmt: skip
+    for step in (
+        "reading the wake",
+        "rendering scan 1 of 2",
+        "rendering scan 2 of 2",
+        "retrieving winds from backscatter",
+        "drawing",
+        "done",
+    ):
         assert step in texts
     assert all(share is None or 0 <= share <= 1 for _, share in demo.told)
 
@@ -202,19 +227,34 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
         f"{source}.{method}.{key}"
         for source, method in product(SOURCES, ("cc", "ws"))
         for key in (
-            "valid_fraction", "found_fraction",
+            "valid_fraction",
+            "found_fraction",
             *(f"{part}{s}" for part in ("", "outside_cores.", "all.") for s in STATISTICS),
         )
-    }  # fmt: skip
+    }
     # the noise of a picture that was rendered is known, and so how well a wind can be found in it
-    expected |= {f"backscatter.{method}.{q}_{name}" for method in ("cc", "ws")
-                 for q in ("bound", "efficiency") for name in "vw"}  # fmt: skip
-    expected |= {"backscatter.mc_relative_error", "backscatter.multiple_scattering_fraction",
-                 "backscatter.depolarization", "backscatter.depolarization_stderr"}  # fmt: skip
-    expected |= {f"wake.{side}_core.{q}" for side in ("port", "starboard")
-                 for q in ("y", "z", "radius", "circulation")}  # fmt: skip
-    expected |= {f"texture_sweep.{level}_percent.{q}" for level in (0, 2, 5, 10, 20, 40)
-                 for q in ("rmse_v", "rmse_w", "valid_fraction")}  # fmt: skip
+    expected |= {
+        f"backscatter.{method}.{q}_{name}"
+        for method in ("cc", "ws")
+        for q in ("bound", "efficiency")
+        for name in "vw"
+    }
+    expected |= {
+        "backscatter.mc_relative_error",
+        "backscatter.multiple_scattering_fraction",
+        "backscatter.depolarization",
+        "backscatter.depolarization_stderr",
+    }
+    expected |= {
+        f"wake.{side}_core.{q}"
+        for side in ("port", "starboard")
+        for q in ("y", "z", "radius", "circulation")
+    }
+    expected |= {
+        f"texture_sweep.{level}_percent.{q}"
+        for level in (0, 2, 5, 10, 20, 40)
+        for q in ("rmse_v", "rmse_w", "valid_fraction")
+    }
     expected |= {f"true_wind.{part}rms_{q}" for part in ("", "outside_cores.") for q in "vw"}
     expected |= {f"timing.{step}_s" for step in ("truth", "render", "retrieve", "figures")}
     assert set(metrics) == expected
@@ -296,8 +336,7 @@ def test_figures_are_readable_and_not_blank(demo, name):
 
 
 @pytest.mark.parametrize(
-    "figure, of",
-    [("fig08_backscatter", "backscatter"), ("fig05_extinction", "extinction")],
+    "figure, of", [("fig08_backscatter", "backscatter"), ("fig05_extinction", "extinction")]
 )
 def test_figures_show_what_the_pilot_sees(demo, figure, of):
     """Brightness of the drawn pictures against the data: port (+y) on the left, up at the top.
@@ -334,9 +373,10 @@ class Links(HTMLParser):
         assert tag not in ("link", "iframe")
         assert tag != "script" or "src" not in dict(attributes)
         self.targets += [
-            value for key, value in attributes
+            value
+            for key, value in attributes
             if key in ("src", "href") and not value.startswith("#")
-        ]  # fmt: skip
+        ]
 
     def handle_data(self, data):
         self.words.append(data)
@@ -362,9 +402,14 @@ def test_report_tells_the_numbers(demo):
         assert text in words
     assert f"{demo.metrics['backscatter.cc.rmse_v']:.3f}" in words
     assert f"backscatter.cc.rmse_v: {demo.metrics['backscatter.cc.rmse_v']:.4g} m/s" in words
-    assert f"wake.port_core.circulation: {demo.metrics['wake.port_core.circulation']:.4g} m²/s" in words
+    assert (
+        f"wake.port_core.circulation: {demo.metrics['wake.port_core.circulation']:.4g} m²/s"
+        in words
+    )
     assert f"{demo.metrics['true_wind.rms_v']:.3g}" in words and "no skill" in words
-    noise = f"simulation {percent(demo.metrics['backscatter.mc_relative_error'])} (64 photons a beam)"
+    noise = (
+        f"simulation {percent(demo.metrics['backscatter.mc_relative_error'])} (64 photons a beam)"
+    )
     assert noise in words and "no detector" in words
     assert "cross-correlation" in words and "weight shift" in words
 
@@ -1018,8 +1063,12 @@ def test_stopped_anywhere_it_goes_on(tmp_path, quick, step):
     stamps = [path.stat().st_mtime_ns for path in done]
     metrics = run(check(small()), folder)
     assert [path.stat().st_mtime_ns for path in done] == stamps
-    expected = {"reading the wake": 0, "rendering scan 1": 0, "rendering scan 2": 1,
-                "retrieving winds": 2}[step]  # fmt: skip
+    expected = {
+        "reading the wake": 0,
+        "rendering scan 1": 0,
+        "rendering scan 2": 1,
+        "retrieving winds": 2,
+    }[step]
     assert len(done) == expected
     assert without_timing(metrics) == without_timing(run(check(small()), tmp_path / "whole"))
 

@@ -18,10 +18,11 @@ import xarray as xr
 from scipy import stats
 from scipy.constants import speed_of_light
 
-from lidar_mi.cli import app as cli
-from lidar_mi.experiment import schema as config, run as experiment
 from lidar_mi.assessment.report.digits import with_error
+from lidar_mi.cli import app as cli
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import run as experiment
+from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.stages.fringes import summed
 from lidar_mi.instrument.fringe_camera import CCD, expose
@@ -39,18 +40,31 @@ SMALL = {
         "photon_samples": 2,
         "retrieval": {
             "methods": ["annular", "pixels", "ca", "ca_r2", "ml", "sg"],
-            "averaged": [1, 9], "images": 6, "slow_images": 1,
+            "averaged": [1, 9],
+            "images": 6,
+            "slow_images": 1,
         },
     },
-}  # fmt: skip
+}
 FILES = {
-    "experiment.yaml", "fringes_emitted.exr", "fringes_photons.exr", "fringes_received_00.exr",
-    "fringes_received_01.exr", "v_los.nc", "metrics.json", "report.html", "log.txt", "figures",
-}  # fmt: skip
+    "experiment.yaml",
+    "fringes_emitted.exr",
+    "fringes_photons.exr",
+    "fringes_received_00.exr",
+    "fringes_received_01.exr",
+    "v_los.nc",
+    "metrics.json",
+    "report.html",
+    "log.txt",
+    "figures",
+}
 FIGURES = {
-    "fig03_fringes", "fig04_ring_cuts", "fig16_doppler_errors", "fig17_doppler_bias",
+    "fig03_fringes",
+    "fig04_ring_cuts",
+    "fig16_doppler_errors",
+    "fig17_doppler_bias",
     "fig18_doppler_speeds",
-}  # fmt: skip
+}
 
 
 def check(**changes):
@@ -77,9 +91,18 @@ def quick(monkeypatch):
     monkeypatch.setattr("lidar_mi.assessment.figures.doppler.draw_all", lambda *_: [])
 
 
-QUICK = {"photon_samples": 0, "v_los": [0], "render": {"samples_per_pixel": 2},
-         "retrieval": {"methods": ["annular"], "averaged": [1], "images": 1, "centre": ["known"],
-                       "slow_images": 0}}  # fmt: skip
+QUICK = {
+    "photon_samples": 0,
+    "v_los": [0],
+    "render": {"samples_per_pixel": 2},
+    "retrieval": {
+        "methods": ["annular"],
+        "averaged": [1],
+        "images": 1,
+        "centre": ["known"],
+        "slow_images": 0,
+    },
+}
 
 
 # ---------------------------------------------------------------- pictures
@@ -99,9 +122,12 @@ def mean_r2(picture, low, high):
 
 @pytest.mark.parametrize(
     ("name", "v"),
-    [("fringes_emitted.exr", 0.0), ("fringes_received_00.exr", 50.0),
-     ("fringes_received_01.exr", -300.0)],
-)  # fmt: skip
+    [
+        ("fringes_emitted.exr", 0.0),
+        ("fringes_received_00.exr", 50.0),
+        ("fringes_received_01.exr", -300.0),
+    ],
+)
 def test_rings_lie_where_the_wind_puts_them(small, name, v):
     """The second ring's middle, from the light itself, against cos(theta) = m / (m_0 (1 + 2 v / c)).
 
@@ -197,8 +223,15 @@ def test_folder_holds_what_it_should(small):
 
 
 def test_metrics_are_the_stable_ones(small):
-    measures = {"found_fraction", "bias", "bias_lowest", "bias_highest", "bias_stderr", "std",
-                "std_stderr"}  # fmt: skip
+    measures = {
+        "found_fraction",
+        "bias",
+        "bias_lowest",
+        "bias_highest",
+        "bias_stderr",
+        "std",
+        "std_stderr",
+    }
     cases = [f"centre_{c}.averaged_{n}" for c in ("free", "known") for n in (1, 9)]
     expected = {f"doppler.bound.{case}.std" for case in cases}
     for method in SMALL["doppler"]["retrieval"]["methods"]:
@@ -209,12 +242,20 @@ def test_metrics_are_the_stable_ones(small):
             f"doppler.{method}.{c}.{name}" for c in cases for name in (measures | more) - spread
         }
     expected |= {
-        f"doppler.{name}" for name in (
-            "photons", "background_photons", "signal", "speckle_modes", "line_width",
-            "free_spectral_range", "finesse", "velocity_range", "render.mc_relative_error",
+        f"doppler.{name}"
+        for name in (
+            "photons",
+            "background_photons",
+            "signal",
+            "speckle_modes",
+            "line_width",
+            "free_spectral_range",
+            "finesse",
+            "velocity_range",
+            "render.mc_relative_error",
             "render.largest_error",
         )
-    } | {f"timing.doppler_{name}_s" for name in ("render", "retrieve", "figures")}  # fmt: skip
+    } | {f"timing.doppler_{name}_s" for name in ("render", "retrieve", "figures")}
     assert set(small[1]) == expected
     assert small[1]["doppler.photons"] == pytest.approx(2.4e7, rel=0.01)
     assert small[1]["doppler.background_photons"] < 1e-4 * small[1]["doppler.photons"]
@@ -269,14 +310,19 @@ def test_another_experiment_is_refused_or_replaces(tmp_path, quick):
 def test_both_lidars_in_one_experiment(tmp_path, quick, monkeypatch):
     monkeypatch.setattr("lidar_mi.experiment.stages.backscatter.figures.draw_all", lambda *_: [])
     monkeypatch.setattr("lidar_mi.experiment.stages.backscatter.TEXTURE_SWEEP", ())
-    both = config.check({
-        "name": "both",
-        "wake": {"vortex_pair": {"width": "40 m", "height": "30 m", "separation": "15 m"},
-                 "spacing": "1 m"},
-        "render": {"samples_per_beam": 2, "max_order": 1},
-        "retrieval": {"methods": ["cc"]},
-        "doppler": {**QUICK, "camera": CAMERA},
-    }, "both")  # fmt: skip
+    both = config.check(
+        {
+            "name": "both",
+            "wake": {
+                "vortex_pair": {"width": "40 m", "height": "30 m", "separation": "15 m"},
+                "spacing": "1 m",
+            },
+            "render": {"samples_per_beam": 2, "max_order": 1},
+            "retrieval": {"methods": ["cc"]},
+            "doppler": {**QUICK, "camera": CAMERA},
+        },
+        "both",
+    )
     metrics = run(both, tmp_path)
     assert {"wind.nc", "v_los.nc", "image_t1.exr", "fringes_emitted.exr"} <= {
         path.name for path in tmp_path.iterdir()
@@ -316,12 +362,16 @@ def test_what_cannot_work_is_said_before_anything_is_written(tmp_path, changes, 
         ({"doppler": {"v_los": [1, 1]}}, "x: doppler: v_los: 1.0 twice is not allowed"),
         ({"doppler": {"photon_samples": 1}}, "x: doppler: photon_samples: 1 is not allowed"),
         ({"doppler": {"speckle_modes": 0}}, "x: doppler.speckle_modes: 0 is not allowed"),
-        ({"doppler": {"retrieval": {"images": 2}}},
-         "x: doppler.retrieval: slow_images: 3 is not allowed; expected at most images = 2"),
-        ({"doppler": {"retrieval": {"methods": ["annular", "annular"]}}},
-         "x: doppler.retrieval: methods: 'annular' twice is not allowed"),
+        (
+            {"doppler": {"retrieval": {"images": 2}}},
+            "x: doppler.retrieval: slow_images: 3 is not allowed; expected at most images = 2",
+        ),
+        (
+            {"doppler": {"retrieval": {"methods": ["annular", "annular"]}}},
+            "x: doppler.retrieval: methods: 'annular' twice is not allowed",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_fault_in_the_file_is_one_line(data, message):
     with pytest.raises(InputError) as error:
         config.check({"name": "a"} | data, "x")

@@ -14,18 +14,17 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.experiment.stages import (
-    backscatter as backscatter_chain,
-    fringes as fringe_chain,
-    sensor as sensor_chain,
-)
-from lidar_mi.experiment import check, schema as config
-from lidar_mi.assessment.report import sensor as sensor_report
 from lidar_mi.assessment.metrics.cores import Core
-from lidar_mi.assessment.report.page import page
 from lidar_mi.assessment.metrics.requirements import read_requirements
+from lidar_mi.assessment.report import sensor as sensor_report
+from lidar_mi.assessment.report.page import page
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import check
+from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.run import run
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+from lidar_mi.experiment.stages import fringes as fringe_chain
+from lidar_mi.experiment.stages import sensor as sensor_chain
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
 
@@ -48,7 +47,12 @@ SMALL = {
         "render": {"samples_per_pixel": 16},
     },
     "sensor": {
-        "directions": {"columns": 5, "rows": 3, "azimuth_half": "14 deg", "elevation_half": "8 deg"},
+        "directions": {
+            "columns": 5,
+            "rows": 3,
+            "azimuth_half": "14 deg",
+            "elevation_half": "8 deg",
+        },
         "method": "cc",
         "crossflow_std": "0.8 m/s",
     },
@@ -96,16 +100,31 @@ def test_the_whole_chain(whole):
     # nine lines, wider apart, hold v and w better than three
     assert metrics["sensor.neighbours.rmse_v"] < metrics["sensor.triples.rmse_v"]
     report = (folder / "report.html").read_text()
-    for text in ("flight control, from wind vectors, landing", "at most 2.5 m/s",
-                 "safe for eyes from", "0.002 J/m² of each pulse", "up to nine by least squares",
-                 "asked for takes 1 of them a direction",
-                 "The pictures take 77000 pulses a second", "2.1 s later", "u is off by", "The wind from both lidars"):  # fmt: skip
+    for text in (
+        "flight control, from wind vectors, landing",
+        "at most 2.5 m/s",
+        "safe for eyes from",
+        "0.002 J/m² of each pulse",
+        "up to nine by least squares",
+        "asked for takes 1 of them a direction",
+        "The pictures take 77000 pulses a second",
+        "2.1 s later",
+        "u is off by",
+        "The wind from both lidars",
+    ):
         assert text in report, text
     for name in ("fig19_lines_of_sight", "fig20_wind3d", "fig22_vortices"):
         assert (folder / "figures" / f"{name}.png").stat().st_size > 10_000
     # pictures, then the verdict, then numbers
-    order = ["what is required:", "<canvas", "data:image", 'id="verdict-1"', 'class="pass"',
-             'id="numbers-1"', "All numbers"]  # fmt: skip
+    order = [
+        "what is required:",
+        "<canvas",
+        "data:image",
+        'id="verdict-1"',
+        'class="pass"',
+        'id="numbers-1"',
+        "All numbers",
+    ]
     places = [report.index(text) for text in order]
     assert places == sorted(places)
 
@@ -128,7 +147,9 @@ def test_files_keep_the_conventions(whole, name):
                 assert len(masks) == len(variable.attrs["flag_meanings"].split())
             else:
                 assert variable.attrs.get("units"), key
-        axes = {axis: data[axis].attrs.get("axis") for axis in ("x", "y", "z") if axis in data.variables}
+        axes = {
+            axis: data[axis].attrs.get("axis") for axis in ("x", "y", "z") if axis in data.variables
+        }
         assert all(found == axis.upper() for axis, found in axes.items())
         if name == "wind3d.nc":
             assert set(axes) == {"x", "y", "z"} and float(data["x"]) == 150
@@ -180,14 +201,21 @@ def without(arguments):
 @pytest.mark.usefixtures("variant")
 def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
     report, folder = again(
-        whole, tmp_path, monkeypatch,
+        whole,
+        tmp_path,
+        monkeypatch,
         lambda wind, lines: (wind.assign(flag=xr.full_like(wind["flag"], 4)), lines),
-    )  # fmt: skip
+    )
     assert "Warning: no wind from both lidars: crossflow" in report
     assert "no vortex pair from the wind vectors: vectors: none were found" in report
     # what there is: the scan, the verdict on it, the pair in the images
-    for text in ("The scan of the Doppler lidar", "at most 2.5 m/s", "not known", "cannot be told",
-                 "From the images, circulation is off by"):  # fmt: skip
+    for text in (
+        "The scan of the Doppler lidar",
+        "at most 2.5 m/s",
+        "not known",
+        "cannot be told",
+        "From the images, circulation is off by",
+    ):
         assert text in report, text
     assert not (folder / "wind3d.nc").exists()
     assert set(read_vortices(folder / "vortex.json")) == {"images"}
@@ -199,9 +227,11 @@ def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypat
 @pytest.mark.usefixtures("variant")
 def test_lines_that_cannot_be_read_are_said_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
     report, folder = again(
-        whole, tmp_path, monkeypatch,
+        whole,
+        tmp_path,
+        monkeypatch,
         lambda wind, lines: (wind, lines.assign(v_los=lines["v_los"] * np.nan)),
-    )  # fmt: skip
+    )
     assert "Warning: no wind from both lidars: " in report
     assert "0 of 15 lines of sight were read" in report
     assert "From the images, circulation is off by" in report
@@ -212,13 +242,20 @@ def test_lines_that_cannot_be_read_are_said_and_the_rest_is_shown(whole, tmp_pat
 @pytest.mark.usefixtures("variant")
 def test_two_lines_give_no_vector_and_that_is_said(whole, tmp_path, monkeypatch):
     report, folder = again(
-        whole, tmp_path, monkeypatch,
-        lambda wind, lines: (wind, lines.assign(v_los=lines["v_los"].where(np.arange(15) % 14 == 0))),
-    )  # fmt: skip
+        whole,
+        tmp_path,
+        monkeypatch,
+        lambda wind, lines: (
+            wind,
+            lines.assign(v_los=lines["v_los"].where(np.arange(15) % 14 == 0)),
+        ),
+    )
     assert "Warning: no vector from both lidars is good; 100 % have the flag beyond_lines" in report
     assert "no wind from lines of sight alone: no three lines beside each other could" in report
     # the scan and the vectors that were rejected, but no figures of nothing
-    assert "The scan of the Doppler lidar" in report and "2 of 15 lines of sight were read" in report
+    assert (
+        "The scan of the Doppler lidar" in report and "2 of 15 lines of sight were read" in report
+    )
     assert "How certain it is" not in report and '"beyond lines"' in report
     with xr.open_dataset(folder / "wind3d.nc", engine="h5netcdf") as wind:
         assert (wind["flag"].values != 0).all()
@@ -237,25 +274,39 @@ def test_errors_of_a_known_field():
     axes = {"z": np.zeros(1), "y": np.arange(10.0)}
     one = xr.DataArray(np.ones((1, 10)), coords=axes, dims=("z", "y"))
     spot = one * (one.y == 0)
-    found = xr.Dataset({
-        "u": 5 + 0.5 * one, "v": 2 * one, "w": 3 * spot, "u_true": 5 * one, "v_true": 0 * one,
-        "w_true": 0 * one, "u_stderr": 0.51 * one, "v_stderr": one, "w_stderr": one,
-        "flag": (one * (one.y == 9)).astype(np.uint8),
-    })  # fmt: skip
+    found = xr.Dataset(
+        {
+            "u": 5 + 0.5 * one,
+            "v": 2 * one,
+            "w": 3 * spot,
+            "u_true": 5 * one,
+            "v_true": 0 * one,
+            "w_true": 0 * one,
+            "u_stderr": 0.51 * one,
+            "v_stderr": one,
+            "w_stderr": one,
+            "flag": (one * (one.y == 9)).astype(np.uint8),
+        }
+    )
     metrics = sensor_chain.errors(found, [Core(y=0.0, z=0.0, radius=0.3, circulation=400.0)])
     assert metrics["sensor.vectors"] == 9 and metrics["sensor.good_fraction"] == 0.9
     assert metrics["sensor.rmse_u"] == pytest.approx(0.5) == metrics["sensor.bias_u"]
     assert metrics["sensor.coverage_68_u"] == 1 and metrics["sensor.coverage_95_v"] == 0
     assert metrics["sensor.reduced_variance_v"] == pytest.approx(4)
     assert metrics["sensor.rmse_w"] == pytest.approx(1)
-    assert metrics["sensor.outside_cores.rmse_w"] == 0 and metrics["sensor.outside_cores.rms_u"] == 5
+    assert (
+        metrics["sensor.outside_cores.rmse_w"] == 0 and metrics["sensor.outside_cores.rms_u"] == 5
+    )
 
 
 @pytest.mark.parametrize(
     ("amplitude", "noise", "errors", "limit"),
-    [(0.0, 0.5, {}, "line_noise"), (1.0, 0.01, {}, "between_lines"),
-     (0.0, 0.01, {"yaw": "20 mrad"}, "pointing")],
-)  # fmt: skip
+    [
+        (0.0, 0.5, {}, "line_noise"),
+        (1.0, 0.01, {}, "between_lines"),
+        (0.0, 0.01, {"yaw": "20 mrad"}, "pointing"),
+    ],
+)
 def test_what_limits_u_is_found(amplitude, noise, errors, limit):
     """An even u is limited by the noise of its lines, or by a yaw that is not known; a u of 4 m waves
     by what lies between them."""
@@ -268,13 +319,26 @@ def test_what_limits_u_is_found(amplitude, noise, errors, limit):
         {n: (("z", "y"), f) for n, f in fields.items()},
         coords={"y": ("y", y, metres), "z": ("z", z, metres)},
     )
-    lines = scan_wind(truth, experiment.sensor.directions, experiment.doppler.lidar, noise, 1, 70.0,
-                      experiment.sensor.errors)  # fmt: skip
+    lines = scan_wind(
+        truth,
+        experiment.sensor.directions,
+        experiment.doppler.lidar,
+        noise,
+        1,
+        70.0,
+        experiment.sensor.errors,
+    )
     crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), np.zeros(waves.shape, np.uint8)))
     crossflow.attrs = {"template": 4, "stride": 1}
     found = sensor_chain._combined(experiment, truth, lines, crossflow)
     metrics = sensor_chain.budget_of_u(experiment, truth, lines, crossflow, found, [])
-    causes = ["line_noise", "range_bin", "crossflow", "between_lines", *(["pointing"] if errors else [])]
+    causes = [
+        "line_noise",
+        "range_bin",
+        "crossflow",
+        "between_lines",
+        *(["pointing"] if errors else []),
+    ]
     shares = {c: metrics[f"sensor.error_budget.{c}.share_u"] for c in causes}
     other = "line_noise" if amplitude else "between_lines"
     assert shares[limit] > 0.9 and shares[other] < 0.1
@@ -315,7 +379,10 @@ def test_the_share_of_noise_is_between_what_draws_and_the_lines_say():
         assert metrics["sensor.error_budget.line_noise.share_u"] == pytest.approx(gained[-1] / full)
         winds.append(found["u"].values[good])
     scatter = np.var(winds, axis=0, ddof=1).mean()
-    assert scatter - 3 * np.std(gained) / math.sqrt(8) < np.mean(gained) < noise**2, (scatter, gained)
+    assert scatter - 3 * np.std(gained) / math.sqrt(8) < np.mean(gained) < noise**2, (
+        scatter,
+        gained,
+    )
 
 
 def test_points_are_counted_as_each_table_means_them():
@@ -348,10 +415,16 @@ def test_bad_descriptions_are_named(sections, message):
 @pytest.mark.parametrize(
     ("sections", "start"),
     [
-        ({"doppler": {"lidar": {"range": "56 m"}}}, "doppler.lidar.range: 56 m is not allowed with"),
+        (
+            {"doppler": {"lidar": {"range": "56 m"}}},
+            "doppler.lidar.range: 56 m is not allowed with",
+        ),
         ({"sensor": {"directions": {"azimuth_half": "25 deg"}}}, "sensor.directions: wind: y from"),
         ({"sensor": {"requirements": "mine.yaml"}}, "sensor.requirements: mine.yaml not found"),
-        ({"platform": {"speed": "1200 m/s"}}, "platform.speed: 1200 m/s is not allowed with sensor"),
+        (
+            {"platform": {"speed": "1200 m/s"}},
+            "platform.speed: 1200 m/s is not allowed with sensor",
+        ),
     ],
 )
 def test_what_does_not_go_together_is_said_ahead(sections, start):

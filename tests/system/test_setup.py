@@ -259,9 +259,14 @@ def test_a_bad_path_set_by_the_user_is_not_answered_with_apt(machine):
 def test_make_without_a_target_lists_every_target():
     environ = {k: v for k, v in os.environ.items() if not k.startswith(("MAKE", "MFLAGS"))}
     done = subprocess.run(
-        ["make", "-s"], check=True, capture_output=True, text=True, cwd=ROOT, env=environ,
+        ["make", "-s"],
+        check=True,
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env=environ,
         timeout=30,
-    )  # fmt: skip
+    )
     for target in ["setup", "demo", "test", "test-all", "bench", "lint", "clean"]:
         assert f"make {target} " in done.stdout
 

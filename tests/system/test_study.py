@@ -15,17 +15,17 @@ import xarray as xr
 import yaml
 from matplotlib.image import imread
 
-from lidar_mi.experiment.stages import (
-    backscatter as backscatter_chain,
-    fringes as fringe_chain,
-    volume as volume_chain,
-)
-from lidar_mi.experiment import schema as config, run as experiment, study
 from lidar_mi.assessment.report import comparison
 from lidar_mi.assessment.report.comparison import differences, flat
 from lidar_mi.assessment.report.digits import three
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import run as experiment
+from lidar_mi.experiment import schema as config
+from lidar_mi.experiment import study
 from lidar_mi.experiment.info import sections
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+from lidar_mi.experiment.stages import fringes as fringe_chain
+from lidar_mi.experiment.stages import volume as volume_chain
 
 SCENES = Path(str(files("lidar_mi.scenes"))).resolve()
 PAIR = {"circulation": 150, "separation": 16, "core_radius": 2, "width": 30, "height": 20}
@@ -95,7 +95,10 @@ def test_plain_files_have_none(file):
         ({"near": 3}, "variants.near: 3 is not allowed; expected keys to change"),
         ({"a/b": {}}, "variants.a/b: not allowed; expected a name of letters"),
         ({"near": {"name": "x"}}, "variants.near.name: not allowed"),
-        ({"near": {"scan": {"rnage": 1}}}, "variants.near: scan.rnage: unknown key; did you mean range?"),
+        (
+            {"near": {"scan": {"rnage": 1}}},
+            "variants.near: scan.rnage: unknown key; did you mean range?",
+        ),
         ({"near": {"seed": -1}}, "variants.near: seed: -1"),
     ],
 )
@@ -121,7 +124,11 @@ def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
         assert (folder / name / "report.html").is_file()
     page = (folder / "report.html").read_text()
     assert '<a href="near/report.html">' in page and '<a href="far/report.html">' in page
-    cells = dict(re.findall(r"<tr><td>([^<]+)</td>(?:<td>[^<]*</td>)?<td>([^<]+)</td><td>[^<]+</td></tr>", page))
+    cells = dict(
+        re.findall(
+            r"<tr><td>([^<]+)</td>(?:<td>[^<]*</td>)?<td>([^<]+)</td><td>[^<]+</td></tr>", page
+        )
+    )
     assert cells["scan.range"] == "150 m"
     assert float(cells["hazard distance of a beam, naked eye"]) == pytest.approx(
         found["near"]["safety.hazard_distance"], rel=5e-3
@@ -147,14 +154,18 @@ def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
 
 VOLUME = {
     "wake": {
-        "file": "wake_volume_40s.nc", "vortex_pair": None, "time": "40 s", "depth": "volume",
-        "x": "20 m", "spacing": "1 m",
+        "file": "wake_volume_40s.nc",
+        "vortex_pair": None,
+        "time": "40 s",
+        "depth": "volume",
+        "x": "20 m",
+        "spacing": "1 m",
     },
     "scan": {"range": "495 m", "thickness": "10 m", "gate_count": 10},
     "render": {"samples_per_beam": 60, "max_order": 1},
     "retrieval": None,
     "volume": {"methods": ["correlation"], "stride": 4},
-}  # fmt: skip
+}
 
 
 @pytest.mark.usefixtures("variant")
@@ -163,7 +174,9 @@ def test_volumes_are_compared(file, tmp_path, monkeypatch):
     monkeypatch.setattr(volume_chain, "draw_all", lambda *_: [])
     drawn, draw = {}, study.draw_comparison
     monkeypatch.setattr(
-        study, "draw_comparison", lambda folder, rows, log: drawn.update(rows) or draw(folder, rows, log)
+        study,
+        "draw_comparison",
+        lambda folder, rows, log: drawn.update(rows) or draw(folder, rows, log),
     )
     metrics = study.run(
         "two", config.load_variants(file(variants={"volume": VOLUME})), tmp_path / "out"
@@ -186,8 +199,10 @@ def test_doppler_lidars_alone_are_compared(tmp_path, monkeypatch):
     data = {
         "name": "rings",
         "doppler": {
-            "camera": {"pixel": "29.6 um", "width": 240, "height": 195}, "v_los": [0.0],
-            "photon_samples": 0, "ccd": {"full_well": 1e8, "bits": None},
+            "camera": {"pixel": "29.6 um", "width": 240, "height": 195},
+            "v_los": [0.0],
+            "photon_samples": 0,
+            "ccd": {"full_well": 1e8, "bits": None},
             "render": {"samples_per_pixel": 16},
             "retrieval": {"methods": ["annular"], "averaged": [1], "images": 3, "slow_images": 0},
         },
@@ -195,7 +210,7 @@ def test_doppler_lidars_alone_are_compared(tmp_path, monkeypatch):
             "near": {"doppler": {"lidar": {"range": "56 m"}}},
             "far": {"doppler": {"lidar": {"range": "76 m"}}},
         },
-    }  # fmt: skip
+    }
     monkeypatch.setattr(fringe_chain.doppler_figures, "draw_all", lambda *_: [])
     path = tmp_path / "rings.yaml"
     path.write_text(yaml.safe_dump(data, sort_keys=False))
@@ -219,7 +234,9 @@ def test_info_on_a_study_that_was_stopped(tmp_path):
     folder.mkdir()
     (folder / "study.yaml").write_text("{name: two, variants: [near, far]}")
     title, rows = next(sections(str(folder)))
-    assert title == f"{folder}: study two" and rows == [("variant", "near (not run)", "far (not run)")]
+    assert title == f"{folder}: study two" and rows == [
+        ("variant", "near (not run)", "far (not run)")
+    ]
     (folder / "study.yaml").write_text("[1]")
     with pytest.raises(InputError, match="study.yaml: not written by a study"):
         list(sections(str(folder)))
@@ -234,7 +251,10 @@ def test_a_fault_in_the_last_stops_the_first(file, tmp_path):
 
 
 def test_differences_of_settings():
-    one, other = {"a": {"b": 1, "c": [1]}, "name": "x"}, {"a": {"b": 2, "c": [1]}, "d": 3, "name": "y"}
+    one, other = (
+        {"a": {"b": 1, "c": [1]}, "name": "x"},
+        {"a": {"b": 2, "c": [1]}, "d": 3, "name": "y"},
+    )
     assert differences({"x": flat(one), "y": flat(other)}) == {"a.b": [1, 2], "d": [None, 3]}
 
 
@@ -251,7 +271,9 @@ def shipped():
 
 def test_shipped_experiments_are_documented():
     """Each has a page that says what it finds."""
-    pages = {page.stem for page in (SCENES.parent / "docs" / "experiments").glob("*.md")} - {"index"}
+    pages = {page.stem for page in (SCENES.parent / "docs" / "experiments").glob("*.md")} - {
+        "index"
+    }
     assert pages and pages <= {path.stem for path in SCENES.glob("*.yaml")}
 
 
@@ -264,14 +286,22 @@ def test_shipped_experiments_fit_together(name, one):
 
 # what makes a shipped experiment small; what it is about stays
 SMALLER = (
-    "wake.spacing=1 m", "render.samples_per_beam=8", "render.max_order=1", "retrieval.methods=[cc]",
-    "retrieval.stride=4", "seed=2",
-)  # fmt: skip
+    "wake.spacing=1 m",
+    "render.samples_per_beam=8",
+    "render.max_order=1",
+    "retrieval.methods=[cc]",
+    "retrieval.stride=4",
+    "seed=2",
+)
 SMALLER_SENSOR = (
-    "sensor.method=cc", "sensor.crossflow_std=0.5 m/s", "sensor.pulses=5", "doppler.ccd.full_well=1e6",
-    "doppler.camera={pixel: 29.6 um, width: 240, height: 195}", "doppler.render.samples_per_pixel=16",
+    "sensor.method=cc",
+    "sensor.crossflow_std=0.5 m/s",
+    "sensor.pulses=5",
+    "doppler.ccd.full_well=1e6",
+    "doppler.camera={pixel: 29.6 um, width: 240, height: 195}",
+    "doppler.render.samples_per_pixel=16",
     "doppler.retrieval={methods: [annular], averaged: [1], images: 2, slow_images: 0}",
-)  # fmt: skip
+)
 
 
 def small_run(name, folder, more=()):
@@ -309,14 +339,17 @@ def test_nearer_light_is_stronger(tmp_path):
     """Photons of a direction go with 1 / r^2 and the air between; lines are read better by as much."""
     found = small_run("near_range", tmp_path / "run", SMALLER_SENSOR)
     far, near = found["at_150m"], found["at_76m"]
-    ratio = near["sensor.doppler.photons_per_direction"] / far["sensor.doppler.photons_per_direction"]
+    ratio = (
+        near["sensor.doppler.photons_per_direction"] / far["sensor.doppler.photons_per_direction"]
+    )
     assert ratio == pytest.approx((150 / 76) ** 2, rel=0.01)
     assert near["sensor.rmse_v_los"] < far["sensor.rmse_v_los"]
     # what lines see of v and w is taken out of u, as well as so few pulses tell v and w
     for one in found.values():
         assert one["sensor.rmse_u"] < 0.5 * one["sensor.triples.rmse_u"], (
-            one["sensor.rmse_u"], one["sensor.triples.rmse_u"]
-        )  # fmt: skip
+            one["sensor.rmse_u"],
+            one["sensor.triples.rmse_u"],
+        )
 
 
 @pytest.mark.slow

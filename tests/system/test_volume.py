@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.experiment import schema as config
-from lidar_mi.experiment.stages import volume as volume_chain
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.run import run
+from lidar_mi.experiment.stages import volume as volume_chain
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 
@@ -23,13 +23,17 @@ from lidar_mi.instrument.scan import Scan, plan_scans
 SMALL = {
     "name": "small",
     "wake": {
-        "file": "wake_volume_40s.nc", "time": "40 s", "depth": "volume", "x": "20 m", "spacing": "1 m",
+        "file": "wake_volume_40s.nc",
+        "time": "40 s",
+        "depth": "volume",
+        "x": "20 m",
+        "spacing": "1 m",
     },
     "platform": {"dt": "0.2 s"},
     "scan": {"range": "495 m", "thickness": "10 m", "gate_count": 10},
     "render": {"samples_per_beam": 240, "max_order": 1},
     "volume": {"methods": ["correlation"], "stride": 2},
-}  # fmt: skip
+}
 
 
 def changed(**sections):
@@ -62,7 +66,9 @@ def test_the_whole_chain(tmp_path):
     report = (tmp_path / "run" / "report.html").read_text()
     for text in ("Wind in three dimensions", "10 slabs of 1 m", "rms standard error, as stated"):
         assert text in report, text
-    assert (tmp_path / "run" / "figures" / "fig31_wind_in_three_dimensions.png").stat().st_size > 10_000
+    assert (
+        tmp_path / "run" / "figures" / "fig31_wind_in_three_dimensions.png"
+    ).stat().st_size > 10_000
 
 
 def test_gates_are_put_where_their_air_is():
@@ -78,9 +84,7 @@ def test_gates_are_put_where_their_air_is():
     for plan in plans:
         middle = plan.gate_start + 0.5 + np.arange(8)
         reach = middle[:, None, None] / plan.centre
-        seen = pattern(
-            middle[:, None, None] + plan.position, reach * axis[:, None], reach * axis
-        )
+        seen = pattern(middle[:, None, None] + plan.position, reach * axis[:, None], reach * axis)
         # the lidar equation, by hand
         oblique = np.sqrt(1 + (axis[:, None] ** 2 + axis**2) / plan.centre**2)
         r = middle[:, None, None] * oblique
@@ -90,8 +94,13 @@ def test_gates_are_put_where_their_air_is():
         expected = pattern(*np.meshgrid(*nodes, indexing="ij"))
         np.testing.assert_allclose(found.transpose("x", "z", "y"), expected, atol=1e-3)
     with pytest.raises(AssertionError):  # the test can fail: a scan referred to the wrong place
-        wrong = volume_chain.scan_volume(s0, replace(plan, gate_start=plan.gate_start + 8,
-                                         gate_stop=plan.gate_stop + 8), lidar, 1e-4, nodes)  # fmt: skip
+        wrong = volume_chain.scan_volume(
+            s0,
+            replace(plan, gate_start=plan.gate_start + 8, gate_stop=plan.gate_stop + 8),
+            lidar,
+            1e-4,
+            nodes,
+        )
         np.testing.assert_allclose(wrong, expected, atol=1e-3)
 
 
@@ -102,12 +111,14 @@ def test_gates_are_put_where_their_air_is():
         ({"scan": {"gates": "spherical"}}, "scan.gates: spherical"),
         ({"wake": {"depth": "plane"}}, "volume: not allowed without a wake in three dimensions"),
         ({"wake": {"second": "40.2 s"}}, "wake.second: 40.2 s is not allowed with volume"),
-        ({"retrieval": {"methods": ["cc"]}, "volume": {"stride": 1}, "wake": {"x": "21 m"}},
-         "retrieval: not allowed with volume"),
+        (
+            {"retrieval": {"methods": ["cc"]}, "volume": {"stride": 1}, "wake": {"x": "21 m"}},
+            "retrieval: not allowed with volume",
+        ),
         ({"volume": {"methods": ["correlation", "correlation"]}}, "methods: 'correlation' twice"),
         ({"volume": {"template": 2}}, "volume.template: 2"),
     ],
-)  # fmt: skip
+)
 def test_bad_descriptions_are_named(sections, message):
     with pytest.raises(InputError) as error:
         changed(**sections)

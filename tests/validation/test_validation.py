@@ -130,11 +130,14 @@ def test_wrong_light_transport_is_found(effort, monkeypatch):
         ours = np.stack([scattering.simulate(case, 10_000, 3, 99 + s)[0] for s in range(32)])
         rows = [
             scattering.difference("all", ours[..., 0].sum((1, 2)), other[..., 0].sum((1, 2))),
-            report.spread("z", "b", scattering.scores(ours[..., 0].sum(2), other[..., 0].sum(2)), 32),
+            report.spread(
+                "z", "b", scattering.scores(ours[..., 0].sum(2), other[..., 0].sum(2)), 32
+            ),
         ]
         assert not all(row.passed for row in rows), wrong
-    again = np.stack([scattering.simulate(scattering.RAYLEIGH, 10_000, 3, 500 + s)[0]
-                      for s in range(32)])  # fmt: skip
+    again = np.stack(
+        [scattering.simulate(scattering.RAYLEIGH, 10_000, 3, 500 + s)[0] for s in range(32)]
+    )
     assert scattering.difference("all", again[..., 0].sum((1, 2)), other[..., 0].sum((1, 2))).passed
 
 
@@ -189,7 +192,9 @@ def test_stored_numbers_belong_to_the_cases():
     script = import_module("validation.eradiate_reference")
     eradiate = import_module("validation.eradiate")
     stored = json.loads(eradiate.STORED.read_text())
-    assert {name: (c["phase"], c["max_order"]) for name, c in stored["cases"].items()} == script.CASES
+    assert {
+        name: (c["phase"], c["max_order"]) for name, c in stored["cases"].items()
+    } == script.CASES
     assert stored["albedo"] == script.ALBEDO and stored["cone_half_angle"] == script.CONE
     for case in stored["cases"].values():
         assert 0 < case["stderr"][0] < 3e-3 * case["stokes"][0]

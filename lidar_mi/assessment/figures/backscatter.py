@@ -17,15 +17,20 @@ from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.errors import deviations, error_by_quality
 
 METHOD_NAMES = {
-    "cc": "cross-correlation", "ws": "weight shift", "multipass": "multi-pass correlation",
-    "variational": "variational retrieval", "vortex_fit": "vortex fit",
-}  # fmt: skip
+    "cc": "cross-correlation",
+    "ws": "weight shift",
+    "multipass": "multi-pass correlation",
+    "variational": "variational retrieval",
+    "vortex_fit": "vortex fit",
+}
 
 SOURCE_NAMES = {
-    "backscatter": "backscatter", "backscatter_noisy": "backscatter with detector noise",
-    "extinction": "extinction", "extinction_blurred": "extinction blurred by the beam",
+    "backscatter": "backscatter",
+    "backscatter_noisy": "backscatter with detector noise",
+    "extinction": "extinction",
+    "extinction_blurred": "extinction blurred by the beam",
     "extinction_without_texture": "extinction without texture",
-}  # fmt: skip
+}
 """What winds are retrieved from, as figures and tables call it."""
 
 BACKSCATTER = "apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$"
@@ -58,7 +63,12 @@ class Drawn:
 
 
 def draw_all(
-    folder: Path, truth, scans, found: xr.Dataset, cores: list[Core], sweep: dict[str, float],
+    folder: Path,
+    truth,
+    scans,
+    found: xr.Dataset,
+    cores: list[Core],
+    sweep: dict[str, float],
     log: Callable,
 ) -> list[Drawn]:
     """Draw every figure of a backscatter run as PNG into ``folder``.
@@ -72,34 +82,68 @@ def draw_all(
     """
     scale = _scale(truth)
     plates = (
-        ("fig00_overview", "What the lidar sees, and the wind found in it",
-         _overview(scans, found, cores, scale)),
+        (
+            "fig00_overview",
+            "What the lidar sees, and the wind found in it",
+            _overview(scans, found, cores, scale),
+        ),
         ("fig05_extinction", "Extinction", _extinction(truth)),
-        ("fig06_wind_from_extinction", "Wind: truth and from the extinction pair",
-         _wind_and_truth(truth, found, cores, scale)),
-        ("fig07_deviation_from_truth", "Winds from extinction against the truth",
-         _deviation_maps(found, "extinction", None)),
+        (
+            "fig06_wind_from_extinction",
+            "Wind: truth and from the extinction pair",
+            _wind_and_truth(truth, found, cores, scale),
+        ),
+        (
+            "fig07_deviation_from_truth",
+            "Winds from extinction against the truth",
+            _deviation_maps(found, "extinction", None),
+        ),
         ("fig08_backscatter", "Backscatter images", _backscatter(scans)),
-        ("fig09_backscatter_against_extinction", "Backscatter against extinction",
-         _picture_differences(truth, scans)),
-        ("fig10_wind_from_backscatter", "Wind from the backscatter pair",
-         _retrieved(found, "backscatter", cores, scale)),
-        ("fig11_deviation_from_extinction_winds", "What the instrument changes in the winds",
-         _deviation_maps(found, "backscatter", "extinction")),
+        (
+            "fig09_backscatter_against_extinction",
+            "Backscatter against extinction",
+            _picture_differences(truth, scans),
+        ),
+        (
+            "fig10_wind_from_backscatter",
+            "Wind from the backscatter pair",
+            _retrieved(found, "backscatter", cores, scale),
+        ),
+        (
+            "fig11_deviation_from_extinction_winds",
+            "What the instrument changes in the winds",
+            _deviation_maps(found, "backscatter", "extinction"),
+        ),
         ("fig12_error_by_texture", "Error and texture", _error_by_texture(found, sweep)),
-    )  # fmt: skip
+    )
     if (drawn := _error_and_bound(found)) is not None:
         plates += (("fig12b_error_and_bound", "Errors and what the noise allows", drawn),)
     if "depolarization" in scans[0]:
-        plates += (("fig14_depolarization", "Linear depolarisation ratio", _product(
-            scans[0], "depolarization", "linear depolarisation ratio",
-            "Linear depolarisation ratio of the first picture, cross- over co-polarised light.",
-        )),)  # fmt: skip
+        plates += (
+            (
+                "fig14_depolarization",
+                "Linear depolarisation ratio",
+                _product(
+                    scans[0],
+                    "depolarization",
+                    "linear depolarisation ratio",
+                    "Linear depolarisation ratio of the first picture, cross- over co-polarised light.",
+                ),
+            ),
+        )
     if "multiple_scattering_fraction" in scans[0]:
-        plates += (("fig15_multiple_scattering", "Multiple scattering", _product(
-            scans[0], "multiple_scattering_fraction", "share of multiple scattering",
-            "Share of the light of the first picture that was scattered more than once.",
-        )),)  # fmt: skip
+        plates += (
+            (
+                "fig15_multiple_scattering",
+                "Multiple scattering",
+                _product(
+                    scans[0],
+                    "multiple_scattering_fraction",
+                    "share of multiple scattering",
+                    "Share of the light of the first picture that was scattered more than once.",
+                ),
+            ),
+        )
     return save_all(folder, plates, log)
 
 
@@ -152,15 +196,25 @@ def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale)
     y, z = (np.broadcast_to(thin[f"{a}_vector"], thin["v"].shape).ravel() for a in "yz")
     v, w, flag = (thin[name].values.ravel() for name in ("v", "w", "flag"))
     known = np.isfinite(v) & np.isfinite(w)
-    style = {"angles": "xy", "scale_units": "xy", "scale": scale.limit / (1.8 * step),
-             "width": 0.0022}  # fmt: skip
+    style = {
+        "angles": "xy",
+        "scale_units": "xy",
+        "scale": scale.limit / (1.8 * step),
+        "width": 0.0022,
+    }
     bad, good = known & (flag != 0), known & (flag == 0)
     if bad.any():
         axes.quiver(y[bad], z[bad], v[bad], w[bad], color="0.75", **style)
     arrows = axes.quiver(
-        y[good], z[good], v[good], w[good], np.hypot(v, w)[good],
-        cmap="viridis", norm=Normalize(0, scale.limit), **style,
-    )  # fmt: skip
+        y[good],
+        z[good],
+        v[good],
+        w[good],
+        np.hypot(v, w)[good],
+        cmap="viridis",
+        norm=Normalize(0, scale.limit),
+        **style,
+    )
     for core in cores:
         axes.plot(core.y, core.z, "+", color="crimson", ms=9)
     _frame(axes, scale.y, scale.z, title)
@@ -178,8 +232,15 @@ def _overview(scans, found, cores, scale):
     detected = "Y_noisy" in scans[0]
     first = scans[0]["Y_noisy" if detected else "Y"] * 1e6
     norm = _span(first) if detected else _bright([first])
-    _image(axes[0, 0], first, "backscatter, $t_1$", BACKSCATTER, "both" if detected else "max",
-           norm=norm, cmap="cividis")  # fmt: skip
+    _image(
+        axes[0, 0],
+        first,
+        "backscatter, $t_1$",
+        BACKSCATTER,
+        "both" if detected else "max",
+        norm=norm,
+        cmap="cividis",
+    )
     source = "backscatter_noisy" if detected else "backscatter"
     wind = found.sel(source=source).isel(algorithm=0)
     _arrows(axes[0, 1], wind, cores, "wind from two such pictures", scale)
@@ -196,8 +257,15 @@ def _extinction(truth):
     fields = [truth.image(k) * 1e3 for k in (0, 1)]
     norm = _bright(fields)
     for k, field in enumerate(fields):
-        _image(axes[0, k], field, f"$t_{k + 1}$", "extinction / km$^{-1}$", "max", norm=norm,
-               cmap="cividis")  # fmt: skip
+        _image(
+            axes[0, k],
+            field,
+            f"$t_{k + 1}$",
+            "extinction / km$^{-1}$",
+            "max",
+            norm=norm,
+            cmap="cividis",
+        )
     return figure, (
         "Extinction coefficient of the slab at t1 and t2, averaged over the gate's depth. "
         "The difference in dt is hardly visible; the retrieval finds it."
@@ -209,8 +277,15 @@ def _wind_and_truth(truth, found, cores, scale):
     first = found.sel(source="extinction").isel(algorithm=0)
     _arrows(axes[0, 0], _truth_vectors(first), cores, "true wind", scale)
     speed = np.hypot(truth.wind["v"], truth.wind["w"])
-    _image(axes[0, 1], speed, "speed of the true wind", "speed / m s$^{-1}$", extend="max",
-           norm=Normalize(0, scale.limit), cmap="viridis")  # fmt: skip
+    _image(
+        axes[0, 1],
+        speed,
+        "speed of the true wind",
+        "speed / m s$^{-1}$",
+        extend="max",
+        norm=Normalize(0, scale.limit),
+        cmap="viridis",
+    )
     for axis in axes[0, 2:]:
         axis.set_axis_off()
     _retrieved_into(axes[1], found, "extinction", cores, scale)
@@ -244,19 +319,34 @@ def _deviation_maps(found, source, reference):
     for row, method in zip(axes, methods):
         wind = found.sel(source=source, algorithm=method)
         other = (
-            _truth_vectors(wind) if reference is None
+            _truth_vectors(wind)
+            if reference is None
             else found.sel(source=reference, algorithm=method)
-        )  # fmt: skip
+        )
         # a vector that its own flags call wrong says nothing of the method
         error = deviations(wind, other).where((wind["flag"] == 0) & (other["flag"] == 0))
         limit = _upper(abs(error["speed"]), 0.99) or 1.0
         for axis in row:
             axis.set_facecolor("0.7")
-        _image(row[0], error["speed"], f"{METHOD_NAMES[method]}: speed", "speed / m s$^{-1}$",
-               extend="both", norm=TwoSlopeNorm(0, -limit, limit), cmap="RdBu_r")  # fmt: skip
+        _image(
+            row[0],
+            error["speed"],
+            f"{METHOD_NAMES[method]}: speed",
+            "speed / m s$^{-1}$",
+            extend="both",
+            norm=TwoSlopeNorm(0, -limit, limit),
+            cmap="RdBu_r",
+        )
         turn = min(_upper(abs(error["direction"]), 0.99) or 1.0, np.pi)
-        _image(row[1], error["direction"], f"{METHOD_NAMES[method]}: direction", "direction / rad",
-               extend="both", norm=TwoSlopeNorm(0, -turn, turn), cmap="PuOr_r")  # fmt: skip
+        _image(
+            row[1],
+            error["direction"],
+            f"{METHOD_NAMES[method]}: direction",
+            "direction / rad",
+            extend="both",
+            norm=TwoSlopeNorm(0, -turn, turn),
+            cmap="PuOr_r",
+        )
     against = "the true wind" if reference is None else f"winds from {reference}"
     return figure, (
         f"Deviations of winds from {source} against {against}: speed (left) and direction "
@@ -284,8 +374,15 @@ def _backscatter(scans):
     figure, axes = _sheet(1, 2)
     norm = _bright([scan["Y"] * 1e6 for scan in scans])
     for k, scan in enumerate(scans):
-        _image(axes[0, k], scan["Y"] * 1e6, f"$t_{k + 1}$", extend="max",
-               label=BACKSCATTER, norm=norm, cmap="cividis")  # fmt: skip
+        _image(
+            axes[0, k],
+            scan["Y"] * 1e6,
+            f"$t_{k + 1}$",
+            extend="max",
+            label=BACKSCATTER,
+            norm=norm,
+            cmap="cividis",
+        )
     return figure, (
         "Rendered backscatter, normalised for range, gate length and the environment's "
         "transmittance; without the noise of a detector."
@@ -323,8 +420,15 @@ def _picture_differences(truth, scans):
         differences.append(scan["Y"] / scan["Y"].mean() - field / field.mean())
     limit = max(float(np.abs(d).quantile(0.999)) for d in differences)
     for k, difference in enumerate(differences):
-        _image(axes[0, k], difference, f"$t_{k + 1}$", "difference of relative values", "both",
-               norm=TwoSlopeNorm(0, -limit, limit), cmap="RdBu_r")  # fmt: skip
+        _image(
+            axes[0, k],
+            difference,
+            f"$t_{k + 1}$",
+            "difference of relative values",
+            "both",
+            norm=TwoSlopeNorm(0, -limit, limit),
+            cmap="RdBu_r",
+        )
     return figure, (
         "Backscatter over its mean minus extinction over its mean: the beam's width rounds off "
         "sharp structure, Monte Carlo noise adds grain, and a pulse that is long beside the slab "
@@ -358,9 +462,12 @@ def _error_and_bound(found):
             return None
         axes.plot([0, max(span)], [0, max(span)], "k--", lw=1, label="bound")
         axes.set(
-            xlabel=f"Cramer-Rao bound of {name} / m s$^{{-1}}$", xlim=(0, None), ylim=(0, None),
-            ylabel=f"rms error of {name} / m s$^{{-1}}$", title=f"valid vectors, {name}",
-        )  # fmt: skip
+            xlabel=f"Cramer-Rao bound of {name} / m s$^{{-1}}$",
+            xlim=(0, None),
+            ylim=(0, None),
+            ylabel=f"rms error of {name} / m s$^{{-1}}$",
+            title=f"valid vectors, {name}",
+        )
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     return figure, (
@@ -373,7 +480,9 @@ def _error_and_bound(found):
 
 def by_factors(axes) -> None:
     """A logarithmic upward axis where values differ by more than a factor of 3, plain numbers on it."""
-    values = np.concatenate([np.ravel(line.get_ydata()).astype(float) for line in axes.lines] or [[]])
+    values = np.concatenate(
+        [np.ravel(line.get_ydata()).astype(float) for line in axes.lines] or [[]]
+    )
     values = values[np.isfinite(values) & (values > 0)]
     if values.size and values.max() > 3 * values.min():
         axes.set_yscale("log")
@@ -392,26 +501,33 @@ def _error_by_texture(found, sweep):
         errors = [np.nan if error is None else error for error in errors]
         left.plot(levels, errors, marker=marker, label=name)
     left.set(
-        xlabel="sub-grid texture, rms / %", ylabel="rms error / m s$^{-1}$",
+        xlabel="sub-grid texture, rms / %",
+        ylabel="rms error / m s$^{-1}$",
         title="cross-correlation from extinction, all vectors",
-    )  # fmt: skip
-    for source, marker in (("extinction", "o"), ("backscatter", "s"),
-                           ("extinction_without_texture", "^")):  # fmt: skip
+    )
+    for source, marker in (
+        ("extinction", "o"),
+        ("backscatter", "s"),
+        ("extinction_without_texture", "^"),
+    ):
         for method in found["algorithm"].values:
             wind = found.sel(source=source, algorithm=method)
             groups = error_by_quality(wind, _truth_vectors(wind), "isotropy")
             if not np.isfinite(groups["rmse"]).any():
                 continue
             right.plot(
-                groups["isotropy"], groups["rmse"], marker=marker, ms=5,
+                groups["isotropy"],
+                groups["rmse"],
+                marker=marker,
+                ms=5,
                 ls="-" if method == "cc" else ":",
                 label=f"{METHOD_NAMES[method]} from {SOURCE_NAMES[source]}",
-            )  # fmt: skip
+            )
     right.set(
         xlabel="isotropy: weakest over strongest rms slope in a window",
         ylabel="rms error of v and w / m s$^{-1}$",
         title="all vectors, in groups by their local isotropy",
-    )  # fmt: skip
+    )
     for axes in (left, right):
         by_factors(axes)
         axes.grid(alpha=0.3, which="both")

@@ -7,12 +7,12 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.instrument.fringe_camera import ring_radii
-from lidar_mi.retrieval.rings.peak_fit import peak
-from lidar_mi.retrieval.rings.centre import circular_average
-from lidar_mi.retrieval.rings.peaks import PIECE, radial_cuts, savitzky_golay
 from lidar_mi.assessment.figures.backscatter import Drawn, save_all
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
+from lidar_mi.instrument.fringe_camera import ring_radii
+from lidar_mi.retrieval.rings.centre import circular_average
+from lidar_mi.retrieval.rings.peak_fit import peak
+from lidar_mi.retrieval.rings.peaks import PIECE, radial_cuts, savitzky_golay
 
 PUBLISHED = {
     "free": {"averaged": 20, "std": 2.5, "bias": 7.0},
@@ -29,9 +29,14 @@ _MARKERS = dict(zip(READERS, "oXs^Dv"))
 
 
 def draw_all(
-    folder: Path, doppler, exposure, photons: xr.Dataset | None, found: xr.Dataset,
-    metrics: dict[str, float], log: Callable,
-) -> list[Drawn]:  # fmt: skip
+    folder: Path,
+    doppler,
+    exposure,
+    photons: xr.Dataset | None,
+    found: xr.Dataset,
+    metrics: dict[str, float],
+    log: Callable,
+) -> list[Drawn]:
     """Draw every figure of a Doppler run as PNG into ``folder``.
 
     Parameters
@@ -46,12 +51,18 @@ def draw_all(
     """
     plates = [
         ("fig03_fringes", "Rings on the CCD", _rings(doppler, exposure, photons)),
-        ("fig04_ring_cuts", "Noise in a cut through the rings, and without it",
-         _cuts(doppler, exposure)),
-        ("fig16_doppler_errors", "Spread and bias of the line-of-sight wind",
-         _errors(doppler, metrics)),
+        (
+            "fig04_ring_cuts",
+            "Noise in a cut through the rings, and without it",
+            _cuts(doppler, exposure),
+        ),
+        (
+            "fig16_doppler_errors",
+            "Spread and bias of the line-of-sight wind",
+            _errors(doppler, metrics),
+        ),
         ("fig18_doppler_speeds", "Line-of-sight wind against the truth", _speeds(found)),
-    ]  # fmt: skip
+    ]
     if set(doppler.retrieval.methods) & set(PEAK_READERS):
         bias = _bias(doppler, exposure, found)
         plates.insert(-1, ("fig17_doppler_bias", "Why peaks of rings are biased", bias))
@@ -81,15 +92,20 @@ def _rings(doppler, exposure, photons):
         radius, mean, weight = circular_average(image, centre)
         near = weight > 30  # beyond, circles have a few pixels in the corners only
         axes[-1].plot(radius[near], mean[near], label=label, **style)
-    axes[-1].set(title="means over circles, without noise", xlabel="radius / px",
-                 ylabel="photons a pixel")  # fmt: skip
+    axes[-1].set(
+        title="means over circles, without noise", xlabel="radius / px", ylabel="photons a pixel"
+    )
     axes[-1].set_ylim(0, 1.25 * exposure.emitted.max())
     axes[-1].legend(loc="upper right")
     axes[-1].grid(alpha=0.3)
-    right = "" if photons is None else (
-        " Middle: the laser's own light, plane waves of random direction, frequency and place, "
-        "photon by photon through etalon and a real lens."
-    )  # fmt: skip
+    right = (
+        ""
+        if photons is None
+        else (
+            " Middle: the laser's own light, plane waves of random direction, frequency and place, "
+            "photon by photon through etalon and a real lens."
+        )
+    )
     return figure, (
         "As the paper's figure 3. Left: the CCD's picture of one pulse, broadened by the air's "
         f"molecules.{right} Right: profiles; emitted and received light have equally many photons."
@@ -110,8 +126,13 @@ def _cuts(doppler, exposure):
         (left, (np.flatnonzero(reached), smooth), "360 cuts, Savitzky-Golay filter, mean"),
         (right, (radius[weight > 30], mean[weight > 30]), "circular averaging (CA)"),
     ):
-        axis.plot(np.flatnonzero(np.isfinite(single)), single[np.isfinite(single)], "C3",
-                  lw=0.7, label="one cut")  # fmt: skip
+        axis.plot(
+            np.flatnonzero(np.isfinite(single)),
+            single[np.isfinite(single)],
+            "C3",
+            lw=0.7,
+            label="one cut",
+        )
         axis.plot(x, y, "C0", lw=1.8, label=title)
         axis.set(xlabel="radius / px", title=title)
         axis.legend(loc="upper right")
@@ -139,16 +160,32 @@ def _errors(doppler, metrics):
                     for end in ("", "_stderr")
                 )
                 axis.errorbar(
-                    settings.averaged, abs(values), bars, color=_COLOURS[name],
-                    marker=_MARKERS[name], ms=5, capsize=3, lw=1.2, label=READERS[name],
-                )  # fmt: skip
-        bound = [metrics[f"doppler.bound.centre_{centre}.averaged_{n}.std"] for n in settings.averaged]
+                    settings.averaged,
+                    abs(values),
+                    bars,
+                    color=_COLOURS[name],
+                    marker=_MARKERS[name],
+                    ms=5,
+                    capsize=3,
+                    lw=1.2,
+                    label=READERS[name],
+                )
+        bound = [
+            metrics[f"doppler.bound.centre_{centre}.averaged_{n}.std"] for n in settings.averaged
+        ]
         column[0].plot(settings.averaged, bound, "k--", label="Cramer-Rao bound")
         column[0].axhline(REQUIRED, color="0.5", ls=":", label="required (table 1)")
         for axis, quantity in zip(column, ("std", "bias")):
             stated = PUBLISHED[centre]
-            axis.plot(stated["averaged"], stated[quantity], "*", color="k", ms=13, zorder=5,
-                      label=f"paper: {'below ' * (centre == 'known')}{stated[quantity]:g} m/s")  # fmt: skip
+            axis.plot(
+                stated["averaged"],
+                stated[quantity],
+                "*",
+                color="k",
+                ms=13,
+                zorder=5,
+                label=f"paper: {'below ' * (centre == 'known')}{stated[quantity]:g} m/s",
+            )
             axis.set(xscale="log", yscale="log")
             axis.set_xticks(settings.averaged, [str(n) for n in settings.averaged])
             axis.minorticks_off()
@@ -182,12 +219,20 @@ def _bias(doppler, exposure, found):
         axis.axvline(crest, color="k", lw=0.8, label="true crest")
         axis.axvline(fitted, color=_BY_COORDINATE[coordinate], ls=":", label="Gaussian's crest")
         axis.set(xlabel=f"{name} / {unit}", ylabel="photons a pixel", title=f"fit in {name}")
-        last.plot(found["piece"], found["peak_bias"].sel(coordinate=coordinate), "o-",
-                  color=_BY_COORDINATE[coordinate], label=f"fit in {name}")  # fmt: skip
+        last.plot(
+            found["piece"],
+            found["peak_bias"].sel(coordinate=coordinate),
+            "o-",
+            color=_BY_COORDINATE[coordinate],
+            label=f"fit in {name}",
+        )
     last.axvline(PIECE, color="0.5", ls=":", label="used here")
     last.axhline(0, color="k", lw=0.8)
-    last.set(xlabel="half width of the fitted piece / radius of the ring",
-             ylabel="error of the wind / m s$^{-1}$", title="peak of the innermost ring, no noise")  # fmt: skip
+    last.set(
+        xlabel="half width of the fitted piece / radius of the ring",
+        ylabel="error of the wind / m s$^{-1}$",
+        title="peak of the innermost ring, no noise",
+    )
     for axis in (*rings, last):
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
@@ -211,8 +256,14 @@ def _speeds(found):
         mean = np.where(count > 0, np.nansum(v, 1) / np.maximum(count, 1), np.nan)
         spread = np.full(len(mean), np.nan)
         spread[count > 1] = np.nanstd(v[count > 1], 1, ddof=1)
-        style = {"color": _COLOURS[str(name)], "marker": _MARKERS[str(name)], "ms": 5,
-                 "capsize": 3, "lw": 1.0, "label": READERS[str(name)]}  # fmt: skip
+        style = {
+            "color": _COLOURS[str(name)],
+            "marker": _MARKERS[str(name)],
+            "ms": 5,
+            "capsize": 3,
+            "lw": 1.0,
+            "label": READERS[str(name)],
+        }
         left.errorbar(true[order], mean, spread, **style)
         right.errorbar(true[order], mean - true[order], spread, **style)
     left.axline((0, 0), slope=1, color="k", lw=0.8)

@@ -24,9 +24,12 @@ def draw_rings(image: np.ndarray, rings: Rings, title: str = "") -> Figure:
         picture.plot(x, y, "--", color=LINE_COLOURS[line], lw=0.9)
     picture.plot(*rings.centre, "+", color="yellow", ms=12)
     picture.set(
-        xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x / px", ylabel="y / px",
+        xlim=(-0.5, width - 0.5),
+        ylim=(height - 0.5, -0.5),
+        xlabel="x / px",
+        ylabel="y / px",
         title=f"{title}\ncentre ({rings.centre[0]:.2f}, {rings.centre[1]:.2f}) px".strip(),
-    )  # fmt: skip
+    )
     profile.plot(rings.r2 * 1e-3, rings.profile, color="0.3", lw=0.9)
     for radius, line in zip(rings.radius, rings.line):
         profile.axvline(radius**2 * 1e-3, color=LINE_COLOURS[line], ls="--", lw=0.9)
@@ -38,12 +41,18 @@ def draw_rings(image: np.ndarray, rings: Rings, title: str = "") -> Figure:
         orders = np.array([-fraction, rings.order.max() + 0.5])
         colour = LINE_COLOURS[line]
         law.plot(orders, (orders + fraction) * rings.spacing * 1e-3, color=colour, lw=0.9)
-        law.plot(rings.order[of_line], rings.radius[of_line] ** 2 * 1e-3, "o", color=colour,
-                 label=f"fractional order at the centre {fraction:.4f}")  # fmt: skip
+        law.plot(
+            rings.order[of_line],
+            rings.radius[of_line] ** 2 * 1e-3,
+            "o",
+            color=colour,
+            label=f"fractional order at the centre {fraction:.4f}",
+        )
     law.legend(loc="upper left", fontsize="small")
     law.set(
-        xlabel="orders below the centre", ylabel="$r^2$ / 1000 px$^2$",
+        xlabel="orders below the centre",
+        ylabel="$r^2$ / 1000 px$^2$",
         title=f"equal steps of {rings.spacing:.6g} px$^2$",
-    )  # fmt: skip
+    )
     law.set_xticks(range(rings.order.max() + 1))
     return figure

@@ -76,9 +76,12 @@ class Rings(NamedTuple):
 
 
 def ring_averages(
-    wind: xr.Dataset, core: Core, others: Sequence[Core] = (), inner: float = 5.0,
+    wind: xr.Dataset,
+    core: Core,
+    others: Sequence[Core] = (),
+    inner: float = 5.0,
     outer: float = 15.0,
-) -> Rings | None:  # fmt: skip
+) -> Rings | None:
     """Averages over rings around a core, with radii from ``inner`` to ``outer``, m.
 
     Circulation is 2 pi r times the mean swirl, which vortices beyond the rings do not change (as

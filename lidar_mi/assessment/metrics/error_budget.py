@@ -38,7 +38,9 @@ def picture_unit(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, flo
     By least squares over both pictures, weighted by 1 / `noise`^2 (standard errors of the rendered
     ones). The offset is light that a pulse longer than the gate brings from the air around it.
     """
-    x, y, s = (np.concatenate([i.values.ravel() for i in pair]) for pair in (blurred, rendered, noise))
+    x, y, s = (
+        np.concatenate([i.values.ravel() for i in pair]) for pair in (blurred, rendered, noise)
+    )
     if np.ptp(x) < 1e-9 * np.abs(x).max():
         return float(y.mean() / x.mean()), 0.0
     weight = 1 / s if (s > 0).all() else np.ones_like(s)
@@ -126,10 +128,12 @@ def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.n
     middle = place = (place[:, known] - np.array([axis[0] for axis in axes])[:, None]) / spacing
 
     def wind(here):
-        return np.stack([
-            ndimage.map_coordinates(speed, here, prefilter=False, mode="nearest")
-            for speed in speeds
-        ])  # fmt: skip
+        return np.stack(
+            [
+                ndimage.map_coordinates(speed, here, prefilter=False, mode="nearest")
+                for speed in speeds
+            ]
+        )
 
     def moved(here, time):
         h = time / steps

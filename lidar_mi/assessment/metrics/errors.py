@@ -115,6 +115,8 @@ def error_by_quality(
 def commonest_flag(flag: xr.DataArray) -> str:
     """Which flag most vectors have, in words; ``flag`` has its CF attributes."""
     meanings, masks = flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"])
-    shares = {text: float(((flag.values & mask) != 0).mean()) for text, mask in zip(meanings, masks)}
+    shares = {
+        text: float(((flag.values & mask) != 0).mean()) for text, mask in zip(meanings, masks)
+    }
     worst = max(shares, key=shares.get)
     return f"{percent(shares[worst])} have the flag {worst}"

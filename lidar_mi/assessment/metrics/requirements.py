@@ -123,7 +123,9 @@ def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list
         _known(name, "measured")
         if value is not None and (value < 0 or math.isinf(value)):
             unit = QUANTITIES[name][1]
-            raise InputError(f"measured.{name}: {value} {unit} is not allowed; expected >= 0 {unit}")
+            raise InputError(
+                f"measured.{name}: {value} {unit} is not allowed; expected >= 0 {unit}"
+            )
     values = {name: math.nan if value is None else float(value) for name, value in measured.items()}
     distance = values.get("range", math.nan)
     return [_judged(row, values.get(row.quantity, math.nan), distance) for row in table.rows]

@@ -10,10 +10,10 @@ import yaml
 from matplotlib.figure import Figure
 
 from lidar_mi import __version__
-from lidar_mi.assessment.report.digits import fixed, three
 from lidar_mi.assessment.figures.backscatter import BACKSCATTER, METHOD_NAMES, Drawn, save_all
-from lidar_mi.assessment.report.page import embedded, template
 from lidar_mi.assessment.metrics.velocities import CENTRES, READERS
+from lidar_mi.assessment.report.digits import fixed, three
+from lidar_mi.assessment.report.page import embedded, template
 
 _SPEED = "m s$^{-1}$"
 
@@ -45,7 +45,7 @@ _ROWS = (
     ("safety.aided_hazard_distance", "hazard distance of a beam, binoculars", "m"),
     ("safety.scan_hazard_distance", "hazard distance of the whole scan, naked eye", "m"),
     ("safety.scan_power", "average power of the scan", "W"),
-)  # fmt: skip
+)
 
 # of the Doppler lidar's readings of single pulses: measure of `velocity_metrics`, name
 _READINGS = (("bias", "bias"), ("std", "standard deviation"), ("found_fraction", "share read"))
@@ -109,9 +109,11 @@ def page(
 def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, str, list[str]]]:
     """What comes of variants: (name, unit, one text a variant), where any of them has a number."""
     winds = dict.fromkeys(
-        key.removesuffix(".valid_fraction") for one in metrics.values() for key in one
+        key.removesuffix(".valid_fraction")
+        for one in metrics.values()
+        for key in one
         if key.startswith("backscatter") and key.endswith(".valid_fraction")
-    )  # fmt: skip
+    )
     for pattern, label, unit in _ROWS:
         for wind in winds if "{}" in pattern else (None,):
             key = pattern.format(wind)
@@ -119,8 +121,11 @@ def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, s
             if any(value is not None for value in values):
                 yield (f"{_named(wind)}: {label}" if wind else label), unit, _shown(values, unit)
     readings = dict.fromkeys(
-        found.groups() for one in metrics.values() for key in one if (found := _SINGLE.fullmatch(key))
-    )  # fmt: skip
+        found.groups()
+        for one in metrics.values()
+        for key in one
+        if (found := _SINGLE.fullmatch(key))
+    )
     for key, reader, centre in readings:
         for measure, label in _READINGS:
             values = [one.get(f"{key}.{measure}") for one in metrics.values()]
@@ -173,18 +178,27 @@ def draw_comparison(
         name: (wind["w"] - wind["w_true"]).where(wind["flag"] == 0)
         for name, (_, wind, _) in rows.items()
     }
-    largest = [float(abs(error).quantile(0.99)) for error in errors.values() if error.notnull().any()]
+    largest = [
+        float(abs(error).quantile(0.99)) for error in errors.values() if error.notnull().any()
+    ]
     # one variant without skill must not hide the errors of those that have some
     top = min(float(np.median(largest)) if largest else 0.0, limit) or limit
     for row, (name, (picture, wind, cores)) in zip(axes, rows.items()):
         low, high = (float(1e6 * picture.quantile(share)) for share in (0.002, 0.998))
-        good, place = wind["flag"] == 0, {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"}
+        good, place = (
+            wind["flag"] == 0,
+            {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"},
+        )
         columns = (
-            (1e6 * picture.sel(place), {"cmap": "cividis", "vmin": low, "vmax": high},
-             f"{name}: picture", BACKSCATTER),
+            (
+                1e6 * picture.sel(place),
+                {"cmap": "cividis", "vmin": low, "vmax": high},
+                f"{name}: picture",
+                BACKSCATTER,
+            ),
             (wind["w"].where(good), speeds, f"{name}: w found", _SPEED),
             (errors[name], speeds | {"vmin": -top, "vmax": top}, f"{name}: error of w", _SPEED),
-        )  # fmt: skip
+        )
         for panel, (field, style, title, label) in zip(row, columns):
             y, z = field["y"].values, field["z"].values
             mesh = panel.pcolormesh(

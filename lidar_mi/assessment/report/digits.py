@@ -27,7 +27,11 @@ def three(value: float) -> str:
 def percent(share: float) -> str:
     """A share as per cent, two digits at most below 10 %: 0.43 %, 72 %, 100 %."""
     value = 100 * share
-    text = f"{round(value) + 0}" if abs(value) >= 9.95 or value == 0 else f"{float(f'{value:.2g}'):.10g}"
+    text = (
+        f"{round(value) + 0}"
+        if abs(value) >= 9.95 or value == 0
+        else f"{float(f'{value:.2g}'):.10g}"
+    )
     return f"{text} %"
 
 

@@ -7,9 +7,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from lidar_mi.assessment.report.digits import fixed
-from lidar_mi.assessment.metrics.error_budget import CAUSES
 from lidar_mi.assessment.figures.backscatter import METHOD_NAMES, Drawn, save_all
+from lidar_mi.assessment.metrics.error_budget import CAUSES
+from lidar_mi.assessment.report.digits import fixed
 from lidar_mi.assessment.report.page import Chapter, Tables
 
 # A cause with less of the mean square error is no limit.
@@ -46,8 +46,10 @@ def _bars(metrics, methods):
     rows = np.arange(len(used))[::-1]
     least = min(
         metrics.get(f"error_budget.{method}.{place}{cause}.share", 0.0)
-        for method in methods for place in _PLACES for cause in used
-    )  # fmt: skip
+        for method in methods
+        for place in _PLACES
+        for cause in used
+    )
     bars = {}
     for panel, method in zip(panels, methods):
         title = []
@@ -114,12 +116,11 @@ def limit_sentence(metrics: Mapping[str, float], method: str) -> str:
         )
     text = (
         f"The wind by {name} is off by {error} rms{where}, limited by "
-        + "), then ".join([f"{parts[0]} of the mean square error", *parts[1:]]) + ")."
+        + "), then ".join([f"{parts[0]} of the mean square error", *parts[1:]])
+        + ")."
     )
     if ranked[0] == "monte_carlo":
-        text += (
-            " That noise is not the lidar's: more photons a beam (render.samples_per_beam) lower it."
-        )
+        text += " That noise is not the lidar's: more photons a beam (render.samples_per_beam) lower it."
     return text
 
 
@@ -166,5 +167,7 @@ def _table(metrics, method):
 
     rows = [("with all causes", "", values(""))]
     rows += [(f"without: {CAUSES[c]}", "", values(f"{c}.")) for c in _causes(metrics, method)]
-    heads = [f"{quantity}{where}" for where in ("", ", beyond cores") for quantity in ("v", "w", "share")]
+    heads = [
+        f"{quantity}{where}" for where in ("", ", beyond cores") for quantity in ("v", "w", "share")
+    ]
     return METHOD_NAMES[method], heads, rows

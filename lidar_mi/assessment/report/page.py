@@ -12,11 +12,11 @@ import jinja2
 from markupsafe import Markup
 from PIL import Image
 
-from lidar_mi.retrieval.vortices.fit import MEANING
-from lidar_mi.assessment.metrics.cores import Core
-from lidar_mi.assessment.report.digits import fixed, in_row, percent, three, with_error
 from lidar_mi.assessment.figures.backscatter import METHOD_NAMES, SOURCE_NAMES, Drawn
+from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
+from lidar_mi.assessment.report.digits import fixed, in_row, percent, three, with_error
+from lidar_mi.retrieval.vortices.fit import MEANING
 
 # rows of the table of results: key, name, unit
 _ROWS = (
@@ -34,9 +34,11 @@ _ROWS = (
 )
 
 _DOPPLER_UNITS = {
-    "doppler.line_width": "Hz", "doppler.free_spectral_range": "Hz",
-    "doppler.velocity_range": "m/s", "doppler.render.largest_error": "m/s",
-}  # fmt: skip
+    "doppler.line_width": "Hz",
+    "doppler.free_spectral_range": "Hz",
+    "doppler.velocity_range": "m/s",
+    "doppler.render.largest_error": "m/s",
+}
 
 _VORTEX_UNITS = {
     name: units.replace(" s-1", "/s").replace("m2", "m²") for name, (units, _) in MEANING.items()
@@ -76,9 +78,13 @@ class Chapter(NamedTuple):
 
 
 def page(
-    experiment, resolved: str, versions: Mapping[str, str], metrics: Mapping[str, float],
-    chapters: Sequence[Chapter], warnings: Sequence[str] = (),
-) -> str:  # fmt: skip
+    experiment,
+    resolved: str,
+    versions: Mapping[str, str],
+    metrics: Mapping[str, float],
+    chapters: Sequence[Chapter],
+    warnings: Sequence[str] = (),
+) -> str:
     """The report as HTML, pictures embedded, everything named by the user escaped.
 
     Parameters
@@ -115,9 +121,10 @@ def page(
 def template(name: str) -> jinja2.Template:
     """One of the pages of this package; whatever is put into it is escaped."""
     return jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
         loader=jinja2.PackageLoader("lidar_mi.assessment.report", ""),
-    ).get_template(name)  # fmt: skip
+    ).get_template(name)
 
 
 def embedded(path: Path) -> str:
@@ -151,9 +158,7 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
             flow = f"{wake.file}{when}, {wake.spacing:g} m grid"
         texture = "no texture added"
         if wake.texture.rms:
-            texture = (
-                f"texture of {percent(wake.texture.rms)} rms, outer scale {wake.texture.outer_scale:g} m"
-            )
+            texture = f"texture of {percent(wake.texture.rms)} rms, outer scale {wake.texture.outer_scale:g} m"
         rows.append(("wake", f"{flow}; {texture}"))
         platform = experiment.platform
         rows.append(("platform", f"{platform.speed:g} m/s, pictures {platform.dt:g} s apart"))
@@ -193,9 +198,12 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
 
 
 def backscatter_chapter(
-    experiment, metrics: dict[str, float], cores: Sequence[Core], drawn: Sequence[Drawn],
+    experiment,
+    metrics: dict[str, float],
+    cores: Sequence[Core],
+    drawn: Sequence[Drawn],
     vectors: dict | None = None,
-) -> Chapter:  # fmt: skip
+) -> Chapter:
     """What the backscatter lidar tells.
 
     Parameters
@@ -229,9 +237,12 @@ def backscatter_chapter(
     if vectors:
         vectors = {"title": "The wind from the backscatter pair, vector by vector"} | vectors
     return Chapter(
-        "The backscatter lidar", [*lead, _noise(experiment, metrics)], drawn, numbers,
+        "The backscatter lidar",
+        [*lead, _noise(experiment, metrics)],
+        drawn,
+        numbers,
         vectors=vectors,
-    )  # fmt: skip
+    )
 
 
 def doppler_chapter(doppler, metrics: dict[str, float], drawn: Sequence[Drawn]) -> Chapter:
@@ -326,12 +337,18 @@ def _noise(experiment, metrics) -> str:
     )
     if not experiment.detector:
         return f"{line}; no detector."
-    causes = {"shot": "photons", "speckle": "speckle", "background": "sky", "dark": "dark current",
-              "readout": "read-out"}  # fmt: skip
+    causes = {
+        "shot": "photons",
+        "speckle": "speckle",
+        "background": "sky",
+        "dark": "dark current",
+        "readout": "read-out",
+    }
     parts = ", ".join(
         f"{name} {percent(metrics[f'detector.noise.{key}'])}"
-        for key, name in causes.items() if metrics.get(f"detector.noise.{key}", 0) >= 5e-5
-    )  # fmt: skip
+        for key, name in causes.items()
+        if metrics.get(f"detector.noise.{key}", 0) >= 5e-5
+    )
     return (
         f"{line}; detector {percent(metrics['detector.noise.all'])} with "
         f"{three(metrics['detector.signal'])} photoelectrons ({parts or 'each below 0.01 %'})."

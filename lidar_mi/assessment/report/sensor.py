@@ -8,20 +8,19 @@ import xarray as xr
 from matplotlib.figure import Figure
 from scipy import stats
 
-from lidar_mi.retrieval.lines.vectors import COMPONENTS
-from lidar_mi.assessment.metrics.cores import Core
-from lidar_mi.assessment.report.digits import in_row, percent, three
 from lidar_mi.assessment.figures.backscatter import Drawn, save_all
-from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.requirements import as_rows, fulfilled, look_ahead
+from lidar_mi.assessment.report.digits import in_row, percent, three
+from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.retrieval.lines.vectors import COMPONENTS
 
 _SPEED = "m s$^{-1}$"
 
 
 def draw_all(
-    folder: Path, found: xr.Dataset | None, lines: xr.Dataset, cores: Sequence[Core],
-    log: Callable,
-) -> list[Drawn]:  # fmt: skip
+    folder: Path, found: xr.Dataset | None, lines: xr.Dataset, cores: Sequence[Core], log: Callable
+) -> list[Drawn]:
     """Draw the combined sensor's figures as PNG into ``folder``.
 
     Parameters
@@ -50,20 +49,40 @@ def _scan(lines, cores):
     read = np.isfinite(speed)
     span = np.quantile(np.where(read, speed, true), (0.0, 1.0))
     for panel, values, title, label, style in (
-        (panels[0], speed, "velocity along the line of sight", _SPEED,
-         {"cmap": "cividis", "vmin": span[0], "vmax": span[1]}),
-        (panels[1], reduced, "its error over its standard error", "reduced error",
-         {"cmap": "RdBu_r", "vmin": -4, "vmax": 4}),
-    ):  # fmt: skip
-        dots = panel.scatter(place[read, 1], place[read, 2], c=values[read], s=90,
-                             edgecolors="0.3", linewidths=0.5, **style)  # fmt: skip
+        (
+            panels[0],
+            speed,
+            "velocity along the line of sight",
+            _SPEED,
+            {"cmap": "cividis", "vmin": span[0], "vmax": span[1]},
+        ),
+        (
+            panels[1],
+            reduced,
+            "its error over its standard error",
+            "reduced error",
+            {"cmap": "RdBu_r", "vmin": -4, "vmax": 4},
+        ),
+    ):
+        dots = panel.scatter(
+            place[read, 1],
+            place[read, 2],
+            c=values[read],
+            s=90,
+            edgecolors="0.3",
+            linewidths=0.5,
+            **style,
+        )
         panel.plot(place[~read, 1], place[~read, 2], "kx", ms=6)
         for core in cores:
             panel.plot(core.y, core.z, "+", color="crimson", ms=9)
         panel.set(title=title, aspect="equal", xlabel="y / m (port is left)", ylabel="z / m")
         figure.colorbar(dots, ax=panel, label=label, pad=0.02)
     # at least as wide as high, also for lines above each other
-    middle, half = (place[:, 1].max() + place[:, 1].min()) / 2, np.ptp(place[:, 1:], axis=0).max() / 2
+    middle, half = (
+        (place[:, 1].max() + place[:, 1].min()) / 2,
+        np.ptp(place[:, 1:], axis=0).max() / 2,
+    )
     panels[0].set_xlim(middle + half + 4, middle - half - 4)
     return figure, (
         "Middles of the range bins; what the aircraft flies is part of the velocity. Black crosses: "
@@ -82,12 +101,18 @@ def _maps(found, lines, cores):
         error = value - true
         both = np.concatenate([true.values.ravel(), value.values.ravel()])
         columns = (
-            (true, _colours(both), f"{name}, true"), (value, _colours(both), f"{name}, found"),
+            (true, _colours(both), f"{name}, true"),
+            (value, _colours(both), f"{name}, found"),
             (error, _colours(error.values), f"{name}, error"),
-        )  # fmt: skip
+        )
         for panel, (field, colours, title) in zip(row, columns):
             mesh = panel.pcolormesh(
-                y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **colours
+                y,
+                z,
+                field.transpose("z", "y").values,
+                shading="nearest",
+                rasterized=True,
+                **colours,
             )
             panel.set(title=title, aspect="equal")
             figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
@@ -116,11 +141,21 @@ def _uncertainty(found):
         stderr = found[f"{name}_stderr"].transpose("z", "y").values
         top = float(np.quantile(stderr[good], 0.99)) if good.any() else 1.0
         mesh = panel.pcolormesh(
-            y, z, np.where(good, stderr, np.nan), shading="nearest", rasterized=True,
-            cmap="viridis", vmin=0, vmax=top,
-        )  # fmt: skip
-        panel.set(title=f"standard error of {name}", aspect="equal", xlabel="y / m (port is left)",
-                  ylabel="z / m")  # fmt: skip
+            y,
+            z,
+            np.where(good, stderr, np.nan),
+            shading="nearest",
+            rasterized=True,
+            cmap="viridis",
+            vmin=0,
+            vmax=top,
+        )
+        panel.set(
+            title=f"standard error of {name}",
+            aspect="equal",
+            xlabel="y / m (port is left)",
+            ylabel="z / m",
+        )
         panel.set_xlim(float(y.max()), float(y.min()))
         figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="max")
     axes = axes[-1]
@@ -128,8 +163,13 @@ def _uncertainty(found):
     for name in COMPONENTS:
         error = (found[name] - found[f"{name}_true"]) / found[f"{name}_stderr"]
         values = error.transpose("z", "y").values[good]
-        axes.hist(np.clip(values[np.isfinite(values)], -5, 5), edges, density=True, histtype="step",
-                  label=name)  # fmt: skip
+        axes.hist(
+            np.clip(values[np.isfinite(values)], -5, 5),
+            edges,
+            density=True,
+            histtype="step",
+            label=name,
+        )
     middle = (edges[1:] + edges[:-1]) / 2
     axes.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
     axes.set(title="errors over standard errors", xlabel="reduced error", ylabel="density")
@@ -151,9 +191,12 @@ def _colours(values: np.ndarray) -> dict:
 
 
 def sensor_chapter(
-    experiment, metrics: dict[str, float], judged: Sequence[tuple], drawn: Sequence[Drawn],
+    experiment,
+    metrics: dict[str, float],
+    judged: Sequence[tuple],
+    drawn: Sequence[Drawn],
     vectors: dict | None = None,
-) -> Chapter:  # fmt: skip
+) -> Chapter:
     """What both lidars together tell, and whether that satisfies flight control.
 
     Parameters
@@ -195,17 +238,24 @@ def sensor_chapter(
     return Chapter(
         title="Both lidars as one sensor",
         lead=[
-            purpose, warning, *_limit_of_u(metrics), *_not_stated(experiment.sensor.errors),
+            purpose,
+            warning,
+            *_limit_of_u(metrics),
+            *_not_stated(experiment.sensor.errors),
             *_costs(metrics),
         ],
         drawn=drawn,
         verdict=Tables(
-            "Whether it does what flight control asks for" if speed else "Whether it does what is asked for",
+            "Whether it does what flight control asks for"
+            if speed
+            else "Whether it does what is asked for",
             "Errors of u, v, w are rms errors of good vectors beyond two core radii, those of v_LOS "
             "rms errors of lines of sight, in this run for all phases of flight. A margin is the "
             "distance from the limit, as a share of it.",
             tables,
-        ) if judged else None,
+        )
+        if judged
+        else None,
         numbers=Tables(
             "How good the wind from both lidars is",
             f"{metrics['sensor.lines_read']} of {metrics['sensor.lines']} lines of sight were read; "
@@ -261,7 +311,11 @@ def _costs(metrics) -> list[str]:
     text = (
         f"The Doppler lidar's directions take {_rate(metrics, 'doppler')}, and give "
         f"{three(metrics['sensor.doppler.photons_per_direction'])} photons each"
-        + (f"; the error of v_LOS that is asked for takes {needed} of them a direction." if needed else ".")
+        + (
+            f"; the error of v_LOS that is asked for takes {needed} of them a direction."
+            if needed
+            else "."
+        )
         + f" The pictures take {_rate(metrics, 'backscatter')}."
     )
     safety = []
@@ -293,14 +347,16 @@ def _rate(metrics, name: str) -> str:
 def _numbers(metrics):
     rows = []
     for key, label, unit in (
-        ("rmse_{}", "rms error", "m/s"), ("outside_cores.rmse_{}", "rms error beyond cores", "m/s"),
+        ("rmse_{}", "rms error", "m/s"),
+        ("outside_cores.rmse_{}", "rms error beyond cores", "m/s"),
         ("outside_cores.rms_{}", "the true wind itself there, rms", "m/s"),
-        ("bias_{}", "bias", "m/s"), ("reduced_variance_{}", "variance of reduced errors", ""),
+        ("bias_{}", "bias", "m/s"),
+        ("reduced_variance_{}", "variance of reduced errors", ""),
         ("coverage_68_{}", "within one standard error", "%"),
         ("coverage_95_{}", "within 1.96 standard errors", "%"),
         ("triples.rmse_{}", "rms error, lines of sight alone, in threes", "m/s"),
         ("neighbours.rmse_{}", "rms error, the same, up to nine by least squares", "m/s"),
-    ):  # fmt: skip
+    ):
         values = [metrics.get(f"sensor.{key.format(name)}") for name in (*COMPONENTS, "v_los")]
         rows.append((label, unit, in_row(values, unit)))
     return "Errors against the truth", ["u", "v", "w", "v_LOS"], rows

@@ -59,6 +59,8 @@ def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core])
             for name in components
         ],
         "flag": [int(bits) for bits in thin["flag"].values.ravel()],
-        "flags": {str(int(mask)): text for mask, text in zip(np.ravel(flag["flag_masks"]), meanings)},
+        "flags": {
+            str(int(mask)): text for mask, text in zip(np.ravel(flag["flag_masks"]), meanings)
+        },
         "cores": [[round(core.y, 2), round(core.z, 2)] for core in cores],
     }

@@ -9,8 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
-from lidar_mi.assessment.metrics.cores import Core
-from lidar_mi.assessment.report.digits import fixed, in_row, percent
 from lidar_mi.assessment.figures.backscatter import (
     BACKSCATTER,
     METHOD_NAMES,
@@ -19,6 +17,8 @@ from lidar_mi.assessment.figures.backscatter import (
     by_factors,
     save_all,
 )
+from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.report.digits import fixed, in_row, percent
 from lidar_mi.assessment.report.page import Chapter, Tables
 
 _SPEED = "m s$^{-1}$"
@@ -26,9 +26,12 @@ _COMPONENTS = ("u", "v", "w")
 
 
 def draw_all(
-    folder: Path, found: xr.Dataset, volumes: Sequence[xr.DataArray], cores: Sequence[Core],
+    folder: Path,
+    found: xr.Dataset,
+    volumes: Sequence[xr.DataArray],
+    cores: Sequence[Core],
     log: Callable,
-) -> list[Drawn]:  # fmt: skip
+) -> list[Drawn]:
     """Draw the figures of a run with volumes as PNG into ``folder``.
 
     Parameters
@@ -104,9 +107,10 @@ def _row(panels, cut, name, across, up, stretch=1):
     error = value - true
     limit, small = _limit(true), _limit(error)
     for panel, field, bound, title in (
-        (panels[0], true, limit, f"{name}, true"), (panels[1], value, limit, f"{name}, found"),
+        (panels[0], true, limit, f"{name}, true"),
+        (panels[1], value, limit, f"{name}, found"),
         (panels[2], error, small, f"{name}, error"),
-    ):  # fmt: skip
+    ):
         mesh = _map(panel, field, across, up, "RdBu_r", -bound, bound)
         panel.set(title=title, aspect=stretch)
         bar = panel.figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
@@ -116,9 +120,15 @@ def _row(panels, cut, name, across, up, stretch=1):
 
 def _map(panel, field, across, up, colours, low, high):
     mesh = panel.pcolormesh(
-        field[across], field[up], field.transpose(up, across).values, shading="nearest",
-        rasterized=True, cmap=colours, vmin=low, vmax=high,
-    )  # fmt: skip
+        field[across],
+        field[up],
+        field.transpose(up, across).values,
+        shading="nearest",
+        rasterized=True,
+        cmap=colours,
+        vmin=low,
+        vmax=high,
+    )
     half = float(field[across][1] - field[across][0]) / 2
     panel.set(aspect="equal", xlabel=f"{across} / m (port is left)", ylabel=f"{up} / m")
     panel.set_xlim(float(field[across].max()) + half, float(field[across].min()) - half)
@@ -142,15 +152,28 @@ def _errors(found):
             stated = wind[f"{name}_stderr"].where(good)
             for values, style, text in ((error, "-", "error"), (stated, "--", "as stated")):
                 level = np.sqrt((values**2).mean(("y", "z")))
-                profile.plot(found["x"], level, style, color=colour, label=f"{METHOD_NAMES.get(method, method)}, {text}")
+                profile.plot(
+                    found["x"],
+                    level,
+                    style,
+                    color=colour,
+                    label=f"{METHOD_NAMES.get(method, method)}, {text}",
+                )
             reduced = (error / stated).values
-            density.hist(np.clip(reduced[np.isfinite(reduced)], -5, 5), edges, density=True,
-                         histtype="step", color=colour, label=METHOD_NAMES.get(method, method))  # fmt: skip
+            density.hist(
+                np.clip(reduced[np.isfinite(reduced)], -5, 5),
+                edges,
+                density=True,
+                histtype="step",
+                color=colour,
+                label=METHOD_NAMES.get(method, method),
+            )
         profile.set(title=f"rms error of {name}", xlabel="x / m", ylabel=_SPEED)
         by_factors(profile)
         density.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
-        density.set(title=f"errors of {name} over standard errors", xlabel="reduced error",
-                    ylabel="density")  # fmt: skip
+        density.set(
+            title=f"errors of {name} over standard errors", xlabel="reduced error", ylabel="density"
+        )
     # between the errors and the wind, of which v and w have much
     axes[0, 1].legend(fontsize="small", loc="center")
     axes[1, 0].legend(fontsize="small")
@@ -166,9 +189,7 @@ def _limit(values: xr.DataArray) -> float:
     return (float(np.quantile(known, 0.995)) if known.size else 0.0) or 1.0
 
 
-def volume_chapter(
-    experiment, metrics: dict[str, float], drawn: Sequence[Drawn]
-) -> Chapter:
+def volume_chapter(experiment, metrics: dict[str, float], drawn: Sequence[Drawn]) -> Chapter:
     """What the volumes tell.
 
     Parameters
@@ -206,10 +227,11 @@ def _tables(experiment, metrics):
                 ("rmse_{}", "rms error", "m/s"),
                 ("outside_cores.rmse_{}", "rms error beyond two core radii", "m/s"),
                 ("all.rmse_{}", "rms error, flagged vectors too", "m/s"),
-                ("bias_{}", "bias", "m/s"), ("stderr_{}", "rms standard error, as stated", "m/s"),
+                ("bias_{}", "bias", "m/s"),
+                ("stderr_{}", "rms standard error, as stated", "m/s"),
                 ("reduced_variance_{}", "variance of reduced errors", ""),
                 ("coverage_68_{}", "within one standard error", "%"),
-            ):  # fmt: skip
+            ):
                 values = [metrics.get(f"{source}.{method}.{key.format(n)}") for n in _COMPONENTS]
                 rows.append((label, unit, in_row(values, unit)))
             own = [fixed(metrics[f"true_wind.rms_{name}"]) for name in _COMPONENTS]

@@ -9,11 +9,11 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from lidar_mi.retrieval.vortices.fit import VortexPairFit
+from lidar_mi.assessment.figures.backscatter import Drawn, save_all
 from lidar_mi.assessment.metrics.cores import Core, ring_averages
 from lidar_mi.assessment.report.digits import fixed, with_error
-from lidar_mi.assessment.figures.backscatter import Drawn, save_all
 from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.retrieval.vortices.fit import VortexPairFit
 
 SOURCES = {"images": "images", "vectors": "wind vectors"}
 
@@ -27,21 +27,24 @@ _ROWS = (
         for key, label, unit in (
             ("circulation_5_15", "circulation, mean over 5 to 15 m", "m²/s"),
             ("circulation", "circulation, far from the core", "m²/s"),
-            ("core_radius", "core radius", "m"), ("y", "y", "m"), ("z", "z", "m"),
+            ("core_radius", "core radius", "m"),
+            ("y", "y", "m"),
+            ("z", "z", "m"),
         )
     ),
     ("separation", "separation b0", "m"),
     ("descent_speed", "descent speed w0 = circulation / (2 pi b0)", "m/s"),
     ("drift_v", "velocity of the pair along y", "m/s"),
     ("drift_w", "velocity of the pair along z", "m/s"),
-)  # fmt: skip
+)
 _ERRORS = (
-    ("rmse_v", "rms error of v", "m/s"), ("rmse_w", "rms error of w", "m/s"),
+    ("rmse_v", "rms error of v", "m/s"),
+    ("rmse_w", "rms error of w", "m/s"),
     ("outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
     ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
     ("reduced_variance_v", "variance of reduced errors of v", ""),
     ("reduced_variance_w", "variance of reduced errors of w", ""),
-)  # fmt: skip
+)
 
 
 def true_pair(wind: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
@@ -72,8 +75,13 @@ def true_pair(wind: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
 
 
 def draw_all(
-    folder: Path, image: xr.DataArray, vectors: xr.Dataset | None, truth: xr.Dataset,
-    fits: Mapping[str, VortexPairFit], cores: Sequence[Core], log: Callable,
+    folder: Path,
+    image: xr.DataArray,
+    vectors: xr.Dataset | None,
+    truth: xr.Dataset,
+    fits: Mapping[str, VortexPairFit],
+    cores: Sequence[Core],
+    log: Callable,
 ) -> list[Drawn]:
     """Draw the fits over the first image, the vectors (None: there are none) and the truth."""
     if not fits:
@@ -85,9 +93,7 @@ def draw_all(
 def _pair(image, vectors, truth, fits, cores):
     figure = Figure(figsize=(13.6, 12.4), layout="compressed")
     grid = figure.add_gridspec(3, 2)
-    seen, found, wrong, stated = (
-        figure.add_subplot(grid[k // 2, k % 2]) for k in range(4)
-    )
+    seen, found, wrong, stated = (figure.add_subplot(grid[k // 2, k % 2]) for k in range(4))
     cut = figure.add_subplot(grid[2, :])
     y, z = truth["y"].values, truth["z"].values
     best = next(iter(fits))
@@ -96,8 +102,16 @@ def _pair(image, vectors, truth, fits, cores):
 
     field = image.transpose("z", "y")
     top = float(np.nanquantile(field, 0.999))
-    seen.pcolormesh(field["y"], field["z"], field.values, cmap="gray", vmin=0, vmax=top or 1.0,
-                    shading="nearest", rasterized=True)  # fmt: skip
+    seen.pcolormesh(
+        field["y"],
+        field["z"],
+        field.values,
+        cmap="gray",
+        vmin=0,
+        vmax=top or 1.0,
+        shading="nearest",
+        rasterized=True,
+    )
     seen.set_title("first picture, fitted pairs")
     limit = float(np.quantile(np.hypot(true["v"], true["w"]), 0.999)) or 1.0
     _arrows(found, y, z, model, limit)
@@ -109,8 +123,9 @@ def _pair(image, vectors, truth, fits, cores):
         (wrong, error, "its error (speed of the difference to the truth)"),
         (stated, stderr, "its standard error"),
     ):
-        mesh = axes.pcolormesh(y, z, values, cmap="magma", vmin=0, vmax=most, shading="nearest",
-                               rasterized=True)  # fmt: skip
+        mesh = axes.pcolormesh(
+            y, z, values, cmap="magma", vmin=0, vmax=most, shading="nearest", rasterized=True
+        )
         figure.colorbar(mesh, ax=axes, label=_SPEED, pad=0.02, extend="max")
         axes.set_title(title)
     for axes in (seen, found, wrong, stated):
@@ -133,10 +148,18 @@ def _arrows(axes, y, z, model, limit):
     v, w = model["v"].values[at], model["w"].values[at]
     step = every * (y[1] - y[0])
     arrows = axes.quiver(
-        y[at[1]].ravel(), z[at[0]].ravel(), v, w, np.hypot(v, w), cmap="viridis",
-        norm=Normalize(0, limit), angles="xy", scale_units="xy", scale=limit / (1.8 * step),
+        y[at[1]].ravel(),
+        z[at[0]].ravel(),
+        v,
+        w,
+        np.hypot(v, w),
+        cmap="viridis",
+        norm=Normalize(0, limit),
+        angles="xy",
+        scale_units="xy",
+        scale=limit / (1.8 * step),
         width=0.0022,
-    )  # fmt: skip
+    )
     axes.figure.colorbar(arrows, ax=axes, label=f"speed / {_SPEED}", pad=0.02, extend="max")
 
 
@@ -145,11 +168,27 @@ def _mark(axes, fits, cores):
         colour, style = _STYLE[name]
         for k, vortex in enumerate((fit.port, fit.starboard)):
             label = f"from the {SOURCES[name]}" if k == 0 else None
-            axes.add_patch(Circle((vortex.y, vortex.z), vortex.core_radius, fill=False, ls=style,
-                                  ec=colour, lw=1.8, label=label))  # fmt: skip
+            axes.add_patch(
+                Circle(
+                    (vortex.y, vortex.z),
+                    vortex.core_radius,
+                    fill=False,
+                    ls=style,
+                    ec=colour,
+                    lw=1.8,
+                    label=label,
+                )
+            )
     for k, core in enumerate(cores):
-        axes.plot(core.y, core.z, "+", color="crimson", ms=10, label=None if k else "true cores",
-                  ls="none")  # fmt: skip
+        axes.plot(
+            core.y,
+            core.z,
+            "+",
+            color="crimson",
+            ms=10,
+            label=None if k else "true cores",
+            ls="none",
+        )
 
 
 def _along(axes, vectors, truth, fits, best):
@@ -160,9 +199,16 @@ def _along(axes, vectors, truth, fits, best):
         good = (row["flag"] == 0).values
         stderr = row["w_stderr"].values[good]
         axes.errorbar(
-            row["y"].values[good], row["w"].values[good], np.nan_to_num(stderr), fmt=".", ms=5,
-            color="0.45", ecolor="0.75", label="vectors", zorder=1,
-        )  # fmt: skip
+            row["y"].values[good],
+            row["w"].values[good],
+            np.nan_to_num(stderr),
+            fmt=".",
+            ms=5,
+            color="0.45",
+            ecolor="0.75",
+            label="vectors",
+            zorder=1,
+        )
     axes.plot(y, truth["w"].interp(z=level).values, "k", lw=1.5, label="truth")
     for name, fit in fits.items():
         colour, style = _STYLE[name]
@@ -177,9 +223,11 @@ def _along(axes, vectors, truth, fits, best):
 
 
 def vortex_chapter(
-    metrics: Mapping[str, float], fits: Mapping[str, VortexPairFit], refused: Mapping[str, str],
+    metrics: Mapping[str, float],
+    fits: Mapping[str, VortexPairFit],
+    refused: Mapping[str, str],
     drawn: Sequence[Drawn],
-) -> Chapter:  # fmt: skip
+) -> Chapter:
     """What wake vortices are described by, beside the truth.
 
     Parameters

@@ -14,8 +14,10 @@ from lidar_mi.assessment.metrics.cores import Core, find_cores, outside_cores
 from lidar_mi.assessment.metrics.errors import commonest_flag, truth_at_vectors, wind_metrics
 from lidar_mi.assessment.report.page import Chapter, backscatter_chapter
 from lidar_mi.assessment.report.vector_map import map_data
-from lidar_mi.experiment.schema import Experiment
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.run_folder import IMAGES, Log, Notice, write_netcdf
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.truth import Flows, Truth, blur_by_beam, make_truth, read_flows
 from lidar_mi.instrument.detector import gate_duration, noise_budget, noisy_scan, speckle_modes
 from lidar_mi.instrument.eye_safety import assess_pulses, scan_hazard_distance
 from lidar_mi.instrument.products import linear_depolarization, with_products
@@ -27,8 +29,6 @@ from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
 from lidar_mi.retrieval.velocimetry.wind import METHODS, retrieve_wind, wind_bound
 from lidar_mi.retrieval.velocimetry.windows import Windows
-from lidar_mi.experiment.run_folder import IMAGES, Log, Notice, write_netcdf
-from lidar_mi.experiment.truth import Flows, Truth, blur_by_beam, make_truth, read_flows
 
 # what winds are retrieved from behind a detector, beside the noise-free picture
 NOISY = "backscatter_noisy"
@@ -290,9 +290,12 @@ def texture_sweep(experiment: Experiment, flows: Flows, log) -> dict[str, float]
         wake = experiment.wake.model_copy(update={"texture": texture})
         truth = make_truth(experiment.model_copy(update={"wake": wake}), flows=flows)
         wind = retrieve_wind(
-            truth.image(0), truth.image(1), dt=experiment.platform.dt, method="cc",
+            truth.image(0),
+            truth.image(1),
+            dt=experiment.platform.dt,
+            method="cc",
             **window_settings(settings),
-        )  # fmt: skip
+        )
         found = wind_metrics(wind, truth_at_vectors(wind, truth.wind), [])
         for key in ("all.rmse_v", "all.rmse_w", "valid_fraction"):
             if key in found:
@@ -329,7 +332,9 @@ def verdict(found: xr.Dataset, scans, cores: list[Core]) -> dict[str, float]:
     if "depolarization" in first:
         s0, s1 = (float(first[name].sum(dtype=float)) for name in ("S0", "S1"))
         metrics["backscatter.depolarization"] = float(linear_depolarization(s0, s1))
-        metrics["backscatter.depolarization_stderr"] = float(first["depolarization_stderr"].median())
+        metrics["backscatter.depolarization_stderr"] = float(
+            first["depolarization_stderr"].median()
+        )
     for core in cores:
         side = "port" if core.circulation > 0 else "starboard"
         for key in ("y", "z", "radius", "circulation"):
@@ -396,9 +401,7 @@ def true_wind(found: xr.Dataset, truth: Truth, cores: list[Core]) -> dict[str, f
 def scan_plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
     """The scans of both pictures."""
     flown = (experiment.platform.speed - experiment.scan.follow) * experiment.platform.dt
-    return plan_scans(
-        experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown)
-    )
+    return plan_scans(experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown))
 
 
 @contextmanager
@@ -406,4 +409,3 @@ def _timed(timing: dict[str, float], name: str):
     start = time.perf_counter()
     yield
     timing[name] = time.perf_counter() - start
-

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.report.error_budget import budget_chapter, draw_all
 from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.assessment.metrics.error_budget import (
     error_budget,
@@ -15,8 +14,11 @@ from lidar_mi.assessment.metrics.error_budget import (
     picture_unit,
     pictures_without,
 )
+from lidar_mi.assessment.report.error_budget import budget_chapter, draw_all
 from lidar_mi.assessment.report.page import Chapter
 from lidar_mi.atmosphere.advection import advect
+from lidar_mi.experiment.run_folder import IMAGES, Log
+from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.backscatter import (
     NOISY,
     known_blur,
@@ -24,11 +26,9 @@ from lidar_mi.experiment.stages.backscatter import (
     scan_plans,
     window_settings,
 )
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.truth import Truth, blur_by_beam, make_truth
 from lidar_mi.io import exr
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
-from lidar_mi.experiment.run_folder import IMAGES, Log
-from lidar_mi.experiment.truth import Truth, blur_by_beam, make_truth
 
 # Pictures of air as it is: a method that undoes the beam's blur has none to undo there.
 _SHARP = ("perfect", "beam_blur")
@@ -104,11 +104,14 @@ def budgets(
                 )
         seen, perfect = winds.pop("seen"), winds.pop("perfect")
         stiff = moved_as_one(
-            seen, pictures["seen"][0], blurred, truth.wind,
+            seen,
+            pictures["seen"][0],
+            blurred,
+            truth.wind,
             lambda pair, stride, method=method: retrieve_wind(
                 *pair, method=method, **settings | {"stride": stride}
             ),
-        )  # fmt: skip
+        )
         winds |= {} if stiff is None else {"shear": stiff}
         found[method] = error_budget(seen, winds, truth.wind, cores, perfect, flagged)
     return found
@@ -145,9 +148,7 @@ def _pictures(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataA
         carried = as_seen([air[0], moved])
     sharp = as_seen(air, blurred=False)
     blurred = as_seen(air)
-    without = pictures_without(
-        seen, blurred, sharp, pair if experiment.detector else None, carried
-    )
+    without = pictures_without(seen, blurred, sharp, pair if experiment.detector else None, carried)
     # without the simulation's noise the detector's is left, if there is one
     counts = np.sqrt(np.maximum(level**2 - noise**2, 0)) if experiment.detector else 0.0
     levels = {"detector_noise": noise, "monte_carlo": counts}

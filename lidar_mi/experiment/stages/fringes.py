@@ -17,13 +17,14 @@ import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.assessment.figures import doppler as doppler_figures
-from lidar_mi.assessment.report.page import Chapter, doppler_chapter
 from lidar_mi.assessment.metrics.velocities import velocity_metrics
+from lidar_mi.assessment.report.page import Chapter, doppler_chapter
 from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
-from lidar_mi.experiment.schema import Doppler, Experiment
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.ring_instrument import air_rings, pixel_noise, ring_model
+from lidar_mi.experiment.run_folder import Log, write_netcdf
+from lidar_mi.experiment.schema import Doppler, Experiment
 from lidar_mi.instrument.doppler import photons, solar_background, speckle_modes
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.instrument.fringe_camera import CCD, expose, fringe_image, ring_radii
@@ -33,7 +34,6 @@ from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.rings import peaks as ring_peaks
 from lidar_mi.retrieval.rings.fit import fit_rings
 from lidar_mi.retrieval.rings.model import PixelNoise, RingModel, cramer_rao
-from lidar_mi.experiment.run_folder import Log, write_netcdf
 
 EMITTED, PHOTONS = "fringes_emitted.exr", "fringes_photons.exr"
 
@@ -145,12 +145,16 @@ def pictures(experiment: Experiment, line: Line, folder: Path, log: Log) -> Pict
             # the number of a picture makes its seed: a resumed run renders the same ones
             first, number = missing[0], before + missing[0]
             rendered = render_fringes(
-                doppler.etalon, doppler.camera, line_, speeds[first:], settings,
+                doppler.etalon,
+                doppler.camera,
+                line_,
+                speeds[first:],
+                settings,
                 (seed + (number << 16)) % 2**31,
                 lambda k, done, paths, n=number: log.bar(
                     f"rendering rings {n + k + 1} of {total}", done / paths
                 ),
-            )  # fmt: skip
+            )
             for k, picture in enumerate(rendered, first):
                 if k in missing:
                     exr.write_fringes(folder / files[k], picture)
@@ -181,8 +185,13 @@ def velocities(
         of the innermost ring's peak without any noise, m/s, at the first speed.
     """
     settings, speeds = doppler.retrieval, doppler.v_los
-    shape = (len(settings.methods), len(settings.centre), len(settings.averaged), len(speeds),
-             settings.images)  # fmt: skip
+    shape = (
+        len(settings.methods),
+        len(settings.centre),
+        len(settings.averaged),
+        len(speeds),
+        settings.images,
+    )
     v, v_std = np.full((2, *shape), np.nan)
     emitted = seen.emitted["S0"].values.astype(float)
     reference = _emitted_velocity(doppler, seen.emitted, rings.photons)
@@ -207,40 +216,58 @@ def velocities(
                         count = len(images) if name == "annular" else few
                         if count:
                             place = places[name], c, j, k, slice(first, first + count)
-                            read = fitted_speeds(frames[:count], doppler, rings.model, noise, name, centre)
+                            read = fitted_speeds(
+                                frames[:count], doppler, rings.model, noise, name, centre
+                            )
                             v[place], v_std[place] = read
                             v[place] -= reference
                     for i in range(few if peaks else 0):
                         found = _peak_radii(frames[i].numpy(), doppler, centre)
                         for name in peaks:
                             v[places[name], c, j, k, first + i] = ring_peaks.velocity_from_radii(
-                                found[name], radii[centre][name],
-                                doppler.camera.focal_length, doppler.camera.pixel,
-                            )  # fmt: skip
+                                found[name],
+                                radii[centre][name],
+                                doppler.camera.focal_length,
+                                doppler.camera.pixel,
+                            )
                 done += len(images)
     dims = ("algorithm", "centre", "averaged", "v_los", "image")
     return xr.Dataset(
         {
             "v": (dims, v, {"units": "m s-1", "long_name": "line-of-sight wind that is read"}),
-            "v_std": (dims, v_std, {
-                "units": "m s-1", "long_name": "standard deviation that the fit expects"}),
+            "v_std": (
+                dims,
+                v_std,
+                {"units": "m s-1", "long_name": "standard deviation that the fit expects"},
+            ),
             "tried": ("algorithm", tried, {"units": "1", "long_name": "pictures of every case"}),
-            "peak_bias": (("coordinate", "piece"), _peak_bias(doppler, seen), {
-                "units": "m s-1",
-                "long_name": "error of the innermost ring's peak by circular averaging, no noise"}),
+            "peak_bias": (
+                ("coordinate", "piece"),
+                _peak_bias(doppler, seen),
+                {
+                    "units": "m s-1",
+                    "long_name": "error of the innermost ring's peak by circular averaging, no noise",
+                },
+            ),
         },
         coords={
             "algorithm": list(settings.methods),
             "centre": list(settings.centre),
-            "averaged": ("averaged", list(settings.averaged), {
-                "units": "1", "long_name": "pictures of an average"}),
+            "averaged": (
+                "averaged",
+                list(settings.averaged),
+                {"units": "1", "long_name": "pictures of an average"},
+            ),
             "v_los": ("v_los", list(speeds), {"units": "m s-1", "long_name": "true wind"}),
             "coordinate": list(ring_peaks.COORDINATES),
-            "piece": ("piece", list(PIECES), {
-                "units": "1", "long_name": "half width of the fitted piece in radii"}),
+            "piece": (
+                "piece",
+                list(PIECES),
+                {"units": "1", "long_name": "half width of the fitted piece in radii"},
+            ),
         },
         attrs={"Conventions": "CF-1.11", "title": "Line-of-sight winds read from rings"},
-    )  # fmt: skip
+    )
 
 
 def fitted_speeds(frames, doppler, model, noise, method, centre) -> tuple[np.ndarray, np.ndarray]:
@@ -319,9 +346,13 @@ def ring_instrument(doppler: Doppler) -> Rings:
     lidar, etalon, camera, ccd = doppler.lidar, doppler.etalon, doppler.camera, doppler.ccd
     pressure, temperature = standard_atmosphere(lidar.altitude)
     line = backscatter_line(
-        lidar.wavelength, temperature, pressure, lidar.laser_width, lidar.aerosol_share,
+        lidar.wavelength,
+        temperature,
+        pressure,
+        lidar.laser_width,
+        lidar.aerosol_share,
         lidar.line_shape,
-    )  # fmt: skip
+    )
     model = air_rings(lidar, etalon, camera)
     for speed in doppler.v_los:
         if not abs(speed) < model.velocity_range / 2:
@@ -360,10 +391,14 @@ def _photon_by_photon(experiment: Experiment):
     laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
     if not doppler.photon_samples:
         return laser, doppler.render
-    return laser, doppler.render.model_copy(update={
-        "estimator": "analog", "line_shape": "sampled", "lens": "singlet",
-        "samples_per_pixel": doppler.photon_samples,
-    })  # fmt: skip
+    return laser, doppler.render.model_copy(
+        update={
+            "estimator": "analog",
+            "line_shape": "sampled",
+            "lens": "singlet",
+            "samples_per_pixel": doppler.photon_samples,
+        }
+    )
 
 
 def _expected(picture: xr.Dataset, total: float) -> torch.Tensor:
@@ -394,12 +429,14 @@ def summed(ccd: CCD, pictures: int) -> CCD:
     """
     if pictures == 1:
         return ccd
-    return ccd.model_copy(update={
-        "read_noise": math.sqrt(pictures) * pixel_noise(ccd).read_noise,
-        "integration_time": pictures * ccd.integration_time,
-        "full_well": pictures * ccd.full_well,
-        "bits": None,
-    })  # fmt: skip
+    return ccd.model_copy(
+        update={
+            "read_noise": math.sqrt(pictures) * pixel_noise(ccd).read_noise,
+            "integration_time": pictures * ccd.integration_time,
+            "full_well": pictures * ccd.full_well,
+            "bits": None,
+        }
+    )
 
 
 def summed_noise(ccd: CCD, modes: float, pictures: int) -> PixelNoise:
@@ -411,7 +448,9 @@ def _instrument(doppler: Doppler, rings: Rings) -> dict[str, float]:
     speckle = {"doppler.speckle_modes": rings.modes} if math.isfinite(rings.modes) else {}
     return speckle | {
         "doppler.photons": rings.photons,
-        "doppler.background_photons": rings.background * doppler.camera.width * doppler.camera.height,
+        "doppler.background_photons": rings.background
+        * doppler.camera.width
+        * doppler.camera.height,
         "doppler.signal": ccd.quantum_efficiency * rings.photons,
         "doppler.line_width": rings.line.width,
         "doppler.free_spectral_range": etalon.free_spectral_range(lidar.wavelength),
@@ -440,13 +479,16 @@ def _bounds(doppler: Doppler, rings: Rings) -> dict[str, float]:
     metrics = {}
     for centre in doppler.retrieval.centre:
         unknown = [
-            name for name in rings.model.parameters
-            if centre == "free" or name not in ("x", "y")
-        ]  # fmt: skip
+            name for name in rings.model.parameters if centre == "free" or name not in ("x", "y")
+        ]
         bound = cramer_rao(
-            rings.model, efficiency * rings.photons, noise, v_los=doppler.v_los[0],
-            background=floor, free=unknown,
-        )["v_los"]  # fmt: skip
+            rings.model,
+            efficiency * rings.photons,
+            noise,
+            v_los=doppler.v_los[0],
+            background=floor,
+            free=unknown,
+        )["v_los"]
         for n in doppler.retrieval.averaged:
             metrics[f"doppler.bound.centre_{centre}.averaged_{n}.std"] = bound / math.sqrt(n)
     return metrics

@@ -15,16 +15,18 @@ import torch
 import xarray as xr
 
 from lidar_mi import __version__
-from lidar_mi.experiment.stages import fringes as fringe_chain
 from lidar_mi.assessment.metrics.cores import find_cores, outside_cores
 from lidar_mi.assessment.metrics.errors import commonest_flag
-from lidar_mi.assessment.report.page import Chapter
 from lidar_mi.assessment.metrics.requirements import judge, read_requirements
+from lidar_mi.assessment.report.page import Chapter
 from lidar_mi.assessment.report.sensor import draw_all, sensor_chapter
 from lidar_mi.assessment.report.vector_map import map_data
-from lidar_mi.experiment.stages.backscatter import NOISY
-from lidar_mi.experiment.schema import Experiment
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.run_folder import Log, write_netcdf
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages import fringes as fringe_chain
+from lidar_mi.experiment.stages.backscatter import NOISY
+from lidar_mi.experiment.truth import find_file, make_truth, moves_along
 from lidar_mi.instrument.budget import pulse_budget, pulses_for_error
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind, sight_volumes, wind_at
@@ -33,8 +35,6 @@ from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.instrument.scan import plan_scans
 from lidar_mi.retrieval.lines.combine import combine
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, wind_from_neighbours, wind_from_triples
-from lidar_mi.experiment.run_folder import Log, write_netcdf
-from lidar_mi.experiment.truth import find_file, make_truth, moves_along
 
 LINES, WIND = "lines_of_sight.nc", "wind3d.nc"
 
@@ -72,7 +72,9 @@ def prepare(
         wind_at(truth, _volumes(experiment))
     except InputError as error:
         raise InputError(f"sensor.directions: {error}") from None
-    fastest = experiment.platform.speed + float(np.sqrt(sum(truth[n] ** 2 for n in COMPONENTS)).max())
+    fastest = experiment.platform.speed + float(
+        np.sqrt(sum(truth[n] ** 2 for n in COMPONENTS)).max()
+    )
     limit = fringe_chain.ring_instrument(experiment.doppler).model.velocity_range / 2
     if fastest > limit:
         raise InputError(
@@ -133,7 +135,9 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
     except InputError as error:
         log.remark(f"no wind from lines of sight alone: {error}")
     metrics |= _costs(experiment, truth) | _pulses_needed(experiment, tables, lines)
-    judged = [(table, judge(table, measured(experiment, metrics, table))) for table in tables.values()]
+    judged = [
+        (table, judge(table, measured(experiment, metrics, table))) for table in tables.values()
+    ]
     for table, findings in judged:
         for row in findings:
             if not math.isnan(row.margin):
@@ -171,10 +175,16 @@ def _combined(experiment, truth, lines, crossflow) -> xr.Dataset:
     )
     for name in COMPONENTS:
         at = {axis: found[axis] for axis in ("z", "y")}
-        found[f"{name}_true"] = truth[name].interp(at).assign_attrs(
-            units="m s-1", long_name=f"true {name}, mean over the slab"
+        found[f"{name}_true"] = (
+            truth[name]
+            .interp(at)
+            .assign_attrs(units="m s-1", long_name=f"true {name}, mean over the slab")
         )
-    ahead = {"units": "m", "long_name": "distance ahead of the first picture's telescope", "axis": "X"}
+    ahead = {
+        "units": "m",
+        "long_name": "distance ahead of the first picture's telescope",
+        "axis": "X",
+    }
     found["x"] = (), experiment.scan.range + experiment.scan.thickness / 2, ahead
     found = found.set_coords("x")
     found.attrs |= {
@@ -193,19 +203,26 @@ def measure_lines(experiment: Experiment, truth: xr.Dataset, log: Log) -> xr.Dat
     """
     sensor, doppler = experiment.sensor, experiment.doppler
     lines = scan_wind(
-        truth, sensor.directions, doppler.lidar, 0.0, experiment.seed, experiment.platform.speed,
+        truth,
+        sensor.directions,
+        doppler.lidar,
+        0.0,
+        experiment.seed,
+        experiment.platform.speed,
         sensor.errors,
-    )  # fmt: skip
+    )
     true = lines["v_los_true"].values
     log(f"measuring {len(true)} lines of sight, {sensor.pulses} pulses each")
     middle, half = (true.max() + true.min()) / 2, max(np.ptp(true) / 2, 1e-3)
     nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
     rings = fringe_chain.ring_instrument(doppler)
     light, counted = photons(doppler.lidar), doppler.lidar.counted
-    images = torch.stack([
-        fringe_image(doppler.camera, doppler.etalon, rings.line, speed, light, counted)
-        for speed in middle + half * nodes
-    ])  # fmt: skip
+    images = torch.stack(
+        [
+            fringe_image(doppler.camera, doppler.etalon, rings.line, speed, light, counted)
+            for speed in middle + half * nodes
+        ]
+    )
     noise = fringe_chain.summed_noise(doppler.ccd, rings.modes, sensor.pulses)
     weights = torch.from_numpy(_lagrange(nodes, (true - middle) / half)).to(images.dtype)
     read = np.empty((2, len(true)))
@@ -217,9 +234,11 @@ def measure_lines(experiment: Experiment, truth: xr.Dataset, log: Log) -> xr.Dat
             farther = doppler.lidar.model_copy(update={"range": float(lines["range"][index])})
             image = torch.tensordot(weights[index], images, 1) * (photons(farther) / light)
             # numbers of their own, apart from those of the pictures of the Doppler lidar's chapter
-            frames.append(fringe_chain.exposed_frames(
-                doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
-            ))  # fmt: skip
+            frames.append(
+                fringe_chain.exposed_frames(
+                    doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
+                )
+            )
         read[:, start : chunk.stop] = fringe_chain.fitted_speeds(
             torch.cat(frames), doppler, rings.model, noise, "annular", "free"
         )
@@ -234,7 +253,10 @@ def _lagrange(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Weights (places, nodes) of values at the nodes in the polynomial through them, at places."""
     others = ~np.eye(len(nodes), dtype=bool)
     return np.stack(
-        [((places[:, None] - nodes[o]) / (node - nodes[o])).prod(1) for node, o in zip(nodes, others)],
+        [
+            ((places[:, None] - nodes[o]) / (node - nodes[o])).prod(1)
+            for node, o in zip(nodes, others)
+        ],
         axis=1,
     )
 
@@ -303,9 +325,14 @@ def budget_of_u(experiment, truth, lines, crossflow, found, cores) -> dict[str, 
         if "pointing" in causes:
             missed = PlatformErrors()
         changed = scan_wind(
-            truth, experiment.sensor.directions, lidar, 0.0, experiment.seed,
-            experiment.platform.speed, missed,
-        )  # fmt: skip
+            truth,
+            experiment.sensor.directions,
+            lidar,
+            0.0,
+            experiment.seed,
+            experiment.platform.speed,
+            missed,
+        )
         # lines that were not read stay so
         noise, std = lines["v_los"] - lines["v_los_true"], lines["v_los_std"]
         if "line_noise" in causes:
@@ -373,17 +400,19 @@ def measured(experiment: Experiment, metrics: dict[str, float], table) -> dict[s
     retrieval = experiment.retrieval
     overlap = min(1.0, retrieval.stride / retrieval.template) ** 2
     along = any(row.quantity == "error_v_los" for row in table.rows)
-    points = metrics["sensor.lines_read"] if along else math.floor(overlap * metrics["sensor.vectors"])
+    points = (
+        metrics["sensor.lines_read"] if along else math.floor(overlap * metrics["sensor.vectors"])
+    )
     return {
         "range": experiment.scan.range + experiment.scan.thickness / 2,
         "points_per_slab": points,
         "slabs_per_second": experiment.sensor.slabs_per_second,
-        "slab_depth": experiment.doppler.lidar.range_bin if along else max(
-            experiment.doppler.lidar.range_bin, experiment.scan.thickness
-        ),
+        "slab_depth": experiment.doppler.lidar.range_bin
+        if along
+        else max(experiment.doppler.lidar.range_bin, experiment.scan.thickness),
         "error_v_los": metrics.get("sensor.rmse_v_los"),
         **{f"error_{n}": metrics.get(f"sensor.outside_cores.rmse_{n}") for n in COMPONENTS},
-    }  # fmt: skip
+    }
 
 
 def _pulses_needed(experiment: Experiment, tables, lines: xr.Dataset) -> dict[str, int]:
@@ -403,7 +432,9 @@ def _costs(experiment: Experiment, truth: xr.Dataset) -> dict[str, float]:
     far = float(sensor.directions.ranges(doppler).max()) + doppler.range_bin / 2
     directions = sensor.directions.columns * sensor.directions.rows
     rate = sensor.slabs_per_second
-    budget = pulse_budget(directions, rate, sensor.pulses, doppler.pulse_energy, far, photons(doppler))
+    budget = pulse_budget(
+        directions, rate, sensor.pulses, doppler.pulse_energy, far, photons(doppler)
+    )
     metrics = {
         "sensor.doppler.pulses_per_second": budget.pulses_per_second,
         "sensor.doppler.average_power": budget.average_power,
@@ -412,9 +443,12 @@ def _costs(experiment: Experiment, truth: xr.Dataset) -> dict[str, float]:
     }
     plan = plan_scans(experiment.scan, truth["y"].values, truth["z"].values, (0.0,))[0]
     pictures = pulse_budget(
-        len(plan.y) * len(plan.z), 1 / experiment.platform.dt, 1, lidar.pulse_energy,
+        len(plan.y) * len(plan.z),
+        1 / experiment.platform.dt,
+        1,
+        lidar.pulse_energy,
         float((plan.ranges()[-1] + plan.gate_length() / 2).max()),
-    )  # fmt: skip
+    )
     metrics |= {
         "sensor.backscatter.pulses_per_second": pictures.pulses_per_second,
         "sensor.backscatter.average_power": pictures.average_power,
@@ -427,9 +461,14 @@ def _costs(experiment: Experiment, truth: xr.Dataset) -> dict[str, float]:
     for name, (beam, radius, repetition) in beams.items():
         if beam.pulse_duration > 0:
             safety = assess_pulses(
-                beam.wavelength, beam.pulse_energy, beam.pulse_duration, radius,
-                beam.divergence_full, repetition, sensor.exposure,
-            )  # fmt: skip
+                beam.wavelength,
+                beam.pulse_energy,
+                beam.pulse_duration,
+                radius,
+                beam.divergence_full,
+                repetition,
+                sensor.exposure,
+            )
             for key in ("hazard_distance", "aided_hazard_distance"):
                 if math.isfinite(getattr(safety, key)):
                     metrics[f"sensor.{name}.{key}"] = getattr(safety, key)

@@ -16,9 +16,11 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.cores import Core, find_cores, outside_cores
 from lidar_mi.assessment.report.page import Chapter
 from lidar_mi.assessment.report.volume import draw_all, volume_chapter
-from lidar_mi.experiment.stages.backscatter import NOISY, check_ahead, pictures, scan_plans
-from lidar_mi.experiment.schema import Experiment
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.run_folder import VOLUME, Log, Notice, write_netcdf
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.backscatter import NOISY, check_ahead, pictures, scan_plans
+from lidar_mi.experiment.truth import make_truth, read_flows
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.signal import apparent_backscatter
@@ -27,8 +29,6 @@ from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.velocimetry.common_grid import resample
 from lidar_mi.retrieval.velocimetry.volume import COMPONENTS, retrieve_wind_volume
 from lidar_mi.retrieval.velocimetry.volume_windows import VolumeWindows
-from lidar_mi.experiment.run_folder import VOLUME, Log, Notice, write_netcdf
-from lidar_mi.experiment.truth import make_truth, read_flows
 
 PASSED = 0.76
 """Share of the variance of white noise that bicubic splines pass, in the mean over all places."""
@@ -51,9 +51,7 @@ def prepare(
     flows = read_flows(experiment, beside)
     flow = flows[0]
     if "u" not in flow:
-        raise InputError(
-            "wake.file: no wind along x (u) in it; expected u, v and w for volume"
-        )
+        raise InputError("wake.file: no wind along x (u) in it; expected u, v and w for volume")
     _check_gates(experiment, flow)
     truth = make_truth(experiment, beside, flows)
     plans = scan_plans(experiment, truth)
@@ -134,9 +132,11 @@ def scan_volume(
     )
     volume = np.empty((len(x), len(z), len(y)))
     for gate, (row, column) in enumerate(zip(_places(plan, "z"), _places(plan, "y"))):
-        picture = xr.DataArray(values[gate], {
-            "z": ("z", row, {"units": "m"}), "y": ("y", column, {"units": "m"}),
-        }, ("z", "y"))  # fmt: skip
+        picture = xr.DataArray(
+            values[gate],
+            {"z": ("z", row, {"units": "m"}), "y": ("y", column, {"units": "m"})},
+            ("z", "y"),
+        )
         volume[gate] = resample(picture, y, z).values
     coords = {name: (name, axis, {"units": "m"}) for name, axis in zip("xzy", nodes)}
     about = {"long_name": "apparent backscatter coefficient", "units": "m-1 sr-1"}
@@ -203,10 +203,18 @@ def winds(experiment, flow: xr.Dataset, volumes, noise, log) -> xr.Dataset:
         for number, method in enumerate(settings.methods):
             log(f"retrieving winds from {source.replace('_', ' ')} by {method}")
             log.bar(f"retrieving winds by {method}", number / len(settings.methods))
-            methods.append(retrieve_wind_volume(
-                *pair, experiment.platform.dt, method, settings.template, settings.search,
-                settings.stride, min_correlation=settings.min_correlation, noise=noise[source],
-            ))  # fmt: skip
+            methods.append(
+                retrieve_wind_volume(
+                    *pair,
+                    experiment.platform.dt,
+                    method,
+                    settings.template,
+                    settings.search,
+                    settings.stride,
+                    min_correlation=settings.min_correlation,
+                    noise=noise[source],
+                )
+            )
         sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
     found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
     found = found.assign_coords(source=list(volumes), algorithm=list(settings.methods))
@@ -261,8 +269,11 @@ def errors(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
             for name in COMPONENTS.values():
                 error = (wind[name] - wind[f"{name}_true"]).values
                 stderr = wind[f"{name}_stderr"].values
-                for part, chosen in (("", valid), ("outside_cores.", valid & far),
-                                     ("all.", np.isfinite(error))):  # fmt: skip
+                for part, chosen in (
+                    ("", valid),
+                    ("outside_cores.", valid & far),
+                    ("all.", np.isfinite(error)),
+                ):
                     if chosen.any():
                         rms = float(np.sqrt((error[chosen] ** 2).mean()))
                         metrics[f"{key}.{part}rmse_{name}"] = rms

@@ -15,16 +15,16 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.cores import find_cores, outside_cores
 from lidar_mi.assessment.report.page import Chapter
 from lidar_mi.assessment.report.vortices import SOURCES, draw_all, true_pair, vortex_chapter
-from lidar_mi.experiment.stages.backscatter import rendered_pairs
-from lidar_mi.experiment.schema import Experiment
 from lidar_mi.errors import InputError
-from lidar_mi.io import exr
-from lidar_mi.retrieval.lines.combine import CombinedFlag
-from lidar_mi.io.vortex_file import write_vortices
-from lidar_mi.retrieval.vortices.fit import VortexPairFit, fit_vortices, fit_vortices_to_wind
 from lidar_mi.experiment.run_folder import IMAGES, Log, write
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.backscatter import rendered_pairs
 from lidar_mi.experiment.stages.sensor import WIND
 from lidar_mi.experiment.truth import make_truth
+from lidar_mi.io import exr
+from lidar_mi.io.vortex_file import write_vortices
+from lidar_mi.retrieval.lines.combine import CombinedFlag
+from lidar_mi.retrieval.vortices.fit import VortexPairFit, fit_vortices, fit_vortices_to_wind
 
 VORTEX = "vortex.json"
 

@@ -200,11 +200,21 @@ def combine(
     wind[~good, 1:] = np.nan
     covariance[~good, 1:] = covariance[~good, :, 1:] = np.nan
     flag = CombinedFlag.NO_CROSSFLOW * ~good + CombinedFlag.BEYOND_LINES * ~_inside(hull, z, y)
-    return _dataset(crossflow, wind, covariance, flag, {
-        "lines_used": len(residual), "misfit": best.misfit,
-        "u_std": best.std, "u_length": best.length, "u_power": best.power,
-        "u_exponent": best.exponent, "window": window,
-    })  # fmt: skip
+    return _dataset(
+        crossflow,
+        wind,
+        covariance,
+        flag,
+        {
+            "lines_used": len(residual),
+            "misfit": best.misfit,
+            "u_std": best.std,
+            "u_length": best.length,
+            "u_power": best.power,
+            "u_exponent": best.exponent,
+            "window": window,
+        },
+    )
 
 
 def _slopes(z: np.ndarray, y: np.ndarray, distance: float | None) -> np.ndarray:
@@ -295,8 +305,9 @@ def _lines(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[_Lines, np.n
     share = weights / 2
     parts = [
         (low_z + dz, low_y + dy, share * _part(part_z, dz) * _part(part_y, dy))
-        for dz in (0, 1) for dy in (0, 1)
-    ]  # fmt: skip
+        for dz in (0, 1)
+        for dy in (0, 1)
+    ]
     row, column, weight = (np.concatenate(p, axis=1)[used] for p in zip(*parts))
     variance = scan["v_los_std"].values[used] ** 2
     middle = np.stack([scan["range"].values * direction[:, k] for k in (1, 2)], -1)
@@ -401,7 +412,9 @@ def _strengths(field, lines, z, y, spacing, power) -> dict[float, np.ndarray]:
     found = {}
     for one in _POWERS if power is None else (power,):
         strength = shear**one
-        found[one] = strength / np.sqrt((strength[lines.z, lines.y] ** 2 * lines.weight).sum(1).mean())
+        found[one] = strength / np.sqrt(
+            (strength[lines.z, lines.y] ** 2 * lines.weight).sum(1).mean()
+        )
     return found
 
 
@@ -435,10 +448,17 @@ def _statistics(
                 square = float(residual @ cho_solve(factor, residual))
                 evidence.append(-np.log(np.diag(factor[0])).sum() - square / 2)
                 shapes.append(shape)
-                choices.append(_Choice(
-                    float(one_std), float(one_length), float(power), one_exponent, 0.0, (),
-                    square / len(residual),
-                ))  # fmt: skip
+                choices.append(
+                    _Choice(
+                        float(one_std),
+                        float(one_length),
+                        float(power),
+                        one_exponent,
+                        0.0,
+                        (),
+                        square / len(residual),
+                    )
+                )
     # steps of the standard deviation grow with it
     share = np.exp(np.array(evidence) - max(evidence)) * [choice.std for choice in choices]
     share /= share.sum()
@@ -498,16 +518,22 @@ def _inside(middles: np.ndarray, z: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 def _dataset(crossflow, wind, covariance, flag, attributes) -> xr.Dataset:
     names = {
-        "u": ("wind along x", "x_wind"), "v": ("wind along y", "y_wind"),
+        "u": ("wind along x", "x_wind"),
+        "v": ("wind along y", "y_wind"),
         "w": ("wind along z", "upward_air_velocity"),
-    }  # fmt: skip
+    }
     dims = ("z", "y")
     return xr.Dataset(
         {
             **{
                 name: (
-                    dims, wind[..., index],
-                    {"units": "m s-1", "long_name": names[name][0], "standard_name": names[name][1]},
+                    dims,
+                    wind[..., index],
+                    {
+                        "units": "m s-1",
+                        "long_name": names[name][0],
+                        "standard_name": names[name][1],
+                    },
                 )
                 for index, name in enumerate(COMPONENTS)
             },
@@ -519,6 +545,8 @@ def _dataset(crossflow, wind, covariance, flag, attributes) -> xr.Dataset:
             "Conventions": "CF-1.11",
             "title": "Wind from a Doppler and a backscatter lidar",
             **attributes,
-            "u_std_units": "m s-1", "u_length_units": "m", "window_units": "m",
+            "u_std_units": "m s-1",
+            "u_length_units": "m",
+            "window_units": "m",
         },
-    )  # fmt: skip
+    )

@@ -39,9 +39,12 @@ def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
         if name not in scan:
             raise InputError(f"scan.{name}: missing; expected {', '.join(_NAMES)}")
     for name, dims in (
-        ("v_los", {"line"}), ("v_los_std", {"line"}), ("range", {"line"}),
-        ("direction", {"line", "axis"}), ("platform_velocity", {"axis"}),
-    ):  # fmt: skip
+        ("v_los", {"line"}),
+        ("v_los_std", {"line"}),
+        ("range", {"line"}),
+        ("direction", {"line", "axis"}),
+        ("platform_velocity", {"axis"}),
+    ):
         if set(scan[name].dims) != dims:
             raise InputError(f"scan.{name}: dims {scan[name].dims} are not {tuple(sorted(dims))}")
     if scan.sizes["axis"] != 3:
@@ -221,13 +224,17 @@ def error_variables(dims, covariance: np.ndarray) -> dict:
     stderr = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     found = {
         f"{name}_stderr": (
-            dims, stderr[..., index], {"units": "m s-1", "long_name": f"standard error of {name}"}
+            dims,
+            stderr[..., index],
+            {"units": "m s-1", "long_name": f"standard error of {name}"},
         )
         for index, name in enumerate(COMPONENTS)
-    }  # fmt: skip
+    }
     for i, j in ((0, 1), (0, 2), (1, 2)):
         both = stderr[..., i] * stderr[..., j]
-        correlation = np.divide(covariance[..., i, j], both, out=np.zeros_like(both), where=both > 0)
+        correlation = np.divide(
+            covariance[..., i, j], both, out=np.zeros_like(both), where=both > 0
+        )
         correlation[np.isnan(both)] = np.nan
         first, second = COMPONENTS[i], COMPONENTS[j]
         text = {"units": "1", "long_name": f"correlation of the errors of {first} and {second}"}

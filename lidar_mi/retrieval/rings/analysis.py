@@ -14,9 +14,9 @@ import numpy as np
 from scipy.signal import find_peaks, peak_widths, savgol_filter
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.peak_fit import peaks
 from lidar_mi.retrieval.rings.centre import gradient_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
+from lidar_mi.retrieval.rings.peak_fit import peaks
 
 STEPS = 1200  # annuli out to the farthest corner
 SECTORS = 48
@@ -98,8 +98,9 @@ class Rings:
     def curve(self, radius: float, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (x, y) of a ring of that mean radius, at angles from x toward y."""
         cosine, sine = np.cos(angle), np.sin(angle)
-        r = radius * (1 + self.ellipticity[0] * np.cos(2 * angle)
-                      + self.ellipticity[1] * np.sin(2 * angle))  # fmt: skip
+        r = radius * (
+            1 + self.ellipticity[0] * np.cos(2 * angle) + self.ellipticity[1] * np.sin(2 * angle)
+        )
         r = r + radius**2 * (self.tilt[0] * cosine + self.tilt[1] * sine)
         return self.centre[0] + r * cosine, self.centre[1] + r * sine
 
@@ -147,14 +148,24 @@ def analyse(
         radius**2, 2 * radius * error
     )
     return Rings(
-        shape=image.shape, centre=centre,
+        shape=image.shape,
+        centre=centre,
         centre_std=tuple(map(float, moved_std)) if free else (0.0, 0.0),
-        radius=radius, radius_std=error, order=order, line=line,
-        spacing=spacing, spacing_std=spacing_std, fraction=fraction, fraction_std=fraction_std,
-        misfit=misfit, roundness=rms,
-        ellipticity=tuple(map(float, distortion[2:4])), tilt=tuple(map(float, distortion[4:])),
-        r2=sectors.r2, profile=sectors.mean,
-    )  # fmt: skip
+        radius=radius,
+        radius_std=error,
+        order=order,
+        line=line,
+        spacing=spacing,
+        spacing_std=spacing_std,
+        fraction=fraction,
+        fraction_std=fraction_std,
+        misfit=misfit,
+        roundness=rms,
+        ellipticity=tuple(map(float, distortion[2:4])),
+        tilt=tuple(map(float, distortion[4:])),
+        r2=sectors.r2,
+        profile=sectors.mean,
+    )
 
 
 def describe(rings: Rings) -> list[tuple[str, list[tuple[str, ...]]]]:
@@ -171,22 +182,26 @@ def describe(rings: Rings) -> list[tuple[str, list[tuple[str, ...]]]]:
     for split in rings.splitting:
         for line, value in enumerate(split, 1):
             whole.append(
-                (f"splitting, line {line} from 0", (f"{value:.6g} px^2, "
-                 f"{value / rings.spacing:.4f} orders"))
-            )  # fmt: skip
-    steps = "no ring left over to test" if math.isnan(rings.misfit) else f"{rings.misfit:.2g} orders"
+                (
+                    f"splitting, line {line} from 0",
+                    (f"{value:.6g} px^2, {value / rings.spacing:.4f} orders"),
+                )
+            )
+    steps = (
+        "no ring left over to test" if math.isnan(rings.misfit) else f"{rings.misfit:.2g} orders"
+    )
     whole += [
         ("rms deviation from equal steps", steps),
         ("rms deviation of crests from the rings", f"{rings.roundness:.2g} px"),
-        ("ellipticity, tilt", (f"{math.hypot(*rings.ellipticity):.2g}, "
-         f"{math.hypot(*rings.tilt):.2g} / px")),
-    ]  # fmt: skip
+        (
+            "ellipticity, tilt",
+            (f"{math.hypot(*rings.ellipticity):.2g}, {math.hypot(*rings.tilt):.2g} / px"),
+        ),
+    ]
     single = [("order", "line", "radius")]
     single += [
         (str(order), str(line), f"{radius:.3f} +- {std:.3f} px")
-        for order, line, radius, std in zip(
-            rings.order, rings.line, rings.radius, rings.radius_std
-        )
+        for order, line, radius, std in zip(rings.order, rings.line, rings.radius, rings.radius_std)
     ]
     return [("pattern", whole), ("rings", single)]
 
@@ -337,6 +352,11 @@ def _law(square: np.ndarray, error: np.ndarray):
     fraction_std = np.sqrt(np.diag(by @ covariance @ by.T))
     passed = np.floor(fraction).astype(int)
     return (
-        order + passed[line], line, float(spacing), float(np.sqrt(covariance[0, 0])),
-        fraction - passed, fraction_std, misfit,
-    )  # fmt: skip
+        order + passed[line],
+        line,
+        float(spacing),
+        float(np.sqrt(covariance[0, 0])),
+        fraction - passed,
+        fraction_std,
+        misfit,
+    )

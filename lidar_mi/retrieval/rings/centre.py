@@ -112,9 +112,7 @@ def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[floa
         below, above = contrast(x, y + 1), contrast(x, y - 1)
         slope = np.array([right - left, below - above]) / 2
         mixed = corner - right - below + middle
-        curve = np.array([
-            [right + left - 2 * middle, mixed], [mixed, below + above - 2 * middle],
-        ])  # fmt: skip
+        curve = np.array([[right + left - 2 * middle, mixed], [mixed, below + above - 2 * middle]])
         # where the contrast is not yet a hill's top, uphill
         hill = np.linalg.eigvalsh(curve)[1] < 0
         step = -np.linalg.solve(curve, slope) if hill else 2 * np.sign(slope)
@@ -125,7 +123,10 @@ def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[floa
 
 
 def midpoint_points(
-    image: np.ndarray, centre: tuple[float, float], radius: float, half_width: float,
+    image: np.ndarray,
+    centre: tuple[float, float],
+    radius: float,
+    half_width: float,
     bands: int = 24,
 ) -> np.ndarray:
     """Crests of one ring along lines across it, left and right and above and below.
@@ -138,7 +139,7 @@ def midpoint_points(
     array (2, 2, bands, 2)
         Direction (along x, along y), side (before, behind the centre), band, and (x, y) in px.
         NaN where the line leaves the picture or has no crest.
-    """  # fmt: skip
+    """
     found = np.full((2, 2, bands, 2), np.nan)
     for direction in range(2):
         # lines along x of the picture, or along y of it: the same on the transposed picture

@@ -217,9 +217,17 @@ def _fit_about(centre, images, task: _Task, number: int, method: str) -> RingFit
     else:
         near = _fit(images, task, number, "annular")
         parameters = torch.stack(
-            [near.v_los, near.x - centre[0], near.y - centre[1], near.level, near.background,
-             near.temperature, near.falloff], 1,
-        )  # fmt: skip
+            [
+                near.v_los,
+                near.x - centre[0],
+                near.y - centre[1],
+                near.level,
+                near.background,
+                near.temperature,
+                near.falloff,
+            ],
+            1,
+        )
         cells = pixels(model.shape, centre, images.device)
         means = cells.means(images)
     parameters, mean, jacobian, variance = _scoring(
@@ -312,7 +320,9 @@ def _scoring(model, cells, means, parameters, noise, indices, number):
         step = torch.linalg.solve_ex(normal, score * unit)[0] * unit
         if not torch.isfinite(step).all():
             bad = number + int((~torch.isfinite(step)).any(1).nonzero()[0])
-            raise InputError(f"images[{bad}]: the fit fails; expected rings that the model describes")
+            raise InputError(
+                f"images[{bad}]: the fit fails; expected rings that the model describes"
+            )
         parameters = parameters.clone()
         bound = limit[indices]
         parameters[:, indices] += step.clamp(-bound, bound)
@@ -321,7 +331,9 @@ def _scoring(model, cells, means, parameters, noise, indices, number):
             parameters[:, 5] = parameters[:, 5].clamp(first, last)
         converged = (step.abs() <= CLOSE * std).all(1)
     bad = number + int((~converged).nonzero()[0])
-    raise InputError(f"images[{bad}]: the fit does not converge; expected two rings or more as the model has them")
+    raise InputError(
+        f"images[{bad}]: the fit does not converge; expected two rings or more as the model has them"
+    )
 
 
 def _rings(model, cells, means, parameters, mean, variance) -> torch.Tensor:

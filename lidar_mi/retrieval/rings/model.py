@@ -102,7 +102,9 @@ class RingModel:
         harmonics = harmonics / harmonics[:, :1].real
         strong = np.flatnonzero(np.abs(harmonics).max(0) > NEGLIGIBLE)[-1]
         if strong < 1:
-            raise InputError("harmonics: all but the mean are 0; expected an etalon that leaves rings")
+            raise InputError(
+                "harmonics: all but the mean are 0; expected an etalon that leaves rings"
+            )
         object.__setattr__(self, "harmonics", harmonics[:, : strong + 1])
         object.__setattr__(self, "temperatures", temperatures)
 
@@ -298,8 +300,9 @@ def parameter_vector(
             )
     vector = torch.tensor(
         [[v_los, 0.0, 0.0, 1.0, 0.0, warm, model.falloff]],
-        dtype=torch.float64, device=cells.x.device,
-    )  # fmt: skip
+        dtype=torch.float64,
+        device=cells.x.device,
+    )
     shares = mean_and_jacobian(model, cells, vector)[0]
     vector[0, 3] = photons / (shares * cells.count).sum()
     vector[0, 4] = background

@@ -18,7 +18,6 @@ from scipy.ndimage import map_coordinates
 from scipy.signal import savgol_filter
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.peak_fit import peak
 from lidar_mi.retrieval.rings.centre import (
     circular_average,
     circular_centre,
@@ -27,6 +26,7 @@ from lidar_mi.retrieval.rings.centre import (
     midpoint_points,
 )
 from lidar_mi.retrieval.rings.frames import inside
+from lidar_mi.retrieval.rings.peak_fit import peak
 
 METHODS = ("ca", "ml", "sg")
 COORDINATES = ("r", "r2")

@@ -24,9 +24,7 @@ class Factor(NamedTuple):
         middle = [right[0]]
         for ratio, part in zip(self.ratio, right[1:]):
             middle.append(part - ratio @ middle[-1])
-        middle = [
-            torch.cholesky_solve(part, root) for part, root in zip(middle, self.diagonal)
-        ]
+        middle = [torch.cholesky_solve(part, root) for part, root in zip(middle, self.diagonal)]
         for k in range(len(self.ratio) - 1, -1, -1):
             middle[k] = middle[k] - self.ratio[k].T @ middle[k + 1]
         return torch.stack(middle)

@@ -48,7 +48,9 @@ def displacement_bound(
     image_pair(image1, image2)
     for image in (image1, image2):
         if not bool(torch.isfinite(image).all()):
-            raise InputError("image: non-finite pixels are not allowed; expected numbers throughout")
+            raise InputError(
+                "image: non-finite pixels are not allowed; expected numbers throughout"
+            )
     if min(image1.shape) < window:
         raise InputError(
             f"window: {window} px does not fit into the image of "
@@ -57,8 +59,7 @@ def displacement_bound(
     level = noise if noise is None else rms(noise)
     spline, level = band_limited(levelled([image1, image2]), level)
     places = [
-        torch.arange(n, dtype=spline.coefficients.dtype, device=image1.device)
-        for n in image1.shape
+        torch.arange(n, dtype=spline.coefficients.dtype, device=image1.device) for n in image1.shape
     ]
     z, y = torch.meshgrid(*places, indexing="ij")
     _, slope_z, slope_y = spline.sample(z.expand(2, -1, -1), y.expand(2, -1, -1))

@@ -51,10 +51,7 @@ def resample(image: xr.DataArray, y: np.ndarray, z: np.ndarray) -> xr.DataArray:
     for name, node in nodes.items():
         if node.ndim != 1 or not node.size or not np.all(np.diff(node) > 0):
             raise InputError(f"{name}: nodes are not a one-dimensional, ascending array")
-    inside = {
-        "y": _within(nodes["y"], axis_y),
-        "z": _within(nodes["z"], axis_z),
-    }
+    inside = {"y": _within(nodes["y"], axis_y), "z": _within(nodes["z"], axis_z)}
     for name, axis in (("y", axis_y), ("z", axis_z)):
         if not inside[name].any():
             raise InputError(
@@ -65,9 +62,7 @@ def resample(image: xr.DataArray, y: np.ndarray, z: np.ndarray) -> xr.DataArray:
     resampled = spline(nodes["z"], nodes["y"])
     resampled[~inside["z"], :] = np.nan
     resampled[:, ~inside["y"]] = np.nan
-    coords = {
-        name: (name, nodes[name], {**image[name].attrs, "units": "m"}) for name in ("z", "y")
-    }
+    coords = {name: (name, nodes[name], {**image[name].attrs, "units": "m"}) for name in ("z", "y")}
     return xr.DataArray(resampled, coords, ("z", "y"), name=image.name, attrs=image.attrs)
 
 
@@ -110,8 +105,9 @@ def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArra
     if image1.shape != image2.shape:
         sizes = " and ".join(f"{i.sizes['y']} x {i.sizes['z']}" for i in (image1, image2))
         raise InputError(f"image2: sizes {sizes} px (y x z) differ; expected two of one size")
-    steps = [float(image["y"][-1] - image["y"][0]) / (image.sizes["y"] - 1)
-             for image in (image1, image2)]  # fmt: skip
+    steps = [
+        float(image["y"][-1] - image["y"][0]) / (image.sizes["y"] - 1) for image in (image1, image2)
+    ]
     tolerance = 1e-3 * min(steps)
     shared = all(
         np.abs(np.diff(image1[a].values, 2)).max(initial=0) < tolerance

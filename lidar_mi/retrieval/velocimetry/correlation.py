@@ -79,9 +79,7 @@ def cross_correlation(
     image1, image2 = working(filled(image1)), working(filled(image2))
     found = Displacement.empty(windows, image1)
     for tile in windows.tiles(_bytes_per_window(windows, chosen)):
-        coefficient = _correlate(
-            image1[tile.pixels], image2[tile.pixels], windows, chosen, floors
-        )
+        coefficient = _correlate(image1[tile.pixels], image2[tile.pixels], windows, chosen, floors)
         for whole, part in zip(found[:4], _peak(coefficient, windows, min_correlation)):
             whole[tile.vectors] = part
     for displacement in (found.dz, found.dy):
@@ -178,9 +176,7 @@ def _correlate(
     n = windows.template
     mean1 = windows.of_templates(image1)
     weight1 = _inverse_deviation(windows.of_templates(image1**2), mean1, floors[0])
-    mean2, square2 = (
-        box_sum(box_sum(power, n, -1), n, -2) / n**2 for power in (image2, image2**2)
-    )
+    mean2, square2 = (box_sum(box_sum(power, n, -1), n, -2) / n**2 for power in (image2, image2**2))
     weight2 = candidates(_inverse_deviation(square2, mean2, floors[1]), windows)
     if algorithm == "dense":
         covariance = _covariance_dense(image1, image2, mean1, candidates(mean2, windows), windows)
@@ -216,9 +212,7 @@ def _covariance_dense(
     return out
 
 
-def _covariance_fft(
-    image1: torch.Tensor, image2: torch.Tensor, windows: Windows
-) -> torch.Tensor:
+def _covariance_fft(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:
     """<(f - <f>) g_s> of each window by the correlation theorem.
 
     Candidates never wrap: a transform of the region's length holds every shift inside it.
@@ -268,9 +262,7 @@ def _gaussian_fit(
     ln c is a parabola: offset = (ln c- - ln c+) / (2 (ln c- - 2 ln c0 + ln c+)). Zero where a
     value is not positive.
     """
-    before, middle, after = (
-        flat.gather(0, (index + move)[None])[0] for move in (-step, 0, step)
-    )
+    before, middle, after = (flat.gather(0, (index + move)[None])[0] for move in (-step, 0, step))
     positive = torch.minimum(torch.minimum(before, after), middle) > 0
     before, middle, after = (
         torch.where(positive, value, 1.0).log() for value in (before, middle, after)

@@ -51,9 +51,14 @@ class Axis:
 
 def _pieces(t: torch.Tensor, order: int) -> torch.Tensor:
     """The four cubic B-splines over a cell at the fraction t, or their derivatives; (..., 4)."""
-    coefficients = torch.tensor(
-        [[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]], dtype=t.dtype, device=t.device
-    ) / 6  # fmt: skip
+    coefficients = (
+        torch.tensor(
+            [[1, -3, 3, -1], [4, 0, -6, 3], [1, 3, 3, -3], [0, 0, 0, 1]],
+            dtype=t.dtype,
+            device=t.device,
+        )
+        / 6
+    )
     for _ in range(order):
         coefficients = coefficients[:, 1:] * torch.arange(
             1, coefficients.shape[1], dtype=t.dtype, device=t.device
@@ -185,9 +190,7 @@ class FlowSpline:
         filling = self._blocks * _REACH - self.y.knots
         diagonal.reshape(self._blocks, _REACH * n, -1)[-1].diagonal()[(_REACH - filling) * n :] = 1
         side = _REACH * n
-        return factor(
-            diagonal.reshape(-1, side, side), below.reshape(-1, side, side)
-        )
+        return factor(diagonal.reshape(-1, side, side), below.reshape(-1, side, side))
 
     def solve(self, root: Factor, right: torch.Tensor) -> torch.Tensor:
         """Coefficients that solve the system, from the right hand side (2, Z, Y)."""

@@ -143,8 +143,7 @@ class Grid(NamedTuple):
         """Rows and columns of this grid that the windows' centres are on."""
         first = windows.lead + (windows.template - 1) // 2
         rows, columns = (
-            first + windows.stride * torch.arange(n, device=self.like.device)
-            for n in windows.count
+            first + windows.stride * torch.arange(n, device=self.like.device) for n in windows.count
         )
         return rows, columns
 
@@ -299,7 +298,9 @@ def _fit(
         steps = step, side
         bells = [[w * x**power for power in range(3)] for w in (bell, bell**2)]
         once, twice = (_moments(fields[:5], bells[0], steps), _moments(fields[:3], bells[1], steps))
-        plain = window_sums(window_sums(fields[5:], bells[0][:1], step, 1)[0], bells[0][:1], side, 2)
+        plain = window_sums(
+            window_sums(fields[5:], bells[0][:1], step, 1)[0], bells[0][:1], side, 2
+        )
         bands.append(_solved(once, twice, plain[0], sigma, variance, spline.passed))
     return _Fit(*(torch.cat(parts, dim=-2) for parts in zip(*bands)))
 
@@ -312,17 +313,22 @@ def _products(
     Zero where one of the images was not seen.
     """
     places = [place.expand_as(flow[0]) for place in places]
-    z, y = (
-        torch.stack([place - d / 2, place + d / 2]) for place, d in zip(places, flow)
-    )
+    z, y = (torch.stack([place - d / 2, place + d / 2]) for place, d in zip(places, flow))
     value, slope_z, slope_y = spline.sample(z, y)
     seen = spline.holds(z, y).all(0)
     slope = torch.stack([slope_z.mean(0), slope_y.mean(0)])
     shift = (slope * flow).sum(0) - (value[1] - value[0])
     pairs = [
-        slope[0] ** 2, slope[0] * slope[1], slope[1] ** 2, *(slope * shift), shift**2,
-        *value, *value**2, value[0] * value[1], torch.ones_like(shift),
-    ]  # fmt: skip
+        slope[0] ** 2,
+        slope[0] * slope[1],
+        slope[1] ** 2,
+        *(slope * shift),
+        shift**2,
+        *value,
+        *value**2,
+        value[0] * value[1],
+        torch.ones_like(shift),
+    ]
     return torch.stack(pairs) * seen
 
 

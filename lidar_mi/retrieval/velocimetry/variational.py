@@ -161,11 +161,15 @@ class Prior(NamedTuple):
                 sign * knots.field(coefficients, self.mesh, order)[a] for a, order, sign in terms
             )
             energy.append(value.square())
-            told.append(sum(
-                sign * other * knots.spread(before[a, b] - found[a, b], self.mesh, first, second)
-                for a, first, sign in terms
-                for b, second, other in terms
-            ))  # fmt: skip
+            told.append(
+                sum(
+                    sign
+                    * other
+                    * knots.spread(before[a, b] - found[a, b], self.mesh, first, second)
+                    for a, first, sign in terms
+                    for b, second, other in terms
+                )
+            )
         local = (self.smooth(self.strength * part) for part in (told[0], energy[0]))
         strength = self._divergent()
         share = strength / self.divergence
@@ -344,7 +348,9 @@ def _weighed(images: Images, seen: Linear, width: float) -> Images:
     level = max(images.noise**2, mean, 1e-30)
     local = local.clamp(min=max(images.noise**2, 0.5 * level))
     trust = images.trust * (level / local)
-    share = mismatch(images.spline, rest * trust.sqrt()).clamp(min=max(images.noise**2, 0.5 * level))
+    share = mismatch(images.spline, rest * trust.sqrt()).clamp(
+        min=max(images.noise**2, 0.5 * level)
+    )
     spline, noise = band_limited(images.stack, level**0.5, share, trust.sqrt(), images.blur)
     return images._replace(spline=spline, noise=noise, trust=trust, weighed=True)
 
@@ -380,9 +386,7 @@ def path(knots: FlowSpline, mesh: Mesh, coefficients: torch.Tensor, time: torch.
     return torch.stack([change[0] + z[:, None], change[1] + y])
 
 
-def _linear(
-    images: Images, knots: FlowSpline, mesh: Mesh, coefficients: torch.Tensor
-) -> Linear:
+def _linear(images: Images, knots: FlowSpline, mesh: Mesh, coefficients: torch.Tensor) -> Linear:
     z, y = path(knots, mesh, coefficients, images.time)
     value, slope_z, slope_y = images.spline.sample(z, y)
     at = [p.round().long().clamp(0, n - 1) for p, n in zip((z, y), images.spline.shape)]

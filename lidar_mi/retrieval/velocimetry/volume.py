@@ -102,9 +102,13 @@ def retrieve_wind_volume(
     spacing = tuple(_spacing(stack[0], axis) for axis in AXES)
     found = METHODS[method](images, windows, spacing, min_correlation)
     settings = {
-        "method": method, "template": template, "search": search, "stride": stride, "dt": dt,
+        "method": method,
+        "template": template,
+        "search": search,
+        "stride": stride,
+        "dt": dt,
         "min_correlation": min_correlation,
-    }  # fmt: skip
+    }
     return _dataset(stack[0], windows, found, spacing, settings)
 
 
@@ -117,9 +121,11 @@ def _dataset(volume, windows, found: VolumeDisplacement, spacing, settings) -> x
             found.d[number] * scale, f"wind along {axis}", "m s-1", standard_name=standard
         )
         variables[f"{name}_stderr"] = _field(
-            found.variance[number].sqrt() * scale, f"standard error of {name}", "m s-1",
+            found.variance[number].sqrt() * scale,
+            f"standard error of {name}",
+            "m s-1",
             standard_name=f"{standard} standard_error",
-        )  # fmt: skip
+        )
     variables["correlation"] = _field(
         found.score, "correlation of the volumes carried to mid-time", "1"
     )
@@ -142,9 +148,11 @@ def _dataset(volume, windows, found: VolumeDisplacement, spacing, settings) -> x
     for number, axis in enumerate(AXES):
         place = float(volume[axis][0]) + spacing[number] * windows.centres(number).numpy()
         coords[axis] = (axis, place, {"units": "m", **about[axis]})
-    dataset = xr.Dataset(variables, coords, {
-        "Conventions": "CF-1.11", "title": "Wind from two volumes", **settings, "dt_units": "s",
-    })  # fmt: skip
+    dataset = xr.Dataset(
+        variables,
+        coords,
+        {"Conventions": "CF-1.11", "title": "Wind from two volumes", **settings, "dt_units": "s"},
+    )
     for axis in AXES:
         dataset[axis].encoding["_FillValue"] = None
     return dataset[["u", "v", "w", "u_stderr", "v_stderr", "w_stderr", "correlation", "flag"]]

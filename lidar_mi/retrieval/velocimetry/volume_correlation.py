@@ -99,8 +99,10 @@ def predicted(images: Volumes, windows: VolumeWindows) -> tuple[VolumeWindows, t
     quadratic through the peak and its 26 neighbours. Returns the windows and their displacements;
     windows whose peak lies on the rim of the search take their neighbours' median.
     """
-    axes = [torch.arange(n, dtype=torch.float32, device=images.coefficients.device)
-            for n in images.shape]  # fmt: skip
+    axes = [
+        torch.arange(n, dtype=torch.float32, device=images.coefficients.device)
+        for n in images.shape
+    ]
     whole = [axis.expand(2, *axis.shape) for axis in torch.meshgrid(*axes, indexing="ij")]
     values, _, seen = images.sample(whole)
     values = avg_pool3d((values * seen)[:, None], 2)[:, 0]
@@ -150,14 +152,16 @@ class _Regular(NamedTuple):
 
 # Values about a peak as a + b x + x' C x / 2: least squares over the 27 places.
 _AROUND = torch.tensor(list(product((-1.0, 0.0, 1.0), repeat=3)), dtype=torch.float64)
-_QUADRATIC = torch.linalg.pinv(torch.cat(
-    [
-        torch.ones(27, 1, dtype=torch.float64),
-        _AROUND,
-        torch.stack([_AROUND[:, a] * _AROUND[:, b] / (1 + (a == b)) for a, b in _PAIRS], 1),
-    ],
-    1,
-))  # fmt: skip
+_QUADRATIC = torch.linalg.pinv(
+    torch.cat(
+        [
+            torch.ones(27, 1, dtype=torch.float64),
+            _AROUND,
+            torch.stack([_AROUND[:, a] * _AROUND[:, b] / (1 + (a == b)) for a, b in _PAIRS], 1),
+        ],
+        1,
+    )
+)
 
 
 def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
@@ -177,7 +181,9 @@ def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
     for (a, b), term in zip(_PAIRS, terms[4:]):
         bend[:, a, b] = bend[:, b, a] = term
     peaked = torch.linalg.eigvalsh(bend)[:, -1] < 0
-    bend = torch.where(peaked[:, None, None], bend, -torch.eye(3, dtype=bend.dtype, device=bend.device))
+    bend = torch.where(
+        peaked[:, None, None], bend, -torch.eye(3, dtype=bend.dtype, device=bend.device)
+    )
     rest = -torch.linalg.solve(bend, slope[..., None])[..., 0]
     rest = torch.where((peaked & (rest.abs() < 1).all(1))[:, None], rest, 0.0).T
     d = torch.where(rim | ~(flat.amax(0) > -1), torch.nan, place - reach + rest)
@@ -186,9 +192,9 @@ def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
 
 def _between(values: torch.Tensor, known, wanted) -> torch.Tensor:
     """Values (..., x, z, y) at windows' centres, at those of others, by trilinear interpolation."""
-    return separable(values, [
-        hats(known.centres(a), wanted.centres(a)).to(values) for a in range(3)
-    ])  # fmt: skip
+    return separable(
+        values, [hats(known.centres(a), wanted.centres(a)).to(values) for a in range(3)]
+    )
 
 
 class _Fit(NamedTuple):
@@ -218,12 +224,14 @@ def _fit(images: Volumes, known, flow, windows: VolumeWindows, sigma: float) -> 
     places = [torch.arange(n, dtype=like.dtype, device=like.device) for n in images.shape]
     weights = bells(windows, sigma, like)
     powers = [
-        torch.stack([
-            bell * ((place - windows.centres(axis).to(place)[:, None]) / sigma) ** p
-            for p in range(3)
-        ])
+        torch.stack(
+            [
+                bell * ((place - windows.centres(axis).to(place)[:, None]) / sigma) ** p
+                for p in range(3)
+            ]
+        )
         for axis, (place, bell) in enumerate(zip(places, weights))
-    ]  # fmt: skip
+    ]
     squares = [power * bell for power, bell in zip(powers, weights)]
     to_voxels = [hats(known.centres(a).to(places[a]), places[a]) for a in range(3)]
     once, twice, plain = {}, {}, 0.0
@@ -235,9 +243,9 @@ def _fit(images: Volumes, known, flow, windows: VolumeWindows, sigma: float) -> 
         for moments, kernels, wanted in ((once, powers, fields[:9]), (twice, squares, fields[:6])):
             kernels = [kernels[0], kernels[1][:, :, here], kernels[2]]
             _add_moments(moments, wanted, kernels)
-        plain = plain + separable(
-            fields[9:], [weights[0], weights[1][:, here], weights[2]]
-        ).double()
+        plain = (
+            plain + separable(fields[9:], [weights[0], weights[1][:, here], weights[2]]).double()
+        )
     whole = separable(torch.ones(images.shape).to(like), weights).double()
     return _solved(once, twice, plain, whole, sigma, images)
 
@@ -290,7 +298,9 @@ def _solved(once, twice, plain, whole, sigma, images) -> _Fit:
     misfit, mean1, mean2, square1, square2, cross, number = plain
     share = number / whole
     number = number.clamp(min=1e-12)
-    contrast = (square1 - mean1**2 / number).clamp(min=0) * (square2 - mean2**2 / number).clamp(min=0)
+    contrast = (square1 - mean1**2 / number).clamp(min=0) * (square2 - mean2**2 / number).clamp(
+        min=0
+    )
     scale = contrast.sqrt()
     normal = _normal(once)
     wanted = torch.stack([once[term][6 + a] for a in range(3) for term in _TERMS], -1)

@@ -46,7 +46,9 @@ class Volumes(NamedTuple):
         """Of a displacement times the sum of squared slopes: of the noise in both volumes."""
         return 2 * self.noise**2 * self.excess
 
-    def sample(self, place: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def sample(
+        self, place: Sequence[torch.Tensor]
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Value and slopes of every volume at its own places.
 
         Parameters

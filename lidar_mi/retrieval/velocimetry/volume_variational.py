@@ -74,8 +74,9 @@ class Knots(NamedTuple):
     def part(self, here: slice) -> "Knots":
         """The same at some of the rows of constant z."""
         cut = [[b[0], b[1][here], b[2]] for b in self.bases]
-        return self._replace(places=(self.places[0], self.places[1][here], self.places[2]),
-                             bases=tuple(cut))  # fmt: skip
+        return self._replace(
+            places=(self.places[0], self.places[1][here], self.places[2]), bases=tuple(cut)
+        )
 
     def field(self, coefficients: torch.Tensor, order=_VALUE) -> torch.Tensor:
         """Derivative of coefficients (..., knots) on the mesh."""
@@ -94,9 +95,7 @@ class Knots(NamedTuple):
     def slopes_pulled(self, values: Sequence[torch.Tensor]) -> torch.Tensor:
         """The transpose of `slopes`: coefficients from three fields (..., mesh)."""
         (x, z, y), (dx, dz, dy) = self.bases
-        along, up, across = (
-            along_x(v, m.T) for v, m in zip(values, (dx, x, x))
-        )
+        along, up, across = (along_x(v, m.T) for v, m in zip(values, (dx, x, x)))
         return (z.T @ along + dz.T @ up) @ y + (z.T @ across) @ dy
 
     def fitted(self, flow: torch.Tensor) -> torch.Tensor:
@@ -104,7 +103,9 @@ class Knots(NamedTuple):
         solvers = []
         for basis in self.bases[0]:
             square = basis.T @ basis
-            square = square + 1e-6 * torch.eye(len(square), dtype=square.dtype, device=square.device)
+            square = square + 1e-6 * torch.eye(
+                len(square), dtype=square.dtype, device=square.device
+            )
             solvers.append(torch.linalg.solve(square, basis.T))
         return separable(flow, solvers)
 
@@ -205,9 +206,7 @@ def fitted_flow(
     data = _linear(images, voxels, mesh, coefficients, time)
     coefficients = _step(data, voxels, mesh, coefficients, prior, spacing)
     (open_,) = _drawn(data, mesh, prior, spacing, _FINAL_DRAWS, draw, before=False)
-    variance = _smooth(
-        mesh.field(open_).square().mean(0), mesh.places, _WIDTH * windows.template
-    )
+    variance = _smooth(mesh.field(open_).square().mean(0), mesh.places, _WIDTH * windows.template)
     return _finished(images, data, axes, coefficients, variance, mesh, windows, min_correlation)
 
 
@@ -239,10 +238,12 @@ def _curl_and_divergence_pulled(knots: Knots, values: torch.Tensor, spacing) -> 
     part = {(a, a): divergence for a in range(3)}
     for value, (first, second) in zip(vorticity, _CURL):
         part[first], part[second] = value, -value
-    return knots.slopes_pulled([
-        torch.stack([part[a, b] * (spacing[a] / spacing[b]) for a in range(3)], -4)
-        for b in range(3)
-    ])  # fmt: skip
+    return knots.slopes_pulled(
+        [
+            torch.stack([part[a, b] * (spacing[a] / spacing[b]) for a in range(3)], -4)
+            for b in range(3)
+        ]
+    )
 
 
 def _linear(images: Volumes, voxels: Knots, mesh: Knots, coefficients, time) -> Data:
@@ -307,9 +308,14 @@ def _step(
 
 
 def _drawn(
-    data: Data, mesh: Knots, prior: Prior, spacing, number: int, draw: torch.Generator,
+    data: Data,
+    mesh: Knots,
+    prior: Prior,
+    spacing,
+    number: int,
+    draw: torch.Generator,
     before: bool = True,
-) -> list[torch.Tensor]:  # fmt: skip
+) -> list[torch.Tensor]:
     """Flows (number, 3, knots) drawn from the prior, if wanted, and from what stays open of it.
 
     Both from the same random numbers: where the volumes tell nothing they are alike.
@@ -368,6 +374,7 @@ def _conjugate_gradients(
     applied, right: torch.Tensor, preconditioned, tolerance: float = _TOLERANCE
 ) -> torch.Tensor:
     """Solutions (n, ...) of a symmetric positive system for right-hand sides (n, ...)."""
+
     def product(a, b):
         return (a * b).flatten(1).sum(1)[:, None, None, None, None]
 
@@ -410,10 +417,11 @@ def _improved(prior: Prior, mesh: Knots, coefficients, drawn, spacing, width: fl
     expected, left, energy = (
         _smooth(
             _by_kind(prior.weights * _curl_and_divergence(mesh, c, spacing).square()).mean(0),
-            mesh.places, width,
+            mesh.places,
+            width,
         )
         for c in (*drawn, coefficients[None])
-    )  # fmt: skip
+    )
     # added to both, for what is drawn has noise of its own
     more = _DAMPING * expected
     change = ((expected - left).clamp(min=0) + more) / (energy + more)
@@ -436,9 +444,15 @@ def _smooth(values: torch.Tensor, places, width: float) -> torch.Tensor:
 
 
 def _finished(
-    images: Volumes, data: Data, axes, coefficients, variance, mesh: Knots,
-    windows: VolumeWindows, min_correlation: float,
-) -> VolumeDisplacement:  # fmt: skip
+    images: Volumes,
+    data: Data,
+    axes,
+    coefficients,
+    variance,
+    mesh: Knots,
+    windows: VolumeWindows,
+    min_correlation: float,
+) -> VolumeDisplacement:
     like = coefficients
     centres = [windows.centres(axis).to(like) for axis in range(3)]
     d = Knots.at(axes, centres).field(coefficients)

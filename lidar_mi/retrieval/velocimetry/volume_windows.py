@@ -142,7 +142,9 @@ def correlation(carried: torch.Tensor, seen: torch.Tensor, weights: Sequence[tor
         sums = separable(fields * seen, weights).double()
         first, second, square1, square2, cross = sums[1:] / sums[0].clamp(min=1e-12)
         contrast = (square1 - first**2).clamp(min=0) * (square2 - second**2).clamp(min=0)
-        scores.append(torch.where(contrast > 1e-10, (cross - first * second) / contrast.sqrt(), torch.nan))
+        scores.append(
+            torch.where(contrast > 1e-10, (cross - first * second) / contrast.sqrt(), torch.nan)
+        )
     whole = separable(torch.ones_like(seen, dtype=carried.dtype), weights)
     return torch.stack(scores).amin(0), (sums[0] / whole).to(carried)
 
@@ -182,10 +184,15 @@ def _neighbours(d: torch.Tensor) -> torch.Tensor:
             inner = [padded.narrow(axis, 1, 1), padded.narrow(axis, -2, 1)]
         padded = torch.cat([2 * first - inner[0], padded, 2 * last - inner[1]], axis)
     x, z, y = d.shape[1:]
-    return torch.stack([
-        padded[:, i : i + x, j : j + z, k : k + y]
-        for i in range(3) for j in range(3) for k in range(3) if (i, j, k) != (1, 1, 1)
-    ])  # fmt: skip
+    return torch.stack(
+        [
+            padded[:, i : i + x, j : j + z, k : k + y]
+            for i in range(3)
+            for j in range(3)
+            for k in range(3)
+            if (i, j, k) != (1, 1, 1)
+        ]
+    )
 
 
 def _median(values: torch.Tensor) -> torch.Tensor:

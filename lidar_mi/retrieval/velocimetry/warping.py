@@ -227,7 +227,9 @@ def band_limited(
     excess = power / told if told > 0 else 1.0
     passed /= sizes[0] * sizes[1]
     worth = told / spread if told > 0 else 1.0
-    return Spline(smooth, shape, passed, excess, (response * white).sqrt(), worth), float(level.sqrt())
+    return Spline(smooth, shape, passed, excess, (response * white).sqrt(), worth), float(
+        level.sqrt()
+    )
 
 
 def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:

@@ -8,11 +8,7 @@ from lidar_mi.retrieval.velocimetry.windows import Windows, candidates, image_pa
 
 
 def weight_shift(
-    image1: torch.Tensor,
-    image2: torch.Tensor,
-    template: int = 8,
-    search: int = 16,
-    stride: int = 1,
+    image1: torch.Tensor, image2: torch.Tensor, template: int = 8, search: int = 16, stride: int = 1
 ) -> Displacement:
     """Displacement of every template to the candidate of like weight and like centre of mass.
 
@@ -80,9 +76,11 @@ def mass(image: torch.Tensor, size: int) -> tuple[torch.Tensor, torch.Tensor, to
     sums, moments = along_z @ ones, along_z @ ramp
     weight = sums.unfold(1, size, 1) @ ones
     divisor = torch.where(weight > 0, weight, torch.nan)
-    return weight, (moments.unfold(1, size, 1) @ ones) / divisor, (
-        sums.unfold(1, size, 1) @ ramp
-    ) / divisor
+    return (
+        weight,
+        (moments.unfold(1, size, 1) @ ones) / divisor,
+        (sums.unfold(1, size, 1) @ ramp) / divisor,
+    )
 
 
 def _best_match(
@@ -91,9 +89,7 @@ def _best_match(
     windows = Windows(tuple(image1.shape), windows.template, windows.search, windows.stride)
     n, lead = windows.template, windows.lead
     inner = image1[lead:, lead:][tuple(slice(s - windows.search + n) for s in windows.shape)]
-    reference = [
-        strided(strided(v, windows.stride, 0), windows.stride, 1) for v in mass(inner, n)
-    ]
+    reference = [strided(strided(v, windows.stride, 0), windows.stride, 1) for v in mass(inner, n)]
     regions = [candidates(v, windows) for v in mass(image2, n)]
     weight, centre_z, centre_y = (r - f for r, f in zip(regions, reference))
     spread = [region.var((0, 1), correction=0) for region in regions]
@@ -107,9 +103,7 @@ def _best_match(
     shift_z, shift_y, rim = windows.unravel(index)
     matched = best.isfinite()
     dz, dy = (
-        torch.where(
-            matched & ~rim, shift + rest.flatten(0, 1).gather(0, index[None])[0], torch.nan
-        )
+        torch.where(matched & ~rim, shift + rest.flatten(0, 1).gather(0, index[None])[0], torch.nan)
         for shift, rest in ((shift_z, centre_z), (shift_y, centre_y))
     )
     flag = Flag.PEAK_ON_RIM * (matched & rim) + Flag.NO_MATCH * ~matched

@@ -8,8 +8,8 @@ import torch
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.velocimetry.bound import displacement_bound
 from lidar_mi.retrieval.checks import checked_pair, on_device, positive
+from lidar_mi.retrieval.velocimetry.bound import displacement_bound
 from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.multipass import multipass
@@ -23,9 +23,9 @@ from lidar_mi.retrieval.velocimetry.quality import (
     uncertain,
 )
 from lidar_mi.retrieval.velocimetry.variational import variational
-from lidar_mi.retrieval.vortices.fit import vortex_windows
 from lidar_mi.retrieval.velocimetry.weight_shift import weight_shift
 from lidar_mi.retrieval.velocimetry.windows import Windows
+from lidar_mi.retrieval.vortices.fit import vortex_windows
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,9 @@ METHODS: Mapping[str, Method] = {
         ("correlation", "normalised cross-correlation at the peak"),
         ("min_correlation",),
     ),
-    "ws": Method(weight_shift, ("mismatch", "misfit of weight and centre of mass over their spread")),
+    "ws": Method(
+        weight_shift, ("mismatch", "misfit of weight and centre of mass over their spread")
+    ),
     "multipass": Method(
         multipass,
         ("correlation", "normalised cross-correlation of the deformed windows"),
@@ -182,9 +184,13 @@ def retrieve_wind(
     chosen = METHODS[method]
     axes = tuple(image1[name].values.astype(float) for name in ("z", "y"))
     offered = {
-        "min_correlation": min_correlation, "noise": noise, "axes": axes, "dt": dt,
-        "more": [on_device(image, device) for image in more], "blur": blurred,
-    }  # fmt: skip
+        "min_correlation": min_correlation,
+        "noise": noise,
+        "axes": axes,
+        "dt": dt,
+        "more": [on_device(image, device) for image in more],
+        "blur": blurred,
+    }
     options = {name: offered[name] for name in chosen.options}
     found = chosen.find(pixels1, pixels2, template, search, stride, **options)
     level = 0.0 if noise is None else noise
@@ -262,7 +268,9 @@ def wind_bound(
         found[f"{name}_bound"] = ("z", "y"), (values * spacing / dt).astype(np.float32), about
     half = (template - 1) / 2
     coords = {
-        axis: np.interp(np.asarray(windows.starts(k)) + half, np.arange(len(axes[axis])), axes[axis])
+        axis: np.interp(
+            np.asarray(windows.starts(k)) + half, np.arange(len(axes[axis])), axes[axis]
+        )
         for k, axis in enumerate(("z", "y"))
     }
     return xr.Dataset(found, coords)
@@ -282,11 +290,7 @@ def _blur_px(image: xr.DataArray, blur: float) -> float:
 
 
 def _dataset(
-    image: xr.DataArray,
-    windows: Windows,
-    found: Displacement,
-    texture: Texture,
-    attributes: dict,
+    image: xr.DataArray, windows: Windows, found: Displacement, texture: Texture, attributes: dict
 ) -> xr.Dataset:
     centre, spacing = {}, {}
     for axis, name in enumerate(("z", "y")):
@@ -294,10 +298,7 @@ def _dataset(
         start = np.asarray(windows.starts(axis))
         centre[name] = (pixel[start] + pixel[start + windows.template - 1]) / 2
         spacing[name] = (pixel[-1] - pixel[0]) / (len(pixel) - 1)
-    moved = {
-        "z": found.dz.cpu().numpy() * spacing["z"],
-        "y": found.dy.cpu().numpy() * spacing["y"],
-    }
+    moved = {"z": found.dz.cpu().numpy() * spacing["z"], "y": found.dy.cpu().numpy() * spacing["y"]}
     method = METHODS[attributes["method"]]
     further = 0.0 if method.centred else 0.5
     shape = windows.count
@@ -324,7 +325,9 @@ def _dataset(
                 stderr["y"], "standard error of v", "m s-1", standard_name="y_wind standard_error"
             ),
             "w_stderr": field(
-                stderr["z"], "standard error of w", "m s-1",
+                stderr["z"],
+                "standard error of w",
+                "m s-1",
                 standard_name="upward_air_velocity standard_error",
             ),
             "vw_correlation": field(correlation, "correlation of the errors of v and w", "1"),

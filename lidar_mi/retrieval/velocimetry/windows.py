@@ -86,9 +86,7 @@ class Windows:
         """First pixel of the templates along `axis` (0 = z, 1 = y)."""
         return range(self.lead, self.lead + self.count[axis] * self.stride, self.stride)
 
-    def unravel(
-        self, index: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def unravel(self, index: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Shift in z and in y (px) of candidate number `index`, and whether it is on the rim."""
         row, column = index // self.shifts, index % self.shifts
         last = self.shifts - 1

@@ -16,11 +16,12 @@ from kornia.filters import gaussian_blur2d
 from lidar_mi.atmosphere.vortex import Vortex
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_pair, on_device, positive
-from lidar_mi.retrieval.velocimetry.displacement import Displacement
-from lidar_mi.retrieval.vortices.flow_error import FlowError, flow_error, mean_length, spread_of
-from lidar_mi.retrieval.velocimetry.quality import Flag, filled, non_finite
 from lidar_mi.retrieval.quantity import Quantity
-from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, fit
+from lidar_mi.retrieval.velocimetry.displacement import Displacement
+from lidar_mi.retrieval.velocimetry.quality import Flag, filled, non_finite
+from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, levelled
+from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair
+from lidar_mi.retrieval.vortices.flow_error import FlowError, flow_error, mean_length, spread_of
 from lidar_mi.retrieval.vortices.model import (
     PROFILES,
     Profile,
@@ -31,9 +32,8 @@ from lidar_mi.retrieval.vortices.model import (
     turning,
     wind,
 )
+from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, fit
 from lidar_mi.retrieval.vortices.search import Observations, starting_points
-from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, levelled
-from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair
 
 # Coarse to fine: standard deviation of the blur and step between the pixels used, px.
 _LEVELS = ((3.0, 4), (1.5, 2), (0.0, 1))
@@ -305,7 +305,9 @@ class _Images:
         value, slope_z, slope_y = self.spline.sample(rows, columns)
         seen = self.spline.holds(rows, columns).all(0)
         if bool(self.bad.any()):
-            nearest = [p.round().long().clamp(0, n - 1) for p, n in zip((rows, columns), self.bad.shape)]
+            nearest = [
+                p.round().long().clamp(0, n - 1) for p, n in zip((rows, columns), self.bad.shape)
+            ]
             seen &= ~self.bad[nearest[0], nearest[1]].any(0)
         slope = torch.stack([slope_y / self.spacing[0], slope_z / self.spacing[1]], 1)
         slope[0] *= gain
@@ -322,9 +324,7 @@ class _Images:
         residual = seen * (value[1] - gain * value[0] - offset)
         if self.whole is not self.spline:
             residual = self.spline.filtered(residual)
-        return Misfit(
-            residual, jacobian, slope.mean(0), seen, self.variance, self.scatter
-        )
+        return Misfit(residual, jacobian, slope.mean(0), seen, self.variance, self.scatter)
 
 
 def fit_vortices(
@@ -437,9 +437,16 @@ def fit_pixels(
     known = make.noise > 0
     chi2 = float((misfit.residual.square() / misfit.scatter)[seen].mean()) if known else np.nan
     return _checked_fit(
-        best, covariance, profile, chi2, match, error.variance**0.5 / dt,
-        mean_length(error) * spacing, z, y,
-    )  # fmt: skip
+        best,
+        covariance,
+        profile,
+        chi2,
+        match,
+        error.variance**0.5 / dt,
+        mean_length(error) * spacing,
+        z,
+        y,
+    )
 
 
 def _understated(noise: torch.Tensor, pair: torch.Tensor) -> float:
@@ -526,7 +533,11 @@ def vortex_windows(
         torch.full_like(v, found.correlation),
         flag,
         torch.stack(
-            [variances[1] / pixel_z**2, variances[0] / pixel_y**2, variances[2] / (pixel_y * pixel_z)]
+            [
+                variances[1] / pixel_z**2,
+                variances[0] / pixel_y**2,
+                variances[2] / (pixel_y * pixel_z),
+            ]
         ),
         found.quantities,
         {
@@ -594,10 +605,19 @@ class _Builder:
         floor = 2 * _INTERPOLATION**2
         whole = spline if blur or noise == 0 else self.unfiltered
         return _Images(
-            spline, whole, lateral, vertical, (float(self.y[0]), float(self.z[0])), self.spacing,
-            self.bad, variance + floor, passed * variance + floor, self.dt, self.profile,
+            spline,
+            whole,
+            lateral,
+            vertical,
+            (float(self.y[0]), float(self.z[0])),
+            self.spacing,
+            self.bad,
+            variance + floor,
+            passed * variance + floor,
+            self.dt,
+            self.profile,
             self.frozen,
-        )  # fmt: skip
+        )
 
 
 def _differences(images: _Images) -> Observations:
@@ -624,8 +644,12 @@ def _limits(y: np.ndarray, z: np.ndarray) -> Callable[[torch.Tensor, torch.Tenso
     def allowed(parameters: torch.Tensor, step: torch.Tensor) -> bool:
         radii = (parameters + step)[[1, 5]]
         near = step[[2, 3, 6, 7]].abs().max() <= 0.15 * min(sides)
-        return bool(near and step[[1, 5]].abs().max() <= 1 and radii.min() >= smallest
-                    and radii.max() <= largest)  # fmt: skip
+        return bool(
+            near
+            and step[[1, 5]].abs().max() <= 1
+            and radii.min() >= smallest
+            and radii.max() <= largest
+        )
 
     return allowed
 
@@ -649,16 +673,15 @@ class _Vectors:
         off = self.value - wind(parameters, self.y, self.z, self.profile)
         residual = (self.root * off).sum(1)
         jacobian = torch.stack(
-            [-sensitivity(parameters, self.y, self.z, along, self.profile) for along in self.root], 1
+            [-sensitivity(parameters, self.y, self.z, along, self.profile) for along in self.root],
+            1,
         )
         one = torch.ones_like(residual)
         seen = self.seen.expand_as(residual)
         return Misfit(residual, jacobian, -self.root.transpose(0, 1), seen, one, one)
 
 
-def fit_vortices_to_wind(
-    vectors: xr.Dataset, profile: Profile = "lamb_oseen"
-) -> VortexPairFit:
+def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -> VortexPairFit:
     """Two vortices and a mean wind that explain retrieved vectors.
 
     Parameters
@@ -728,7 +751,9 @@ def fit_vortices_to_wind(
         off = best.misfit.residual[:, seen]
         spread = float(1.4826 * (off - off.median()).abs().median())
         if spread > 0:
-            model = _Vectors(*tensors[:2], torch.as_tensor(root) / spread, tensors[2], seen, profile)
+            model = _Vectors(
+                *tensors[:2], torch.as_tensor(root) / spread, tensors[2], seen, profile
+            )
     for _ in range(3):
         error = _flow_error(best, 1.0)
         best = fit(model, best.parameters, limits, error.variance, 12, _TOLERANCE)
@@ -740,9 +765,16 @@ def fit_vortices_to_wind(
     explained = 1 - float(left.square().sum() / varied.square().sum())
     spacing = (float(np.diff(y).mean()) * float(np.diff(z).mean())) ** 0.5
     return _checked_fit(
-        best, covariance, profile, chi2, explained, error.variance**0.5,
-        mean_length(error) * spacing, z, y,
-    )  # fmt: skip
+        best,
+        covariance,
+        profile,
+        chi2,
+        explained,
+        error.variance**0.5,
+        mean_length(error) * spacing,
+        z,
+        y,
+    )
 
 
 def _components(vectors: _Vectors, flow_variance: float) -> Observations:
@@ -755,7 +787,11 @@ def _components(vectors: _Vectors, flow_variance: float) -> Observations:
     weight = 1 / (1 + flow_variance * along.square().sum(0))
     y, z = (axis[part][seen] for axis in (vectors.y, vectors.z))
     return Observations(
-        y.repeat(2), z.repeat(2), along.flatten(1), (root * value).sum(1).flatten(), weight.flatten()
+        y.repeat(2),
+        z.repeat(2),
+        along.flatten(1),
+        (root * value).sum(1).flatten(),
+        weight.flatten(),
     )
 
 
@@ -875,9 +911,7 @@ def _checked_fit(
             )
         if not (y[0] <= at_y <= y[-1] and z[0] <= at_z <= z[-1]):
             reasons.append(f"{side} vortex at ({at_y:.1f}, {at_z:.1f}) m is outside")
-    return VortexPairFit(
-        theta, covariance, profile, chi2, match, error, length, tuple(reasons)
-    )
+    return VortexPairFit(theta, covariance, profile, chi2, match, error, length, tuple(reasons))
 
 
 def _check_profile(profile) -> None:

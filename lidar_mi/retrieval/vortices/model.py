@@ -11,10 +11,17 @@ Profile = Literal["lamb_oseen", "burnham_hallock"]
 PROFILES: tuple[str, ...] = get_args(Profile)
 
 PARAMETERS = (
-    "port_circulation", "port_log_radius", "port_y", "port_z",
-    "starboard_circulation", "starboard_log_radius", "starboard_y", "starboard_z",
-    "mean_v", "mean_w",
-)  # fmt: skip
+    "port_circulation",
+    "port_log_radius",
+    "port_y",
+    "port_z",
+    "starboard_circulation",
+    "starboard_log_radius",
+    "starboard_y",
+    "starboard_z",
+    "mean_v",
+    "mean_w",
+)
 """Order of the parameters: m^2 s^-1, log of the core radius in m, m, m; twice; m s^-1."""
 
 # Root of 1 + 2 a = exp(a): puts the peak of the Lamb-Oseen swirl at the core radius.

@@ -42,7 +42,7 @@ def starting_points(seen: Observations, count: int, profile: Profile) -> torch.T
     Vortices turn in opposite directions and are at least three core radii apart. Of each
     neighbourhood only the best pair is taken.
     """
-    low, high = (torch.stack([seen.y, seen.z]).aminmax(dim=1))
+    low, high = torch.stack([seen.y, seen.z]).aminmax(dim=1)
     sides = (high - low).tolist()
     step = (sides[0] * sides[1] / _PLACES) ** 0.5
     axes = [
@@ -75,8 +75,11 @@ def starting_points(seen: Observations, count: int, profile: Profile) -> torch.T
             ]
             found.append((float(gain[p, q]), torch.cat([*vortices, value.new_zeros(2)])))
     found.sort(key=lambda pair: -pair[0])
-    return torch.stack([_with_mean_wind(theta, seen, root, profile) for _, theta in found[:count]]) \
-        if found else value.new_empty(0, 10)
+    return (
+        torch.stack([_with_mean_wind(theta, seen, root, profile) for _, theta in found[:count]])
+        if found
+        else value.new_empty(0, 10)
+    )
 
 
 def _swirls(seen: Observations, root, place, radius: float, profile: Profile) -> torch.Tensor:

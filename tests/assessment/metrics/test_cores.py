@@ -43,9 +43,7 @@ def circulation_inside(r, circulation, core_radius, model):
 def test_pair(model, core_radius, place):
     """Centres anywhere between nodes. The partner's flow is potential on the rings, so its mean
     swirl is zero; what is left is interpolation, 1e-4 of the circulation."""
-    port, starboard = find_cores(
-        flow_of(*vortex_pair(458.0, 47.1, core_radius, *place, model))
-    )
+    port, starboard = find_cores(flow_of(*vortex_pair(458.0, 47.1, core_radius, *place, model)))
     for core, side in ((port, 1), (starboard, -1)):
         assert core.y == pytest.approx(place[0] + side * 23.55, abs=0.1)
         assert core.z == pytest.approx(place[1], abs=0.1)

@@ -6,7 +6,6 @@ import pytest
 import xarray as xr
 from scipy.ndimage import gaussian_filter
 
-from lidar_mi.assessment.report.error_budget import budget_chapter, draw_all, limit_sentence
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.error_budget import (
     CAUSES,
@@ -17,6 +16,7 @@ from lidar_mi.assessment.metrics.error_budget import (
     pictures_without,
     window_mean,
 )
+from lidar_mi.assessment.report.error_budget import budget_chapter, draw_all, limit_sentence
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
@@ -32,9 +32,10 @@ def field(values):
 
 def flow(v, w, columns=81, rows=61):
     z, y = np.meshgrid(
-        (np.arange(rows) - (rows - 1) / 2) * H, (np.arange(columns) - (columns - 1) / 2) * H,
+        (np.arange(rows) - (rows - 1) / 2) * H,
+        (np.arange(columns) - (columns - 1) / 2) * H,
         indexing="ij",
-    )  # fmt: skip
+    )
     return xr.Dataset({"v": field(v(y, z) + 0 * y), "w": field(w(y, z) + 0 * y)})
 
 
@@ -114,10 +115,12 @@ def test_chords_agree_with_their_series_in_time():
     pair = (Vortex(400.0, 3.0, -8.0, 0.5), Vortex(-400.0, 3.0, 8.0, 0.0))
     axis = np.arange(-100, 101) * 0.2
     y, z = np.meshgrid(axis, axis)
-    truth = xr.Dataset({
-        n: xr.DataArray(x, {"z": axis, "y": axis}, ("z", "y"))
-        for n, x in zip("vw", velocity(pair, y, z))
-    })  # fmt: skip
+    truth = xr.Dataset(
+        {
+            n: xr.DataArray(x, {"z": axis, "y": axis}, ("z", "y"))
+            for n, x in zip("vw", velocity(pair, y, z))
+        }
+    )
     places = np.meshgrid(np.linspace(-12, 12, 25), np.linspace(-6, 6, 13))
 
     def along(of, by, y, z, step=1e-3):
@@ -160,9 +163,9 @@ def test_displacements_in_a_core_are_off_by_the_time_step_alone():
     y, z = (np.arange(n) * H / 2 - (n - 1) * H / 4 for n in (81, 81))
     place = np.meshgrid(y, z)
     metres = {"z": z, "y": y}
-    truth = xr.Dataset({
-        n: xr.DataArray(x, metres, ("z", "y")) for n, x in zip("vw", velocity((vortex,), *place))
-    })  # fmt: skip
+    truth = xr.Dataset(
+        {n: xr.DataArray(x, metres, ("z", "y")) for n, x in zip("vw", velocity((vortex,), *place))}
+    )
     start = place[0] - vortex.y + 1j * (place[1] - vortex.z)
     r = np.abs(start)
     swirl = 400 / (2 * np.pi * r) * (1 - np.exp(-1.2564 * r**2 / 9))
@@ -177,7 +180,9 @@ def test_displacements_in_a_core_are_off_by_the_time_step_alone():
     assert budget["rmse_v"] > 0.05
     assert budget["time_step.share"] > 0.999
     # a field that knows of curved paths has no such error
-    assert "time_step.share" not in error_budget(found.assign_attrs(method="variational"), {}, truth, [])
+    assert "time_step.share" not in error_budget(
+        found.assign_attrs(method="variational"), {}, truth, []
+    )
 
 
 # --- shares
@@ -257,9 +262,10 @@ def texture():
 def carried(texture, move, columns=81, rows=61):
     """Images at t1 and t2; `move` takes places dt back."""
     z, y = np.meshgrid(
-        (np.arange(rows) - (rows - 1) / 2) * H, (np.arange(columns) - (columns - 1) / 2) * H,
+        (np.arange(rows) - (rows - 1) / 2) * H,
+        (np.arange(columns) - (columns - 1) / 2) * H,
         indexing="ij",
-    )  # fmt: skip
+    )
     return [field(texture(y, z)), field(texture(*move(y, z)))]
 
 
@@ -318,7 +324,11 @@ def test_shear_within_the_window(texture, shear):
     settings = {"dt": DT, "method": "cc", "search": 24}
     found = retrieve_wind(*seen, **settings)
     stiff = moved_as_one(
-        found, seen, sharp, truth, lambda pair, stride: retrieve_wind(*pair, stride=stride, **settings)
+        found,
+        seen,
+        sharp,
+        truth,
+        lambda pair, stride: retrieve_wind(*pair, stride=stride, **settings),
     )
     budget = error_budget(found, {"shear": stiff}, truth, [], flagged=True)
     if shear:

@@ -67,9 +67,7 @@ def test_truth_is_exact_for_cubic_flows_at_any_place():
     cubic = flow(lambda y, z: y**3 / 400 - y * z, lambda y, z: z**3 / 100 + y**2 * z / 50)
     found = truth_at_vectors(winds(y * 0, y * 0, y=y, z=z), cubic)
     np.testing.assert_allclose(found["v"].values[0], y**3 / 400 - y * z, atol=1e-9)
-    np.testing.assert_allclose(
-        found["w"].values[0], z**3 / 100 + y**2 * z / 50, atol=1e-9
-    )
+    np.testing.assert_allclose(found["w"].values[0], z**3 / 100 + y**2 * z / 50, atol=1e-9)
 
 
 def test_truth_belongs_to_the_vector_not_to_its_template():
@@ -182,6 +180,9 @@ def test_error_by_quality_leaves_out_what_is_unknown():
 
 
 def test_the_commonest_flag_is_named():
-    attributes = {"flag_masks": np.array([1, 2, 4], np.uint8), "flag_meanings": "edge no_texture far"}
+    attributes = {
+        "flag_masks": np.array([1, 2, 4], np.uint8),
+        "flag_meanings": "edge no_texture far",
+    }
     flag = xr.DataArray(np.array([[1, 3], [2, 6]], np.uint8), dims=("z", "y"), attrs=attributes)
     assert commonest_flag(flag) == "75 % have the flag no_texture"

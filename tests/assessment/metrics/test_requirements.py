@@ -37,8 +37,12 @@ def test_the_published_table():
     for phase, reach, depth in (("landing", 150, 4.5), ("cruise", 500, 15)):
         rows = limits("disturbance", phase)
         assert set(rows) == {
-            "range", "points_per_slab", "slabs_per_second", "slab_depth", "error_v_los"
-        }  # fmt: skip
+            "range",
+            "points_per_slab",
+            "slabs_per_second",
+            "slab_depth",
+            "error_v_los",
+        }
         assert rows["range"].minimum == reach
         assert rows["points_per_slab"].minimum == 63
         assert rows["slabs_per_second"].minimum == 10
@@ -54,9 +58,14 @@ def test_the_published_table():
 
 
 GOOD = {
-    "range": 76.0, "points_per_slab": 63, "slabs_per_second": 10.0, "slab_depth": 7.0,
-    "error_u": 1.0, "error_v": 2.0, "error_w": 2.5,
-}  # fmt: skip
+    "range": 76.0,
+    "points_per_slab": 63,
+    "slabs_per_second": 10.0,
+    "slab_depth": 7.0,
+    "error_u": 1.0,
+    "error_v": 2.0,
+    "error_w": 2.5,
+}
 
 
 def test_a_sensor_that_does_it_and_what_is_left():
@@ -65,10 +74,15 @@ def test_a_sensor_that_does_it_and_what_is_left():
     margins = {f.quantity: f.margin for f in findings}
     assert margins == pytest.approx(
         {
-            "range": 1 - 76 / 150, "points_per_slab": 43 / 20, "slabs_per_second": 0.0,
-            "slab_depth": 0.6 / 7.6, "error_u": 0.6, "error_v": 0.2, "error_w": 0.0,
+            "range": 1 - 76 / 150,
+            "points_per_slab": 43 / 20,
+            "slabs_per_second": 0.0,
+            "slab_depth": 0.6 / 7.6,
+            "error_u": 0.6,
+            "error_v": 0.2,
+            "error_w": 0.0,
         }
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(
@@ -99,7 +113,9 @@ def test_what_is_not_known_does_not_pass():
     without = {k: v for k, v in GOOD.items() if k != "range"}
     findings = judge(TABLES["flight_control", "landing"], without)
     assert {f.quantity for f in findings if f.passed is None} == {"range", "slab_depth"}
-    assert fulfilled(judge(TABLES["flight_control", "landing"], without | {"error_u": 9.0})) is False
+    assert (
+        fulfilled(judge(TABLES["flight_control", "landing"], without | {"error_u": 9.0})) is False
+    )
     nothing = judge(TABLES["flight_control", "landing"], {})
     assert all(f.passed is None for f in nothing)
 
@@ -134,9 +150,11 @@ def test_a_table_of_ones_own(tmp_path):
     file.write_text("glider:\n  soaring:\n    range: {min: 0.1 km}\n    error_w: {max: 50 cm/s}\n")
     (table,) = read_requirements(file).values()
     assert table == RequirementTable(
-        "glider", "glider", "soaring",
+        "glider",
+        "glider",
+        "soaring",
         (Requirement("range", minimum=100.0), Requirement("error_w", maximum=0.5)),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.parametrize(

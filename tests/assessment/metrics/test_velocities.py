@@ -37,11 +37,18 @@ def test_measures_by_hand():
     freedom."""
     got = measures([[1, 3, np.nan], [-5, -3, -4]], 3, v_std=[1, 7, np.nan])
     std = np.sqrt(4 / 3)
-    assert got == pytest.approx({
-        "found_fraction": 5 / 6, "bias": -1.0, "bias_lowest": -4.0, "bias_highest": 2.0,
-        "bias_stderr": std * np.sqrt(1 / 2 + 1 / 3) / 2, "std": std, "std_stderr": std / np.sqrt(6),
-        "expected_std": 5.0,
-    })  # fmt: skip
+    assert got == pytest.approx(
+        {
+            "found_fraction": 5 / 6,
+            "bias": -1.0,
+            "bias_lowest": -4.0,
+            "bias_highest": 2.0,
+            "bias_stderr": std * np.sqrt(1 / 2 + 1 / 3) / 2,
+            "std": std,
+            "std_stderr": std / np.sqrt(6),
+            "expected_std": 5.0,
+        }
+    )
 
 
 def test_standard_errors_are_those_of_repeated_experiments():

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.experiment import schema as config
-from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.figures.backscatter import Drawn
+from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.report.page import Chapter, Tables, page
 from lidar_mi.assessment.report.vector_map import map_data
+from lidar_mi.experiment import schema as config
 
 EVIL = "</script><script>alert(1)</script>&\"'"
 
@@ -72,9 +72,10 @@ def test_names_are_never_markup(tmp_path):
     wind["flag"].attrs["flag_meanings"] = "no_crossflow " + EVIL.replace(" ", "")
     vectors = {"title": EVIL} | map_data(wind, ("u", "v", "w"), [])
     text = some_page(
-        vectors=vectors, drawn=[Drawn(tmp_path / "a.png", EVIL, EVIL)],
+        vectors=vectors,
+        drawn=[Drawn(tmp_path / "a.png", EVIL, EVIL)],
         verdict=Tables(EVIL, EVIL, []),
-    )  # fmt: skip
+    )
     assert "alert(1)" in text and "<script>alert" not in text
     found = Tags(text)
     # the data and the program, nothing else
@@ -124,8 +125,11 @@ def test_a_browser_draws_the_map_and_tells_of_a_vector(tmp_path):
     path.write_text(some_page(vectors=vectors))
     done = subprocess.run(
         [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", path.as_uri()],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
     dom = done.stdout
     assert '<p class="where">y = 1.0 m, z = 4.0 m: good</p>' in dom
     rows = re.search("<tbody>(<tr><td>u.*?)</tbody>", dom)[1]

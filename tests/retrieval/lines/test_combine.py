@@ -27,9 +27,12 @@ METRES = {"units": "m"}
 def crossflow(v, w, stderr, correlation=0.0, y=Y, z=Z, flag=None, **attrs):
     shape = (len(z), len(y))
     fields = {
-        "v": v, "w": w, "v_stderr": stderr, "w_stderr": np.asarray(stderr) * 1.5,
+        "v": v,
+        "w": w,
+        "v_stderr": stderr,
+        "w_stderr": np.asarray(stderr) * 1.5,
         "vw_correlation": correlation,
-    }  # fmt: skip
+    }
     return xr.Dataset(
         {n: (("z", "y"), np.broadcast_to(f, shape).astype(float).copy()) for n, f in fields.items()}
         | {"flag": (("z", "y"), np.zeros(shape, np.uint8) if flag is None else flag)},
@@ -44,12 +47,14 @@ def lines(places, v_los, std, distance=10.0, range_bin=0.0):
     reach = np.linalg.norm(ends, axis=1)
     return xr.Dataset(
         {
-            "v_los": ("line", v_los), "v_los_std": ("line", np.broadcast_to(std, len(places)) * 1.0),
-            "range": ("line", reach), "range_bin": ((), range_bin),
+            "v_los": ("line", v_los),
+            "v_los_std": ("line", np.broadcast_to(std, len(places)) * 1.0),
+            "range": ("line", reach),
+            "range_bin": ((), range_bin),
             "platform_velocity": ("axis", np.zeros(3)),
         },
         coords={"direction": (("line", "axis"), ends / reach[:, None])},
-    )  # fmt: skip
+    )
 
 
 def written_out(flow, scan, u_std, length, window, exponent, mean_std=100.0):
@@ -61,8 +66,9 @@ def written_out(flow, scan, u_std, length, window, exponent, mean_std=100.0):
     prior[:n, :n] = mean_std**2 + u_std**2 * np.exp(-far / length**exponent)
     overlap = np.eye(n)
     if window:
-        overlap = (np.clip(1 - abs(zz[:, None] - zz) / window, 0, None)
-                   * np.clip(1 - abs(yy[:, None] - yy) / window, 0, None))  # fmt: skip
+        overlap = np.clip(1 - abs(zz[:, None] - zz) / window, 0, None) * np.clip(
+            1 - abs(yy[:, None] - yy) / window, 0, None
+        )
     sv, sw, c = (flow[k].values.ravel() for k in ("v_stderr", "w_stderr", "vw_correlation"))
     # Cholesky factor of each node's errors
     vv, wv, ww = sv, c * sw, np.sqrt(1 - c**2) * sw
@@ -105,9 +111,11 @@ def test_generalised_least_squares_written_out(window, range_bin, exponent):
     random = np.random.default_rng(3)
     shape = (len(Z), len(Y))
     flow = crossflow(
-        random.normal(0, 3, shape), random.normal(0, 3, shape), random.uniform(0.3, 2, shape),
+        random.normal(0, 3, shape),
+        random.normal(0, 3, shape),
+        random.uniform(0.3, 2, shape),
         random.uniform(-0.8, 0.8, shape),
-    )  # fmt: skip
+    )
     places = random.uniform([-2.6, -1.6], [2.6, 1.6], (8, 2))
     scan = lines(places, random.normal(0, 3, 8), random.uniform(0.1, 2, 8), range_bin=range_bin)
     found = combine(
@@ -130,8 +138,15 @@ def test_images_that_see_motion_along_x():
     flow = crossflow(random.normal(0, 3, shape), random.normal(0, 3, shape), 0.6, 0.3)
     scan = lines(random.uniform([-2.6, -1.6], [2.6, 1.6], (8, 2)), random.normal(0, 3, 8), 0.4)
     found = combine(
-        flow, scan, window=0.0, u_std=1.3, u_length=2.0, u_power=0.0, u_exponent=1.0,
-        distance=distance, gate_speed=gates,
+        flow,
+        scan,
+        window=0.0,
+        u_std=1.3,
+        u_length=2.0,
+        u_power=0.0,
+        u_exponent=1.0,
+        distance=distance,
+        gate_speed=gates,
     )
     zz, yy = (a.ravel() for a in np.meshgrid(Z, Y, indexing="ij"))
     n, one = len(zz), np.eye(len(zz))
@@ -143,8 +158,12 @@ def test_images_that_see_motion_along_x():
     see = np.zeros((2, n, 3 * n))
     see[0] = np.hstack([-np.diag(yy / distance), one, 0 * one])
     see[1] = np.hstack([-np.diag(zz / distance), 0 * one, one])
-    measured = np.stack([flow.v.values.ravel() - gates * yy / distance,
-                         flow.w.values.ravel() - gates * zz / distance])  # fmt: skip
+    measured = np.stack(
+        [
+            flow.v.values.ravel() - gates * yy / distance,
+            flow.w.values.ravel() - gates * zz / distance,
+        ]
+    )
     data = np.einsum("anx,ab,bn->x", see, both, measured)
     information += np.einsum("anx,ab,bny->xy", see, both, see)
     for k in range(8):
@@ -197,27 +216,33 @@ def scene(random, u_std=1.0, length=12.0, noise=0.7, line_std=0.5, std=None):
     """Random truth and measurements as the estimator takes them to be."""
     y, z = np.arange(-24, 24.1, 2.0), np.arange(-16, 16.1, 2.0)
     root = [np.linalg.cholesky(np.exp(-abs(a[:, None] - a) / length)) for a in (z, y)]
-    overlap = [np.linalg.cholesky(np.clip(1 - abs(a[:, None] - a) / 4, 0, None)
-                                  + 1e-12 * np.eye(len(a))) for a in (z, y)]  # fmt: skip
+    overlap = [
+        np.linalg.cholesky(np.clip(1 - abs(a[:, None] - a) / 4, 0, None) + 1e-12 * np.eye(len(a)))
+        for a in (z, y)
+    ]
     shape = (len(z), len(y))
 
     def smooth(roots):
         return roots[0] @ random.standard_normal(shape) @ roots[1].T
 
-    truth = {
-        "u": 4.0 + u_std * smooth(root), "v": 3 * smooth(root), "w": 3 * smooth(root),
-    }  # fmt: skip
+    truth = {"u": 4.0 + u_std * smooth(root), "v": 3 * smooth(root), "w": 3 * smooth(root)}
     wind = xr.Dataset({k: (("z", "y"), f) for k, f in truth.items()}, coords={"y": y, "z": z})
     errors = noise * smooth(overlap), noise * smooth(overlap)
-    flow = crossflow(truth["v"] + errors[0], truth["w"] + 1.5 * errors[1], noise, 0.0, y, z,
-                     stride=1, template=2)  # fmt: skip
+    flow = crossflow(
+        truth["v"] + errors[0], truth["w"] + 1.5 * errors[1], noise, 0.0, y, z, stride=1, template=2
+    )
     # narrow beams and short bins, which see the wind of a place
-    lidar = DopplerLidar(range=76, range_bin=0.2, beam_radius=1e-3, divergence_full=0,
-                         pulse_duration=0)  # fmt: skip
+    lidar = DopplerLidar(
+        range=76, range_bin=0.2, beam_radius=1e-3, divergence_full=0, pulse_duration=0
+    )
     scan = scan_wind(
-        wind, DopplerScan(azimuth_half="15 deg", elevation_half="10 deg"), lidar, line_std,
-        int(random.integers(2**31)), 150.0,
-    )  # fmt: skip
+        wind,
+        DopplerScan(azimuth_half="15 deg", elevation_half="10 deg"),
+        lidar,
+        line_std,
+        int(random.integers(2**31)),
+        150.0,
+    )
     return wind, flow, scan
 
 
@@ -231,14 +256,17 @@ def reduced_errors(known, draws):
         # far apart, so that nodes hardly know of each other
         pick = {"z": slice(3, -3, 5), "y": slice(3, -3, 6)}
         assert (found.flag.isel(pick) == 0).all()
-        rows.append([((found[c] - wind[c]) / found[f"{c}_stderr"]).isel(pick).values.ravel()
-                     for c in "uvw"])  # fmt: skip
+        rows.append(
+            [((found[c] - wind[c]) / found[f"{c}_stderr"]).isel(pick).values.ravel() for c in "uvw"]
+        )
     return np.array(rows)
 
 
 def test_errors_are_as_stated():
     """Statistics of u given: unit variance and coverage to 4 sigma of 40 draws x 12 nodes."""
-    reduced = reduced_errors({"u_std": 1.0, "u_length": 12.0, "u_power": 0.0, "u_exponent": 1.0}, 40)
+    reduced = reduced_errors(
+        {"u_std": 1.0, "u_length": 12.0, "u_power": 0.0, "u_exponent": 1.0}, 40
+    )
     for values in reduced.transpose(1, 0, 2):
         count = values.size / 2  # nodes of a draw share the lines
         assert abs(values.mean()) < 4 / math.sqrt(count)
@@ -284,10 +312,17 @@ def uneven_scene(random, follows):
     fields = {"u": smooth() * (strength if follows else 0.6)}
     fields |= {name: 3 * strength * smooth() for name in "vw"}
     wind = xr.Dataset({k: (("z", "y"), f) for k, f in fields.items()}, coords={"y": y, "z": z})
-    lidar = DopplerLidar(range=76, range_bin=0.2, beam_radius=1e-3, divergence_full=0,
-                         pulse_duration=0)  # fmt: skip
-    scan = scan_wind(wind, DopplerScan(azimuth_half="15 deg", elevation_half="10 deg"), lidar, 0.1,
-                     int(random.integers(2**31)), 150.0)  # fmt: skip
+    lidar = DopplerLidar(
+        range=76, range_bin=0.2, beam_radius=1e-3, divergence_full=0, pulse_duration=0
+    )
+    scan = scan_wind(
+        wind,
+        DopplerScan(azimuth_half="15 deg", elevation_half="10 deg"),
+        lidar,
+        0.1,
+        int(random.integers(2**31)),
+        150.0,
+    )
     return wind, crossflow(wind.v, wind.w, 0.01, 0.0, y, z), scan
 
 
@@ -308,8 +343,10 @@ def test_u_may_vary_where_the_cross_flow_does(follows):
         assert abs(np.mean(values) - 1) < 4 * error + 0.3, (np.mean(quiet), np.mean(wild))
     if follows:
         even = combine(flow, scan, u_power=0.0)
-        ratio = [found.u_stderr.where(side & inside).mean() / even.u_stderr.where(side & inside).mean()
-                 for side in (found.y < -4, found.y > 4)]  # fmt: skip
+        ratio = [
+            found.u_stderr.where(side & inside).mean() / even.u_stderr.where(side & inside).mean()
+            for side in (found.y < -4, found.y > 4)
+        ]
         assert ratio[0] < 0.9 and ratio[1] > 1.05
 
 
@@ -336,13 +373,21 @@ def test_a_vortex_pair():
     axial = sum(2 * np.exp(-((grid_y - s * 15) ** 2 + grid_z**2) / 50) for s in (1, -1))
     fields = {name: (("z", "y"), f) for name, f in (("u", axial), ("v", v), ("w", w))}
     wind = xr.Dataset(fields, coords={"y": y, "z": z})
-    overlap = [np.linalg.cholesky(np.clip(1 - abs(a[:, None] - a) / 4, 0, None)
-                                  + 1e-12 * np.eye(len(a))) for a in (z, y)]  # fmt: skip
+    overlap = [
+        np.linalg.cholesky(np.clip(1 - abs(a[:, None] - a) / 4, 0, None) + 1e-12 * np.eye(len(a)))
+        for a in (z, y)
+    ]
     noise = (0.7 * overlap[0] @ random.standard_normal(axial.shape) @ overlap[1].T for _ in "vw")
     flow = crossflow(wind.v + next(noise), wind.w + next(noise), 0.7, 0.0, y, z, template=4)
     flow["w_stderr"] = flow.v_stderr
-    scan = scan_wind(wind, DopplerScan(azimuth_half="20 deg", elevation_half="13 deg"),
-                     DopplerLidar(range=76), 0.5, 1, 150.0)  # fmt: skip
+    scan = scan_wind(
+        wind,
+        DopplerScan(azimuth_half="20 deg", elevation_half="13 deg"),
+        DopplerLidar(range=76),
+        0.5,
+        1,
+        150.0,
+    )
     found = combine(flow, scan)
     inside = found.flag == 0
     rms = {c: float(np.sqrt((((found[c] - wind[c]) ** 2).where(inside)).mean())) for c in "uvw"}
@@ -475,7 +520,10 @@ LINES = lines(np.array([[0.3, 0.2], [1.0, 1.0]]), [1.0, 2.0], 0.5)
 @pytest.mark.parametrize(
     ("call", "start"),
     [
-        (lambda: combine(FLOW.assign(flag=FLOW.flag + 1), LINES), "crossflow.flag: every vector is"),
+        (
+            lambda: combine(FLOW.assign(flag=FLOW.flag + 1), LINES),
+            "crossflow.flag: every vector is",
+        ),
         (lambda: combine(FLOW.drop_vars("v"), LINES), "crossflow.v: missing"),
         (lambda: combine(FLOW, LINES.drop_vars("range_bin")), "scan.range_bin: missing"),
         (lambda: combine(FLOW, LINES.drop_vars("v_los")), "scan.v_los: missing"),

@@ -22,17 +22,20 @@ from scipy.ndimage import gaussian_filter
 from lidar_mi.atmosphere.texture import gaussian_field
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
 from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.experiment.truth import find_file
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind
 from lidar_mi.retrieval.lines.combine import combine
-from lidar_mi.experiment.truth import find_file
 
 Y, Z = np.arange(-49.0, 49.1), np.arange(-31.0, 31.1)
 GRID_Y, GRID_Z = np.meshgrid(Y, Z)
 METRES = {"units": "m"}
 # Azimuth and elevation of the outermost lines, and standard error of a velocity (m/s), by range.
-SCANS = {76: ("21.5 deg", "14 deg", 0.044), 150: ("16 deg", "10 deg", 0.16),
-         500: ("4.92 deg", "3.03 deg", 0.5)}  # fmt: skip
+SCANS = {
+    76: ("21.5 deg", "14 deg", 0.044),
+    150: ("16 deg", "10 deg", 0.16),
+    500: ("4.92 deg", "3.03 deg", 0.5),
+}
 # Of v and w, m/s, correlated over a window of so many m.
 CROSSFLOW_STD, WINDOW = 0.13, 4
 
@@ -48,9 +51,15 @@ def simulated(random):
 
 
 def pair(random):
-    separation, radius, (y, z) = random.uniform(15, 47), random.uniform(2, 5), random.uniform(-5, 5, 2)
-    return [Vortex(circulation=side * 458.0, core_radius=radius, y=y + side * separation / 2, z=z)
-            for side in (1, -1)]  # fmt: skip
+    separation, radius, (y, z) = (
+        random.uniform(15, 47),
+        random.uniform(2, 5),
+        random.uniform(-5, 5, 2),
+    )
+    return [
+        Vortex(circulation=side * 458.0, core_radius=radius, y=y + side * separation / 2, z=z)
+        for side in (1, -1)
+    ]
 
 
 def speeds(random):
@@ -100,8 +109,10 @@ def jets(background):
     def flow(random):
         vortices, strength = pair(random), random.uniform(0.5, 3) * random.choice([-1, 1])
         width = random.uniform(2, 8)
-        u = sum(strength * np.exp(-((GRID_Y - v.y) ** 2 + (GRID_Z - v.z) ** 2) / (2 * width**2))
-                for v in vortices)  # fmt: skip
+        u = sum(
+            strength * np.exp(-((GRID_Y - v.y) ** 2 + (GRID_Z - v.z) ** 2) / (2 * width**2))
+            for v in vortices
+        )
         winds = [u, *velocity(vortices, GRID_Y, GRID_Z)]
         return [wind + gusts(random, 30.0, background) for wind in winds] if background else winds
 
@@ -109,8 +120,15 @@ def jets(background):
 
 
 def turbine(random):
-    wake = TurbineWake(diameter=50.0, thrust=0.75, tip_speed_ratio=7, wind_speed=8.0, growth=0.03,
-                       downstream=150.0, hub_core=5.0)  # fmt: skip
+    wake = TurbineWake(
+        diameter=50.0,
+        thrust=0.75,
+        tip_speed_ratio=7,
+        wind_speed=8.0,
+        growth=0.03,
+        downstream=150.0,
+        hub_core=5.0,
+    )
     flow = turbine_flow(wake, [0.0, 1.0], Y, Z, 0.06, 20.0, int(random.integers(2**31))).isel(x=0)
     return [flow[name].transpose("z", "y").values for name in "uvw"]
 
@@ -120,11 +138,18 @@ def even(random):
 
 
 FLOWS = {
-    "simulated": simulated, "turbulence 10 m": turbulence(10.0), "turbulence 30 m": turbulence(30.0),
-    "turbulence 100 m": turbulence(100.0), "smooth 15 m": smooth(15.0), "exponential": exponential,
-    "jets in gusts": jets(0.2), "turbine": turbine,
-    "smooth 5 m": smooth(5.0), "jets": jets(0.0), "even": even,
-}  # fmt: skip
+    "simulated": simulated,
+    "turbulence 10 m": turbulence(10.0),
+    "turbulence 30 m": turbulence(30.0),
+    "turbulence 100 m": turbulence(100.0),
+    "smooth 15 m": smooth(15.0),
+    "exponential": exponential,
+    "jets in gusts": jets(0.2),
+    "turbine": turbine,
+    "smooth 5 m": smooth(5.0),
+    "jets": jets(0.0),
+    "even": even,
+}
 # Flows whose errors are stated too large: of lines 7 to 11 m apart none can tell that u has nothing
 # finer than that, errors near zero but for a few large ones have no normal distribution, and that an
 # even wind is even is known to the lines' noise alone.
@@ -133,15 +158,21 @@ TOO_LARGE = {"smooth 5 m", "jets", "even"}
 
 def measured(winds, distance, random):
     azimuth, elevation, std = SCANS[distance]
-    wind = xr.Dataset({n: (("z", "y"), f) for n, f in zip("uvw", winds)},
-                      coords={"y": ("y", Y, METRES), "z": ("z", Z, METRES)})  # fmt: skip
+    wind = xr.Dataset(
+        {n: (("z", "y"), f) for n, f in zip("uvw", winds)},
+        coords={"y": ("y", Y, METRES), "z": ("z", Z, METRES)},
+    )
     lidar = DopplerLidar(range=f"{distance} m")
     directions = DopplerScan(azimuth_half=azimuth, elevation_half=elevation)
     lines = scan_wind(wind, directions, lidar, std, int(random.integers(2**31)), 70.0)
-    reach = distance * np.tan([float(text.split()[0]) * math.pi / 180 for text in SCANS[distance][:2]])
+    reach = distance * np.tan(
+        [float(text.split()[0]) * math.pi / 180 for text in SCANS[distance][:2]]
+    )
     seen = wind.sel(y=slice(-reach[0] - 4, reach[0] + 4), z=slice(-reach[1] - 3, reach[1] + 3))
     roots = [
-        np.linalg.cholesky(np.clip(1 - abs(a[:, None] - a) / WINDOW, 0, None) + 1e-9 * np.eye(len(a)))
+        np.linalg.cholesky(
+            np.clip(1 - abs(a[:, None] - a) / WINDOW, 0, None) + 1e-9 * np.eye(len(a))
+        )
         for a in (seen.z.values, seen.y.values)
     ]
     flow = xr.Dataset(coords=seen.coords, attrs={"template": WINDOW, "stride": 1})
@@ -193,4 +224,6 @@ def test_errors_are_as_stated_over_all_flows():
     """To 5 points, and to a third in variance, of all that lines can tell of."""
     told = [name for name in FLOWS if name not in TOO_LARGE]
     mean = np.mean([shares(name, distance, 10) for name in told for distance in SCANS], (0, 1))
-    assert mean[:2] == pytest.approx([0.683, 0.95], abs=0.05) and mean[2] == pytest.approx(1, abs=0.33)
+    assert mean[:2] == pytest.approx([0.683, 0.95], abs=0.05) and mean[2] == pytest.approx(
+        1, abs=0.33
+    )

@@ -60,8 +60,9 @@ METHODS = {
 def test_uniform_wind_is_exact_and_the_platforms_motion_gone(method):
     for speed in (0.0, 150.0):
         found = METHODS[method](scanned(noisy=False, speed=speed))
-        np.testing.assert_allclose(vectors(found), np.broadcast_to(TRUE, (found.sizes["vector"], 3)),
-                                   atol=1e-9)  # fmt: skip
+        np.testing.assert_allclose(
+            vectors(found), np.broadcast_to(TRUE, (found.sizes["vector"], 3)), atol=1e-9
+        )
         assert (found.flag == 0).all()
         if method != "triples":
             np.testing.assert_allclose(found.misfit, 0, atol=1e-18)
@@ -93,7 +94,13 @@ def test_neighbours_are_the_nearest():
     scan = scanned()
     found = wind_from_neighbours(scan, 5)
     middle = 3 * 9 + 4
-    assert set(found.lines.values[middle]) == {middle, middle - 1, middle + 1, middle - 9, middle + 9}
+    assert set(found.lines.values[middle]) == {
+        middle,
+        middle - 1,
+        middle + 1,
+        middle - 9,
+        middle + 9,
+    }
 
 
 # covariance
@@ -104,7 +111,9 @@ def test_neighbours_are_the_nearest():
 def test_a_cone_in_closed_form(count, degrees):
     """u to s / (sqrt(k) cos a), v and w to s sqrt(2 / k) / sin a, and nothing between them."""
     half, s = math.radians(degrees), 0.7
-    _, covariance, _ = solve_lines(cone(count, half)[None], np.zeros((1, count)), np.full((1, count), s))
+    _, covariance, _ = solve_lines(
+        cone(count, half)[None], np.zeros((1, count)), np.full((1, count), s)
+    )
     expected = np.diag(
         [s**2 / count / math.cos(half) ** 2] + [2 * s**2 / count / math.sin(half) ** 2] * 2
     )
@@ -133,8 +142,9 @@ def test_another_solver_gives_the_same():
         matrix = lines[n] / std[n, :, None]
         expected, residual, *_ = np.linalg.lstsq(matrix, along[n] / std[n])
         np.testing.assert_allclose(wind[n], expected, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(covariance[n], np.linalg.inv(matrix.T @ matrix), rtol=1e-9,
-                                   atol=1e-9)  # fmt: skip
+        np.testing.assert_allclose(
+            covariance[n], np.linalg.inv(matrix.T @ matrix), rtol=1e-9, atol=1e-9
+        )
         assert chi_square[n] == pytest.approx(residual[0])
 
 
@@ -190,9 +200,7 @@ def test_an_attitude_error_turns_the_relative_wind():
     """All lines turned by R: the air's velocity relative to the platform comes out turned back."""
     errors = PlatformErrors(yaw="3 mrad", pitch="-2 mrad", roll="5 mrad")
     found = wind_from_neighbours(scanned(noisy=False, errors=errors), 63)
-    cy, sy, cp, sp, cr, sr = (
-        f(a) for a in (3e-3, 2e-3, 5e-3) for f in (math.cos, math.sin)
-    )  # fmt: skip
+    cy, sy, cp, sp, cr, sr = (f(a) for a in (3e-3, 2e-3, 5e-3) for f in (math.cos, math.sin))
     # columns: where forward, port and up of the platform point; pitch nose down
     yaw = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
     pitch = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
@@ -231,18 +239,25 @@ def test_neighbours_in_a_row_are_flagged():
     ("call", "start"),
     [
         (lambda: wind_from_triples(scanned(columns=2, rows=1)), "scan: 2 lines of sight are not"),
-        (lambda: wind_from_triples(scanned(rows=1)), "scan.direction: all 9 lines lie in one plane"),
+        (
+            lambda: wind_from_triples(scanned(rows=1)),
+            "scan.direction: all 9 lines lie in one plane",
+        ),
         (lambda: wind_from_neighbours(scanned(), 2), "count: 2 is not allowed; expected 3 to 63"),
         (lambda: wind_from_neighbours(scanned(), 64), "count: 64"),
         (lambda: wind_from_triples(scanned().drop_vars("range")), "scan.range: missing"),
         (lambda: wind_from_triples(scanned(std=0.0)), "scan.v_los_std: not > 0"),
-        (lambda: wind_from_triples(scanned().assign_coords(direction=2 * scanned().direction)),
-         "scan.direction: not of length 1"),
-        (lambda: wind_from_triples(scanned().assign_coords(direction=-scanned().direction)),
-         "scan.direction: a line goes backward"),
+        (
+            lambda: wind_from_triples(scanned().assign_coords(direction=2 * scanned().direction)),
+            "scan.direction: not of length 1",
+        ),
+        (
+            lambda: wind_from_triples(scanned().assign_coords(direction=-scanned().direction)),
+            "scan.direction: a line goes backward",
+        ),
         (lambda: wind_from_triples(scanned().isel(axis=slice(2))), "scan.axis: 2 components"),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_named(call, start):
     with pytest.raises(InputError) as error:
         call()

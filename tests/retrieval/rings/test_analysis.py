@@ -142,11 +142,13 @@ def images():
         "blob": (np.exp(-(r**2) / 5000), "rings: 0 seen|none seen"),
         "one ring": (np.exp(-(((r - 90) / 12) ** 2)), "rings: 1 seen; expected at least 2"),
         "unequal": (
-            sum(np.exp(-(((r - a) / 3) ** 2)) for a in (60, 75, 100, 110, 140)), "equal steps"),
+            sum(np.exp(-(((r - a) / 3) ** 2)) for a in (60, 75, 100, 110, 140)),
+            "equal steps",
+        ),
         "nan": (spoiled, r"1 pixel\(s\) of NaN"),
         "saturated": (good.clip(max=0.5), "saturated"),
         "outside": (split_rings((300, 400), (-40.0, 160.0), 8000.0, (0.5,)), "centre: "),
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("kind", images())

@@ -98,8 +98,10 @@ def test_reaches_the_bound_on_the_whole_camera(case):
             both = flat - found[0][:some]
     v = torch.cat(found)
     bound = bound_of(case)
-    print(f"{case}: bound {bound:.4f} std {v.std():.4f} bias {v.mean() - 20:+.4f} "
-          f"2-D less annular {both.std():.4f}")  # fmt: skip
+    print(
+        f"{case}: bound {bound:.4f} std {v.std():.4f} bias {v.mean() - 20:+.4f} "
+        f"2-D less annular {both.std():.4f}"
+    )
     assert v.std() <= 1.2 * bound
     assert abs(v.mean() - 20) <= 0.1
     assert both.std() < 0.2 * bound
@@ -162,7 +164,9 @@ def test_emitted_picture_takes_the_instrument_off():
     assert float(emitted.v_los) == pytest.approx(-0.03 * air.velocity_range, abs=0.05)
     v, std = difference(received, emitted)
     assert abs(float(v) - 33) < 0.05
-    assert float(std) == pytest.approx(float(received.v_los_std.square() + emitted.v_los_std.square()) ** 0.5)
+    assert float(std) == pytest.approx(
+        float(received.v_los_std.square() + emitted.v_los_std.square()) ** 0.5
+    )
 
 
 # --- bad input ------------------------------------------------------------------------------
@@ -196,7 +200,9 @@ def test_one_ring():
     r = np.hypot(x - 119.5, y - 97)
     mean = np.where(r < 50, reference.picture(0.0, **COARSE), 300.0)
     rng = np.random.default_rng(2)
-    refused(rng.poisson(mean).astype(float), "expected (at least 2|two rings)", max_chi_square=np.inf)
+    refused(
+        rng.poisson(mean).astype(float), "expected (at least 2|two rings)", max_chi_square=np.inf
+    )
     # and a camera that is too small for two
     small = {"shape": (70, 70), "pixel": 4 * reference.PIXEL}
     image = torch.as_tensor(rng.poisson(reference.picture(0.0, 1e6, **small)).astype(float))

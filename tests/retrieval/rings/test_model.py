@@ -28,10 +28,15 @@ def ring_model(shape=reference.SHAPE, pixel=reference.PIXEL, temperatures=TEMPER
     centre = ((shape[1] - 1) / 2, (shape[0] - 1) / 2)
     rows = np.array([reference.harmonics(t) for t in temperatures])
     values = {
-        "shape": shape, "centre": centre, "pixel": pixel, "focal_length": reference.FOCAL_LENGTH,
-        "wavelength": reference.WAVELENGTH, "order_at_centre": reference.ORDER,
-        "harmonics": rows, "temperatures": temperatures,
-    }  # fmt: skip
+        "shape": shape,
+        "centre": centre,
+        "pixel": pixel,
+        "focal_length": reference.FOCAL_LENGTH,
+        "wavelength": reference.WAVELENGTH,
+        "order_at_centre": reference.ORDER,
+        "harmonics": rows,
+        "temperatures": temperatures,
+    }
     return RingModel(**{**values, **changes})
 
 
@@ -76,9 +81,13 @@ def test_derivatives_are_differences(kind):
         cells = pixels(model.shape, centre)
     else:
         cells = annular_sectors(model.shape, centre, model.order_spacing / 40, 8)
-    at = torch.tensor([[35.0, 0.2, -0.1, 30.0, 2.0, 240.0, 0.4], [-90, 0, 0, 5, 1, 221, 0]]).double()
+    at = torch.tensor(
+        [[35.0, 0.2, -0.1, 30.0, 2.0, 240.0, 0.4], [-90, 0, 0, 5, 1, 221, 0]]
+    ).double()
     jacobian = mean_and_jacobian(model, cells, at)[1]
-    for place, (name, step) in enumerate(zip(PARAMETERS, (0.01, 1e-3, 1e-3, 1e-3, 1e-3, 1e-2, 1e-4))):
+    for place, (name, step) in enumerate(
+        zip(PARAMETERS, (0.01, 1e-3, 1e-3, 1e-3, 1e-3, 1e-2, 1e-4))
+    ):
         move = torch.zeros(7, dtype=torch.float64)
         move[place] = step
         up, down = (mean_and_jacobian(model, cells, at + s * move)[0] for s in (1, -1))

@@ -11,13 +11,13 @@ import ring_reference as reference
 from scipy.signal import savgol_coeffs
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.peak_fit import peak, peaks
 from lidar_mi.retrieval.rings.centre import (
     circular_average,
     circular_centre,
     gradient_centre,
     midpoint_line_centre,
 )
+from lidar_mi.retrieval.rings.peak_fit import peak, peaks
 from lidar_mi.retrieval.rings.peaks import (
     PIECE,
     find_centre,
@@ -98,9 +98,9 @@ def test_radial_cuts_and_their_filter():
 def test_peaks_that_overlap():
     """Two Gaussians of one width on a slope, one width apart: exact when fitted together."""
     x = np.linspace(0, 100, 400)
-    values = 3 + 0.01 * x + sum(
-        h * np.exp(-(((x - p) / 8) ** 2) / 2) for p, h in ((42, 5), (60, 4))
-    )  # fmt: skip
+    values = (
+        3 + 0.01 * x + sum(h * np.exp(-(((x - p) / 8) ** 2) / 2) for p, h in ((42, 5), (60, 4)))
+    )
     np.testing.assert_allclose(peaks(x, values, [44, 58], 25, slope=True), [42, 60], atol=1e-6)
     assert abs(peak(x, values, 44, 12) - 42) > 0.05
     with pytest.raises(InputError, match="no peak within"):
@@ -122,9 +122,8 @@ def test_gaussian_over_r2_has_no_bias(pictures, method):
     """The ring is symmetric in r^2. Filtered cuts were smoothed over r: 1 m/s of the skew is left."""
     for kind, v in (("still", 0.0), ("wind", 50.0)):
         found = paper_velocity(
-            pictures[kind], pictures["emitted"], method=method, coordinate="r2",
-            centre=CENTRE,
-        )  # fmt: skip
+            pictures[kind], pictures["emitted"], method=method, coordinate="r2", centre=CENTRE
+        )
         assert abs(found - v) < (0.3 if method == "ca" else 2.0)
 
 
@@ -132,9 +131,8 @@ def test_gaussian_over_r2_has_no_bias(pictures, method):
 def test_gaussian_over_r_is_biased(pictures, method):
     for piece in (0.2, 0.35):
         found = paper_velocity(
-            pictures["wind"], pictures["emitted"], method=method, centre=CENTRE,
-            piece=piece,
-        )  # fmt: skip
+            pictures["wind"], pictures["emitted"], method=method, centre=CENTRE, piece=piece
+        )
         assert -40 < found - 50 < -10
 
 
@@ -148,7 +146,9 @@ def test_bias_grows_with_the_fitted_piece(pictures, piece, bias):
 
 def test_radius_of_the_emitted_ring(pictures):
     """Narrow rings hardly care: 0.1 px over r, 0.02 px over r^2."""
-    truth = reference.FOCAL_LENGTH / reference.PIXEL * np.sqrt((1 - 0.5 / reference.ORDER) ** -2 - 1)
+    truth = (
+        reference.FOCAL_LENGTH / reference.PIXEL * np.sqrt((1 - 0.5 / reference.ORDER) ** -2 - 1)
+    )
     image = pictures["emitted"]
     assert innermost(image, CENTRE) == pytest.approx(truth, abs=3)
     assert ring_radius(image, CENTRE, "ca", "r2") == pytest.approx(truth, abs=0.05)
@@ -169,14 +169,19 @@ def test_twenty_pictures():
     images = [reference.noisy(mean, rng, 5.0, 10.0) for _ in range(20)]
     found = {
         (method, coordinate): np.array(
-            [paper_velocity(image, emitted, method=method, coordinate=coordinate,
-                            piece=0.15) for image in images]
+            [
+                paper_velocity(image, emitted, method=method, coordinate=coordinate, piece=0.15)
+                for image in images
+            ]
         )
         for method, coordinate in (("ca", "r"), ("ca", "r2"), ("ml", "r"))
-    }  # fmt: skip
+    }
     for way, v in found.items():
-        print(way, f"bias {v.mean():+.2f} std of one {v.std(ddof=1):.2f} of 20 "
-              f"{v.std(ddof=1) / np.sqrt(20):.2f} m/s")  # fmt: skip
+        print(
+            way,
+            f"bias {v.mean():+.2f} std of one {v.std(ddof=1):.2f} of 20 "
+            f"{v.std(ddof=1) / np.sqrt(20):.2f} m/s",
+        )
     spread = {way: v.std(ddof=1) / np.sqrt(20) for way, v in found.items()}
     assert -14 < found["ca", "r"].mean() < -4
     assert -14 < found["ml", "r"].mean() < -2

@@ -33,8 +33,15 @@ def direct(image1, image2, template, search, stride):
 
 
 SIZES = [
-    (8, 16, 1), (8, 16, 5), (7, 16, 3), (8, 15, 2), (5, 9, 1), (4, 7, 4), (2, 4, 1), (3, 20, 2)
-]  # fmt: skip
+    (8, 16, 1),
+    (8, 16, 5),
+    (7, 16, 3),
+    (8, 15, 2),
+    (5, 9, 1),
+    (4, 7, 4),
+    (2, 4, 1),
+    (3, 20, 2),
+]
 
 
 @pytest.mark.parametrize("algorithm", ["dense", "fft", "auto"])
@@ -44,7 +51,11 @@ def test_equals_the_direct_sum(template, search, stride, algorithm):
     first, second = rng.random((2, 23, 27))
     expected = direct(first, second, template, search, stride)
     found = correlate(
-        torch.as_tensor(first), torch.as_tensor(second), template, search, stride,
+        torch.as_tensor(first),
+        torch.as_tensor(second),
+        template,
+        search,
+        stride,
         algorithm=algorithm,
     )
     np.testing.assert_allclose(found, expected, atol=1e-10)

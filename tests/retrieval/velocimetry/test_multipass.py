@@ -22,7 +22,9 @@ def wind_errors(pair, method, **options):
     """Errors of v and w at the vectors (2, z, y), m/s, their standard errors, and which are far."""
     wind = retrieve_wind(pair.first, pair.second, DT, method, noise=pair.noise or None, **options)
     z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
-    errors = np.stack([wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z))])
+    errors = np.stack(
+        [wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z))]
+    )
     stderr = np.stack([wind["v_stderr"].values, wind["w_stderr"].values])
     far = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) > 6
     return errors, stderr, far
@@ -196,8 +198,10 @@ def test_particle_images(method):
         z = z0 - 0.6 * part
         y = y0 + (1.3 + shear * (z0 - 45)) * part - 0.3 * shear * part**2
         total = np.zeros((rows, columns))
-        edges = [np.exp(-((np.arange(n)[:, None] - p) ** 2) / (2 * radius**2))
-                 for n, p in ((rows, z), (columns, y))]  # fmt: skip
+        edges = [
+            np.exp(-((np.arange(n)[:, None] - p) ** 2) / (2 * radius**2))
+            for n, p in ((rows, z), (columns, y))
+        ]
         np.matmul(edges[0] * bright, edges[1].T, out=total)
         return total + 0.01 * random.standard_normal(total.shape)
 

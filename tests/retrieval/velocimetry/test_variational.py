@@ -48,7 +48,9 @@ def wind_errors(pair):
     wind = retrieve_wind(pair.first, pair.second, DT, "variational", noise=pair.noise or None)
     assert (wind.flag == 0).mean() > 0.95
     z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
-    errors = np.stack([wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z))])
+    errors = np.stack(
+        [wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z))]
+    )
     stderr = np.stack([wind["v_stderr"].values, wind["w_stderr"].values])
     far = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) > 6
     return errors, stderr, far
@@ -134,7 +136,9 @@ def test_noise_of_a_burst_is_what_still_images_differ_by(number, spread):
     random = np.random.default_rng(8)
     z, y = (SPACING * np.arange(n) for n in (80, 90))
     still = texture(plane_waves(8, 3.0), *np.meshgrid(y, z))
-    stack = [torch.tensor(still + 0.05 * random.standard_normal(still.shape)) for _ in range(number)]
+    stack = [
+        torch.tensor(still + 0.05 * random.standard_normal(still.shape)) for _ in range(number)
+    ]
     # told too little noise, the fit has to take it from the misfit
     images = _prepared(stack, 0.02, 0.0)
     knots = FlowSpline(*(Axis(n, 10.0) for n in still.shape))
@@ -274,7 +278,7 @@ def test_where_images_share_less_standard_errors_are_larger():
     z, y = grid(90, 120)
     pattern, other = waves(5, 3.0), waves(6, 3.0)
     random = np.random.default_rng(5)
-    patch = np.exp(-(((z - 45) / 12) ** 2 + ((y - 35) / 12) ** 2) ** 2)
+    patch = np.exp(-((((z - 45) / 12) ** 2 + ((y - 35) / 12) ** 2) ** 2))
     first, second = (
         0.2 * pattern(y - 1.2 * t, z + 0.7 * t) + 0.01 * random.standard_normal(z.shape)
         for t in (-0.5, 0.5)
@@ -328,7 +332,9 @@ def blurred_errors(seed, noise, sigma):
         z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
         true = velocity(pair.vortices, y, z)
         core = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) < 6
-        errors.append([rms((wind[n].values - t)[m]) for m in (core, ~core) for n, t in zip("vw", true)])
+        errors.append(
+            [rms((wind[n].values - t)[m]) for m in (core, ~core) for n, t in zip("vw", true)]
+        )
     return np.reshape(errors, (2, 2, 2))
 
 

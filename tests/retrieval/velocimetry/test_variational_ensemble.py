@@ -11,8 +11,8 @@ import pytest
 
 from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.stages.backscatter import scan_plans, window_settings
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.experiment.truth import blur_by_beam, make_truth
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
 SCENES = Path(config.__file__).parents[1] / "scenes"
 SIMULATION = Path(__file__).parents[4] / "shared" / "data" / "wake_les_40s.nc"
@@ -27,9 +27,7 @@ def reduced_errors(seed, amount, **changes):
     experiment = config.load(SCENES / "wake_sensor.yaml", overrides)
     truth = make_truth(experiment, SCENES)
     plans = scan_plans(experiment, truth)
-    pictures = [
-        blur_by_beam(truth.image(k), experiment.lidar, plans[k].centre) for k in (0, 1)
-    ]
+    pictures = [blur_by_beam(truth.image(k), experiment.lidar, plans[k].centre) for k in (0, 1)]
     noise = pictures[0].copy(data=np.sqrt(amount * np.polyval(NOISE[::-1], pictures[0].values)))
     random = np.random.default_rng(seed)
     noisy = [
@@ -37,9 +35,12 @@ def reduced_errors(seed, amount, **changes):
         for p in pictures
     ]
     wind = retrieve_wind(
-        *noisy, experiment.platform.dt, "variational", noise=noise,
+        *noisy,
+        experiment.platform.dt,
+        "variational",
+        noise=noise,
         **window_settings(experiment.retrieval),
-    )  # fmt: skip
+    )
     good = wind["flag"].values == 0
     assert good.mean() > 0.9
     reduced, errors = [], []
@@ -69,7 +70,11 @@ def test_coverage_on_the_shipped_wake():
 def test_coverage_over_planes_of_the_simulation(amount):
     """Planes 6 m apart, of other small eddies, each with an aerosol of its own."""
     places = np.arange(2.5, 40, 6)
-    check(np.concatenate([
-        reduced_errors(seed, amount, **{"wake.file": SIMULATION, "wake.x": x})[0]
-        for seed, x in enumerate(places, 11)
-    ]))  # fmt: skip
+    check(
+        np.concatenate(
+            [
+                reduced_errors(seed, amount, **{"wake.file": SIMULATION, "wake.x": x})[0]
+                for seed, x in enumerate(places, 11)
+            ]
+        )
+    )

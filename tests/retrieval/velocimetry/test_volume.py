@@ -40,8 +40,7 @@ def nodes(shape):
 
 def volume(values):
     axes = {
-        name: (name, SPACING * np.arange(n), {"units": "m"})
-        for name, n in zip("xzy", values.shape)
+        name: (name, SPACING * np.arange(n), {"units": "m"}) for name, n in zip("xzy", values.shape)
     }
     return xr.DataArray(values, axes, ("x", "z", "y"))
 
@@ -61,9 +60,9 @@ def errors(found, true):
     off, reduced = {}, {}
     for name, expected in zip(("u", "w", "v"), true(places)):
         off[name] = (found[name].values * DT / SPACING - expected)[found["flag"].values == 0]
-        reduced[name] = off[name] / (found[f"{name}_stderr"].values * DT / SPACING)[
-            found["flag"].values == 0
-        ]
+        reduced[name] = (
+            off[name] / (found[f"{name}_stderr"].values * DT / SPACING)[found["flag"].values == 0]
+        )
     return off, reduced
 
 
@@ -97,7 +96,11 @@ def test_solid_rotation_about_x(method):
     def back(x, t):
         _, z, y = x - middle
         c, s = np.cos(t * angle), np.sin(t * angle)
-        return np.stack([x[0] - 0.4 * t, c * z - s * y, s * z + c * y]) + middle * [[[[0]]], [[[1]]], [[[1]]]]
+        return np.stack([x[0] - 0.4 * t, c * z - s * y, s * z + c * y]) + middle * [
+            [[[0]]],
+            [[[1]]],
+            [[[1]]],
+        ]
 
     def true(x):
         _, z, y = x - middle
@@ -180,9 +183,9 @@ def test_errors_reach_the_bound_of_a_known_shift():
     square = np.einsum("axyz,bxyz,xyz->ab", slopes, slopes, weight**2)
     inverse = np.linalg.inv(matrix)
     bound = np.sqrt(2 * noise**2 * np.diag(inverse @ square @ inverse))
-    all_of_it = np.sqrt(2 * noise**2 * np.diag(np.linalg.inv(
-        np.einsum("axyz,bxyz->ab", slopes, slopes)
-    )))  # fmt: skip
+    all_of_it = np.sqrt(
+        2 * noise**2 * np.diag(np.linalg.inv(np.einsum("axyz,bxyz->ab", slopes, slopes)))
+    )
     rng, found, stated = np.random.default_rng(5), [], []
     shift = np.array([0.2, -0.3, 0.1])[:, None, None, None]
     clean = [1 + CONTRAST * texture(places - t * shift) for t in (-0.5, 0.5)]
@@ -248,7 +251,10 @@ ONE = volume(1 + 0.1 * np.random.default_rng(1).standard_normal((10, 10, 10)))
     ("change", "message"),
     [
         ({"volume1": ONE[:1], "volume2": ONE[:1]}, "volume1.x: 1 value, not at least two"),
-        ({"volume1": ONE[:6], "volume2": ONE[:6]}, "template: 8 voxels do not fit into the volume of 6"),
+        (
+            {"volume1": ONE[:6], "volume2": ONE[:6]},
+            "template: 8 voxels do not fit into the volume of 6",
+        ),
         ({"volume2": ONE[:9]}, "volume2: sizes 10 x 10 x 10 and 9 x 10 x 10 voxels"),
         ({"volume2": ONE.assign_coords(x=ONE.x + 0.1)}, "volume2.x: "),
         ({"volume1": ONE.rename(x="a")}, "volume1: dims"),
@@ -276,13 +282,17 @@ def test_more_volumes_tell_more():
     shape, noise, shift = (12, 16, 16), 0.05, 0.4 * SHIFT[:, None, None, None]
     texture, rng = waves(2), np.random.default_rng(2)
     stack = [
-        volume(1 + CONTRAST * texture(nodes(shape) - t * shift) + noise * rng.standard_normal(shape))
+        volume(
+            1 + CONTRAST * texture(nodes(shape) - t * shift) + noise * rng.standard_normal(shape)
+        )
         for t in (-1.5, -0.5, 0.5, 1.5)
     ]
     level = []
     for more in ([], stack[2:]):
         first = stack[:2] if more else stack[1:3]
-        off, _ = errors(retrieve_wind_volume(*first, DT, more=more, noise=noise), lambda x: shift + 0 * x)
+        off, _ = errors(
+            retrieve_wind_volume(*first, DT, more=more, noise=noise), lambda x: shift + 0 * x
+        )
         level.append(rms([rms(part) for part in off.values()]))
     assert level[1] < 0.6 * level[0] and level[1] < 0.06, level
 

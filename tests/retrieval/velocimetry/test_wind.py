@@ -44,7 +44,10 @@ def vortex_pairs(synthetic):
     grid = np.meshgrid(y, z)
     before = synthetic.origin(wind, *grid, DT)
     pairs = [
-        [synthetic.data_array(synthetic.texture(*at, seed, 1.5, 0.2), y, z) for at in (grid, before)]
+        [
+            synthetic.data_array(synthetic.texture(*at, seed, 1.5, 0.2), y, z)
+            for at in (grid, before)
+        ]
         for seed in (1, 2, 3, 4)
     ]
     return pairs, wind
@@ -65,9 +68,15 @@ def scores(vortex_pairs, method):
         for found, true in zip((dataset.v.values, dataset.w.values), wind(y, z)):
             error = found - true
             rows.append(
-                [rms(error), rms(error[far]), rms(error[good]), rms(true), np.nanmean(error),
-                 good.mean()]
-            )  # fmt: skip
+                [
+                    rms(error),
+                    rms(error[far]),
+                    rms(error[good]),
+                    rms(true),
+                    np.nanmean(error),
+                    good.mean(),
+                ]
+            )
     return np.mean(rows, axis=0)
 
 
@@ -192,7 +201,10 @@ def test_constant_images_are_flagged_throughout(synthetic, method):
 
 @pytest.mark.parametrize(
     "method",
-    [*(m for m in METHODS if m != "vortex_fit"), pytest.param("vortex_fit", marks=pytest.mark.slow)],
+    [
+        *(m for m in METHODS if m != "vortex_fit"),
+        pytest.param("vortex_fit", marks=pytest.mark.slow),
+    ],
 )
 def test_no_vector_is_good_without_a_number(synthetic, method):
     """Noise against noise, with a hole: whatever is not flagged is finite."""
@@ -226,10 +238,18 @@ def test_data_set_is_cf_and_survives_a_file(synthetic, tmp_path):
         expected = {"method": method, "template": 8, "search": 16, "stride": 2, "dt": DT}
         assert {key: dataset.attrs[key] for key in expected} == expected
         for name, units in {
-            "v": "m s-1", "w": "m s-1", "displacement_y": "m", "displacement_z": "m",
-            score: "1", "texture": "1", "isotropy": "1", "y": "m", "z": "m",
-            "y_vector": "m", "z_vector": "m",
-        }.items():  # fmt: skip
+            "v": "m s-1",
+            "w": "m s-1",
+            "displacement_y": "m",
+            "displacement_z": "m",
+            score: "1",
+            "texture": "1",
+            "isotropy": "1",
+            "y": "m",
+            "z": "m",
+            "y_vector": "m",
+            "z_vector": "m",
+        }.items():
             assert dataset[name].attrs["units"] == units and dataset[name].attrs["long_name"]
         assert set(dataset.coords) == {"y", "z", "y_vector", "z_vector"}
         file = tmp_path / f"{method}.nc"

@@ -12,11 +12,14 @@ import torch
 import xarray as xr
 
 from benchmarks.cases import data_array, origin, plane_waves, texture, vortex_pair_images
-from lidar_mi.experiment import schema as config
 from lidar_mi.atmosphere.vortex import Vortex, velocity, vortex_pair
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.vortices import fit as vortex_fit
+from lidar_mi.experiment import schema as config
+from lidar_mi.experiment.truth import make_truth
 from lidar_mi.retrieval.velocimetry.quality import Flag
+from lidar_mi.retrieval.velocimetry.warping import band_limited
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.vortices import fit as vortex_fit
 from lidar_mi.retrieval.vortices.fit import (
     VortexPairFit,
     circulation_5_15,
@@ -33,9 +36,6 @@ from lidar_mi.retrieval.vortices.model import (
     sensitivity,
     wind,
 )
-from lidar_mi.retrieval.velocimetry.warping import band_limited
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
-from lidar_mi.experiment.truth import make_truth
 
 DT = 0.1
 SMALL = {"columns": 130, "rows": 90}
@@ -76,10 +76,13 @@ def test_derivatives_by_differences(profile):
     y, z = grid()
     step = 1e-5
     along_y, along_z = (
-        (wind(theta, y + a * step, z + b * step, profile)
-         - wind(theta, y - a * step, z - b * step, profile)) / (2 * step)
+        (
+            wind(theta, y + a * step, z + b * step, profile)
+            - wind(theta, y - a * step, z - b * step, profile)
+        )
+        / (2 * step)
         for a, b in ((1, 0), (0, 1))
-    )  # fmt: skip
+    )
     v_y, v_z, w_y = gradient(theta, y, z, profile)
     for ours, expected in ((v_y, along_y[0]), (v_z, along_z[0]), (w_y, along_y[1])):
         np.testing.assert_allclose(ours, expected, atol=1e-6)
@@ -146,23 +149,29 @@ def test_quantities_in_closed_form():
     # the mean of r^2 / (r^2 + c^2) from 5 to 15 m
     c = 4.0
     mean = 1 - c / 10 * (np.arctan(15 / c) - np.arctan(5 / c))
-    assert float(circulation_5_15(400.0, c, "burnham_hallock")) == pytest.approx(400 * mean, rel=1e-4)
+    assert float(circulation_5_15(400.0, c, "burnham_hallock")) == pytest.approx(
+        400 * mean, rel=1e-4
+    )
     assert float(circulation_5_15(400.0, 0.01)) == pytest.approx(400.0)
 
 
 def test_errors_of_quantities_and_wind_against_drawn_parameters():
     """First order against 1500 draws from the covariance: their spread scatters by 2 %."""
     random = np.random.default_rng(3)
-    root = random.standard_normal((10, 10)) * np.array([3, 0.01, 0.1, 0.1] * 2 + [0.05] * 2)[:, None]
+    root = (
+        random.standard_normal((10, 10)) * np.array([3, 0.01, 0.1, 0.1] * 2 + [0.05] * 2)[:, None]
+    )
     covariance = root @ root.T
     fit = some_fit(covariance)
     drawn = random.multivariate_normal(fit.parameters, covariance, 1500)
     y, z = np.array([10.0, 14.0, -3.0]), np.array([0.0, 3.0, 5.0])
     fits = [VortexPairFit(p, covariance, "lamb_oseen", 1.0, 1.0, 0.0, 0.0) for p in drawn[:200]]
-    winds = np.array([
-        wind(torch.as_tensor(p), torch.as_tensor(y), torch.as_tensor(z), "lamb_oseen").numpy()
-        for p in drawn
-    ])  # fmt: skip
+    winds = np.array(
+        [
+            wind(torch.as_tensor(p), torch.as_tensor(y), torch.as_tensor(z), "lamb_oseen").numpy()
+            for p in drawn
+        ]
+    )
     stated = fit.wind(y, z)
     np.testing.assert_allclose(stated["v_stderr"], winds[:, 0].std(0), rtol=0.08)
     np.testing.assert_allclose(stated["w_stderr"], winds[:, 1].std(0), rtol=0.08)
@@ -190,10 +199,12 @@ def test_the_pair_drifts_on_and_its_errors_grow():
     here, there = now.wind([5.0], [3.0]), later.wind([9.0], [3.0 + sunk])
     np.testing.assert_allclose(here["w"], there["w"])
     drawn = np.random.default_rng(5).multivariate_normal(now.parameters, covariance, 150)
-    moved = np.array([
-        VortexPairFit(p, covariance, "lamb_oseen", 1.0, 1.0, 0.1, 3.0).after(2.0).parameters
-        for p in drawn
-    ])  # fmt: skip
+    moved = np.array(
+        [
+            VortexPairFit(p, covariance, "lamb_oseen", 1.0, 1.0, 0.1, 3.0).after(2.0).parameters
+            for p in drawn
+        ]
+    )
     # the spread of 150 scatters by 6 %
     np.testing.assert_allclose(moved.std(0), np.sqrt(np.diag(later.covariance)), rtol=0.24)
 
@@ -219,7 +230,9 @@ def pair_bound(image, pair, noise):
     total = 0
     for time in (-DT / 2, DT / 2):
         middle, _ = carried(theta, lateral, vertical, time, profile)
-        total = total + path_sensitivity(theta, middle, slope, time, profile).flatten(1) * np.sign(time)
+        total = total + path_sensitivity(theta, middle, slope, time, profile).flatten(1) * np.sign(
+            time
+        )
     normal = total @ total.T
     scale = normal.diagonal().sqrt()
     inverse = torch.linalg.inv(normal / scale / scale[:, None]) / scale / scale[:, None]
@@ -294,7 +307,10 @@ def test_profile_gain_offset_and_unlike_spacings(profile):
     # in the frame that goes with the mean wind the vortices stand still
     back = lateral - mean[0] * DT / 2, vertical - mean[1] * DT / 2
     on = lateral + mean[0] * DT / 2, vertical + mean[1] * DT / 2
-    images = [texture(waves, *origin(pair, *on, -DT / 2)), texture(waves, *origin(pair, *back, DT / 2))]
+    images = [
+        texture(waves, *origin(pair, *on, -DT / 2)),
+        texture(waves, *origin(pair, *back, DT / 2)),
+    ]
     first, second = (data_array(i, y, z) for i in (images[0], 1.3 * images[1] + 0.4))
     found = fit_vortices(first, second, DT, noise=0.0, profile=profile)
     assert found.success, found.reasons
@@ -366,13 +382,19 @@ def test_a_fit_that_stops_short_is_believed_within_its_errors(monkeypatch, index
     noisy to find it: below one it is believed and counted as an error, above it is not."""
     true = vector(*uneven(), mean=(1.0, -0.5))
     y, z = (np.arange(n) * 2.0 - (n - 1) for n in (33, 23))
-    v, w = wind(torch.as_tensor(true), *(torch.as_tensor(a) for a in np.meshgrid(y, z)), "lamb_oseen")
+    v, w = wind(
+        torch.as_tensor(true), *(torch.as_tensor(a) for a in np.meshgrid(y, z)), "lamb_oseen"
+    )
     noise = 0.3 * np.random.default_rng(6).standard_normal((2, *v.shape))
     stderr = data_array(np.full(v.shape, 0.3), y, z)
-    vectors = xr.Dataset({
-        "v": data_array(v.numpy() + noise[0], y, z), "w": data_array(w.numpy() + noise[1], y, z),
-        "v_stderr": stderr, "w_stderr": stderr,
-    })  # fmt: skip
+    vectors = xr.Dataset(
+        {
+            "v": data_array(v.numpy() + noise[0], y, z),
+            "w": data_array(w.numpy() + noise[1], y, z),
+            "v_stderr": stderr,
+            "w_stderr": stderr,
+        }
+    )
     whole = fit_vortices_to_wind(vectors)
     assert whole.success
     errors = np.sqrt(np.diag(whole.covariance))
@@ -431,7 +453,10 @@ def test_bad_input_is_named():
     for call, start in (
         (lambda: fit_vortices(pair.first, pair.second, 0), "dt: 0 s"),
         (lambda: fit_vortices(pair.first, pair.second[1:], DT), "image2: sizes"),
-        (lambda: fit_vortices(pair.first, pair.second, DT, profile="rankine"), "profile: 'rankine'"),
+        (
+            lambda: fit_vortices(pair.first, pair.second, DT, profile="rankine"),
+            "profile: 'rankine'",
+        ),
         (lambda: fit_vortices(pair.first, pair.second, DT, noise=-1.0), "noise: "),
         (lambda: fit_vortices_to_wind(xr.Dataset()), "vectors.v: missing"),
     ):
@@ -447,12 +472,10 @@ def simulated(texture_rms, noise):
     experiment = config.check(
         {
             "name": "wake",
-            "wake": {
-                "file": "wake_slab_40s.nc", "time": "40 s", "texture": {"rms": texture_rms},
-            },
+            "wake": {"file": "wake_slab_40s.nc", "time": "40 s", "texture": {"rms": texture_rms}},
         },
         "test",
-    )  # fmt: skip
+    )
     truth = make_truth(experiment)
     random = np.random.default_rng(1)
     level = noise * float(truth.image(0).mean())
@@ -482,9 +505,11 @@ def test_simulated_wake_without_texture():
     truth, found = simulated(0.0, 0.0)
     assert found.success
     for name, expected in (
-        ("port_circulation_5_15", 440), ("starboard_circulation_5_15", -438),
-        ("port_y", 23.4), ("starboard_y", -23.4),
-    ):  # fmt: skip
+        ("port_circulation_5_15", 440),
+        ("starboard_circulation_5_15", -438),
+        ("port_y", 23.4),
+        ("starboard_y", -23.4),
+    ):
         quantity = found.quantities[name]
         allowed = 1.0 if name.endswith("_y") else 0.15 * abs(expected)
         assert quantity.value == pytest.approx(expected, abs=allowed)
