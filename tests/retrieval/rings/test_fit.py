@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import ring_reference as reference
 import torch
-from test_ring_model import TABLE, ring_model
+from ring_models import TABLE, ring_model
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.fit import difference, fit_rings
