@@ -17,7 +17,7 @@ HEAD = """\
 # Plugins
 
 Mitsuba plugins of lidar-mi: types and parameters as in XML scenes and Python dictionaries.
-`import lidar_mi` makes them known in every variant but the scalar ones. Formulas are in the
+`import lidar_mi` registers them in every variant except the scalar ones. Formulas are in the
 [theory](theory.md), whole scenes in the [user guide](user_guide.md#xml-scenes).
 
 <!-- Written by docs/make_plugin_reference.py from the docstrings in plugins/; edit those. -->

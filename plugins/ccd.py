@@ -4,9 +4,9 @@
 Lens and CCD (``ccd``)
 ----------------------
 
-A camera focused at infinity: parallel light through a round stop becomes a point on a CCD. The lens
-belongs to the camera and is followed in its own coordinates, surface by surface, without the
-displaced origins of rays between shapes (1e-4 m, some m/s of wind).
+A camera focused at infinity: parallel light through a round stop is focused to a point on a CCD.
+The lens is part of the camera. Rays are traced through it in its own coordinates, surface by
+surface, which avoids the displacement of ray origins at Mitsuba shapes (1e-4 m, some m/s of wind).
 
 ============================ ========== ==================================================== =======
 Parameter                    Type       Meaning                                              Default
@@ -24,14 +24,14 @@ Parameter                    Type       Meaning                                 
                                         scene, y to the left, z up
 ============================ ========== ==================================================== =======
 
-The picture is upright: its top is z up, its left is y. A lens has a row for each surface in the
-light's way, the stop first: radius of curvature (m; positive: the centre lies on the CCD's side; 0:
-plane), conic constant, distance to the next surface or the CCD (m), refractive index behind. The
-lens is taken as coated: it loses nothing and leaves polarisation alone. ``focal_length`` then only
-tells others what it is.
+The image is upright: its top is z up, its left is y. A lens has a row for each surface along the
+light path, the stop first: radius of curvature (m; positive: the centre is on the side of the CCD;
+0: plane), conic constant, distance to the next surface or the CCD (m), refractive index behind.
+The lens is assumed to be coated: without loss and without effect on the polarisation. For a real
+lens ``focal_length`` is only information for other parts of the program.
 
-A sampled ray weighs as the étendue (m^2 sr) of its pixel, so that the mean of weight times radiance
-is the power on the pixel.
+The weight of a sampled ray is the étendue (m^2 sr) of its pixel, so that the mean of weight times
+radiance is the power on the pixel.
 
 .. code-block:: xml
 

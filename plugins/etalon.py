@@ -4,10 +4,11 @@
 Fabry-Perot etalon (``etalon``)
 -------------------------------
 
-Two plane mirrors and the gap between them as one surface: light of the frequencies and angles at
-which the waves of all round trips add up passes straight through, the rest is reflected. For the
-frequency *offset* from a laser line; the whole orders of the gap are split off in double precision,
-so that float32 holds the rest (2e-6 orders within 1 degree of the axis, 0.004 m/s at 355 nm).
+Two plane mirrors and the gap between them as one surface. Light is transmitted without deflection
+at the frequencies and angles at which the waves of all round trips interfere constructively; the
+remaining light is reflected. Frequencies are *offsets* from a laser line. The integer part of the
+order of the gap is subtracted in double precision, so that float32 resolves the remainder (2e-6
+orders within 1 degree of the axis, 0.004 m/s at 355 nm).
 
 ============================ ======= ====================================================== ========
 Parameter                    Type    Meaning                                                Default
@@ -22,7 +23,8 @@ Parameter                    Type    Meaning                                    
                                      "index thickness extinction", separated by commas:
                                      "2.1 42e-9, 1.48 60e-9"
 ``plate_index``              float   refractive index of the plates under a ``coating``     1.4761
-``absorption``               float   share a mirror absorbs, at its transmission's cost     0
+``absorption``               float   fraction absorbed by a mirror, which reduces its       0
+                                     transmission
 ``surface_rms``              float   Gaussian defects: rms deviation of the gap, m          0
 ``bow``                      float   spherical defect: difference of the gap between middle 0
                                      and edge of the clear aperture, m
@@ -30,23 +32,24 @@ Parameter                    Type    Meaning                                    
                                                                                             line's
 ``line_shape``               string  ``folded``: mean over the nested line, all defects and folded
                                      the whole aperture, analytically; ``sampled``: the
-                                     ray's own frequency and one place on the plates
+                                     frequency of the ray and one place on the plates
 *(nested)*                   texture the :ref:`line <texture-spectral_line>`; required if   none
                                      folded
 ============================ ======= ====================================================== ========
 
-Transmitted (component 1, ``Null``) and reflected light (component 0) carry Mueller matrices of s and
-p with their phases. The plates' outer faces are taken as coated and wedged: they reflect nothing
-that is seen. A coating is that of both mirrors, computed for the laser line at the ray's angle
-(transfer matrices); its dispersion enters as the delay of a reflection on the axis. Waves walk off
-sideways by 2 d tan(angle) a round trip, 0.4 mm at 15 mrad: nothing beside an aperture of a few cm.
-A gap index n bends light by Snell's law from air of index 1.
+Transmitted (component 1, ``Null``) and reflected light (component 0) have Mueller matrices with s
+and p components and their phases. The outer faces of the plates are assumed to be coated and
+wedged, so that their reflections are not received. A coating applies to both mirrors and is
+computed for the laser line at the angle of the ray (transfer matrices); its dispersion is included
+as the delay of a reflection on the axis. The walk-off of 2 d tan(angle) per round trip, 0.4 mm at
+15 mrad, is neglected; it is small compared with an aperture of a few cm. With a gap of index n
+light is refracted by Snell's law from air of index 1.
 
-With ``sampled`` a ray's ``time`` holds its frequency offset from the laser line in Hz, which the
-:ref:`fringes <integrator-fringes>` integrator sets; use it for several etalons in a row. Folding
-takes the line as seen at the axis: widths are then wrong by 1 - cos(angle), 1e-4 at 15 mrad.
-``gap``, ``reflectivity`` and ``surface_rms``, like the line, can differ between scenes of one kind
-without compiling anything again.
+With ``sampled`` the ``time`` of a ray contains its frequency offset from the laser line in Hz,
+which the :ref:`fringes <integrator-fringes>` integrator sets; use it for several etalons in a row.
+``folded`` uses the width of the line on the axis: widths are then wrong by 1 - cos(angle), 1e-4 at
+15 mrad. ``gap``, ``reflectivity`` and ``surface_rms``, like the line, can differ between scenes of
+one kind without recompilation.
 
 .. code-block:: xml
 

@@ -4,34 +4,34 @@
 Fringes of an interferometer (``fringes``)
 ------------------------------------------
 
-Plane waves of a :ref:`source <emitter-plane_waves>` through everything that lets light pass
-straight, such as an :ref:`etalon <bsdf-etalon>`, into a :ref:`camera <sensor-ccd>`: for every pixel
-the Stokes vector of the light that arrives as *received energy over the energy the source sends
-through the stop*, and the standard error of its first component.
+Plane waves of a :ref:`source <emitter-plane_waves>` through surfaces that transmit light without
+deflection, such as an :ref:`etalon <bsdf-etalon>`, into a :ref:`camera <sensor-ccd>`. The result
+for every pixel is the Stokes vector of the received light as *received energy over the energy that
+the source sends through the stop*, and the standard error of its first component.
 
 ============================ ======= ======================================================= =======
 Parameter                    Type    Meaning                                                 Default
 ============================ ======= ======================================================= =======
 ``estimator``                string  ``camera``: from every pixel out to the source;         camera
                                      ``forward``: plane waves of random direction,
-                                     frequency, polarisation and place, through the lens to
-                                     where they arrive, each with the share that is let
-                                     through; ``analog``: the same, and every photon is let
-                                     through or not: a picture of counts
-``samples_per_pass``         int     light paths at once; bounds the memory, does not        4194304
-                                     change the expectation
+                                     frequency, polarisation and position, traced through
+                                     the lens to the CCD, each weighted with its
+                                     transmission; ``analog``: the same, but every photon is
+                                     either transmitted or rejected: an image of counts
+``samples_per_pass``         int     light paths that are traced at once; limits the memory, 4194304
+                                     does not change the expectation
 ============================ ======= ======================================================= =======
 
-All have the same expectation. A path is a straight line from the source to the stop, kept as it was
-drawn: surfaces weigh it (component ``Null`` of their BSDF) and never move it. Surfaces without that
-component are stops; what surfaces reflect is lost. Each path's frequency is drawn from the source's
-line and travels with the ray, as an offset in Hz in place of its ``time``.
+All estimators have the same expectation. A path is a straight line from the source to the stop.
+Surfaces multiply its weight (component ``Null`` of their BSDF) and do not displace it. Surfaces
+without that component block the light; reflected light is lost. The frequency of each path is drawn
+from the line of the source and stored with the ray, as an offset in Hz in place of its ``time``.
 
-``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``S0`` ... ``S3``,
-``S0_stderr``; row 0 is the top. The Stokes vector refers to the horizontal axis. Unpolarised
-variants carry intensity only: S1 to S3 are 0 there. ``sample_count`` of the sensor's sampler (or
-``spp``) is the number of paths a pixel, forward on the average over all pixels. Forward, S0_stderr
-of a pixel that nothing reached is 0.
+``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``S0`` ...
+``S3``, ``S0_stderr``; row 0 is the top. The Stokes vector refers to the horizontal axis.
+Unpolarised variants compute intensity only: S1 to S3 are 0. ``sample_count`` of the sensor's
+sampler (or ``spp``) is the number of paths per pixel, for ``forward`` the mean over all pixels.
+With ``forward`` the S0_stderr of a pixel without any path is 0.
 
 .. code-block:: xml
 

@@ -5,9 +5,9 @@ Pulsed laser (``laser``)
 ------------------------
 
 A pulsed laser with a truncated Gaussian beam. Position in the aperture and direction are
-independent, as behind a beam expander seen from its far field: the fluence falls as
-exp(-2 r^2 / beam_radius^2) over the aperture, the radiant intensity as
-exp(-2 a^2 / (divergence_full / 2)^2) with the tangent of the angle a to the axis.
+independent, as in the far field of a beam expander. The fluence is proportional to
+exp(-2 r^2 / beam_radius^2) over the aperture, the radiant intensity to
+exp(-2 a^2 / (divergence_full / 2)^2) with a the tangent of the angle to the axis.
 
 ============================ ========== ==================================================== =======
 Parameter                    Type       Meaning                                              Default

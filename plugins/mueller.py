@@ -14,12 +14,12 @@ Parameter                    Type            Meaning
 ``table``                    tensor, string  N x 7 numbers, or the name of a file of N lines
                                              (``.npy``, or text with ``#`` comments): scattering
                                              angle in degrees, a1, a2, a3, a4, b1, b2. Angles
-                                             rise from 0 to 180; linear interpolation in angle
+                                             ascend from 0 to 180; linear interpolation in angle
 ============================ =============== ====================================================
 
 The matrix has the rows (a1, b1, 0, 0), (b1, a2, 0, 0), (0, 0, a3, b2), (0, 0, -b2, a4) and refers
 to the scattering plane, Q > 0 parallel to it. The table is scaled so that a1 integrates to one
-over the sphere (values are then per steradian); all elements share that factor.
+over the sphere (values are then per steradian); all elements are scaled by the same factor.
 
 .. code-block:: xml
 

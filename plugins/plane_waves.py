@@ -4,26 +4,26 @@
 Plane waves from an extended source (``plane_waves``)
 -----------------------------------------------------
 
-Light from far away: plane waves from all directions of a cone, as an extended source or the end of
-a multimode fibre behind a collimator sends them. It lies around the scene like an environment.
-Traced forward, every plane wave has a random direction, frequency, polarisation and place on the
-stop of the :ref:`camera <sensor-ccd>`.
+Light from a distant source: plane waves from all directions of a cone, as emitted by an extended
+source or by the end of a multimode fibre behind a collimator. It surrounds the scene like an
+environment emitter. If traced forward, every plane wave has a random direction, frequency,
+polarisation and position on the stop of the :ref:`camera <sensor-ccd>`.
 
 ============================ ========== ==================================================== =======
 Parameter                    Type       Meaning                                              Default
 ============================ ========== ==================================================== =======
 ``field_half_mrad``          float      half angle of the cone, mrad                         16
-``radiance_radius_mrad``     float      angle at which the radiance has fallen to 1/e^2 of   infinite
-                                        the middle's; Gaussian in its tangent
+``radiance_radius_mrad``     float      angle at which the radiance is 1/e^2 of that on the  infinite
+                                        axis; Gaussian in its tangent
 ``stokes``                   string     I, Q, U, V with I = 1, about the horizontal axis     1, 0,
                                                                                              0, 0
-``to_world``                 transform  of a frame whose x axis points to the source's       identity
-                                        middle
+``to_world``                 transform  of a frame whose x axis points to the centre of      identity
+                                        the source
 *(nested)*                   texture    the :ref:`line <texture-spectral_line>`              required
 ============================ ========== ==================================================== =======
 
-Natural light (the default) is a plane wave of random elliptical polarisation, evenly distributed on
-the Poincaré sphere; partially polarised light has that for its unpolarised share.
+Natural light (the default) is a plane wave of random elliptical polarisation, uniformly distributed
+on the Poincaré sphere. The unpolarised fraction of partially polarised light is drawn in this way.
 
 .. code-block:: xml
 

@@ -4,7 +4,7 @@
 Polarised Rayleigh scattering (``rayleigh_polarized``)
 ------------------------------------------------------
 
-Scattering by molecules, with their anisotropy, as a Mueller matrix (Hansen & Travis 1974, Space
+Scattering by anisotropic molecules as a Mueller matrix (Hansen & Travis 1974, Space
 Sci. Rev. 16, eq. 2.15). In unpolarised variants it is the phase function for natural light.
 
 ============================ ======= ============================================================

@@ -4,10 +4,11 @@
 Scanning monostatic lidar (``scanning_lidar``)
 ----------------------------------------------
 
-A telescope at the origin that looks along many beams, one a pixel of its film, and records what a
-nested :ref:`laser <emitter-laser>` sends back from range gates. Each beam has a telescope disc
-perpendicular to its axis, centred where the laser leaves; a photon counts when it arrives at the
-disc within the field of view and half its whole optical path lies in a gate.
+A telescope at the origin that points along many beams, one per pixel of its film, and receives the
+light of a nested :ref:`laser <emitter-laser>` that is scattered back from range gates. The
+telescope of each beam is a disc perpendicular to its axis, centred at the laser aperture. Light is
+received if it arrives at the disc within the field of view and half its optical path length lies
+in a gate.
 
 ============================ ========== ==================================================== =======
 Parameter                    Type       Meaning                                              Default
@@ -16,7 +17,7 @@ Parameter                    Type       Meaning                                 
 ``fov_half_mrad``            float      field of view, half angle, mrad                      5
 ``gate_kind``                string     ``planar``: between planes perpendicular to the      planar
                                         scan's axis; ``spherical``: equal two-way time
-``gate_start, gate_stop``    float      the gates together, m                                required
+``gate_start, gate_stop``    float      start of the first and end of the last gate, m       required
 ``gate_count``               int        number of equal gates between start and stop         1
 ``azimuth_min_deg, .._max``  float      beams across the film's width; the left column is    0, 0
                                         the largest azimuth (positive to port, +y)
@@ -27,16 +28,16 @@ Parameter                    Type       Meaning                                 
                                         file of them
 ``to_world``                 transform  of the lidar's frame (x forward, y left, z up)       identity
 *(nested)*                   emitter    a ``laser``                                          required
-*(nested)*                   medium     the environment the telescope sits in                vacuum
+*(nested)*                   medium     the environment in which the telescope is            vacuum
 ============================ ========== ==================================================== =======
 
-Angles are equidistant and include both ends; a beam is (1, tan azimuth, tan elevation),
-normalised. One column (row) lies at the middle of its angles. The laser's local +z is laid on the
-beam's axis and its local +x on the horizontal axis e_h.
+Angles are equidistant and include both ends; a beam direction is (1, tan azimuth, tan elevation),
+normalised. A single column (row) is at the middle of its angles. The local +z axis of the laser is
+the beam axis, its local +x axis the horizontal axis e_h.
 
-A photon's range is half its optical path. A ``planar`` gate between x = X0 and X1 means ranges
-from X0 to X1 over the cosine between beam axis and x. Directions, gates, aperture and pose can
-be changed through ``mi.traverse`` without compiling anything again.
+The range of a light path is half its optical length. A ``planar`` gate between x = X0 and X1 covers
+the ranges from X0 to X1 over the cosine of the angle between beam axis and x. Directions, gates,
+aperture and pose can be changed through ``mi.traverse`` without recompilation.
 """
 
 import drjit as dr

@@ -5,8 +5,8 @@ Spectral line (``spectral_line``)
 ---------------------------------
 
 The spectrum of backscattered light as a sum of Gaussians about the Doppler-shifted laser line, in
-frequency offsets from the laser line. A spectral variant's float32 wavelength cannot hold what a
-fringe measures (1 m/s is 5.6 MHz in 845 THz at 355 nm); an offset can.
+frequency offsets from the laser line. The float32 wavelength of a spectral variant does not resolve
+the shifts that fringes measure (1 m/s is 5.6 MHz in 845 THz at 355 nm); an offset does.
 
 ============================ ======= ====================================================== =========
 Parameter                    Type    Meaning                                                Default
@@ -15,15 +15,15 @@ Parameter                    Type    Meaning                                    
 ``v_los``                    float   line-of-sight velocity, m/s; positive: the scatterers  0
                                      approach and the frequency rises by
                                      2 v_los / wavelength
-``weights``                  string  shares of the Gaussians; scaled to a sum of one        1
+``weights``                  string  fractions of the Gaussians; scaled to a sum of one     1
 ``offsets``                  string  their centres about the shifted line, Hz               0
 ``sigmas``                   string  their standard deviations, Hz; 0: a sharp line         1.46e9
 ============================ ======= ====================================================== =========
 
-The default is the Rayleigh line of air at 232.9 K. One line serves the
-:ref:`plane waves <emitter-plane_waves>`, which draw their frequencies from it, and the
-:ref:`etalon <bsdf-etalon>`, which may fold it in analytically. ``v_los`` can be changed through
-``mi.traverse`` without compiling anything again.
+The default is the Rayleigh line of air at 232.9 K. The same line is used by the :ref:`plane waves
+<emitter-plane_waves>`, which draw their frequencies from it, and by the :ref:`etalon
+<bsdf-etalon>`, which can average over it analytically. ``v_los`` can be changed through
+``mi.traverse`` without recompilation.
 
 .. code-block:: xml
 
