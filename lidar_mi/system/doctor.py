@@ -37,7 +37,7 @@ DISK_NEEDED = 1 * GIB
 # that the backend computes, the second compiles the kind of kernel that LLVM 14 to 16 abort on.
 _TRY_VARIANT = """
 import sys
-from lidar_mi.llvm import select_llvm
+from lidar_mi.system.llvm import select_llvm
 select_llvm()
 import mitsuba as mi
 mi.set_variant(sys.argv[1])
