@@ -39,10 +39,12 @@ docs: setup ## build the documentation as a site in site/, readable offline
 	$(PYTHON_ENV) -m sphinx -q -W --keep-going -d build/doctrees docs site $(ARGS)
 	@echo "open site/index.html"
 
-lint: setup ## check the style of the code
-	@$(PYTHON_ENV) -c "import ruff" 2>/dev/null || $(PYTHON_ENV) -m pip install -q ruff
-	$(PYTHON_ENV) -m ruff check $(if $(ARGS),$(ARGS),.)
+lint: setup ## check style, format and types
+	@$(PYTHON_ENV) -c "import ruff, mypy" 2>/dev/null || $(PYTHON_ENV) -m pip install -q -e ".[dev]"
+	$(PYTHON_ENV) -m ruff check .
+	$(PYTHON_ENV) -m ruff format --check .
+	$(PYTHON_ENV) -m mypy
 
 clean: ## remove caches and build leftovers; .venv and outputs stay
-	rm -rf build dist site .pytest_cache .ruff_cache *.egg-info
+	rm -rf build dist site .pytest_cache .ruff_cache .mypy_cache *.egg-info
 	find . -name .venv -prune -o -name outputs -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +

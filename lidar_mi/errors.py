@@ -18,5 +18,8 @@ def causes(error: BaseException | None) -> Iterator[BaseException]:
 
 
 def is_interrupt(error: BaseException) -> bool:
-    """Whether someone stopped the program: others put exceptions of their own in that one's place."""
+    """Whether someone stopped the program.
+
+    Libraries put exceptions of their own in the place of ``KeyboardInterrupt``.
+    """
     return any(isinstance(cause, KeyboardInterrupt) for cause in causes(error))

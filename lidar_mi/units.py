@@ -8,12 +8,13 @@ except angles, which must say their unit (degrees and radians are too easily con
 import re
 import tokenize
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
 import pint
-from pydantic import BeforeValidator, PlainSerializer
+from pydantic import GetCoreSchemaHandler
+from pydantic_core import CoreSchema, core_schema
 
-UNITS = pint.UnitRegistry()
+UNITS: pint.UnitRegistry[float] = pint.UnitRegistry()
 # one number, then a unit: pint alone reads "0,1 m" as 1 m and "500 m 3" as 1500 m
 _TEXT = re.compile(r"""([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan))\s*([^\n,;#"']*)""")
 # what pint raises, and what reaches us through it from Python's tokenizer and arithmetic
@@ -29,14 +30,7 @@ _BAD_UNIT = (
 )
 
 
-@dataclass(frozen=True)
-class Unit:
-    """The SI unit that a key's values are in; stands in the annotations of its type."""
-
-    symbol: str
-
-
-def to_si(value, unit: str, example: str) -> float:
+def to_si(value: object, unit: str, example: str) -> float:
     """``value`` as a float in the SI unit ``unit``.
 
     Raises
@@ -45,7 +39,7 @@ def to_si(value, unit: str, example: str) -> float:
         The text is no quantity, or its unit is no multiple of ``unit``.
     """
     if isinstance(value, bool) or not isinstance(value, int | float | str):
-        raise ValueError(f"{value!r} is not allowed; expected a quantity such as '{example}'")  # noqa: TRY004
+        raise ValueError(f"{value!r} is not allowed; expected a quantity such as '{example}'")
     if not isinstance(value, str):
         if unit == "rad" and value != 0:
             raise ValueError(f"{value!r} has no unit; expected an angle such as '{example}'")
@@ -67,24 +61,35 @@ def to_si(value, unit: str, example: str) -> float:
         raise wrong from None
 
 
-def _quantity(unit: str, example: str):
-    return Annotated[
-        float,
-        BeforeValidator(lambda value: to_si(value, unit, example)),
-        PlainSerializer(lambda value: f"{value!r} {unit}" if unit else value, when_used="json"),
-        Unit(unit),
-    ]
+@dataclass(frozen=True)
+class Unit:
+    """The SI unit of a key's values: its place is in the annotation of their type."""
+
+    symbol: str
+    example: str
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Reads quantities with ``to_si``; JSON has the unit beside the number."""
+        return core_schema.no_info_before_validator_function(
+            lambda value: to_si(value, self.symbol, self.example),
+            handler(source),
+            serialization=core_schema.plain_serializer_function_ser_schema(
+                lambda value: f"{value!r} {self.symbol}" if self.symbol else value, when_used="json"
+            ),
+        )
 
 
-Length = _quantity("m", "500 m")
-Angle = _quantity("rad", "2 mrad")
-Speed = _quantity("m/s", "150 m/s")
-Time = _quantity("s", "0.1 s")
-Energy = _quantity("J", "1 mJ")
-Extinction = _quantity("1/m", "1.8 / km")
-Backscatter = _quantity("1/m/sr", "3e-6 / m / sr")
-Area = _quantity("m^2", "0.13 m^2")
-Frequency = _quantity("Hz", "1 kHz")
-SpectralRadiance = _quantity("W/m^3/sr", "0.3 W/m^2/sr/nm")
-Circulation = _quantity("m^2/s", "458 m^2/s")
-Number = _quantity("", "0.5")
+Length = Annotated[float, Unit("m", "500 m")]
+Angle = Annotated[float, Unit("rad", "2 mrad")]
+Speed = Annotated[float, Unit("m/s", "150 m/s")]
+Time = Annotated[float, Unit("s", "0.1 s")]
+Energy = Annotated[float, Unit("J", "1 mJ")]
+Extinction = Annotated[float, Unit("1/m", "1.8 / km")]
+Backscatter = Annotated[float, Unit("1/m/sr", "3e-6 / m / sr")]
+Area = Annotated[float, Unit("m^2", "0.13 m^2")]
+Frequency = Annotated[float, Unit("Hz", "1 kHz")]
+SpectralRadiance = Annotated[float, Unit("W/m^3/sr", "0.3 W/m^2/sr/nm")]
+Circulation = Annotated[float, Unit("m^2/s", "458 m^2/s")]
+Number = Annotated[float, Unit("", "0.5")]

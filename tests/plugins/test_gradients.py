@@ -129,7 +129,7 @@ def test_gradient_of_the_albedo_is_the_picture_over_the_albedo(variant, world):
         world.lidar((3, 2), (500.0, 503.0), **VIEW), slab=world.box(LOW, HIGH, medium)
     )
     parameters = mi.traverse(scene)
-    (key,) = [k for k in parameters.keys() if "albedo" in k]  # noqa: SIM118
+    (key,) = [k for k in parameters.keys() if "albedo" in k]
     dr.enable_grad(parameters[key])
     parameters.update()
     image = mi.render(scene, parameters, spp=64, seed=4)

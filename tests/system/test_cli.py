@@ -742,7 +742,7 @@ def test_ctrl_c_stops_cleanly_and_the_run_goes_on(there):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         # a shell's background job inherits ignored interrupts
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     ) as process:
         seen = []
         for line in process.stderr:
