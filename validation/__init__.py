@@ -1,4 +1,4 @@
-"""lidar-mi against numbers that did not come from it.
+"""Comparison of lidar-mi with independent numbers.
 
 ``make validate`` (or ``python -m validation``) runs every check, prints one table a group and writes
 ``docs/validation.md`` with its figures; it ends with an error if any row fails.
@@ -6,10 +6,10 @@
 lidar_equation       single scattering: closed forms
 multiple_scattering  all orders in a dense slab: an independent simulation in numpy
 steady_state         all ranges together: an integral equation, conservation of energy, Eradiate
-scattering_matrices  particles: published tables, other solvers, laws every matrix obeys
+scattering_matrices  particles: published tables, other solvers, inequalities of matrices
 molecules            air: published numbers
 error_bars           standard errors against the scatter over seeds
-gradients            derivatives of a picture: those of the lidar equation
+gradients            derivatives of an image against those of the lidar equation
 """
 
 import lidar_mi  # noqa: F401  chooses the LLVM before any of the modules here imports drjit

@@ -25,7 +25,7 @@ def main(arguments: list[str] | None = None) -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("groups", nargs="*", metavar="NAME", help="some of the groups; default all")
-    parser.add_argument("--slow", action="store_true", help="sixteen times the photons")
+    parser.add_argument("--slow", action="store_true", help="sixteen times the Monte Carlo samples")
     parser.add_argument(
         "--eradiate",
         metavar="PYTHON",

@@ -29,12 +29,15 @@ def provenance(python: str | None = None) -> str:
     """Where Eradiate's numbers come from."""
     if python is not None:
         return (
-            "Eradiate's numbers were made beside this page, by `validation/eradiate_reference.py`."
+            "The numbers of Eradiate were computed together with this page, by "
+            "`validation/eradiate_reference.py`."
         )
     stored = json.loads(STORED.read_text())
     versions = ", ".join(f"{name} {number}" for name, number in stored["versions"].items())
     return (
-        f"Eradiate's stored numbers were made by `{stored['command']}` with {versions}, in the variant "
-        f"`{stored['variant']}`; `make validate ARGS='--eradiate PYTHON'` makes new ones with an "
+        f"The stored numbers of Eradiate were computed by `{stored['command']}` with {versions}, "
+        "in the variant "
+        f"`{stored['variant']}`; `make validate ARGS='--eradiate PYTHON'` computes new ones with "
+        "an "
         "interpreter that has eradiate-mitsuba."
     )

@@ -11,10 +11,10 @@ from .multiple_scattering import FORWARD, RAYLEIGH, dense
 from .report import Check, Row
 from .scenes import ENVIRONMENT, batches, layer, medium, render, scene, secants
 
-TITLE = "Error bars"
+TITLE = "Standard errors"
 INTRODUCTION = (
-    "A z-score is a difference from the truth over the stated standard error. Over beams, gates and "
-    "seeds its mean is 0 and its variance 1, if errors are honest and nothing is cut off."
+    "A z-score is the error of a value over its standard error. If the standard errors are "
+    "correct, it has the mean 0 and the variance 1 over beams, gates and seeds."
 )
 
 
@@ -72,7 +72,7 @@ def single_scattering(effort):
             1e-5 * (truth / found["S0_stderr"]).mean(),
         ),
         Row(
-            "share of beams beyond 3 sigmas",
+            "fraction of beams beyond 3 sigma",
             "normal distribution",
             0.0027,
             (np.abs(z) > 3).mean(),
@@ -82,7 +82,8 @@ def single_scattering(effort):
     ]
     return Check(
         "Single scattering, beam by beam",
-        f"219 x 139 beams over 12.4 by 7.8 degrees, {photons} photons each, slab of 0.02 / m, gate of "
+        f"219 x 139 beams over 12.4 by 7.8 degrees, {photons} samples each, slab of 0.02 / m, "
+        "gate of "
         "2.5 m at 500 m.",
         tuple(rows),
     )
@@ -120,10 +121,11 @@ def multiple_scattering(effort):
     _draw(place, scores)
     return Check(
         "Multiple scattering, gate by gate",
-        "The dense slabs of six orders, 30 000 (molecules) and 60 000 photons (forward scatterers), a "
-        "tenth of them in each gate where the estimator is gated. With so few a bright photon raises a "
-        "mean and its error together, and z-scores lean to the left; variances are compared before "
-        "that division.",
+        "The dense slabs with six orders, 30 000 (molecules) and 60 000 Monte Carlo samples "
+        "(forward scatterers), for the gated estimator a tenth of them in each gate. With so few "
+        "samples a rare large contribution increases both a mean and its standard error, and the "
+        "z-scores have a negative skewness. Variances are therefore compared before this "
+        "division.",
         tuple(rows),
         ((place.name, "z-scores of ten gates and 100 seeds about the mean over seeds."),),
     )
@@ -163,7 +165,7 @@ def rare_paths(effort):
                 noise,
             ),
             Row(
-                f"{name}: mean difference over its error",
+                f"{name}: mean difference over its standard error",
                 "two seeds",
                 0.0,
                 difference.sum() / math.sqrt(stated.sum()),
@@ -174,10 +176,11 @@ def rare_paths(effort):
     _draw(place, scores)
     return Check(
         "Rare paths in a thin slab",
-        f"The paper's scan with {photons} photons a beam, orders 1 to 4: orders above one are few, rare "
-        "and bright. Differences of two seeds over all beams.",
+        f"The paper's scan with {photons} samples per beam, orders 1 to 4. Contributions of "
+        "orders above one "
+        "are rare and large. Differences of two seeds over all beams.",
         tuple(rows),
-        ((place.name, "Differences of two seeds over their errors, 30 441 beams."),),
+        ((place.name, "Differences of two seeds over their standard errors, 30 441 beams."),),
     )
 
 

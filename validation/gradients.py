@@ -10,8 +10,8 @@ from .scenes import box, grid, scene
 
 TITLE = "Gradients"
 INTRODUCTION = (
-    "The picture is differentiable with respect to the extinction grid. In a slab that varies along the "
-    "beam alone, single scattering has the lidar equation's derivatives."
+    "The image is differentiable with respect to the extinction grid. In a slab that varies only "
+    "along the beam, single scattering has the derivatives of the lidar equation."
 )
 
 KEY = "slab.interior_medium.sigma_t.data"
@@ -73,9 +73,10 @@ def derivatives(effort):
         )
     return Check(
         "Extinction grid",
-        "Relative change of the signal of a gate from 500 to 508 m with the extinction of each of ten "
-        "planes of cells (4 m thick, summed over the plane): attenuation before the gate, scattering "
-        "and attenuation in it, nothing behind.",
+        "Relative change of the signal of a gate from 500 to 508 m with the extinction of each "
+        "of ten "
+        "planes of cells (4 m thick, summed over the plane): attenuation in front of the gate, "
+        "scattering and attenuation in it, no contribution behind it.",
         tuple(rows),
     )
 

@@ -13,9 +13,10 @@ from .scenes import ENVIRONMENT, box, grid, layer, medium, render, scene, secant
 
 TITLE = "Single scattering"
 INTRODUCTION = (
-    "The lidar equation, integrated over each gate by Gauss-Legendre quadrature, for beams inside the "
-    "field of view. What it leaves out, the finite beam and telescope, is 1e-6 of the signal at 500 m; "
-    "ranges in single precision add about as much."
+    "The lidar equation, integrated over each gate by Gauss-Legendre quadrature, for beams "
+    "inside the "
+    "field of view. It neglects the finite beam and telescope, which are 1e-6 of the signal at "
+    "500 m; ranges in single precision contribute about as much."
 )
 EQUATION = "lidar equation (Weitkamp 2005, chap. 1)"
 
@@ -137,7 +138,8 @@ def profile_through_layers(effort):
         bottom.set(xlabel="range, m", ylabel="deviation, sigmas", ylim=(-5, 5))
     return Check(
         "Profile through nested layers",
-        "100 gates of 2.5 m; a slab of 0.005 / m from 300 to 450 m around one of 0.02 / m from 350 to "
+        "100 gates of 2.5 m; a slab of 0.005 / m from 300 to 450 m around one of 0.02 / m from "
+        "350 to "
         "416.25 m (inside a gate), environment of 0.001 / m.",
         tuple(compared("100 gates", found, truth)),
         ((place.name, "Signal of every gate, and its difference from the lidar equation."),),
@@ -172,8 +174,9 @@ def valley_of_extinction(effort):
         rows += compared(name, found, truth, 5e-5)
     return Check(
         "Valley of extinction on a grid",
-        "Extinction falls from 0.007 to 0.001 / m at 465 m and rises again, four gates behind. The "
-        "majorant of the null collisions is raised by one voxel that no beam meets.",
+        "Extinction decreases from 0.007 to 0.001 / m at 465 m and increases again. Four gates "
+        "are behind this minimum. The majorant of the null collisions is raised by one voxel "
+        "that no beam crosses.",
         tuple(rows),
     )
 
@@ -226,7 +229,8 @@ def phase_functions(effort):
         )
     return Check(
         "Phase functions in backscatter",
-        "Rendered signal over the lidar equation's factor: what the scatterer itself contributes.",
+        "Rendered signal over the geometric factor of the lidar equation: the contribution of "
+        "the scatterer.",
         tuple(rows),
     )
 
@@ -250,7 +254,8 @@ def depolarisation(effort):
             rows.append(
                 Row(
                     f"{kind} ratio, depolarisation factor {delta:g}",
-                    "D / (2 - D), circular 2 d / (1 - d) of the linear one (Mishchenko & Hovenier 1995)",
+                    "D / (2 - D), circular 2 d / (1 - d) of the linear one (Mishchenko & "
+                    "Hovenier 1995)",
                     expected,
                     got.item(),
                     tolerance=1e-5,
@@ -273,8 +278,9 @@ def depolarisation(effort):
     )
     return Check(
         "Depolarisation in backscatter",
-        "I and Q of a photon are fully correlated here, so the ratio has no noise. Light returns up to "
-        "1 mrad off 180 degrees, for the telescope has a size: second order in that.",
+        "I and Q of a Monte Carlo sample are fully correlated here, so that the ratio has no "
+        "noise. The finite telescope receives light up to 1 mrad off 180 degrees; the effect is "
+        "of second order in this angle.",
         tuple(rows),
     )
 

@@ -7,7 +7,7 @@ from lidar_mi.atmosphere import molecules
 from .report import Check, Row
 
 TITLE = "Molecules"
-INTRODUCTION = "Dry air as `lidar_mi.atmosphere.molecules` has it."
+INTRODUCTION = "Dry air of `lidar_mi.atmosphere.molecules`."
 
 
 def cross_sections(effort):
@@ -53,7 +53,8 @@ def cross_sections(effort):
         )
     return Check(
         "Cross-sections and King factors",
-        "Published numbers have four digits and the fit 0.01 %; constants of nature have moved by less.",
+        "Published numbers have four digits and the fit has an accuracy of 0.01 %; revisions of "
+        "the physical constants are smaller.",
         tuple(rows),
     )
 
@@ -127,7 +128,7 @@ def depolarisation(effort):
     ]
     return Check(
         "Depolarisation of backscatter",
-        "Behrendt & Nakamura used slightly other King factors: 2 %.",
+        "Behrendt & Nakamura used slightly different King factors (2 %).",
         tuple(rows),
     )
 

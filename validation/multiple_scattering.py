@@ -15,11 +15,11 @@ from .transport_reference import Case, simulate
 
 TITLE = "Multiple scattering"
 INTRODUCTION = (
-    "A slab of 100 m and optical thickness 2 in a vacuum, 500 m away, seen in ten gates of 10 m, six "
-    "orders of scattering; in its last gates multiple scattering exceeds single scattering. The "
-    "reference is [an analog simulation](../validation/transport_reference.py) in numpy: double "
-    "precision, its own Stokes algebra, nothing shared with the plugins. Standard errors of both sides "
-    "are those over independent batches."
+    "A slab of 100 m and optical thickness 2 in a vacuum, 500 m away, in ten gates of 10 m, with "
+    "six orders of scattering. In its last gates multiple scattering exceeds single scattering. "
+    "The reference is [an analog simulation](../validation/transport_reference.py) in numpy, "
+    "with double precision, its own Stokes algebra and no code in common with the plugins. "
+    "Standard errors of both sides are from independent batches."
 )
 REFERENCE = "independent simulation (numpy)"
 
@@ -182,7 +182,8 @@ def molecules(effort):
     rows, drawn = _compare(RAYLEIGH, "rayleigh", effort)
     return Check(
         "Dense slab of molecules",
-        "Extinction 0.02 / m, albedo 1, Rayleigh scattering of light polarised along e_h; Gaussian beam "
+        "Extinction 0.02 / m, albedo 1, Rayleigh scattering of light polarised along e_h; "
+        "Gaussian beam "
         "of 0.1 m radius and 1 mrad half divergence, telescope 0.5 m, field of view 50 mrad half.",
         rows,
         drawn,
@@ -222,7 +223,8 @@ def majorants(effort):
         rows.append(spread(f"{name}: gate by gate", REFERENCE, scores(i, other[..., 0].sum(2)), 32))
     return Check(
         "Any majorant",
-        "The dense slab of molecules as a grid; one far voxel raises the majorant of all of it.",
+        "The dense slab of molecules as a grid; one distant voxel raises the majorant of the "
+        "whole grid.",
         tuple(rows),
     )
 
@@ -270,7 +272,9 @@ def sharpness(effort):
         spread("the same, gate by gate", "lidar equation", (got - expected) / error, BATCHES)
     )
     return Check(
-        "The reference itself", f"What agreement within {SIGMAS} sigmas means above.", tuple(rows)
+        "The reference itself",
+        f"The sensitivity of the comparisons above, which pass within {SIGMAS} sigma.",
+        tuple(rows),
     )
 
 

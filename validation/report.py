@@ -123,7 +123,7 @@ def show(check: Check, console: Console) -> None:
     for name, justify in (
         ("", "left"),
         ("expected", "right"),
-        ("got", "right"),
+        ("obtained", "right"),
         ("sigma", "right"),
         ("deviation", "right"),
         ("", "left"),
@@ -155,17 +155,22 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
         "",
         "<!-- Written by `python -m validation`; edit validation/ instead. -->",
         "",
-        "Numbers of lidar-mi against numbers that did not come from it: closed forms, published",
-        "values, conservation laws and other programs. Every row of this page is made again by",
+        "Comparisons of lidar-mi with independent numbers: closed forms, published",
+        "values, conservation laws and other programs. They concern the light transport; errors of the",
+        "retrievals are under [accuracy](accuracy.md). Every row of this page is computed again by",
         "",
         "```sh",
         command,
         "```",
         "",
-        f"A row passes if the numbers agree within {SIGMAS} standard errors plus what the reference",
-        "itself leaves open (the tolerance). *Sigma* is the standard error of the difference, of",
-        "both sides together; *deviation* is the difference in sigmas. Rows without chance have a",
-        "tolerance in place of sigma (marked with a bar, as in \\|5e-05\\|), and their deviation is in",
+        f"A row passes if the numbers agree within {SIGMAS} standard errors plus what the "
+        "reference",
+        "itself leaves undetermined (the tolerance). *Sigma* is the standard error of the "
+        "difference,",
+        "from both sides together; *deviation* is the difference in units of sigma. Rows without "
+        "random error have a",
+        "tolerance in place of sigma (marked with a bar, as in \\|5e-05\\|), and their deviation "
+        "is in",
         f"tolerances. Seeds are fixed. **Of {len(rows)} rows, {verdict}.**",
         "",
     ]
@@ -187,7 +192,7 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
 def _section(check: Check) -> list[str]:
     lines = [f"### {check.title}", "", f"<!-- {check.name} -->", "", check.text, ""]
     lines += [
-        "| what | expected | got | sigma | deviation | | reference |",
+        "| quantity | expected | obtained | sigma | deviation | | reference |",
         "| --- | ---: | ---: | ---: | ---: | --- | --- |",
     ]
     for row in check.rows:

@@ -20,8 +20,9 @@ from .report import Check, Row, largest
 TITLE = "Scattering matrices"
 INTRODUCTION = (
     "Tables of randomly oriented spheroids and spheres, made with "
-    "[scatrs](https://pypi.org/project/scatrs/): rows (a1, b1, 0, 0), (b1, a2, 0, 0), (0, 0, a3, b2), "
-    "(0, 0, -b2, a4), a1 averaging to one."
+    "[scatrs](https://pypi.org/project/scatrs/): rows (a1, b1, 0, 0), (b1, a2, 0, 0), (0, 0, a3, "
+    "b2), "
+    "(0, 0, -b2, a4), where a1 has the mean one."
 )
 GREEN = 532e-9
 
@@ -92,10 +93,12 @@ def laws(effort):
     return Check(
         "Laws that hold for every collection of particles",
         "Worst values over the 361 angles of each shipped table (seven digits are written). The "
-        "coherency matrix of a sum of Mueller-Jones matrices has no negative eigenvalue: that contains "
-        "all inequalities between the elements. At 0 degrees a2 = a3, at 180 degrees a2 = -a3 and "
-        "a4 = a1 - 2 a2, b1 = b2 = 0 at both. Straight lines between the angles lie above a peak: the "
-        "mean may exceed one by 0.1 % (plug-ins take that out).",
+        "coherency matrix of a sum of Mueller-Jones matrices has no negative eigenvalue; this "
+        "includes all inequalities between the elements. At 0 degrees a2 = a3, at 180 degrees a2 "
+        "= -a3 and "
+        "a4 = a1 - 2 a2, b1 = b2 = 0 at both. Linear interpolation between the angles "
+        "overestimates a1 near a peak: the mean may exceed one by 0.1 % (the plugins normalise "
+        "it).",
         tuple(rows),
     )
 
@@ -193,10 +196,13 @@ def published(effort):
     _draw(drawn, *polydisperse(1.0)[3:], np.array(POLYDISPERSE[1.0]["elements"]))
     return Check(
         "Published table of randomly oriented spheroids",
-        "Oblate spheroids, 2 to 1, wavelength 0.5 um, index 1.53 + 0.008i, power law r^-3 of effective "
-        "variance 0.1, at the same sizes. The published computation was stopped when cross-sections had "
-        "converged to 1e-3, and has four decimals: elements may be off by a few 1e-3. It tests the "
-        "solver under the tables, at size parameters (up to 20) beyond theirs.",
+        "Oblate spheroids, 2 to 1, wavelength 0.5 um, index 1.53 + 0.008i, power law r^-3 of "
+        "effective "
+        "variance 0.1, at the same sizes. The published computation was stopped when "
+        "cross-sections had "
+        "converged to 1e-3, and has four decimals: the error of its elements may be a few 1e-3. "
+        "It tests the solver that computes the tables, at larger size parameters (up to 20) than "
+        "theirs.",
         tuple(rows),
         ((drawn.name, "Elements over a1 (a1 itself top left): line computed, points published."),),
     )
@@ -315,9 +321,9 @@ def prolate(effort):
         ]
     return Check(
         "Prolate spheroids by another solver",
-        "The published amplitude matrix (prolate, 2 to 1, x of equal area 10, index 1.5 + 0.02i) makes "
-        "rustmatrix a witness; averaged over 12 x 24 orientations it stands against tables of one size, "
-        "532 nm, index 1.53 + 0.008i, whose solver is asked for 1e-4.",
+        "The published amplitude matrix (prolate, 2 to 1, x of equal area 10, index 1.5 + 0.02i) "
+        "validates rustmatrix. Its average over 12 x 24 orientations is then compared with "
+        "tables of one size, 532 nm, index 1.53 + 0.008i, whose solver has a tolerance of 1e-4.",
         tuple(rows),
     )
 
@@ -385,8 +391,9 @@ def spheres(effort):
         ]
     return Check(
         "Spheres",
-        "Tables of one size against Lorenz-Mie theory by another program. The mean cosine is that of "
-        "straight lines between the table's angles, which costs a few 1e-5.",
+        "Tables of one size against Lorenz-Mie theory by another program. The mean cosine is "
+        "computed with linear interpolation between the angles of the table, with an error of a "
+        "few 1e-5.",
         tuple(rows),
     )
 
@@ -414,7 +421,8 @@ def small_spheroids(effort):
         )
     return Check(
         "Small spheroids",
-        "Radius 2 nm at 532 nm: size parameter 0.024, whose square is what the closed form leaves out.",
+        "Radius 2 nm at 532 nm: size parameter 0.024; the closed form neglects terms of the "
+        "order of its square.",
         tuple(rows),
     )
 
@@ -434,7 +442,7 @@ def shipped(effort):
         ),
         Row(
             "droplets: extinction efficiency",
-            "2.05 to 2.20: twice the area and the edge's part",
+            "2.05 to 2.20: twice the area and the edge term",
             2.125,
             1e12 * table.extinction_cross_section / area,
             tolerance=0.075,
@@ -451,7 +459,7 @@ def shipped(effort):
         )
     )
     return Check(
-        "Shipped tables against what is known of such particles",
+        "Shipped tables against published properties",
         "Cloud C.1 of Deirmendjian 1969 and OPAC's dry water-soluble aerosol.",
         tuple(rows),
     )

@@ -12,9 +12,10 @@ from .scenes import batches, layer, medium, scene
 
 TITLE = "Steady states"
 INTRODUCTION = (
-    "Light of a narrow beam that a plane-parallel slab of optical thickness 1 returns within a cone, into "
-    "a telescope so wide that none of it misses. Moved over the surface, the narrow beam is a plane "
-    "wave: the signal, summed over all ranges, is the reflectance of the slab in steady state."
+    "A plane-parallel slab of optical thickness 1 reflects the light of a narrow beam within a "
+    "cone into a telescope wide enough to receive all of it. The integral over all positions of "
+    "a narrow beam is a plane wave, so that the signal summed over all ranges is the "
+    "steady-state reflectance of the slab."
 )
 
 BATCHES = 32
@@ -119,8 +120,8 @@ def isotropic(effort):
         )
     return Check(
         "Isotropic scattering, order by order",
-        "Albedo 0.9, a cone of 0.2 rad about the normal. The reference is exact but for the size of "
-        "its cells (1e-6).",
+        "Albedo 0.9, a cone of 0.2 rad about the normal. The reference is exact except for the "
+        "size of its cells (1e-6).",
         tuple(rows),
     )
 
@@ -167,10 +168,12 @@ def energy(effort):
         )
     return Check(
         "Conservation of energy",
-        "Albedo 1, isotropic scattering, 40 orders, a field of view of 80 degrees half angle. What the "
-        f"slab transmits ({below.sum() + direct:.4f}) and what leaves flatter than 80 degrees "
-        f"({grazing:.4f}) comes from the integral equation; with the rendered reflection it is all "
-        "there was.",
+        "Albedo 1, isotropic scattering, 40 orders, a field of view of 80 degrees half angle. The "
+        f"transmission of the slab ({below.sum() + direct:.4f}) and the reflection beyond 80 "
+        "degrees "
+        f"({grazing:.4f}) are from the integral equation; with the rendered reflection the sum "
+        "must be "
+        "one.",
         tuple(rows),
     )
 
@@ -213,8 +216,8 @@ def eradiate(effort):
                 )
     return Check(
         "Polarised slabs",
-        "Albedo 0.9, light polarised along e_h, a cone of 0.2 rad. Eradiate does not depolarise where a "
-        "phase function knows no polarisation, as lidar-mi does: there only I is compared.",
+        "Albedo 0.9, light polarised along e_h, a cone of 0.2 rad. Unpolarised phase functions "
+        "depolarise in lidar-mi but not in Eradiate; for these only I is compared.",
         tuple(rows),
     )
 
