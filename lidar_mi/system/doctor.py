@@ -114,37 +114,6 @@ def examine() -> list[Check]:
     return [*checks, _check_cores(), _check_memory(), _check_disk(), _check_exr_tools()]
 
 
-def print_report() -> int:
-    """Print the examination as a table, then the remedies.
-
-    Returns
-    -------
-    int
-        Exit code: 0 if everything needed works, 1 if something failed.
-    """
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
-    console = Console()
-    with console.status("examining this machine"):
-        checks = examine()
-    marks = {True: Text("ok", "green"), False: Text("FAILED", "bold red"), None: Text("-", "dim")}
-    table = Table(box=None, pad_edge=False)
-    for heading in ("", "what", "found"):
-        table.add_column(heading, overflow="fold")
-    for check in checks:
-        table.add_row(marks[check.ok], Text(check.name), Text(check.detail))
-    console.print(table)
-    for check in checks:
-        if check.remedy:
-            kind = "to repair" if check.ok is False else "optional"
-            console.print(Text(f"{kind}: {check.name}: {check.remedy}"), soft_wrap=True)
-    failed = sum(check.ok is False for check in checks)
-    console.print(f"{failed} of {len(checks)} checks failed" if failed else "all is well")
-    return 1 if failed else 0
-
-
 def _check_python() -> Check:
     version = ".".join(map(str, sys.version_info[:3]))
     try:

@@ -19,7 +19,7 @@ from scipy import stats
 from scipy.constants import speed_of_light
 
 from lidar_mi.assessment.report.digits import with_error
-from lidar_mi.cli import app as cli
+from lidar_mi.cli.run import run as run_command
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment import schema as config
@@ -402,7 +402,7 @@ def test_the_variant_option_reaches_the_lidar(tmp_path, monkeypatch, wake):
     data = {"name": "x", "doppler": {}} | ({"wake": {"vortex_pair": {}}} if wake else {})
     path.write_text(json.dumps(data))
     with pytest.raises(Caught) as stop:
-        cli.run(str(path), variant="llvm_ad_mono")
+        run_command(str(path), variant="llvm_ad_mono")
     loaded = stop.value.loaded
     assert loaded.doppler.render.variant == "llvm_ad_mono"
     if wake:

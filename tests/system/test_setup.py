@@ -14,7 +14,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 
+from lidar_mi.cli.doctor import doctor as show_checks
 from lidar_mi.system import doctor, llvm
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -307,7 +309,9 @@ OLD = next((path for path, version in llvm.find_llvm() if version in (15, 16)), 
 @pytest.mark.skipif(OLD is None, reason="no LLVM 15 or 16 here, with which Dr.Jit aborts")
 def test_doctor_explains_an_llvm_that_aborts(monkeypatch, capsys):
     monkeypatch.setenv(llvm.VARIABLE, str(OLD))
-    assert doctor.print_report() == 1
+    with pytest.raises(typer.Exit) as stop:
+        show_checks()
+    assert stop.value.exit_code == 1
     printed = capsys.readouterr().out
     assert "SIGABRT" in printed
     assert f"LLVM library: unset {llvm.VARIABLE}" in printed

@@ -4,13 +4,12 @@ import io
 
 from rich.console import Console
 
-from lidar_mi.cli import app as cli
+from lidar_mi.progress import progress
 
 
-def test_the_clock_goes_on_after_a_step_is_done(monkeypatch):
+def test_the_clock_goes_on_after_a_step_is_done():
     console = Console(file=io.StringIO(), force_terminal=True, width=100)
-    monkeypatch.setattr(cli, "_err", console)
-    bar = cli._progress()
+    bar = progress(console)
     with bar as notice:
         task = bar.bars.tasks[0]
         notice("rendering", 1.0)

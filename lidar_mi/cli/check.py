@@ -1,0 +1,30 @@
+"""``lidar-mi check``: whether an experiment can be run, and what it will look at."""
+
+from lidar_mi.cli.options import Changes, ExperimentName
+from lidar_mi.cli.terminal import output, print_rows
+from lidar_mi.experiment.shipped import experiment_file
+from lidar_mi.progress import progress
+
+EXAMPLES = (
+    "Examples: `lidar-mi check wake_sensor` - `lidar-mi check my_wake.yaml --set "
+    "scan.range='200 m'`"
+)
+
+
+def check(experiment: ExperimentName, set_: Changes = None) -> None:
+    """Say whether an experiment can be run, and in numbers what it will look at and with what.
+
+    Reads the wake, the scattering and the requirements as run does, and writes nothing.
+    """
+    from lidar_mi.experiment import schema as config
+    from lidar_mi.experiment.check import sections
+
+    path, changes = experiment_file(experiment), list(set_ or [])
+    asked = config.load_variants(path, changes) or {"": config.load(path, changes)}
+    with progress() as notice:
+        found = [
+            section for one in asked.values() for section in sections(one, path.parent, notice)
+        ]
+    for title, rows in found:
+        print_rows(title, rows)
+    output.print("nothing wrong found", highlight=False)

@@ -1,0 +1,68 @@
+"""``lidar-mi info``: what a file, a folder of results or a scatterer is."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidar_mi.cli.metric_tables import print_metrics
+from lidar_mi.cli.options import quantity
+from lidar_mi.cli.terminal import output, print_rows
+from lidar_mi.progress import progress
+
+EXAMPLES = (
+    "Examples: `lidar-mi info outputs/wake_backscatter` - `lidar-mi info image_t1.exr` - "
+    "`lidar-mi info spheroids` - `lidar-mi info molecules --wavelength '355 nm' "
+    "--altitude '8500 m'`"
+)
+
+
+def info(
+    what: Annotated[
+        str,
+        typer.Argument(
+            help="EXR, NetCDF or scattering-table file (.txt), folder of a run or of variants, or a name: molecules, "
+            "spheroids, spheres, continental, sea_salt, dust, droplets, soot."
+        ),
+    ],
+    wavelength: Annotated[
+        str | None, typer.Option(help="Of a named scatterer. Default: 532 nm.")
+    ] = None,
+    altitude: Annotated[
+        str | None, typer.Option(help="Of molecules, in the standard atmosphere. Default: 0 m.")
+    ] = None,
+) -> None:
+    """Say what a file or a folder of results holds, or how an aerosol or air scatters.
+
+    Of scatterers: extinction and backscatter coefficient and the number of particles they go with,
+    single-scattering albedo, lidar ratio, depolarisation ratio.
+    """
+    import json
+
+    from lidar_mi.experiment.info import sections
+    from lidar_mi.experiment.run_folder import failure
+    from lidar_mi.experiment.study import RECORD
+
+    with progress() as notice:
+        found = list(
+            sections(
+                what,
+                quantity("--wavelength", wavelength, "m", "532 nm"),
+                quantity("--altitude", altitude, "m", "8500 m"),
+                notice,
+            )
+        )
+    for title, rows in found:
+        print_rows(title, rows)
+    folder = Path(what)
+    if folder.is_dir():
+        if reason := failure(folder):
+            output.print(f"failed: {reason}", soft_wrap=True)
+        elif (folder / RECORD).is_file():
+            if not (folder / "metrics.json").is_file():
+                output.print("unfinished: no metrics.json yet; run it again to go on")
+            output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)
+        elif (folder / "metrics.json").is_file():
+            print_metrics(json.loads((folder / "metrics.json").read_text()))
+        else:
+            output.print("unfinished: no metrics.json yet; run it again to go on")

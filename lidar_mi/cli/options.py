@@ -1,0 +1,37 @@
+"""Arguments and options that several commands take."""
+
+from typing import Annotated
+
+import typer
+
+from lidar_mi.errors import InputError
+
+ExperimentName = Annotated[
+    str, typer.Argument(help="Experiment file, or the name of a shipped one.")
+]
+Changes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change a key of the file, as often as needed: --set scan.range='400 m'.",
+    ),
+]
+Variant = Annotated[
+    str | None,
+    typer.Option(
+        "-m", "--variant", help="Mitsuba variant, such as llvm_ad_mono_polarized or cuda_ad_mono."
+    ),
+]
+
+
+def quantity(option: str, text: str | None, unit: str, example: str) -> float | None:
+    """An option's value in SI; None where it is not given."""
+    from lidar_mi.units import to_si
+
+    if text is None:
+        return None
+    try:
+        return to_si(text, unit, example)
+    except ValueError as error:
+        raise InputError(f"{option}: {error}") from None

@@ -1,0 +1,55 @@
+"""``lidar-mi render``: a Mitsuba scene with the project's plugins."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidar_mi.cli.options import Variant
+from lidar_mi.cli.terminal import output
+from lidar_mi.errors import InputError
+from lidar_mi.progress import progress
+
+EXAMPLES = "Example: `lidar-mi render slab.xml -s 256 -D range=485 -o slab.exr`"
+
+
+def render(
+    scene: Annotated[Path, typer.Argument(help="Mitsuba scene (XML).")],
+    variant: Variant = None,
+    samples: Annotated[
+        int, typer.Option("-s", "--spp", min=0, help="Photons a beam; 0 = as the scene says.")
+    ] = 0,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="EXR file. Default: beside the scene.")
+    ] = None,
+    define: Annotated[
+        list[str] | None,
+        typer.Option("-D", "--define", metavar="KEY=VALUE", help="Fill in $KEY in the scene."),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
+) -> None:
+    """Render a Mitsuba scene with the project's plugins, like the `mitsuba` command."""
+    from lidar_mi.rendering.scene import render_file
+
+    path = out or scene.with_suffix(".exr")
+    with progress() as notice:
+        render_file(
+            scene,
+            path,
+            variant or "llvm_ad_mono_polarized",
+            samples,
+            seed,
+            _definitions(define or []),
+            lambda share: notice(f"rendering {scene.name}", share),
+        )
+    output.print(f"image    {path}")
+
+
+def _definitions(texts: list[str]) -> dict[str, str]:
+    pairs = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        if not equals or not key:
+            raise InputError(f"-D {text}: expected KEY=VALUE")
+        pairs[key] = value
+    return pairs

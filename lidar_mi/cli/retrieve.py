@@ -1,0 +1,90 @@
+"""``lidar-mi retrieve``: the cross-flow wind in images of the same air."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidar_mi.cli.terminal import output, print_rows
+
+EXAMPLES = "Example: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc`"
+
+
+def retrieve(
+    first: Annotated[Path, typer.Argument(help="Image at t1: EXR, TIFF, PNG, BMP, JPEG or FITS.")],
+    second: Annotated[Path, typer.Argument(help="Image at t2.")],
+    *,
+    more: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Further images of a burst, each dt after the one before (variational)."
+        ),
+    ] = None,
+    dt: Annotated[float, typer.Option(help="Time between the images, s.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="NetCDF file.")] = Path("wind.nc"),
+    method: Annotated[
+        str,
+        typer.Option(
+            help="cc (cross-correlation), ws (weight shift), multipass, variational or vortex_fit."
+        ),
+    ] = "cc",
+    template: Annotated[int, typer.Option(help="Template size, pixels.")] = 8,
+    search: Annotated[int, typer.Option(help="Search region, pixels.")] = 16,
+    stride: Annotated[int, typer.Option(help="Step between vectors, pixels.")] = 1,
+    layer: Annotated[
+        str | None, typer.Option(help="Layer of the EXR files. Default: Y, or the only one.")
+    ] = None,
+    spacing: Annotated[
+        float | None, typer.Option(help="Pixel spacing in m, for files without axes.")
+    ] = None,
+    noise: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            help="Standard deviation of the images' noise. Default: what our EXR "
+            "files say, else estimated.",
+        ),
+    ] = None,
+    device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
+) -> None:
+    """Find the cross-flow wind (v, w) in any two images of the same air."""
+    from lidar_mi.experiment.run_folder import write_netcdf
+    from lidar_mi.io.images import read_image, read_noise
+    from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
+    from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+
+    images = [read_image(path, layer, spacing) for path in (first, second, *(more or []))]
+    pair = on_one_grid(*images[:2])
+    if noise is None:
+        noise = read_noise(first, layer, spacing)
+        if noise is not None and pair[0] is not images[0]:
+            # noise has no structure to interpolate: its level goes along
+            noise = float(noise.median())
+    wind = retrieve_wind(
+        *pair,
+        dt=dt,
+        method=method,
+        template=template,
+        search=search,
+        stride=stride,
+        device=device,
+        noise=noise,
+        more=images[2:],
+    )
+    write_netcdf(wind, out)
+    valid = float((wind["flag"] == 0).mean())
+    if "fit" in wind.attrs:
+        _print_vortices(wind)
+    output.print(f"{wind.sizes['y']} x {wind.sizes['z']} vectors, {valid:.1%} valid")
+    output.print(f"winds    {out}")
+
+
+def _print_vortices(wind) -> None:
+    """The numbers of a fitted vortex pair with their standard errors."""
+    rows = []
+    for name in (n for n in wind.data_vars if f"{n}_stderr" in wind and not wind[n].dims):
+        value, stderr = float(wind[name]), float(wind[f"{name}_stderr"])
+        rows.append((name, f"{value:.2f} +- {stderr:.2f} {wind[name].attrs['units']}"))
+    print_rows(
+        f"vortex pair, {wind.attrs['profile'].replace('_', ' ')} ({wind.attrs['fit']})", rows
+    )

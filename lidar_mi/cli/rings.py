@@ -1,0 +1,54 @@
+"""``lidar-mi rings``: the rings of an etalon in any image."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidar_mi.cli.terminal import output, print_rows
+from lidar_mi.errors import InputError
+
+EXAMPLES = (
+    "Examples: `lidar-mi rings fringes.png` - `lidar-mi rings frame.exr --layer Y "
+    "--centre 479.5 389.5 -o frame_rings.png`"
+)
+
+
+def rings(
+    image: Annotated[Path, typer.Argument(help="EXR, PNG, TIFF, BMP, JPEG or FITS image.")],
+    centre: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            help="Where the rings' centre is known: x to the right, y down, pixels from "
+            "the middle of the top left one. Default: found."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Picture (PNG). Default: IMAGE_rings.png.")
+    ] = None,
+    layer: Annotated[
+        str | None, typer.Option(help="Layer of an EXR file. Default: Y, or the only one.")
+    ] = None,
+    saturation: Annotated[
+        float | None, typer.Option(help="Value from which on a pixel is full.")
+    ] = None,
+) -> None:
+    """Measure the rings of an etalon in any image: centre, radii, orders, quality of the fit."""
+    from lidar_mi.assessment.figures.rings import draw_rings
+    from lidar_mi.experiment.run_folder import write
+    from lidar_mi.io.images import read_picture
+    from lidar_mi.retrieval.rings.analysis import analyse, describe
+
+    path = out or Path(f"{image.stem}_rings.png")
+    if not path.parent.is_dir():
+        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
+    values = read_picture(image, layer)
+    try:
+        found = analyse(values, centre, saturation)
+    except InputError as error:
+        raise InputError(f"{image}: {error}") from None
+    figure = draw_rings(values, found, image.name)
+    write(path, lambda part: figure.savefig(part, dpi=110, format="png"))
+    for title, rows in describe(found):
+        print_rows(title, rows)
+    output.print(f"picture  {path}")

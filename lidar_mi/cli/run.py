@@ -1,0 +1,80 @@
+"""``lidar-mi run``: run an experiment, start to end."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidar_mi.cli.metric_tables import print_metrics
+from lidar_mi.cli.options import Changes, ExperimentName, Variant
+from lidar_mi.cli.terminal import output
+from lidar_mi.experiment.shipped import experiment_file
+from lidar_mi.progress import progress
+
+EXAMPLES = (
+    "Examples: `lidar-mi run wake_backscatter.yaml` (a shipped experiment) - "
+    "`lidar-mi run my.yaml -o outputs/calm --set wake.texture.rms=0 --set seed=7`"
+)
+
+
+def run(
+    experiment: ExperimentName,
+    variant: Variant = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Run folder. Default: outputs/NAME.")
+    ] = None,
+    set_: Changes = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a run of a different experiment.")
+    ] = False,
+) -> None:
+    """Run an experiment, start to end.
+
+    Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
+    A run that was stopped goes on with the images it has.
+    """
+    from lidar_mi.experiment import run as chain
+    from lidar_mi.experiment import schema as config
+    from lidar_mi.experiment import study
+
+    path, changes = experiment_file(experiment), list(set_ or [])
+    variants = config.load_variants(path, changes)
+    loaded = next(iter(variants.values())) if variants else config.load(path, changes)
+    if variant:
+        sections = {"render": loaded.wake, "doppler.render": loaded.doppler}
+        changes += [f"{key}.variant={variant}" for key, asked in sections.items() if asked]
+    if variants:
+        _run_study(config.load_variants(path, changes), out, path, overwrite, study.run)
+        return
+    loaded = config.load(path, changes)
+    folder = out or Path("outputs") / loaded.name
+    with progress() as notice:
+        metrics = chain.run(loaded, folder, path.parent, overwrite, notice)
+    print_metrics(metrics)
+    output.print(f"report   {folder / 'report.html'}")
+    output.print(f"figures  {folder / 'figures'}")
+    winds = "wind_volume.nc" if loaded.volume else "wind.nc"
+    found = "sensor.rmse_u" in metrics
+    for name, asked in (
+        (winds, loaded.wake),
+        ("v_los.nc", loaded.doppler),
+        ("lines_of_sight.nc", loaded.sensor),
+        ("wind3d.nc", found),
+    ):
+        if asked:
+            output.print(f"winds    {folder / name}")
+    if "timing.vortex_s" in metrics:
+        output.print(f"vortices {folder / 'vortex.json'}")
+
+
+def _run_study(variants, out, path, overwrite, start) -> None:
+    """Variants of one experiment, each in a folder of its own, and their comparison."""
+    first, experiment = next(iter(variants.items()))
+    name = experiment.name.removesuffix(f".{first}")
+    folder = out or Path("outputs") / name
+    with progress() as notice:
+        metrics = start(name, variants, folder, path.parent, overwrite, notice)
+    for variant, found in metrics.items():
+        output.print(f"\n{variant}", style="bold")
+        print_metrics(found)
+    output.print(f"report   {folder / 'report.html'}")
