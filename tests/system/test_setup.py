@@ -248,8 +248,8 @@ def test_llvm_that_cannot_be_installed_is_asked_for(machine, obstacle):
 @pytest.mark.skipif(sys.platform != "linux", reason="the LLVM search differs elsewhere")
 def test_a_bad_path_set_by_the_user_is_not_answered_with_apt(machine):
     machine.has_apt()
-    source = machine.project / "lidar_mi"
-    source.mkdir()
+    source = machine.project / "lidar_mi" / "system"
+    source.mkdir(parents=True)
     shutil.copy(llvm.__file__, source)
     done = machine.set_up(PYTHON=sys.executable, DRJIT_LIBLLVM_PATH="/nowhere/libLLVM-19.so")
     assert done.returncode == 1
