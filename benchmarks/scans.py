@@ -7,7 +7,8 @@ from pathlib import Path
 import mitsuba as mi
 import xarray as xr
 
-from lidar_mi.experiment.schema import Experiment, load
+from lidar_mi.experiment.reading import load
+from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import make_truth
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, render_scans, scene_dict

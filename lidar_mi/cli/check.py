@@ -16,7 +16,7 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
 
     Reads the wake, the scattering and the requirements as run does, and writes nothing.
     """
-    from lidar_mi.experiment import schema as config
+    from lidar_mi.experiment import reading as config
     from lidar_mi.experiment.check import sections
 
     path, changes = experiment_file(experiment), list(set_ or [])

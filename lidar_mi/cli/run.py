@@ -33,8 +33,8 @@ def run(
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
     A run that was stopped goes on with the images it has.
     """
+    from lidar_mi.experiment import reading as config
     from lidar_mi.experiment import run as chain
-    from lidar_mi.experiment import schema as config
     from lidar_mi.experiment import study
 
     path, changes = experiment_file(experiment), list(set_ or [])

@@ -11,7 +11,7 @@ from pathlib import Path
 from lidar_mi import __version__
 from lidar_mi.assessment.report import page as report
 from lidar_mi.errors import is_interrupt
-from lidar_mi.experiment import schema as config
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.run_folder import Log, Notice, claim, read_record, write
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages import backscatter as backscatter_chain

@@ -13,7 +13,7 @@ import yaml
 
 from lidar_mi import __version__
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import schema as config
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import find_file
 from lidar_mi.rendering.phase import table_files

@@ -13,8 +13,8 @@ import yaml
 
 from lidar_mi.assessment.report.comparison import draw_comparison, page
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.run_folder import IMAGES, VOLUME, Log, Notice, read_record, write
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.io import exr
@@ -37,7 +37,7 @@ def run(
     name : str
         Of the study.
     variants : mapping
-        From `lidar_mi.experiment.schema.load_variants`.
+        From `lidar_mi.experiment.reading.load_variants`.
     folder, beside, overwrite, notice
         As in `lidar_mi.experiment.run`.
 

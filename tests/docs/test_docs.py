@@ -25,8 +25,7 @@ from pydantic import BaseModel
 from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
-from lidar_mi.experiment import schema as config
-from lidar_mi.experiment import truth
+from lidar_mi.experiment import reading, schema, truth
 from lidar_mi.rendering.phase import scatterer
 
 ROOT = Path(__file__).parents[2]
@@ -42,7 +41,7 @@ PAGES = (
 )
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
-OPTIONAL = (config.VortexPair, config.Turbine, config.Part)
+OPTIONAL = (schema.VortexPair, schema.Turbine, schema.Part)
 # what makes a printed run small; nothing else of it changes
 SMALLER = ("wake.spacing=1 m", "render.samples_per_beam=2", "retrieval.stride=8")
 
@@ -74,7 +73,7 @@ def test_plugin_reference_does_not_guess(docstring, message):
 # --- the experiment file --------------------------------------------------------------------
 
 
-def leaves(model=config.Experiment, path=()):
+def leaves(model=schema.Experiment, path=()):
     """Every key of an experiment file: dotted name, section's model, field."""
     for name, field in model.model_fields.items():
         section = next((t for t in _parts(field.annotation) if _is_model(t)), None)
@@ -165,7 +164,7 @@ def _value(name, model, *given):
     """A key's value in a valid experiment that gives it, or else leaves it to its default."""
     *parents, key = name.split(".")
     if model in OPTIONAL:
-        whole = {"phase": "rayleigh", "share": 1.0} if model is config.Part else {}
+        whole = {"phase": "rayleigh", "share": 1.0} if model is schema.Part else {}
         return getattr(model.model_validate(whole | dict(zip([key], given))), key)
     data = copy.deepcopy(BASE)
     if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors
@@ -179,7 +178,7 @@ def _value(name, model, *given):
     if name in ("wake.file", "wake.time"):  # without them this experiment is none
         return given[0] if given else model.model_fields[key].default
     section |= zip([key], given)
-    found = config.check(data, "base")
+    found = reading.check(data, "base")
     for part in name.split("."):
         found = getattr(found, part)
     return found
@@ -294,10 +293,10 @@ def check_yaml(block):
         assert read_requirements(block.file)
     elif block.file:
         Path(block.file).write_text(block.text)
-        for experiment in config.load_variants(block.file).values() or [config.load(block.file)]:
+        for experiment in reading.load_variants(block.file).values() or [reading.load(block.file)]:
             truth.make_truth(experiment)
     else:
-        loaded = config.check({**BASE, **data}, block.place)
+        loaded = reading.check({**BASE, **data}, block.place)
         scatterer(loaded.scattering, wavelength=loaded.lidar.wavelength)  # finds the tables
 
 

@@ -6,7 +6,8 @@ from importlib.resources import files
 import pytest
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema import Experiment, check, dump, load
+from lidar_mi.experiment.reading import check, dump, load
+from lidar_mi.experiment.schema import Experiment
 
 LEAST = "name: least\nwake: {file: wake.nc}\n"
 

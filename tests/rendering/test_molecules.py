@@ -11,7 +11,8 @@ import xarray as xr
 from lidar_mi.atmosphere.molecules import molecular_table
 from lidar_mi.atmosphere.particles import aerosol_table
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import schema as config
+from lidar_mi.experiment.reading import check
+from lidar_mi.experiment.schema import Scattering
 from lidar_mi.experiment.truth import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
@@ -27,7 +28,7 @@ def scans(fields, settings, **air):
     plans = plan_scans(Scan(range=100, thickness=2.5), AXIS, AXIS, (0.0, 5.0))
     lidar = BackscatterLidar(fov_half="20 mrad", divergence_full="0.1 mrad")
     solid = [extrude(field, plans[0], lidar) for field in fields]
-    scattering = config.Scattering(phase="aerosol", aerosol="spheroids")
+    scattering = Scattering(phase="aerosol", aerosol="spheroids")
     return list(
         render_scans(
             solid,
@@ -84,7 +85,7 @@ def test_light_is_depolarised_by_particles_alone():
 
 
 def experiment(**extinction):
-    return config.check(
+    return check(
         {
             "name": "air",
             "wake": {
@@ -112,7 +113,7 @@ def test_unpolarised_particles_have_no_molecules_beside():
         "scattering": {"phase": "isotropic"},
     }
     with pytest.raises(InputError) as error:
-        config.check(data, "air")
+        check(data, "air")
     assert "wake.extinction.molecules: not allowed with scattering.phase isotropic" in str(
         error.value
     )

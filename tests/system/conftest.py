@@ -6,8 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment import schema as config
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 

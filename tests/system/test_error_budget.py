@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
-from lidar_mi.experiment import schema as config
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.run_folder import IMAGES
 from lidar_mi.experiment.stages import backscatter as backscatter_chain

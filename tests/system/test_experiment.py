@@ -30,8 +30,8 @@ from scipy.stats import norm, qmc
 from lidar_mi.assessment.report.digits import percent
 from lidar_mi.atmosphere.wake import read_wake
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run_folder
-from lidar_mi.experiment import schema as config
 from lidar_mi.experiment import truth as truth_module
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.run_folder import IMAGES

@@ -21,9 +21,10 @@ from scipy.constants import speed_of_light
 from lidar_mi.assessment.report.digits import with_error
 from lidar_mi.cli.run import run as run_command
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment import schema as config
 from lidar_mi.experiment.run import run
+from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.fringes import summed
 from lidar_mi.instrument.fringe_camera import CCD, expose
 from lidar_mi.io.exr import read_fringes
@@ -389,7 +390,7 @@ def test_the_record_is_the_experiment_again():
 
 @dataclasses.dataclass
 class Caught(Exception):
-    loaded: config.Experiment
+    loaded: Experiment
 
 
 @pytest.mark.parametrize("wake", [False, True])

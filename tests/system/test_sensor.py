@@ -20,7 +20,7 @@ from lidar_mi.assessment.report import sensor as sensor_report
 from lidar_mi.assessment.report.page import page
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import check
-from lidar_mi.experiment import schema as config
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.stages import backscatter as backscatter_chain
 from lidar_mi.experiment.stages import fringes as fringe_chain

@@ -19,8 +19,8 @@ from lidar_mi.assessment.report import comparison
 from lidar_mi.assessment.report.comparison import differences, flat
 from lidar_mi.assessment.report.digits import three
 from lidar_mi.errors import InputError
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment import schema as config
 from lidar_mi.experiment import study
 from lidar_mi.experiment.info import sections
 from lidar_mi.experiment.stages import backscatter as backscatter_chain

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import schema as config
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.stages import volume as volume_chain
 from lidar_mi.instrument.lidar import BackscatterLidar

@@ -4,17 +4,18 @@ Detects standard errors that are wrong by a seventh on air as a lidar sees it: t
 shortest waves that pixels hold, far brighter in the vortices than around them.
 """
 
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from lidar_mi.experiment import schema as config
+from lidar_mi.experiment.reading import load
 from lidar_mi.experiment.stages.backscatter import scan_plans, window_settings
 from lidar_mi.experiment.truth import blur_by_beam, make_truth
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
-SCENES = Path(config.__file__).parents[1] / "scenes"
+SCENES = Path(str(files("lidar_mi.scenes")))
 SIMULATION = Path(__file__).parents[4] / "shared" / "data" / "wake_les_40s.nc"
 # Variance of a picture's noise in units of the extinction (m^-1) by its powers: what simulation and
 # detector leave in the pictures of the wake_sensor experiment.
@@ -24,7 +25,7 @@ NOISE = 7.3e-13, 2.1e-9, 2.7e-8
 def reduced_errors(seed, amount, **changes):
     """Errors of v and w over their standard errors, good vectors, and the errors (m/s)."""
     overrides = [f"{key}={value}" for key, value in changes.items()] + [f"seed={seed}"]
-    experiment = config.load(SCENES / "wake_sensor.yaml", overrides)
+    experiment = load(SCENES / "wake_sensor.yaml", overrides)
     truth = make_truth(experiment, SCENES)
     plans = scan_plans(experiment, truth)
     pictures = [blur_by_beam(truth.image(k), experiment.lidar, plans[k].centre) for k in (0, 1)]

@@ -14,7 +14,7 @@ import xarray as xr
 from benchmarks.cases import data_array, origin, plane_waves, texture, vortex_pair_images
 from lidar_mi.atmosphere.vortex import Vortex, velocity, vortex_pair
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import schema as config
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.truth import make_truth
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.warping import band_limited

@@ -1,0 +1,243 @@
+"""Reading experiments: from a YAML file and its variants to a checked description, faults in words."""
+
+import copy
+import difflib
+import re
+from pathlib import Path
+from typing import Any, get_args
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema import BACKSCATTER, NAME, Experiment
+from lidar_mi.units import Unit
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML as it should be: a key that is there twice is a fault, not the last one's value."""
+
+    def construct_mapping(self, node, deep=False):
+        seen = set()
+        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
+            if key.value in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"key {key.value!r} is there twice", key.start_mark
+                )
+            seen.add(key.value)
+        return super().construct_mapping(node, deep)
+
+
+def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
+    """Read an experiment file; ``overrides`` are texts such as ``"wake.texture.rms=0.2"``.
+
+    Raises
+    ------
+    InputError
+        Unreadable file, unknown key, wrong unit, value out of range: the first fault is named. A
+        file of several variants: `load_variants` reads it.
+    """
+    data = _read(path)
+    for override in overrides or []:
+        _override(data, override)
+    if "variants" in data:
+        raise InputError(
+            f"{path}: variants: not allowed for a single experiment; expected load_variants"
+        )
+    return check(data, str(path))
+
+
+def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[str, Experiment]:
+    """Read a file whose ``variants`` each change some keys of the experiment; empty if it has none.
+
+    Sections merge key by key, other values replace; null removes a section. ``overrides`` count for
+    all variants and over what these say, but those of ``variants.NAME.KEY`` for one. A variant's
+    experiment is called NAME-OF-ALL.NAME.
+
+    Raises
+    ------
+    InputError
+        As `load`, with the variant's name; no variants, or one that is no section.
+    """
+    data = _read(path)
+    own = [text for text in overrides or [] if text.strip().startswith("variants.")]
+    if "variants" not in data and not own:
+        return {}
+    for override in own:
+        _override(data, override)
+    variants = data.pop("variants")
+    if not isinstance(variants, dict) or not variants:
+        raise InputError(f"{path}: variants: {variants!r} is not allowed; expected names with keys")
+    found = {}
+    for name, changes in variants.items():
+        place = f"{path}: variants.{name}"
+        if not re.fullmatch(NAME, str(name)):
+            raise InputError(
+                f"{place}: not allowed; expected a name of letters, digits, _, . and -"
+            )
+        if not isinstance(changes, dict):
+            raise InputError(f"{place}: {changes!r} is not allowed; expected keys to change")
+        if "name" in changes:
+            raise InputError(f"{place}.name: not allowed; the variant is its name")
+        merged = _merged(data, changes)
+        for override in overrides or []:
+            if override not in own:
+                _override(merged, override)
+        if isinstance(merged.get("name"), str):
+            merged["name"] += f".{name}"
+        found[str(name)] = check(merged, place)
+    return found
+
+
+def _merged(data: dict, changes: dict) -> dict:
+    """``data`` with ``changes`` in it, section by section; null: without. Neither is touched."""
+    merged = copy.deepcopy(data)
+    for key, value in changes.items():
+        inner = merged.get(key)
+        if value is None and isinstance(inner, dict):
+            del merged[key]
+            continue
+        both = isinstance(inner, dict) and isinstance(value, dict)
+        merged[key] = _merged(inner, value) if both else copy.deepcopy(value)
+    return merged
+
+
+def _read(path: str | Path) -> dict:
+    """The keys of an experiment file, as they stand."""
+    path = Path(path)
+    if path.suffix == ".xml":
+        raise InputError(
+            f"{path}: a Mitsuba scene, not an experiment; expected lidar-mi render {path}"
+        )
+    if path.suffix in (".nc", ".nc4", ".cdf"):
+        raise InputError(
+            f"{path}: a wake, not an experiment; expected a YAML file that says wake: {{file: {path}}}"
+        )
+    try:
+        text = path.read_text()
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; expected an experiment file") from None
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not a text file; expected an experiment in YAML") from None
+    try:
+        data = yaml.load(text, _Loader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" line {mark.line + 1}" if mark else ""
+        reason = " ".join(str(getattr(error, "problem", error)).split())
+        raise InputError(f"{path}:{line} not valid YAML ({reason})") from None
+    if not isinstance(data, dict):
+        raise InputError(f"{path}: holds no keys; expected name, wake, ...")
+    if isinstance(data.get("experiment"), dict) and "versions" in data:
+        data = data["experiment"]  # the record in a run folder can be run again
+    return data
+
+
+def check(data: dict, origin: str) -> Experiment:
+    """An experiment from a nested dictionary; see `load` for the errors."""
+    try:
+        return Experiment.model_validate(data)
+    except ValidationError as error:
+        raise InputError(f"{origin}: {_first_fault(error)}") from None
+
+
+def dump(experiment: Experiment) -> str:
+    """The resolved experiment as YAML, quantities with their SI units; `load` reads it again.
+
+    Without the sections of a lidar that it does not have.
+    """
+    unused = {"wake", *BACKSCATTER} if experiment.wake is None else set()
+    unused |= {
+        name for name in ("doppler", "sensor", "volume") if getattr(experiment, name) is None
+    }
+    data = experiment.model_dump(mode="json", exclude=unused)
+    return yaml.safe_dump(data, sort_keys=False)
+
+
+def _override(data: dict, text: str) -> None:
+    key, equals, value = text.partition("=")
+    if not equals or not key.strip():
+        raise InputError(f"--set {text}: expected KEY=VALUE, such as wake.texture.rms=0.2")
+    *parents, last = key.strip().split(".")
+    for parent in parents:
+        data = data.setdefault(parent, {})
+        if not isinstance(data, dict):
+            raise InputError(f"--set {text}: {parent} is a value, not a section")
+    try:
+        data[last] = yaml.load(value, _Loader)
+    except yaml.YAMLError:
+        raise InputError(f"--set {text}: {value!r} is not a YAML value") from None
+
+
+def _first_fault(error: ValidationError) -> str:
+    faults = error.errors()
+    # a misspelt key also leaves one missing: what is there tells more
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    where = [str(p) for p in fault["loc"] if p not in ("float", "literal['advect']")]
+    field = ".".join(where)
+    message = fault["msg"].removeprefix("Value error, ")
+    if fault["type"] == "extra_forbidden":
+        allowed = _keys_at(fault["loc"][:-1])
+        close = difflib.get_close_matches(where[-1], allowed, 1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        return f"{field}: unknown key{hint} (allowed: {', '.join(allowed)})"
+    if fault["type"] == "missing":
+        return f"{field}: missing"
+    if fault["type"] == "value_error":
+        return f"{field}: {message}" if field else message
+    value = fault["input"]
+    unit = _unit_at(fault["loc"])
+    shown = f"{value:g} {unit}".strip() if isinstance(value, float) else repr(value)
+    if fault["type"] in _LIMITS:
+        limit, words = _LIMITS[fault["type"]]
+        expected = f"{words} {fault['ctx'][limit]:g} {unit}".strip()
+    elif fault["type"].startswith("model_"):
+        expected = f"a section with keys out of {', '.join(_keys_at(fault['loc']))}"
+    elif fault["type"] == "string_pattern_mismatch":
+        expected = "letters, digits, _, . and -, a letter or digit first"
+    elif fault["type"] in ("tuple_type", "list_type"):
+        expected = "a list in brackets"
+    elif fault["type"] == "too_short":
+        expected = f"{fault['ctx']['min_length']} or more"
+    else:
+        expected = message.removeprefix("Input should be ")
+    return f"{field}: {shown} is not allowed; expected {expected}"
+
+
+_LIMITS = {
+    "greater_than": ("gt", "more than"),
+    "greater_than_equal": ("ge", "at least"),
+    "less_than": ("lt", "less than"),
+    "less_than_equal": ("le", "at most"),
+}
+
+
+def _unit_at(location: tuple) -> str:
+    """The SI unit of the key at a location, empty if it has none."""
+    model, field = Experiment, None
+    for part in location:
+        if model and part in model.model_fields:
+            field = model.model_fields[part]
+            model = _section(field.annotation)
+    pending = [field.annotation, *field.metadata] if field else []
+    while pending:
+        part = pending.pop()
+        if isinstance(part, Unit):
+            return part.symbol
+        pending += (*get_args(part), *getattr(part, "__metadata__", ()))
+    return ""
+
+
+def _keys_at(location: tuple) -> list[str]:
+    model: Any = Experiment
+    for part in location:
+        if isinstance(part, str):
+            model = _section(model.model_fields[part].annotation)
+    return list(model.model_fields)
+
+
+def _section(annotation) -> type[BaseModel] | None:
+    """The model in an annotation such as ``tuple[Model, ...] | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_section, get_args(annotation))), None)

@@ -1,0 +1,38 @@
+"""Methods of retrieval by name, as experiments, files and metrics write them."""
+
+from enum import StrEnum
+
+
+class ImageMethod(StrEnum):
+    """From two images to the cross-flow wind (v, w)."""
+
+    CC = "cc"
+    WS = "ws"
+    MULTIPASS = "multipass"
+    VARIATIONAL = "variational"
+    VORTEX_FIT = "vortex_fit"
+
+
+class VolumeMethod(StrEnum):
+    """From two volumes to the wind in three dimensions (u, v, w)."""
+
+    CORRELATION = "correlation"
+    VARIATIONAL = "variational"
+
+
+class RingMethod(StrEnum):
+    """From an image of rings to the velocity along the line of sight."""
+
+    ANNULAR = "annular"
+    PIXELS = "pixels"
+    CA = "ca"
+    CA_R2 = "ca_r2"
+    ML = "ml"
+    SG = "sg"
+
+
+class RingCentre(StrEnum):
+    """Whether a ring method retrieves the centre of the rings or is given it."""
+
+    FREE = "free"
+    KNOWN = "known"
