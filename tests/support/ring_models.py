@@ -1,9 +1,9 @@
 """The ring model of the default instrument, and the bounds that belong to its cases."""
 
 import numpy as np
-import ring_reference as reference
 
 from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
+from tests.support import ring_reference as reference
 
 TEMPERATURES = reference.TEMPERATURE * np.array([0.75, 0.875, 1, 1.125, 1.25])
 

@@ -1,13 +1,18 @@
-"""One run of the demo, shared by every test that looks at its results."""
+"""One run of the demo for every test that looks at its results, quick runs, the command line."""
 
+import gc
+import sys
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from lidar_mi.cli import app as cli
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
+from tests.support.command_line import TINY
+from tests.support.experiments import without_figures
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 
@@ -22,3 +27,42 @@ def demo(tmp_path_factory):
         loaded, folder, SCENES, notice=lambda text, share: told.append((text, share))
     )
     return SimpleNamespace(folder=folder, experiment=loaded, metrics=metrics, told=told)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def free_scenes():
+    """Scenes hold reference cycles, and every live one takes part in later kernels."""
+    yield
+    gc.collect()
+    gc.collect()
+
+
+@pytest.fixture
+def quick():
+    with without_figures():
+        yield
+
+
+@pytest.fixture
+def there(tmp_path, monkeypatch):
+    """A folder to work in, with an experiment and a small scene; names stay short in messages."""
+    (tmp_path / "tiny.yaml").write_text(TINY)
+    scene = (SCENES / "slab.xml").read_text()
+    scene = scene.replace('value="219"', 'value="21"').replace('value="139"', 'value="17"')
+    (tmp_path / "slab.xml").write_text(scene)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def lidar_mi(monkeypatch, capsys):
+    """Runs the command in this process: exit code, output, error output."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["lidar-mi", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        out, err = capsys.readouterr()
+        return stop.value.code or 0, out, err
+
+    return call

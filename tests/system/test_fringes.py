@@ -1,11 +1,10 @@
 """A Doppler lidar's experiment, from the etalon to the verdict, through the public `run`.
 
-Detects: rings in the wrong place or moved the wrong way by the wind, winds worse than the Cramer-Rao
-bound allows for or biased, a stated uncertainty that is not met, averages whose noise is not that of
-averages, a paper's chain without its bias, pictures that are not used again or not the same when
-rendered again, results of another experiment taken for this one's, changed or non-finite metrics,
-experiments of both lidars that lose one, and input that only fails later.
-"""
+Detects: rings in the wrong place or moved the wrong way by the wind, winds worse than the Cramer-
+Rao bound allows for or biased, a stated uncertainty that is not met, averages whose noise is not
+that of averages, a paper's chain without its bias, pictures that are not used again or not the same
+when rendered again, results of another experiment taken for this one's, changed or non-finite
+metrics, experiments of both lidars that lose one, and input that only fails later."""
 
 import dataclasses
 import json

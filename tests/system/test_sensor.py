@@ -1,9 +1,8 @@
 """Both lidars as one sensor, from the experiment file to the report.
 
 Detects a chain that does not run or leaves something out, lines of sight that are read wrongly or
-with wrong errors (4 sigma), a verdict that contradicts its numbers, and descriptions of lidars that do
-not look at the same air.
-"""
+with wrong errors (4 sigma), a verdict that contradicts its numbers, and descriptions of lidars that
+do not look at the same air."""
 
 import json
 import math

@@ -1,9 +1,8 @@
 """Wind in three dimensions from the experiment file to the report.
 
 Detects a chain that does not run or leaves something out, gates put in the wrong place (the beams'
-spread or the flight would show as wind), air that does not move along x, and descriptions of which no
-volume can be made.
-"""
+spread or the flight would show as wind), air that does not move along x, and descriptions of which
+no volume can be made."""
 
 import json
 from dataclasses import replace

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import ring_reference as reference
 from PIL import Image
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.analysis import analyse, describe
+from tests.support import ring_reference as reference
 
 LABORATORY = Path(__file__).parents[4] / "shared" / "data" / "fringes"
 # r of the laser's rings on the default camera: order 77248.5, closed form

@@ -7,13 +7,13 @@ default suite sees 1.4 times), error bars that are not the scatter, an order los
 
 import numpy as np
 import pytest
-import ring_reference as reference
 import torch
-from ring_models import TABLE, ring_model
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.fit import difference, fit_rings
 from lidar_mi.retrieval.rings.model import PixelNoise, cramer_rao
+from tests.support import ring_reference as reference
+from tests.support.ring_models import TABLE, ring_model
 
 # The whole camera in sixteen times fewer pixels: as many photons, the same rings.
 COARSE = {"shape": (195, 240), "pixel": 4 * reference.PIXEL}

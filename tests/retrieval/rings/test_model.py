@@ -7,9 +7,7 @@ wrong sign or factor of any derivative, cells that forget where their pixels lie
 
 import numpy as np
 import pytest
-import ring_reference as reference
 import torch
-from ring_models import TABLE, TEMPERATURES, ring_model
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.cells import annular_average, annular_sectors, pixels
@@ -20,6 +18,8 @@ from lidar_mi.retrieval.rings.model import (
     expected,
     mean_and_jacobian,
 )
+from tests.support import ring_reference as reference
+from tests.support.ring_models import TABLE, TEMPERATURES, ring_model
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ over r, free of it over r^2.
 
 import numpy as np
 import pytest
-import ring_reference as reference
 from scipy.signal import savgol_coeffs
 
 from lidar_mi.errors import InputError
@@ -27,6 +26,7 @@ from lidar_mi.retrieval.rings.peaks import (
     savitzky_golay,
     velocity_from_radii,
 )
+from tests.support import ring_reference as reference
 
 CENTRE = (471.3, 402.8)
 OPTICS = reference.FOCAL_LENGTH, reference.PIXEL

@@ -1,0 +1,1 @@
+"""What several test modules use: synthetic flows and images, small experiments."""

@@ -1,0 +1,85 @@
+"""Small experiments and wakes of the system tests, and what the demo writes."""
+
+from contextlib import contextmanager
+
+import numpy as np
+import OpenEXR
+import pytest
+import xarray as xr
+
+from lidar_mi.experiment import reading as config
+from lidar_mi.experiment.stages import backscatter as backscatter_chain
+
+SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
+
+FIGURES = {
+    "fig00_overview",
+    "fig05_extinction",
+    "fig06_wind_from_extinction",
+    "fig07_deviation_from_truth",
+    "fig08_backscatter",
+    "fig09_backscatter_against_extinction",
+    "fig10_wind_from_backscatter",
+    "fig11_deviation_from_extinction_winds",
+    "fig12_error_by_texture",
+    "fig12b_error_and_bound",
+    "fig14_depolarization",
+    "fig15_multiple_scattering",
+}
+
+
+def small(name="small", **wake):
+    """A vortex pair seen by 61 x 41 beams in single scattering, as a dictionary."""
+    pair = {"circulation": 150, "separation": 16, "core_radius": 2, "width": 30, "height": 20}
+    return {
+        "name": name,
+        "wake": {"vortex_pair": pair, **wake},
+        "render": {"samples_per_beam": 8, "max_order": 1},
+        "retrieval": {"methods": ["cc"]},
+    }
+
+
+def check(data):
+    return config.check(data, "test")
+
+
+def write_wake(path, tracer, v=10.0, w=5.0, x=None):
+    """A uniform wind that carries ``tracer(y, z)`` or ``tracer(x, y, z)``; even aerosol; 1 m."""
+    axes = {"y": np.arange(-20, 20.5, 1.0), "z": np.arange(-15, 15.5, 1.0)}
+    if x is not None:
+        axes = {"x": x, **axes}
+    grid = np.meshgrid(*axes.values(), indexing="ij")
+    fields = {
+        "v": (v, "m s-1"),
+        "w": (w, "m s-1"),
+        "aerosol": (1.0, "1"),
+        "tracer": (tracer(*grid), "1"),
+    }
+    data = xr.Dataset(
+        {
+            name: (tuple(axes), np.broadcast_to(values, grid[0].shape).copy(), {"units": unit})
+            for name, (values, unit) in fields.items()
+        },
+        coords={name: (name, values, {"units": "m"}) for name, values in axes.items()},
+    )
+    data.to_netcdf(path, engine="h5netcdf")
+    return path.name
+
+
+def blob(y0, z0, sigma=1.5):
+    return lambda y, z: np.exp(-((y - y0) ** 2 + (z - z0) ** 2) / (2 * sigma**2))
+
+
+def as_seen(path):
+    """The picture as any EXR program has it: row 0 at the top, column 0 at the left."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return np.array(file.channels()["Y"].pixels)
+
+
+@contextmanager
+def without_figures():
+    """Runs without figures and texture sweep, most of a small run's time: the demo has them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
+        patch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
+        yield
