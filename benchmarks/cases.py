@@ -103,7 +103,7 @@ def texture(waves, y: np.ndarray, z: np.ndarray, contrast: float = CONTRAST) -> 
     """1 + texture of rms `contrast` at the points (y, z)."""
     vectors, phases = waves
     total = np.zeros(np.shape(y))
-    for (a, b), phase in zip(vectors, phases):
+    for (a, b), phase in zip(vectors, phases, strict=True):
         total += np.cos(a * y + b * z + phase)
     return 1 + contrast * np.sqrt(2 / len(phases)) * total
 

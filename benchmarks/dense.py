@@ -122,7 +122,10 @@ def _rows(case, scene, repeats, gated_photons, analog_photons):
             float(np.median(photons * image.var(0, ddof=1) / mean**2)) for image in images
         ]
         times[name] = [s / (photons * len(images[0])) for s, _ in found[name]]
-    products = {name: [1e9 * v * t for v, t in zip(variances[name], times[name])] for name in sides}
+    products = {
+        name: [1e9 * v * t for v, t in zip(variances[name], times[name], strict=True)]
+        for name in sides
+    }
     return [
         row(case, "relative variance", "", variances["gated"], variances["analog"], "lower"),
         row(

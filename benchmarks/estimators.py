@@ -90,7 +90,7 @@ def _rows(
     ours, other = variance(gated), variance(analog)
     time, other_time = seconds(gated), seconds(analog)
     # E[w^2] of a photon: 1 + cv^2 when all count, (1 + cv^2) / p when a share p does
-    one_in = [(1 + a) / (1 + g) for g, a in zip(ours, other)]
+    one_in = [(1 + a) / (1 + g) for g, a in zip(ours, other, strict=True)]
     need = [max(2.0, np.ceil(v / 1e-4)) for v in ours]
     lines = [
         row(case, "photons for one that counts", "", [1.0], one_in, "lower", expected),
@@ -116,8 +116,8 @@ def _rows(
             case,
             "variance x time of one photon",
             "ns",
-            [1e9 * v * t for v, t in zip(ours, time)],
-            [1e9 * v * t for v, t in zip(other, other_time)],
+            [1e9 * v * t for v, t in zip(ours, time, strict=True)],
+            [1e9 * v * t for v, t in zip(other, other_time, strict=True)],
             "lower",
             "ratio of efficiencies",
         ),

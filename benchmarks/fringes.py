@@ -94,7 +94,7 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780, samples: int 
             case,
             "time for 0.1 % noise",
             "s",
-            [s * (n / 1e-3) ** 2 for (s, _), n in zip(found["ours"], noise)],
+            [s * (n / 1e-3) ** 2 for (s, _), n in zip(found["ours"], noise, strict=True)],
             [s * (other_noise / 1e-3) ** 2 for s, _ in found["path"]],
             "lower",
             "extrapolated",

@@ -115,7 +115,7 @@ def rms_errors(pair: Pair, field: Field) -> tuple[float, float]:
     """Rms error of v everywhere and beyond two core radii, m/s."""
     place = [
         float(pair.first[name][0]) + (field.start + np.arange(n)) * SPACING
-        for name, n in zip(("z", "y"), field.dz.shape)
+        for name, n in zip(("z", "y"), field.dz.shape, strict=True)
     ]
     z, y = np.meshgrid(*place, indexing="ij")
     dz, dy = field.dz * SPACING, field.dy * SPACING

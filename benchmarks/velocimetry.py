@@ -187,7 +187,7 @@ def wind_errors(pair: Pair, ours: Field, other: Field) -> tuple[dict, int]:
     size = [min(int(f.start - first) + f.dz.shape[axis] for f in (ours, other)) for axis in (0, 1)]
     place = [
         float(pair.first[name][0]) + (first + np.arange(n)) * SPACING
-        for name, n in zip(("z", "y"), size)
+        for name, n in zip(("z", "y"), size, strict=True)
     ]
     z, y = np.meshgrid(*place, indexing="ij")
     errors = []

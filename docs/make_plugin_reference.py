@@ -90,7 +90,7 @@ def _closing_rule(lines: list[str], first: int) -> int:
 def _table(lines: list[str]) -> list[str]:
     """A simple table as a Markdown table; a row whose first cell is empty goes on the one above."""
     edges = [match.start() for match in re.finditer(r"=+", lines[0])]
-    spans = list(zip(edges, [*edges[1:], None]))
+    spans = list(zip(edges, [*edges[1:], None], strict=True))
     rows: list[list[str]] = []
     for line in lines[1:-1]:
         if _RULE.fullmatch(line):
@@ -101,7 +101,9 @@ def _table(lines: list[str]) -> list[str]:
         if cells[0]:
             rows.append(cells)
         else:
-            rows[-1] = [f"{above} {cell}".strip() for above, cell in zip(rows[-1], cells)]
+            rows[-1] = [
+                f"{above} {cell}".strip() for above, cell in zip(rows[-1], cells, strict=True)
+            ]
     body = [f"| {' | '.join(_inline(cell) for cell in row)} |" for row in rows]
     return [body[0], "|" + " --- |" * len(spans), *body[1:], ""]
 

@@ -90,6 +90,7 @@ def draw(truth, guess, found, path) -> None:
             f"as seen: error {error(guess, truth):.1%}",
             f"recovered: error {error(found, truth):.1%}",
         ),
+        strict=True,
     ):
         mesh = axes.pcolormesh(
             field["y"],

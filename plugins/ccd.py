@@ -65,7 +65,7 @@ def define():
                 number(props, NAME, "centre_x", (width - 1) / 2),
                 number(props, NAME, "centre_y", (height - 1) / 2),
             )
-            for axis, value in zip("xy", self.centre):
+            for axis, value in zip("xy", self.centre, strict=True):
                 if not np.isfinite(value):
                     fail(NAME, f"centre_{axis}", value, "a finite number")
             self.stop_radius = positive(props, NAME, "stop_radius", 5e-3)

@@ -280,7 +280,7 @@ def define():
                 bs.pdf = back[0] / (back[0] + through[0])
                 reflected = sample1 < bs.pdf
                 bs.pdf = dr.select(reflected, bs.pdf, 1 - bs.pdf)
-                elements = [dr.select(reflected, b, t) for b, t in zip(back, through)]
+                elements = [dr.select(reflected, b, t) for b, t in zip(back, through, strict=True)]
             else:
                 bs.pdf, reflected = mi.Float(1), mi.Bool(reflects)
                 elements = back if reflects else through

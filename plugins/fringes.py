@@ -123,7 +123,7 @@ def define():
                 square = dr.block_sum(deviation * deviation, paths)
                 means.append(dr.sqrt(square / (number * (number - 1))))
                 place = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
-                for channel, mean in zip(channels, means):
+                for channel, mean in zip(channels, means, strict=True):
                     dr.scatter(channel, mean, place)
                 self._tell(first + count, pixels, channels)
             return channels
@@ -155,7 +155,7 @@ def define():
                 stokes = _about_horizontal(stokes, direction)
                 column, row = (mi.UInt32(dr.clip(v + 0.5, 0, 2**31)) for v in (place.x, place.y))
                 pixel = row * width + column
-                for channel, value in zip(sums, (*stokes, stokes[0] * stokes[0])):
+                for channel, value in zip(sums, (*stokes, stokes[0] * stokes[0]), strict=True):
                     dr.scatter_reduce(dr.ReduceOp.Add, channel, value, pixel, arrives)
                 self._tell(first + count, total, sums)
             *stokes, squares = sums
@@ -227,7 +227,7 @@ def _reach(scene, sensor) -> float:
         return 1.0
     stop = sensor.world_transform() @ mi.Point3f(0)
     sphere = box.bounding_sphere()
-    offset = [a[0] - b for a, b in zip((stop.x, stop.y, stop.z), sphere.center)]
+    offset = [a[0] - b for a, b in zip((stop.x, stop.y, stop.z), sphere.center, strict=True)]
     return 1.1 * (sum(v * v for v in offset) ** 0.5 + float(sphere.radius)) + 1e-3
 
 

@@ -119,7 +119,9 @@ def define():
                     number, means, spreads = total
                     errors = _errors(_opaque(number), spreads)
                     values = [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:]]
-                    for value, place in zip(values, self._places(first * gates, count * gates)):
+                    for value, place in zip(
+                        values, self._places(first * gates, count * gates), strict=True
+                    ):
                         dr.scatter(image, value, place)
                     dr.eval(image)
                     total = None
@@ -130,7 +132,7 @@ def define():
             """Gradients of the scene from those of the image (of S0 to S3; S0_stderr has none)."""
             for means, places in self._differentiable(scene, sensor, seed, spp):
                 grads = [dr.gather(mi.Float, grad_in.array, place) for place in places]
-                dr.backward(sum(dr.sum(m * g) for m, g in zip(means, grads)))
+                dr.backward(sum(dr.sum(m * g) for m, g in zip(means, grads, strict=True)))
 
         def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
             """Gradients of the image (of S0 to S3) from those of the scene."""
@@ -140,7 +142,7 @@ def define():
             image = dr.zeros(mi.Float, shape[0] * shape[1] * shape[2])
             for means, places in self._differentiable(scene, sensor, seed, spp):
                 dr.forward_to(means)
-                for mean, place in zip(means, places):
+                for mean, place in zip(means, places, strict=True):
                     dr.scatter_reduce(dr.ReduceOp.Add, image, dr.grad(mean), place)
             return mi.TensorXf(image, shape)
 
@@ -234,7 +236,9 @@ def define():
             )
             dr.eval(stokes, by_order)
             means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
-            off = [s - dr.gather(mi.Float, m, cell) for s, m in zip(stokes[:2], means)]
+            off = [
+                s - dr.gather(mi.Float, m, cell) for s, m in zip(stokes[:2], means[:2], strict=True)
+            ]
             spreads = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
             return rounds, means + self._per_order(by_order, rounds), spreads
 
@@ -305,10 +309,11 @@ def _merge(first, second):
     n1, means1, spreads1 = first
     n2, means2, spreads2 = second
     share, weight = _opaque(n2 / (n1 + n2)), _opaque(n1 * n2 / (n1 + n2))
-    off = [b - a for a, b in zip(means1, means2)]
-    means = [a + o * share for a, o in zip(means1, off)]
+    off = [b - a for a, b in zip(means1, means2, strict=True)]
+    means = [a + o * share for a, o in zip(means1, off, strict=True)]
     spreads = [
-        a + b + off[i] * off[j] * weight for a, b, (i, j) in zip(spreads1, spreads2, PRODUCTS)
+        a + b + off[i] * off[j] * weight
+        for a, b, (i, j) in zip(spreads1, spreads2, PRODUCTS[: len(spreads1)], strict=True)
     ]
     return n1 + n2, means, spreads
 

@@ -66,7 +66,7 @@ class Air:
         if self.cubes is None:
             return self._trace(origin, direction, start, distance, medium, active)
         end, behind = mi.Float(distance), mi.MediumPtr(medium)
-        for (near, far), (_, _, interior, exterior) in zip(crossings, self.cubes):
+        for (near, far), (_, _, interior, exterior) in zip(crossings, self.cubes, strict=True):
             enters = near > start
             place = dr.select(enters, near, far)
             nearest = active & (place > start) & (place < end)

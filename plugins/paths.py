@@ -410,7 +410,7 @@ def _add(total, value, cell, active=True):
 def _deposit(sums, products, cell, held, active):
     """Add what photons have brought to their gates, and products of its components."""
     active = active & (held[0] != 0)
-    for total, value in zip(sums, held):
+    for total, value in zip(sums, held, strict=True):
         _add(total, value, cell, active)
     for (i, j), total in products.items():
         _add(total, held[i] * held[j], cell, active)
@@ -467,7 +467,7 @@ def _choose(rng, first, second):
 
 def _either(condition, yes, no):
     if isinstance(yes, list | tuple):
-        return [_either(condition, y, n) for y, n in zip(yes, no)]
+        return [_either(condition, y, n) for y, n in zip(yes, no, strict=True)]
     return dr.select(condition, yes, no)
 
 
@@ -476,7 +476,7 @@ def _apply(value, stokes, channel):
     if not mi.is_polarized:
         return [value[channel] * stokes[0]]
     matrix = [[value[row, column][channel] for column in range(4)] for row in range(4)]
-    scattered = [sum(m * s for m, s in zip(row, stokes)) for row in matrix]
+    scattered = [sum(m * s for m, s in zip(row, stokes, strict=True)) for row in matrix]
     # scalar phase functions answer with a multiple of the unit matrix in *any* pair of axes
     scalar = matrix[0][0]
     depolarises = (matrix[0][1] == 0) & (matrix[1][0] == 0)

@@ -124,7 +124,7 @@ def define():
             polarised = which < degree
             drawn = [
                 dr.select(polarised, s / max(degree, 1e-30), r)
-                for s, r in zip(self.stokes[1:], (state.x, state.y, state.z))
+                for s, r in zip(self.stokes[1:], (state.x, state.y, state.z), strict=True)
             ]
             return self._turned([mi.Float(1), *drawn], direction)
 

@@ -48,7 +48,7 @@ def equation(edges, extinction, depth, breaks=(), backscatter=RAYLEIGH):
     total = 0.0
     for begin, end in itertools.pairwise([-np.inf, *breaks, np.inf]):
         low, high = (np.clip(e, begin, end) for e in (edges[:-1], edges[1:]))
-        for node, weight in zip(*np.polynomial.legendre.leggauss(12)):
+        for node, weight in zip(*np.polynomial.legendre.leggauss(12), strict=True):
             r = (low + high) / 2 + (high - low) / 2 * node
             signal = AREA * backscatter * extinction(r) / r**2 * np.exp(-2 * depth(r))
             total = total + weight * (high - low) / 2 * signal
@@ -57,7 +57,7 @@ def equation(edges, extinction, depth, breaks=(), backscatter=RAYLEIGH):
 
 def layered(edges, steps, secant=1.0):
     """`equation` for layers across x, (start, extinction) each; all paths grow by ``secant``."""
-    starts, values = (np.array(v, float) for v in zip(*steps))
+    starts, values = (np.array(v, float) for v in zip(*steps, strict=True))
     depths = np.concatenate([[0], np.cumsum(np.diff(starts) * values[:-1])])
 
     def of(r):

@@ -169,7 +169,7 @@ def _draw_depolarisation(place, case, pictures, other):
             label="independent simulation, 2 sigma",
         )
         for (estimator, (_, i, q)), colour, shift in zip(
-            pictures.items(), (figures.OURS, figures.OTHER), (-0.7, 0.7)
+            pictures.items(), (figures.OURS, figures.OTHER), (-0.7, 0.7), strict=True
         ):
             got, own = mean_and_error(depolarisation(i, q))
             axis.errorbar(range_ + shift, got, 2 * own, fmt=".", color=colour, label=estimator)

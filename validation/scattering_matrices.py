@@ -130,7 +130,7 @@ def polydisperse(effective_radius):
     cosine = np.cos(np.radians(np.arange(0.0, 181.0, 10.0)))
     extinction = scattering = forward = 0.0
     elements = np.zeros((19, 6))
-    for r, w in zip(radius, weight):
+    for r, w in zip(radius, weight, strict=True):
         solved = scatrs.tmatrix.compute(
             2 * math.pi * r / 0.5, 1.53 + 0.008j, 2.0, rtol=1e-4, precision="auto"
         )
@@ -211,7 +211,7 @@ def published(effort):
 def _draw(place, ours, published_table):
     angle = published_table[:, 0]
     with figures.figure(place, (7, 4), 2, 3, sharex=True) as axes:
-        for k, (axis, element) in enumerate(zip(axes.ravel(), ELEMENTS)):
+        for k, (axis, element) in enumerate(zip(axes.ravel(), ELEMENTS, strict=True)):
             scale = (1, 1) if k == 0 else (ours[:, 0], published_table[:, 1])
             axis.plot(angle, ours[:, k] / scale[0], color=figures.OURS)
             axis.plot(angle, published_table[:, k + 1] / scale[1], ".", color=figures.REFERENCE)
@@ -241,7 +241,7 @@ def orientations(x, index, elongation, angle, order=24):
     cosine, weight = cosine[cosine > 0], weight[cosine > 0]
     turns = (np.arange(order) + 0.5) * 360 / order
     elements, forward = np.zeros((len(angle), 6)), 0.0
-    for c, w in zip(cosine, weight):
+    for c, w in zip(cosine, weight, strict=True):
         beta = math.degrees(math.acos(c))
         for k, scattered in enumerate(angle):
             s = np.array(
@@ -275,6 +275,7 @@ def prolate(effort):
             ("Z11", "Z22", "Z33", "Z44", "Z12", "Z34"),
             (650.3172, 631.6323, 635.2768, 643.1738, -17.9846, -34.7730),
             z,
+            strict=True,
         )
     ]
     witness = "rustmatrix, quadrature over orientations"

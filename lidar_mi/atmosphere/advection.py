@@ -138,7 +138,7 @@ def advect(
     moved = np.stack(
         [
             _sampler(piece)(_departures(speed, dt, int(steps)))
-            for piece, *speed in zip(pieces, *speeds)
+            for piece, *speed in zip(pieces, *speeds, strict=True)
         ]
     )
     if pieces.min() >= 0:

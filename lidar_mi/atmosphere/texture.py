@@ -57,7 +57,7 @@ def gaussian_field(
     d = len(shape)
     noise = np.random.Generator(np.random.PCG64(seed)).standard_normal(shape)
     spectrum = rfftn(noise, overwrite_x=True)
-    frequencies = [fftfreq(n, s) for n, s in zip(shape[:-1], spacing[:-1])]
+    frequencies = [fftfreq(n, s) for n, s in zip(shape[:-1], spacing[:-1], strict=True)]
     frequencies.append(rfftfreq(shape[-1], spacing[-1]))
     k2 = sum(f**2 for f in np.meshgrid(*frequencies, indexing="ij", sparse=True))
     # Frequencies in cycles per metre: the common 2 pi drops out of the shape.

@@ -174,7 +174,9 @@ def isotropic_turbulence(x, y, z, outer_scale: float, seed: int) -> np.ndarray:
     axes = (x, y, z)
     step = [float(axis[1] - axis[0]) for axis in axes]
     shape = [len(axis) + 2 for axis in axes]
-    period = [next_fast_len(n + math.ceil(outer_scale / h)) for n, h in zip(shape, step)]
+    period = [
+        next_fast_len(n + math.ceil(outer_scale / h)) for n, h in zip(shape, step, strict=True)
+    ]
     cut = tuple(slice(n) for n in shape)
     potential = [
         gaussian_field(tuple(period), tuple(step), outer_scale, part, slope=11 / 3)[cut]
@@ -239,7 +241,7 @@ def turbine_flow(
     return xr.Dataset(
         {
             name: (tuple(axes), field, {"units": "m s-1", "long_name": titles[name]})
-            for name, field in zip(titles, flow)
+            for name, field in zip(titles, flow, strict=True)
         },
         coords={name: (name, nodes, {"units": "m"}) for name, nodes in axes.items()},
     )

@@ -204,7 +204,7 @@ def _check_values(values, axes, name, path, may_be_negative):
         count = int(bad.sum())
         if count:
             first = np.unravel_index(int(bad.argmax()), bad.shape)
-            place = ", ".join(f"{d} = {axes[d][i]:g} m" for d, i in zip("xyz", first))
+            place = ", ".join(f"{d} = {axes[d][i]:g} m" for d, i in zip("xyz", first, strict=True))
             raise InputError(
                 f"{path}: variable {name!r} is {fault} at {count} of {values.size} places, the "
                 f"first at {place}; allowed: nowhere"

@@ -59,7 +59,7 @@ def test_volumes_turn_about_any_axis():
     x, y, z = np.meshgrid(*axes, indexing="ij")
 
     def volume(values):
-        return xr.DataArray(values + 0 * x, dict(zip("xyz", axes)), ("x", "y", "z"))
+        return xr.DataArray(values + 0 * x, dict(zip("xyz", axes, strict=True)), ("x", "y", "z"))
 
     def blob(x, y, z):
         return np.exp(-((x - 2) ** 2 + y**2 + (z + 1) ** 2) / (2 * 1.8**2))

@@ -471,7 +471,7 @@ OPAC = {
 def test_indices_are_the_published_ones(name, wavelength):
     """Between OPAC's wavelengths linearly: real parts to 0.02 (dust falls between 1 and 1.25 um, where
     its place is not known better), imaginary ones to 10 %, of salt to 1e-5."""
-    micrometres, real, imaginary = zip(*OPAC[name])
+    micrometres, real, imaginary = zip(*OPAC[name], strict=True)
     m = AEROSOLS[name].refractive_index(wavelength)
     assert m.real == pytest.approx(np.interp(wavelength * 1e6, micrometres, real), abs=0.02)
     expected = np.interp(wavelength * 1e6, micrometres, imaginary)

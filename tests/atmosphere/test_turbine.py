@@ -114,7 +114,9 @@ def test_turbulence_has_no_divergence_and_unit_strength():
     assert gusts.shape == (3, 24, 40, 30)
     steps = (1.0, 0.5, 0.8)
     inner = (slice(2, -2),) * 3
-    parts = [np.gradient(g, h, axis=k)[inner] for k, (g, h) in enumerate(zip(gusts, steps))]
+    parts = [
+        np.gradient(g, h, axis=k)[inner] for k, (g, h) in enumerate(zip(gusts, steps, strict=True))
+    ]
     assert abs(sum(parts)).max() < 1e-9 * max(abs(part).max() for part in parts)
     assert (gusts**2).mean() == pytest.approx(1)
     assert_allclose(gusts.mean((1, 2, 3)), 0, atol=1e-12)

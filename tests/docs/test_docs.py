@@ -163,9 +163,10 @@ def test_key_has_the_documented_unit_default_and_limits(name, model, field):
 def _value(name, model, *given):
     """A key's value in a valid experiment that gives it, or else leaves it to its default."""
     *parents, key = name.split(".")
+    changes = {key: given[0]} if given else {}
     if model in OPTIONAL:
         whole = {"phase": "rayleigh", "share": 1.0} if model is schema.Part else {}
-        return getattr(model.model_validate(whole | dict(zip([key], given))), key)
+        return getattr(model.model_validate(whole | changes), key)
     data = copy.deepcopy(BASE)
     if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors
         data |= {"doppler": {}, "retrieval": {"methods": ["variational"]}}
@@ -177,7 +178,7 @@ def _value(name, model, *given):
         section = section.setdefault(parent, {})
     if name in ("wake.file", "wake.time"):  # without them this experiment is none
         return given[0] if given else model.model_fields[key].default
-    section |= zip([key], given)
+    section |= changes
     found = reading.check(data, "base")
     for part in name.split("."):
         found = getattr(found, part)

@@ -160,7 +160,7 @@ def test_a_vortex_by_random_points():
     found = np.einsum("lp,lpc->lc", weights, wind_at(wind, points))
 
     random = np.random.default_rng(5)
-    for line, middle, mean in zip(lines, ranges, found):
+    for line, middle, mean in zip(lines, ranges, found, strict=True):
         r = middle + random.uniform(-5, 5, 40_000)
         r = r + random.standard_normal(len(r)) * constants.c / 2 * 10e-9 / math.sqrt(
             8 * math.log(2)

@@ -78,7 +78,7 @@ def test_is_the_sum_of_round_trips(reflectivity, absorption):
     for sine, offset in ((SINE, 0.0), (0.003, OFFSET)):
         delta = phase(np.sqrt(as_float32(np.square(sine))), as_float32(offset))
         expected = round_trips(np.atleast_1d(delta), reflectivity, absorption)
-        for matrix, value in zip(elements(bsdf, sine, offset), expected):
+        for matrix, value in zip(elements(bsdf, sine, offset), expected, strict=True):
             # 2e-6 orders times the steepest slope of the transmission
             np.testing.assert_allclose(matrix[0], value, atol=4e-6 / (1 - reflectivity) ** 2)
             assert (matrix[1] == 0).all() and (matrix[3] == 0).all()
@@ -203,7 +203,7 @@ def test_folded_is_the_mean_of_sampled(kind):
         per_order = LIGHT / (2 * GAP)
         rms = 2 * 5e-9 / WAVELENGTH * per_order
         offset = o + np.hypot(s, rms) * x + 2 * 80 / WAVELENGTH
-        for b, sb in zip(bow, share / 2):
+        for b, sb in zip(bow, share / 2, strict=True):
             order = 2 * 20e-9 / WAVELENGTH * b / 2
             found = elements(single, sine[:, None], offset, order)
             expected += w * sb * (np.array(found) @ weight)

@@ -25,7 +25,7 @@ LINE = {
     "type": "spectral_line",
     **{
         name: ", ".join(map(repr, column))
-        for name, column in zip(("weights", "offsets", "sigmas"), GAUSSIANS.T.tolist())
+        for name, column in zip(("weights", "offsets", "sigmas"), GAUSSIANS.T.tolist(), strict=True)
     },
 }
 ETALON = {"type": "etalon", "gap": 13.7e-3, "order_fraction": 0.5, "surface_rms": 2e-9}
@@ -106,7 +106,7 @@ def _curve(cosine, v_los, reflectivity):
     level = (1 - reflectivity) ** 2 / (1 - reflectivity**2)
     result = np.full(np.shape(cosine), level)
     order = (ORDER + 2 * v_los / WAVELENGTH / SPECTRAL_RANGE) * cosine
-    for k, c in zip(n, coefficients):
+    for k, c in zip(n, coefficients, strict=True):
         if abs(c) > 1e-9:
             result += 2 * level * np.real(c * np.exp(2j * np.pi * k * order))
     return result
@@ -118,7 +118,10 @@ def rings(
     """Share of the source's energy on each pixel: its solid angle, and what the etalon lets pass."""
     points, weights = np.polynomial.legendre.leggauss(nodes)
     centre = centre or ((size[0] - 1) / 2, (size[1] - 1) / 2)
-    x, y = ((np.arange(n)[:, None] + points / 2 - c).ravel() * pixel for n, c in zip(size, centre))
+    x, y = (
+        (np.arange(n)[:, None] + points / 2 - c).ravel() * pixel
+        for n, c in zip(size, centre, strict=True)
+    )
     tan2 = (y[:, None] ** 2 + x**2) / FOCAL**2
     cosine = 1 / np.sqrt(1 + tan2)
     light = transmission(tan2, v_los, **more) * cosine**4 * np.exp(-2 * tan2 / radius**2)
@@ -286,7 +289,7 @@ def test_two_etalons_see_the_same_frequency(estimator, statistics):
     share = share / share.sum()
     expected = np.zeros(cosine.shape)
     for weight, offset, sigma in GAUSSIANS:
-        for z, s in zip(node, share):
+        for z, s in zip(node, share, strict=True):
             order = ORDER * cosine + (offset + sigma * z) / SPECTRAL_RANGE
             both = np.ones(cosine.shape)
             for reflectivity in (0.7, 0.4):
@@ -464,7 +467,7 @@ def test_lens_is_followed_to_a_thousandth_of_a_pixel():
         place, arrives = sensor.receive(
             mi.Point3f(*(mi.Float(v) for v in point)), mi.Vector3f(*(mi.Float(v) for v in way))
         )
-        expected = np.array([snell(h, s) for h, s in zip(heights, slopes)]) / 7.4e-6
+        expected = np.array([snell(h, s) for h, s in zip(heights, slopes, strict=True)]) / 7.4e-6
         found = np.array(getattr(place, axis), float) - (479.5 if axis == "x" else 389.5)
         # right is -y and down is -z of the scene; the picture is upright
         np.testing.assert_allclose(found, -expected, atol=2e-3)

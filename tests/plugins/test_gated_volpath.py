@@ -222,7 +222,7 @@ class TestPasses:
         calls = []
         scene.integrator().progress = lambda done, total: calls.append((done, total))
         mi.render(scene, spp=100)
-        done, total = zip(*calls)
+        done, total = zip(*calls, strict=True)
         assert set(total) == {1500} and done == (300, 600, 900, 1200, 1500)
 
     @pytest.mark.slow

@@ -41,7 +41,7 @@ def lidar_equation(edges, extinction, depth, breaks=()):
     total = 0.0
     for begin, end in itertools.pairwise([-np.inf, *breaks, np.inf]):
         low, high = (np.clip(e, begin, end) for e in (edges[:-1], edges[1:]))
-        for node, weight in zip(*np.polynomial.legendre.leggauss(12)):
+        for node, weight in zip(*np.polynomial.legendre.leggauss(12), strict=True):
             r = (low + high) / 2 + (high - low) / 2 * node
             part = AREA * RAYLEIGH_BACKSCATTER * extinction(r) / r**2 * np.exp(-2 * depth(r))
             total = total + weight * (high - low) / 2 * part
@@ -53,7 +53,7 @@ def layered_signal(edges, secant, steps):
 
     ``secant`` is 1 / cos of the angle between each beam and x: all paths grow by it.
     """
-    starts, values = (np.array(v, float) for v in zip(*steps))
+    starts, values = (np.array(v, float) for v in zip(*steps, strict=True))
     depths = np.concatenate([[0], np.cumsum(np.diff(starts) * values[:-1])])
 
     def layer(r):

@@ -51,7 +51,7 @@ CASES = {
 def reference(case, rounds=3):
     """Means and standard errors of S0, S1, S2, from a million photons a round, seed 2."""
     rng = np.random.default_rng(2)
-    means, errors = zip(*(one_round(case, rng, 1_000_000) for _ in range(rounds)))
+    means, errors = zip(*(one_round(case, rng, 1_000_000) for _ in range(rounds)), strict=True)
     return np.mean(means, 0), np.linalg.norm(errors, axis=0) / rounds
 
 

@@ -110,7 +110,7 @@ def test_stokes_vectors_are_those_of_radiating_dipoles(optics, depolarization):
     field = optics.jones(rng, incident)
     tensors, weights = uniaxial_dipoles(depolarization)
     expected = 0
-    for tensor, weight in zip(tensors, weights):
+    for tensor, weight in zip(tensors, weights, strict=True):
         radiated = np.cross(scattered, np.cross(scattered, field @ tensor))
         expected = expected + weight * optics.stokes(radiated, *optics.axes(scattered))
     matrix, _ = optics.evaluate(phase(depolarization), incident, scattered)

@@ -132,7 +132,9 @@ class TestHomogeneousSlab:
         """Both scans, 30 441 beams: 0.2 % flat in planar gates, and as the closed form says."""
         plans = plan_scans(Scan(gates=gates), Y, Z, (0.0, 15.0))
         solid = extrude(plane(self.SIGMA), plans[0], BackscatterLidar())
-        for plan, scan in zip(plans, render([solid, solid], plans, samples_per_beam=128)):
+        for plan, scan in zip(
+            plans, render([solid, solid], plans, samples_per_beam=128), strict=True
+        ):
             ratio = scan["Y"].values.astype(float) / self.expected(plan, solid, scan)
             sigma = ratio.std()  # of one beam
             assert abs(ratio.mean() - 1) < 4 * sigma / math.sqrt(ratio.size) + 1e-4

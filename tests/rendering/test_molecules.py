@@ -59,7 +59,7 @@ def test_backscatter_is_the_sum_of_both():
     ]
     per = [aerosol_table("spheroids", WAVELENGTH), molecular_table(WAVELENGTH, band="cabannes")]
     found = scans(fields, RenderSettings(samples_per_beam=256, max_order=1))
-    for scan, value in zip(found, extinctions):
+    for scan, value in zip(found, extinctions, strict=True):
         beta = (
             value * per[0].backscatter_per_extinction
             + MOLECULES * per[1].backscatter_per_extinction
@@ -78,7 +78,9 @@ def test_light_is_depolarised_by_particles_alone():
     )
     scan = scans([field, field], RenderSettings(samples_per_beam=256, max_order=1))[0].isel(gate=0)
     tables = aerosol_table("spheroids", WAVELENGTH), molecular_table(WAVELENGTH, band="cabannes")
-    betas = [e * t.backscatter_per_extinction for e, t in zip((5e-4, MOLECULES), tables)]
+    betas = [
+        e * t.backscatter_per_extinction for e, t in zip((5e-4, MOLECULES), tables, strict=True)
+    ]
     kept = [(1 - t.depolarization_ratio) / (1 + t.depolarization_ratio) for t in tables]
     expected = np.dot(betas, kept) / sum(betas)
     assert float(scan["S1"].sum() / scan["S0"].sum()) == pytest.approx(expected, rel=3e-3)
@@ -101,7 +103,7 @@ def experiment(**extinction):
 def test_molecules_have_no_texture():
     """They raise the extinction everywhere alike, at both times."""
     with_them, without = (make_truth(experiment(molecules=m)) for m in (7e-5, 0))
-    for one, other in zip(with_them.extinction, without.extinction):
+    for one, other in zip(with_them.extinction, without.extinction, strict=True):
         np.testing.assert_allclose(one - other, 7e-5, rtol=1e-9)
     assert float(without.extinction[0].std()) > 5e-6
 

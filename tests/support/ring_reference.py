@@ -30,7 +30,7 @@ def profile(sigma, count=2**14):
     order = np.linspace(0, 1, count + 1)
     finesse = 4 * REFLECTIVITY / (1 - REFLECTIVITY) ** 2
     total = np.zeros_like(order)
-    for o, w in zip(offset, weight):
+    for o, w in zip(offset, weight, strict=True):
         total += w / (1 + finesse * np.sin(np.pi * (order + o * width)) ** 2)
     return order, total
 
