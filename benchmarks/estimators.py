@@ -59,12 +59,13 @@ def compare(repeats: int = 5, photons: int = 64, columns: int = 219, rows: int =
         "analog",
         tuple(lines),
         (
-            "Photons for one that counts: that scatters in the gate. Times: whole calls, all beams.",
+            "Photons for one that counts: that scatters in the gate. Times: whole calls, all "
+            "beams.",
             (
-                "Relative variance: of one photon's weight, over the squared mean, beam by beam. Its "
-                "ratio is how many times more photons the analog estimator needs. It exceeds 1 / tau "
-                "because gated photons all count and weigh nearly the same; in the wake, texture "
-                "within a beam makes them differ more."
+                "Relative variance: of one photon's weight, over the squared mean, beam by beam. "
+                "Its ratio is how many times more photons the analog estimator needs. It exceeds "
+                "1 / tau because gated photons all count and weigh nearly the same; in the wake, "
+                "texture within a beam makes them differ more."
             ),
         ),
     )

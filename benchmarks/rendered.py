@@ -96,10 +96,11 @@ def compare(
         (
             f"Rms error of v, mean over {repeats} textures, no vector left out; default settings.",
             (
-                f"Remark: by how many per cent the mean square error of v falls without a cause, "
-                f"everywhere / beyond 2 core radii: the detector's noise; the simulation's "
-                f"({samples} photons a beam); the beam's width; averaging over the window; shear within it; curved "
-                "paths in the time step; the method on perfect pictures. They need not add up."
+                "Remark: by how many per cent the mean square error of v falls without a cause, "
+                "everywhere / beyond 2 core radii: the detector's noise; the simulation's "
+                f"({samples} photons a beam); the beam's width; averaging over the window; shear "
+                "within it; curved paths in the time step; the method on perfect pictures. They "
+                "need not add up."
             ),
         ),
     )

@@ -89,8 +89,9 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780) -> Comparison
         ),
         (
             (
-                f"{PHOTONS:g} photons and {noise.read_noise:.2g} electrons of read noise a picture; "
-                "the 2-D fit starts from the annular one, scipy's from 5 m/s and 1 px beside the truth."
+                f"{PHOTONS:g} photons and {noise.read_noise:.2g} electrons of read noise a "
+                "picture; the 2-D fit starts from the annular one, scipy's from 5 m/s and 1 px "
+                "beside the truth."
             ),
         ),
     )

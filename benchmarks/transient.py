@@ -57,15 +57,16 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139, samples: int 
         tuple(lines),
         (
             (
-                f"Same air, gate ({GATE[0]:g} to {GATE[1]:g} m), phase function, {VARIANT}; processes "
-                "of their own take turns. What differs: lidar-mi has a laser of 2 mrad and a telescope "
-                "of 0.5 m radius in a field of view of 5 mrad; mitransient a point emitter and a "
-                "pinhole at the same place, a pixel being the field of view (10 mrad for the single "
-                "beam, 1 mrad in the scan), so no ray of its misses the light."
+                f"Same air, gate ({GATE[0]:g} to {GATE[1]:g} m), phase function, {VARIANT}; "
+                "processes of their own take turns. What differs: lidar-mi has a laser of 2 mrad "
+                "and a telescope of 0.5 m radius in a field of view of 5 mrad; mitransient a "
+                "point emitter and a pinhole at the same place, a pixel being the field of view "
+                "(10 mrad for the single beam, 1 mrad in the scan), so no ray of its misses the "
+                "light."
             ),
             (
-                "Scan: lidar-mi renders all beams at once as a lidar; mitransient renders all pixels "
-                "at once as a flash lidar, which equals a scan for single scattering only."
+                "Scan: lidar-mi renders all beams at once as a lidar; mitransient renders all "
+                "pixels at once as a flash lidar, which equals a scan for single scattering only."
             ),
             (
                 "mitransient times are scaled linearly from renders of "
@@ -73,9 +74,10 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139, samples: int 
                 "needs more."
             ),
             (
-                "mitransient fills all its time bins with one render: for a profile of G gates divide "
-                "the ratios by G. Homogeneous air only: its time of flight is wrong in heterogeneous "
-                "media. There a gated photon of lidar-mi varies more, see the estimators."
+                "mitransient fills all its time bins with one render: for a profile of G gates "
+                "divide the ratios by G. Homogeneous air only: its time of flight is wrong in "
+                "heterogeneous media. There a gated photon of lidar-mi varies more, see the "
+                "estimators."
             ),
         ),
     )

@@ -115,18 +115,20 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
         (
             (
                 f"Vortex pair of {CIRCULATION:g} m2/s, {SEPARATION:g} m apart, core radius "
-                f"{CORE_RADIUS:g} m; {SPACING:g} m pixels, {DT:g} s; texture with {CORRELATION_LENGTH:g} "
-                f"px correlation length and {CONTRAST:.0%} contrast, no noise; one vector a pixel."
+                f"{CORE_RADIUS:g} m; {SPACING:g} m pixels, {DT:g} s; texture with "
+                f"{CORRELATION_LENGTH:g} px correlation length and {CONTRAST:.0%} contrast, no "
+                "noise; one vector a pixel."
             ),
             (
-                "lidar-mi's time includes its quality flags, which OpenPIV's one-pass times do not; it "
-                "computes on all cores, OpenPIV on one."
+                "lidar-mi's time includes its quality flags, which OpenPIV's one-pass times do "
+                "not; it computes on all cores, OpenPIV on one."
             ),
             "Flagged vectors take part: rms over all that both sides return.",
             (
-                "extended search and one pass: extended_search_area_piv with normalised correlation, "
-                "Gaussian sub-pixel fit, vectorised. Window deformation: windef.simple_multipass, "
-                "default correlation, windows as named, the last at one vector a pixel."
+                "extended search and one pass: extended_search_area_piv with normalised "
+                "correlation, Gaussian sub-pixel fit, vectorised. Window deformation: "
+                "windef.simple_multipass, default correlation, windows as named, the last at one "
+                "vector a pixel."
             ),
         ),
     )

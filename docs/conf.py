@@ -58,4 +58,5 @@ def _styled(found):
 
 
 def setup(app):
+    """Formulas of the pages in MathML."""
     app.add_html_math_renderer("mathml", (_inline, None), (_block, None))

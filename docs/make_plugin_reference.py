@@ -1,4 +1,6 @@
-"""Write docs/plugins.md from the plugin modules' docstrings: ``python docs/make_plugin_reference.py``.
+"""Write docs/plugins.md from the docstrings of the plugins.
+
+Usage: ``python docs/make_plugin_reference.py``.
 
 The docstrings are reStructuredText as Mitsuba's own plugins have them. Of that language this knows
 what they use: a label, a title, paragraphs, simple tables and code blocks, with literals and

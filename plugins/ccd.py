@@ -8,21 +8,21 @@ A camera focused at infinity: parallel light through a round stop is focused to 
 The lens is part of the camera. Rays are traced through it in its own coordinates, surface by
 surface, which avoids the displacement of ray origins at Mitsuba shapes (1e-4 m, some m/s of wind).
 
-============================ ========== ==================================================== =======
-Parameter                    Type       Meaning                                              Default
-============================ ========== ==================================================== =======
-``focal_length``             float      m                                                    0.3
-``pixel``                    float      side of a square pixel, m                            7.4e-6
-``centre_x, centre_y``       float      where the optical axis meets the CCD, px right and   middle
-                                        down from the centre of the top left pixel
-``stop_radius``              float      m                                                    5e-3
-``lens``                     string,    ``ideal``: light at an angle goes to r = f tan       ideal
-                             tensor     (angle), from everywhere on the stop; or N x 4
-                                        numbers, row by row, or the name of a file of them
-                                        (``.npy``, text with ``#`` comments): a real lens
-``to_world``                 transform  of the camera's frame: stop at the origin, x to the  identity
-                                        scene, y to the left, z up
-============================ ========== ==================================================== =======
+=========================== ========== ==================================================== =======
+Parameter                   Type       Meaning                                              Default
+=========================== ========== ==================================================== =======
+``focal_length``            float      m                                                    0.3
+``pixel``                   float      side of a square pixel, m                            7.4e-6
+``centre_x, centre_y``      float      where the optical axis meets the CCD, px right and   middle
+                                       down from the centre of the top left pixel
+``stop_radius``             float      m                                                    5e-3
+``lens``                    string,    ``ideal``: light at an angle goes to r = f tan       ideal
+                            tensor     (angle), from everywhere on the stop; or N x 4
+                                       numbers, row by row, or the name of a file of them
+                                       (``.npy``, text with ``#`` comments): a real lens
+``to_world``                transform  of the camera's frame: stop at the origin, x to the  identity
+                                       scene, y to the left, z up
+=========================== ========== ==================================================== =======
 
 The image is upright: its top is z up, its left is y. A lens has a row for each surface along the
 light path, the stop first: radius of curvature (m; positive: the centre is on the side of the CCD;
@@ -55,6 +55,8 @@ NAME, KIND = "ccd", "sensor"
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class Ccd(mi.Sensor):
         def __init__(self, props):
             super().__init__(props)
@@ -144,7 +146,7 @@ def define():
             return self.m_pose @ point, self.m_pose @ direction, weight
 
         def _exit_radius(self) -> float:
-            """Radius of the light's cross-section in the last surface's tangent plane, all pixels."""
+            """Radius of the light's cross-section in the tangent plane of the last surface."""
             width, height = self.film().size()
             corner = np.abs(np.array([[0, 0], [width, height]]) - 0.5 - self.centre).max(0)
             field = np.hypot(*corner) * self.pixel / self.focal_length

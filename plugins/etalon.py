@@ -76,6 +76,8 @@ LEAST_PASSED = 1e-6
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class Etalon(mi.BSDF):
         def __init__(self, props):
             super().__init__(props)
@@ -143,7 +145,7 @@ def define():
             self.m_order = dr.opaque(mi.Float, self.order)
             self.m_orders_per_hertz = dr.opaque(mi.Float, per_hertz)
             self.m_reflectivity = dr.opaque(mi.Float, self.reflectivity)
-            # amplitude that a mirror's absorption leaves of what it transmits, twice
+            # factor of the transmitted amplitude by absorption, for two mirrors
             self.m_left = dr.opaque(mi.Float, 1 - self.absorption / passed)
             self.m_defect_order = 2 * self.index / self.wavelength
             self.m_rms = dr.opaque(mi.Float, self.surface_rms * self.m_defect_order)
@@ -172,14 +174,16 @@ def define():
                 return _stack(layers, self.index, self.plate_index, np)
 
         def _mirrors(self, sine2):
-            """Per polarisation: reflection seen from the gap, passage of both mirrors, reflection
-            seen from outside; amplitudes of the transverse field at an outer angle's sine squared.
+            """Amplitudes of the mirrors for s and p, at an outer angle's sine squared.
+
+            Of the transverse field: reflection on the side of the gap, transmission through both
+            mirrors, reflection on the outer side.
             """
             if not self.coating:
                 amplitude = dr.sqrt(self.m_reflectivity)
                 passed = (1 - self.m_reflectivity) * self.m_left
                 return [tuple(mi.Complex2f(a, 0) for a in (-amplitude, passed, amplitude))]
-            found = []
+            amplitudes = []
             for polarisation in "sp":
                 layers = []
                 for n, thickness in self.coating:
@@ -192,13 +196,13 @@ def define():
                     for index in (self.index, self.plate_index)
                 ]
                 inside, passed, outside = _stack(layers, *ends, dr)
-                found.append((inside, passed * self.m_left, outside))
-            return found
+                amplitudes.append((inside, passed * self.m_left, outside))
+            return amplitudes
 
         # --- light
 
         def order_of(self, sine2, offset):
-            """Phase order less a whole number, at an outer angle's sine squared and an offset (Hz)."""
+            """Fractional phase order at an outer angle's sine squared and an offset (Hz)."""
             sine2 = sine2 / self.index**2
             cosine = dr.sqrt(1 - sine2)
             # order (1 - cosine), without the difference of two large numbers
@@ -330,7 +334,7 @@ def define():
             return mi.Spectrum(0), mi.Float(0)
 
         def description(self) -> dict:
-            """What a picture's header says of it; the order in two parts, exact in float32."""
+            """Entries of an image's header; the order in two parts, exact in float32."""
             return {
                 "gap": self.gap,
                 "gap_index": self.index,
@@ -403,7 +407,7 @@ def _stack(layers, gap, plate, xp):
     Returns
     -------
     tuple
-        Reflection seen from the gap, product of the transmissions both ways, reflection seen from
+        Reflection on the side of the gap, product of the transmissions both ways, reflection from
         the plate, for the transverse electric field and exp(-i omega t).
     """
     number = mi.Complex2f if xp is dr else complex

@@ -51,6 +51,8 @@ STOKES = ("S0", "S1", "S2", "S3")
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class Fringes(mi.CppADIntegrator):
         def __init__(self, props):
             super().__init__(props)
@@ -125,11 +127,11 @@ def define():
                 place = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
                 for channel, mean in zip(channels, means, strict=True):
                     dr.scatter(channel, mean, place)
-                self._tell(first + count, pixels, channels)
+                self._report(first + count, pixels, channels)
             return channels
 
         def _forward(self, scene, source, sensor, seed, paths, pixels):
-            """Light sorted into the pixels where it arrives."""
+            """Light accumulated in the pixels where it arrives."""
             total = paths * pixels
             sums = [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
             context = mi.BSDFContext(mi.TransportMode.Importance)
@@ -157,15 +159,15 @@ def define():
                 pixel = row * width + column
                 for channel, value in zip(sums, (*stokes, stokes[0] * stokes[0]), strict=True):
                     dr.scatter_reduce(dr.ReduceOp.Add, channel, value, pixel, arrives)
-                self._tell(first + count, total, sums)
+                self._report(first + count, total, sums)
             *stokes, squares = sums
-            # the photons' share of all energy; those drawn stand for a little more than is sent
-            share = drawn / source.flux() * dr.opaque(mi.Float, 1 / total)
+            # energy per photon; the sampled flux is a little larger than the emitted one
+            energy = drawn / source.flux() * dr.opaque(mi.Float, 1 / total)
             mean = dr.square(stokes[0]) * dr.opaque(mi.Float, 1 / total)
             variance = dr.maximum(squares - mean, 0)
-            return [*(s * share for s in stokes), dr.sqrt(variance) * share]
+            return [*(s * energy for s in stokes), dr.sqrt(variance) * energy]
 
-        def _tell(self, done, total, values):
+        def _report(self, done, total, values):
             dr.eval(values)
             if self.progress:
                 dr.sync_thread()
@@ -179,7 +181,7 @@ def define():
 
 @dr.syntax
 def _surfaces(scene, ray, rng, context, active):
-    """What all surfaces along a line do to light of the source, as one matrix.
+    """Mueller matrix of all surfaces along a line, for light of the source.
 
     From the source's axes to those of the light that arrives, both Mitsuba's own; a single factor
     in unpolarised variants. ``context`` says whether the line is followed with the light.
@@ -221,7 +223,7 @@ def _about_horizontal(stokes, direction):
 
 
 def _reach(scene, sensor) -> float:
-    """A distance from the stop beyond which there is nothing, m."""
+    """A distance from the stop beyond which there are no surfaces, m."""
     box = scene.bbox()
     if not box.valid():
         return 1.0
@@ -232,7 +234,7 @@ def _reach(scene, sensor) -> float:
 
 
 def _check_straight(scene):
-    """Surfaces that bend light would be passed over: that is a mistake of the scene."""
+    """Surfaces that refract light would be ignored: that is an error of the scene."""
     kinds = mi.BSDFFlags
     bending = kinds.DiffuseTransmission | kinds.GlossyTransmission | kinds.DeltaTransmission
     for shape in scene.shapes():

@@ -70,6 +70,8 @@ PRODUCTS = ((0, 0), (1, 1), (0, 1))
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class GatedVolpath(mi.CppADIntegrator):
         def __init__(self, props):
             super().__init__(props)
@@ -78,14 +80,14 @@ def define():
             self.orders = bool(props.get("orders", False))
             self.covariance = bool(props.get("covariance", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
-            # called with (photons done, photons in all) after every pass, when set
+            # called with (samples done, samples in all) after every pass, when set
             self.progress = None
 
         def aov_names(self):
             return []
 
         def quantities(self) -> list[str]:
-            """What is rendered of every gate."""
+            """Quantities that are rendered for every gate."""
             orders = range(1, self.max_order + 1) if self.orders else ()
             more = ("S1_stderr", "S0_S1_correlation") if self.covariance else ()
             return [*STOKES, "S0_stderr", *(f"order{order}.S0" for order in orders), *more]
@@ -99,21 +101,21 @@ def define():
             ]
 
         def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-            sensor, seed, photons = self._prepare(scene, sensor, seed, spp)
+            sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates, beams = sensor.gate_count, sensor.beam_count
             quantities = len(self.quantities())
             image = dr.zeros(mi.Float, beams * gates * quantities)
             trace = self._gated if self.estimator == "gated" else self._analog
             done, total = 0, None
             with dr.suspend_grad(), _nothing_freed():
-                for first, count, start, now, complete in self._passes(sensor, photons):
+                for first, count, start, now, complete in self._passes(sensor, samples):
                     part = trace(scene, sensor, seed, first, count, start, now)
                     total = part if total is None else _merge(total, part)
                     done += count * now * self._unit(sensor)
                     if self.progress:
                         dr.eval(total[1:])
                         dr.sync_thread()
-                        self.progress(done, beams * photons)
+                        self.progress(done, beams * samples)
                     if not complete:
                         continue
                     number, means, spreads = total
@@ -147,7 +149,7 @@ def define():
             return mi.TensorXf(image, shape)
 
         def _differentiable(self, scene, sensor, seed, spp):
-            """Means of passes, attached to the scene's parameters, and their places in the image."""
+            """Means of passes, differentiable in the parameters, and their image indices."""
             if self.estimator != "gated" or self.max_order > 1:
                 fail(
                     NAME,
@@ -155,46 +157,46 @@ def define():
                     f"{self.estimator}, max_order {self.max_order}",
                     "the gated estimator with max_order 1",
                 )
-            sensor, seed, photons = self._prepare(scene, sensor, seed, spp)
+            sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates = sensor.gate_count
-            for first, count, start, now, _ in self._passes(sensor, photons):
+            for first, count, start, now, _ in self._passes(sensor, samples):
                 with dr.resume_grad():
                     _, means, _ = self._gated(
                         scene, sensor, seed, first, count, start, now, differentiable=True
                     )
-                    share = now * gates / photons
-                    means = [m * share for m in means[: len(STOKES)]]
+                    fraction = now * gates / samples
+                    means = [m * fraction for m in means[: len(STOKES)]]
                     yield means, self._places(first * gates, count * gates)[: len(STOKES)]
 
         def _prepare(self, scene, sensor, seed, spp):
-            """The sensor, an opaque seed, and the number of photons a beam, all checked."""
+            """The sensor, an opaque seed, and the number of samples per beam, all checked."""
             if isinstance(sensor, int):
                 sensor = scene.sensors()[sensor]
             if not hasattr(sensor, "beam_frame"):
                 fail(NAME, "sensor", type(sensor).__name__, "a sensor of type 'scanning_lidar'")
             _check_gate_meets_medium(scene, sensor)
             _check_blends(scene, sensor)
-            photons = int(spp) or sensor.sampler().sample_count()
+            samples = int(spp) or sensor.sampler().sample_count()
             if self.estimator == "gated":
-                photons = sensor.gate_count * max(2, -(-photons // sensor.gate_count))
-            elif photons < 2:
-                fail(NAME, "sample_count", photons, "at least 2, for a standard error")
+                samples = sensor.gate_count * max(2, -(-samples // sensor.gate_count))
+            elif samples < 2:
+                fail(NAME, "sample_count", samples, "at least 2, for a standard error")
             seed = mi.UInt32(seed)
             dr.make_opaque(seed)  # a new seed compiles nothing
-            return sensor, seed, photons
+            return sensor, seed, samples
 
         def _unit(self, sensor) -> int:
-            """Gated photons come in rounds of one photon a gate."""
+            """Gated samples come in rounds of one sample per gate."""
             return sensor.gate_count if self.estimator == "gated" else 1
 
-        def _passes(self, sensor, photons):
-            """All beams, a few at a time; a beam's photons in several passes if they are many.
+        def _passes(self, sensor, samples):
+            """All beams, a few at a time; many samples of a beam in several passes.
 
             Yields first beam, number of beams, first round, number of rounds, and whether these
             beams are then complete.
             """
             beams, unit = sensor.beam_count, self._unit(sensor)
-            rounds = photons // unit
+            rounds = samples // unit
             rounds_at_once = min(rounds, max(2, self.samples_per_pass // unit))
             beams_at_once = max(1, self.samples_per_pass // (rounds_at_once * unit))
             for first in range(0, beams, beams_at_once):
@@ -202,13 +204,13 @@ def define():
                 while start < rounds:
                     now = min(rounds_at_once, rounds - start)
                     if rounds - start - now == 1:
-                        now += 1  # a pass of one photon has no variance
+                        now += 1  # a pass of one sample has no variance
                     last = start + now == rounds
                     yield first, min(beams_at_once, beams - first), start, now, last
                     start += now
 
         def _places(self, first: int, cells: int):
-            """Where each quantity of a run of cells (beam by beam, gate by gate) is in the image."""
+            """Image indices of each quantity for a range of cells (beam by beam, gate by gate)."""
             quantities = len(self.quantities())
             cell = (dr.arange(mi.UInt32, cells) + dr.opaque(mi.UInt32, first)) * quantities
             return [cell + index for index in range(quantities)]
@@ -217,7 +219,7 @@ def define():
             """Means and summed products of deviations, last collisions forced into the gates."""
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * gates * rounds)
-            # opaque, so that neither the number of photons nor the pass is baked into the kernel
+            # opaque, so that neither the number of samples nor the pass is compiled into the kernel
             rounds_ = dr.opaque(mi.UInt32, rounds)
             cell = lane // rounds_
             beam, gate = cell // gates, cell % gates
@@ -243,7 +245,7 @@ def define():
             return rounds, means + self._per_order(by_order, rounds), spreads
 
         def _analog(self, scene, sensor, seed, first, count, start, rounds):
-            """The same, free flights as nature draws them."""
+            """The same, with analog free flights."""
             gates = sensor.gate_count
             lane = dr.arange(mi.UInt32, count * rounds)
             rounds_ = dr.opaque(mi.UInt32, rounds)
@@ -305,12 +307,12 @@ def _opaque(number: float):
 
 
 def _merge(first, second):
-    """Moments of two sets of photons together (Chan, Golub & LeVeque 1983)."""
+    """Moments of two sets of samples together (Chan, Golub & LeVeque 1983)."""
     n1, means1, spreads1 = first
     n2, means2, spreads2 = second
-    share, weight = _opaque(n2 / (n1 + n2)), _opaque(n1 * n2 / (n1 + n2))
+    fraction, weight = _opaque(n2 / (n1 + n2)), _opaque(n1 * n2 / (n1 + n2))
     off = [b - a for a, b in zip(means1, means2, strict=True)]
-    means = [a + o * share for a, o in zip(means1, off, strict=True)]
+    means = [a + o * fraction for a, o in zip(means1, off, strict=True)]
     spreads = [
         a + b + off[i] * off[j] * weight
         for a, b, (i, j) in zip(spreads1, spreads2, PRODUCTS[: len(spreads1)], strict=True)
@@ -345,7 +347,7 @@ def _check_blends(scene, sensor):
 
 
 def _check_gate_meets_medium(scene, sensor):
-    """A gate without any medium in it is a mistake of the scene, not a black image."""
+    """A gate without any medium in it is an error of the scene, not a black image."""
     if sensor.get_medium() is not None:
         return
     near, far = sensor.nearest_and_farthest()

@@ -9,19 +9,19 @@ independent, as in the far field of a beam expander. The fluence is proportional
 exp(-2 r^2 / beam_radius^2) over the aperture, the radiant intensity to
 exp(-2 a^2 / (divergence_full / 2)^2) with a the tangent of the angle to the axis.
 
-============================ ========== ==================================================== =======
-Parameter                    Type       Meaning                                              Default
-============================ ========== ==================================================== =======
-``beam_radius``              float      1/e^2 radius in the aperture, m                      0.1
-``beam_cut``                 float      outer radius of the aperture, m                      uncut
-``divergence_full_mrad``     float      1/e^2 divergence, full angle, mrad; 0 = collimated   0
-``stokes``                   string     I, Q, U, V about e_h (local x), I = 1                1, 1, 0, 0
-``wavelength``               float      vacuum wavelength, m                                 532e-9
-``pulse_energy``             float      energy of a pulse, J                                 1
-``pulse_duration``           float      full width at half maximum of the pulse, s;          0
-                                        Gaussian in time; 0 = instantaneous
-``to_world``                 transform  light leaves along local +z, e_h is local +x         identity
-============================ ========== ==================================================== =======
+========================= ========== ==================================================== =======
+Parameter                 Type       Meaning                                              Default
+========================= ========== ==================================================== =======
+``beam_radius``           float      1/e^2 radius in the aperture, m                      0.1
+``beam_cut``              float      outer radius of the aperture, m                      uncut
+``divergence_full_mrad``  float      1/e^2 divergence, full angle, mrad; 0 = collimated   0
+``stokes``                string     I, Q, U, V about e_h (local x), I = 1                1, 1, 0, 0
+``wavelength``            float      vacuum wavelength, m                                 532e-9
+``pulse_energy``          float      energy of a pulse, J                                 1
+``pulse_duration``        float      full width at half maximum of the pulse, s;          0
+                                     Gaussian in time; 0 = instantaneous
+``to_world``              transform  light leaves along local +z, e_h is local +x         identity
+========================= ========== ==================================================== =======
 
 .. code-block:: xml
 
@@ -48,6 +48,8 @@ NAME, KIND = "laser", "emitter"
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class Laser(mi.Emitter):
         def __init__(self, props):
             super().__init__(props)
@@ -61,7 +63,7 @@ def define():
             self.m_pose = pose(props)
             dr.make_opaque(self.m_pose)
             self.m_radius = dr.opaque(mi.Float, radius)
-            # share of an uncut beam inside the aperture; radii are drawn from that share
+            # fraction of an uncut beam inside the aperture; radii are drawn from that fraction
             self.m_inside = dr.opaque(mi.Float, -math.expm1(-2 * (cut / radius) ** 2))
             self.m_divergence_half = dr.opaque(mi.Float, divergence / 2)
             self.m_flags = mi.EmitterFlags.DeltaDirection  # seen by no ray traced backwards
@@ -98,7 +100,7 @@ def define():
             return ray, weight
 
         def wavelengths(self):
-            """The laser's wavelength in nm, as a ray carries it (empty outside spectral variants)."""
+            """The laser's wavelength in nm, for a ray (empty outside spectral variants)."""
             kind = type(mi.Ray3f().wavelengths)
             return kind(self.wavelength * 1e9) if mi.is_spectral else kind()
 

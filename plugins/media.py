@@ -57,7 +57,7 @@ class Air:
         return found
 
     def next_surface(self, crossings, origin, direction, start, distance, medium, active):
-        """The next surface of a line between two distances, and what lies behind it.
+        """The next surface of a line between two distances, and the medium behind it.
 
         Returns the end of the present segment, whether a surface ends it, whether light passes that
         surface and the medium behind it.

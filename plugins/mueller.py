@@ -42,6 +42,8 @@ NAME, KIND = "mueller", "phase"
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class Mueller(mi.PhaseFunction):
         def __init__(self, props):
             super().__init__(props)

@@ -15,7 +15,7 @@ from .random_numbers import generator, pair
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
 
-# Of first vertices, the share that is put where isotropic scattering closes paths most often.
+# Fraction of first vertices sampled where isotropic scattering closes paths most often.
 NEAR_SHARE = 0.35
 # Of last flights, the share whose direction is the phase function's, and the largest share that is
 # looked for from the telescope.
@@ -27,12 +27,12 @@ PHASE_FLIGHT_SHARE = 0.3
 WIDER = 1.6
 # Of flights between, the share that leaves as much of the path as first vertices do.
 NEAR_FLIGHT_SHARE = 0.3
-# A photon goes on with this times the weight its last flight has left it.
+# Probability of survival over the weight of the last flight.
 FOLLOWED = 30.0
 
 
 class Photon:
-    """Photons as they leave the laser, each with the telescope point it will be connected to.
+    """Photons at the laser, each with the telescope point it will be connected to.
 
     World coordinates. ``frame`` holds the beam's axes in the lidar's own frame, ``axes`` in the
     world. ``delay`` is half the light path (m) by which the photon left after the middle of the
@@ -57,6 +57,7 @@ class Lidar:
         self.context = mi.PhaseFunctionContext()
 
     def emit(self, seed, beam, number) -> Photon:
+        """Photons of beams by their index, with random numbers of their own."""
         rng = generator(seed, beam, number)
         sensor, laser = self.sensor, self.sensor.laser
         to_world = sensor.world_transform()
@@ -81,7 +82,7 @@ class Lidar:
         return Photon(rng, frame, axes, origin, direction, aperture, delay, list(stokes))
 
     def forced(self, photon, low, high, share, max_order, split, by_order, cell):
-        """Stokes vector (about e_h) a photon brings back from its gate.
+        """Stokes vector (about e_h) that a photon returns from its gate.
 
         ``low`` and ``high`` are twice the gate's ranges less the photon's delay, ``share`` (0 to
         1) says where between them this photon's whole path is. The sum of all orders up to
@@ -115,7 +116,7 @@ class Lidar:
 
     @dr.syntax
     def _forced_further(self, photon, medium, path, width, last, split, by_order, cell, max_order):
-        """Orders from two on: from every vertex but the last one the path is closed once."""
+        """Orders from two on: the path is closed once from every vertex but the last."""
         # a local name, since the loop carries local variables, not what objects hold
         aperture, rng = photon.aperture, photon.rng
         total, order = _copied([0, 0, 0, 0]), mi.UInt32(2)
@@ -201,7 +202,7 @@ class Lidar:
     def _last_flight(self, rng, photon, medium, mei, stokes, way, active):
         """Direction, Stokes vector and length of the flight to the last vertex; its weight.
 
-        Of two candidates one is taken, by what it brings back if nothing is in the way and the air
+        Of two candidates one is taken, by its contribution if nothing is in the way and the air
         is the same there. The weight includes d(length)/d(path).
         """
         phase, axes, path = medium.phase_function(), photon.axes, way.distance + way.budget
@@ -348,7 +349,7 @@ class Lidar:
 
     @dr.syntax
     def analog(self, photon, max_order, base, gates, sums, products, split, by_order):
-        """Free flights as nature draws them; every collision is connected to the telescope.
+        """Analog free flights; every collision is connected to the telescope.
 
         A photon's apparent range never falls from one order to the next (triangle inequality), so
         what it brings to a gate is complete when a later gate is reached: only then is it squared.
@@ -408,7 +409,7 @@ def _add(total, value, cell, active=True):
 
 
 def _deposit(sums, products, cell, held, active):
-    """Add what photons have brought to their gates, and products of its components."""
+    """Add contributions of photons to their gates, and products of their components."""
     active = active & (held[0] != 0)
     for total, value in zip(sums, held, strict=True):
         _add(total, value, cell, active)
@@ -431,7 +432,7 @@ def _closing(offset, direction, path):
 def _sample_near(least, most, scale, sample, again):
     """Distance of a vertex from where a flight along the beam would close the path.
 
-    Of directions of isotropic scattering there, weighted by the length they close at, a share of
+    Of directions of isotropic scattering there, weighted by the length they close at, a fraction of
     ln(1 + (scale / left)^2) leads back into view. Uniform, if that falls out of the range.
     """
     left = scale * sample.x * dr.tan(0.5 * dr.pi * sample.y)
@@ -453,16 +454,16 @@ def _near_chance(left, scale):
 def _choose(rng, first, second):
     """One of two candidates and its weight (resampled importance sampling, Talbot et al. 2005).
 
-    A candidate is its worth, to which what it brings should be proportional, its density, and what
-    is taken of it.
+    A candidate is its target value, to which its contribution should be proportional, its density,
+    and the values to return.
     """
-    (worth, density, one), (other_worth, other_density, other) = first, second
-    share = dr.select(worth > 0, worth / density, 0)
-    other_share = dr.select(other_worth > 0, other_worth / other_density, 0)
-    total = share + other_share
-    turned = rng.next_float32() * total >= share
-    worth = dr.select(turned, other_worth, worth)
-    return _either(turned, other, one), dr.select(worth > 0, 0.5 * total / worth, 0)
+    (target, density, one), (other_target, other_density, other) = first, second
+    weight = dr.select(target > 0, target / density, 0)
+    other_weight = dr.select(other_target > 0, other_target / other_density, 0)
+    total = weight + other_weight
+    second_chosen = rng.next_float32() * total >= weight
+    target = dr.select(second_chosen, other_target, target)
+    return _either(second_chosen, other, one), dr.select(target > 0, 0.5 * total / target, 0)
 
 
 def _either(condition, yes, no):
@@ -477,7 +478,7 @@ def _apply(value, stokes, channel):
         return [value[channel] * stokes[0]]
     matrix = [[value[row, column][channel] for column in range(4)] for row in range(4)]
     scattered = [sum(m * s for m, s in zip(row, stokes, strict=True)) for row in matrix]
-    # scalar phase functions answer with a multiple of the unit matrix in *any* pair of axes
+    # scalar phase functions return a multiple of the unit matrix in *any* pair of axes
     scalar = matrix[0][0]
     depolarises = (matrix[0][1] == 0) & (matrix[1][0] == 0)
     depolarises &= (matrix[1][1] == scalar) & (matrix[2][2] == scalar) & (matrix[3][3] == scalar)
@@ -497,5 +498,5 @@ def _scaled(stokes, factor):
 
 
 def _channel(wavelength: float) -> int:
-    """Index of the spectrum's entry that stands for the laser."""
+    """Index of the spectrum's entry for the laser."""
     return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0

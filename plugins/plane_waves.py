@@ -9,18 +9,18 @@ source or by the end of a multimode fibre behind a collimator. It surrounds the 
 environment emitter. If traced forward, every plane wave has a random direction, frequency,
 polarisation and position on the stop of the :ref:`camera <sensor-ccd>`.
 
-============================ ========== ==================================================== =======
-Parameter                    Type       Meaning                                              Default
-============================ ========== ==================================================== =======
-``field_half_mrad``          float      half angle of the cone, mrad                         16
-``radiance_radius_mrad``     float      angle at which the radiance is 1/e^2 of that on the  infinite
-                                        axis; Gaussian in its tangent
-``stokes``                   string     I, Q, U, V with I = 1, about the horizontal axis     1, 0,
-                                                                                             0, 0
-``to_world``                 transform  of a frame whose x axis points to the centre of      identity
-                                        the source
-*(nested)*                   texture    the :ref:`line <texture-spectral_line>`              required
-============================ ========== ==================================================== =======
+=========================== ========== ==================================================== =======
+Parameter                   Type       Meaning                                              Default
+=========================== ========== ==================================================== =======
+``field_half_mrad``         float      half angle of the cone, mrad                         16
+``radiance_radius_mrad``    float      angle at which the radiance is 1/e^2 of that on the  infinite
+                                       axis; Gaussian in its tangent
+``stokes``                  string     I, Q, U, V with I = 1, about the horizontal axis     1, 0,
+                                                                                            0, 0
+``to_world``                transform  of a frame whose x axis points to the centre of      identity
+                                       the source
+*(nested)*                  texture    the :ref:`line <texture-spectral_line>`              required
+=========================== ========== ==================================================== =======
 
 Natural light (the default) is a plane wave of random elliptical polarisation, uniformly distributed
 on the Poincaré sphere. The unpolarised fraction of partially polarised light is drawn in this way.
@@ -46,6 +46,8 @@ NAME, KIND = "plane_waves", "emitter"
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class PlaneWaves(mi.Emitter):
         def __init__(self, props):
             super().__init__(props)
@@ -87,9 +89,7 @@ def define():
             return mi.Float(self.m_flux)
 
         def sample_direction_of_light(self, sample):
-            """A direction light travels in (world), its share that counts (at most 1), and the flux
-            of all that is drawn.
-            """
+            """A direction of propagation (world), its weight (at most 1), the sampled flux."""
             if self.even:
                 disc = mi.warp.square_to_uniform_disk(sample) * self.m_sine
             else:
@@ -98,13 +98,13 @@ def define():
                 sine, cosine = dr.sincos(dr.two_pi * sample.y)
                 disc = mi.Point2f(radius * cosine, radius * sine)
             sine2 = dr.squared_norm(disc)
-            share = (
+            weight = (
                 mi.Float(1)
                 if self.even
                 else dr.exp(-2 * sine2 * sine2 / ((1 - sine2) * self.m_scale2))
             )
             local = mi.Vector3f(-dr.sqrt(1 - sine2), disc.x, disc.y)
-            return dr.normalize(self.m_pose @ local), share, mi.Float(self.m_drawn)
+            return dr.normalize(self.m_pose @ local), weight, mi.Float(self.m_drawn)
 
         def radiance(self, direction):
             """Radiance of light travelling along ``direction`` (world), 1 in the middle."""

@@ -76,7 +76,7 @@ def rotate_from_scattering_plane(incident, scattered, elements):
 
 
 def first_unpolarized_in_blend(medium):
-    """The first of a medium's blended phase functions that knows no polarisation beside ones that do.
+    """The first scalar phase function of a medium that is blended with polarised ones, or None.
 
     Such a function (``hg``, ``isotropic``) answers with a multiple of the unit matrix between any
     two axes. Alone it is recognised and depolarises; added to a Mueller matrix it cannot be told

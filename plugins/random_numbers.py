@@ -1,4 +1,4 @@
-"""Random numbers of photons: independent generators, and what is drawn from them in pairs."""
+"""Random numbers of photons: independent generators, and pairs of numbers."""
 
 import mitsuba as mi
 
@@ -13,4 +13,5 @@ def generator(seed, group, number):
 
 
 def pair(rng):
+    """Two numbers in [0, 1)."""
     return mi.Point2f(rng.next_float32(), rng.next_float32())

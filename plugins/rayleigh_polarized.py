@@ -33,6 +33,8 @@ NAME, KIND = "rayleigh_polarized", "phase"
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class RayleighPolarized(mi.PhaseFunction):
         def __init__(self, props):
             super().__init__(props)

@@ -10,26 +10,26 @@ telescope of each beam is a disc perpendicular to its axis, centred at the laser
 received if it arrives at the disc within the field of view and half its optical path length lies
 in a gate.
 
-============================ ========== ==================================================== =======
-Parameter                    Type       Meaning                                              Default
-============================ ========== ==================================================== =======
-``aperture_radius``          float      telescope radius, m                                  0.5
-``fov_half_mrad``            float      field of view, half angle, mrad                      5
-``gate_kind``                string     ``planar``: between planes perpendicular to the      planar
-                                        scan's axis; ``spherical``: equal two-way time
-``gate_start, gate_stop``    float      start of the first and end of the last gate, m       required
-``gate_count``               int        number of equal gates between start and stop         1
-``azimuth_min_deg, .._max``  float      beams across the film's width; the left column is    0, 0
-                                        the largest azimuth (positive to port, +y)
-``elevation_min_deg, .._max`` float     beams down the film's height; the top row is the     0, 0
-                                        largest elevation (positive up, +z)
-``directions``               tensor,    N x 3 beam directions in place of the angles, film   none
-                             string     row by row from the top left; or a ``.npy`` or text
-                                        file of them
-``to_world``                 transform  of the lidar's frame (x forward, y left, z up)       identity
-*(nested)*                   emitter    a ``laser``                                          required
-*(nested)*                   medium     the environment in which the telescope is            vacuum
-============================ ========== ==================================================== =======
+============================ ========= ==================================================== =======
+Parameter                    Type      Meaning                                              Default
+============================ ========= ==================================================== =======
+``aperture_radius``          float     telescope radius, m                                  0.5
+``fov_half_mrad``            float     field of view, half angle, mrad                      5
+``gate_kind``                string    ``planar``: between planes perpendicular to the      planar
+                                       scan's axis; ``spherical``: equal two-way time
+``gate_start, gate_stop``    float     start of the first and end of the last gate, m       required
+``gate_count``               int       number of equal gates between start and stop         1
+``azimuth_min_deg, .._max``  float     beams across the film's width; the left column is    0, 0
+                                       the largest azimuth (positive to port, +y)
+``elevation_min_deg, .._max`` float    beams down the film's height; the top row is the     0, 0
+                                       largest elevation (positive up, +z)
+``directions``               tensor,   N x 3 beam directions in place of the angles, film   none
+                             string    row by row from the top left; or a ``.npy`` or text
+                                       file of them
+``to_world``                 transform of the lidar's frame (x forward, y left, z up)       identity
+*(nested)*                   emitter   a ``laser``                                          required
+*(nested)*                   medium    the environment in which the telescope is            vacuum
+============================ ========= ==================================================== =======
 
 Angles are equidistant and include both ends; a beam direction is (1, tan azimuth, tan elevation),
 normalised. A single column (row) is at the middle of its angles. The local +z axis of the laser is
@@ -52,6 +52,8 @@ NAME, KIND = "scanning_lidar", "sensor"
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class ScanningLidar(mi.Sensor):
         def __init__(self, props):
             super().__init__(props)

@@ -8,17 +8,17 @@ The spectrum of backscattered light as a sum of Gaussians about the Doppler-shif
 frequency offsets from the laser line. The float32 wavelength of a spectral variant does not resolve
 the shifts that fringes measure (1 m/s is 5.6 MHz in 845 THz at 355 nm); an offset does.
 
-============================ ======= ====================================================== =========
-Parameter                    Type    Meaning                                                Default
-============================ ======= ====================================================== =========
-``wavelength``               float   of the laser line, m                                   354.7e-9
-``v_los``                    float   line-of-sight velocity, m/s; positive: the scatterers  0
-                                     approach and the frequency rises by
-                                     2 v_los / wavelength
-``weights``                  string  fractions of the Gaussians; scaled to a sum of one     1
-``offsets``                  string  their centres about the shifted line, Hz               0
-``sigmas``                   string  their standard deviations, Hz; 0: a sharp line         1.46e9
-============================ ======= ====================================================== =========
+=========================== ======= ====================================================== =========
+Parameter                   Type    Meaning                                                Default
+=========================== ======= ====================================================== =========
+``wavelength``              float   of the laser line, m                                   354.7e-9
+``v_los``                   float   line-of-sight velocity, m/s; positive: the scatterers  0
+                                    approach and the frequency rises by
+                                    2 v_los / wavelength
+``weights``                 string  fractions of the Gaussians; scaled to a sum of one     1
+``offsets``                 string  their centres about the shifted line, Hz               0
+``sigmas``                  string  their standard deviations, Hz; 0: a sharp line         1.46e9
+=========================== ======= ====================================================== =========
 
 The default is the Rayleigh line of air at 232.9 K. The same line is used by the :ref:`plane waves
 <emitter-plane_waves>`, which draw their frequencies from it, and by the :ref:`etalon
@@ -44,6 +44,8 @@ NAME, KIND = "spectral_line", "texture"
 
 
 def define():
+    """The plugin's class in the variant in force."""
+
     class SpectralLine(mi.Texture):
         def __init__(self, props):
             super().__init__(props)
@@ -69,7 +71,7 @@ def define():
             return self.m_v_los * (2 / self.wavelength)
 
         def sample(self, which, sample):
-            """Frequency offsets from the laser line, Hz: a Gaussian by ``which``, then its value."""
+            """Frequency offsets from the laser line, Hz; ``which`` selects the Gaussian."""
             index = mi.UInt32(0)
             for k in range(dr.width(self.m_offsets) - 1):
                 index += dr.select(which < dr.gather(mi.Float, self.m_reached, k), 0, 1)
@@ -78,7 +80,7 @@ def define():
             return self.shift() + dr.fma(sigma, normal, dr.gather(mi.Float, self.m_offsets, index))
 
         def characteristic(self, time: np.ndarray) -> np.ndarray:
-            """Mean of exp(2 pi i offset time) about the shifted line's centre; time in s, float64."""
+            """Mean of exp(2 pi i offset time) about the shifted centre; time in s, float64."""
             weight, offset, sigma = self.gaussians.T[:, :, None]
             width = np.exp(-2 * (np.pi * sigma * time) ** 2)
             return (weight * width * np.exp(2j * np.pi * offset * time)).sum(0)

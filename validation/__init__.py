@@ -1,7 +1,7 @@
 """Comparison of lidar-mi with independent numbers.
 
-``make validate`` (or ``python -m validation``) runs every check, prints one table a group and writes
-``docs/validation.md`` with its figures; it ends with an error if any row fails.
+``make validate`` (or ``python -m validation``) runs every check, prints one table a group and
+writes ``docs/validation.md`` with its figures; it ends with an error if any row fails.
 
 lidar_equation       single scattering: closed forms
 multiple_scattering  all orders in a dense slab: an independent simulation in numpy

@@ -12,7 +12,7 @@ PHOTONS = 1_000_000  # of every case, times the effort
 
 
 def reference(python: str | None, scale: int) -> dict:
-    """What ``eradiate_reference.py`` writes: newly made where an interpreter is given, else stored."""
+    """Output of ``eradiate_reference.py``: made anew by the given interpreter, else stored."""
     if python is None:
         return json.loads(STORED.read_text())
     with tempfile.TemporaryDirectory() as folder:

@@ -6,8 +6,9 @@ It replaces mitsuba, so it runs in an environment of its own and knows nothing o
     eradiate/bin/python validation/eradiate_reference.py -o validation/eradiate_reference.json
 
 Every case is a plane-parallel slab of optical thickness 1, lit at right angles by a plane wave that
-is polarised along y. Asked for is the light that comes back inside a cone about the surface's normal:
-power per area of the surface over the irradiance, I and Q about the part of y across the light.
+is polarised along y. Asked for is the light that comes back inside a cone about the surface's
+normal: power per area of the surface over the irradiance, I and Q about the part of y across the
+light.
 
 Of Eradiate this uses medium, phase functions, integrator and emitter sampling; only the emitter is
 ours, because its own are unpolarised.

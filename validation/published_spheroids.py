@@ -1,12 +1,13 @@
 """Published numbers of randomly oriented spheroids.
 
-The test result that comes with M. I. Mishchenko's code ``tmd.lp.f`` (Mishchenko & Travis 1998, J. Quant.
-Spectrosc. Radiat. Transfer 60, 309; https://www.giss.nasa.gov/staff/mmishchenko/t_matrix.html): oblate
-spheroids of axis ratio 2, wavelength 0.5, index 1.53 + 0.008i, power law of Hansen & Travis 1974
-between two radii (of spheres of equal surface area), averaged with a few Gauss points.
+The test result that comes with M. I. Mishchenko's code ``tmd.lp.f`` (Mishchenko & Travis 1998, J.
+Quant. Spectrosc. Radiat. Transfer 60, 309;
+https://www.giss.nasa.gov/staff/mmishchenko/t_matrix.html): oblate spheroids of axis ratio 2,
+wavelength 0.5, index 1.53 + 0.008i, power law of Hansen & Travis 1974 between two radii (of spheres
+of equal surface area), averaged with a few Gauss points.
 
-By effective radius: number of Gauss points, limits of the radius, cross-sections, asymmetry parameter
-and lines of angle (degrees), a1, a2, a3, a4, b1, b2. Lengths in um.
+By effective radius: number of Gauss points, limits of the radius, cross-sections, asymmetry
+parameter and lines of angle (degrees), a1, a2, a3, a4, b1, b2. Lengths in um.
 """
 
 POLYDISPERSE = {

@@ -156,7 +156,8 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
         "<!-- Written by `python -m validation`; edit validation/ instead. -->",
         "",
         "Comparisons of lidar-mi with independent numbers: closed forms, published",
-        "values, conservation laws and other programs. They concern the light transport; errors of the",
+        "values, conservation laws and other programs. They concern the light transport; errors "
+        "of the",
         "retrievals are under [accuracy](accuracy.md). Every row of this page is computed again by",
         "",
         "```sh",

@@ -254,7 +254,7 @@ def orientations(x, index, elongation, angle, order=24):
 
 
 def prolate(effort):
-    """Prolate spheroids: a published amplitude matrix for the witness, then the witness for ours."""
+    """Prolate spheroids: rustmatrix against a published amplitude matrix, ours against it."""
     solver = rustmatrix.Scatterer(
         radius=9.63711, wavelength=2 * math.pi, m=1.5 + 0.02j, axis_ratio=0.5, ddelt=1e-6, ndgs=4
     )

@@ -14,7 +14,7 @@ DOCS = Path(__file__).resolve().parents[1] / "docs" / "validation"
 
 @dataclass(frozen=True)
 class Effort:
-    """How sharp a run is: ``scale`` times the default number of photons, figures into ``folder``."""
+    """Effort of a run: ``scale`` times the default number of samples, figures into ``folder``."""
 
     scale: int = 1
     folder: Path = DOCS
@@ -58,7 +58,7 @@ ENVIRONMENT = {"type": "ref", "id": "environment"}
 
 
 def lidar(size, gate, laser=None, environment=None, **parameters) -> dict:
-    """A scanning lidar of (width, height) beams that records the gates from ``gate[0]`` to ``[1]``."""
+    """A scanning lidar of (width, height) beams with gates from ``gate[0]`` to ``gate[1]``."""
     sensor = {
         "type": "scanning_lidar",
         "gate_start": gate[0],

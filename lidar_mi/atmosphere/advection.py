@@ -1,4 +1,4 @@
-"""Carry a field with the flow: the image at t2 from the image at t1."""
+"""Advection of a scalar field by the wind: the field at t2 from the field at t1."""
 
 import numpy as np
 import xarray as xr
@@ -6,10 +6,11 @@ from scipy.ndimage import map_coordinates, spline_filter
 
 from lidar_mi.errors import InputError
 
-# Cells of edge values put around a plane or a volume, so that the spline's response to the edge (it falls
-# by 0.43 a cell) and air that blows in find the edge value.
+# Cells of edge values added around a plane or a volume, for the spline's response to the edge (it
+# falls by a factor 0.43 per cell) and for inflow.
 _MARGIN = 12
-# Of the splines; cubic ones would lose four times as much of a wave of three cells, nine times of four.
+# Of the splines. Cubic splines damp waves of three cells four times and waves of four cells nine
+# times as much.
 _ORDER = 5
 
 
@@ -25,9 +26,9 @@ def _axis(field, name):
 
 
 def _sampler(values):
-    """Quintic B-spline through the nodes of a plane or a volume; call it with fractional indices.
+    """Quintic B-spline through the nodes of a plane or a volume, a function of fractional indices.
 
-    Outside the value at the nearest edge holds.
+    Outside the grid it has the value at the nearest edge.
     """
     coefficients = spline_filter(np.pad(values, _MARGIN, mode="edge"), order=_ORDER, mode="mirror")
 
@@ -66,10 +67,10 @@ def advect(
     there is read from the quintic B-spline through its nodes (Staniforth and Cote,
     Mon. Wea. Rev. 119, 1991). The
     spline keeps waves of 4 cells and longer; a wave of 2 cells is lost at half-cell shifts, as
-    it must be on this grid. Without u nothing moves along x, and planes know nothing of each
-    other. Air that enters through an edge carries
-    the edge's value, so a strip of width speed*dt along inflow edges is not meaningful. A field
-    that is nowhere negative stays so: the spline's undershoots at sharp edges are set to zero.
+    it must be on this grid. Without u there is no motion along x, and planes are independent of
+    each other. Air that enters through an edge has the value at the edge, so that a strip of width
+    speed*dt along inflow edges is not meaningful. A field without negative values remains so: the
+    undershoots of the spline at sharp edges are set to zero.
 
     Parameters
     ----------
@@ -124,7 +125,8 @@ def advect(
         bad = int((~np.isfinite(component)).sum())
         if bad:
             raise InputError(
-                f"advection.{name}: not finite at {bad} of {component.size} places; allowed: nowhere"
+                f"advection.{name}: not finite at {bad} of {component.size} places; allowed: "
+                "nowhere"
             )
 
     order = [d for d in ("x", "y", "z") if d in dims]

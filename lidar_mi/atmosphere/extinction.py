@@ -1,4 +1,4 @@
-"""From what a flow simulation carries to an extinction coefficient in m^-1."""
+"""Extinction coefficient (m^-1) from the tracer and aerosol fields of a flow simulation."""
 
 import numpy as np
 import xarray as xr
@@ -40,8 +40,8 @@ def _stretched(field, stretch, reference, key):
     largest = float(field.max())
     if largest == 0 and not reference:
         raise InputError(
-            f"extinction.{key}: 0 everywhere, so there is nothing to see; expected some of it, or "
-            "null for air without it"
+            f"extinction.{key}: 0 everywhere, so there is no contrast; expected values above 0, "
+            "or null for air without it"
         )
     if reference is None:
         reference = largest
@@ -53,7 +53,7 @@ def _stretched(field, stretch, reference, key):
     if largest > reference:
         raise InputError(
             f"extinction.reference: {reference:g} is below the largest value {largest:g} "
-            f"of {key}; it must be at least that, for nothing is clipped"
+            f"of {key}; it must be at least that, as no value is clipped"
         )
     return 1 - (1 - field / reference) ** stretch
 
@@ -83,8 +83,8 @@ def extinction_from_tracer(
 
     E = background * aerosol + (maximum - background) * (1 - (1 - x)^stretch), with
     x = tracer/reference in [0, 1]: a contrast stretch that raises thin tracer by the factor
-    `stretch` (the slope at x = 0) and leaves the ends alone. It is monotone, so the order of
-    values is kept, and nothing is clipped; `stretch` = 1 is linear. The paper states "a
+    `stretch` (the slope at x = 0) and keeps both ends. It is monotone, so the order of values is
+    kept, and no value is clipped; `stretch` = 1 is linear. The paper states "a
     stretching factor of 2.0" and that relative structure is maintained, but no formula: this
     reading of it is ours. Where aerosol > 1, E may pass `maximum` by background*(aerosol - 1).
 
@@ -120,8 +120,8 @@ def extinction_from_tracer(
     else:
         extinction = background * _variable(wake, aerosol, "aerosol")
     if tracer is not None:
-        share = _stretched(_variable(wake, tracer, "tracer"), stretch, reference, "tracer")
-        extinction = extinction + (maximum - background) * share
+        fraction = _stretched(_variable(wake, tracer, "tracer"), stretch, reference, "tracer")
+        extinction = extinction + (maximum - background) * fraction
     return _finished(extinction, background, maximum, stretch)
 
 
@@ -160,5 +160,5 @@ def extinction_from_speed(
                 f"{', '.join(map(str, wake.data_vars))}"
             )
     speed = np.hypot(wake["v"].astype(float), wake["w"].astype(float))
-    share = _stretched(speed, stretch, reference, "speed")
-    return _finished(background + (maximum - background) * share, background, maximum, stretch)
+    fraction = _stretched(speed, stretch, reference, "speed")
+    return _finished(background + (maximum - background) * fraction, background, maximum, stretch)

@@ -1,4 +1,4 @@
-"""The backscattered line: what the air's motion, temperature and pressure do to a laser's line.
+"""The backscattered line: broadening and shift by the motion, temperature and pressure of the air.
 
 Every line here is a sum of Gaussians, so that its Fourier transform, which an etalon's series
 needs, is a closed form. Widths are full widths at half maximum, sigmas are standard deviations;
@@ -32,7 +32,7 @@ class Line:
     wavelength : float
         m, in vacuum, of the laser; the zero of the offsets.
     weights : array (K,)
-        Share of the photons in each Gaussian, 0 or more; they sum to one.
+        Fraction of the photons in each Gaussian, 0 or more, with a sum of one.
     offsets, sigmas : array (K,)
         Centres and standard deviations, Hz; sigma 0 is a monochromatic line.
 
@@ -73,12 +73,12 @@ class Line:
         """
         if not self.sigmas.all():
             return 0.0
-        reach = 10 * self.sigmas.max() + np.ptp(self.offsets)
-        nu = self.mean + np.linspace(-reach, reach, 20_001)
+        extent = 10 * self.sigmas.max() + np.ptp(self.offsets)
+        nu = self.mean + np.linspace(-extent, extent, 20_001)
         peak = nu[np.argmax(self.pdf(nu))]
         half = self.pdf(peak) / 2
         left, right = (
-            brentq(lambda x: float(self.pdf(x) - half), peak, peak + side * reach, xtol=1.0)
+            brentq(lambda x: float(self.pdf(x) - half), peak, peak + side * extent, xtol=1.0)
             for side in (-1, 1)
         )
         return right - left
@@ -90,7 +90,7 @@ class Line:
         return np.exp(phase - 2 * (np.pi * t * self.sigmas) ** 2) @ self.weights
 
     def pdf(self, nu):
-        """Share of the photons per Hz at the offsets ``nu`` (Hz); no sigma may be 0."""
+        """Fraction of the photons per Hz at the offsets ``nu`` (Hz); no sigma may be 0."""
         z = (np.asarray(nu, float)[..., None] - self.offsets) / self.sigmas
         return np.exp(-(z**2) / 2) @ (self.weights / (math.sqrt(2 * math.pi) * self.sigmas))
 
@@ -135,12 +135,12 @@ def viscosity(temperature: float) -> float:
 
 
 def rayleigh_brillouin(wavelength: float, temperature: float, pressure: float) -> Line:
-    """Line of air in backscatter, with the sound waves that collisions carry.
+    """Backscattered line of air, with Brillouin scattering by thermal sound waves.
 
     Three Gaussians fitted to the Tenti S6 model (Witschas 2011, Appl. Opt. 50, 267, with the
     coefficients of the erratum, Appl. Opt. 50, 5758): in the units x of 2^(1/2) 2 v0 / wavelength
-    their widths and places depend on y = p / (2^(1/2) k v0 eta) alone, k = 4 pi / wavelength.
-    Good to 0.85 % of the peak; the missing wings leave an rms 0.4 % (y = 0.17) to 1.5 % (y = 1) below
+    their widths and places depend on y = p / (2^(1/2) k v0 eta) alone, k = 4 pi / wavelength. Good
+    to 0.85 % of the peak; the missing wings leave an rms 0.4 % (y = 0.17) to 1.5 % (y = 1) below
     that of molecules without collisions, which it should equal.
 
     Parameters
@@ -157,7 +157,7 @@ def rayleigh_brillouin(wavelength: float, temperature: float, pressure: float) -
     unit = math.sqrt(2) * rayleigh_width(wavelength, temperature) / _FWHM
     y = pressure / (2 * math.pi * unit * viscosity(temperature))
     _check("y = pressure / (2^(1/2) k v0 viscosity)", y, y <= 1.027, "0 to 1.027")
-    # the fit's sum at y = 0 is 1.0005: no photons are taken off the outer Gaussians there
+    # the fit's sum at y = 0 is 1.0005: the outer Gaussians keep weights of 0 or more there
     centre = min(1, 0.18526 * math.exp(-1.31255 * y) + 0.07103 * math.exp(-18.26117 * y) + 0.74421)
     sigma_r = 0.70813 - 0.16366 * y**2 + 0.19132 * y**3 - 0.07217 * y**4
     sigma_b = 0.07845 * math.exp(-4.88663 * y) + 0.804 * math.exp(-0.15003 * y) - 0.45142
@@ -188,8 +188,8 @@ def backscatter_line(
     laser_width : float
         Full width at half maximum of the emitted line, Hz.
     aerosol_share : float
-        Share of the backscattered photons that comes from aerosol, 0 to 1: aerosol is too heavy
-        to broaden the line.
+        Fraction of the backscattered photons that comes from aerosol, 0 to 1; aerosol is too
+        heavy to broaden the line.
     shape : {"rayleigh", "rayleigh_brillouin"}
         Of the molecular line.
 
@@ -208,8 +208,8 @@ def backscatter_line(
     air = air.broadened(laser.sigmas[0])
     weights = np.concatenate([[aerosol_share], (1 - aerosol_share) * air.weights])
     offsets, sigmas = np.append(laser.offsets, air.offsets), np.append(laser.sigmas, air.sigmas)
-    seen = weights > 0
-    return Line(wavelength, weights[seen], offsets[seen], sigmas[seen])
+    present = weights > 0
+    return Line(wavelength, weights[present], offsets[present], sigmas[present])
 
 
 def _check(name, value, good, allowed):

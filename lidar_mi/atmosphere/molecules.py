@@ -1,8 +1,8 @@
 """Rayleigh scattering by dry air (Bodhaine et al. 1999, J. Atmos. Oceanic Technol. 16, 1854).
 
-Two bands must be told apart. The *Rayleigh* band is everything that molecules scatter: the
+Two bands must be distinguished. The *Rayleigh* band is everything that molecules scatter: the
 central Cabannes line and the rotational Raman lines around it (within about +-10 nm at 532 nm),
-which carry three quarters of the anisotropic part. The *Cabannes* line alone is what a
+which contain three quarters of the anisotropic part. The *Cabannes* line alone is what a
 narrow-band receiver (filter below about 0.3 nm) sees. Extinction always takes the whole band, for
 Raman-shifted light has left the laser's wavelength too. Vibrational Raman scattering (0.1 %) is
 left out. Water vapour is left out: below 1 % in the cross-section.
@@ -166,7 +166,7 @@ def molecular_scattering(
     band: str = "cabannes",
     co2: float = 360e-6,
 ) -> MolecularScattering:
-    """Everything a lidar needs to know about the air it looks through.
+    """Optical properties of molecular air that a lidar measurement depends on.
 
     Parameters
     ----------
@@ -184,13 +184,13 @@ def molecular_scattering(
     InputError
     """
     king = king_factor(wavelength, co2)
-    whole, seen = anisotropy(king, "rayleigh"), anisotropy(king, band)
+    whole, passed = anisotropy(king, "rayleigh"), anisotropy(king, band)
     density = number_density(pressure, temperature)
     sigma = cross_section(wavelength, co2)
     extinction = density * sigma
     # Intensity ratios of a freely turning linear molecule (Placzek): total 45 + 10 e,
     # backward 45 + 7 e with 3/(8 pi) of the isotropic part.
-    per_extinction = 3 / (8 * math.pi) * (45 + 7 * seen) / (45 + 10 * whole)
+    per_extinction = 3 / (8 * math.pi) * (45 + 7 * passed) / (45 + 10 * whole)
     return MolecularScattering(
         band=band,
         wavelength=wavelength,
@@ -200,11 +200,11 @@ def molecular_scattering(
         king_factor=king,
         cross_section=sigma,
         extinction=extinction,
-        albedo=(45 + 10 * seen) / (45 + 10 * whole),
+        albedo=(45 + 10 * passed) / (45 + 10 * whole),
         backscatter=extinction * per_extinction,
         lidar_ratio=1 / per_extinction,
         depolarization=depolarization_factor(king, band),
-        depolarization_ratio=3 * seen / (45 + 4 * seen),
+        depolarization_ratio=3 * passed / (45 + 4 * passed),
     )
 
 

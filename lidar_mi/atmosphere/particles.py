@@ -6,7 +6,7 @@ The tables that ship with the package were made by this module, one command each
 
 Matrices come from ``scatrs`` (an optional library): T-matrix with analytic average over random
 orientation for spheroids (Mishchenko 1991, J. Opt. Soc. Am. A 8, 871), Lorenz-Mie for spheres.
-The average over sizes is ours: equal steps in the logarithm of the radius.
+The average over sizes is computed here: equal steps in the logarithm of the radius.
 """
 
 import math
@@ -21,7 +21,7 @@ from lidar_mi.atmosphere.scattering import ScatteringTable, read_table
 from lidar_mi.errors import InputError
 
 Notice = Callable[[str, float | None], None]
-"""Called with what is done and the share that is finished."""
+"""Called with a text that names the work and the fraction of it that is done."""
 
 # Sizes to average over. Backscatter converges last. Spheroids: 48, 64, 96 sizes give lidar ratios
 # within 0.7 % of each other (the orientation average smooths the ripple in size); spheres, whose
@@ -91,7 +91,7 @@ class Aerosol:
     sizes : LogNormal or ModifiedGamma
         Of the radius of the sphere of equal volume.
     index : tuple of (wavelength in m, complex refractive index)
-        Positive imaginary part absorbs. Linear between the wavelengths, nothing beyond them.
+        Positive imaginary part absorbs. Linear between the wavelengths, undefined beyond them.
     elongation : float
         Length over width of a prolate spheroid; 1 is a sphere.
     number_density : float
@@ -162,7 +162,7 @@ class Aerosol:
         )
 
     def area_left_out(self) -> float:
-        """Share of the unbounded distribution's geometric cross-section beyond the size limits."""
+        """Fraction of the geometric cross-section of all sizes that is beyond the limits."""
 
         def area(low, high):
             return quad(
@@ -188,10 +188,11 @@ _DUST_LIKE = (
 _WATER_SOLUBLE = ((355e-9, 1.53 + 0.005j), (532e-9, 1.53 + 0.006j), (1064e-9, 1.52 + 0.017j))
 _SOOT = ((355e-9, 1.75 + 0.46j), (532e-9, 1.75 + 0.44j), (1064e-9, 1.75 + 0.44j))
 _WATER = ((355e-9, 1.343 + 1e-8j), (532e-9, 1.334 + 1e-9j), (1064e-9, 1.326 + 1e-6j))
-# One part of dry salt (1.50 at 532 nm) in eight of solution: growth by 2 at 80 % humidity, as OPAC's.
+# One part of dry salt (1.50 at 532 nm) in eight of solution: growth by 2 at 80 % humidity, as
+# OPAC's.
 _SEA_SALT = ((355e-9, 1.364 + 1e-8j), (532e-9, 1.355 + 1e-8j), (1064e-9, 1.344 + 2.5e-5j))
-# Ours: absorbs less than OPAC's mineral (0.0065i at 532 nm), more than sun photometers find in desert
-# dust (0.001i to 0.003i; Dubovik et al. 2002, J. Atmos. Sci. 59, 590).
+# Our choice: less absorption than OPAC's mineral (0.0065i at 532 nm), more than sun photometers
+# measure in desert dust (0.001i to 0.003i; Dubovik et al. 2002, J. Atmos. Sci. 59, 590).
 _DESERT = ((532e-9, 1.53 + 0.004j), (1064e-9, 1.53 + 0.003j))
 
 AEROSOLS: dict[str, Aerosol] = {
@@ -332,7 +333,7 @@ def changed(
 
 
 def aerosol_table(
-    name: str, wavelength: float, notice: Notice = lambda text, share: None
+    name: str, wavelength: float, notice: Notice = lambda text, fraction: None
 ) -> ScatteringTable:
     """The table of a named aerosol: the one that ships, or else a new one from `make_table`.
 
@@ -379,7 +380,7 @@ def make_table(
     particles: Aerosol | str,
     wavelength: float,
     nodes: int | None = None,
-    notice: Notice = lambda text, share: None,
+    notice: Notice = lambda text, fraction: None,
 ) -> ScatteringTable:
     """The scattering table of an aerosol: averages over sizes and, for spheroids, orientations.
 
@@ -393,7 +394,7 @@ def make_table(
         Sizes to compute; default 128 for spheroids, 10 000 for spheres, with which the lidar
         ratio has converged to 0.5 %.
     notice : callable, optional
-        Told what is done and the share that is finished.
+        Called with a text that names the work and the fraction of it that is done.
 
     Returns
     -------
@@ -406,7 +407,7 @@ def make_table(
 
     Notes
     -----
-    Sizes beyond the aerosol's limits are left out; the provenance says which share of the
+    Sizes beyond the aerosol's limits are left out; the provenance states which fraction of the
     geometric cross-section that is (at 532 nm, taking the spheroids on to 2 um changes the lidar
     ratio by 0.4 %, depolarisation by 1 %). The cost of a spheroid grows steeply with its size:
     at size parameter 18 a second or two, at 26 minutes, and ``scatrs`` refuses what it has not

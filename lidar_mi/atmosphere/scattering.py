@@ -22,7 +22,7 @@ from lidar_mi.errors import InputError
 
 ELEMENTS = ("a1", "a2", "a3", "a4", "b1", "b2")
 
-# What a table file must say about itself, besides the numbers.
+# Header lines that a table file must have.
 _HEADER = {
     "name": str,
     "wavelength_m": float,
@@ -272,7 +272,7 @@ def read_table(path: str | Path) -> ScatteringTable:
     values = []
     for key, kind in _HEADER.items():
         if key not in header:
-            raise InputError(f"{path}: no line '# {key}: ...'; a table must say its {key}")
+            raise InputError(f"{path}: no line '# {key}: ...'; a table must state its {key}")
         try:
             values.append(kind(header[key]))
         except ValueError:
@@ -392,8 +392,8 @@ def mix(tables, extinctions, name: str = "mixture") -> ScatteringTable:
     )
     angle = np.unique(np.concatenate([table.angle for table in tables]))
     elements = sum(
-        share / sum(scattering) * table.at(angle)
-        for share, table in zip(scattering, tables, strict=True)
+        part / sum(scattering) * table.at(angle)
+        for part, table in zip(scattering, tables, strict=True)
     )
     parts = ", ".join(
         f"{w:.4g} m^-1 {table.name}" for w, table in zip(extinctions, tables, strict=True)
@@ -411,7 +411,7 @@ def mix(tables, extinctions, name: str = "mixture") -> ScatteringTable:
 
 
 def describe(table: ScatteringTable) -> dict[str, str]:
-    """The numbers people ask for, as text with units, in the order to print them."""
+    """The main properties, as text with units, in the order to print them."""
     return {
         "name": table.name,
         "wavelength": f"{table.wavelength * 1e9:.6g} nm",

@@ -1,4 +1,4 @@
-"""Sub-grid aerosol texture: what a simulation on a metre grid has lost and a lidar would see."""
+"""Sub-grid aerosol texture: the fluctuations that a simulation on a metre grid does not resolve."""
 
 import numpy as np
 import xarray as xr
@@ -31,11 +31,11 @@ def gaussian_field(
     """Periodic Gaussian random field, isotropic, with line spectra that fall with k^-slope.
 
     The spectral density is (k^2 + k0^2)^(-(slope + d - 1)/2) in d dimensions, k0 = 2 pi/L: its
-    integral over the d - 1 other wavenumbers, the line spectrum, is, for 5/3, (k^2 + k0^2)^(-5/6) (von
-    Karman's form of the Corrsin-Obukhov spectrum; Monin and Yaglom, Statistical Fluid
+    integral over the d - 1 other wavenumbers, the line spectrum, is, for 5/3, (k^2 + k0^2)^(-5/6)
+    (von Karman's form of the Corrsin-Obukhov spectrum; Monin and Yaglom, Statistical Fluid
     Mechanics 2, 1975, section 21). Waves up to the grid's shortest along each axis are filled;
-    those it cannot hold are missing from a line spectrum, which for d = 2 (3) lies below the law
-    by 5 (8) % at a quarter of the largest wavenumber, 15 (23) % at half, 35 (51) % at the end.
+    those it cannot hold are missing from a line spectrum, which for d = 2 (3) lies below the law by
+    5 (8) % at a quarter of the largest wavenumber, 15 (23) % at half, 35 (51) % at the end.
 
     Parameters
     ----------
@@ -72,7 +72,7 @@ def corrsin_obukhov(y, z, rms: float, outer_scale: float, seed: int, x=None) -> 
     Log-normal, exp(g - s^2/2) with s^2 = ln(1 + rms^2), so it is positive with mean 1 and
     relative rms `rms`. g is a piece cut from a `gaussian_field` that is longer than the image by
     `outer_scale` in every direction (there the correlation has fallen to about 1e-3), so opposite
-    edges know nothing of each other; its mean and standard deviation *over the image* are set to
+    opposite edges are independent; its mean and standard deviation *over the image* are set to
     0 and s. The factor's own mean and rms therefore scatter only by what the tails do: some
     per cent of the rms in an image of ten outer scales.
 

@@ -28,7 +28,7 @@ class TurbineWake:
     thrust : float
         Thrust coefficient C_T, above 0 and below 1.
     tip_speed_ratio : float
-        Speed of the blades' tips over that of the wind; negative: the rotor turns from +z towards
+        Speed of the blades' tips over that of the wind; negative: the rotor rotates from +z towards
         +y, and the wake's swirl from +y towards +z.
     wind_speed : float
         U of the undisturbed wind, m s^-1.
@@ -46,14 +46,14 @@ class TurbineWake:
 
     Notes
     -----
-    Deficit: Bastankhah and Porte-Agel 2014 (Renew. Energy 70, 116-123), eq. 23. It conserves mass and
-    momentum for a Gaussian profile and holds in the far wake, from about three diameters on.
+    Deficit: Bastankhah and Porte-Agel 2014 (Renew. Energy 70, 116-123), eq. 23. It conserves mass
+    and momentum for a Gaussian profile and holds in the far wake, from about three diameters on.
 
-    Swirl: the angular momentum that the rotor's torque leaves in the wake, in a profile of our
+    Swirl: the angular momentum that the rotor's torque adds to the wake, in a profile of our
     choice: that of a hub vortex with a core, enclosed by the opposite vorticity that the tips have
-    shed, which has spread as the deficit has. Torque: power over rotation rate, power: thrust
-    times the wind at the disc, U (1 - a), a = (1 - sqrt(1 - C_T)) / 2. That is the ideal rotor; real
-    ones have some tenths less swirl.
+    shed, which has spread as the deficit has. Torque: power over rotation rate, power: thrust times
+    the wind at the disc, U (1 - a), a = (1 - sqrt(1 - C_T)) / 2. That is the ideal rotor; real ones
+    have some tenths less swirl.
     """
 
     diameter: float
@@ -104,7 +104,7 @@ class TurbineWake:
 
     @property
     def axial_deficit(self) -> float:
-        """Deficit on the axis as a share of the wind."""
+        """Deficit on the axis as a fraction of the wind."""
         return 1 - math.sqrt(1 - self.thrust / (8 * self._relative_width**2))
 
     @property
@@ -141,7 +141,7 @@ class TurbineWake:
         return self.circulation * self._profile(r)
 
     def _profile(self, r):
-        """Swirl of a hub vortex of circulation 1: Lamb-Oseen, less what of the tips' lies within r."""
+        """Swirl of a hub vortex of circulation 1: Lamb-Oseen, less the tip vorticity within r."""
         r = np.asarray(r, float)
         core = -np.expm1(-LAMB_OSEEN_CONSTANT * (r / self.hub_core) ** 2)
         outer = np.exp(-(r**2) / (2 * self.width**2))
@@ -204,7 +204,7 @@ def turbine_flow(
     """u, v, w behind a turbine: the mean wake, on all planes x alike, and turbulence.
 
     Turbulence is isotropic, of the intensity ``ambient`` plus, in squares, what the wake adds
-    (`added_turbulence`) in its middle, fading outwards as the deficit does. That modulation leaves
+    (`added_turbulence`) in its middle, fading outwards as the deficit does. This modulation causes
     a divergence of some per cent of the gusts' gradients.
 
     Parameters

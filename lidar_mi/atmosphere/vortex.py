@@ -1,6 +1,6 @@
 """Analytic wake vortices: swirl profiles, the flow of any set of them, the wake pair.
 
-Frame: x forward, y to port (left), z up. A vortex with positive circulation turns about +x,
+Frame: x forward, y to port (left), z up. A vortex with positive circulation rotates about +x,
 from +y towards +z.
 """
 
@@ -16,7 +16,7 @@ from lidar_mi.errors import InputError
 Model = Literal["lamb_oseen", "burnham_hallock"]
 MODELS: tuple[str, ...] = get_args(Model)
 
-# Root of 1 + 2 a = exp(a): puts the peak of the Lamb-Oseen swirl at r = core_radius.
+# Root of 1 + 2 a = exp(a): the Lamb-Oseen swirl has its maximum at r = core_radius.
 LAMB_OSEEN_CONSTANT = 1.2564
 
 
@@ -27,7 +27,7 @@ class Vortex:
     Parameters
     ----------
     circulation : float
-        Gamma in m^2 s^-1; positive turns about +x (port vortex of a wake).
+        Gamma in m^2 s^-1; positive rotates about +x (port vortex of a wake).
     core_radius : float
         Radius of the largest tangential speed, m, > 0.
     y, z : float
@@ -140,7 +140,7 @@ def vortex_pair(
 ) -> tuple[Vortex, Vortex]:
     """The counter-rotating pair behind an aircraft: port, starboard.
 
-    Port (larger y) carries +circulation, starboard -circulation, so the air between them moves
+    Port (larger y) has +circulation, starboard -circulation, so the air between them moves
     down. Separation and core radius default to the paper's 47.1 m and 3 m.
 
     Parameters
@@ -181,7 +181,7 @@ def descent_speed(circulation: float, separation: float) -> float:
     """Speed w_0 = Gamma/(2 pi b_0) at which a pair of point vortices descends, m s^-1.
 
     With a core, the partner's swirl at b_0 is smaller by exp(-1.2564 b_0^2/r_c^2) (Lamb-Oseen,
-    nothing at b_0/r_c = 16) or by 1/(1 + b_0^2/r_c^2) (Burnham-Hallock, 0.4 %).
+    negligible at b_0/r_c = 16) or by 1/(1 + b_0^2/r_c^2) (Burnham-Hallock, 0.4 %).
     """
     _check_pair(circulation, separation)
     return circulation / (2 * np.pi * separation)

@@ -1,4 +1,4 @@
-"""Wake flows from files: read, check, refine, and put into the lidar's frame."""
+"""Wake flows from files: read, check, refine, and transform to the lidar frame."""
 
 import math
 import re
@@ -111,8 +111,8 @@ def _file_names(names, path):
     doubled = {t for t in table.values() if list(table.values()).count(t) > 1}
     if doubled:
         raise InputError(
-            f"wake.names: {', '.join(sorted(doubled))} of {path} stands for more than one thing; "
-            "allowed: one each"
+            f"wake.names: {', '.join(sorted(doubled))} of {path} stands for more than one "
+            "variable; allowed: one each"
         )
     return table
 
@@ -135,7 +135,7 @@ def _pick_time(data, name, time, path):
     coordinate = data[name]
     if coordinate.ndim > 1:
         raise InputError(f"{path}: {name!r} has dims {coordinate.dims}; allowed: one at most")
-    # "seconds since 2000-01-01" counts in seconds; the date itself is of no use here.
+    # "seconds since 2000-01-01" counts in seconds; the date itself is not used.
     plain = coordinate.copy()
     if "units" in plain.attrs:
         plain.attrs["units"] = str(plain.attrs["units"]).split(" since ")[0]
@@ -237,7 +237,7 @@ def read_wake(
     x : float, optional
         m; keeps the one plane nearest to it. Default: all planes.
     require : iterable of str
-        Variables that must be there beside v and w, out of u, tracer, aerosol.
+        Variables that must be present besides v and w, out of u, tracer, aerosol.
 
     Returns
     -------
@@ -266,7 +266,7 @@ def read_wake(
 
 
 def _hint(name, table):
-    """How to say what a file calls a thing, for those who have not said anything of it."""
+    """How to give the name in the file, where none has been given."""
     if table[name] != name:
         return ""
     none = f", or wake.extinction.{name}: null" if name in ("tracer", "aerosol") else ""
@@ -362,8 +362,8 @@ def check_nodes(spacing: float, counts: Mapping[str, int]) -> None:
     if math.prod(counts.values()) > _MOST_NODES:
         counted = " x ".join(f"{count} ({name})" for name, count in counts.items())
         raise InputError(
-            f"wake.spacing: {spacing:g} m is not allowed, it makes {counted} nodes; expected at most "
-            f"{_MOST_NODES:g} nodes"
+            f"wake.spacing: {spacing:g} m is not allowed, it makes {counted} nodes; expected at "
+            f"most {_MOST_NODES:g} nodes"
         )
 
 
@@ -372,7 +372,7 @@ def resample(wake: xr.Dataset, spacing: float, axes: str = "yz") -> xr.Dataset:
 
     Splines (not-a-knot) along one axis after the other, through the nodes; exact for cubic
     polynomials. The end nodes are kept: 110 x 70 nodes of 1 m become 219 x 139 of 0.5 m. tracer and
-    aerosol are clipped to the range of their data, which a spline leaves at sharp edges (a tracer
+    aerosol are clipped to the range of their data, which a spline exceeds at sharp edges (a tracer
     would go negative there).
 
     Parameters
@@ -433,7 +433,7 @@ def centre(
     z: float | None = None,
     about: tuple[float, float] = (0.0, 0.0),
 ) -> xr.Dataset:
-    """Put the wake's point (y, z) at `about` in the lidar frame, by default on the beam axis.
+    """Translate the wake: its point (y, z) to `about` in the lidar frame, by default the beam axis.
 
     Parameters
     ----------

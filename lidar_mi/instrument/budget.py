@@ -80,7 +80,7 @@ def pulse_budget(
         pulses_per_second=rate,
         average_power=rate * pulse_energy,
         echo_time=echo_time,
-        # an echo that just fits must not ask for a second beam by rounding
+        # rounding must not make an echo that just fits require a second beam
         beams=max(1, math.ceil(rate * echo_time * (1 - 1e-12))),
         photons_per_direction=pulses_per_direction * photons_per_pulse,
     )

@@ -49,7 +49,7 @@ class Detector(BaseModel):
     readout_noise: Number = Field(0.0, ge=0, description="rms photoelectrons a gate, at the input")
     sky_radiance: SpectralRadiance = Field("0.3 W/m^2/sr/nm", ge=0, description="solar background")
     filter_bandwidth: Length = Field("1 nm", gt=0, description="equivalent width of the filter")
-    speckle: bool = Field(True, description="whether the laser's coherence is seen")
+    speckle: bool = Field(True, description="whether the coherence of the laser causes speckle")
     line_width: Frequency = Field(
         "30 GHz", gt=0, description="of the echo, full width half maximum"
     )
@@ -197,9 +197,9 @@ def speckle_modes(
 ):
     """Degrees of freedom M of the received light: its relative variance is 1 / M.
 
-    Temporal times spatial modes, times 2 / (1 + P^2) for light of degree of polarisation P, as
-    both polarisations are counted (Goodman, Statistical Optics, section 6.1). Light scattered
-    several times comes from a wider spot, so M is a lower bound there. ``detector.speckle_modes`` replaces
+    Temporal times spatial modes, times 2 / (1 + P^2) for light of degree of polarisation P, as both
+    polarisations are counted (Goodman, Statistical Optics, section 6.1). Light scattered several
+    times comes from a wider spot, so M is a lower bound there. ``detector.speckle_modes`` replaces
     all of it; without ``detector.speckle`` M is infinite.
 
     Parameters
@@ -287,7 +287,7 @@ def detect(
     distance : array
         Range of the gate, m.
     seed : int or sequence of int
-        Images that should not share their noise need different ones.
+        Images with independent noise need different ones.
     polarization : array
         Degree of polarisation of the received light, 0 to 1.
 
@@ -335,10 +335,10 @@ def detect(
 def noisy_scan(
     scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector, seed: int | Sequence[int]
 ) -> xr.Dataset:
-    """A scan with the detector's noise beside the noise-free image.
+    """A scan with the detector's noise, in addition to the noise-free image.
 
     Adds ``S0_noisy`` and ``S0_noise_std`` (gate, z, y), ``Y_noisy`` and ``Y_noise_std`` (z, y), the
-    apparent backscatter of the first gate; and the detector as attributes ``detector_...``. The
+    attenuated backscatter of the first gate; and the detector as attributes ``detector_...``. The
     rendered image's Monte Carlo error (``S0_stderr``) comes on top of ``S0_noise_std``. Speckle
     of gates, pixels and scans is independent (the air moves by more than a wavelength from scan
     to scan; between gates that holds for lines wider than 1 / gate duration).
@@ -353,21 +353,21 @@ def noisy_scan(
     Raises
     ------
     InputError
-        The scan does not say its gates; see `detect` for the rest.
+        The scan does not state its gates; see `detect` for the rest.
     """
     plan = _plan(scan)
     scan = scan.transpose("gate", "z", "y", ...)
     s0 = scan["S0"].values
     ranges = np.broadcast_to(plan.ranges(), s0.shape)
     duration = np.broadcast_to(gate_duration(plan.gate_length()), s0.shape)
-    found = detect(s0, lidar, detector, duration, ranges, seed, _polarization(scan))
+    counted = detect(s0, lidar, detector, duration, ranges, seed, _polarization(scan))
     scene = (plan, lidar.aperture_area, scan.attrs["environment_extinction"])
-    y, y_std = (apparent_backscatter(x, *scene)[0] for x in (found.s0, found.s0_std))
+    y, y_std = (apparent_backscatter(x, *scene)[0] for x in (counted.s0, counted.s0_std))
     image, pixel = ("gate", "z", "y"), ("z", "y")
     noise = {
-        "S0_noisy": (image, found.s0, "S0 with the detector's noise", "1"),
-        "S0_noise_std": (image, found.s0_std, "standard deviation of the noise of S0_noisy", "1"),
-        "Y_noisy": (pixel, y, "apparent backscatter with the detector's noise", "m-1 sr-1"),
+        "S0_noisy": (image, counted.s0, "S0 with the detector's noise", "1"),
+        "S0_noise_std": (image, counted.s0_std, "standard deviation of the noise of S0_noisy", "1"),
+        "Y_noisy": (pixel, y, "attenuated backscatter with the detector's noise", "m-1 sr-1"),
         "Y_noise_std": (pixel, y_std, "standard deviation of the noise of Y_noisy", "m-1 sr-1"),
     }
     fields = detector.model_dump(exclude_none=True)
@@ -391,7 +391,7 @@ def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) 
     Raises
     ------
     InputError
-        The scan does not say its gates, or is dark.
+        The scan does not state its gates, or is dark.
     """
     plan = _plan(scan)
     scan = scan.transpose("gate", "z", "y", ...)
@@ -436,7 +436,7 @@ def _means(s0, lidar, detector, duration, distance, polarization):
 
 
 def _polarization(scan: xr.Dataset) -> np.ndarray:
-    """Degree of polarisation; 1, the most speckle, where the rendering carried none."""
+    """Degree of polarisation; 1, the most speckle, where the rendering was unpolarised."""
     s0 = scan["S0"].values
     if not scan.attrs.get("polarized"):
         return np.ones_like(s0)
@@ -446,7 +446,7 @@ def _polarization(scan: xr.Dataset) -> np.ndarray:
 
 
 def _plan(scan: xr.Dataset) -> ScanPlan:
-    """Where the gates of a scan lie, from what the scan says about itself."""
+    """Where the gates of a scan lie, from the attributes of the scan."""
     names = ("gate_start", "gate_stop", "gate_kind", "gate_count")
     for name in (*names, "environment_extinction"):
         if name not in scan.attrs:

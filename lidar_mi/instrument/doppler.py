@@ -33,9 +33,9 @@ from lidar_mi.units import (
 class DopplerLidar(BaseModel):
     """A monostatic direct-detection Doppler lidar; defaults are the paper's Table 2.
 
-    The paper has 76 m beside 56 m. Not the paper's are: the widths of the laser's line and of the
-    filter, the field of view (which holds the beam from 34 m on), the sky's radiance, the line's
-    shape and ``aerosol_share``.
+    The paper has ranges of 56 m and 76 m. Not from the paper are: the widths of the laser's line
+    and of the filter, the field of view (which holds the beam from 34 m on), the sky's radiance,
+    the line's shape and ``aerosol_share``.
 
     ``instrument_constant`` is taken to hold everything between telescope and photoelectron, so that
     the lidar equation counts detected photons. With ``counted: before_etalon`` it ends in front of
@@ -87,20 +87,20 @@ class DopplerLidar(BaseModel):
 
     @property
     def gate_duration(self) -> float:
-        """Time in which the range bin is seen, s: 67 ns for 10 m."""
+        """Duration of the echo from the range bin, s: 67 ns for 10 m."""
         return float(gate_duration(self.range_bin))
 
     @property
     def beam_width(self) -> float:
-        """Diameter of the beam at ``range``, m, as the paper adds it up: aperture plus divergence."""
+        """Diameter of the beam at ``range``, m: aperture plus divergence, as in the paper."""
         return 2 * self.beam_radius + self.divergence_full * self.range
 
 
 def photons(lidar: DopplerLidar) -> float:
-    """Photons of a pulse that come back from the range bin, where ``lidar.counted`` says.
+    """Photons of a pulse received from the range bin, at the place that ``lidar.counted`` names.
 
-    The single-scattering lidar equation n = E lambda / (h c) k A / r^2 beta dr exp(-2 alpha r).
-    The bin is seen from its middle: 1 / r^2 over 10 m at 56 m gives 0.8 % more.
+    The single-scattering lidar equation n = E lambda / (h c) k A / r^2 beta dr exp(-2 alpha r). It
+    is evaluated at the middle of the bin: the mean of 1 / r^2 over 10 m at 56 m gives 0.8 % more.
     """
     emitted = lidar.pulse_energy * photons_per_energy(lidar.wavelength)
     collected = lidar.instrument_constant * lidar.telescope_area / lidar.range**2
@@ -143,21 +143,21 @@ def coherence_time(etalon: Etalon, line, order: float = 0.0) -> float:
     """
     if not line.sigmas.all():
         raise InputError("line.sigmas: 0 Hz is not allowed; expected a line with a width")
-    reach = 8 * line.sigmas.max() + abs(line.offsets).max()
-    # an eighth of the narrowest Gaussian's sigma: sums of its square are exact to rounding
-    nu = np.arange(-reach, reach, line.sigmas.min() / 8)
-    turns = order + nu / etalon.free_spectral_range(line.wavelength)
-    passed = series(harmonics(etalon, line.wavelength), torch.from_numpy(turns)).numpy()
-    seen = line.pdf(nu) * passed
-    return float((seen**2).sum() / seen.sum() ** 2 / (nu[1] - nu[0]))
+    extent = 8 * line.sigmas.max() + abs(line.offsets).max()
+    # steps of sigma / 8 of the narrowest Gaussian: sums of its square are exact to rounding
+    nu = np.arange(-extent, extent, line.sigmas.min() / 8)
+    orders = order + nu / etalon.free_spectral_range(line.wavelength)
+    passed = series(harmonics(etalon, line.wavelength), torch.from_numpy(orders)).numpy()
+    transmitted = line.pdf(nu) * passed
+    return float((transmitted**2).sum() / transmitted.sum() ** 2 / (nu[1] - nu[0]))
 
 
 def speckle_modes(lidar: DopplerLidar, camera: FringeCamera, etalon: Etalon, line) -> float:
     """Degrees of freedom M of the speckle in one pixel: its relative variance is 1 / M.
 
-    Modes in time, for a Gaussian line of the `coherence_time` at the peak of a fringe, times
-    modes in space: those of the telescope, A Omega / lambda^2, spread evenly over the pixels, and one
-    at least. Polarised light is taken, the least that molecules leave; the polarisations of
+    Modes in time, for a Gaussian line of the `coherence_time` at the peak of a fringe, times modes
+    in space: those of the telescope, A Omega / lambda^2, spread evenly over the pixels, and one at
+    least. Polarised light is taken, the least that molecules leave; the polarisations of
     depolarised light would add modes.
     """
     # FWHM of the Gaussian line with that coherence time

@@ -1,4 +1,4 @@
-"""A Doppler lidar's scan: where its lines of sight go, the air each of them sees, what it measures.
+"""A Doppler lidar's scan: lines of sight, the volume of air of each, line-of-sight velocities.
 
 Line-of-sight velocities are positive toward the instrument, as in the paper's eq. 1.
 """
@@ -43,7 +43,7 @@ class DopplerScan(_Model):
     gates: Literal["planar", "spherical"] = "planar"
 
     def directions(self) -> np.ndarray:
-        """Unit vectors, (rows * columns, 3), as a pilot reads a page: top left first."""
+        """Unit vectors, (rows * columns, 3), row by row from the top left."""
         lateral = np.tan(_spread(self.azimuth_half, self.columns))[::-1]
         vertical = np.tan(_spread(self.elevation_half, self.rows))[::-1]
         up, left = np.meshgrid(vertical, lateral, indexing="ij")
@@ -59,10 +59,10 @@ class DopplerScan(_Model):
 
 
 class PlatformErrors(_Model):
-    """What the retrieval does not know of the platform: truth less what is taken for it.
+    """Errors of the platform's attitude, pointing and speed: truth minus the assumed value.
 
-    Pitch is positive nose up, yaw nose to port, roll port wing up. An angle e turns the platform's
-    speed V, seen at the angle t off the axis, into an error of the velocity of V e sin(t).
+    Pitch is positive nose up, yaw nose to port, roll port wing up. An angle error e causes a
+    velocity error of V e sin(t) at the angle t off the axis, V being the speed of the platform.
     """
 
     roll: Angle = Field(0.0, gt=-1, lt=1, description="of the attitude")
@@ -73,31 +73,31 @@ class PlatformErrors(_Model):
 
 
 def pointed(directions: np.ndarray, errors: PlatformErrors, seed: int = 0) -> np.ndarray:
-    """Where the lines of sight really go, (n, 3), for the directions they are taken to have.
+    """True lines of sight, (n, 3), for the assumed directions.
 
-    The attitude turns all alike (yaw, pitch, roll, in this order), then every one is tilted by
+    The attitude rotates all alike (yaw, pitch, roll, in this order), then each one is tilted by
     normally distributed small angles about two axes perpendicular to it.
     """
-    turn = Rotation.from_euler("ZYX", [errors.yaw, -errors.pitch, errors.roll])
-    turned = turn.apply(np.asarray(directions, float))
+    attitude = Rotation.from_euler("ZYX", [errors.yaw, -errors.pitch, errors.roll])
+    rotated = attitude.apply(np.asarray(directions, float))
     if errors.jitter == 0:
-        return turned
-    across = np.cross(turned, [0.0, 0.0, 1.0])
+        return rotated
+    across = np.cross(rotated, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    above = np.cross(across, turned)
-    tilt = errors.jitter * np.random.default_rng(seed).standard_normal((2, len(turned), 1))
-    turned = turned + tilt[0] * across + tilt[1] * above
-    return turned / np.linalg.norm(turned, axis=1, keepdims=True)
+    above = np.cross(across, rotated)
+    tilt = errors.jitter * np.random.default_rng(seed).standard_normal((2, len(rotated), 1))
+    rotated = rotated + tilt[0] * across + tilt[1] * above
+    return rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
 
 
 def sight_volumes(
     directions: np.ndarray, ranges: np.ndarray, lidar: DopplerLidar
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points and weights that stand for the air each line of sight averages over.
+    """Points and weights of the average over air along each line of sight.
 
     Range bin (even), pulse (Gaussian of ``pulse_duration``, which smears range by c t / 2), beam
-    (Gaussian, ``beam_width`` its 1/e^2 diameter), each weighted with the signal it sends back,
-    exp(-2 alpha r) / r^2: 10 m at 56 m are seen 0.3 m nearer than their middle.
+    (Gaussian, ``beam_width`` its 1/e^2 diameter), each weighted with its signal,
+    exp(-2 alpha r) / r^2: the centroid of 10 m at 56 m is 0.3 m nearer than the middle.
 
     Returns
     -------
@@ -202,9 +202,9 @@ def scan_wind(
     seed : int
         Of noise and jitter.
     speed : float
-        Of the platform along x, as the platform knows it, m/s.
+        Of the platform along x, as measured on board, m/s.
     errors : PlatformErrors
-        What it does not know; by default nothing.
+        Errors of that knowledge; by default none.
 
     Returns
     -------

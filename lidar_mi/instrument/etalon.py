@@ -5,7 +5,7 @@ light passes where m is an integer: the phase of reflection is tuned away with t
 77 000, so it is computed in float64 and its integer part split off; the rest fits in float32.
 
 As a series in the order the transmission is T(m) = A_0 + 2 sum A_n cos(2 pi n m). A line with the
-Fourier transform chi (`lidar_mi.atmosphere.line.Line`) turns A_n into A_n chi(n / FSR), uneven
+Fourier transform chi (`lidar_mi.atmosphere.line.Line`) replaces A_n by A_n chi(n / FSR), uneven
 plates into A_n D_n: all convolutions are products.
 """
 
@@ -22,7 +22,8 @@ from lidar_mi.errors import InputError
 from lidar_mi.units import Length, Number
 
 POLARIZATIONS = ("s", "p")
-# Less than this and a mirror is taken for opaque: even lossless, no pulse would be seen through it.
+# A mirror that transmits less is taken for opaque: even lossless, it would transmit no photon of a
+# pulse.
 _LEAST_TRANSMITTANCE = 1e-6
 # A finesse of 9000: the series is for rings on a camera, and is kept in memory.
 _MOST_HARMONICS = 100_000
@@ -47,7 +48,7 @@ class Mirrors(NamedTuple):
 class Etalon(BaseModel):
     """A plane Fabry-Perot etalon; lengths in m, text with units is read as such.
 
-    The paper gives no numbers for its etalon. The defaults are derived: they put four rings on
+    The paper gives no numbers for its etalon. The defaults are derived: they give four rings on
     960 x 780 pixels of 7.4 um behind a lens of 300 mm.
 
     Mirrors are given by ``reflectivity`` and ``absorption``, or by ``coatings`` on the inner faces
@@ -68,7 +69,9 @@ class Etalon(BaseModel):
     )
     index: Number = Field(1.0, ge=1, le=4, description="refractive index in the gap")
     reflectivity: Number = Field(0.70, gt=0, lt=1, description="of each mirror")
-    absorption: Number = Field(0.0, ge=0, lt=1, description="share of the light lost in a mirror")
+    absorption: Number = Field(
+        0.0, ge=0, lt=1, description="fraction of the light absorbed by a mirror"
+    )
     surface_rms: Length = Field(
         2e-9, ge=0, description="standard deviation of the gap by irregular plates"
     )
@@ -136,9 +139,9 @@ def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
             f"etalon.coatings: a mirror that transmits {transmittance:.1e} at {wavelength:g} m is "
             f"not allowed; expected at least {_LEAST_TRANSMITTANCE:g}"
         )
-    turns = float(np.angle(r)) / np.pi
+    phase = float(np.angle(r)) / np.pi
     # a whole order more or less is the same phase
-    return Mirrors(float(abs(r) ** 2), transmittance, turns - round(turns))
+    return Mirrors(float(abs(r) ** 2), transmittance, phase - round(phase))
 
 
 def cosine_inside(etalon: Etalon, cosine):
@@ -213,8 +216,8 @@ def harmonics(etalon: Etalon, wavelength: float, line=None, count: int | None = 
 
 def series(amplitudes, order: torch.Tensor) -> torch.Tensor:
     """A_0 + 2 Re sum A_n exp(2 pi i n m) at the orders ``m``, by Horner's rule in float64."""
-    turns = 2 * math.pi * order.double()
-    z = torch.polar(torch.ones_like(turns), turns)
+    phase = 2 * math.pi * order.double()
+    z = torch.polar(torch.ones_like(phase), phase)
     total = torch.zeros_like(z)
     for amplitude in amplitudes[:0:-1].tolist():
         total += amplitude
@@ -294,7 +297,7 @@ def _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization):
     """Of one mirror: reflection in the gap, transmission.
 
     Characteristic matrices of the layers (Macleod 2010, Thin-Film Optical Filters, chap. 2) for
-    fields as exp(-i omega t), normalised so that |t|^2 is the transmitted share of the power.
+    fields as exp(-i omega t), normalised so that |t|^2 is the transmitted fraction of the power.
     """
     if polarization not in POLARIZATIONS:
         raise InputError(f"polarization: {polarization!r} is not allowed; expected s or p")

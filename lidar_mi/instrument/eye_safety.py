@@ -19,7 +19,7 @@ Rule = Literal["single pulse", "average", "repeated pulses"]
 
 @dataclass(frozen=True)
 class PulseLimit:
-    """How much one pulse of a train may bring to the cornea.
+    """Permissible exposure of the cornea to one pulse of a train.
 
     Attributes
     ----------
@@ -41,7 +41,7 @@ class PulseLimit:
 
 @dataclass(frozen=True)
 class ViewingAid:
-    """Binoculars or a telescope, through which somebody looks into the beam; default: 7 x 50.
+    """Binoculars or a telescope, through which a person looks into the beam; default: 7 x 50.
 
     ``transmission`` 1 is the worst case; real ones pass 70 to 90 %.
     """
@@ -69,7 +69,7 @@ class EyeSafety:
     hazard_distance : float
         Nominal ocular hazard distance, m; 0 if the beam is safe at its exit, inf if it never is.
     aided_hazard_distance : float
-        The same for somebody with binoculars, m.
+        The same for a person with binoculars, m.
     """
 
     limit: PulseLimit
@@ -86,7 +86,7 @@ def permissible_exposure(wavelength: float, duration: float) -> float:
     wavelength : float
         m, 180 nm to 1 mm.
     duration : float
-        s, 1e-13 to 3e4. For a steady beam: the time somebody looks into it.
+        s, 1e-13 to 3e4. For a steady beam: the duration of exposure.
 
     Raises
     ------
@@ -95,10 +95,10 @@ def permissible_exposure(wavelength: float, duration: float) -> float:
 
     Notes
     -----
-    Table A.1. From 400 to 600 nm the lesser of the thermal and the photochemical limit, from 1250 to
-    1400 nm not above the limit of the skin (the table's footnote), below 315 nm the lesser of C1 and
-    C2. Nanosecond pulses: 2e-3 J m^-2 in the visible (5e-3 before 2014), 5600 t^(1/4) from 315 to
-    400 nm, 1e4 from 1500 to 1800 nm.
+    Table A.1. From 400 to 600 nm the lesser of the thermal and the photochemical limit, from 1250
+    to 1400 nm not above the limit of the skin (the table's footnote), below 315 nm the lesser of C1
+    and C2. Nanosecond pulses: 2e-3 J m^-2 in the visible (5e-3 before 2014), 5600 t^(1/4) from 315
+    to 400 nm, 1e4 from 1500 to 1800 nm.
     """
     nm = _nanometres(wavelength)
     t = _duration("duration", duration)
@@ -157,8 +157,8 @@ def permissible_pulse(
 def time_base(wavelength: float) -> float:
     """How long an exposure is reckoned with, s (IEC 60825-1:2014, 4.3 e).
 
-    0.25 s where people turn away (400 to 700 nm), 3e4 s in the ultraviolet, else 100 s. Somebody
-    before a moving aircraft is exposed for a shorter time: that time may be taken instead.
+    0.25 s where the aversion response acts (400 to 700 nm), 3e4 s in the ultraviolet, else 100 s.
+    Somebody before a moving aircraft is exposed for a shorter time: that time may be taken instead.
     """
     nm = _nanometres(wavelength)
     if nm < 400:
@@ -167,7 +167,7 @@ def time_base(wavelength: float) -> float:
 
 
 def limiting_aperture(wavelength: float, duration: float) -> float:
-    """Diameter of the circle over which exposure is averaged, m: the pupil's 7 mm, or 1 to 11 mm."""
+    """Diameter of the circle over which exposure is averaged, m: 7 mm (pupil), or 1 to 11 mm."""
     nm = _nanometres(wavelength)
     if nm < 400:
         return 1e-3
@@ -211,8 +211,8 @@ def exposure_at(
     aid = aid or ViewingAid(1.0, aperture)
     entrance = min(aid.objective, aperture * aid.magnification) / 2
     square = beam_radius**2 + (divergence_full / 2 * distance) ** 2
-    share = -math.expm1(-2 * entrance**2 / square)
-    arrived = energy * math.exp(-extinction * distance) * aid.transmission * share
+    fraction = -math.expm1(-2 * entrance**2 / square)
+    arrived = energy * math.exp(-extinction * distance) * aid.transmission * fraction
     return arrived / (math.pi / 4 * aperture**2)
 
 
@@ -224,7 +224,7 @@ def hazard_distance(
     extinction: float = 0.0,
     aid: ViewingAid | None = None,
 ) -> float:
-    """Nominal ocular hazard distance (NOHD), m: beyond it no pulse brings more than the limit.
+    """Nominal ocular hazard distance (NOHD), m: beyond it no pulse exceeds the limit.
 
     Parameters as in `exposure_at`; with ``aid`` the extended distance. 0 if the beam is safe where
     it leaves, inf if it never becomes so (no divergence, clear air).
@@ -270,10 +270,10 @@ def scan_hazard_distance(
 ) -> float:
     """Distance from which an eye may look into a whole scan, m.
 
-    Beams side by side, ``spacing`` (rad) apart in both directions, overlap near the scanner, where they
-    leave one aperture, and, if they diverge by more than the spacing, anywhere. An eye at the
-    distance r gets the light of n pulses in every scan, n = (pi w^2 / 2) / (spacing r)^2 for the 1/e^2
-    radius w, between 1 and ``beams``, each taken as strong as the one that points at it.
+    Beams side by side, ``spacing`` (rad) apart in both directions, overlap near the scanner, where
+    they leave one aperture, and, if they diverge by more than the spacing, anywhere. An eye at the
+    distance r gets the light of n pulses in every scan, n = (pi w^2 / 2) / (spacing r)^2 for the
+    1/e^2 radius w, between 1 and ``beams``, each taken as strong as the one that points at it.
 
     Parameters
     ----------
@@ -289,7 +289,8 @@ def scan_hazard_distance(
 
     Notes
     -----
-    Where the limit of the whole time decides, r = sqrt(energy scan_rate time / MPE(time)) / spacing.
+    Where the limit of the whole time decides, r = sqrt(energy scan_rate time / MPE(time)) /
+    spacing.
     """
     _positive("spacing", spacing, " rad")
     _positive("beams", beams, "")

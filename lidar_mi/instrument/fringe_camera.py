@@ -114,10 +114,11 @@ def fringe_image(
         Photons of an image.
     counted : {"detected", "before_etalon"}
         Where they are counted: ``photons`` is the sum over the image, or what that sum would be
-        without an etalon; then the image's share of it is the etalon's mean transmission.
+        without an etalon; then the ratio of the image to it is the etalon's mean transmission.
     subsamples : {1, 2}
-        Points a pixel is averaged over, along each axis. With 1 the rings are sampled in the
-        middle of the pixels, which leaves up to 0.3 % too much contrast in the corners of the default camera.
+        Points a pixel is averaged over, along each axis. With 1 the rings are sampled in the middle
+        of the pixels, which leaves up to 0.3 % too much contrast in the corners of the default
+        camera.
 
     Returns
     -------
@@ -161,8 +162,8 @@ def ring_radii(camera: FringeCamera, etalon: Etalon, wavelength: float, v_los=0.
     v_los : float
         m/s.
     """
-    reach = math.hypot(camera.width, camera.height) / 2 * camera.pixel
-    cosines = cosine_inside(etalon, camera.cosine(np.array([0, reach**2])))
+    corner = math.hypot(camera.width, camera.height) / 2 * camera.pixel
+    cosines = cosine_inside(etalon, camera.cosine(np.array([0, corner**2])))
     offset = doppler_shift(v_los, wavelength)
     first, last = fractional_order(etalon, wavelength, cosines, offset)
     orders = np.arange(math.floor(first), last, -1)

@@ -47,7 +47,7 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
     wavelength : float
         m.
     stop_radius : float
-        Of the light, m; at most a tenth of the focal length.
+        Of the light, m; at most 0.1 focal lengths.
     field : float
         Half angle of the image that is to be sharp, rad; at most 0.05.
 
@@ -93,12 +93,12 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
 
     def aberrations(shape):
         across, along = trace(lens(shape), *pupil, 0.0)
-        found = [across, along]  # of light on the axis: spherical aberration, focus
+        residuals = [across, along]  # of light on the axis: spherical aberration, focus
         for angle in angles:
             place, _ = trace(lens(shape), *pupil, angle)
             rings = place.reshape(len(zone), -1).mean(1)  # coma moves them, blur does not
-            found.append(rings - np.tan(angle))
-        return np.concatenate(found)
+            residuals.append(rings - np.tan(angle))
+        return np.concatenate(residuals)
 
     power = 1 / (index - 1)
     solved = least_squares(

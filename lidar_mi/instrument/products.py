@@ -1,4 +1,4 @@
-"""What else a scan tells: linear depolarisation ratio, share of multiple scattering."""
+"""Derived products of a scan: linear depolarisation ratio, fraction of multiple scattering."""
 
 import re
 
@@ -14,7 +14,7 @@ def linear_depolarization(s0, s1):
     """Linear depolarisation ratio delta = (S0 - S1) / (S0 + S1), cross over co-polarised light.
 
     For emission polarised along e_h, the axis that S1 refers to. NaN where no co-polarised light
-    came back.
+    was received.
     """
     s0, s1 = np.asarray(s0, float), np.asarray(s1, float)
     parallel = s0 + s1
@@ -31,40 +31,42 @@ def depolarization_stderr(s0, s1, s0_stderr, s1_stderr, correlation):
         Standard errors of S0 and S1.
     correlation : array
         Correlation coefficient of the estimates of S0 and S1. It is near +-1, as both come from
-        the same photons: taking it as 0 makes the error many times too large.
+        the same samples; with 0 the error would be many times too large.
     """
     s0, s1 = np.asarray(s0, float), np.asarray(s1, float)
     first, second = s1 * s0_stderr, s0 * s1_stderr
-    # written as a sum of squares, because its terms nearly cancel where all photons agree
+    # written as a sum of squares, because its terms nearly cancel where all samples agree
     correlation = np.clip(correlation, -1, 1)
     root = 2 * np.sqrt((first - correlation * second) ** 2 + (1 - correlation**2) * second**2)
     total = s0 + s1
     return np.divide(root, total**2, out=np.full(root.shape, np.nan), where=total > 0)
 
 
-def depolarization_stderr_bound(s0, s1, s0_stderr, photons: int):
+def depolarization_stderr_bound(s0, s1, s0_stderr, samples: int):
     """The largest standard error the depolarisation ratio can have, from that of S0 alone.
 
-    A photon of weight s brings x cross- and s - x co-polarised light, 0 <= x <= s. The error of
+    A Monte Carlo sample of weight s contributes x cross- and s - x co-polarised light,
+    0 <= x <= s. The error of
     the ratio delta of their sums is that of the mean of (1 + delta) x - delta s, over the mean
-    co-polarised light; it lies between -delta s and s, whatever the photon did. So for n
-    independent photons
+    co-polarised light; it lies between -delta s and s, whatever the path of the sample. So for n
+    independent samples
 
         stderr(delta) <= max(1, delta) (1 + delta) sqrt(<s^2> / n) / <s>,
         <s^2> / n = stderr(S0)^2 + S0^2 / n.
 
-    Nothing smaller is certain: it would be reached if few photons brought all the depolarisation.
-    Single scattering, where all photons of a beam are nearly alike, lies orders of magnitude below.
+    No smaller bound is certain: it would be reached if few samples contributed all the
+    depolarisation. In single scattering, where all samples of a beam are nearly alike, the error is
+    orders of magnitude smaller.
 
     Parameters
     ----------
-    photons : int
-        Number n of independent photons of a pixel and gate.
+    samples : int
+        Number n of independent samples of a pixel and gate.
     """
     s0 = np.asarray(s0, float)
     ratio = linear_depolarization(s0, s1)
     relative = np.divide(s0_stderr, s0, out=np.full(s0.shape, np.nan), where=s0 > 0)
-    return np.maximum(1, ratio) * (1 + ratio) * np.sqrt(relative**2 + 1 / photons)
+    return np.maximum(1, ratio) * (1 + ratio) * np.sqrt(relative**2 + 1 / samples)
 
 
 def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
@@ -81,8 +83,9 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
     """
     if not _emitted_along_e_h(scan):
         raise InputError(
-            f"stokes_emitted: {scan.attrs.get('stokes_emitted')} is not allowed for the linear depolarisation ratio; "
-            "expected (1, 1, 0, 0), light polarised along the horizontal axis"
+            f"stokes_emitted: {scan.attrs.get('stokes_emitted')} is not allowed for the linear "
+            "depolarisation ratio; expected (1, 1, 0, 0), light polarised along the horizontal "
+            "axis"
         )
     if not scan.attrs.get("polarized"):
         raise InputError("polarized: 0 is not allowed; expected a scan of a polarised variant")
@@ -91,7 +94,7 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
     known = [scan[n].transpose(*dims).values.astype(float) for n in names if n in scan]
     bound = len(known) < len(names)
     if bound:
-        stderr = depolarization_stderr_bound(*known[:3], _photons(scan))
+        stderr = depolarization_stderr_bound(*known[:3], _samples(scan))
     else:
         stderr = depolarization_stderr(*known)
     ratio = linear_depolarization(*known[:2])
@@ -121,7 +124,7 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
 def multiple_scattering_fraction(
     single, multiple, single_stderr=0.0, multiple_stderr=0.0, correlation=0.0
 ):
-    """Share of the received light that was scattered more than once, and its standard error.
+    """Fraction of the received light that was scattered more than once, and its standard error.
 
     Parameters
     ----------
@@ -130,13 +133,13 @@ def multiple_scattering_fraction(
     single_stderr, multiple_stderr : array
         Their standard errors.
     correlation : array
-        Correlation coefficient of the two estimates; 0 when the orders were sampled by photons of
-        their own, -1 for an upper bound of the error.
+        Correlation coefficient of the two estimates; 0 when the orders were sampled
+        independently, -1 for an upper bound of the error.
 
     Returns
     -------
     fraction, stderr : arrays
-        multiple / (single + multiple); NaN where no light came back.
+        multiple / (single + multiple); NaN where no light was received.
     """
     single, multiple = np.asarray(single, float), np.asarray(multiple, float)
     total = single + multiple
@@ -150,13 +153,13 @@ def multiple_scattering_fraction(
 
 
 def multiple_scattering_image(scan: xr.Dataset) -> xr.Dataset:
-    """Share of light scattered more than once, of a scan whose orders were told apart.
+    """Fraction of light scattered more than once, of a scan with separate scattering orders.
 
     ``multiple_scattering_fraction`` and ``multiple_scattering_fraction_stderr``. A scan has the
     standard error of all orders together: taken as that of the larger part alone, it is an upper
-    bound of the share's error, as long as a photon that brings more in one order does not bring
-    less in another (attribute ``stderr_is_bound``). Where few photons bring all of the multiple
-    scattering, S0_stderr itself is too small for most pixels, and so is the bound.
+    bound of the error of the fraction, as long as a sample that contributes more to one order does
+    not contribute less to another (attribute ``stderr_is_bound``). Where few samples contribute all
+    of the multiple scattering, S0_stderr itself is too small for most pixels, and so is the bound.
 
     Raises
     ------
@@ -166,7 +169,7 @@ def multiple_scattering_image(scan: xr.Dataset) -> xr.Dataset:
     orders = sorted(str(name) for name in scan.data_vars if _ORDER.fullmatch(str(name)))
     if len(orders) < 2 or "order1.S0" not in orders:
         raise InputError(
-            f"orders: {', '.join(orders) or 'none'} is not allowed for the share of multiple "
+            f"orders: {', '.join(orders) or 'none'} is not allowed for the fraction of multiple "
             "scattering; expected order1.S0 and others, from an integrator with orders"
         )
     dims = ("gate", "z", "y")
@@ -175,7 +178,7 @@ def multiple_scattering_image(scan: xr.Dataset) -> xr.Dataset:
     total = single + sum(further)
     stderr = scan["S0_stderr"].transpose(*dims).values.astype(float)
     relative = np.divide(stderr, total, out=np.full(total.shape, np.nan), where=total > 0)
-    text = "share of light scattered more than once"
+    text = "fraction of light scattered more than once"
     return xr.Dataset(
         {
             "multiple_scattering_fraction": (dims, fraction, {"long_name": text, "units": "1"}),
@@ -194,11 +197,11 @@ def multiple_scattering_image(scan: xr.Dataset) -> xr.Dataset:
 
 
 def with_products(scan: xr.Dataset) -> xr.Dataset:
-    """The scan with what else it tells, as far as it was rendered for that; float32.
+    """The scan with its derived products, as far as it was rendered for them; float32.
 
-    Adds the variables of `depolarization_image`, if light polarised along e_h was followed in a
-    polarised variant, and of `multiple_scattering_image`, if orders were told apart. Attributes
-    ``NAME_is_bound`` say whether NAME, a standard error, is an upper bound.
+    Adds the variables of `depolarization_image`, if light polarised along e_h was rendered in a
+    polarised variant, and of `multiple_scattering_image`, if the scan has separate orders.
+    Attributes ``NAME_is_bound`` say whether NAME, a standard error, is an upper bound.
     """
     images = []
     if scan.attrs.get("polarized") and _emitted_along_e_h(scan):
@@ -218,10 +221,10 @@ def _emitted_along_e_h(scan: xr.Dataset) -> bool:
     return emitted is not None and np.allclose(emitted, (1, 1, 0, 0), rtol=0, atol=1e-6)
 
 
-def _photons(scan: xr.Dataset) -> int:
-    """Independent photons of a pixel and gate: the gated estimator spreads a beam's over gates."""
+def _samples(scan: xr.Dataset) -> int:
+    """Independent samples of a pixel and gate; the gated estimator divides a beam's among gates."""
     for name in ("samples_per_beam", "estimator", "gate_count"):
         if name not in scan.attrs:
             raise InputError(f"scan: attribute {name} is missing; expected a scan rendered here")
-    photons, gates = scan.attrs["samples_per_beam"], scan.attrs["gate_count"]
-    return max(2, -(-photons // gates)) if scan.attrs["estimator"] == "gated" else photons
+    samples, gates = scan.attrs["samples_per_beam"], scan.attrs["gate_count"]
+    return max(2, -(-samples // gates)) if scan.attrs["estimator"] == "gated" else samples

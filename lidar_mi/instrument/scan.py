@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from lidar_mi.units import Angle, Length, Speed
 
 MOST_BEAMS = 10**7
-"""A picture of so many beams holds about 1 GB, with a layer for each order and its errors."""
+"""An image of this many beams has about 1 GB, with a layer for each order and its errors."""
 
 HalfAngle = Annotated[Angle, Field(gt=0, lt=math.pi / 2)]
 
@@ -89,7 +89,7 @@ class ScanPlan:
         return (self.gate_start + self.gate_stop) / 2
 
     def directions(self) -> np.ndarray:
-        """Unit vectors of the beams, (rows * columns, 3), as a pilot reads a page: top left first."""
+        """Unit vectors of the beams, (rows * columns, 3), row by row from the top left."""
         vertical, lateral = np.meshgrid(self.z[::-1], self.y[::-1], indexing="ij")
         beams = np.stack([np.full_like(lateral, self.centre), lateral, vertical], -1)
         beams = beams.reshape(-1, 3)

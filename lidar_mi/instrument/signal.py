@@ -1,4 +1,4 @@
-"""From received energy to what the atmosphere scattered back."""
+"""From received energy to backscatter."""
 
 import numpy as np
 
@@ -6,11 +6,12 @@ from lidar_mi.instrument.scan import ScanPlan
 
 
 def apparent_backscatter(s0, plan: ScanPlan, aperture_area: float, environment: float):
-    """Apparent backscatter coefficient, m^-1 sr^-1: S0 r^2 / (A dr T^2).
+    """Range-corrected attenuated backscatter coefficient, m^-1 sr^-1: S0 r^2 / (A dr T^2).
 
     The single-scattering lidar equation solved for the backscatter coefficient, with the
-    environment's two-way transmittance to the middle of the gate. A homogeneous slab gives a flat
-    image. Attenuation by the slab itself is left in (0.25 % to the middle of 2.5 m at 1 / km).
+    environment's two-way transmittance to the middle of the gate. The image of a homogeneous slab
+    is flat. Attenuation by the slab itself is not corrected (0.25 % to the middle of 2.5 m at
+    1 / km).
 
     Parameters
     ----------

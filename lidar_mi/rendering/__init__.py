@@ -1,1 +1,1 @@
-"""The picture: Mitsuba scenes, running them, EXR files in and out."""
+"""Images: Mitsuba scenes and their rendering."""

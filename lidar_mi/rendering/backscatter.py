@@ -1,4 +1,4 @@
-"""The backscatter lidar's picture: an extinction field and a scan become a Mitsuba scene."""
+"""Images of the backscatter lidar: a Mitsuba scene from an extinction field and a scan."""
 
 import math
 import time
@@ -32,19 +32,19 @@ def extrude(plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar) -> xr.
     InputError
         Beams so wide that the extended plane would not fit into the memory.
     """
-    reach = lidar.beam_cut if np.isfinite(lidar.beam_cut) else 3 * lidar.beam_radius
+    radius = lidar.beam_cut if np.isfinite(lidar.beam_cut) else 3 * lidar.beam_radius
     # the Gaussian divergence exceeds 2.2 times its 1/e^2 angle once in 16 000 photons
-    reach += 2.2 * lidar.divergence_full / 2 * plan.gate_stop
+    radius += 2.2 * lidar.divergence_full / 2 * plan.gate_stop
     slope = np.hypot(np.abs(plan.y).max(), np.abs(plan.z).max()) / plan.centre
     # spherical gates bulge: their rim lies nearer by the beam's obliquity
     bulge = (plan.obliquity().max() - 1) * plan.gate_stop if plan.gate_kind == "spherical" else 0
-    margin = reach * slope + bulge
-    pad = {axis: int(np.ceil(reach / _spacing(plane, axis))) for axis in ("y", "z")}
+    margin = radius * slope + bulge
+    pad = {axis: int(np.ceil(radius / _spacing(plane, axis))) for axis in ("y", "z")}
     cells = math.prod(plane.sizes[axis] + 2 * n for axis, n in pad.items())
     if cells > MOST_CELLS:
         raise InputError(
             f"scan.range: {plan.gate_stop:g} m is not allowed with beams that spread by "
-            f"{reach:.3g} m until there; the plane would have {cells:.2g} nodes, expected at most "
+            f"{radius:.3g} m until there; the plane would have {cells:.2g} nodes, expected at most "
             f"{MOST_CELLS:g} (a narrower beam, a nearer range or a coarser wake.spacing)"
         )
     padded = plane.pad({axis: (n, n) for axis, n in pad.items()}, mode="edge")
@@ -76,7 +76,7 @@ def render_scans(
     ----------
     extinctions : sequence of (x, y, z) arrays
         Extinction coefficient (m^-1) at cell centres, x from the telescope's place at the first
-        scan, all on one grid; a single x plane says its depth in ``x.attrs["cell_width"]``.
+        scan, all on one grid; a single x plane has its depth in ``x.attrs["cell_width"]``.
     environment : float
         Extinction coefficient around the slab and on the way, m^-1.
     phase : dict
@@ -149,10 +149,10 @@ def scene_dict(
 
     around = within = {"albedo": albedo, "phase": phase}
     if molecules:
-        both, share = _mixed(environment, albedo, molecules)
-        around = {"albedo": both, "phase": _blend(phase, molecules, share)}
-        both, share = (volume(field) for field in _mixed(extinction, albedo, molecules))
-        within = {"albedo": both, "phase": _blend(phase, molecules, share)}
+        both, fraction = _mixed(environment, albedo, molecules)
+        around = {"albedo": both, "phase": _blend(phase, molecules, fraction)}
+        both, fraction = (volume(field) for field in _mixed(extinction, albedo, molecules))
+        within = {"albedo": both, "phase": _blend(phase, molecules, fraction)}
     return {
         "type": "scene",
         "integrator": {
@@ -205,29 +205,29 @@ def scene_dict(
 
 
 def _mixed(extinction, albedo: float, molecules: Molecules):
-    """Albedo of air, and the molecules' share of what it scatters."""
+    """Albedo of air, and the fraction of its scattering that is molecular."""
     by_molecules = molecules.albedo * molecules.extinction
     # rounding may leave a little less extinction than the molecules'
     by_others = albedo * np.maximum(extinction - molecules.extinction, 0)
     return (by_molecules + by_others) / extinction, by_molecules / (by_molecules + by_others)
 
 
-def _blend(phase: dict, molecules: Molecules, share) -> dict:
-    return {"type": "blendphase", "weight": share, "others": phase, "molecules": molecules.phase}
+def _blend(phase: dict, molecules: Molecules, fraction) -> dict:
+    return {"type": "blendphase", "weight": fraction, "others": phase, "molecules": molecules.phase}
 
 
 def _move(
     parameters, extinction: xr.DataArray, plan: ScanPlan, albedo: float, molecules: Molecules | None
 ) -> None:
-    """Put the telescope, its beams and the air in the slab where they are at a later scan."""
+    """Update the telescope, its beams and the air in the slab to a later scan."""
     parameters["sensor.to_world"] = mi.Transform4f().translate([plan.position, 0, 0])
     parameters["sensor.directions"] = mi.Float(plan.directions().ravel())
     parameters["sensor.gate_start"] = plan.gate_start
     parameters["sensor.gate_stop"] = plan.gate_stop
     fields = {"sigma_t": extinction}
     if molecules:
-        both, share = _mixed(extinction, albedo, molecules)
-        fields |= {"albedo": both, "phase_function.weight": share}
+        both, fraction = _mixed(extinction, albedo, molecules)
+        fields |= {"albedo": both, "phase_function.weight": fraction}
     for name, field in fields.items():
         parameters[f"slab.interior_medium.{name}.data"] = mi.TensorXf(_voxels(field))
     parameters.update()

@@ -1,4 +1,4 @@
-"""The fringe camera's picture: an etalon, a camera and a line become a Mitsuba scene."""
+"""Images of the fringe camera: a Mitsuba scene from an etalon, a camera and a line."""
 
 import math
 import time
@@ -44,15 +44,15 @@ def render_fringes(
     v_los : sequence of float
         m/s; positive when the air approaches.
     seed : int
-        Picture k uses seed + k * 2^16.
+        Image k uses seed + k * 2^16.
     progress : callable, optional
-        Called with (picture, paths done, paths in all).
+        Called with (image number, paths done, paths in all).
 
     Yields
     ------
     xr.Dataset
         S0 ... S3 and S0_stderr, dims (y, x) from the top left, received energy over the energy the
-        source sends through the stop; one picture at a time, as soon as it is rendered.
+        source sends through the stop; one image at a time, as soon as it is rendered.
 
     Raises
     ------
@@ -71,13 +71,13 @@ def render_fringes(
         if progress:
             scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
         start = time.perf_counter()
-        picture = render_picture(scene, seed=(seed + (index << 16)) % 2**31)
-        picture.attrs |= {
+        image = render_image(scene, seed=(seed + (index << 16)) % 2**31)
+        image.attrs |= {
             "v_los": float(speed),  # the scene's is rounded to float32
             "lens": settings.lens,
             "render_seconds": time.perf_counter() - start,
         }
-        yield picture
+        yield image
 
 
 def scene_dict(etalon: Etalon, camera: FringeCamera, line: Line, settings: FringeSettings) -> dict:
@@ -152,13 +152,13 @@ def scene_dict(etalon: Etalon, camera: FringeCamera, line: Line, settings: Fring
     }
 
 
-def render_picture(scene, samples: int = 0, seed: int = 0) -> xr.Dataset:
-    """Render a loaded scene of a `ccd` with the `fringes` integrator and say what it shows.
+def render_image(scene, samples: int = 0, seed: int = 0) -> xr.Dataset:
+    """Render a loaded scene of a `ccd` with the `fringes` integrator and describe the image.
 
     Parameters
     ----------
     samples : int
-        Light paths a pixel; 0: as the scene says.
+        Light paths per pixel; 0: as in the scene.
     """
     sensor, integrator = scene.sensors()[0], scene.integrator()
     image = np.array(mi.render(scene, spp=samples, seed=seed))

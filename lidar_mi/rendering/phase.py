@@ -21,7 +21,7 @@ class Scatterer(NamedTuple):
 
 
 class Molecules(NamedTuple):
-    """The molecules' part of the air, the same everywhere: extinction (m^-1), phase function, albedo."""
+    """Uniform molecular part of the air: extinction (m^-1), phase function, albedo."""
 
     extinction: float
     phase: dict
@@ -51,7 +51,7 @@ def scatterer(
     scattering,
     beside: str | Path = ".",
     wavelength: float = 532e-9,
-    notice: Notice = lambda text, share: None,
+    notice: Notice = lambda text, fraction: None,
 ) -> Scatterer:
     """How the air of an experiment scatters.
 
@@ -64,7 +64,7 @@ def scatterer(
     wavelength : float
         Of the laser, m; aerosols and molecules scatter accordingly.
     notice : callable, optional
-        Told how far a table is that must be made first.
+        Called with the progress of a table that must be made first.
 
     Raises
     ------
@@ -85,12 +85,12 @@ def scatterer(
         case "henyey_greenstein":
             phase = {"type": "hg", "g": scattering.asymmetry}
         case "mixture":
-            shares = [part.share for part in scattering.parts]
+            fractions = [part.share for part in scattering.parts]
             tables = [
                 _table(part, beside, wavelength, f"scattering.parts.{index}", notice)
                 for index, part in enumerate(scattering.parts)
             ]
-            phase, albedo = _tabulated(mix(tables, shares))
+            phase, albedo = _tabulated(mix(tables, fractions))
         case "table" if not _is_complete(table_files(scattering, beside)["scattering.table"]):
             path = table_files(scattering, beside)["scattering.table"]
             phase = {"type": "mueller", "table": str(path)}
@@ -123,7 +123,7 @@ def _table(part, beside, wavelength, field, notice) -> ScatteringTable:
     """One kind of scatterer as a table."""
     match part.phase:
         case "rayleigh":
-            # only shares of the extinction count: any cross-section will do
+            # only fractions of the extinction matter: any cross-section will do
             return rayleigh_table(part.depolarization, wavelength, 1.0)
         case "molecules":
             return molecular_table(wavelength, band=part.band)
@@ -145,7 +145,7 @@ def _tabulated(table: ScatteringTable) -> Scatterer:
 
 
 def _is_complete(path: Path) -> bool:
-    """Whether a table says more than numbers: albedo, wavelength, as `write_table` does."""
+    """Whether a table has a header with albedo and wavelength, as `write_table` writes it."""
     try:
         return "# single_scattering_albedo:" in path.read_text()
     except UnicodeDecodeError:  # .npy

@@ -11,7 +11,7 @@ import xarray as xr
 from lidar_mi import __version__
 from lidar_mi.errors import InputError
 from lidar_mi.io.exr import label_scan, unpack, write_fringes, write_scan
-from lidar_mi.rendering.fringes import render_picture
+from lidar_mi.rendering.fringes import render_image
 from lidar_mi.rendering.variant import use_variant
 
 
@@ -24,15 +24,16 @@ def render_file(
     definitions: dict[str, str] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> xr.Dataset:
-    """Render an XML scene with a `scanning_lidar` or a `ccd` and write its picture as EXR.
+    """Render an XML scene with a `scanning_lidar` or a `ccd` and write its image as EXR.
 
-    ``Y`` in a scan's file is the apparent backscatter of the first gate, S0 r^2 / (A dr), with the
-    transmittance left in: a scene says nothing about which of its media are "the environment".
+    ``Y`` in a scan's file is the attenuated backscatter of the first gate, S0 r^2 / (A dr), with
+    the transmittance not corrected: a scene does not state which of its media are "the
+    environment".
 
     Parameters
     ----------
     samples : int
-        Photons a beam or a pixel; 0: as the scene says.
+        Monte Carlo samples per beam or pixel; 0: as in the scene.
     definitions : dict
         Values for ``$name`` in the scene.
 
@@ -66,10 +67,10 @@ def render_file(
     if progress:
         integrator.progress = lambda done, total: progress(done / total)
     if fringes:
-        picture = render_picture(scene, samples, seed)
-        picture.attrs["scene"] = scene_path.name
-        write_fringes(out, picture)
-        return picture
+        image = render_image(scene, samples, seed)
+        image.attrs["scene"] = scene_path.name
+        write_fringes(out, image)
+        return image
     image = np.array(mi.render(scene, spp=samples, seed=seed))
     scan = _as_dataset(image, integrator.quantities(), sensor)
     scan.attrs |= {

@@ -4,10 +4,10 @@ Dr.Jit 1.5 emits instructions that LLVM 14 to 16 cannot compile; LLVM then abort
 which Python cannot catch. Dr.Jit opens its LLVM while ``drjit`` is imported, so the choice is
 made on ``import lidar_mi``, through ``DRJIT_LIBLLVM_PATH``.
 
-The module needs the standard library only and is also a script: ``python3 -P lidar_mi/system/llvm.py``
-prints the chosen library (exit code 0), or what to install (3), or what is wrong with the
-``DRJIT_LIBLLVM_PATH`` that the user has set (4). On systems other than Linux and macOS the search
-is left to Dr.Jit.
+The module needs the standard library only and is also a script: ``python3 -P
+lidar_mi/system/llvm.py`` prints the chosen library (exit code 0), or what to install (3), or what
+is wrong with the ``DRJIT_LIBLLVM_PATH`` that the user has set (4). On systems other than Linux and
+macOS the search is left to Dr.Jit.
 """
 
 import ctypes

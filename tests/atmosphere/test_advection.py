@@ -147,9 +147,10 @@ def test_vortex_flow_conserves_mass_and_variance_of_resolved_texture():
 
 
 def test_wave_of_four_cells_keeps_its_variance_in_one_step():
-    """Half a cell's shift is the worst. The quintic B-spline halfway between nodes has weights
-    (1, 237, 1682, 1682, 237, 1)/3840, at nodes (1, 26, 66, 26, 1)/120; for a wave of 4 cells
-    (p = pi/2) the ratio of the two responses is 0.9971: 0.6 % of the variance, and no more, is lost."""
+    """Half a cell's shift is the worst. The quintic B-spline halfway between nodes has weights (1,
+    237, 1682, 1682, 237, 1)/3840, at nodes (1, 26, 66, 26, 1)/120; for a wave of 4 cells (p = pi/2)
+    the ratio of the two responses is 0.9971: 0.6 % of the variance, and no more, is lost.
+    """
     p = np.pi / 2
     half = 1682 * np.cos(p / 2) + 237 * np.cos(3 * p / 2) + np.cos(5 * p / 2)
     transfer = 2 * half / 3840 / ((66 + 52 * np.cos(p) + 2 * np.cos(2 * p)) / 120)

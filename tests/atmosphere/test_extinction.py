@@ -63,7 +63,7 @@ def test_one_reference_puts_two_times_on_one_scale(wake):
     same = extinction_from_tracer(thinner, reference=0.4, aerosol=None)
     expected = 1e-4 + 1.7e-3 * (1 - (1 - 0.9) ** 2)
     assert float(same.max()) == pytest.approx(expected, rel=1e-12)
-    with pytest.raises(InputError, match="extinction.reference: 0.3 .*0.4"):
+    with pytest.raises(InputError, match=r"extinction.reference: 0.3 .*0.4"):
         extinction_from_tracer(wake, reference=0.3)
 
 
@@ -114,14 +114,14 @@ def test_bad_input_for_speed(wake):
 def test_negative_or_missing_values_are_refused(wake):
     wake["tracer"] = wake.tracer.where(wake.tracer < 0.4)
     wake["aerosol"] = -wake.aerosol
-    with pytest.raises(InputError, match="aerosol.*minimum of -1.2"):
+    with pytest.raises(InputError, match=r"aerosol.*minimum of -1.2"):
         extinction_from_tracer(wake)
 
 
 def test_a_wake_without_any_tracer_is_told():
     wake = xr.Dataset({"tracer": ("y", np.zeros(4)), "aerosol": ("y", np.ones(4))})
     with pytest.raises(
-        InputError, match="extinction.tracer: 0 everywhere, so there is nothing to see"
+        InputError, match=r"extinction.tracer: 0 everywhere, so there is no contrast"
     ):
         extinction_from_tracer(wake)
     # of two times, of which neither has any

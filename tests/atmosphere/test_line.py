@@ -59,8 +59,9 @@ def relaxing_gas(frequency, y, freedoms=5):
     """Spectrum of density fluctuations by the Boltzmann equation with BGK collisions.
 
     Frequency in k v0. Molecules relax to the local equilibrium (density, flow, temperature) at the
-    rate p / eta = 2^(1/2) y: the Laplace transform of the density that starts as a wave solves three
-    linear equations, whose coefficients are moments of a Maxwellian over rate + i (c - frequency).
+    rate p / eta = 2^(1/2) y: the Laplace transform of the density that starts as a wave solves
+    three linear equations, whose coefficients are moments of a Maxwellian over rate + i (c -
+    frequency).
     """
     rate = math.sqrt(2) * y
     c = np.linspace(-9, 9, 3001)
@@ -80,7 +81,7 @@ def relaxing_gas(frequency, y, freedoms=5):
 
 @pytest.mark.parametrize("y", [0.05, 0.17, 0.5, 1.0])
 def test_brillouin_widths_by_kinetic_theory(y):
-    """Within 1 %, where a factor 2^(1/2) in y makes 2 to 3 % (0.17, 0.5); at 8500 m also the shape."""
+    """Within 1 %, where a factor 2^(1/2) in y makes 2 to 3 % (0.17, 0.5); the shape at 8500 m."""
     frequency = np.linspace(0, 8, 2001)
     found = relaxing_gas(frequency, y)
     assert 2 * integrate.simpson(found, x=frequency) == pytest.approx(1, abs=1e-4)
@@ -96,7 +97,8 @@ def test_brillouin_widths_by_kinetic_theory(y):
 def test_collisions_leave_the_second_moment_alone(y):
     """<omega^2> = k^2 k_B T / m of any classical ideal gas (Boon & Yip 1980, sect. 2.3).
 
-    The fit may miss 0.85 % of the peak anywhere, and as much in the wings as makes 1.5 % of the rms.
+    The fit may miss 0.85 % of the peak anywhere, and as much in the wings as makes 1.5 % of the
+    rms.
     """
     line = rayleigh_brillouin(WAVELENGTH, TEMPERATURE, y * ONE)
     assert math.sqrt(variance(line)) == pytest.approx(THERMAL, rel=0.015)
@@ -173,7 +175,10 @@ def test_shift_turns_the_transform():
 def test_samples_follow_the_density():
     line = crooked()
     drawn = line.sample(np.random.default_rng(1), 50_000)
-    cdf = lambda nu: stats.norm.cdf((nu[:, None] - line.offsets) / line.sigmas) @ line.weights
+
+    def cdf(nu):
+        return stats.norm.cdf((nu[:, None] - line.offsets) / line.sigmas) @ line.weights
+
     assert stats.kstest(drawn, cdf).pvalue > 1e-3
 
 

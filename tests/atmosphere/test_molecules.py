@@ -120,7 +120,7 @@ def test_standard_atmosphere():
     pressure, temperature = molecules.standard_atmosphere(8500)
     assert (pressure, temperature) == pytest.approx((33154, 232.974), rel=1e-5)
     assert molecules.standard_atmosphere(15000)[1] == pytest.approx(216.65)
-    with pytest.raises(InputError, match="altitude: 90000.*-5004 to 81020"):
+    with pytest.raises(InputError, match=r"altitude: 90000.*-5004 to 81020"):
         molecules.standard_atmosphere(90000)
     with pytest.raises(InputError, match="altitude"):
         molecules.standard_atmosphere(np.nan)

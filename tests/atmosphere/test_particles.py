@@ -427,8 +427,8 @@ def test_refractive_index_is_linear_between_wavelengths():
     assert m == pytest.approx(1.53 + 0.0055j, rel=1e-12)
 
 
-# Hess, Koepke & Schult 1998 (OPAC), as ECMWF's aerosol optics code tabulates it: um, real, imaginary.
-# The dust-like component is called insoluble there; sea salt at 80 % humidity.
+# Hess, Koepke & Schult 1998 (OPAC), as ECMWF's aerosol optics code tabulates it: um, real,
+# imaginary. The dust-like component is called insoluble there; sea salt at 80 % humidity.
 OPAC = {
     "spheres": (
         (0.35, 1.53, 8e-3),
@@ -469,8 +469,10 @@ OPAC = {
     [(name, w) for name in OPAC for w in (355e-9, 532e-9, 1064e-9)] + [("spheres", 1550e-9)],
 )
 def test_indices_are_the_published_ones(name, wavelength):
-    """Between OPAC's wavelengths linearly: real parts to 0.02 (dust falls between 1 and 1.25 um, where
-    its place is not known better), imaginary ones to 10 %, of salt to 1e-5."""
+    """Linear between OPAC's wavelengths: real parts to 0.02, imaginary to 10 %, of salt to 1e-5.
+
+    Dust falls between 1 and 1.25 um, where its index is not known better.
+    """
     micrometres, real, imaginary = zip(*OPAC[name], strict=True)
     m = AEROSOLS[name].refractive_index(wavelength)
     assert m.real == pytest.approx(np.interp(wavelength * 1e6, micrometres, real), abs=0.02)

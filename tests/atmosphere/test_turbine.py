@@ -123,7 +123,7 @@ def test_turbulence_has_no_divergence_and_unit_strength():
 
 
 def test_turbulence_has_von_karmans_spectrum():
-    """Longitudinal line spectrum: that of E(k) = k^4 / (k^2 + k0^2)^(17/6), summed over other waves.
+    """Longitudinal line spectrum: that of E(k) = k^4 / (k^2 + k0^2)^(17/6), summed over the others.
 
     Phi_11 = E / (4 pi k^2) (k2^2 + k3^2) / k^2 (isotropic, solenoidal) over the waves the grid
     holds, each derivative k as central differences see it, sin(k h) / h. From 2 k0 to half of the

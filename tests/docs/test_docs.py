@@ -347,7 +347,7 @@ def test_what_is_printed_runs(pages, workplace, capsys):
 
 @pytest.mark.usefixtures("variant")
 def test_plugin_examples_load(workplace):
-    """XML and Python of the plugin reference; a table of the shipped ones stands in for the named."""
+    """XML and Python of the plugin reference, with a shipped table for the one it names."""
     import mitsuba as mi
 
     table = np.loadtxt(ROOT / "scenes" / "aerosol_spheroids_532nm.txt")
@@ -367,7 +367,7 @@ def test_plugin_examples_load(workplace):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_command_lines_are_understood(page):
-    """Options and commands that a page prints exist, also where the test above does not run them."""
+    """Options and commands that a page prints exist, also where no test runs them."""
     import typer
 
     group = typer.main.get_command(cli.app)

@@ -1,4 +1,4 @@
-"""The example programs, made small. Detects one that no longer runs or no longer does what it says."""
+"""The example programs, made small. Detects one that does not run or misses its result."""
 
 import runpy
 import sys
@@ -13,9 +13,11 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_a_blurred_slab_is_recovered_by_gradient_descent():
-    """A tenth of the full example's beams, a fifth of its steps: the error against the true air, 11 %
-    of blur, falls by a quarter; asked is a fifth, as the seeds move it by 1 % of the whole. What is
-    left of the misfit is mostly the noise of 32 photons a beam."""
+    """With 1/10 of the full example's beams and 1/5 of its steps the error falls by a quarter.
+
+    From 11 % of blur against the true air; 20 % are required, as the seeds change it by 1 % of the
+    whole. The remaining misfit is mostly the noise of 32 samples per beam.
+    """
     example = runpy.run_path(str(EXAMPLES / "recover_slab.py"))
     truth = example["port_vortex"](10, 8)
     guess, found, misfits = example["recover"](truth, steps=12, photons=32, learning_rate=0.05)

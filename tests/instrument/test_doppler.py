@@ -43,7 +43,10 @@ def test_published_photon_numbers(distance, published):
 @pytest.mark.parametrize("distance, share", [(76, 0.0044), (56, 0.0081)])
 def test_photons_of_the_whole_bin(distance, share):
     """1 / r^2 and the transmittance integrated over the bin: more by (dr / r)^2 / 4."""
-    density = lambda r: math.exp(-2 * 2.7e-5 * r) / r**2
+
+    def density(r):
+        return math.exp(-2 * 2.7e-5 * r) / r**2
+
     whole = integrate.quad(density, distance - 5, distance + 5)[0] / (10 * density(distance))
     assert whole - 1 == pytest.approx(share, abs=2e-4)
 

@@ -131,8 +131,7 @@ def test_weights_along_the_line_by_adaptive_quadrature():
         return inside * math.exp(-2 * 2e-3 * r) / r**2
 
     for power in (1, 2, 3):
-        moment = lambda r, k=power: (r - 56) ** k * seen(r)
-        mean = integrate.quad(moment, 40, 72, epsabs=1e-14)[0]
+        mean = integrate.quad(lambda r, k=power: (r - 56) ** k * seen(r), 40, 72, epsabs=1e-14)[0]
         mean /= integrate.quad(seen, 40, 72, epsabs=1e-14)[0]
         found = (weights[0] * (points[0, :, 0] - 56) ** power).sum()
         assert found == pytest.approx(mean, rel=2e-4)

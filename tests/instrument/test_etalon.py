@@ -132,8 +132,10 @@ def test_bow_by_quadrature_over_the_aperture():
 
 
 def test_finesse():
-    """pi R^(1/2) / (1 - R) = 8.76 for narrow fringes, pi / 2 / arcsin((1 - R) / (2 R^(1/2))) for all
-    (Born & Wolf, sect. 7.6)."""
+    """Finesse pi R^(1/2) / (1 - R) = 8.76 for narrow fringes (Born & Wolf, sect. 7.6).
+
+    For all fringes pi / 2 / arcsin((1 - R) / (2 R^(1/2))).
+    """
     exact = math.pi / 2 / math.asin(0.3 / 2 / math.sqrt(0.7))
     assert finesse(PERFECT, WAVELENGTH) == pytest.approx(exact, rel=1e-9)
     assert exact == pytest.approx(math.pi * math.sqrt(0.7) / 0.3, rel=6e-3)
@@ -236,7 +238,7 @@ def test_bad_descriptions(changes, words):
 def test_coating_that_does_not_transmit():
     opaque = coated((HIGH, LOW) * 25)
     for call in (opaque.order_at_centre, lambda x: harmonics(opaque, x)):
-        with pytest.raises(InputError, match="mirror that transmits .* expected at least 1e-06"):
+        with pytest.raises(InputError, match=r"mirror that transmits .* expected at least 1e-06"):
             call(WAVELENGTH)
 
 

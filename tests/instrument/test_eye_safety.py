@@ -310,5 +310,5 @@ def test_scan_of_beams_far_apart_is_one_beam():
 
 def test_weak_scan_is_safe_everywhere_and_none_without_spacing():
     assert scan_hazard_distance(1550e-9, 1e-9, 1e-8, 0.08, 2e-3, 1e-3, 100, 10, 10) == 0
-    with pytest.raises(InputError, match="spacing: 0.0 rad is not allowed"):
+    with pytest.raises(InputError, match=r"spacing: 0.0 rad is not allowed"):
         scan_hazard_distance(1550e-9, 1e-3, 1e-8, 0.08, 2e-3, 0.0, 100, 10, 10)

@@ -1,7 +1,7 @@
 """The etalon's Mueller matrices against sums over round trips and another transfer-matrix code.
 
-Detects: 0.01 m/s of phase lost in float32, 2e-5 in transmission or reflection, energy gained or lost,
-a line or plate defects folded otherwise than averaged, s and p or the sign of their phase
+Detects: 0.01 m/s of phase lost in float32, 2e-5 in transmission or reflection, energy gained or
+lost, a line or plate defects folded otherwise than averaged, s and p or the sign of their phase
 exchanged, a Stokes axis turned, a lobe drawn with another probability than its weight says.
 """
 
@@ -123,7 +123,7 @@ def test_gap_is_tuned_and_index_bends():
 
 def stack(sine, offset, polarisation, gap=GAP):
     """The whole coated etalon between its plates, by Byrnes's transfer-matrix code."""
-    layers = COATING + [(1.0, gap)] + COATING[::-1]
+    layers = [*COATING, (1.0, gap), *COATING[::-1]]
     indices = [1.476, *(n for n, _ in layers), 1.476]
     thicknesses = [np.inf, *(d for _, d in layers), np.inf]
     angle = np.arcsin(sine / 1.476)

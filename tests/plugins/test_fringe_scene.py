@@ -115,7 +115,7 @@ def _curve(cosine, v_los, reflectivity):
 def rings(
     size=(96, 78), pixel=74e-6, centre=None, v_los=0.0, field=0.016, radius=np.inf, nodes=4, **more
 ):
-    """Share of the source's energy on each pixel: its solid angle, and what the etalon lets pass."""
+    """Fraction of the source's energy on each pixel: solid angle times transmission."""
     points, weights = np.polynomial.legendre.leggauss(nodes)
     centre = centre or ((size[0] - 1) / 2, (size[1] - 1) / 2)
     x, y = (
@@ -392,7 +392,10 @@ def test_plane_waves_are_random_and_pure():
     source = mi.load_dict({"type": "plane_waves", "stokes": "1, 0.3, 0, -0.4", "line": LINE})
     n = 1 << 16
     rng = np.random.default_rng(9)
-    draw = lambda: mi.Float(np.float32(rng.random(n)))
+
+    def draw():
+        return mi.Float(np.float32(rng.random(n)))
+
     direction, share, _ = source.sample_direction_of_light(mi.Point2f(draw(), draw()))
     stokes = source.sample_stokes(direction, draw(), mi.Point2f(draw(), draw()))
     stokes = np.array([np.broadcast_to(np.array(s), n) for s in stokes], float)
@@ -413,7 +416,10 @@ def test_frequencies_follow_the_line():
     line = mi.load_dict({**LINE, "v_los": 120.0})
     n = 1 << 17
     rng = np.random.default_rng(10)
-    draw = lambda: mi.Float(np.float32(rng.random(n)))
+
+    def draw():
+        return mi.Float(np.float32(rng.random(n)))
+
     offset = np.array(line.sample(draw(), mi.Point2f(draw(), draw())), float)
 
     def cumulative(nu):

@@ -165,7 +165,7 @@ class TestVariants:
         indirect=True,
     )
     def test_same_seed_same_intensity_in_every_variant(self, world, variant):
-        """S0 of horizontally polarised light in backscatter differs by 1e-6 from natural light's."""
+        """S0 of horizontally polarised and of natural light differ by 1e-6 in backscatter."""
         integrator = {"estimator": "gated"}
         stokes, error = world.render(scan(world, integrator=integrator, gate_count=2), seed=1)
         analog, _ = world.render(scan(world, integrator={"estimator": "analog"}), seed=1, spp=4000)
@@ -244,7 +244,8 @@ import resource
 import lidar_mi, mitsuba as mi, numpy as np
 mi.set_variant("llvm_ad_mono_polarized")
 mi.set_log_level(mi.LogLevel.Error)
-air = {"type": "homogeneous", "sigma_t": 1e-3, "albedo": 1.0, "phase": {"type": "rayleigh_polarized"}}
+phase = {"type": "rayleigh_polarized"}
+air = {"type": "homogeneous", "sigma_t": 1e-3, "albedo": 1.0, "phase": phase}
 scene = mi.load_dict({
     "type": "scene", "integrator": {"type": "gated_volpath"},
     "sensor": {
@@ -319,7 +320,7 @@ class TestSeeds:
         assert lit.any() and (one[0, 0][lit] != other[0, 0][lit]).all()
 
     def test_more_samples_add_to_the_same_photons(self, world):
-        """A photon's random numbers depend on seed, beam and number alone, not on the scan's size."""
+        """A sample's random numbers depend on seed, beam and number, not on the scan's size."""
         small = scan(world, (1, 1), azimuth_min_deg=0.0, azimuth_max_deg=0.0)
         large = world.scene(
             world.lidar(

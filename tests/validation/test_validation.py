@@ -1,8 +1,8 @@
 """The validation: that it can fail, that its references are right, that its page is in date.
 
 Detects: a row that passes with a wrong number or without any yardstick, a failure that does not end
-in an error, a check or figure that the page lacks or has too many, 1e-5 in the integral equation that
-stands for steady states, stored numbers that belong to other cases than those asked for.
+in an error, a check or figure that the page lacks or has too many, 1e-5 in the integral equation
+that stands for steady states, stored numbers that belong to other cases than those asked for.
 
 What the checks themselves find is not tested here: that is `make validate`.
 """
@@ -158,7 +158,7 @@ def test_an_impossible_matrix_is_found():
 
 
 def test_integral_equation_of_a_thick_slab_is_chandrasekhars():
-    """Half-space, normal incidence: reflectance 1 - H(1) (1 - albedo)^1/2 (Radiative Transfer 1950)."""
+    """Half-space, normal incidence: reflectance 1 - H(1) (1 - albedo)^1/2 (Chandrasekhar 1950)."""
     steady = group("steady_state")
     albedo = 0.8
     node, weight = np.polynomial.legendre.leggauss(64)
