@@ -4,11 +4,8 @@ One plugin a file. A Mitsuba class belongs to one variant, so every plugin modul
 ``define()`` that builds its class for the variant in force, and says under which ``NAME`` and
 ``KIND`` Mitsuba knows it; the module's docstring is the plugin's reference page.
 
-`register` may be called at any time and any number of times. Once called, the plugins follow every
-later ``mi.set_variant``.
+Importing this package registers all plugins, see `registration`.
 """
-
-import mitsuba as mi
 
 from . import (
     ccd,
@@ -22,6 +19,9 @@ from . import (
     scanning_lidar,
     spectral_line,
 )
+from .registration import register_plugins
+
+__all__ = ["PLUGINS", "register_plugins"]
 
 PLUGINS = (
     laser,
@@ -35,23 +35,3 @@ PLUGINS = (
     ccd,
     fringes,
 )
-
-_following_variants = False
-
-
-def register() -> None:
-    """Make the plugins known to Mitsuba in the variant in force and in every later one."""
-    global _following_variants
-    if not _following_variants:
-        mi.detail.add_variant_callback(lambda _old, new: _register_in(new))
-        _following_variants = True
-    if mi.variant():
-        _register_in(mi.variant())
-
-
-def _register_in(variant: str | None) -> None:
-    # Python plugins handle arrays of photons: the scalar variants have none.
-    if not variant or variant.startswith("scalar"):
-        return
-    for plugin in PLUGINS:
-        getattr(mi, f"register_{plugin.KIND}")(plugin.NAME, plugin.define())

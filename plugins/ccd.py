@@ -50,6 +50,7 @@ import numpy as np
 
 from .parameters import fail, number, pose, positive
 from .parameters import table as read_table
+from .registration import register
 
 NAME, KIND = "ccd", "sensor"
 
@@ -251,3 +252,6 @@ def _through(lens, place, way, xp):
         distance, before = after, index
     step = (distance - z) / w
     return (x + step * u, y + step * v), (u, v, w), met
+
+
+register(KIND, NAME, define)

@@ -65,6 +65,7 @@ import mitsuba as mi
 import numpy as np
 
 from .parameters import at_least, choice, fail, number, positive
+from .registration import register
 
 NAME, KIND = "etalon", "bsdf"
 
@@ -426,3 +427,6 @@ def _stack(layers, gap, plate, xp):
     # the same stack from the other side has a and d exchanged
     outside = (plate * (d + b * gap) - (c + a * gap)) / total
     return inside, 4 * gap * plate / (total * total), outside
+
+
+register(KIND, NAME, define)

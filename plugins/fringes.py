@@ -44,6 +44,7 @@ import mitsuba as mi
 from .parameters import choice, fail, whole
 from .polarization import horizontal_axis, rotate_stokes
 from .random_numbers import generator, pair
+from .registration import register
 
 NAME, KIND = "fringes", "integrator"
 
@@ -241,3 +242,6 @@ def _check_straight(scene):
         flags = shape.bsdf().flags()
         if flags & bending and not flags & kinds.Null:
             fail(NAME, "scene", shape.id(), "surfaces that light passes straight or not at all")
+
+
+register(KIND, NAME, define)

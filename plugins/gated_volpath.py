@@ -61,6 +61,7 @@ import mitsuba as mi
 from .parameters import choice, fail, whole
 from .paths import Lidar
 from .polarization import first_unpolarized_in_blend
+from .registration import register
 
 NAME, KIND = "gated_volpath", "integrator"
 
@@ -365,3 +366,6 @@ def _check_gate_meets_medium(scene, sensor):
         fail(
             NAME, "gates", f"{near:g} to {far:g} m", f"ranges with a medium (there is one: {where})"
         )
+
+
+register(KIND, NAME, define)

@@ -43,6 +43,7 @@ import mitsuba as mi
 
 from .parameters import at_least, fail, pose, positive
 from .polarization import rotate_stokes, transverse
+from .registration import register
 
 NAME, KIND = "laser", "emitter"
 
@@ -131,3 +132,6 @@ def _stokes(text) -> tuple[float, float, float, float]:
     if values[0] != 1 or not degree <= 1 + 1e-6:
         fail(NAME, "stokes", text, "I = 1 and Q^2 + U^2 + V^2 <= 1")
     return tuple(values)
+
+
+register(KIND, NAME, define)

@@ -37,6 +37,7 @@ import numpy as np
 from .parameters import fail
 from .parameters import table as read_table
 from .polarization import rotate_from_scattering_plane, scattering_angle
+from .registration import register
 
 NAME, KIND = "mueller", "phase"
 
@@ -143,3 +144,6 @@ def check_table(table: np.ndarray) -> np.ndarray:
     integral += (slope * np.diff(np.sin(theta))).sum()
     table[:, 1:] /= 2 * np.pi * integral
     return table
+
+
+register(KIND, NAME, define)

@@ -41,6 +41,7 @@ import numpy as np
 
 from .parameters import fail, numbers, pose, positive
 from .polarization import horizontal_axis, rotate_stokes
+from .registration import register
 
 NAME, KIND = "plane_waves", "emitter"
 
@@ -160,3 +161,6 @@ def define():
             return f"PlaneWaves[field_half={1e3 * self.field_half:g} mrad, line={self.line}]"
 
     return PlaneWaves
+
+
+register(KIND, NAME, define)

@@ -28,6 +28,7 @@ import mitsuba as mi
 
 from .parameters import fail, number
 from .polarization import rotate_from_scattering_plane
+from .registration import register
 
 NAME, KIND = "rayleigh_polarized", "phase"
 
@@ -86,3 +87,6 @@ def define():
             return f"RayleighPolarized[depolarization={self.depolarization:g}]"
 
     return RayleighPolarized
+
+
+register(KIND, NAME, define)

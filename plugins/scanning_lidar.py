@@ -47,6 +47,7 @@ import numpy as np
 from .parameters import choice, fail, number, pose, positive, whole
 from .parameters import table as read_table
 from .polarization import horizontal_axis
+from .registration import register
 
 NAME, KIND = "scanning_lidar", "sensor"
 
@@ -215,3 +216,6 @@ def _angles(props, name: str, count: int) -> np.ndarray:
     if low == high:
         fail(NAME, f"{name}_max_deg", high, f"more than the minimum for {count} beams")
     return np.radians(np.linspace(low, high, count))
+
+
+register(KIND, NAME, define)

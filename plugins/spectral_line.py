@@ -39,6 +39,7 @@ import mitsuba as mi
 import numpy as np
 
 from .parameters import fail, number, numbers, positive
+from .registration import register
 
 NAME, KIND = "spectral_line", "texture"
 
@@ -103,3 +104,6 @@ def define():
             )
 
     return SpectralLine
+
+
+register(KIND, NAME, define)

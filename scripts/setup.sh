@@ -97,7 +97,7 @@ install_packages() {
         die "pip could not install what pyproject.toml asks for (see above); check the network" \
             "(HTTPS_PROXY, PIP_INDEX_URL) and run make setup again, downloads are kept"
     fi
-    .venv/bin/python -c 'import lidar_mi' || die "the installed package cannot be imported"
+    .venv/bin/python -c 'import lidar_mi.plugins' || die "the installed package cannot be imported"
     rm -f "$interrupted"
 }
 

@@ -151,7 +151,7 @@ def test_unknown_xml_parameter_is_named(scene_file):
 def test_plugins_survive_every_change_of_variant():
     for name in ("llvm_ad_rgb", "scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"):
         mi.set_variant(name)
-        lidar_mi.plugins.register()  # any number of times
+        lidar_mi.register_plugins()  # any number of times
         if not name.startswith("scalar"):
             for plugin in ("laser", "rayleigh_polarized", "gated_volpath"):
                 assert mi.load_dict({"type": plugin}) is not None
