@@ -8,7 +8,14 @@ from lidar_mi.errors import InputError
 
 
 def experiments() -> list[str]:
-    """Names of the shipped experiments, in alphabetical order."""
+    """Names of the experiments that come with the package, in alphabetical order.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> "wake_backscatter" in lm.experiments()
+    True
+    """
     return sorted(path.stem for path in _folder().glob("*.yaml"))
 
 

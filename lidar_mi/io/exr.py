@@ -144,12 +144,31 @@ def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
 
 
 def read_scan(path: str | Path) -> xr.Dataset:
-    """Read a scan written by `write_scan`, y and z ascending; the round trip is exact in float32.
+    """Read a scan of the backscatter lidar from an EXR file; the round trip is exact in float32.
+
+    Parameters
+    ----------
+    path : path
+        Such as ``image_t1.exr`` of a run folder.
+
+    Returns
+    -------
+    xr.Dataset, dims (gate, z, y), y and z ascending, m
+        Stokes vector ``S0`` ... ``S3`` (received over emitted pulse energy) with standard errors,
+        depolarisation, orders of scattering; ``Y`` (z, y), the range-corrected attenuated
+        backscatter of the first gate, m^-1 sr^-1; behind a detector ``Y_noisy``. Attributes say
+        how it was made.
 
     Raises
     ------
     InputError
-        Not an EXR file, or one without our layers or axes.
+        Not an EXR file, or one without a scan's layers or axes.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> scan = lm.read_scan("image_t1.exr")                              # doctest: +SKIP
+    >>> wind = lm.retrieve_wind(scan["Y"], later["Y"], scan.attrs["dt"])  # doctest: +SKIP
     """
     header, layers = read_layers(path)
     gates: dict[int, dict[str, np.ndarray]] = {}

@@ -50,10 +50,33 @@ def read_image(
     attributes ``y`` and ``z`` that the EXR files of our scans carry; for other files ``spacing``
     (m, from pixel to pixel) puts the picture's middle at zero.
 
+    Parameters
+    ----------
+    path : path
+        EXR, PNG, TIFF, BMP, JPEG or FITS file. Colours are averaged.
+    layer : str, optional
+        Of an EXR file. Default: Y, or the only one, or the mean of R, G and B.
+    spacing : float, optional
+        From pixel to pixel, m; for files without axes.
+
+    Returns
+    -------
+    xr.DataArray, dims (z, y), m
+        Values as in the file, float64.
+
     Raises
     ------
     InputError
-        As `read_picture`; no axes and no spacing above 0.
+        No such file, one that cannot be read, or no such layer; no axes and no spacing above 0.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> from PIL import Image
+    >>> Image.new("L", (60, 40), 128).save("camera.png")
+    >>> image = lm.read_image("camera.png", spacing=0.5)
+    >>> image.dims, image.shape, float(image["y"][-1])
+    (('z', 'y'), (40, 60), 14.75)
     """
     if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"{path}: spacing: {spacing} m is not allowed; expected a number above 0")

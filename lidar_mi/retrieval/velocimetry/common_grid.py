@@ -95,12 +95,38 @@ def resample_pair(
 def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
     """The pair as it is if both images share one uniform grid, else resampled onto one.
 
-    The common grid has the coarser image's mean spacing along y, see `resample_pair`.
+    Needed where the scans have equidistant angles from a moving platform: their pixels then lie
+    elsewhere at t1 and t2. The common grid has the coarser image's mean spacing along y; values
+    come from bicubic splines, whose error is of fourth order in the spacing.
+
+    Parameters
+    ----------
+    image1, image2 : xr.DataArray, dims (z, y), m
+        Of one size.
+
+    Returns
+    -------
+    xr.DataArray, xr.DataArray
+        The pair on its common grid, which covers what both images cover.
 
     Raises
     ------
     InputError
-        Images of different size, or as `resample_pair`.
+        Images of different size, without coordinates, with values that are not finite, or that do
+        not overlap.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> near, far = (
+    ...     xr.DataArray(np.ones((9, 9)), {"z": s * np.arange(-4, 5), "y": s * np.arange(-4, 5)})
+    ...     for s in (0.97, 1.0)
+    ... )
+    >>> first, second = lm.on_one_grid(near, far)
+    >>> bool((first["y"] == second["y"]).all()), first.sizes["y"]
+    (True, 7)
     """
     if image1.shape != image2.shape:
         sizes = " and ".join(f"{i.sizes['y']} x {i.sizes['z']}" for i in (image1, image2))

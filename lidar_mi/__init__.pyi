@@ -1,0 +1,32 @@
+"""The public names: what ``import lidar_mi as lm`` offers, and where each is made."""
+
+from .errors import InputError
+from .experiment.schema import Experiment
+from .experiment.shipped import experiments
+from .io.exr import read_scan
+from .io.images import read_image
+from .io.vortex_file import read_vortices
+from .plugins import register_plugins
+from .retrieval.velocimetry.common_grid import on_one_grid
+from .retrieval.velocimetry.volume import retrieve_wind_volume
+from .retrieval.velocimetry.wind import retrieve_wind
+from .retrieval.vortices.fit import VortexPairFit, fit_vortices, fit_vortices_to_wind
+
+__version__: str
+
+__all__ = [
+    "Experiment",
+    "InputError",
+    "VortexPairFit",
+    "__version__",
+    "experiments",
+    "fit_vortices",
+    "fit_vortices_to_wind",
+    "on_one_grid",
+    "read_image",
+    "read_scan",
+    "read_vortices",
+    "register_plugins",
+    "retrieve_wind",
+    "retrieve_wind_volume",
+]

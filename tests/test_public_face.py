@@ -1,0 +1,94 @@
+"""What ``import lidar_mi as lm`` offers. Unit tier.
+
+Detects: an import that loads a renderer or a tensor library; a public name that does not exist, has
+no documentation, or differs between the stub that editors read and the program.
+"""
+
+import ast
+import importlib
+import inspect
+import json
+import subprocess
+import sys
+from importlib.resources import files
+from pathlib import Path
+
+import pytest
+
+import lidar_mi as lm
+
+HEAVY = ("mitsuba", "drjit", "torch", "numpy", "scipy", "xarray", "matplotlib", "pydantic", "rich")
+
+
+def modules_after(code: str) -> set[str]:
+    """Modules that a fresh interpreter has loaded after running some code."""
+    code += "\nimport json, sys; print(json.dumps(list(sys.modules)))"
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def stub() -> ast.Module:
+    return ast.parse((Path(lm.__file__).parent / "__init__.pyi").read_text())
+
+
+def test_import_loads_nothing_heavy():
+    assert modules_after("import lidar_mi").isdisjoint(HEAVY)
+
+
+def test_light_names_load_no_renderer():
+    """Where a retrieval or an experiment file is all that is asked, Mitsuba is not loaded."""
+    code = "import lidar_mi as lm; lm.experiments(); lm.read_image; lm.InputError"
+    assert modules_after(code).isdisjoint(("mitsuba", "drjit", "torch"))
+    code = "import lidar_mi as lm; lm.retrieve_wind; lm.fit_vortices; lm.read_vortices"
+    assert modules_after(code).isdisjoint(("mitsuba", "drjit"))
+
+
+def test_help_loads_nothing_heavy():
+    code = "import sys; sys.argv = ['lidar-mi', '--help']\n"
+    code += "from lidar_mi.cli.app import main\ntry: main()\nexcept SystemExit: pass"
+    assert modules_after(code).isdisjoint(set(HEAVY) - {"rich"})
+
+
+def test_stub_names_exactly_what_is_public():
+    (listed,) = (
+        ast.literal_eval(node.value)
+        for node in stub().body
+        if isinstance(node, ast.Assign) and node.targets[0].id == "__all__"
+    )
+    imported = {
+        alias.name
+        for node in stub().body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert set(listed) == imported | {"__version__"} == set(lm.__all__)
+    assert listed == sorted(listed)
+
+
+@pytest.mark.parametrize("name", sorted(set(lm.__all__) - {"__version__"}))
+def test_public_name_is_there_and_documented(name):
+    """By the same object as in the module that the stub says it comes from."""
+    (home,) = (
+        node.module
+        for node in stub().body
+        if isinstance(node, ast.ImportFrom) and name in [alias.name for alias in node.names]
+    )
+    public = getattr(lm, name)
+    assert public is getattr(importlib.import_module(f"lidar_mi.{home}"), name)
+    assert name in dir(lm)
+    described = inspect.getdoc(public)
+    assert described and described.splitlines()[0].endswith(".")
+    if inspect.isfunction(public) and inspect.signature(public).parameters:
+        assert "Parameters\n-----" in described
+
+
+def test_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="nonsense"):
+        lm.nonsense  # noqa: B018
+
+
+def test_types_are_announced():
+    package = files("lidar_mi")
+    assert (package / "py.typed").is_file() and (package / "__init__.pyi").is_file()
