@@ -62,12 +62,27 @@ def _number(value: float) -> float | None:
 
 
 def read_vortices(path: str | Path) -> dict[str, VortexPairFit]:
-    """Fits by name, as `write_vortices` wrote them; `VortexPairFit.wind` gives the wind anywhere.
+    """Vortex pairs by name, as a run writes them into ``vortex.json``.
+
+    Parameters
+    ----------
+    path : path
+
+    Returns
+    -------
+    dict of str to VortexPairFit
+        `VortexPairFit.wind` gives the wind of each anywhere, with its standard error.
 
     Raises
     ------
     InputError
         Not readable, another format, or a covariance that is none.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> pairs = lm.read_vortices("outputs/wake_sensor/vortex.json")  # doctest: +SKIP
+    >>> pairs["images"].port.circulation                             # doctest: +SKIP
     """
     path = Path(path)
     try:

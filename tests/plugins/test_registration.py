@@ -14,7 +14,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-
 from lidar_mi.plugins import PLUGINS
 
 ROOT = Path(__file__).parents[2]

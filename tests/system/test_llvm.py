@@ -165,7 +165,7 @@ def python(code: str, **environ: str) -> subprocess.CompletedProcess:
 @pytest.mark.skipif(not HAS_LLVM, reason="no LLVM >= 17 on this machine")
 def test_dr_jit_takes_the_chosen_library():
     done = python(
-        "from lidar_mi import llvm\n"
+        "from lidar_mi.system import llvm\n"
         "chosen = llvm.select_llvm()\n"
         "llvm.require_llvm()\n"
         "import mitsuba as mi\n"
