@@ -41,8 +41,8 @@ def test_the_readme_tells_the_demo_s_numbers(demo):
     printed of the larger ones."""
     rows = {
         "the extinction field itself": "extinction.cc.rmse",
-        "the same, blurred by the beam's width": "extinction_blurred.cc.rmse",
-        "rendered backscatter, all orders, 64 photons a beam": "backscatter.cc.rmse",
+        "the same, blurred by the beam width": "extinction_blurred.cc.rmse",
+        "rendered backscatter, all orders, 64 samples per beam": "backscatter.cc.rmse",
         "the extinction field without sub-grid texture": "extinction_without_texture.cc.rmse",
         "*(rms of the true wind)*": "true_wind.rms",
     }
