@@ -20,6 +20,7 @@ COMPARISONS = (
     "renderer",
     "fringes",
     "rings",
+    "imports",
 )
 
 

@@ -1,6 +1,7 @@
 """The public names: what ``import lidar_mi as lm`` offers, and where each is made."""
 
 from .errors import InputError
+from .experiment.reading import load_experiment
 from .experiment.schema import Experiment
 from .experiment.shipped import experiments
 from .io.exr import read_scan
@@ -22,6 +23,7 @@ __all__ = [
     "experiments",
     "fit_vortices",
     "fit_vortices_to_wind",
+    "load_experiment",
     "on_one_grid",
     "read_image",
     "read_scan",

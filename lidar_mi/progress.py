@@ -1,42 +1,102 @@
 """What is running, and how far it is: on a terminal, in a pipe and in a notebook."""
 
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from html import escape
+
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+Notice = Callable[[str, float | None], None]
+"""Called with what is running and how far it is (0 to 1, None: unknown)."""
+
+# seconds between two pictures of a bar in a notebook, each of which is a message to the browser
+_NOTEBOOK_INTERVAL = 0.2
 
 
-class progress:
-    """A progress bar that says what is running; plain lines where there is no terminal."""
+def progress(console: Console | None = None) -> AbstractContextManager[Notice]:
+    """Show what is running while the context lasts.
 
-    def __init__(self, console: Console | None = None):
-        # names of files may hold brackets and colons: they are no markup
-        self.console = console or Console(stderr=True, markup=False, emoji=False)
+    A bar with a clock on a terminal and in a notebook, gone at the end; a line for every step where
+    the output is a file or a pipe. Warnings, which are texts that begin so, stay.
 
-    def __enter__(self):
-        self.bars = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            TimeElapsedColumn(),
-            console=self.console,
-            transient=True,
-            disable=not self.console.is_terminal,
-        )
-        self.bars.start()
-        self.task = self.bars.add_task("starting", total=None)
-        self.last = None
-        return self._notice
+    Parameters
+    ----------
+    console : rich.console.Console, optional
+        Default: standard error.
 
-    def _notice(self, text: str, share: float | None) -> None:
-        # a full bar would stop clock and spinner, and what comes next goes on
-        self.bars.update(
-            self.task,
-            description=text,
-            total=None if share is None else 1.0,
-            completed=min(share or 0.0, 0.999),
-        )
-        if text != self.last and (text.startswith("warning: ") or not self.console.is_terminal):
-            self.console.print(text, highlight=False, soft_wrap=True)
-        self.last = text
+    Returns
+    -------
+    context manager
+        Gives the callable that is told what is running.
+    """
+    # names in files and folders may hold brackets and colons: they are no markup
+    console = console or Console(stderr=True, markup=False, emoji=False)
+    if console.is_jupyter:
+        return _in_notebook()
+    return _on_terminal(console) if console.is_terminal else _as_lines(console)
 
-    def __exit__(self, *_):
-        self.bars.stop()
+
+@contextmanager
+def _as_lines(console: Console) -> Iterator[Notice]:
+    last = None
+
+    def notice(text: str, share: float | None) -> None:
+        nonlocal last
+        if text != last:
+            console.print(text, highlight=False, soft_wrap=True)
+        last = text
+
+    yield notice
+
+
+@contextmanager
+def _on_terminal(console: Console) -> Iterator[Notice]:
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    text_column = TextColumn("{task.description}", markup=False)
+    columns = (SpinnerColumn(), text_column, BarColumn(), TimeElapsedColumn())
+    last = None
+    with Progress(*columns, console=console, transient=True) as bars:
+        task = bars.add_task("starting", total=None)
+
+        def notice(text: str, share: float | None) -> None:
+            nonlocal last
+            # a full bar would stop clock and spinner, and what comes next goes on
+            total, completed = (None, 0.0) if share is None else (1.0, min(share, 0.999))
+            bars.update(task, description=text, total=total, completed=completed)
+            if text != last and _is_warning(text):
+                console.print(text, highlight=False, soft_wrap=True)
+            last = text
+
+        yield notice
+
+
+@contextmanager
+def _in_notebook() -> Iterator[Notice]:
+    from IPython.display import HTML, display
+
+    start = shown = time.monotonic()
+    last = None
+    bar = display(HTML(""), display_id=True)
+
+    def notice(text: str, share: float | None) -> None:
+        nonlocal shown, last
+        now = time.monotonic()
+        if text != last and _is_warning(text):
+            print(text)
+        if text != last or now - shown > _NOTEBOOK_INTERVAL:
+            value = "" if share is None else f' value="{share:.3f}"'
+            clock = f"{int(now - start) // 60}:{int(now - start) % 60:02d}"
+            bar.update(HTML(f"<progress{value}></progress> {clock} {escape(text)}"))
+            shown = now
+        last = text
+
+    try:
+        yield notice
+    finally:
+        bar.update(HTML(""))
+
+
+def _is_warning(text: str) -> bool:
+    return text.startswith("warning: ")

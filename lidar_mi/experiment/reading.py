@@ -11,6 +11,7 @@ from pydantic import BaseModel, ValidationError
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema import BACKSCATTER, NAME, Experiment
+from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.units import Unit
 
 
@@ -26,6 +27,55 @@ class _Loader(yaml.SafeLoader):
                 )
             seen.add(key.value)
         return super().construct_mapping(node, deep)
+
+
+def load_experiment(name: str | Path, *, variant: str | None = None, **changes: Any) -> Experiment:
+    """Read an experiment, and change some of its keys.
+
+    Parameters
+    ----------
+    name : path or str
+        An experiment file, or the name of a shipped experiment, see `experiments`.
+    variant : str, optional
+        Which, where the file describes several.
+    **changes
+        Keys of the experiment file with their new values, as numbers in SI units or text with a
+        unit: sections as dicts, which merge with what is there, or dotted keys,
+        ``**{"scan.range": "200 m"}``. None removes a section.
+
+    Returns
+    -------
+    Experiment
+        Frozen and checked. Quantities are in SI units. It remembers its file's folder, where the
+        files that it names are looked for first.
+
+    Raises
+    ------
+    InputError
+        No such file, an unknown key, a wrong unit, a value out of range: the first fault is named.
+        No variant is named where there are several, or none of this name.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> experiment = lm.load_experiment("wake_backscatter", scan={"range": "200 m"}, seed=7)
+    >>> experiment.scan.range, experiment.seed
+    (200.0, 7)
+    """
+    path = experiment_file(name)
+    variants = load_variants(path)
+    if variant not in (variants or (None,)):
+        wanted = f"one of {', '.join(variants)}" if variants else f"none, as {name} has no variants"
+        raise InputError(f"variant: {variant!r} is not allowed; expected {wanted}")
+    found = variants[variant] if variants else load(path)
+    if changes:
+        data = yaml.safe_load(dump(found))
+        for key, value in changes.items():
+            for part in reversed(key.split(".")):
+                value = {part: value}
+            data = _merged(data, value)
+        found = check(data, str(name))
+    return found.read_from(path.parent)
 
 
 def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:

@@ -1,9 +1,10 @@
 """What an experiment file may say: every key, its unit, its default and its limits."""
 
 import math
+from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
 
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.doppler import DopplerLidar
@@ -335,6 +336,18 @@ class Experiment(_Section):
     volume: Volume | None = Field(
         None, description="u, v, w from all gates, in place of retrieval; {} for all defaults"
     )
+    _folder: Path = PrivateAttr(Path())
+
+    @property
+    def folder(self) -> Path:
+        """Where it was read from: files that it names are looked for there first."""
+        return self._folder
+
+    def read_from(self, folder: str | Path) -> "Experiment":
+        """The same experiment, with another folder for the files that it names."""
+        copy = self.model_copy()
+        copy._folder = Path(folder)
+        return copy
 
     @model_validator(mode="after")
     def _gates_that_make_a_volume(self):
