@@ -46,13 +46,11 @@ def test_sections_come_and_go():
 
 
 def test_a_variant_has_to_be_named():
-    with pytest.raises(lm.InputError, match=r"variant: None is not allowed; expected one of \w+"):
+    with pytest.raises(lm.InputError, match="variant: None is not allowed; expected one") as stop:
         lm.load_experiment("near_range")
     with pytest.raises(lm.InputError, match="expected none, as turbine has no variants"):
         lm.load_experiment("turbine", variant="day")
-    first = str(pytest.raises(lm.InputError, lm.load_experiment, "near_range").value)
-    names = first.split("one of ")[1].split(", ")
-    for name in names:
+    for name in str(stop.value).split("one of ")[1].split(", "):
         assert lm.load_experiment("near_range", variant=name, seed=9).seed == 9
 
 
