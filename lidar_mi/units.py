@@ -8,7 +8,7 @@ except angles, which must say their unit (degrees and radians are too easily con
 import re
 import tokenize
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import pint
 from pydantic import GetCoreSchemaHandler
@@ -79,6 +79,11 @@ class Unit:
                 lambda value: f"{value!r} {self.symbol}" if self.symbol else value, when_used="json"
             ),
         )
+
+
+def quantity(text: str) -> float:
+    """A default as text with its unit: a float after validation (``validate_default``)."""
+    return cast(float, text)
 
 
 Length = Annotated[float, Unit("m", "500 m")]

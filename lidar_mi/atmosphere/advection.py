@@ -32,7 +32,7 @@ def _sampler(values):
     """
     coefficients = spline_filter(np.pad(values, _MARGIN, mode="edge"), order=_ORDER, mode="mirror")
 
-    def sample(indices):
+    def sample(indices: np.ndarray) -> np.ndarray:
         return map_coordinates(
             coefficients, indices + _MARGIN, order=_ORDER, mode="nearest", prefilter=False
         )

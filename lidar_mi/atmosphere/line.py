@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.constants import Avogadro, Boltzmann
 from scipy.optimize import brentq
 
@@ -83,13 +84,13 @@ class Line:
         )
         return right - left
 
-    def characteristic(self, t):
+    def characteristic(self, t: ArrayLike) -> np.ndarray:
         """Fourier transform <exp(2 pi i nu t)> over the line, complex, at the times ``t`` (s)."""
         t = np.asarray(t, float)[..., None]
         phase = 2j * np.pi * t * self.offsets
         return np.exp(phase - 2 * (np.pi * t * self.sigmas) ** 2) @ self.weights
 
-    def pdf(self, nu):
+    def pdf(self, nu: ArrayLike) -> np.ndarray:
         """Fraction of the photons per Hz at the offsets ``nu`` (Hz); no sigma may be 0."""
         z = (np.asarray(nu, float)[..., None] - self.offsets) / self.sigmas
         return np.exp(-(z**2) / 2) @ (self.weights / (math.sqrt(2 * math.pi) * self.sigmas))
@@ -111,7 +112,7 @@ class Line:
 def laser_line(wavelength: float, laser_width: float) -> Line:
     """The emitted line: one Gaussian of full width ``laser_width`` (Hz) at half maximum."""
     _check("laser_width", laser_width, laser_width >= 0, "0 Hz or more")
-    return Line(wavelength, [1.0], [0.0], [laser_width / _FWHM])
+    return Line(wavelength, np.ones(1), np.zeros(1), np.array([laser_width / _FWHM]))
 
 
 def rayleigh_width(wavelength: float, temperature: float) -> float:
@@ -126,7 +127,8 @@ def rayleigh_width(wavelength: float, temperature: float) -> float:
 
 def rayleigh(wavelength: float, temperature: float) -> Line:
     """Line of molecules that never collide: one Gaussian (m, K)."""
-    return Line(wavelength, [1.0], [0.0], [rayleigh_width(wavelength, temperature) / _FWHM])
+    sigma = rayleigh_width(wavelength, temperature) / _FWHM
+    return Line(wavelength, np.ones(1), np.zeros(1), np.array([sigma]))
 
 
 def viscosity(temperature: float) -> float:
@@ -165,7 +167,7 @@ def rayleigh_brillouin(wavelength: float, temperature: float, pressure: float) -
     side = (1 - centre) / 2
     return Line(
         wavelength,
-        [side, centre, side],
+        np.array([side, centre, side]),
         unit * np.array([-place, 0, place]),
         unit * np.array([sigma_b, sigma_r, sigma_b]),
     )

@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 from scipy.integrate import quad
@@ -164,7 +165,7 @@ class Aerosol:
     def area_left_out(self) -> float:
         """Fraction of the geometric cross-section of all sizes that is beyond the limits."""
 
-        def area(low, high):
+        def area(low: float, high: float) -> float:
             return quad(
                 lambda u: self.sizes(math.exp(u)) * math.exp(3 * u), low, high, epsabs=0, limit=400
             )[0]
@@ -302,11 +303,11 @@ def changed(
         Unknown name, a number out of range, or a change without a new name.
     """
     particles = aerosol(name)
-    changes = {"elongation": elongation, "number_density": number_density}
-    changes = {key: value for key, value in changes.items() if value is not None}
+    numbers = {"elongation": elongation, "number_density": number_density}
+    changes: dict[str, Any] = {key: x for key, x in numbers.items() if x is not None}
     if index is not None:
         changes["index"] = ((wavelength, index),)
-    given = {key: value for key, value in sizes.items() if value is not None}
+    given: dict[str, Any] = {key: x for key, x in sizes.items() if x is not None}
     if "radius" in given:
         of = "median" if isinstance(particles.sizes, LogNormal) else "mode"
         given[of] = given.pop("radius")

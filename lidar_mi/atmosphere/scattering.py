@@ -13,10 +13,12 @@ a1 averages to one over the sphere of directions.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidar_mi.errors import InputError
 
@@ -112,7 +114,7 @@ class ScatteringTable:
         """Backscatter coefficient at `number_density`, m^-1 sr^-1."""
         return self.extinction * self.backscatter_per_extinction
 
-    def at(self, angle) -> np.ndarray:
+    def at(self, angle: ArrayLike) -> np.ndarray:
         """The elements at other angles (degrees), shape (..., 6), linear between the nodes."""
         angle = np.asarray(angle, float)
         return np.stack([np.interp(angle, self.angle, row) for row in self.elements.T], axis=-1)
@@ -123,7 +125,7 @@ def _moments(angle, a1):
     theta = np.radians(angle)
     slope = np.diff(a1) / np.diff(theta)
 
-    def half_integral(first, second):
+    def half_integral(first: np.ndarray, second: np.ndarray) -> float:
         # by parts on each interval, with the first and second antiderivative of the weight
         return float((np.diff(a1 * first) - slope * np.diff(second)).sum()) / 2
 
@@ -345,7 +347,9 @@ def rayleigh_table(
     )
 
 
-def mix(tables, extinctions, name: str = "mixture") -> ScatteringTable:
+def mix(
+    tables: Sequence[ScatteringTable], extinctions: Sequence[float], name: str = "mixture"
+) -> ScatteringTable:
     """Several kinds of particles in one volume (external mixture).
 
     Matrices add weighted by scattering coefficient, albedos by extinction coefficient.
@@ -391,10 +395,9 @@ def mix(tables, extinctions, name: str = "mixture") -> ScatteringTable:
         w / table.extinction_cross_section for w, table in zip(extinctions, tables, strict=True)
     )
     angle = np.unique(np.concatenate([table.angle for table in tables]))
-    elements = sum(
-        part / sum(scattering) * table.at(angle)
-        for part, table in zip(scattering, tables, strict=True)
-    )
+    elements = np.zeros((len(angle), 6))
+    for part, table in zip(scattering, tables, strict=True):
+        elements += part / sum(scattering) * table.at(angle)
     parts = ", ".join(
         f"{w:.4g} m^-1 {table.name}" for w, table in zip(extinctions, tables, strict=True)
     )

@@ -2,6 +2,7 @@
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from scipy.fft import fftfreq, irfftn, next_fast_len, rfftfreq, rfftn
 
 from lidar_mi.errors import InputError
@@ -66,12 +67,19 @@ def gaussian_field(
     return irfftn(spectrum, s=shape, overwrite_x=True)
 
 
-def corrsin_obukhov(y, z, rms: float, outer_scale: float, seed: int, x=None) -> xr.DataArray:
+def corrsin_obukhov(
+    y: ArrayLike,
+    z: ArrayLike,
+    rms: float,
+    outer_scale: float,
+    seed: int,
+    x: ArrayLike | None = None,
+) -> xr.DataArray:
     """Random factor with which small-scale mixing modulates the aerosol.
 
     Log-normal, exp(g - s^2/2) with s^2 = ln(1 + rms^2), so it is positive with mean 1 and
     relative rms `rms`. g is a piece cut from a `gaussian_field` that is longer than the image by
-    `outer_scale` in every direction (there the correlation has fallen to about 1e-3), so opposite
+    `outer_scale` in every direction (there the correlation has fallen to about 1e-3), so
     opposite edges are independent; its mean and standard deviation *over the image* are set to
     0 and s. The factor's own mean and rms therefore scatter only by what the tails do: some
     per cent of the rms in an image of ten outer scales.

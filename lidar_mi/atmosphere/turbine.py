@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from scipy import integrate
 from scipy.fft import next_fast_len
 
@@ -131,12 +132,12 @@ class TurbineWake:
         )
         return torque / momentum
 
-    def axial_speed(self, r):
+    def axial_speed(self, r: ArrayLike) -> np.ndarray:
         """u at distances r (m) from the axis, m s^-1."""
         deficit = self.axial_deficit * np.exp(-(np.asarray(r, float) ** 2) / (2 * self.width**2))
         return self.wind_speed * (1 - deficit)
 
-    def tangential_speed(self, r):
+    def tangential_speed(self, r: ArrayLike) -> np.ndarray:
         """Swirl at distances r (m) from the axis, m s^-1."""
         return self.circulation * self._profile(r)
 
@@ -159,7 +160,9 @@ def added_turbulence(thrust: float, ambient: float, downstream: float, diameter:
     return 0.73 * induction**0.8325 * ambient**0.0325 * (downstream / diameter) ** -0.32
 
 
-def isotropic_turbulence(x, y, z, outer_scale: float, seed: int) -> np.ndarray:
+def isotropic_turbulence(
+    x: np.ndarray, y: np.ndarray, z: np.ndarray, outer_scale: float, seed: int
+) -> np.ndarray:
     """Frozen isotropic turbulence (3, x, y, z), of mean square 1 a component, m s^-1.
 
     The curl of a Gaussian vector potential, with von Karman's energy spectrum
@@ -183,7 +186,7 @@ def isotropic_turbulence(x, y, z, outer_scale: float, seed: int) -> np.ndarray:
         for part in np.random.SeedSequence(seed).generate_state(3).tolist()
     ]
 
-    def slope(component, along):
+    def slope(component: int, along: int) -> np.ndarray:
         """Derivative of a component of the potential at the inner nodes."""
         ends = [slice(1, -1)] * 3
         high, low = list(ends), list(ends)
@@ -199,7 +202,13 @@ def isotropic_turbulence(x, y, z, outer_scale: float, seed: int) -> np.ndarray:
 
 
 def turbine_flow(
-    wake: TurbineWake, x, y, z, ambient: float = 0.0, outer_scale: float = 30.0, seed: int = 0
+    wake: TurbineWake,
+    x: ArrayLike,
+    y: ArrayLike,
+    z: ArrayLike,
+    ambient: float = 0.0,
+    outer_scale: float = 30.0,
+    seed: int = 0,
 ) -> xr.Dataset:
     """u, v, w behind a turbine: the mean wake, on all planes x alike, and turbulence.
 
@@ -221,8 +230,8 @@ def turbine_flow(
     xarray.Dataset
         m s^-1 on (x, y, z).
     """
-    axes = {"x": x, "y": y, "z": z}
-    axes = {name: np.atleast_1d(np.asarray(values, float)) for name, values in axes.items()}
+    given = {"x": x, "y": y, "z": z}
+    axes = {name: np.atleast_1d(np.asarray(values, float)) for name, values in given.items()}
     lateral, vertical = np.meshgrid(axes["y"], axes["z"], indexing="ij")
     r = np.hypot(lateral, vertical)
     swirl = np.divide(wake.tangential_speed(r), r, out=np.zeros_like(r), where=r > 0)
@@ -231,7 +240,7 @@ def turbine_flow(
     if ambient > 0:
         added = added_turbulence(wake.thrust, ambient, wake.downstream, wake.diameter)
         added *= np.exp(-(r**2) / (2 * wake.width**2))
-        gusts = isotropic_turbulence(*axes.values(), outer_scale, seed)
+        gusts = isotropic_turbulence(**axes, outer_scale=outer_scale, seed=seed)
         flow += wake.wind_speed * np.hypot(ambient, added) * gusts
     titles = {
         "u": "velocity along the wind",

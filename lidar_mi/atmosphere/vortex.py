@@ -10,6 +10,7 @@ from typing import Literal, get_args
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from lidar_mi.errors import InputError
 
@@ -77,7 +78,9 @@ def _angular_velocity(r2, circulation, core_radius, model):
     return circulation / (2 * np.pi * core_radius**2) * profile
 
 
-def tangential_speed(r, circulation, core_radius, model: Model = "lamb_oseen"):
+def tangential_speed(
+    r: ArrayLike, circulation: float, core_radius: float, model: Model = "lamb_oseen"
+) -> np.ndarray:
     """Swirl velocity of a single vortex.
 
     Lamb-Oseen: Gamma/(2 pi r) (1 - exp(-1.2564 r^2/r_c^2)).
@@ -102,7 +105,9 @@ def tangential_speed(r, circulation, core_radius, model: Model = "lamb_oseen"):
     return r * _angular_velocity(r**2, circulation, core_radius, model)
 
 
-def velocity(vortices: Sequence[Vortex], y, z):
+def velocity(
+    vortices: Sequence[Vortex], y: ArrayLike, z: ArrayLike
+) -> tuple[np.ndarray, np.ndarray]:
     """Cross-flow velocity of a set of vortices, by superposition.
 
     A vortex at (y0, z0) gives v = -v_t (z - z0)/r and w = +v_t (y - y0)/r.
@@ -187,7 +192,7 @@ def descent_speed(circulation: float, separation: float) -> float:
     return circulation / (2 * np.pi * separation)
 
 
-def pair_wake(vortices: Sequence[Vortex], y, z, x: float = 0.0) -> xr.Dataset:
+def pair_wake(vortices: Sequence[Vortex], y: ArrayLike, z: ArrayLike, x: float = 0.0) -> xr.Dataset:
     """The flow of analytic vortices in the layout of `lidar_mi.atmosphere.wake.read_wake`.
 
     Parameters

@@ -33,7 +33,7 @@ _UNEVEN = 1e-3
 _MOST_NODES = 10**8
 
 
-def parse_units(text: str) -> pint.Quantity:
+def parse_units(text: str) -> pint.Quantity[float]:
     """A CF units string as a pint quantity: 'm s-1', 'km/h', 'kg m-3', '1', '%'.
 
     CF (UDUNITS) writes powers as digits behind a unit and products as a dot, pint does not.
@@ -395,35 +395,35 @@ def resample(wake: xr.Dataset, spacing: float, axes: str = "yz") -> xr.Dataset:
     """
     if not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"wake.spacing: {spacing} m is not allowed; it must be > 0 m")
-    nodes = {}
+    ends = {}
     for name in axes:
-        axis = wake[name].values.astype(float)
-        if axis.size < 4:
+        places = wake[name].values.astype(float)
+        if places.size < 4:
             raise InputError(
-                f"wake.{name}: {axis.size} nodes are too few to interpolate; allowed: 4 or more"
+                f"wake.{name}: {places.size} nodes are too few to interpolate; allowed: 4 or more"
             )
-        extent = axis[-1] - axis[0]
+        extent = places[-1] - places[0]
         cells = round(extent / spacing)
         if cells < 1 or abs(cells * spacing - extent) > _UNEVEN * spacing:
             raise InputError(
                 f"wake.spacing: {spacing:g} m does not divide the extent of {name}, "
                 f"{extent:g} m; allowed: {extent:g} m over a whole number"
             )
-        nodes[name] = (axis[0], axis[-1], cells + 1)
-    check_nodes(spacing, {d: nodes[d][2] if d in nodes else wake.sizes[d] for d in "xyz"})
-    nodes = {name: np.linspace(*ends) for name, ends in nodes.items()}
+        ends[name] = (places[0], places[-1], cells + 1)
+    check_nodes(spacing, {d: ends[d][2] if d in ends else wake.sizes[d] for d in "xyz"})
+    nodes = {name: np.linspace(*end) for name, end in ends.items()}
 
     fine = wake.drop_vars([*wake.data_vars, *axes]).assign_coords(
         {name: (name, values, {"units": "m"}) for name, values in nodes.items()}
     )
-    for name, variable in wake.data_vars.items():
+    for variable_name, variable in wake.data_vars.items():
         values = variable.transpose("x", "y", "z").values.astype(float)
         low, high = values.min(), values.max()
         for axis in axes:
             values = CubicSpline(wake[axis].values, values, axis="xyz".index(axis))(nodes[axis])
-        if name in ("tracer", "aerosol"):
+        if variable_name in ("tracer", "aerosol"):
             values = values.clip(low, high)
-        fine[name] = ("x", "y", "z"), values, variable.attrs
+        fine[variable_name] = ("x", "y", "z"), values, variable.attrs
     return fine
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy import constants, special
 
@@ -17,7 +18,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.signal import apparent_backscatter
-from lidar_mi.units import Frequency, Length, Number, SpectralRadiance
+from lidar_mi.units import Frequency, Length, Number, SpectralRadiance, quantity
 
 
 class Detector(BaseModel):
@@ -43,15 +44,21 @@ class Detector(BaseModel):
     )
 
     optics_efficiency: Number = Field(0.5, gt=0, le=1, description="telescope to detector")
-    quantum_efficiency: Number = Field(0.4, gt=0, le=1, description="photoelectrons a photon")
+    quantum_efficiency: Number = Field(0.4, gt=0, le=1, description="photoelectrons per photon")
     excess_noise_factor: Number = Field(1.25, ge=1, description="variance added by the gain")
-    dark_rate: Frequency = Field("1 kHz", ge=0, description="photoelectrons without light")
+    dark_rate: Frequency = Field(
+        quantity("1 kHz"), ge=0, description="photoelectrons without light"
+    )
     readout_noise: Number = Field(0.0, ge=0, description="rms photoelectrons a gate, at the input")
-    sky_radiance: SpectralRadiance = Field("0.3 W/m^2/sr/nm", ge=0, description="solar background")
-    filter_bandwidth: Length = Field("1 nm", gt=0, description="equivalent width of the filter")
+    sky_radiance: SpectralRadiance = Field(
+        quantity("0.3 W/m^2/sr/nm"), ge=0, description="solar background"
+    )
+    filter_bandwidth: Length = Field(
+        quantity("1 nm"), gt=0, description="equivalent width of the filter"
+    )
     speckle: bool = Field(True, description="whether the coherence of the laser causes speckle")
     line_width: Frequency = Field(
-        "30 GHz", gt=0, description="of the echo, full width half maximum"
+        quantity("30 GHz"), gt=0, description="of the echo, full width half maximum"
     )
     speckle_modes: Number | None = Field(
         None, ge=1, description="number of modes; default: from line width, telescope and footprint"
@@ -74,7 +81,7 @@ class Detection(NamedTuple):
     s0_std: np.ndarray
 
 
-def gate_duration(gate_length):
+def gate_duration(gate_length: ArrayLike) -> np.ndarray:
     """Time in which a gate is recorded, s: 2 dr / c for a gate dr (m) long."""
     return 2 * np.asarray(gate_length, float) / constants.c
 
@@ -84,7 +91,9 @@ def photons_per_energy(wavelength: float) -> float:
     return wavelength / (constants.h * constants.c)
 
 
-def signal_photoelectrons(s0, pulse_energy: float, wavelength: float, detector: Detector):
+def signal_photoelectrons(
+    s0: ArrayLike, pulse_energy: float, wavelength: float, detector: Detector
+) -> np.ndarray:
     """Mean photoelectrons of an echo.
 
     Parameters
@@ -102,8 +111,12 @@ def signal_photoelectrons(s0, pulse_energy: float, wavelength: float, detector: 
 
 
 def background_photoelectrons(
-    detector: Detector, duration, aperture_area: float, fov_half: float, wavelength: float
-):
+    detector: Detector,
+    duration: ArrayLike,
+    aperture_area: float,
+    fov_half: float,
+    wavelength: float,
+) -> np.ndarray:
     """Mean photoelectrons of scattered sunlight: radiance x filter x area x solid angle x time.
 
     Their number is Poisson distributed: sunlight through a filter has far too many modes for
@@ -127,12 +140,12 @@ def background_photoelectrons(
     )
 
 
-def dark_counts(detector: Detector, duration):
+def dark_counts(detector: Detector, duration: ArrayLike) -> np.ndarray:
     """Mean photoelectrons that come without light in ``duration`` (s)."""
     return detector.dark_rate * np.asarray(duration, float)
 
 
-def footprint_radius(lidar: BackscatterLidar, distance):
+def footprint_radius(lidar: BackscatterLidar, distance: ArrayLike) -> np.ndarray:
     """1/e^2 radius of the beam at a distance (m), as far as the field of view holds it, m.
 
     A Gaussian with the variance of the truncated aperture plus the divergence. Area pi w^2 is
@@ -146,7 +159,7 @@ def footprint_radius(lidar: BackscatterLidar, distance):
     return np.sqrt(squared * np.tanh((distance * lidar.fov_half) ** 2 / squared))
 
 
-def temporal_modes(line_width: float, duration):
+def temporal_modes(line_width: float, duration: ArrayLike) -> np.ndarray:
     """Independent speckle patterns in the time a gate is recorded.
 
     M = [2/T int_0^T (1 - t/T) |g(t)|^2 dt]^-1 for a Gaussian line (Goodman, Statistical Optics,
@@ -164,7 +177,9 @@ def temporal_modes(line_width: float, duration):
     return 1 / (special.erf(np.sqrt(np.pi) * x) / x + np.expm1(-np.pi * x**2) / (np.pi * x**2))
 
 
-def spatial_modes(aperture_radius: float, wavelength: float, footprint, distance):
+def spatial_modes(
+    aperture_radius: float, wavelength: float, footprint: ArrayLike, distance: ArrayLike
+) -> np.ndarray:
     """Speckle grains in the telescope: A Omega / lambda^2, and 1 when a grain is larger than it.
 
     M = [1/A^2 int int |mu(p - q)|^2 dp dq]^-1 over the aperture, where mu is the coherence that a
@@ -184,7 +199,8 @@ def spatial_modes(aperture_radius: float, wavelength: float, footprint, distance
     distance : array
         r, m.
     """
-    a = 2 * (np.pi * footprint * aperture_radius / (wavelength * np.asarray(distance, float))) ** 2
+    footprint, distance = np.asarray(footprint, float), np.asarray(distance, float)
+    a = 2 * (np.pi * footprint * aperture_radius / (wavelength * distance)) ** 2
     # 1 + a / 2 is the series; for small a the closed form loses digits
     small = a < 1e-6
     safe = np.where(small, 1.0, a)
@@ -193,8 +209,12 @@ def spatial_modes(aperture_radius: float, wavelength: float, footprint, distance
 
 
 def speckle_modes(
-    detector: Detector, lidar: BackscatterLidar, duration, distance, polarization=1.0
-):
+    detector: Detector,
+    lidar: BackscatterLidar,
+    duration: ArrayLike,
+    distance: ArrayLike,
+    polarization: ArrayLike = 1.0,
+) -> float | np.ndarray:
     """Degrees of freedom M of the received light: its relative variance is 1 / M.
 
     Temporal times spatial modes, times 2 / (1 + P^2) for light of degree of polarisation P, as both
@@ -232,7 +252,13 @@ def speckle_modes(
     return temporal_modes(detector.line_width, duration) * spatial * both
 
 
-def noise_terms(signal, background, dark, modes, detector: Detector) -> dict:
+def noise_terms(
+    signal: np.ndarray,
+    background: np.ndarray,
+    dark: np.ndarray,
+    modes: float | np.ndarray,
+    detector: Detector,
+) -> dict[str, np.ndarray]:
     """Variances of the counts by cause: shot, speckle, background, dark, readout.
 
     Counts of partly coherent light are Poisson with a Gamma distributed mean, that is negative
@@ -253,23 +279,30 @@ def noise_terms(signal, background, dark, modes, detector: Detector) -> dict:
         "speckle": signal**2 / modes,
         "background": factor * background,
         "dark": factor * dark,
-        "readout": np.float64(detector.readout_noise**2),
+        "readout": np.asarray(detector.readout_noise**2),
     }
 
 
-def noise_variance(signal, background, dark, modes, detector: Detector):
+def noise_variance(
+    signal: np.ndarray,
+    background: np.ndarray,
+    dark: np.ndarray,
+    modes: float | np.ndarray,
+    detector: Detector,
+) -> np.ndarray:
     """Variance of the counts, the sum of `noise_terms`."""
-    return sum(noise_terms(signal, background, dark, modes, detector).values())
+    terms = noise_terms(signal, background, dark, modes, detector)
+    return np.asarray(sum(terms.values()))
 
 
 def detect(
-    s0,
+    s0: ArrayLike,
     lidar: BackscatterLidar,
     detector: Detector,
-    duration,
-    distance,
+    duration: ArrayLike,
+    distance: ArrayLike,
     seed: int | Sequence[int],
-    polarization=1.0,
+    polarization: ArrayLike = 1.0,
 ) -> Detection:
     """Read the detector once, every pixel with noise of its own.
 
@@ -412,7 +445,7 @@ def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) 
     }
     if detector.speckle:
         budget["speckle_modes"] = modes
-    terms["all"] = sum(terms.values())
+    terms["all"] = noise_variance(signal, background, dark, modes, detector)
     for name, variance in terms.items():
         spread = np.sqrt(np.broadcast_to(variance, s0.shape)[lit])
         budget[f"noise.{name}"] = spread / signal[lit]
@@ -451,9 +484,8 @@ def _plan(scan: xr.Dataset) -> ScanPlan:
     for name in (*names, "environment_extinction"):
         if name not in scan.attrs:
             raise InputError(f"scan: attribute {name} is missing; expected a scan rendered here")
-    return ScanPlan(
-        scan["y"].values, scan["z"].values, *(scan.attrs[name] for name in names), position=0.0
-    )
+    gates = {name: scan.attrs[name] for name in names}
+    return ScanPlan(scan["y"].values, scan["z"].values, **gates, position=0.0)
 
 
 def _generator(seed) -> np.random.Generator:

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from lidar_mi.atmosphere.line import Line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.detector import (
     gate_duration,
@@ -27,6 +28,7 @@ from lidar_mi.units import (
     Number,
     SpectralRadiance,
     Time,
+    quantity,
 )
 
 
@@ -56,11 +58,13 @@ class DopplerLidar(BaseModel):
     pulse_duration: Time = Field(
         10e-9, ge=0, le=1e-3, description="full width at half maximum of a pulse"
     )
-    laser_width: Frequency = Field("100 MHz", gt=0, description="full width half maximum")
+    laser_width: Frequency = Field(quantity("100 MHz"), gt=0, description="full width half maximum")
     beam_radius: Length = Field(0.025, gt=0, le=10, description="of the outgoing beam")
-    divergence_full: Angle = Field("500 urad", ge=0, lt=0.5, description="full angle")
+    divergence_full: Angle = Field(quantity("500 urad"), ge=0, lt=0.5, description="full angle")
     telescope_area: Area = Field(0.13, gt=0, description="of the receiving telescope")
-    fov_half: Angle = Field("1 mrad", gt=0, lt=0.5, description="field of view, half angle")
+    fov_half: Angle = Field(
+        quantity("1 mrad"), gt=0, lt=0.5, description="field of view, half angle"
+    )
     instrument_constant: Number = Field(0.15, gt=0, le=1, description="efficiency of the lidar")
     counted: Literal["detected", "before_etalon"] = Field(
         "detected", description="which photons the lidar equation counts"
@@ -72,8 +76,12 @@ class DopplerLidar(BaseModel):
     extinction: Extinction = Field(2.70e-5, ge=0, description="extinction coefficient")
     aerosol_share: Number = Field(0.0, ge=0, le=1, description="of the backscattered photons")
     line_shape: Literal["rayleigh", "rayleigh_brillouin"] = "rayleigh_brillouin"
-    sky_radiance: SpectralRadiance = Field("0.18 W/m^2/sr/nm", ge=0, description="background")
-    filter_bandwidth: Length = Field("1 nm", gt=0, description="equivalent width of the filter")
+    sky_radiance: SpectralRadiance = Field(
+        quantity("0.18 W/m^2/sr/nm"), ge=0, description="background"
+    )
+    filter_bandwidth: Length = Field(
+        quantity("1 nm"), gt=0, description="equivalent width of the filter"
+    )
 
     @model_validator(mode="after")
     def _pulse_has_its_width(self):
@@ -122,7 +130,7 @@ def solar_background(lidar: DopplerLidar, etalon: Etalon) -> float:
     return energy * photons_per_energy(lidar.wavelength)
 
 
-def coherence_time(etalon: Etalon, line, order: float = 0.0) -> float:
+def coherence_time(etalon: Etalon, line: Line, order: float = 0.0) -> float:
     """Coherence time of the light of a line behind the etalon, s.
 
     int |g|^2 dt over all times, which by Parseval's theorem is int p^2 dnu, with p the spectrum
@@ -152,7 +160,7 @@ def coherence_time(etalon: Etalon, line, order: float = 0.0) -> float:
     return float((transmitted**2).sum() / transmitted.sum() ** 2 / (nu[1] - nu[0]))
 
 
-def speckle_modes(lidar: DopplerLidar, camera: FringeCamera, etalon: Etalon, line) -> float:
+def speckle_modes(lidar: DopplerLidar, camera: FringeCamera, etalon: Etalon, line: Line) -> float:
     """Degrees of freedom M of the speckle in one pixel: its relative variance is 1 / M.
 
     Modes in time, for a Gaussian line of the `coherence_time` at the peak of a fringe, times modes

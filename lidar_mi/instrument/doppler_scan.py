@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.scan import HalfAngle
-from lidar_mi.units import Angle, Speed
+from lidar_mi.units import Angle, Speed, quantity
 
 # nodes of the quadrature over range bin, pulse and beam: exact for winds of degree 15, 5 and 5
 _BIN, _PULSE, _BEAM = 8, 3, 3
@@ -38,8 +38,8 @@ class DopplerScan(_Model):
 
     columns: int = Field(9, ge=1, le=1000, description="directions across")
     rows: int = Field(7, ge=1, le=1000, description="directions up")
-    azimuth_half: HalfAngle = Field("21.5 deg", description="of the outermost directions")
-    elevation_half: HalfAngle = Field("14 deg", description="of the outermost directions")
+    azimuth_half: HalfAngle = Field(quantity("21.5 deg"), description="of the outermost directions")
+    elevation_half: HalfAngle = Field(quantity("14 deg"), description="of the outermost directions")
     gates: Literal["planar", "spherical"] = "planar"
 
     def directions(self) -> np.ndarray:

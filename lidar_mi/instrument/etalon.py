@@ -14,10 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy import constants
 from scipy.optimize import brentq
 
+from lidar_mi.atmosphere.line import Line
 from lidar_mi.errors import InputError
 from lidar_mi.units import Length, Number
 
@@ -32,7 +34,7 @@ _MOST_HARMONICS = 100_000
 class Layer(NamedTuple):
     """One layer of a coating: refractive index, thickness (m), extinction coefficient."""
 
-    index: float
+    index: float  # type: ignore[assignment]  # hides a method of tuples
     thickness: Length
     extinction: float = 0.0
 
@@ -121,8 +123,8 @@ def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
     """One mirror at normal incidence.
 
     At the angles of a ring image (10 mrad) coatings of quarter waves reflect the same to 2e-5 and
-    shift the orders by 2e-5 more, which looks like 0.03 m/s there (others up to 0.1 m/s), the same
-    in every image; `coated_transmission` has it all.
+    shift the orders by 2e-5 more, equivalent to 0.03 m/s there (others up to 0.1 m/s), the same in
+    every image; `coated_transmission` has it all.
 
     Raises
     ------
@@ -144,13 +146,15 @@ def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
     return Mirrors(float(abs(r) ** 2), transmittance, phase - round(phase))
 
 
-def cosine_inside(etalon: Etalon, cosine):
+def cosine_inside(etalon: Etalon, cosine: ArrayLike) -> np.ndarray:
     """Cosine of the angle in the gap, of light that comes from outside (index 1): Snell's law."""
     cosine = np.asarray(cosine, float)
     return np.sqrt(1 - (1 - cosine**2) / etalon.index**2)
 
 
-def fractional_order(etalon: Etalon, wavelength: float, cosine, offset=0.0):
+def fractional_order(
+    etalon: Etalon, wavelength: float, cosine: ArrayLike, offset: ArrayLike = 0.0
+) -> np.ndarray:
     """Order less the integer part of the order at the centre.
 
     Parameters
@@ -167,7 +171,7 @@ def fractional_order(etalon: Etalon, wavelength: float, cosine, offset=0.0):
     return _less_whole_orders(centre, gap, wavelength, cosine, offset)
 
 
-def plate_defects(etalon: Etalon, wavelength: float, n):
+def plate_defects(etalon: Etalon, wavelength: float, n: ArrayLike) -> np.ndarray:
     """What uneven plates leave of harmonic ``n`` of the transmission.
 
     Irregularities vary the order by a Gaussian of standard deviation 2 n rms / wavelength; a bow,
@@ -178,7 +182,9 @@ def plate_defects(etalon: Etalon, wavelength: float, n):
     return np.exp(-2 * (np.pi * orders * etalon.surface_rms) ** 2) * np.sinc(orders * etalon.bow)
 
 
-def harmonics(etalon: Etalon, wavelength: float, line=None, count: int | None = None):
+def harmonics(
+    etalon: Etalon, wavelength: float, line: Line | None = None, count: int | None = None
+) -> np.ndarray:
     """A_0 ... A_count of T = A_0 + 2 Re sum A_n exp(2 pi i n m), m the order of the laser's light.
 
     A_n = T^2 / (1 - R^2) R^n of the mirrors, times `plate_defects`, times the line's Fourier
@@ -214,7 +220,7 @@ def harmonics(etalon: Etalon, wavelength: float, line=None, count: int | None = 
     return amplitudes[: max(2, np.count_nonzero(left > 1e-12 * left[0]))]
 
 
-def series(amplitudes, order: torch.Tensor) -> torch.Tensor:
+def series(amplitudes: np.ndarray, order: torch.Tensor) -> torch.Tensor:
     """A_0 + 2 Re sum A_n exp(2 pi i n m) at the orders ``m``, by Horner's rule in float64."""
     phase = 2 * math.pi * order.double()
     z = torch.polar(torch.ones_like(phase), phase)
@@ -225,7 +231,13 @@ def series(amplitudes, order: torch.Tensor) -> torch.Tensor:
     return amplitudes[0].real + 2 * total.real
 
 
-def transmission(etalon: Etalon, wavelength: float, cosine, offset=0.0, line=None) -> np.ndarray:
+def transmission(
+    etalon: Etalon,
+    wavelength: float,
+    cosine: ArrayLike,
+    offset: ArrayLike = 0.0,
+    line: Line | None = None,
+) -> np.ndarray:
     """Transmission of the etalon with its plate defects, mean of both polarisations.
 
     Parameters
@@ -241,7 +253,7 @@ def transmission(etalon: Etalon, wavelength: float, cosine, offset=0.0, line=Non
     return series(harmonics(etalon, wavelength, line), torch.as_tensor(order)).numpy()
 
 
-def finesse(etalon: Etalon, wavelength: float, line=None) -> float:
+def finesse(etalon: Etalon, wavelength: float, line: Line | None = None) -> float:
     """Free spectral range over the full width of a fringe at half its height above zero.
 
     Raises
@@ -251,7 +263,7 @@ def finesse(etalon: Etalon, wavelength: float, line=None) -> float:
     """
     amplitudes = harmonics(etalon, wavelength, line)
 
-    def above_half(order):
+    def above_half(order: float) -> float:
         both = series(amplitudes, torch.tensor([order, 0.0], dtype=torch.float64))
         return float(both[0] - both[1] / 2)
 
@@ -261,8 +273,12 @@ def finesse(etalon: Etalon, wavelength: float, line=None) -> float:
 
 
 def coated_transmission(
-    etalon: Etalon, wavelength: float, cosine, offset=0.0, polarization: str = "s"
-):
+    etalon: Etalon,
+    wavelength: float,
+    cosine: ArrayLike,
+    offset: ArrayLike = 0.0,
+    polarization: str = "s",
+) -> np.ndarray:
     """Transmittance of perfectly even coated plates, by transfer matrices.
 
     With all dispersion of the coatings and their dependence on angle and polarisation, which the

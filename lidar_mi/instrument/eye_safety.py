@@ -243,7 +243,7 @@ def hazard_distance(
         if not (math.isfinite(value) and value >= 0):
             raise InputError(f"{name}: {value} {unit} is not allowed; expected >= 0 {unit}")
 
-    def excess(distance, absorbed=extinction):
+    def excess(distance: float, absorbed: float = extinction) -> float:
         beam = (energy, beam_radius, divergence_full, limit.aperture, absorbed, aid)
         return exposure_at(distance, *beam) - limit.exposure
 
@@ -295,7 +295,7 @@ def scan_hazard_distance(
     _positive("spacing", spacing, " rad")
     _positive("beams", beams, "")
 
-    def excess(distance):
+    def excess(distance: float) -> float:
         radius2 = beam_radius**2 + (divergence_full / 2 * distance) ** 2
         overlap = min(max(1.0, math.pi / 2 * radius2 / (spacing * distance) ** 2), beams)
         limit = permissible_pulse(

@@ -9,11 +9,13 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field
 
+from lidar_mi.atmosphere.line import Line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon, cosine_inside, fractional_order, harmonics, series
-from lidar_mi.units import Frequency, Length, Number, Time
+from lidar_mi.units import Frequency, Length, Number, Time, quantity
 
 _CONFIG = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 # Two Gauss-Legendre points average a pixel to fourth order.
@@ -55,16 +57,16 @@ class FringeCamera(BaseModel):
 
         Of the point ``shift`` (x, y; pixels) from the middle of each pixel.
         """
-        x, y = self.centre_pixel
-        x = (np.arange(self.width) + shift[0] - x) * self.pixel
-        y = (np.arange(self.height) + shift[1] - y) * self.pixel
+        column, row = self.centre_pixel
+        x = (np.arange(self.width) + shift[0] - column) * self.pixel
+        y = (np.arange(self.height) + shift[1] - row) * self.pixel
         return x**2 + y[:, None] ** 2
 
-    def cosine(self, radius_squared):
+    def cosine(self, radius_squared: ArrayLike) -> np.ndarray:
         """Cosine of the angle to the axis, from squared distances on the CCD (m^2)."""
         return 1 / np.sqrt(1 + np.asarray(radius_squared, float) / self.focal_length**2)
 
-    def illumination(self, radius_squared):
+    def illumination(self, radius_squared: ArrayLike) -> np.ndarray:
         """Light that reaches the CCD without an etalon, relative to the rings' centre."""
         return np.exp(-2 * np.asarray(radius_squared, float) / self.illumination_radius**2)
 
@@ -78,11 +80,13 @@ class CCD(BaseModel):
 
     model_config = _CONFIG
 
-    quantum_efficiency: Number = Field(1.0, gt=0, le=1, description="photoelectrons a photon")
+    quantum_efficiency: Number = Field(1.0, gt=0, le=1, description="photoelectrons per photon")
     read_noise: Number = Field(5.0, ge=0, description="rms a pixel")
-    dark_current: Frequency = Field("1 Hz", ge=0, description="photoelectrons a pixel in the dark")
+    dark_current: Frequency = Field(
+        quantity("1 Hz"), ge=0, description="photoelectrons a pixel in the dark"
+    )
     integration_time: Time = Field(
-        "10 ms", ge=0, description="from one read-out to the next; a laser of 100 Hz"
+        quantity("10 ms"), ge=0, description="from one read-out to the next; a laser of 100 Hz"
     )
     full_well: Number = Field(20e3, gt=0, description="most a pixel holds; no blooming")
     gain: Number = Field(1.0, gt=0, description="photoelectrons a step of the digitiser")
@@ -93,8 +97,8 @@ class CCD(BaseModel):
 def fringe_image(
     camera: FringeCamera,
     etalon: Etalon,
-    line,
-    v_los=0.0,
+    line: Line,
+    v_los: ArrayLike = 0.0,
     photons: float = 2.4e7,
     counted: str = "detected",
     subsamples: int = 2,
@@ -139,7 +143,7 @@ def fringe_image(
     return (passed * (photons / total)).reshape(*speeds.shape, camera.height, camera.width)
 
 
-def doppler_shift(v_los, wavelength: float):
+def doppler_shift(v_los: ArrayLike, wavelength: float) -> np.ndarray:
     """Frequency shift 2 v_LOS / wavelength of backscattered light, Hz.
 
     Parameters
@@ -152,7 +156,9 @@ def doppler_shift(v_los, wavelength: float):
     return 2 * np.asarray(v_los, float) / wavelength
 
 
-def ring_radii(camera: FringeCamera, etalon: Etalon, wavelength: float, v_los=0.0) -> np.ndarray:
+def ring_radii(
+    camera: FringeCamera, etalon: Etalon, wavelength: float, v_los: float = 0.0
+) -> np.ndarray:
     """Radii of the fringes' peaks that fit into the half diagonal of the image, pixels, rising.
 
     Parameters
@@ -175,11 +181,11 @@ def ring_radii(camera: FringeCamera, etalon: Etalon, wavelength: float, v_los=0.
 
 
 def expose(
-    expected,
+    expected: torch.Tensor,
     ccd: CCD,
     seed: int,
     images: int | Sequence[int] | None = None,
-    modes=math.inf,
+    modes: float | torch.Tensor = math.inf,
     background: float = 0.0,
 ) -> torch.Tensor:
     """Read the CCD: noisy images, in photoelectrons.

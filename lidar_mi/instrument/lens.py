@@ -8,6 +8,7 @@ corners, evenly to all sides.
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from lidar_mi.errors import InputError
@@ -81,7 +82,7 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
     pupil = (height * np.cos(spoke)).ravel(), (height * np.sin(spoke)).ravel()
     angles = field * np.linspace(0, 1, 5)[1:]
 
-    def lens(shape):
+    def lens(shape: np.ndarray) -> np.ndarray:
         front, back, conic, distance = shape
         return np.array(
             [
@@ -91,7 +92,7 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
             ]
         )
 
-    def aberrations(shape):
+    def aberrations(shape: np.ndarray) -> np.ndarray:
         across, along = trace(lens(shape), *pupil, 0.0)
         residuals = [across, along]  # of light on the axis: spherical aberration, focus
         for angle in angles:
@@ -112,7 +113,9 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
     return lens(solved.x) * np.array([focal_length, 1, focal_length, 1])
 
 
-def trace(lens: np.ndarray, across, along, angle):
+def trace(
+    lens: np.ndarray, across: ArrayLike, along: ArrayLike, angle: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Where light through points of the stop arrives, by Snell's law at every surface.
 
     Parameters

@@ -3,9 +3,10 @@
 import math
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from lidar_mi.units import Angle, Energy, Length, Time
+from lidar_mi.units import Angle, Energy, Length, Time, quantity
 
 
 class BackscatterLidar(BaseModel):
@@ -28,7 +29,7 @@ class BackscatterLidar(BaseModel):
         0.1, gt=0, allow_inf_nan=True, description="outer radius of the emitted beam; inf: uncut"
     )
     divergence_full: Angle = Field(
-        "2 mrad", ge=0, lt=0.5, description="1/e^2 divergence, full angle"
+        quantity("2 mrad"), ge=0, lt=0.5, description="1/e^2 divergence, full angle"
     )
     stokes: tuple[float, float, float, float] = Field(
         (1.0, 1.0, 0.0, 0.0), description="Stokes vector (I, Q, U, V) about the horizontal axis"
@@ -38,11 +39,15 @@ class BackscatterLidar(BaseModel):
         0.0, ge=0, le=1e-3, description="full width at half maximum of the pulse"
     )
     aperture_radius: Length = Field(0.5, gt=0, le=10, description="radius of the telescope")
-    fov_half: Angle = Field("5 mrad", gt=0, lt=0.5, description="field of view, half angle")
+    fov_half: Angle = Field(
+        quantity("5 mrad"), gt=0, lt=0.5, description="field of view, half angle"
+    )
 
     @field_validator("stokes")
     @classmethod
-    def _physical(cls, value):
+    def _physical(
+        cls, value: tuple[float, float, float, float]
+    ) -> tuple[float, float, float, float]:
         if value[0] != 1 or not math.hypot(*value[1:]) <= 1 + 1e-6:
             raise ValueError(f"{value} is not allowed; expected I = 1 and Q^2 + U^2 + V^2 <= 1")
         return value
@@ -52,7 +57,7 @@ class BackscatterLidar(BaseModel):
         """Area of the telescope, m^2."""
         return math.pi * self.aperture_radius**2
 
-    def radius_at(self, distance):
+    def radius_at(self, distance: ArrayLike) -> np.ndarray:
         """1/e^2 radius of the Gaussian with the beam's variance at a distance (m), m.
 
         Variance of the truncated aperture plus that of the divergence.

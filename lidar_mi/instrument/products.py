@@ -4,13 +4,14 @@ import re
 
 import numpy as np
 import xarray as xr
+from numpy.typing import ArrayLike
 
 from lidar_mi.errors import InputError
 
 _ORDER = re.compile(r"order\d+\.S0")
 
 
-def linear_depolarization(s0, s1):
+def linear_depolarization(s0: ArrayLike, s1: ArrayLike) -> np.ndarray:
     """Linear depolarisation ratio delta = (S0 - S1) / (S0 + S1), cross over co-polarised light.
 
     For emission polarised along e_h, the axis that S1 refers to. NaN where no co-polarised light
@@ -21,7 +22,9 @@ def linear_depolarization(s0, s1):
     return np.divide(s0 - s1, parallel, out=np.full(parallel.shape, np.nan), where=parallel > 0)
 
 
-def depolarization_stderr(s0, s1, s0_stderr, s1_stderr, correlation):
+def depolarization_stderr(
+    s0: ArrayLike, s1: ArrayLike, s0_stderr: ArrayLike, s1_stderr: ArrayLike, correlation: ArrayLike
+) -> np.ndarray:
     """Standard error of `linear_depolarization` by linear error propagation.
 
     Parameters
@@ -34,7 +37,7 @@ def depolarization_stderr(s0, s1, s0_stderr, s1_stderr, correlation):
         the same samples; with 0 the error would be many times too large.
     """
     s0, s1 = np.asarray(s0, float), np.asarray(s1, float)
-    first, second = s1 * s0_stderr, s0 * s1_stderr
+    first, second = s1 * np.asarray(s0_stderr), s0 * np.asarray(s1_stderr)
     # written as a sum of squares, because its terms nearly cancel where all samples agree
     correlation = np.clip(correlation, -1, 1)
     root = 2 * np.sqrt((first - correlation * second) ** 2 + (1 - correlation**2) * second**2)
@@ -42,7 +45,9 @@ def depolarization_stderr(s0, s1, s0_stderr, s1_stderr, correlation):
     return np.divide(root, total**2, out=np.full(root.shape, np.nan), where=total > 0)
 
 
-def depolarization_stderr_bound(s0, s1, s0_stderr, samples: int):
+def depolarization_stderr_bound(
+    s0: ArrayLike, s1: ArrayLike, s0_stderr: ArrayLike, samples: int
+) -> np.ndarray:
     """The largest standard error the depolarisation ratio can have, from that of S0 alone.
 
     A Monte Carlo sample of weight s contributes x cross- and s - x co-polarised light,
@@ -94,7 +99,8 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
     known = [scan[n].transpose(*dims).values.astype(float) for n in names if n in scan]
     bound = len(known) < len(names)
     if bound:
-        stderr = depolarization_stderr_bound(*known[:3], _samples(scan))
+        s0, s1, s0_stderr = known[:3]
+        stderr = depolarization_stderr_bound(s0, s1, s0_stderr, _samples(scan))
     else:
         stderr = depolarization_stderr(*known)
     ratio = linear_depolarization(*known[:2])
@@ -122,8 +128,12 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
 
 
 def multiple_scattering_fraction(
-    single, multiple, single_stderr=0.0, multiple_stderr=0.0, correlation=0.0
-):
+    single: ArrayLike,
+    multiple: ArrayLike,
+    single_stderr: ArrayLike = 0.0,
+    multiple_stderr: ArrayLike = 0.0,
+    correlation: ArrayLike = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
     """Fraction of the received light that was scattered more than once, and its standard error.
 
     Parameters
@@ -144,7 +154,7 @@ def multiple_scattering_fraction(
     single, multiple = np.asarray(single, float), np.asarray(multiple, float)
     total = single + multiple
     fraction = np.divide(multiple, total, out=np.full(total.shape, np.nan), where=total > 0)
-    first, second = multiple * single_stderr, single * multiple_stderr
+    first, second = multiple * np.asarray(single_stderr), single * np.asarray(multiple_stderr)
     correlation = np.clip(correlation, -1, 1)
     root = np.sqrt((first - correlation * second) ** 2 + (1 - correlation**2) * second**2)
     root, total = np.broadcast_arrays(root, total)

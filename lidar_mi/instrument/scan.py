@@ -1,13 +1,15 @@
 """Scan geometry: where the beams of a scan go and which ranges are recorded."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from lidar_mi.units import Angle, Length, Speed
+from lidar_mi.units import Angle, Length, Speed, quantity
 
 MOST_BEAMS = 10**7
 """An image of this many beams has about 1 GB, with a layer for each order and its errors."""
@@ -44,8 +46,8 @@ class Scan(BaseModel):
     )
     columns: int = Field(219, ge=1, description="beams across, with aim: angles")
     rows: int = Field(139, ge=1, description="beams up, with aim: angles")
-    azimuth_half: tuple[HalfAngle, HalfAngle] = ("6.2 deg", "6.4 deg")
-    elevation_half: tuple[HalfAngle, HalfAngle] = ("3.9 deg", "4.1 deg")
+    azimuth_half: tuple[HalfAngle, HalfAngle] = (quantity("6.2 deg"), quantity("6.4 deg"))
+    elevation_half: tuple[HalfAngle, HalfAngle] = (quantity("3.9 deg"), quantity("4.1 deg"))
 
     @model_validator(mode="after")
     def _fits_into_memory(self):
@@ -116,7 +118,9 @@ class ScanPlan:
         return oblique if self.gate_kind == "planar" else np.ones_like(oblique)
 
 
-def plan_scans(scan: Scan, y, z, travelled) -> list[ScanPlan]:
+def plan_scans(
+    scan: Scan, y: ArrayLike, z: ArrayLike, travelled: Iterable[float]
+) -> list[ScanPlan]:
     """The scans of one slab of air from a moving telescope.
 
     Parameters

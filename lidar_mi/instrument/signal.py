@@ -5,7 +5,9 @@ import numpy as np
 from lidar_mi.instrument.scan import ScanPlan
 
 
-def apparent_backscatter(s0, plan: ScanPlan, aperture_area: float, environment: float):
+def apparent_backscatter(
+    s0: np.ndarray, plan: ScanPlan, aperture_area: float, environment: float
+) -> np.ndarray:
     """Range-corrected attenuated backscatter coefficient, m^-1 sr^-1: S0 r^2 / (A dr T^2).
 
     The single-scattering lidar equation solved for the backscatter coefficient, with the
