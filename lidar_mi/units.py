@@ -98,3 +98,22 @@ Frequency = Annotated[float, Unit("Hz", "1 kHz")]
 SpectralRadiance = Annotated[float, Unit("W/m^3/sr", "0.3 W/m^2/sr/nm")]
 Circulation = Annotated[float, Unit("m^2/s", "458 m^2/s")]
 Number = Annotated[float, Unit("", "0.5")]
+
+
+def parse_units(text: str) -> pint.Quantity[float]:
+    """A CF units string as a pint quantity: 'm s-1', 'km/h', 'kg m-3', '1', '%'.
+
+    CF (UDUNITS) writes powers as digits behind a unit and products as a dot, pint does not.
+
+    Raises
+    ------
+    ValueError
+        If it is not a unit.
+    """
+    text = str(text).strip()
+    products = re.sub(r"(?<=[^\W_])\.(?=[^\W\d_])", "*", text)
+    powers = re.sub(r"(?<![\w.])([^\W\d_]+)\^?(-?\d+)(?!\w)", r"\1**\2", products)
+    try:
+        return 1.0 * UNITS.parse_expression(powers or "1") * UNITS.dimensionless
+    except Exception as error:  # pint lets its tokenizer's own exceptions through
+        raise ValueError(f"{text!r} is not a unit") from error

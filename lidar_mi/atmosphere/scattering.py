@@ -15,7 +15,6 @@ a1 averages to one over the sphere of directions.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -23,16 +22,6 @@ from numpy.typing import ArrayLike
 from lidar_mi.errors import InputError
 
 ELEMENTS = ("a1", "a2", "a3", "a4", "b1", "b2")
-
-# Header lines that a table file must have.
-_HEADER = {
-    "name": str,
-    "wavelength_m": float,
-    "extinction_cross_section_m2": float,
-    "single_scattering_albedo": float,
-    "number_density_m-3": float,
-    "provenance": str,
-}
 
 # Rounding of seven digits in files; an interpolated 180 degree value is as good as its neighbours.
 _TOLERANCE = 1e-5
@@ -215,84 +204,6 @@ def _worst(label, angle, what, excess, scale):
     worst = int((excess / scale).argmax())
     if excess[worst] > _TOLERANCE * scale[worst]:
         raise InputError(f"{label}: {what} at {angle[worst]:g} degrees; such a matrix cannot exist")
-
-
-def write_table(table: ScatteringTable, path: str | Path) -> None:
-    """Write a table as text: ``# key: value`` lines, then angle and six elements a line.
-
-    `numpy.loadtxt` and the ``mueller`` phase function read it as it is. The derived numbers
-    (lidar ratio and so on) are written for the reader of the file; `read_table` computes them.
-    """
-    values = {
-        "name": table.name,
-        "wavelength_m": f"{table.wavelength:.9g}",
-        "extinction_cross_section_m2": f"{table.extinction_cross_section:.7e}",
-        "single_scattering_albedo": f"{table.albedo:.9g}",
-        "number_density_m-3": f"{table.number_density:.7g}",
-        "provenance": " ".join(table.provenance.split()),
-    }
-    derived = {
-        "lidar_ratio_sr": f"{table.lidar_ratio:.5g}",
-        "linear_depolarization_ratio_180": f"{table.depolarization_ratio:.5g}",
-        "asymmetry_parameter": f"{table.asymmetry:.5g}",
-    }
-    lines = ["# Scattering matrix, rows (a1,b1,0,0) (b1,a2,0,0) (0,0,a3,b2) (0,0,-b2,a4)"]
-    lines += [f"# {key}: {value}" for key, value in (values | derived).items()]
-    lines += ["# angle/degree a1 a2 a3 a4 b1 b2"]
-    for angle, row in zip(table.angle, table.elements, strict=True):
-        # adding zero turns -0.0 into 0.0
-        lines.append(f"{angle:g} " + " ".join(f"{value + 0.0:.6e}" for value in row))
-    Path(path).write_text("\n".join(lines) + "\n")
-
-
-def read_table(path: str | Path) -> ScatteringTable:
-    """Read what `write_table` wrote.
-
-    Raises
-    ------
-    InputError
-        No such file, a missing or wrong header line, or a matrix that fails `check`.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a scattering-matrix table")
-    try:
-        text = path.read_text()
-        numbers = np.loadtxt(text.splitlines(), ndmin=2)
-    except (UnicodeDecodeError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"{path}: not a table of seven numbers a line ({reason})") from None
-    if numbers.ndim != 2 or numbers.shape[1] != 7:
-        raise InputError(
-            f"{path}: {numbers.shape[-1]} columns; expected seven: angle and a1 ... b2"
-        )
-    header = {}
-    for line in text.splitlines():
-        key, colon, value = line.lstrip("# ").partition(":")
-        if line.startswith("#") and colon and key in _HEADER:
-            header[key] = value.strip()
-    values = []
-    for key, kind in _HEADER.items():
-        if key not in header:
-            raise InputError(f"{path}: no line '# {key}: ...'; a table must state its {key}")
-        try:
-            values.append(kind(header[key]))
-        except ValueError:
-            raise InputError(f"{path}, {key}: {header[key]!r} is not a number") from None
-    name, wavelength, cross_section, albedo, number_density, provenance = values
-    try:
-        return ScatteringTable(
-            name,
-            wavelength,
-            numbers[:, 0],
-            numbers[:, 1:],
-            cross_section,
-            albedo,
-            number_density,
-            provenance,
-        )
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
 
 
 def rayleigh_table(

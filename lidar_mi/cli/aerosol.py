@@ -81,9 +81,10 @@ def aerosol(
     extinction cross-section and albedo. A table of spheroids takes half a minute, of spheres a
     few seconds. Needs the library scatrs: `pip install 'lidar-mi[particles]'`.
     """
-    from lidar_mi.atmosphere.particles import changed, make_table
-    from lidar_mi.atmosphere.scattering import describe, write_table
-    from lidar_mi.experiment.run_folder import write
+    from lidar_mi.atmosphere.aerosols import changed
+    from lidar_mi.atmosphere.particle_scattering import make_table
+    from lidar_mi.atmosphere.scattering import describe
+    from lidar_mi.io.scattering_table import write_table
 
     metres = quantity("--wavelength", wavelength, "m", "532 nm")
     particles = changed(
@@ -103,7 +104,7 @@ def aerosol(
         raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
     with progress() as notice:
         table = make_table(particles, metres, nodes, notice)
-    write(path, lambda part: write_table(table, part))
+    write_table(table, path)
     print_rows(particles.name, list(describe(table).items()))
     output.print(f"table    {path}")
 

@@ -37,11 +37,10 @@ def info(
     Of scatterers: extinction and backscatter coefficient and the number of particles they go with,
     single-scattering albedo, lidar ratio, depolarisation ratio.
     """
-    import json
-
     from lidar_mi.experiment.info import sections
     from lidar_mi.experiment.run_folder import failure
     from lidar_mi.experiment.study import RECORD
+    from lidar_mi.io.json import read_json
 
     with progress() as notice:
         found = list(
@@ -63,6 +62,6 @@ def info(
                 output.print("unfinished: no metrics.json yet; run it again to go on")
             output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)
         elif (folder / "metrics.json").is_file():
-            print_metrics(json.loads((folder / "metrics.json").read_text()))
+            print_metrics(read_json(folder / "metrics.json", "metrics"))
         else:
             output.print("unfinished: no metrics.json yet; run it again to go on")

@@ -48,8 +48,8 @@ def retrieve(
     device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
 ) -> None:
     """Find the cross-flow wind (v, w) in any two images of the same air."""
-    from lidar_mi.experiment.run_folder import write_netcdf
     from lidar_mi.io.images import read_image, read_noise
+    from lidar_mi.io.netcdf import write_netcdf
     from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
     from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 

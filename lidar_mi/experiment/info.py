@@ -5,11 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from lidar_mi.atmosphere.aerosols import AEROSOLS
 from lidar_mi.atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphere
-from lidar_mi.atmosphere.particles import AEROSOLS, Notice, aerosol_table
-from lidar_mi.atmosphere.scattering import describe, read_table
-from lidar_mi.atmosphere.wake import open_netcdf
+from lidar_mi.atmosphere.particle_scattering import Notice
+from lidar_mi.atmosphere.scattering import describe
 from lidar_mi.errors import InputError
+from lidar_mi.io.netcdf import open_netcdf
+from lidar_mi.io.scattering_table import aerosol_table, read_table
 from lidar_mi.io.vortex_file import read_vortices
 
 MOLECULES = "molecules"

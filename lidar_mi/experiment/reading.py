@@ -6,27 +6,13 @@ import re
 from pathlib import Path
 from typing import Any, get_args
 
-import yaml
 from pydantic import BaseModel, ValidationError
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema import BACKSCATTER, NAME, Experiment
 from lidar_mi.experiment.shipped import experiment_file
+from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
 from lidar_mi.units import Unit
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML as it should be: a key that is there twice is a fault, not the last one's value."""
-
-    def construct_mapping(self, node, deep=False):
-        seen = set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key.value!r} is there twice", key.start_mark
-                )
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
 
 
 def load_experiment(name: str | Path, *, variant: str | None = None, **changes: Any) -> Experiment:
@@ -69,7 +55,7 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
         raise InputError(f"variant: {variant!r} is not allowed; expected {wanted}")
     found = variants[variant] if variants else load(path)
     if changes:
-        data = yaml.safe_load(dump(found))
+        data = parse_yaml(dump(found), str(name))
         for key, value in changes.items():
             for part in reversed(key.split(".")):
                 value = {part: value}
@@ -163,19 +149,7 @@ def _read(path: str | Path) -> dict:
         raise InputError(
             f"{path}: a wake, not an experiment; expected a YAML file that says wake: {{file: {path}}}"
         )
-    try:
-        text = path.read_text()
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; expected an experiment file") from None
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not a text file; expected an experiment in YAML") from None
-    try:
-        data = yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" line {mark.line + 1}" if mark else ""
-        reason = " ".join(str(getattr(error, "problem", error)).split())
-        raise InputError(f"{path}:{line} not valid YAML ({reason})") from None
+    data = read_yaml(path, "an experiment file")
     if not isinstance(data, dict):
         raise InputError(f"{path}: holds no keys; expected name, wake, ...")
     if isinstance(data.get("experiment"), dict) and "versions" in data:
@@ -201,7 +175,7 @@ def dump(experiment: Experiment) -> str:
         name for name in ("doppler", "sensor", "volume") if getattr(experiment, name) is None
     }
     data = experiment.model_dump(mode="json", exclude=unused)
-    return yaml.safe_dump(data, sort_keys=False)
+    return to_yaml(data)
 
 
 def _override(data: dict, text: str) -> None:
@@ -214,8 +188,8 @@ def _override(data: dict, text: str) -> None:
         if not isinstance(data, dict):
             raise InputError(f"--set {text}: {parent} is a value, not a section")
     try:
-        data[last] = yaml.load(value, _Loader)
-    except yaml.YAMLError:
+        data[last] = parse_yaml(value, key)
+    except InputError:
         raise InputError(f"--set {text}: {value!r} is not a YAML value") from None
 
 

@@ -4,7 +4,6 @@ A run lives in one folder. Pictures are kept as soon as they are there; a run th
 goes on with those, and everything after them is made again.
 """
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from lidar_mi import __version__
 from lidar_mi.assessment.report import page as report
 from lidar_mi.errors import is_interrupt
 from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.run_folder import Log, Notice, claim, read_record, write
+from lidar_mi.experiment.run_folder import Log, Notice, claim, read_record
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages import backscatter as backscatter_chain
 from lidar_mi.experiment.stages import error_budget as budget_chain
@@ -20,6 +19,8 @@ from lidar_mi.experiment.stages import fringes as fringe_chain
 from lidar_mi.experiment.stages import sensor as sensor_chain
 from lidar_mi.experiment.stages import volume as volume_chain
 from lidar_mi.experiment.stages import vortices as vortex_chain
+from lidar_mi.io.json import write_json
+from lidar_mi.io.text import write_text
 
 
 def run(
@@ -92,13 +93,10 @@ def _run(experiment, chains, folder: Path, log: Log) -> dict[str, float]:
         found, chapter = chain(folder, log)
         metrics |= found
         chapters.append(chapter)
-    write(
-        folder / "metrics.json",
-        lambda path: path.write_text(json.dumps(metrics, indent=1, allow_nan=False) + "\n"),
-    )
+    write_json(folder / "metrics.json", metrics)
     versions = read_record(folder)["versions"]
     resolved = config.dump(experiment)
     page = report.page(experiment, resolved, versions, metrics, chapters, log.warnings)
-    write(folder / "report.html", lambda path: path.write_text(page))
+    write_text(folder / "report.html", page)
     log("done")
     return metrics

@@ -1,21 +1,19 @@
-"""The folder of a run: whose it is, what was run in it, and files that are never half written."""
+"""The folder of a run: whose it is, what was run in it, how far it came."""
 
 import hashlib
-import os
 import platform
 import time
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
-import xarray as xr
-import yaml
-
 from lidar_mi import __version__
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import find_file
+from lidar_mi.io.text import write_text
+from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
 from lidar_mi.rendering.phase import table_files
 
 IMAGES = ("image_t1.exr", "image_t2.exr")
@@ -47,7 +45,7 @@ def claim(folder: Path, experiment: Experiment, beside: str | Path, overwrite: b
     marker = folder / "experiment.yaml"
     libraries = ("mitsuba", "drjit", "numpy", "scipy", "torch", "kornia", "OpenEXR", "xarray")
     record = {
-        "experiment": yaml.safe_load(config.dump(experiment)),
+        "experiment": parse_yaml(config.dump(experiment), experiment.name),
         "files": _checksums(experiment, beside),
         "versions": {
             "lidar-mi": __version__,
@@ -75,7 +73,7 @@ def claim(folder: Path, experiment: Experiment, beside: str | Path, overwrite: b
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
-    write(marker, lambda path: path.write_text(yaml.safe_dump(record, sort_keys=False)))
+    write_text(marker, to_yaml(record))
 
 
 def _difference(before: dict, now: dict) -> str | None:
@@ -108,38 +106,17 @@ def read_record(folder: str | Path) -> dict:
         The folder's experiment.yaml is missing or was not written by a run.
     """
     marker = Path(folder) / "experiment.yaml"
+    if not marker.is_file():
+        raise InputError(f"{folder}: no experiment.yaml in it; expected a run folder")
     try:
-        record = yaml.safe_load(marker.read_text())
-    except OSError:
-        raise InputError(f"{folder}: no experiment.yaml in it; expected a run folder") from None
-    except (yaml.YAMLError, UnicodeDecodeError):
+        record = read_yaml(marker, "a run's record")
+    except InputError:
         record = None
     if not isinstance(record, dict) or not all(
         isinstance(record.get(key), dict) for key in ("experiment", "versions")
     ):
         raise InputError(f"{marker}: not written by a run; expected a run folder")
     return record
-
-
-def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
-    """Write a data set as NetCDF-4 under a temporary name, then rename."""
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
-    packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
-    # CF 2.5.1: no missing values in coordinate variables
-    packed |= {name: {"_FillValue": None} for name in data.coords if name in data.dims}
-    write(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=packed))
-
-
-def write(path: Path, write: Callable[[Path], object]) -> None:
-    """Write under a temporary name, then rename: never half a file."""
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        write(temporary)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def failure(folder: str | Path) -> str | None:

@@ -4,20 +4,22 @@ Each variant is a run of its own in a folder of its own; beside these folders li
 report, its figure and all metrics, named VARIANT.METRIC.
 """
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
 import xarray as xr
-import yaml
 
 from lidar_mi.assessment.report.comparison import draw_comparison, page
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment.run_folder import IMAGES, VOLUME, Log, Notice, read_record, write
+from lidar_mi.experiment.run_folder import IMAGES, VOLUME, Log, Notice, read_record
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.io import exr
+from lidar_mi.io.json import read_json, write_json
+from lidar_mi.io.netcdf import open_netcdf
+from lidar_mi.io.text import write_text
+from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
 
 RECORD = "study.yaml"
 
@@ -54,13 +56,13 @@ def run(
     ready = {
         key: experiment.prepare(one, beside, _of(key, notice)) for key, one in variants.items()
     }
-    settings = {key: yaml.safe_load(config.dump(one)) for key, one in variants.items()}
+    settings = {key: parse_yaml(config.dump(one), key) for key, one in variants.items()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
-    record = yaml.safe_dump({"name": name, "variants": list(variants)}, sort_keys=False)
-    write(folder / RECORD, lambda path: path.write_text(record))
+    record = to_yaml({"name": name, "variants": list(variants)})
+    write_text(folder / RECORD, record)
     metrics = {key: one(folder / key, overwrite, _of(key, notice)) for key, one in ready.items()}
     log = Log(folder / "log.txt", notice)
     log(f"comparing {', '.join(variants)}")
@@ -73,9 +75,8 @@ def run(
     drawn = draw_comparison(folder / "figures", rows, log) if rows else []
     merged = {f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()}
     html = page(name, settings, metrics, drawn)
-    text = json.dumps(merged, indent=1, allow_nan=False) + "\n"
-    write(folder / "metrics.json", lambda path: path.write_text(text))
-    write(folder / "report.html", lambda path: path.write_text(html))
+    write_json(folder / "metrics.json", merged)
+    write_text(folder / "report.html", html)
     log("done")
     return metrics
 
@@ -101,9 +102,9 @@ def read_study(
     """
     folder = Path(folder)
     try:
-        record = yaml.safe_load((folder / RECORD).read_text())
+        record = read_yaml(folder / RECORD, "a study's record")
         name, variants = str(record["name"]), [str(key) for key in record["variants"]]
-    except (OSError, yaml.YAMLError, UnicodeDecodeError, TypeError, KeyError):
+    except (InputError, TypeError, KeyError):
         raise InputError(
             f"{folder / RECORD}: not written by a study; expected its folder"
         ) from None
@@ -113,10 +114,7 @@ def read_study(
     for key in variants:
         path = folder / key / "metrics.json"
         if path.is_file():
-            try:
-                metrics[key] = json.loads(path.read_text())
-            except ValueError:
-                raise InputError(f"{path}: not written by a run; expected metrics") from None
+            metrics[key] = read_json(path, "metrics of a run")
     return name, records, metrics
 
 
@@ -130,7 +128,7 @@ def _pictures(folder: Path, file: str, metrics) -> tuple[xr.DataArray, xr.Datase
     Of winds in three dimensions the layer nearest to the first gate, whose picture it is.
     """
     scan = exr.read_scan(folder / IMAGES[0])
-    with xr.open_dataset(folder / file, engine="h5netcdf") as winds:
+    with open_netcdf(folder / file) as winds:
         source = winds["source"].values[-1]  # behind the detector, where there is one
         wind = winds.sel(source=source).isel(algorithm=0)
         wind = (wind.isel(x=0) if "x" in wind.dims else wind).load()

@@ -14,9 +14,10 @@ from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_fro
 from lidar_mi.atmosphere.texture import corrsin_obukhov
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
 from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
-from lidar_mi.atmosphere.wake import centre, check_nodes, read_wake, resample
+from lidar_mi.atmosphere.wake import centre, check_nodes, resample
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.io.wake_file import read_wake
 
 Flows = tuple[xr.Dataset, xr.Dataset | None]
 

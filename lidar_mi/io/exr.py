@@ -11,7 +11,6 @@ beside them, and with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``,
 camera's file has the layers ``S0`` ... ``S3``, ``S0_stderr`` and ``Y``, seen as the camera sees it.
 """
 
-import os
 import re
 from pathlib import Path
 
@@ -20,6 +19,7 @@ import OpenEXR
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.io.atomic import write_atomically
 
 QUANTITIES = ("S0", "S1", "S2", "S3", "S0_stderr")
 _MEANING = {
@@ -115,12 +115,7 @@ def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> Non
     for key, value in attributes.items():
         header[key] = value.astype(np.float32) if isinstance(value, np.ndarray) else value
     channels = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in channels.items()}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        OpenEXR.File(header, channels).write(str(temporary))
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_atomically(path, lambda part: OpenEXR.File(header, channels).write(str(part)))
 
 
 def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:

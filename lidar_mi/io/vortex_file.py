@@ -1,6 +1,5 @@
 """Vortex pairs as a small JSON file: what a controller reads to know the wind ahead anywhere."""
 
-import json
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import get_args
 import numpy as np
 
 from lidar_mi.errors import InputError
+from lidar_mi.io.json import read_json, write_json
 from lidar_mi.retrieval.vortices.fit import VortexPairFit
 from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile
 
@@ -34,7 +34,7 @@ def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about:
     """
     data = {"format": FORMAT, **about, "frame": _FRAME, "parameters": list(PARAMETERS)}
     data["fits"] = {name: _as_data(fit) for name, fit in fits.items()}
-    Path(path).write_text(json.dumps(data, indent=1, allow_nan=False) + "\n")
+    write_json(path, data)
 
 
 def _as_data(fit: VortexPairFit) -> dict:
@@ -84,13 +84,7 @@ def read_vortices(path: str | Path) -> dict[str, VortexPairFit]:
     >>> pairs = lm.read_vortices("outputs/wake_sensor/vortex.json")  # doctest: +SKIP
     >>> pairs["images"].port.circulation                             # doctest: +SKIP
     """
-    path = Path(path)
-    try:
-        data = json.loads(path.read_text())
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; expected a file of vortex pairs") from None
-    except ValueError:
-        raise InputError(f"{path}: not JSON; expected a file of vortex pairs") from None
+    data = read_json(path, "a file of vortex pairs")
     if not isinstance(data, dict) or data.get("format") != FORMAT:
         raise InputError(f"{path}: not a file of vortex pairs; expected the format {FORMAT!r}")
     if not isinstance(data.get("fits"), dict):

@@ -8,9 +8,10 @@ import mitsuba as mi
 import numpy as np
 
 from lidar_mi.atmosphere.molecules import molecular_scattering, molecular_table
-from lidar_mi.atmosphere.particles import Notice, aerosol_table
-from lidar_mi.atmosphere.scattering import ScatteringTable, mix, rayleigh_table, read_table
+from lidar_mi.atmosphere.particle_scattering import Notice
+from lidar_mi.atmosphere.scattering import ScatteringTable, mix, rayleigh_table
 from lidar_mi.errors import InputError
+from lidar_mi.io.scattering_table import aerosol_table, is_complete, read_table
 
 
 class Scatterer(NamedTuple):
@@ -91,7 +92,7 @@ def scatterer(
                 for index, part in enumerate(scattering.parts)
             ]
             phase, albedo = _tabulated(mix(tables, fractions))
-        case "table" if not _is_complete(table_files(scattering, beside)["scattering.table"]):
+        case "table" if not is_complete(table_files(scattering, beside)["scattering.table"]):
             path = table_files(scattering, beside)["scattering.table"]
             phase = {"type": "mueller", "table": str(path)}
         case _:
@@ -142,11 +143,3 @@ def _table(part, beside, wavelength, field, notice) -> ScatteringTable:
 def _tabulated(table: ScatteringTable) -> Scatterer:
     rows = mi.TensorXf(np.column_stack([table.angle, table.elements]))
     return Scatterer({"type": "mueller", "table": rows}, table.albedo)
-
-
-def _is_complete(path: Path) -> bool:
-    """Whether a table has a header with albedo and wavelength, as `write_table` writes it."""
-    try:
-        return "# single_scattering_albedo:" in path.read_text()
-    except UnicodeDecodeError:  # .npy
-        return False

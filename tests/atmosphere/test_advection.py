@@ -10,8 +10,9 @@ import xarray as xr
 from lidar_mi.atmosphere.advection import advect
 from lidar_mi.atmosphere.texture import corrsin_obukhov
 from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
-from lidar_mi.atmosphere.wake import read_wake, resample
+from lidar_mi.atmosphere.wake import resample
 from lidar_mi.errors import InputError
+from lidar_mi.io.wake_file import read_wake
 
 SLAB = files("lidar_mi.scenes") / "wake_slab_40s.nc"
 

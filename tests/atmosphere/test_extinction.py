@@ -7,8 +7,8 @@ import pytest
 import xarray as xr
 
 from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
-from lidar_mi.atmosphere.wake import read_wake
 from lidar_mi.errors import InputError
+from lidar_mi.io.wake_file import read_wake
 
 
 @pytest.fixture

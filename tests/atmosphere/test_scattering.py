@@ -1,4 +1,4 @@
-"""Scattering tables: closed forms, conservation and files. Detects 1e-5 in a derived number, any
+"""Scattering tables: closed forms and conservation. Detects 1e-5 in a derived number, any
 sign or column mistaken, and any physically impossible table accepted."""
 
 import math
@@ -7,14 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lidar_mi.atmosphere.scattering import (
-    ScatteringTable,
-    describe,
-    mix,
-    rayleigh_table,
-    read_table,
-    write_table,
-)
+from lidar_mi.atmosphere.scattering import ScatteringTable, describe, mix, rayleigh_table
 from lidar_mi.errors import InputError
 
 
@@ -95,22 +88,6 @@ def test_mixture_of_one_is_itself():
     assert alone.number_density == pytest.approx(table.number_density, rel=1e-12)
 
 
-def test_file_round_trip_and_plain_numpy(tmp_path):
-    table = mix([haze(), rayleigh_table(0.0284, 532e-9, 5.167e-31)], [5e-5, 1.3e-5], "both")
-    path = tmp_path / "both.txt"
-    write_table(table, path)
-    again = read_table(path)
-    np.testing.assert_array_equal(again.angle, table.angle)
-    np.testing.assert_allclose(again.elements, table.elements, rtol=6e-7, atol=1e-12)
-    for name in ("wavelength", "extinction_cross_section", "albedo", "number_density"):
-        assert getattr(again, name) == pytest.approx(getattr(table, name), rel=1e-6)
-    assert again.name == "both" and again.provenance == table.provenance
-    assert again.lidar_ratio == pytest.approx(table.lidar_ratio, rel=1e-6)
-    numbers = np.loadtxt(path)
-    assert numbers.shape == (len(table.angle), 7)
-    np.testing.assert_allclose(numbers[:, 1], table.elements[:, 0], rtol=6e-7)
-
-
 def test_description_prints_what_the_table_says(tmp_path):
     text = describe(haze())
     assert text["wavelength"] == "532 nm"
@@ -163,22 +140,3 @@ def broken(column, row, value):
 def test_impossible_tables_are_refused(make, words):
     with pytest.raises(InputError, match=words):
         make()
-
-
-def test_unreadable_files(tmp_path):
-    path = tmp_path / "t.txt"
-    with pytest.raises(InputError, match="no such file"):
-        read_table(path)
-    write_table(haze(), path)
-    text = path.read_text()
-    cases = {
-        "\n".join(line for line in text.splitlines() if "albedo" not in line): "single_scattering",
-        text.replace("wavelength_m: 5.32e-07", "wavelength_m: green"): "wavelength_m: 'green'",
-        text.replace("albedo: 0.9", "albedo: 1.9"): "albedo: 1.9",
-        "# nothing\n1 2 3\n4 5 6\n": "3 columns",
-        text + "words\n": "not a table",
-    }
-    for content, words in cases.items():
-        path.write_text(content)
-        with pytest.raises(InputError, match=f"t.txt.*{words}"):
-            read_table(path)

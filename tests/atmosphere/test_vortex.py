@@ -16,8 +16,8 @@ from lidar_mi.atmosphere.vortex import (
     velocity,
     vortex_pair,
 )
-from lidar_mi.atmosphere.wake import read_wake
 from lidar_mi.errors import InputError
+from lidar_mi.io.wake_file import read_wake
 
 
 def test_lamb_oseen_formula():

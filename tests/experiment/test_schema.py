@@ -347,7 +347,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
     for path, message in [
         (tmp_path / "absent.yaml", "No such file or directory; expected an experiment file"),
         (tmp_path, "Is a directory; expected an experiment file"),
-        (binary, "not a text file; expected an experiment in YAML"),
+        (binary, "not a text file; expected an experiment file"),
     ]:
         with pytest.raises(InputError) as error:
             load(path)

@@ -9,13 +9,13 @@ import pytest
 import xarray as xr
 
 from lidar_mi.atmosphere.molecules import molecular_table
-from lidar_mi.atmosphere.particles import aerosol_table
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.reading import check
 from lidar_mi.experiment.schema import Scattering
 from lidar_mi.experiment.truth import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
+from lidar_mi.io.scattering_table import aerosol_table
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import molecules, scatterer
 from lidar_mi.rendering.settings import RenderSettings

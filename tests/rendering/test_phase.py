@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from lidar_mi.atmosphere.molecules import molecular_scattering
-from lidar_mi.atmosphere.particles import aerosol_table
-from lidar_mi.atmosphere.scattering import write_table
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema import Scattering
+from lidar_mi.io.scattering_table import aerosol_table, write_table
 from lidar_mi.rendering.phase import scatterer, table_files
 
 pytestmark = pytest.mark.usefixtures("variant")

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import xarray as xr
 
-from lidar_mi.atmosphere.scattering import read_table
+from lidar_mi.io.scattering_table import read_table
 from tests.support.command_line import words_of
 
 SCENES = Path(str(files("lidar_mi.scenes")))

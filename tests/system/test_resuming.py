@@ -8,7 +8,6 @@ import pytest
 import xarray as xr
 import yaml
 
-from lidar_mi.atmosphere.wake import read_wake
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run_folder
 from lidar_mi.experiment import truth as truth_module
@@ -16,6 +15,7 @@ from lidar_mi.experiment.run import run
 from lidar_mi.experiment.run_folder import IMAGES
 from lidar_mi.experiment.stages import backscatter as backscatter_chain
 from lidar_mi.io.exr import read_scan
+from lidar_mi.io.wake_file import read_wake
 from tests.support.experiments import blob, check, small, write_wake
 
 
@@ -174,23 +174,6 @@ def test_stopped_anywhere_it_goes_on(tmp_path, quick, step):
     }[step]
     assert len(done) == expected
     assert without_timing(metrics) == without_timing(run(check(small()), tmp_path / "whole"))
-
-
-def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
-    data = xr.Dataset({"v": ("y", [1.0, 2.0])})
-    run_folder.write_netcdf(data, tmp_path / "wind.nc")
-
-    def half(self, path, **_):
-        path.write_bytes(b"half a fi")
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", half)
-    with pytest.raises(KeyboardInterrupt):
-        run_folder.write_netcdf(data * 2, tmp_path / "wind.nc")
-    monkeypatch.undo()
-    assert [p.name for p in tmp_path.iterdir()] == ["wind.nc"]
-    with xr.open_dataset(tmp_path / "wind.nc") as kept:
-        assert kept["v"].values.tolist() == [1.0, 2.0]
 
 
 def test_the_seed_decides(tmp_path, quick):

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
-import yaml
-
 from lidar_mi.errors import InputError
+from lidar_mi.io.yaml import read_yaml
 from lidar_mi.units import to_si
 
 PAPER = files("lidar_mi.assessment.metrics") / "requirements.yaml"
@@ -85,13 +84,7 @@ def read_requirements(path: str | Path = PAPER) -> dict[tuple[str, str], Require
     InputError
         A file that cannot be read, a row or a limit that is not known, a value with a wrong unit.
     """
-    try:
-        data = yaml.safe_load(Path(str(path)).read_text())
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; expected a requirement table") from None
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(getattr(error, "problem", None) or error).split())
-        raise InputError(f"{path}: not valid YAML ({reason})") from None
+    data = read_yaml(str(path), "a requirement table")
     tables = {}
     for application, phases in _section(data, str(path)).items():
         place = f"{path}: {application}"

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import xarray as xr
-import yaml
 from matplotlib.figure import Figure
 
 from lidar_mi import __version__
@@ -14,6 +13,7 @@ from lidar_mi.assessment.figures.backscatter import BACKSCATTER, METHOD_NAMES, D
 from lidar_mi.assessment.metrics.velocities import CENTRES, READERS
 from lidar_mi.assessment.report.digits import fixed, three
 from lidar_mi.assessment.report.page import embedded, template
+from lidar_mi.io.yaml import to_yaml
 
 _SPEED = "m s$^{-1}$"
 
@@ -102,7 +102,7 @@ def page(
             ("What comes of it", legend, list(results(metrics))),
             ("What differs", "In SI units; a dash: the variant has no such key.", changed),
         ],
-        resolved=yaml.safe_dump(dict(settings), sort_keys=False),
+        resolved=to_yaml(dict(settings)),
     )
 
 

@@ -28,6 +28,7 @@ from lidar_mi.experiment.stages.backscatter import (
 )
 from lidar_mi.experiment.truth import Truth, blur_by_beam, make_truth
 from lidar_mi.io import exr
+from lidar_mi.io.netcdf import open_netcdf
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
 # Pictures of air as it is: a method that undoes the beam's blur has none to undo there.
@@ -46,7 +47,7 @@ def _run(experiment, truth, folder, log) -> tuple[dict[str, float], Chapter]:
     start = time.perf_counter()
     log("finding what limits the wind")
     scans = [exr.read_scan(folder / name) for name in IMAGES]
-    with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
+    with open_netcdf(folder / "wind.nc") as winds:
         known = winds.load()
     methods = experiment.retrieval.methods
     metrics = {

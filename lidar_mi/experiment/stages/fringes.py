@@ -23,12 +23,13 @@ from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.ring_instrument import air_rings, pixel_noise, ring_model
-from lidar_mi.experiment.run_folder import Log, write_netcdf
+from lidar_mi.experiment.run_folder import Log
 from lidar_mi.experiment.schema import Doppler, Experiment
 from lidar_mi.instrument.doppler import photons, solar_background, speckle_modes
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.instrument.fringe_camera import CCD, expose, fringe_image, ring_radii
 from lidar_mi.io import exr
+from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.rendering.fringes import render_fringes, scene_dict
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.rings import peaks as ring_peaks

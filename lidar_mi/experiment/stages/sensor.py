@@ -22,7 +22,7 @@ from lidar_mi.assessment.report.page import Chapter
 from lidar_mi.assessment.report.sensor import draw_all, sensor_chapter
 from lidar_mi.assessment.report.vector_map import map_data
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.run_folder import Log, write_netcdf
+from lidar_mi.experiment.run_folder import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages import fringes as fringe_chain
 from lidar_mi.experiment.stages.backscatter import NOISY
@@ -33,6 +33,7 @@ from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind, sight_vo
 from lidar_mi.instrument.eye_safety import assess_pulses
 from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.instrument.scan import plan_scans
+from lidar_mi.io.netcdf import open_netcdf, write_netcdf
 from lidar_mi.retrieval.lines.combine import combine
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, wind_from_neighbours, wind_from_triples
 
@@ -152,7 +153,7 @@ def _run(experiment, truth, tables, folder, log) -> tuple[dict[str, float], Chap
 
 def _crossflow(experiment, folder) -> xr.Dataset:
     """The pictures' wind that the folder holds."""
-    with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
+    with open_netcdf(folder / "wind.nc") as winds:
         source = NOISY if experiment.detector else "backscatter"
         return winds.sel(source=source, algorithm=experiment.sensor.method).load()
 

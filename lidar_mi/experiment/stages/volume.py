@@ -17,13 +17,14 @@ from lidar_mi.assessment.metrics.cores import Core, find_cores, outside_cores
 from lidar_mi.assessment.report.page import Chapter
 from lidar_mi.assessment.report.volume import draw_all, volume_chapter
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.run_folder import VOLUME, Log, Notice, write_netcdf
+from lidar_mi.experiment.run_folder import VOLUME, Log, Notice
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.backscatter import NOISY, check_ahead, pictures, scan_plans
 from lidar_mi.experiment.truth import make_truth, read_flows
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.signal import apparent_backscatter
+from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.velocimetry.common_grid import resample

@@ -16,12 +16,13 @@ from lidar_mi.assessment.metrics.cores import find_cores, outside_cores
 from lidar_mi.assessment.report.page import Chapter
 from lidar_mi.assessment.report.vortices import SOURCES, draw_all, true_pair, vortex_chapter
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.run_folder import IMAGES, Log, write
+from lidar_mi.experiment.run_folder import IMAGES, Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.backscatter import rendered_pairs
 from lidar_mi.experiment.stages.sensor import WIND
 from lidar_mi.experiment.truth import make_truth
 from lidar_mi.io import exr
+from lidar_mi.io.netcdf import open_netcdf, read_netcdf
 from lidar_mi.io.vortex_file import write_vortices
 from lidar_mi.retrieval.lines.combine import CombinedFlag
 from lidar_mi.retrieval.vortices.fit import VortexPairFit, fit_vortices, fit_vortices_to_wind
@@ -57,11 +58,8 @@ def _run(experiment, truth, folder, log) -> tuple[dict[str, float], Chapter]:
             refused[name] = "; ".join(found.reasons)
     for name, reason in refused.items():
         log.remark(f"no vortex pair from the {SOURCES[name]}: {reason}")
-    write(
-        folder / VORTEX,
-        lambda path: write_vortices(
-            path, fits, experiment=experiment.name, source=f"lidar-mi {__version__}"
-        ),
+    write_vortices(
+        folder / VORTEX, fits, experiment=experiment.name, source=f"lidar-mi {__version__}"
     )
     cores = find_cores(truth)
     true = true_pair(truth, cores)
@@ -81,15 +79,14 @@ def _seen(experiment, folder):
     if experiment.sensor:
         if not (folder / WIND).is_file():
             return picture, None
-        with xr.open_dataset(folder / WIND, engine="h5netcdf") as wind:
-            found = wind.load()
+        found = read_netcdf(folder / WIND)
         # v and w do not need lines of sight
         flag = found["flag"] & CombinedFlag.NO_CROSSFLOW.value
         return picture, found.assign(flag=flag)
     local = [name for name in experiment.retrieval.methods if name != "vortex_fit"]
     if not local:
         return picture, None
-    with xr.open_dataset(folder / "wind.nc", engine="h5netcdf") as winds:
+    with open_netcdf(folder / "wind.nc") as winds:
         found = winds.sel(source=source, algorithm=local[0]).load()
     return picture, found.set_coords(["y_vector", "z_vector"])
 

@@ -9,7 +9,8 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, find_cores, outside_cores, ring_averages
 from lidar_mi.atmosphere.vortex import Vortex, pair_wake, vortex_pair
-from lidar_mi.atmosphere.wake import centre, read_wake, resample
+from lidar_mi.atmosphere.wake import centre, resample
+from lidar_mi.io.wake_file import read_wake
 
 Y, Z = np.linspace(-54.5, 54.5, 219), np.linspace(-34.5, 34.5, 139)
 HALF_RING = 0.125  # rings are 0.25 m apart on this grid

@@ -2,21 +2,18 @@
 
 Detects: 1e-5 in a sphere's matrix, 0.1 % in a spheroid's, a wrong sign of b1 or b2, prolate taken
 for oblate, radius of equal volume taken for another one, a size average or normalisation off by
-1 %, and a shipped table that is not what its name says. Tests that compute need the library scatrs.
+1 %. Tests that compute need the library scatrs.
 """
 
 import math
-import re
 from dataclasses import replace
-from importlib.resources import files
 
 import numpy as np
 import pytest
 
-from lidar_mi.atmosphere import particles
-from lidar_mi.atmosphere.molecules import molecular_table
-from lidar_mi.atmosphere.particles import AEROSOLS, Aerosol, LogNormal, ModifiedGamma, make_table
-from lidar_mi.atmosphere.scattering import mix, read_table
+from lidar_mi.atmosphere import particle_scattering
+from lidar_mi.atmosphere.aerosols import Aerosol, LogNormal
+from lidar_mi.atmosphere.particle_scattering import make_table
 from lidar_mi.errors import InputError
 from validation.amplitude_matrix import phase_matrix
 
@@ -36,11 +33,9 @@ def single_size(radius, m, elongation=1.0):
 
 def one_matrix(x, m, elongation, angle):
     """Efficiencies and normalised elements of particles of one size parameter."""
-    make = particles._sphere if elongation == 1 else particles._spheroid
+    make = particle_scattering._sphere if elongation == 1 else particle_scattering._spheroid
     return make(x, m, elongation, np.cos(np.radians(angle)))
 
-
-# --- spheres ------------------------------------------------------------------------------------
 
 # Bohren & Huffman 1983, appendix A: sphere of radius 0.525 um, index 1.55, at 632.8 nm. Angle,
 # S11 relative to forward, -S12/S11, S33/S11, S34/S11.
@@ -118,9 +113,6 @@ def test_opac_water_soluble(scatrs):
     """OPAC (Hess et al. 1998): single-scattering albedo 0.962 at 550 nm, dry."""
     table = make_table("continental", GREEN, nodes=1000)
     assert table.albedo == pytest.approx(0.962, abs=0.002)
-
-
-# --- spheroids ----------------------------------------------------------------------------------
 
 
 def rayleigh_spheroid(m, elongation, angle):
@@ -254,9 +246,6 @@ def test_spheroid_table_keeps_every_law(scatrs):
     assert one.asymmetry == pytest.approx(float(solver.efficiencies().g), abs=3e-4)
 
 
-# --- size averages --------------------------------------------------------------------------------
-
-
 def test_size_average_against_an_independent_one(scatrs):
     """The library's own adaptive average over a log-normal, which has no limits of size."""
     sizes = LogNormal(0.1e-6, 1.6, 0.002e-6, 4e-6)
@@ -270,257 +259,9 @@ def test_size_average_against_an_independent_one(scatrs):
     assert ours.asymmetry == pytest.approx(float(theirs.g), abs=3e-4)
 
 
-def test_share_left_out_in_closed_form():
-    """Area is log-normal too, about median exp(2 ln^2 sigma): a normal tail."""
-    sizes = LogNormal(0.2e-6, 1.7, 0.03e-6, 1.5e-6)
-    spread = math.log(1.7)
-
-    def below(radius):
-        centred = math.log(radius / 0.2e-6) - 2 * spread**2
-        return 0.5 * math.erfc(-centred / (spread * math.sqrt(2)))
-
-    expected = below(0.03e-6) + 1 - below(1.5e-6)
-    made = Aerosol("a", "t", sizes, ((GREEN, 1.5),)).area_left_out()
-    assert made == pytest.approx(expected, rel=1e-6)
-
-
-def test_modified_gamma_is_deirmendjians():
-    """C.1: n(r) = 2.373 r^6 exp(-1.5 r) per cm^3 and um holds 100 droplets; the mode is 4 um."""
-    sizes = AEROSOLS["droplets"].sizes
-    radius = np.linspace(0.5, 15, 50)
-    expected = 2.373 * radius**6 * np.exp(-1.5 * radius)
-    got = sizes(radius * 1e-6)
-    np.testing.assert_allclose(got / got[10], expected / expected[10], rtol=1e-10)
-    fine = np.linspace(3, 5, 2001)
-    assert fine[sizes(fine * 1e-6).argmax()] == pytest.approx(4.0)
-
-
-# --- what ships -----------------------------------------------------------------------------------
-
-
-def shipped(name, nanometres=532):
-    return files("lidar_mi.scenes") / f"aerosol_{name}_{nanometres}nm.txt"
-
-
-@pytest.mark.parametrize("name", sorted(AEROSOLS))
-def test_shipped_table_is_what_it_says(name):
-    """`read_table` checks normalisation, inequalities and the relations at 0 and 180 degrees."""
-    table = read_table(shipped(name))
-    preset = AEROSOLS[name]
-    assert table.name == name and table.wavelength == pytest.approx(GREEN)
-    assert table.number_density == pytest.approx(preset.number_density)
-    m = preset.refractive_index(GREEN)
-    assert f"m = {m.real:.4g} + {m.imag:.3g}i" in table.provenance
-    assert particles._sizes_text(preset.sizes) in table.provenance
-    assert len(table.angle) == 361
-    assert shipped(name).stat().st_size < 60_000
-    a1, a2, a3, a4 = table.elements.T[:4]
-    if preset.elongation == 1:
-        np.testing.assert_array_equal(a2, a1)
-        np.testing.assert_array_equal(a3, a4)
-        assert table.depolarization_ratio == 0
-    else:
-        assert table.depolarization_ratio > 0.05
-
-
-@pytest.mark.parametrize("name", sorted(AEROSOLS))
-def test_shipped_table_is_read_by_the_phase_function(name):
-    """The plug-in takes the file as it is; its own normalisation changes a1 by less than 0.1 %."""
-    check_table = pytest.importorskip("lidar_mi.plugins.mueller").check_table
-    numbers = np.loadtxt(shipped(name))
-    scaled = check_table(numbers)
-    np.testing.assert_allclose(scaled[:, 1:] * 4 * math.pi, numbers[:, 1:], rtol=1e-3, atol=1e-12)
-
-
-def test_shipped_spheroids():
-    """532 nm, 1.53 + 0.008i, log-normal 0.20 um, 1.7, two to one: lidar ratio about 76 sr and
-    depolarisation about 0.27, as found before with another program; spheres of the same volumes
-    scatter back three times as much."""
-    spheroids, spheres = read_table(shipped("spheroids")), read_table(shipped("spheres"))
-    assert spheroids.lidar_ratio == pytest.approx(76, rel=0.03)
-    assert spheroids.depolarization_ratio == pytest.approx(0.27, abs=0.01)
-    assert 2.5 < spheroids.lidar_ratio / spheres.lidar_ratio < 3.5
-    # elongation hardly changes what is taken out of the beam
-    assert spheroids.extinction_cross_section == pytest.approx(
-        spheres.extinction_cross_section, rel=0.05
-    )
-
-
-@pytest.mark.parametrize("name", ["spheres", "continental", "soot"])
-def test_shipped_spheres_can_be_made_again(scatrs, name):
-    table = read_table(shipped(name))
-    again = make_table(name, GREEN, nodes=1000)
-    assert again.lidar_ratio == pytest.approx(table.lidar_ratio, rel=2e-3)
-    assert again.extinction_cross_section == pytest.approx(table.extinction_cross_section, rel=1e-3)
-    np.testing.assert_allclose(
-        again.elements / table.elements[:, :1], table.elements / table.elements[:, :1], atol=5e-3
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["spheroids", "dust"])
-def test_shipped_spheroids_can_be_made_again(scatrs, name):
-    """The whole table again with fewer sizes: the size average has converged to 2 % backwards."""
-    table = read_table(shipped(name))
-    again = make_table(name, GREEN, nodes=48)
-    assert again.lidar_ratio == pytest.approx(table.lidar_ratio, rel=0.02)
-    assert again.depolarization_ratio == pytest.approx(table.depolarization_ratio, rel=0.02)
-    assert again.extinction_cross_section == pytest.approx(table.extinction_cross_section, rel=5e-3)
-
-
-def test_named_aerosol_comes_from_the_shipped_table_only_at_its_wavelength(monkeypatch):
-    made = []
-    monkeypatch.setattr(particles, "make_table", lambda *given, **_: made.append(given))
-    assert particles.aerosol_table("dust", GREEN).name == "dust" and not made
-    particles.aerosol_table("dust", 532.4e-9)
-    particles.aerosol_table("dust", 1064e-9)
-    assert made == [("dust", 532.4e-9), ("dust", 1064e-9)]
-    with pytest.raises(InputError, match="'smoke'"):
-        particles.aerosol_table("smoke", GREEN)
-
-
-def test_aerosol_in_air():
-    """A tenth per kilometre of spheroids in sea-level air: coefficients add, and depolarised and
-    polarised backscatter each add too (Tesche et al. 2009, eq. 4)."""
-    aerosol = particles.aerosol_table("spheroids", GREEN)
-    aerosol = replace(aerosol, number_density=1e-4 / aerosol.extinction_cross_section)
-    air = molecular_table(GREEN)
-    both = mix([aerosol, air], [aerosol.extinction, air.extinction])
-    assert both.extinction == pytest.approx(1e-4 + 1.316e-5, rel=1e-4)
-    assert both.backscatter == pytest.approx(aerosol.backscatter + air.backscatter, rel=1e-9)
-
-    def crossed(table):
-        ratio = table.depolarization_ratio
-        return table.backscatter * ratio / (1 + ratio)
-
-    assert crossed(both) == pytest.approx(crossed(aerosol) + crossed(air), rel=1e-9)
-
-
-# --- bad input ------------------------------------------------------------------------------------
-
-SIZES = LogNormal(0.2e-6, 1.7, 0.03e-6, 1e-6)
-INDEX = ((GREEN, 1.5 + 0.01j),)
-
-
-@pytest.mark.parametrize(
-    "make, words",
-    [
-        (lambda: make_table("smoke", GREEN), "'smoke' is not known; expected one of continental"),
-        (lambda: make_table("spheres", 1.6e-6), "1600 nm .*'spheres'.* 355 to 1550 nm"),
-        (lambda: Aerosol("a", "t", replace(SIZES, sigma=0.9), INDEX), "sigma: 0.9"),
-        (lambda: Aerosol("a", "t", replace(SIZES, median=-1.0), INDEX), "median: -1.0"),
-        (lambda: Aerosol("a", "t", replace(SIZES, largest=1e-8), INDEX), "radii from"),
-        (lambda: Aerosol("a", "t", ModifiedGamma(1e-6, 0, 1, 1e-7, 1e-5), INDEX), "alpha: 0"),
-        (lambda: Aerosol("a", "t", SIZES, INDEX, elongation=0.5), "elongation: 0.5.*1 .sphere"),
-        (lambda: Aerosol("a", "t", SIZES, INDEX, number_density=0), "number_density: 0"),
-        (lambda: Aerosol("a", "t", SIZES, ()), "wavelengths"),
-        (lambda: Aerosol("a", "t", SIZES, ((GREEN, 1.5 - 0.1j),)), "imaginary part >= 0"),
-    ],
-)
-def test_bad_input(make, words):
-    with pytest.raises(InputError, match=words):
-        make()
-
-
-def test_refractive_index_is_linear_between_wavelengths():
-    m = AEROSOLS["continental"].refractive_index((355e-9 + 532e-9) / 2)
-    assert m == pytest.approx(1.53 + 0.0055j, rel=1e-12)
-
-
-# Hess, Koepke & Schult 1998 (OPAC), as ECMWF's aerosol optics code tabulates it: um, real,
-# imaginary. The dust-like component is called insoluble there; sea salt at 80 % humidity.
-OPAC = {
-    "spheres": (
-        (0.35, 1.53, 8e-3),
-        (0.5, 1.53, 8e-3),
-        (0.55, 1.53, 8e-3),
-        (1.0, 1.52, 8e-3),
-        (1.25, 1.46, 8e-3),
-        (1.5, 1.41, 8e-3),
-        (1.75, 1.34, 8e-3),
-    ),
-    "continental": (
-        (0.35, 1.53, 5e-3),
-        (0.5, 1.53, 5e-3),
-        (0.55, 1.53, 6e-3),
-        (1.0, 1.52, 1.55e-2),
-        (1.25, 1.51, 1.9e-2),
-    ),
-    "soot": (
-        (0.35, 1.75, 0.465),
-        (0.4, 1.75, 0.46),
-        (0.5, 1.75, 0.45),
-        (0.55, 1.75, 0.44),
-        (1.0, 1.76, 0.44),
-        (1.25, 1.76, 0.45),
-    ),
-    "sea_salt": (
-        (0.35, 1.364, 4.7e-8),
-        (0.5, 1.356, 2.8e-9),
-        (0.55, 1.354, 3.0e-9),
-        (1.0, 1.345, 2.0e-5),
-        (1.25, 1.342, 5.3e-5),
-    ),
-}
-
-
-@pytest.mark.parametrize(
-    ("name", "wavelength"),
-    [(name, w) for name in OPAC for w in (355e-9, 532e-9, 1064e-9)] + [("spheres", 1550e-9)],
-)
-def test_indices_are_the_published_ones(name, wavelength):
-    """Linear between OPAC's wavelengths: real parts to 0.02, imaginary to 10 %, of salt to 1e-5.
-
-    Dust falls between 1 and 1.25 um, where its index is not known better.
-    """
-    micrometres, real, imaginary = zip(*OPAC[name], strict=True)
-    m = AEROSOLS[name].refractive_index(wavelength)
-    assert m.real == pytest.approx(np.interp(wavelength * 1e6, micrometres, real), abs=0.02)
-    expected = np.interp(wavelength * 1e6, micrometres, imaginary)
-    assert m.imag == pytest.approx(expected, rel=0.1, abs=1e-5 if name == "sea_salt" else 0)
-
-
-@pytest.mark.parametrize(
-    ("nm", "aerosol"), [(355, "spheres"), (532, "spheroids"), (1550, "spheroids")]
-)
-def test_shipped_spheroids_have_the_index_of_dust(nm, aerosol):
-    """What a table says it was made of is what the aerosol has at that wavelength."""
-    said = re.search(r"m = ([\d.]+) \+ ([\d.]+)i", read_table(shipped("spheroids", nm)).provenance)
-    m = AEROSOLS[aerosol].refractive_index(nm * 1e-9)
-    assert complex(float(said[1]), float(said[2])) == pytest.approx(m, rel=1e-9)
-
-
 def test_missing_library_is_answered_with_the_line_to_type(monkeypatch):
     import sys
 
     monkeypatch.setitem(sys.modules, "scatrs.mie", None)
     with pytest.raises(InputError, match=r"pip install 'lidar-mi\[particles\]'"):
         make_table("spheres", GREEN)
-
-
-def test_a_changed_aerosol_keeps_the_rest():
-    one = particles.changed("dust", GREEN, "ash", index=1.6 + 0.01j, sigma=1.5, largest=1e-6)
-    dust = AEROSOLS["dust"]
-    assert one.refractive_index(GREEN) == 1.6 + 0.01j
-    assert (one.sizes.median, one.sizes.sigma, one.sizes.largest) == (0.3e-6, 1.5, 1e-6)
-    assert (one.elongation, one.number_density) == (dust.elongation, dust.number_density)
-    assert particles.changed("dust", GREEN) is dust
-    gamma = particles.changed("droplets", GREEN, "fog", radius=2e-6)
-    assert gamma.sizes == replace(AEROSOLS["droplets"].sizes, mode=2e-6)
-
-
-@pytest.mark.parametrize(
-    "changes, words",
-    [
-        ({"sigma": 2.0}, "name: None is not allowed for a changed 'droplets'|sigma"),
-        ({"new_name": "fog", "sigma": 2.0}, "sigma: 2 is not allowed; the sizes of 'droplets'"),
-        ({"new_name": "dust", "radius": 1e-6}, "name: dust is not allowed"),
-        ({"radius": 1e-6}, "name: None is not allowed"),
-        ({"new_name": "fog", "radius": -1.0}, "mode: -1.0 is not allowed"),
-        ({"new_name": "fog", "elongation": 9.0}, "elongation: 9.0 is not allowed"),
-        ({"new_name": "fog", "index": 0.0}, "index: 0.0 is not allowed"),
-    ],
-)
-def test_a_change_that_makes_no_aerosol_is_refused(changes, words):
-    with pytest.raises(InputError, match=words):
-        particles.changed("droplets", GREEN, **changes)

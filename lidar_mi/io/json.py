@@ -1,0 +1,33 @@
+"""JSON files."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+from lidar_mi.errors import InputError
+from lidar_mi.io.text import read_text, write_text
+
+
+def read_json(path: str | Path, expected: str) -> Any:
+    """Content of a JSON file.
+
+    Parameters
+    ----------
+    path : str or Path
+    expected : str
+        What kind of file was asked for, for the message: "a file of vortex pairs".
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read or is not JSON.
+    """
+    try:
+        return json.loads(read_text(path, expected))
+    except json.JSONDecodeError:
+        raise InputError(f"{path}: not JSON; expected {expected}") from None
+
+
+def write_json(path: str | Path, data: Any) -> None:
+    """Write a JSON file, whole or not at all; NaN and infinity are refused with a ValueError."""
+    write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")

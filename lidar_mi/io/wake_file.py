@@ -1,0 +1,290 @@
+"""Wake flows from NetCDF files with CF units: read, checked, in SI units on ascending axes."""
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pint
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.io.netcdf import load_variable, open_netcdf
+from lidar_mi.units import parse_units
+
+_DIMENSIONS = ("time", "x", "y", "z")
+_VARIABLES = {
+    "u": ("m s-1", "velocity along the flight path"),
+    "v": ("m s-1", "velocity across the flight path, positive to port"),
+    "w": ("m s-1", "vertical velocity, positive upwards"),
+    "tracer": (None, "exhaust tracer"),  # any scale, any unit: its largest value is what counts
+    "aerosol": ("1", "background aerosol relative to its mean"),
+}
+_REQUIRED = ("v", "w")
+
+# Largest deviation of a step from the mean step, in steps: float32 axes a few kilometres from
+# their origin reach 5e-4.
+_UNEVEN = 1e-3
+
+
+def _scale_to(variable: xr.DataArray, target: str, name: str, path: Path) -> float:
+    """Factor from the variable's units to `target`."""
+    text = variable.attrs.get("units")
+    allowed = f"allowed: {target} or a unit that converts to it"
+    if text is None and target == "1":
+        return 1.0  # CF section 3.1: no units attribute means dimensionless
+    if text is None:
+        raise InputError(f"{path}: {name} has no units attribute; {allowed}")
+    try:
+        return float(parse_units(text).to(parse_units(target).units).magnitude)
+    except (ValueError, pint.PintError):
+        raise InputError(f"{path}: {name} has the unit {text!r}; {allowed}") from None
+
+
+def _file_names(names, path):
+    """Our name -> the file's, for all dimensions and variables."""
+    known = (*_DIMENSIONS, *_VARIABLES)
+    names = dict(names or {})
+    for ours, theirs in names.items():
+        if ours not in known:
+            raise InputError(f"wake.names: {ours!r} is not known; allowed: {', '.join(known)}")
+        if not isinstance(theirs, str):
+            raise InputError(f"wake.names.{ours}: {theirs!r} is not allowed; a text is")
+    table = {ours: names.get(ours, ours) for ours in known}
+    doubled = {t for t in table.values() if list(table.values()).count(t) > 1}
+    if doubled:
+        raise InputError(
+            f"wake.names: {', '.join(sorted(doubled))} of {path} stands for more than one "
+            "variable; allowed: one each"
+        )
+    return table
+
+
+def _pick_time(data, name, time, path):
+    """The data set at one time, without the dimension, and that time in s (None: unknown)."""
+    if name not in data.dims and name not in data.variables:
+        if time is None:
+            return data, None
+        raise InputError(
+            f"{path}: time {time:g} s is asked for, but there is no {name!r}; it has the "
+            f"dimensions {', '.join(map(str, data.dims))}"
+        )
+    if name not in data.variables:
+        if time is None and data.sizes[name] == 1:
+            return data.isel({name: 0}), None
+        raise InputError(
+            f"{path}: dimension {name!r} has no values; allowed: a coordinate variable {name!r}"
+        )
+    coordinate = data[name]
+    if coordinate.ndim > 1:
+        raise InputError(f"{path}: {name!r} has dims {coordinate.dims}; allowed: one at most")
+    # "seconds since 2000-01-01" counts in seconds; the date itself is not used.
+    plain = coordinate.copy()
+    if "units" in plain.attrs:
+        plain.attrs["units"] = str(plain.attrs["units"]).split(" since ")[0]
+    times = np.atleast_1d(coordinate.values.astype(float)) * _scale_to(plain, "s", name, path)
+    listing = ", ".join(f"{t:.10g}" for t in times[:20]) + (" ..." if times.size > 20 else "")
+    if time is None:
+        if times.size > 1:
+            raise InputError(f"{path}: time is not given; allowed: one of {listing} s")
+        index = 0
+    else:
+        if not np.isfinite(time):
+            raise InputError(f"wake.time: {time} s is not allowed; any finite time is")
+        index = int(np.argmin(np.abs(times - time)))
+        if not abs(times[index] - time) <= 1e-6 * max(abs(time), abs(times[index])):
+            raise InputError(f"{path}: time {time:.10g} s is not there; allowed: {listing} s")
+    return data.isel({name: index}) if name in data.dims else data, float(times[index])
+
+
+def _axis(data, name, ours, path):
+    """The axis in metres, ascending and exact, and whether the file's runs the other way."""
+    if name not in data.variables:
+        raise InputError(
+            f"{path}: dimension {name!r} ({ours}) has no values; allowed: a coordinate "
+            f"variable {name!r} in m"
+        )
+    variable = data[name]
+    values = variable.values.astype(float) * _scale_to(variable, "m", name, path)
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        raise InputError(
+            f"{path}: axis {name!r} is not finite at {bad.size} of {values.size} places, the first "
+            f"at index {bad[0]}; allowed: finite numbers"
+        )
+    if values.size == 1:
+        return values, False
+    exact = np.linspace(values[0], values[-1], values.size)
+    step = exact[1] - exact[0]
+    off = np.abs(np.diff(values) - step)
+    if step == 0 or off.max() > _UNEVEN * abs(step):
+        worst = int(off.argmax())
+        raise InputError(
+            f"{path}: axis {name!r} is not uniform, the step after index {worst} is "
+            f"{values[worst + 1] - values[worst]:g} m, the mean {step:g} m; allowed: equal steps"
+        )
+    return (exact[::-1], True) if step < 0 else (exact, False)
+
+
+def _plane_index(axis, x, path, name):
+    """Index of the plane nearest to x, which must lie in one of the planes' cells."""
+    half = (axis[1] - axis[0]) / 2 if axis.size > 1 else 0.0
+    slack = half + 1e-6 * max(1.0, abs(x))
+    if not axis[0] - slack <= x <= axis[-1] + slack:
+        raise InputError(
+            f"{path}: {name} = {x:g} m is outside; allowed: {axis[0] - half:g} to "
+            f"{axis[-1] + half:g} m"
+        )
+    return int(np.argmin(np.abs(axis - x)))
+
+
+def _check_values(values, axes, name, path, may_be_negative):
+    """Every value finite and, unless it may, not negative."""
+    for fault, bad in (
+        ("not finite", ~np.isfinite(values)),
+        ("negative", (values < 0) & (not may_be_negative)),
+    ):
+        count = int(bad.sum())
+        if count:
+            first = np.unravel_index(int(bad.argmax()), bad.shape)
+            place = ", ".join(f"{d} = {axes[d][i]:g} m" for d, i in zip("xyz", first, strict=True))
+            raise InputError(
+                f"{path}: variable {name!r} is {fault} at {count} of {values.size} places, the "
+                f"first at {place}; allowed: nowhere"
+            )
+
+
+def read_wake(
+    path: str | Path,
+    time: float | None = None,
+    names: Mapping[str, str] | None = None,
+    x: float | None = None,
+    require: Iterable[str] = (),
+) -> xr.Dataset:
+    """One instant of a simulated wake from a NetCDF file with CF units.
+
+    The file's variables lie on (time, x, y, z) in any order; time and x may be missing (a slab
+    gets one x plane, at its scalar coordinate or at 0). Descending axes are turned round, units
+    are converted; nothing is interpolated.
+
+    Parameters
+    ----------
+    path : str or Path
+        NetCDF-4 or NetCDF-3 classic.
+    time : float, optional
+        s; the file must hold it to 1e-6 relative. May be left out where there is one time only.
+        In "seconds since ..." axes the count is meant.
+    names : mapping, optional
+        Our name to the file's, for time, x, y, z, u, v, w, tracer, aerosol, where they differ:
+        {"v": "V_wind", "y": "lateral"}. A variable named here must exist.
+    x : float, optional
+        m; keeps the one plane nearest to it. Default: all planes.
+    require : iterable of str
+        Variables that must be present besides v and w, out of u, tracer, aerosol.
+
+    Returns
+    -------
+    xarray.Dataset
+        float64 on dims (x, y, z), ascending, metres: u, v, w in m s^-1, the tracer in the file's
+        unit, aerosol dimensionless, as far as the file has them. Scalar coordinate `time` in s if
+        known.
+
+    Raises
+    ------
+    InputError
+        Naming file and variable: unreadable, missing, wrong dims or units, values that are not
+        finite, a tracer or aerosol that is asked for and negative somewhere, axes that are not
+        uniform, a time or plane that is not there.
+    """
+    path = Path(path)
+    table = _file_names(names, path)
+    for name in require:
+        if name not in _VARIABLES:
+            raise InputError(
+                f"wake: variable {name!r} is not known; allowed: {', '.join(_VARIABLES)}"
+            )
+    asked = {*_REQUIRED, *require, *(n for n in (names or {}) if n in _VARIABLES)}
+    with open_netcdf(path) as data:
+        return _read(data, table, asked, time, x, path)
+
+
+def _hint(name, table):
+    """How to give the name in the file, where none has been given."""
+    if table[name] != name:
+        return ""
+    none = f", or wake.extinction.{name}: null" if name in ("tracer", "aerosol") else ""
+    return f"; expected wake.names: {{{name}: its name there}}{none}"
+
+
+def _read(data, table, asked, time, x, path):
+    for name in _VARIABLES:
+        if name in asked and table[name] not in data.data_vars:
+            raise InputError(
+                f"{path}: variable {table[name]!r} ({name}) is missing; it has "
+                f"{', '.join(map(str, data.data_vars)) or 'none'}{_hint(name, table)}"
+            )
+    for name in ("y", "z"):
+        if table[name] not in data.dims:
+            raise InputError(
+                f"{path}: dimension {table[name]!r} ({name}) is missing; it has "
+                f"{', '.join(map(str, data.dims)) or 'none'}{_hint(name, table)}"
+            )
+    present = [name for name in _VARIABLES if table[name] in data.data_vars]
+    spatial = {table[d]: d for d in ("x", "y", "z") if table[d] in data.dims}
+    for name in present:
+        dims = set(data[table[name]].dims)
+        if not dims - {table["time"]} == set(spatial):
+            raise InputError(
+                f"{path}: variable {table[name]!r} has the dimensions "
+                f"({', '.join(map(str, data[table[name]].dims))}); allowed: "
+                f"{', '.join(spatial)} and, at choice, {table['time']}, in any order"
+            )
+
+    data, seconds = _pick_time(data, table["time"], time, path)
+    axes, reverse = {}, []
+    for theirs, ours in spatial.items():
+        axes[ours], turned = _axis(data, theirs, ours, path)
+        if turned:
+            reverse.append(theirs)
+    data = data.isel({theirs: slice(None, None, -1) for theirs in reverse})
+    if "x" not in axes:
+        theirs = table["x"]
+        place = 0.0
+        if theirs in data.variables and data[theirs].ndim == 0:
+            place = float(data[theirs]) * _scale_to(data[theirs], "m", theirs, path)
+        elif x is not None:
+            raise InputError(
+                f"{path}: x = {x:g} m is asked for, but there is no {theirs!r}; it has the "
+                f"dimensions {', '.join(map(str, data.dims))}"
+            )
+        axes = {"x": np.array([place]), **axes}
+    if x is not None:
+        index = _plane_index(axes["x"], x, path, table["x"])
+        axes["x"] = axes["x"][index : index + 1]
+        if table["x"] in data.dims:
+            data = data.isel({table["x"]: slice(index, index + 1)})
+
+    wake = xr.Dataset(
+        coords={d: (d, axes[d], {"units": "m"}) for d in ("x", "y", "z")},
+        attrs={"source": path.name},
+    )
+    for name in present:
+        variable = data[table[name]]
+        unit, long_name = _VARIABLES[name]
+        scale = 1.0
+        if unit is None:
+            unit = variable.attrs.get("units", "1")
+        else:
+            scale = _scale_to(variable, unit, f"variable {table[name]!r}", path)
+        variable = load_variable(variable, path)
+        if variable.dtype.kind not in "iuf":
+            raise InputError(
+                f"{path}: variable {table[name]!r} is of type {variable.dtype}; allowed: numbers"
+            )
+        variable = variable.transpose(*(table[d] for d in "xyz" if table[d] in variable.dims))
+        values = variable.values.astype(float).reshape([axes[d].size for d in "xyz"]) * scale
+        amount = name in asked and name in ("tracer", "aerosol")
+        _check_values(values, axes, table[name], path, may_be_negative=not amount)
+        wake[name] = ("x", "y", "z"), values, {"units": unit, "long_name": long_name}
+    if seconds is not None:
+        wake = wake.assign_coords(time=((), seconds, {"units": "s"}))
+    return wake

@@ -1,0 +1,62 @@
+"""NetCDF files: unit tests. Detect a value or a fill value changed on the way, a file half written,
+and any damaged file that does not give one clear line."""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.io.netcdf import open_netcdf, read_netcdf, write_netcdf
+
+DATA = xr.Dataset({"v": ("y", [1.0, np.nan, 3.0])}, {"y": ("y", [0.0, 0.5, 1.0], {"units": "m"})})
+
+
+def test_round_trip(tmp_path):
+    write_netcdf(DATA, tmp_path / "wind.nc")
+    xr.testing.assert_identical(read_netcdf(tmp_path / "wind.nc"), DATA)
+    with xr.open_dataset(tmp_path / "wind.nc", engine="h5netcdf") as stored:
+        assert "_FillValue" not in stored["y"].encoding  # CF 2.5.1
+
+
+def test_netcdf_3_and_4_are_told_by_their_content(tmp_path):
+    for engine, name in (("scipy", "old.nc"), ("h5netcdf", "new.cdf")):
+        DATA.to_netcdf(tmp_path / name, engine=engine)
+        with open_netcdf(tmp_path / name) as data:
+            np.testing.assert_array_equal(data["v"], DATA["v"])
+
+
+def test_no_folder_is_named(tmp_path):
+    with pytest.raises(InputError, match="nowhere is no folder; expected one that exists"):
+        write_netcdf(DATA, tmp_path / "nowhere" / "wind.nc")
+
+
+@pytest.mark.parametrize("cut", [3, 40, 900, -30])
+def test_damaged_files_give_one_line(tmp_path, cut):
+    path = tmp_path / "wind.nc"
+    write_netcdf(DATA, path)
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(InputError) as error:
+        read_netcdf(path)
+    assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
+
+
+def test_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match="no.nc: cannot be read .No such file"):
+        open_netcdf(tmp_path / "no.nc")
+
+
+def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
+    data = xr.Dataset({"v": ("y", [1.0, 2.0])})
+    write_netcdf(data, tmp_path / "wind.nc")
+
+    def half(self, path, **_):
+        path.write_bytes(b"half a fi")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(xr.Dataset, "to_netcdf", half)
+    with pytest.raises(KeyboardInterrupt):
+        write_netcdf(data * 2, tmp_path / "wind.nc")
+    monkeypatch.undo()
+    assert [p.name for p in tmp_path.iterdir()] == ["wind.nc"]
+    with xr.open_dataset(tmp_path / "wind.nc") as kept:
+        assert kept["v"].values.tolist() == [1.0, 2.0]
