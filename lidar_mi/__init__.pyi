@@ -11,7 +11,9 @@ from .plugins import register_plugins
 from .retrieval.velocimetry.common_grid import on_one_grid
 from .retrieval.velocimetry.volume import retrieve_wind_volume
 from .retrieval.velocimetry.wind import retrieve_wind
-from .retrieval.vortices.fit import VortexPairFit, fit_vortices, fit_vortices_to_wind
+from .retrieval.vortices.image_fit import fit_vortices
+from .retrieval.vortices.pair import VortexPairFit
+from .retrieval.vortices.vector_fit import fit_vortices_to_wind
 
 __version__: str
 

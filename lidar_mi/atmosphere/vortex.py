@@ -193,7 +193,7 @@ def descent_speed(circulation: float, separation: float) -> float:
 
 
 def pair_wake(vortices: Sequence[Vortex], y: ArrayLike, z: ArrayLike, x: float = 0.0) -> xr.Dataset:
-    """The flow of analytic vortices in the layout of `lidar_mi.atmosphere.wake.read_wake`.
+    """The flow of analytic vortices in the layout of `lidar_mi.io.wake_file.read_wake`.
 
     Parameters
     ----------

@@ -9,8 +9,8 @@ import numpy as np
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.json import read_json, write_json
-from lidar_mi.retrieval.vortices.fit import VortexPairFit
 from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 FORMAT = "lidar-mi vortex pairs 1"
 

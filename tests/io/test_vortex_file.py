@@ -8,7 +8,7 @@ import pytest
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.info import sections
 from lidar_mi.io.vortex_file import read_vortices, write_vortices
-from lidar_mi.retrieval.vortices.fit import VortexPairFit
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
 def some_pair(profile="lamb_oseen", reasons=()):
@@ -23,7 +23,11 @@ def test_what_is_read_is_what_was_written(tmp_path, profile):
     """The wind anywhere and its errors to the last digit."""
     fit = some_pair(profile)
     nothing = VortexPairFit(
-        np.full(10, np.nan), np.full((10, 10), np.nan), profile, *[np.nan] * 4, ("nothing turns",)
+        np.full(10, np.nan),
+        np.full((10, 10), np.nan),
+        profile,
+        *[np.nan] * 4,
+        ("no vortex signature",),
     )
     write_vortices(tmp_path / "vortex.json", {"images": fit, "vectors": nothing}, source="a test")
     read = read_vortices(tmp_path / "vortex.json")
@@ -34,7 +38,8 @@ def test_what_is_read_is_what_was_written(tmp_path, profile):
     assert read["images"].quantities == fit.quantities and read["images"].success
     assert np.isnan(read["images"].chi2)
     assert (
-        read["vectors"].reasons == ("nothing turns",) and np.isnan(read["vectors"].parameters).all()
+        read["vectors"].reasons == ("no vortex signature",)
+        and np.isnan(read["vectors"].parameters).all()
     )
     # anyone's JSON reader takes it, and finds numbers with units
     data = json.loads((tmp_path / "vortex.json").read_text(), parse_constant=pytest.fail)

@@ -16,7 +16,7 @@ from lidar_mi.experiment.stages import backscatter as backscatter_chain
 from lidar_mi.io.exr import read_scan
 from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
-from lidar_mi.retrieval.vortices.fit import fit_vortices
+from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 

@@ -16,7 +16,7 @@ from lidar_mi.assessment.figures.backscatter import METHOD_NAMES, SOURCE_NAMES, 
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
 from lidar_mi.assessment.report.digits import fixed, in_row, percent, three, with_error
-from lidar_mi.retrieval.vortices.fit import MEANING
+from lidar_mi.retrieval.vortices.pair import MEANING
 
 # rows of the table of results: key, name, unit
 _ROWS = (

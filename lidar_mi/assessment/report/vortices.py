@@ -13,7 +13,7 @@ from lidar_mi.assessment.figures.backscatter import Drawn, save_all
 from lidar_mi.assessment.metrics.cores import Core, ring_averages
 from lidar_mi.assessment.report.digits import fixed, with_error
 from lidar_mi.assessment.report.page import Chapter, Tables
-from lidar_mi.retrieval.vortices.fit import VortexPairFit
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 SOURCES = {"images": "images", "vectors": "wind vectors"}
 

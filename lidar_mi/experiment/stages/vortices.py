@@ -25,7 +25,9 @@ from lidar_mi.io import exr
 from lidar_mi.io.netcdf import open_netcdf, read_netcdf
 from lidar_mi.io.vortex_file import write_vortices
 from lidar_mi.retrieval.lines.combine import CombinedFlag
-from lidar_mi.retrieval.vortices.fit import VortexPairFit, fit_vortices, fit_vortices_to_wind
+from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
 
 VORTEX = "vortex.json"
 

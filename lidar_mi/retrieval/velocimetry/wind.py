@@ -25,7 +25,7 @@ from lidar_mi.retrieval.velocimetry.quality import (
 from lidar_mi.retrieval.velocimetry.variational import variational
 from lidar_mi.retrieval.velocimetry.weight_shift import weight_shift
 from lidar_mi.retrieval.velocimetry.windows import Windows
-from lidar_mi.retrieval.vortices.fit import vortex_windows
+from lidar_mi.retrieval.vortices.windows import vortex_windows
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,9 @@
-"""How far a flow departs from its model, and what that does to the model's parameters.
+"""Departure of a flow from its model, and the error of the parameters that it causes.
 
 A real flow is not two vortices. What is left of it moves the air by a smooth random field, taken to
 be isotropic: each component has the covariance sum_j a_j exp(-h^2 / (2 L_j^2)) at the distance h.
-It shows in the residuals of a fit as displacement that neighbours share, and in the parameters as
-an error that does not average out over pixels.
+In the residuals of a fit it is a displacement correlated between neighbours, in the parameters an
+error that does not average out over pixels.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ import scipy.fft
 import torch
 from scipy.optimize import nnls
 
-# Lengths L_j in steps of the grid; up to a fifth of its shorter side are used.
+# Lengths L_j in steps of the grid; those up to 1/5 of its shorter side are used.
 _LENGTHS = (3.0, 6.0, 12.0, 24.0, 48.0)
 
 
@@ -96,25 +96,25 @@ class Lags:
         return total
 
 
-def flow_error(pushed: torch.Tensor, stiffness: torch.Tensor, shortest: float) -> FlowError:
-    """The departure from a model that explains what the residuals of its fit share.
+def flow_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) -> FlowError:
+    """The departure from a model that explains the correlation of the residuals of its fit.
 
-    With the residual r, its slope g and its weight w, the push is q = w g r and the stiffness
+    With the residual r, its slope g and its weight w, the force is q = w g r and the stiffness
     A = w g g^T. A field of displacements with covariance C(h) adds C(h) tr sum A(x) A(x + h) to
     the correlation sum q(x) . q(x + h); noise that differs from pixel to pixel adds nothing at
     h > 0. The variances a_j >= 0 follow by least squares over the lags.
 
     Parameters
     ----------
-    pushed : torch.Tensor, shape (2, z, y)
+    force : torch.Tensor, shape (2, z, y)
         q; zero where nothing is known.
     stiffness : torch.Tensor, shape (3, z, y)
         A: yy, yz, zz.
     shortest : float
         Lags below this (steps of the grid) are left out, as noise may correlate over them.
     """
-    lags = Lags(tuple(pushed.shape[1:]), pushed)
-    seen = lags.autocorrelation(pushed, (1.0, 1.0))
+    lags = Lags(tuple(force.shape[1:]), force)
+    observed = lags.autocorrelation(force, (1.0, 1.0))
     unit = lags.autocorrelation(stiffness, (1.0, 2.0, 1.0))
     distance = lags.distance()
     side = min(lags.shape)
@@ -125,23 +125,23 @@ def flow_error(pushed: torch.Tensor, stiffness: torch.Tensor, shortest: float) -
         return FlowError()
     columns = [unit[used] / scale * torch.exp(-(distance[used] ** 2) / (2 * n**2)) for n in lengths]
     # normalised in both directions: least squares needs numbers near one
-    size = float((seen[used] / scale).abs().max())
+    size = float((observed[used] / scale).abs().max())
     if not size > 0:
         return FlowError()
     amplitudes, _ = nnls(
-        torch.stack(columns, 1).cpu().numpy(), (seen[used] / scale / size).cpu().numpy()
+        torch.stack(columns, 1).cpu().numpy(), (observed[used] / scale / size).cpu().numpy()
     )
     variances = amplitudes * size
     kept = [(float(a), n) for a, n in zip(variances, lengths) if a > 0]
     return FlowError(tuple(a for a, _ in kept), tuple(n for _, n in kept))
 
 
-def spread_of(pulls: torch.Tensor, error: FlowError) -> torch.Tensor:
+def spread_of(responses: torch.Tensor, error: FlowError) -> torch.Tensor:
     """Covariance (p, p) of sum_x P_p(x) . d(x), d the field of the flow's error, P (p, 2, z, y)."""
-    lags = Lags(tuple(pulls.shape[2:]), pulls)
+    lags = Lags(tuple(responses.shape[2:]), responses)
     if not error.variances:
-        return pulls.new_zeros(len(pulls), len(pulls))
-    return lags.quadratic(pulls, error.covariance(lags.distance()))
+        return responses.new_zeros(len(responses), len(responses))
+    return lags.quadratic(responses, error.covariance(lags.distance()))
 
 
 def mean_length(error: FlowError) -> float:

@@ -1,6 +1,6 @@
-"""The flow of two vortices in a mean wind: the wind, paths of the air, what each parameter does.
+"""The flow of two vortices in a mean wind: wind, paths of the air, sensitivity to each parameter.
 
-Frame: y to port, z up. A vortex with positive circulation turns from +y towards +z.
+Frame: y to port, z up. A vortex with positive circulation rotates from +y towards +z.
 """
 
 from typing import Literal, get_args
@@ -26,11 +26,11 @@ PARAMETERS = (
 
 # Root of 1 + 2 a = exp(a): puts the peak of the Lamb-Oseen swirl at the core radius.
 _LAMB_OSEEN = 1.2564
-# Angle (rad) that the fastest air may turn in one Runge-Kutta step: errs by 3e-4 of its radius.
+# Angle (rad) by which the fastest air may rotate in one Runge-Kutta step: errs by 3e-4 of its radius.
 _STEP_ANGLE = 0.5
 
 
-def turning(s: torch.Tensor, profile: Profile) -> tuple[torch.Tensor, torch.Tensor]:
+def angular_velocity(s: torch.Tensor, profile: Profile) -> tuple[torch.Tensor, torch.Tensor]:
     """Angular velocity over Gamma/(2 pi r_c^2), and its derivative, at s = r^2 / r_c^2.
 
     Lamb-Oseen: (1 - exp(-1.2564 s)) / s. Burnham-Hallock: 1 / (1 + s).
@@ -55,7 +55,7 @@ def wind(theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, profile: Profile
     for first in (0, 4):
         circulation, radius = theta[first], theta[first + 1].exp()
         dy, dz = y - theta[first + 2], z - theta[first + 3]
-        value, _ = turning((dy**2 + dz**2) / radius**2, profile)
+        value, _ = angular_velocity((dy**2 + dz**2) / radius**2, profile)
         omega = circulation / (2 * torch.pi * radius**2) * value
         v, w = v - omega * dz, w + omega * dy
     return torch.stack([v, w])
@@ -69,7 +69,7 @@ def gradient(
     for first in (0, 4):
         circulation, radius = theta[first], theta[first + 1].exp()
         dy, dz = y - theta[first + 2], z - theta[first + 3]
-        value, slope = turning((dy**2 + dz**2) / radius**2, profile)
+        value, slope = angular_velocity((dy**2 + dz**2) / radius**2, profile)
         omega = circulation / (2 * torch.pi * radius**2) * value
         bend = circulation / (torch.pi * radius**4) * slope
         v_y = v_y - bend * dy * dz
@@ -88,7 +88,7 @@ def sensitivity(
         circulation, radius = theta[first], theta[first + 1].exp()
         dy, dz = y - theta[first + 2], z - theta[first + 3]
         square = dy**2 + dz**2
-        value, slope = turning(square / radius**2, profile)
+        value, slope = angular_velocity(square / radius**2, profile)
         unit = value / (2 * torch.pi * radius**2)
         omega = circulation * unit
         bend = circulation / (torch.pi * radius**4) * slope
@@ -101,7 +101,7 @@ def sensitivity(
     return columns
 
 
-def carried(
+def advected(
     theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, time: float, profile: Profile
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Where air at places (...) is after half of a time and after all of it, (2, ...) each, in m.
@@ -127,7 +127,7 @@ def carried(
 
 
 def drift(theta: torch.Tensor, profile: Profile) -> torch.Tensor:
-    """Velocity (2,) of the pair, m s^-1: the mean wind and what the vortices do to each other."""
+    """Velocity (2,) of the pair, m s^-1: the mean wind and the velocity that the vortices induce on each other."""
     centres = theta[[2, 6]], theta[[3, 7]]
     return wind(theta, *centres, profile).mean(1)
 
@@ -137,8 +137,8 @@ def path_sensitivity(
 ) -> torch.Tensor:
     """Derivatives (10, ...) of along . (end of the path) with respect to `PARAMETERS`.
 
-    A parameter's push du along the path is carried to its end by the flow. The integral over the
-    path is taken by its value in the middle, carried on by exp(L time/2) with the gradient L of the
+    A parameter's change du of the wind along the path is advected to its end by the flow. The integral over the
+    path is taken by its value in the middle, advected on by exp(L time/2) with the gradient L of the
     wind there: off by (omega time)^2/24, 0.7 % for 0.4 rad.
     """
     v_y, v_z, w_y = gradient(theta, *middle, profile)
@@ -148,10 +148,10 @@ def path_sensitivity(
     even = 1 + square / 2 + square**2 / 24
     odd = h * (1 + square / 6 + square**2 / 120)
     along_y, along_z = along
-    pulled = torch.stack(
+    adjoint = torch.stack(
         [
             even * along_y + odd * (v_y * along_y + w_y * along_z),
             even * along_z + odd * (v_z * along_y - v_y * along_z),
         ]
     )
-    return time * sensitivity(theta, *middle, pulled, profile)
+    return time * sensitivity(theta, *middle, adjoint, profile)

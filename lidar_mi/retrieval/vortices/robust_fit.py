@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import torch
 
-# Residuals beyond so many standard deviations pull with the force of those at it (Huber, 1964):
+# Residuals beyond so many standard deviations have the influence of those at it (Huber, 1964):
 # costs normal noise 0.1 % of its information.
 _HUBER = 3.0
 _LARGEST_DAMPING = 1e4
-# Squared standard errors from the bottom that a fit may stop at.
+# Squared standard errors from the minimum that a fit may stop at.
 _NEAR = 0.1
 
 
@@ -23,10 +23,10 @@ class Misfit(NamedTuple):
         Derivatives of the residual with respect to the parameters.
     slope : torch.Tensor, shape (2, ..., z, y)
         Change of the residual per metre (per m/s) that the model's flow is off along y, z.
-    seen : torch.Tensor of bool
+    valid : torch.Tensor of bool
         Which residuals exist.
     variance : torch.Tensor
-        Of the noise, as it tells on the parameters.
+        Of the noise, as it acts on the parameters.
     scatter : torch.Tensor
         Of the noise, as it shows in a residual (less than `variance` after a filter).
     """
@@ -34,13 +34,13 @@ class Misfit(NamedTuple):
     residual: torch.Tensor
     jacobian: torch.Tensor
     slope: torch.Tensor
-    seen: torch.Tensor
+    valid: torch.Tensor
     variance: torch.Tensor
     scatter: torch.Tensor
 
 
 class Solution(NamedTuple):
-    """Where a fit came to: parameters (p,), the misfit there, its weights, sum of w J J^T."""
+    """Result of a fit: parameters (p,), the misfit there, its weights, sum of w J J^T."""
 
     parameters: torch.Tensor
     misfit: Misfit
@@ -51,10 +51,10 @@ class Solution(NamedTuple):
 
 
 def weights(misfit: Misfit, flow_variance: float) -> torch.Tensor:
-    """1 / variance of noise and flow error together, less for outliers; 0 where nothing is seen."""
+    """1 / variance of noise and flow error together, less for outliers; 0 where there is no residual."""
     moved = flow_variance * misfit.slope.square().sum(0)
     size = misfit.residual.abs() / (misfit.scatter + moved).sqrt()
-    return misfit.seen * (_HUBER / size.clamp(min=_HUBER)) / (misfit.variance + moved)
+    return misfit.valid * (_HUBER / size.clamp(min=_HUBER)) / (misfit.variance + moved)
 
 
 def fit(
@@ -76,7 +76,7 @@ def fit(
     allowed : callable
         (parameters, step) -> whether such a step may be tried.
     flow_variance : float
-        Of what the model's flow is off in each component; adds to the noise through `slope`.
+        Of the model flow's error in each component; adds to the noise through `slope`.
     iterations : int
         At most.
     tolerance : float
@@ -93,16 +93,16 @@ def fit(
                 tried = evaluate(parameters + step)
                 if float(step @ normal @ step) < tolerance and damping < 1:
                     return _solution(parameters + step, tried, flow_variance, True)
-                both = misfit.seen & tried.seen
+                both = misfit.valid & tried.valid
                 before, after = (
                     float((weight * m.residual.square())[both].sum()) for m in (misfit, tried)
                 )
-                # derivatives are approximate: what is no worse to the eye of the noise will do
+                # derivatives are approximate: a cost that rises by less than the noise is accepted
                 if after <= before + tolerance and bool(both.any()):
                     break
             damping = 8 * max(damping, 1e-4)
             if damping > _LARGEST_DAMPING:
-                # no way down: at the bottom if the way would have been short
+                # no step lowers the cost: converged if the step would have been short
                 step = _step(normal, force, 1e-6)
                 near = step is not None and float(step @ normal @ step) < _NEAR
                 return _solution(parameters, misfit, flow_variance, near)
@@ -132,6 +132,6 @@ def _step(normal, force, damping: float) -> torch.Tensor | None:
 def _solution(parameters, misfit: Misfit, flow_variance: float, converged: bool) -> Solution:
     weight = weights(misfit, flow_variance)
     normal, _ = _normal(misfit, weight)
-    number = max(1, int(misfit.seen.sum()))
+    number = max(1, int(misfit.valid.sum()))
     cost = float((weight * misfit.residual.square()).sum()) / number
     return Solution(parameters, misfit, weight, normal, cost, converged)

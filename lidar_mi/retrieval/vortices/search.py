@@ -8,22 +8,22 @@ from typing import NamedTuple
 
 import torch
 
-from lidar_mi.retrieval.vortices.model import Profile, turning, wind
+from lidar_mi.retrieval.vortices.model import Profile, angular_velocity, wind
 
-# Places tried for each vortex, and core radii as shares of the shorter side of the region.
+# Places tried for each vortex, and core radii as fractions of the shorter side of the region.
 _PLACES = 700
 _RADII = (0.03, 0.08)
 
 
 class Observations(NamedTuple):
-    """Components of the wind seen at places: value = along . wind + noise, tensors of shape (n,).
+    """Components of the wind observed at places: value = along . wind + noise, tensors of shape (n,).
 
     Attributes
     ----------
     y, z : torch.Tensor
         m.
     along : torch.Tensor, shape (2, n)
-        The component seen, times whatever makes it the value's unit.
+        The component observed, times whatever makes it the value's unit.
     value : torch.Tensor
     weight : torch.Tensor
         1 / variance, up to a factor.
@@ -36,32 +36,32 @@ class Observations(NamedTuple):
     weight: torch.Tensor
 
 
-def starting_points(seen: Observations, count: int, profile: Profile) -> torch.Tensor:
-    """Parameters (up to `count`, 10) of pairs that explain most of what is seen, best first.
+def starting_points(observed: Observations, count: int, profile: Profile) -> torch.Tensor:
+    """Parameters (up to `count`, 10) of pairs that explain most of the observations, best first.
 
-    Vortices turn in opposite directions and are at least three core radii apart. Of each
+    Vortices rotate in opposite directions and are at least three core radii apart. Of each
     neighbourhood only the best pair is taken.
     """
-    low, high = torch.stack([seen.y, seen.z]).aminmax(dim=1)
+    low, high = torch.stack([observed.y, observed.z]).aminmax(dim=1)
     sides = (high - low).tolist()
     step = (sides[0] * sides[1] / _PLACES) ** 0.5
     axes = [
-        torch.linspace(float(a), float(b), max(2, round(side / step))).to(seen.y)
+        torch.linspace(float(a), float(b), max(2, round(side / step))).to(observed.y)
         for a, b, side in zip(low, high, sides)
     ]
     place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
     apart = torch.cdist(place, place)
-    root = seen.weight.sqrt()
-    plain = torch.linalg.qr((seen.along * root).T)[0]
+    root = observed.weight.sqrt()
+    plain = torch.linalg.qr((observed.along * root).T)[0]
 
     def without_mean_wind(values):
         return values - plain @ (plain.T @ values)
 
-    value = without_mean_wind(seen.value * root)
+    value = without_mean_wind(observed.value * root)
     found = []
-    for share in _RADII:
-        radius = share * min(sides)
-        columns = without_mean_wind(_swirls(seen, root, place, radius, profile))
+    for fraction in _RADII:
+        radius = fraction * min(sides)
+        columns = without_mean_wind(_swirls(observed, root, place, radius, profile))
         normal, wanted = columns.T @ columns, columns.T @ value
         gain, first, second = _explained(normal, wanted)
         gain = torch.where((first > 0) & (second < 0) & (apart > 3 * radius), gain, 0.0)
@@ -76,17 +76,17 @@ def starting_points(seen: Observations, count: int, profile: Profile) -> torch.T
             found.append((float(gain[p, q]), torch.cat([*vortices, value.new_zeros(2)])))
     found.sort(key=lambda pair: -pair[0])
     return (
-        torch.stack([_with_mean_wind(theta, seen, root, profile) for _, theta in found[:count]])
+        torch.stack([_with_mean_wind(theta, observed, root, profile) for _, theta in found[:count]])
         if found
         else value.new_empty(0, 10)
     )
 
 
-def _swirls(seen: Observations, root, place, radius: float, profile: Profile) -> torch.Tensor:
-    """What is seen of vortices of unit circulation at each place, (n, places)."""
-    dy, dz = (seen[axis][:, None] - place[:, axis] for axis in (0, 1))
-    value, _ = turning((dy**2 + dz**2) / radius**2, profile)
-    across = seen.along[1][:, None] * dy - seen.along[0][:, None] * dz
+def _swirls(observed: Observations, root, place, radius: float, profile: Profile) -> torch.Tensor:
+    """Weighted observations that vortices of unit circulation at each place make, (n, places)."""
+    dy, dz = (observed[axis][:, None] - place[:, axis] for axis in (0, 1))
+    value, _ = angular_velocity((dy**2 + dz**2) / radius**2, profile)
+    across = observed.along[1][:, None] * dy - observed.along[0][:, None] * dz
     return root[:, None] * across * value / (2 * torch.pi * radius**2)
 
 
@@ -110,8 +110,8 @@ def _peaks(gain, apart, count: int, distance: float):
         gain = gain.masked_fill((apart[p] < distance)[:, None] & (apart[q] < distance), 0.0)
 
 
-def _with_mean_wind(theta, seen: Observations, root, profile: Profile) -> torch.Tensor:
+def _with_mean_wind(theta, observed: Observations, root, profile: Profile) -> torch.Tensor:
     """The parameters with the mean wind that fits the rest best."""
-    left = seen.value - (seen.along * wind(theta, seen.y, seen.z, profile)).sum(0)
-    mean = torch.linalg.lstsq((seen.along * root).T, (left * root)[:, None]).solution[:, 0]
+    left = observed.value - (observed.along * wind(theta, observed.y, observed.z, profile)).sum(0)
+    mean = torch.linalg.lstsq((observed.along * root).T, (left * root)[:, None]).solution[:, 0]
     return torch.cat([theta[:8], mean])

@@ -1,0 +1,80 @@
+"""Limits of the steps of a fit of a pair, and the conditions on which its result is accepted."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.vortices.covariance import far_from_minimum
+from lidar_mi.retrieval.vortices.model import PROFILES, Profile
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.retrieval.vortices.robust_fit import Solution
+
+# How many starting points are followed.
+STARTS = 3
+# A fit has converged when its steps get smaller than so many standard errors, squared.
+TOLERANCE = 0.03
+
+# A fit is refused below these: circulation over its standard error, correlation of the images.
+_SIGNIFICANCE = 5.0
+_MATCH = 0.5
+
+
+def step_limits(y: np.ndarray, z: np.ndarray) -> Callable[[torch.Tensor, torch.Tensor], bool]:
+    """Steps that stay near and keep core radii between a cell and the region."""
+    sides = float(y[-1] - y[0]), float(z[-1] - z[0])
+    cell = max(sides[0] / (len(y) - 1), sides[1] / (len(z) - 1))
+    smallest, largest = np.log(cell / 2), np.log(min(sides) / 2)
+
+    def allowed(parameters: torch.Tensor, step: torch.Tensor) -> bool:
+        radii = (parameters + step)[[1, 5]]
+        near = step[[2, 3, 6, 7]].abs().max() <= 0.15 * min(sides)
+        return bool(
+            near
+            and step[[1, 5]].abs().max() <= 1
+            and radii.min() >= smallest
+            and radii.max() <= largest
+        )
+
+    return allowed
+
+
+def no_fit(profile: Profile, reason: str) -> VortexPairFit:
+    """A failed fit without numbers."""
+    nothing = np.full(10, np.nan)
+    return VortexPairFit(
+        nothing, np.full((10, 10), np.nan), profile, np.nan, np.nan, np.nan, np.nan, (reason,)
+    )
+
+
+def checked_fit(
+    found: Solution, covariance, profile, chi2, match, error, length, z, y
+) -> VortexPairFit:
+    """The fit, with the reasons for which it is not to be trusted."""
+    theta = found.parameters[:10].cpu().numpy()
+    reasons = []
+    if not found.converged and far_from_minimum(found, covariance):
+        reasons.append("did not converge")
+    if not match >= _MATCH:
+        reasons.append(f"correlation {match:.2f}; expected at least {_MATCH:g}")
+    if not (np.isfinite(covariance).all() and (np.diagonal(covariance) > 0).all()):
+        reasons.append("some parameters are undetermined")
+    spread = np.sqrt(np.clip(np.diagonal(covariance), 0, None))
+    for side, first in (("port", 0), ("starboard", 4)):
+        circulation, _, at_y, at_z = theta[first : first + 4]
+        sign = 1 if side == "port" else -1
+        if not sign * circulation > _SIGNIFICANCE * spread[first]:
+            reasons.append(
+                f"{side} circulation {circulation:.0f} +- {spread[first]:.0f} m2/s is not significant "
+                f"(below {_SIGNIFICANCE:g} standard errors)"
+            )
+        if not (y[0] <= at_y <= y[-1] and z[0] <= at_z <= z[-1]):
+            reasons.append(f"{side} vortex at ({at_y:.1f}, {at_z:.1f}) m is outside")
+    return VortexPairFit(theta, covariance, profile, chi2, match, error, length, tuple(reasons))
+
+
+def check_profile(profile) -> None:
+    """Raises InputError for an unknown profile."""
+    if profile not in PROFILES:
+        raise InputError(f"profile: {profile!r} is not one of {', '.join(PROFILES)}")

@@ -1,0 +1,93 @@
+"""Covariance of fitted parameters: noise, the flow's departure from the model, steps not taken."""
+
+import numpy as np
+import torch
+
+from lidar_mi.retrieval.vortices.flow_error import FlowError, flow_error, spread_of
+from lidar_mi.retrieval.vortices.robust_fit import Solution
+
+
+def flow_error_of(found: Solution, shortest: float) -> FlowError:
+    """Departure of the flow from the model, from the residuals of a fit; see `flow_error`."""
+    misfit = found.misfit
+    residual, slope, weight = misfit.residual, misfit.slope, found.weight
+    if residual.ndim == 2:
+        residual, slope, weight = residual[None], slope[:, None], weight[None]
+    force = (slope * weight * residual).sum(1)
+    stiffness = torch.stack(
+        [(weight * slope[a] * slope[b]).sum(0) for a, b in ((0, 0), (0, 1), (1, 1))]
+    )
+    return flow_error(force, stiffness, shortest)
+
+
+def parameter_covariance(found: Solution, error: FlowError, excess: float) -> np.ndarray:
+    """Covariance (10, 10): H^-1 M H^-1 with the noise's and the flow error's spread M of the force."""
+    misfit, weight = found.misfit, found.weight
+    spread = _noise_spread(found, error) * excess
+    jacobian, slope = misfit.jacobian, misfit.slope
+    if weight.ndim == 2:
+        weight, jacobian, slope = weight[None], jacobian[:, None], slope[:, None]
+    responses = torch.einsum("ozy,pozy,aozy->pazy", weight, jacobian, slope)
+    spread = spread + spread_of(responses, error)
+    scale = found.normal.diagonal().sqrt()
+    inverse = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
+    inverse = inverse / scale / scale[:, None]
+    covariance = (inverse @ spread @ inverse)[:10, :10]
+    attenuation = _attenuation(found)
+    covariance = covariance + torch.outer(attenuation, attenuation)
+    if not found.converged:
+        left = _remaining_step(found)
+        covariance = covariance + torch.outer(left, left)
+    return covariance.cpu().numpy()
+
+
+def _noise_spread(found: Solution, error: FlowError) -> torch.Tensor:
+    """Covariance of the force that noise makes: by the stated noise or, if larger, by the residuals.
+
+    By the residuals, each stands for its own variance (White 1980, Econometrica 48, 817), whatever
+    pixels are noisier than stated.
+    """
+    misfit, weight = found.misfit, found.weight
+    columns = misfit.jacobian.flatten(1)
+    moved = error.variance * misfit.slope.square().sum(0)
+    ratio = (misfit.residual.square() / (misfit.scatter + moved)).where(misfit.valid, 0.0)
+    stated, observed = (
+        (columns * (weight**2 * part).flatten()) @ columns.T
+        for part in (misfit.variance, misfit.variance * ratio)
+    )
+    scale = found.normal.diagonal()
+    excess = float((observed.diagonal() / scale).sum() / (stated.diagonal() / scale).sum())
+    return observed if excess > 1 else stated
+
+
+def _remaining_step(found: Solution) -> torch.Tensor:
+    """The step (10,) that a fit would still take, where noise in the interpolation stopped it."""
+    misfit, weight = found.misfit, found.weight
+    force = -misfit.jacobian.flatten(1) @ (weight * misfit.residual).flatten()
+    scale = found.normal.diagonal().sqrt()
+    scaled = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
+    return (scaled @ (force / scale) / scale)[:10]
+
+
+def far_from_minimum(found: Solution, covariance: np.ndarray) -> bool:
+    """Whether the step left is more than a standard error of any parameter, itself apart."""
+    left = _remaining_step(found).cpu().numpy() ** 2
+    return not (left < np.diagonal(covariance) - left).all()
+
+
+def _attenuation(found: Solution) -> torch.Tensor:
+    """How far the circulations may be biased towards zero, as an error of all parameters (10,).
+
+    Structure that has been wound up for long lies along the flow: the images change little, and
+    what remains unexplained may as well be the model's error. Regressing the other way round
+    (errors in the model, not in the change) would make both circulations larger by the unexplained
+    fraction of the change: this is the error stated.
+    """
+    misfit, theta = found.misfit, found.parameters
+    explained = theta[0] * misfit.jacobian[0] + theta[4] * misfit.jacobian[4]
+    left = float((found.weight * (misfit.residual.square() - misfit.scatter))[misfit.valid].sum())
+    power = float((found.weight * explained.square())[misfit.valid].sum())
+    fraction = max(0.0, left / power) if power > 0 else 0.0
+    attenuation = torch.zeros_like(theta[:10])
+    attenuation[0], attenuation[4] = fraction * theta[0], fraction * theta[4]
+    return attenuation

@@ -1,0 +1,224 @@
+"""A pair of vortices in a mean wind: parameters, covariance, derived quantities, wind anywhere."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi.atmosphere.vortex import Vortex
+from lidar_mi.retrieval.quantity import Quantity
+from lidar_mi.retrieval.vortices.model import Profile, angular_velocity, drift, sensitivity, wind
+
+
+@dataclass(frozen=True, eq=False)
+class VortexPairFit:
+    """Two vortices in a mean wind, at mid-time.
+
+    Attributes
+    ----------
+    parameters : ndarray, shape (10,)
+        In the order of `lidar_mi.retrieval.vortices.model.PARAMETERS`; NaN where there is no fit at all. Port is the
+        vortex that rotates from +y towards +z (circulation > 0).
+    covariance : ndarray, shape (10, 10)
+        Of the parameters: from the noise and from the flow's departure from the model.
+    profile : {"lamb_oseen", "burnham_hallock"}
+        To which circulation and core radius belong: the same data give different radii.
+    chi2 : float
+        Mean square of the residuals over that of the noise; 1 where the model is all there is.
+        NaN where no noise is known.
+    correlation : float
+        Of image 1 and image 2, each advected to mid-time by the fit; of fits to vectors the fraction
+        of their variance that is explained.
+    flow_error : float
+        Rms of each component of the wind that the model misses, m s^-1, estimated from the
+        residuals.
+    flow_error_length : float
+        Over which it correlates, m.
+    success : bool
+    reasons : tuple of str
+        Why not.
+    """
+
+    parameters: np.ndarray
+    covariance: np.ndarray
+    profile: Profile
+    chi2: float
+    correlation: float
+    flow_error: float
+    flow_error_length: float
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def success(self) -> bool:
+        return not self.reasons
+
+    @property
+    def port(self) -> Vortex:
+        return self._vortex(0)
+
+    @property
+    def starboard(self) -> Vortex:
+        return self._vortex(4)
+
+    @property
+    def mean_wind(self) -> tuple[float, float]:
+        """v and w of the air the pair is in, m s^-1."""
+        return float(self.parameters[8]), float(self.parameters[9])
+
+    def _vortex(self, first: int) -> Vortex:
+        circulation, log_radius, y, z = self.parameters[first : first + 4]
+        return Vortex(
+            float(circulation), float(np.exp(log_radius)), float(y), float(z), self.profile
+        )
+
+    @cached_property
+    def quantities(self) -> Mapping[str, Quantity]:
+        """Derived quantities of the pair, with standard errors to first order.
+
+        circulation (Gamma, far from the core) and circulation_5_15 (Gamma of the single vortex,
+        mean over radii from 5 to 15 m), core_radius (of the largest swirl), y, z of port and
+        starboard; separation b_0, centre_y, centre_z, descent_speed w_0 = Gamma/(2 pi b_0) with
+        the mean circulation, time_scale t_0 = b_0/w_0; mean_v, mean_w; drift_v and drift_w, the
+        velocity of the pair, which the mean wind and its own make together.
+        """
+        theta = torch.as_tensor(self.parameters)
+
+        def derived(theta):
+            return torch.stack(list(_derived(theta, self.profile).values()))
+
+        values = _derived(theta, self.profile)
+        slope = torch.autograd.functional.jacobian(derived, theta).numpy()
+        spread = np.sqrt(np.einsum("ij,jk,ik->i", slope, self.covariance, slope))
+        return {
+            name: Quantity(float(value), float(error), *MEANING[name])
+            for (name, value), error in zip(values.items(), spread)
+        }
+
+    def after(self, seconds: float) -> "VortexPairFit":
+        """The pair as it drifts on, with the errors that grow on the way.
+
+        The vortices keep their circulation, core radius and distance: good for a fraction of the
+        time in which the pair descends by its separation.
+        """
+
+        def moved(theta):
+            return theta + seconds * drift(theta, self.profile) @ _CENTRES.to(theta)
+
+        theta = torch.as_tensor(self.parameters)
+        slope = torch.autograd.functional.jacobian(moved, theta).numpy()
+        covariance = slope @ self.covariance @ slope.T
+        return replace(self, parameters=moved(theta).numpy(), covariance=covariance)
+
+    def wind(self, y, z) -> xr.Dataset:
+        """The wind of the fit anywhere, at mid-time; `after` gives that of a later one.
+
+        Parameters
+        ----------
+        y, z : array_like
+            m; they broadcast. One-dimensional DataArrays or arrays of the same shape give values
+            place by place; use ``y[None, :]`` and ``z[:, None]`` for a grid.
+
+        Returns
+        -------
+        Dataset
+            `v`, `w`, `v_stderr`, `w_stderr` (m s^-1) and `vw_correlation`, dims (row, column) or as
+            the arrays have. The errors hold those of the parameters and the flow's error.
+        """
+        y, z = np.broadcast_arrays(np.asarray(y, dtype=float), np.asarray(z, dtype=float))
+        values, covariance = self.wind_and_covariance(y, z)
+        stderr = np.sqrt(covariance[:2])
+        both = stderr[0] * stderr[1]
+        dims = [f"dim_{k}" for k in range(y.ndim)]
+        fields = {
+            "v": values[0],
+            "w": values[1],
+            "v_stderr": stderr[0],
+            "w_stderr": stderr[1],
+            "vw_correlation": np.divide(
+                covariance[2], both, out=np.zeros_like(both), where=both > 0
+            ),
+        }
+        return xr.Dataset(
+            {
+                name: (dims, field, {"units": "1" if "correlation" in name else "m s-1"})
+                for name, field in fields.items()
+            },
+            coords={"y": (dims, y, {"units": "m"}), "z": (dims, z, {"units": "m"})},
+        )
+
+    def wind_and_covariance(self, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """v, w (2, ...) at places and their covariance vv, ww, vw (3, ...)."""
+        y, z = np.broadcast_arrays(y, z)
+        theta = torch.as_tensor(self.parameters)
+        places = [torch.as_tensor(np.array(axis, dtype=float)) for axis in (y, z)]
+        unit = torch.eye(2, dtype=theta.dtype)
+        slope = [
+            sensitivity(theta, *places, direction.view(2, *[1] * places[0].ndim), self.profile)
+            for direction in unit
+        ]
+        covariance = torch.as_tensor(self.covariance)
+        v, w = (torch.tensordot(covariance, part, 1) for part in slope)
+        own = self.flow_error**2
+        spread = torch.stack(
+            [(v * slope[0]).sum(0) + own, (w * slope[1]).sum(0) + own, (v * slope[1]).sum(0)]
+        )
+        return wind(theta, *places, self.profile).numpy(), spread.numpy()
+
+
+# What a drift along y and along z adds to the parameters.
+_CENTRES = torch.zeros(2, 10)
+
+_CENTRES[0, [2, 6]] = _CENTRES[1, [3, 7]] = 1.0
+
+MEANING = {
+    f"{side}_{name}": (units, f"{text} of the {side} vortex")
+    for side in ("port", "starboard")
+    for name, units, text in (
+        ("circulation", "m2 s-1", "circulation"),
+        ("circulation_5_15", "m2 s-1", "circulation, mean over radii from 5 to 15 m,"),
+        ("core_radius", "m", "radius of the largest swirl"),
+        ("y", "m", "y of the centre"),
+        ("z", "m", "z of the centre"),
+    )
+} | {
+    "separation": ("m", "distance of the vortices, b0"),
+    "centre_y": ("m", "y half way between the vortices"),
+    "centre_z": ("m", "z half way between the vortices"),
+    "descent_speed": ("m s-1", "descent speed of the pair, w0 = Gamma / (2 pi b0)"),
+    "time_scale": ("s", "time in which the pair descends by its separation, t0 = b0 / w0"),
+    "mean_v": ("m s-1", "mean wind along y"),
+    "mean_w": ("m s-1", "mean wind along z"),
+    "drift_v": ("m s-1", "velocity of the pair along y, mean wind included"),
+    "drift_w": ("m s-1", "velocity of the pair along z, mean wind included"),
+}
+"""Units and long name of every quantity of a pair."""
+
+
+def circulation_5_15(circulation, core_radius, profile: Profile = "lamb_oseen"):
+    """Circulation of a vortex averaged over radii from 5 to 15 m, as lidars report it, m^2 s^-1."""
+    circulation = torch.as_tensor(circulation, dtype=torch.float64)
+    core_radius = torch.as_tensor(core_radius, dtype=torch.float64)
+    radius = torch.linspace(5, 15, 101, dtype=torch.float64)
+    s = (radius / core_radius) ** 2
+    return circulation * torch.trapezoid(angular_velocity(s, profile)[0] * s, radius) / 10
+
+
+def _derived(theta: torch.Tensor, profile: Profile) -> dict[str, torch.Tensor]:
+    values = {}
+    for side, first in (("port", 0), ("starboard", 4)):
+        circulation, radius = theta[first], theta[first + 1].exp()
+        values[f"{side}_circulation"] = circulation
+        values[f"{side}_circulation_5_15"] = circulation_5_15(circulation, radius, profile)
+        values[f"{side}_core_radius"] = radius
+        values[f"{side}_y"], values[f"{side}_z"] = theta[first + 2], theta[first + 3]
+    separation = torch.hypot(theta[2] - theta[6], theta[3] - theta[7])
+    speed = (theta[0] - theta[4]) / 2 / (2 * torch.pi * separation)
+    values["separation"] = separation
+    values["centre_y"], values["centre_z"] = (theta[2] + theta[6]) / 2, (theta[3] + theta[7]) / 2
+    values["descent_speed"], values["time_scale"] = speed, separation / speed
+    values["mean_v"], values["mean_w"] = theta[8], theta[9]
+    values["drift_v"], values["drift_w"] = drift(theta, profile)
+    return values

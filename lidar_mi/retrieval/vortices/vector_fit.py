@@ -1,0 +1,162 @@
+"""A pair of wake vortices from retrieved wind vectors."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.vortices.acceptance import (
+    STARTS,
+    TOLERANCE,
+    check_profile,
+    checked_fit,
+    no_fit,
+    step_limits,
+)
+from lidar_mi.retrieval.vortices.covariance import flow_error_of, parameter_covariance
+from lidar_mi.retrieval.vortices.flow_error import mean_length
+from lidar_mi.retrieval.vortices.model import Profile, sensitivity, wind
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.retrieval.vortices.robust_fit import Misfit, fit
+from lidar_mi.retrieval.vortices.search import Observations, starting_points
+
+
+@dataclass(frozen=True)
+class _Vectors:
+    """Wind vectors on a grid, whitened by their covariance; call with parameters for the misfit."""
+
+    y: torch.Tensor
+    z: torch.Tensor
+    root: torch.Tensor
+    """Inverse of the covariance's Cholesky factor, (2, 2, z, y)."""
+    value: torch.Tensor
+    valid: torch.Tensor
+    profile: Profile
+
+    def __call__(self, parameters: torch.Tensor) -> Misfit:
+        off = self.value - wind(parameters, self.y, self.z, self.profile)
+        residual = (self.root * off).sum(1)
+        jacobian = torch.stack(
+            [-sensitivity(parameters, self.y, self.z, along, self.profile) for along in self.root],
+            1,
+        )
+        one = torch.ones_like(residual)
+        valid = self.valid.expand_as(residual)
+        return Misfit(residual, jacobian, -self.root.transpose(0, 1), valid, one, one)
+
+
+def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -> VortexPairFit:
+    """Two vortices and a mean wind that explain retrieved vectors.
+
+    Parameters
+    ----------
+    vectors : Dataset, dims (z, y)
+        As `lidar_mi.retrieval.velocimetry.wind.retrieve_wind` gives it: v, w, and where there are any
+        v_stderr, w_stderr, vw_correlation, flag, y_vector, z_vector. Vectors with a flag or without
+        a number are left out. Without standard errors all count alike, with the error that
+        their residuals show.
+    profile : {"lamb_oseen", "burnham_hallock"}
+
+    Returns
+    -------
+    VortexPairFit
+        Errors correlated between neighbouring vectors show in the residuals and count as the
+        flow's.
+
+    Raises
+    ------
+    InputError
+        Variables missing, or fewer than 20 vectors.
+    """
+    check_profile(profile)
+    for name in ("v", "w"):
+        if name not in vectors:
+            raise InputError(f"vectors.{name}: missing; expected v and w on (z, y)")
+    vectors = vectors.transpose("z", "y")
+
+    def field(name, default=None):
+        if name not in vectors and name not in vectors.coords:
+            return default
+        return np.broadcast_to(vectors[name].values.astype(float), vectors["v"].shape)
+
+    z, y = (vectors[name].values.astype(float) for name in ("z", "y"))
+    vertical, lateral = np.meshgrid(z, y, indexing="ij")
+    value = np.stack([field("v"), field("w")])
+    place = np.stack([field("y_vector", lateral), field("z_vector", vertical)])
+    good = np.isfinite(value).all(0) & np.isfinite(place).all(0)
+    good &= field("flag", np.zeros(good.shape)) == 0
+    stderr = [field(name, np.full(good.shape, np.nan)) for name in ("v_stderr", "w_stderr")]
+    stderr = np.stack(stderr)
+    known = bool(np.isfinite(stderr[:, good]).any())
+    if known:
+        good &= (np.isfinite(stderr) & (stderr > 0)).all(0)
+    if int(good.sum()) < 20:
+        raise InputError(f"vectors: {int(good.sum())} are good; expected at least 20")
+    stderr = np.where(good, stderr if known else 1.0, 1.0)
+    shared = np.nan_to_num(field("vw_correlation", np.zeros(good.shape))) * good
+    shared = shared.clip(-0.999, 0.999) if known else 0 * shared
+    root = np.zeros((2, 2, *good.shape))
+    root[0, 0] = 1 / stderr[0]
+    root[1, 0] = -shared / np.sqrt(1 - shared**2) / stderr[0]
+    root[1, 1] = 1 / np.sqrt(1 - shared**2) / stderr[1]
+
+    tensors = [torch.as_tensor(np.where(good, a, 0.0)) for a in (*place, value)]
+    valid = torch.as_tensor(good)
+    model = _Vectors(*tensors[:2], torch.as_tensor(root), tensors[2], valid, profile)
+    limits = step_limits(y, z)
+    flow_variance = float(np.square(value[:, good]).mean()) / 4
+    best = None
+    for start in starting_points(_components(model, flow_variance), STARTS, profile):
+        found = fit(model, start, limits, flow_variance, 30, TOLERANCE)
+        if best is None or found.cost < best.cost:
+            best = found
+    if best is None:
+        return no_fit(profile, "no vortex signature")
+    if not known:
+        off = best.misfit.residual[:, valid]
+        spread = float(1.4826 * (off - off.median()).abs().median())
+        if spread > 0:
+            model = _Vectors(
+                *tensors[:2], torch.as_tensor(root) / spread, tensors[2], valid, profile
+            )
+    for _ in range(3):
+        error = flow_error_of(best, 1.0)
+        best = fit(model, best.parameters, limits, error.variance, 12, TOLERANCE)
+    error = flow_error_of(best, 1.0)
+    covariance = parameter_covariance(best, error, 1.0)
+    chi2 = float(best.misfit.residual[:, valid].square().mean()) if known else np.nan
+    left = (tensors[2] - wind(best.parameters, *tensors[:2], profile))[:, valid]
+    varied = tensors[2][:, valid] - tensors[2][:, valid].mean(1, keepdim=True)
+    explained = 1 - float(left.square().sum() / varied.square().sum())
+    spacing = (float(np.diff(y).mean()) * float(np.diff(z).mean())) ** 0.5
+    return checked_fit(
+        best,
+        covariance,
+        profile,
+        chi2,
+        explained,
+        error.variance**0.5,
+        mean_length(error) * spacing,
+        z,
+        y,
+    )
+
+
+def _components(vectors: _Vectors, flow_variance: float) -> Observations:
+    """Vectors as single components, thinned to a few hundred places."""
+    step = max(1, round((float(vectors.valid.sum()) / 1000) ** 0.5))
+    part = (Ellipsis, slice(step // 2, None, step), slice(step // 2, None, step))
+    valid = vectors.valid[part]
+    root, value = vectors.root[part][..., valid], vectors.value[part][..., valid]
+    along = root.transpose(0, 1)
+    weight = 1 / (1 + flow_variance * along.square().sum(0))
+    y, z = (axis[part][valid] for axis in (vectors.y, vectors.z))
+    return Observations(
+        y.repeat(2),
+        z.repeat(2),
+        along.flatten(1),
+        (root * value).sum(1).flatten(),
+        weight.flatten(),
+    )

@@ -1,0 +1,84 @@
+"""The wind of a fitted pair at the windows of the local methods."""
+
+import numpy as np
+import torch
+
+from lidar_mi.retrieval.velocimetry.displacement import Displacement
+from lidar_mi.retrieval.velocimetry.quality import Flag, non_finite
+from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair
+from lidar_mi.retrieval.vortices.image_fit import fit_pixels
+
+
+def vortex_windows(
+    image1: torch.Tensor,
+    image2: torch.Tensor,
+    template: int = 8,
+    search: int = 16,
+    stride: int = 1,
+    *,
+    axes: tuple[np.ndarray, np.ndarray],
+    dt: float,
+    noise: float | torch.Tensor | None = None,
+) -> Displacement:
+    """The wind of a fitted pair at the windows' centres, as displacement in dt.
+
+    Parameters
+    ----------
+    image1, image2 : torch.Tensor, shape (z, y)
+    template, search, stride : int
+        Pixels; they say where vectors are wanted and nothing else.
+    axes : (array, array)
+        z and y of the pixels, m.
+    dt : float
+        s.
+    noise : float or torch.Tensor, optional
+        As `fit_vortices`.
+
+    Returns
+    -------
+    Displacement
+        With the pair's `quantities`. Without a fit that can be believed every vector has the flag
+        NO_MATCH, and no number where there is none.
+    """
+    image_pair(image1, image2)
+    windows = Windows(tuple(image1.shape), template, search, stride)
+    found = fit_pixels(image1, image2, *axes, dt, noise, "lamb_oseen")
+    centres = [
+        (axis[start := np.asarray(windows.starts(k))] + axis[start + template - 1]) / 2
+        for k, axis in enumerate(axes)
+    ]
+    values, covariance = found.wind_and_covariance(centres[1][None, :], centres[0][:, None])
+    pixel_z, pixel_y = (float(a[-1] - a[0]) / (len(a) - 1) / dt for a in axes)
+
+    def tensor(array):
+        return torch.as_tensor(np.ascontiguousarray(array), device=image1.device)
+
+    v, w = tensor(values)
+    variances = tensor(covariance)
+    flag = torch.zeros(windows.count, dtype=torch.uint8, device=image1.device)
+    flag[non_finite(image1, image2, windows)] |= Flag.NON_FINITE_INPUT.value
+    if not found.success:
+        flag |= Flag.NO_MATCH.value
+    if "an image is constant" in found.reasons:
+        flag |= Flag.LOW_TEXTURE.value
+    return Displacement(
+        w / pixel_z,
+        v / pixel_y,
+        torch.full_like(v, found.correlation),
+        flag,
+        torch.stack(
+            [
+                variances[1] / pixel_z**2,
+                variances[0] / pixel_y**2,
+                variances[2] / (pixel_y * pixel_z),
+            ]
+        ),
+        found.quantities,
+        {
+            "profile": found.profile,
+            "fit": "; ".join(found.reasons) or "good",
+            "chi2": found.chi2,
+            "flow_error": found.flow_error,
+            "flow_error_length": found.flow_error_length,
+        },
+    )
