@@ -16,7 +16,7 @@ _COPLANAR = 1e-8
 
 
 class LineFlag(enum.IntFlag):
-    """Why a vector is rejected, one bit a reason; 0 is a good vector."""
+    """Why a vector is rejected, one bit per reason; 0: valid."""
 
     COPLANAR = 1
     """The lines lie in one plane: they do not say how the wind blows across it. No vector."""
@@ -60,7 +60,7 @@ def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
 def solve_lines(
     directions: np.ndarray, along: np.ndarray, std: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Least squares for one wind seen along several lines, many times at once.
+    """Least squares for one wind measured along several lines, many times at once.
 
     Parameters
     ----------

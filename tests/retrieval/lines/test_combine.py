@@ -488,7 +488,8 @@ def test_lines_that_leave_the_images_or_have_no_velocity_are_not_used():
 def test_chunks_do_not_matter(monkeypatch):
     _, flow, scan = scene(np.random.default_rng(14))
     whole = combine(flow, scan)
-    monkeypatch.setattr("lidar_mi.retrieval.lines.combine._CHUNK_NUMBERS", 3e4)
+    for module in ("combine", "grid_lines"):
+        monkeypatch.setattr(f"lidar_mi.retrieval.lines.{module}.CHUNK_NUMBERS", 3e4)
     xr.testing.assert_allclose(combine(flow, scan), whole, rtol=1e-9)
 
 

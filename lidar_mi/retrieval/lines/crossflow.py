@@ -1,0 +1,98 @@
+"""Cross-flow wind of images, as it enters the combination of both lidars."""
+
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.checks import checked_image
+
+# Standard deviation of v and w about their mean where the images gave no vector, in standard
+# deviations of the valid ones: vectors are rejected where the wind varies most.
+_PRIOR_WITHOUT_IMAGE = 2.0
+
+
+class Crossflow(NamedTuple):
+    """v and w of the images on the grid, arrays (z, y, ...).
+
+    ``root`` is the Cholesky factor of the errors' covariance. Where a vector is not ``valid`` the
+    value is the mean of the valid ones, with the standard deviation ``prior_std`` (2,).
+    """
+
+    value: np.ndarray
+    root: np.ndarray
+    valid: np.ndarray
+    prior_std: np.ndarray
+
+
+def apparent_slopes(z: np.ndarray, y: np.ndarray, distance: float | None) -> np.ndarray:
+    """Motion in the images per m/s of u relative to the gates, with the sign reversed, (z, y, 2).
+
+    Oblique beams: air that moves along x by dx shifts by -(y, z) dx / distance in the images.
+    """
+    if distance is None:
+        return np.zeros((len(z), len(y), 2))
+    if not distance > 0:
+        raise InputError(f"distance: {distance} m is not allowed; expected more than 0 m")
+    return np.stack(np.meshgrid(y, z), -1) / distance
+
+
+def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
+    """v and w of a data set with the covariance of their errors; ``std`` (m/s) in place of its own.
+
+    Raises
+    ------
+    InputError
+        No valid vector, or an error that is not known.
+    """
+    for name in ("v", "w", "flag"):
+        if name not in wind:
+            raise InputError(f"crossflow.{name}: missing; expected v, w and flag on (z, y)")
+        checked_image(f"crossflow.{name}", wind[name])
+    value = np.stack([wind[n].transpose("z", "y").values.astype(float) for n in ("v", "w")], -1)
+    if std is not None:
+        if not std > 0:
+            raise InputError(f"crossflow_std: {std} m/s is not allowed; expected more than 0 m/s")
+        first = second = np.full(value.shape[:2], float(std))
+        correlation = np.zeros_like(first)
+    else:
+        names = ("v_stderr", "w_stderr", "vw_correlation")
+        if any(n not in wind or not np.isfinite(wind[n]).any() for n in names):
+            method = wind.attrs.get("method", "unknown")
+            raise InputError(
+                f"crossflow.v_stderr: not known by method {method!r}; give crossflow_std"
+            )
+        first, second, correlation = (
+            wind[n].transpose("z", "y").values.astype(float) for n in names
+        )
+    valid = (wind["flag"].transpose("z", "y").values == 0) & np.isfinite(value).all(-1)
+    valid &= (first > 0) & (second > 0) & (abs(correlation) < 1)
+    if not valid.any():
+        raise InputError("crossflow.flag: every vector is flagged; expected some valid ones")
+    root = np.zeros((*valid.shape, 2, 2))
+    root[..., 0, 0] = first
+    root[..., 1, 0] = correlation * second
+    root[..., 1, 1] = np.sqrt(1 - correlation**2) * second
+    root[~valid] = 0.0
+    mean, prior_std = value[valid].mean(0), _PRIOR_WITHOUT_IMAGE * value[valid].std(0)
+    return Crossflow(np.where(valid[..., None], value, mean), root, valid, prior_std)
+
+
+def window_size(crossflow: xr.Dataset) -> float:
+    """Size of the windows of a data set, m."""
+    try:
+        pixels = crossflow.attrs["template"] / crossflow.attrs["stride"]
+    except KeyError:
+        raise InputError(
+            "crossflow: attributes template and stride missing; give window in m"
+        ) from None
+    return float(pixels * np.diff(crossflow["y"].values.astype(float)).mean())
+
+
+def window_overlap(axis: np.ndarray, window: float) -> np.ndarray:
+    """Fraction by which windows on the nodes of an axis overlap, (n, n)."""
+    distance = abs(axis[:, None] - axis)
+    if window == 0:
+        return np.eye(len(axis))
+    return np.clip(1 - distance / window, 0, None)

@@ -1,0 +1,133 @@
+"""Statistics of the wind along x, weighted by the evidence of the lines of sight."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+from scipy import ndimage
+from scipy.linalg import cho_factor, cho_solve
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.lines.grid_lines import covariance_of_lines
+
+# Values of u's standard deviation, m/s, and number of lengths that the evidence is averaged over.
+_STDS = np.geomspace(0.05, 10, 16)
+_LENGTHS = 8
+
+# Powers of the cross-flow's shear that u's standard deviation may go with.
+_POWERS = (0.0, 0.5, 1.0)
+
+# Exponents of u's correlation: rough as turbulence, and smooth.
+_EXPONENTS = (1.0, 2.0)
+
+# Number of statistics drawn, each as often as it is probable.
+_DRAWN = 16
+
+
+class Statistics(NamedTuple):
+    """One set of statistics of u.
+
+    ``probability`` is its fraction of the evidence, ``factor`` the Cholesky factor of the
+    covariance S of the lines' velocities, ``misfit`` their mean squared normalised residual.
+    """
+
+    std: float
+    length: float
+    power: float
+    exponent: float
+    probability: float
+    factor: tuple
+    misfit: float
+
+
+def correlation(axis: np.ndarray, length: float, exponent: float) -> np.ndarray:
+    """exp(-(distance / length)^exponent) of the nodes of an axis, (n, n)."""
+    return np.exp(-((abs(axis[:, None] - axis) / length) ** exponent))
+
+
+def relative_std(field, lines, z, y, spacing, power) -> dict[float, np.ndarray]:
+    """Standard deviation of u at the nodes in units of u_std, (z, y), by the power of the shear."""
+    if power is not None and not power >= 0:
+        raise InputError(f"u_power: {power} is not allowed; expected >= 0")
+    square, known = np.zeros(field.valid.shape), np.zeros(field.valid.shape)
+    for axis, nodes in enumerate((z, y)):
+        step = np.diff(nodes).mean()
+        both = np.stack([np.roll(field.valid, shift, axis) for shift in (1, -1)]).all(0)
+        edge = np.arange(len(nodes))[[0, -1]]
+        both[(slice(None),) * axis + (edge,)] = False
+        change = np.roll(field.value, -1, axis) - np.roll(field.value, 1, axis)
+        square += np.where(both, ((change / (2 * step)) ** 2).sum(-1), 0)
+        known += both
+    # over the lines' spacing: finer variations of u are not observed
+    width = [spacing / np.diff(nodes).mean() for nodes in (z, y)]
+    square, known = (ndimage.gaussian_filter(a, width, mode="constant") for a in (square, known))
+    even = np.ones_like(square)
+    known_here = known > 1e-3
+    if not (square[known_here] > 0).any():
+        return {0.0: even} if power is None else {power: even}
+    shear = np.sqrt(square / np.where(known_here, known, 1))
+    shear = np.where(known_here, shear, shear[known_here].mean())
+    shear = np.maximum(shear, 1e-3 * shear.max())
+    found = {}
+    for one in _POWERS if power is None else (power,):
+        relative = shear**one
+        found[one] = relative / np.sqrt(
+            (relative[lines.z, lines.y] ** 2 * lines.weight).sum(1).mean()
+        )
+    return found
+
+
+def probable_statistics(
+    fixed, residual, lines, z, y, spacing, relative_stds, asked
+) -> tuple[list[Statistics], Statistics]:
+    """Statistics of u drawn by their probability, and those of largest evidence.
+
+    The prior is uniform in the standard deviation, which favours no small ones where lines are too
+    noisy to determine it (Gelman 2006, Bayesian Analysis 1, 515-533), and uniform in the logarithm
+    of the length. The evidence is the likelihood of the lines' velocities. Statistics are drawn at
+    even steps of the cumulative probability, so that each draw has the same weight.
+    """
+    std, length, exponent = asked
+    for name, value, unit in (("u_std", std, "m/s"), ("u_length", length, "m")):
+        if value is not None and not value > 0:
+            raise InputError(f"{name}: {value} {unit} is not allowed; expected more than 0 {unit}")
+    if exponent is not None and not 0 < exponent <= 2:
+        raise InputError(f"u_exponent: {exponent} is not allowed; expected more than 0, up to 2")
+    stds = _STDS if std is None else np.array([float(std)])
+    extent = spacing * np.sqrt(len(residual))
+    lengths = np.geomspace(spacing / 4, 2 * extent, _LENGTHS) if length is None else [length]
+    exponents = _EXPONENTS if exponent is None else (float(exponent),)
+    weight = np.stack([lines.forward * s[lines.z, lines.y] for s in relative_stds.values()], -1)
+    choices, shapes, evidence = [], [], []
+    for one_exponent, one_length in itertools.product(exponents, lengths):
+        correlations = [correlation(axis, one_length, one_exponent) for axis in (z, y)]
+        for power, shape in zip(relative_stds, covariance_of_lines(lines, weight, *correlations)):
+            for one_std in stds:
+                factor = cho_factor(fixed + one_std**2 * shape, lower=True)
+                square = float(residual @ cho_solve(factor, residual))
+                evidence.append(-np.log(np.diag(factor[0])).sum() - square / 2)
+                shapes.append(shape)
+                choices.append(
+                    Statistics(
+                        float(one_std),
+                        float(one_length),
+                        float(power),
+                        one_exponent,
+                        0.0,
+                        (),
+                        square / len(residual),
+                    )
+                )
+    # steps of the standard deviation grow with it
+    probability = np.exp(np.array(evidence) - max(evidence)) * [choice.std for choice in choices]
+    probability /= probability.sum()
+    steps = (np.arange(_DRAWN) + 0.5) / _DRAWN
+    drawn = np.searchsorted(np.cumsum(probability), steps).clip(max=len(choices) - 1)
+    found = [
+        choices[k]._replace(
+            probability=times / _DRAWN,
+            factor=cho_factor(fixed + choices[k].std ** 2 * shapes[k], lower=True),
+        )
+        for k, times in zip(*np.unique(drawn, return_counts=True))
+    ]
+    return found, choices[int(np.argmax(evidence))]
