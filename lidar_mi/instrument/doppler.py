@@ -9,14 +9,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lidar_mi.atmosphere.line import Line
 from lidar_mi.errors import InputError
-from lidar_mi.instrument.detector import (
-    gate_duration,
-    photons_per_energy,
-    spatial_modes,
-    temporal_modes,
-)
+from lidar_mi.instrument.detector import gate_duration, photons_per_energy
 from lidar_mi.instrument.etalon import Etalon, harmonics, series
 from lidar_mi.instrument.fringe_camera import FringeCamera
+from lidar_mi.instrument.speckle import spatial_modes, temporal_modes
 from lidar_mi.units import (
     Angle,
     Area,

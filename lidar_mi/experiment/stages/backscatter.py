@@ -18,10 +18,12 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.run_folder import IMAGES, Log, Notice
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import Flows, Truth, blur_by_beam, make_truth, read_flows
-from lidar_mi.instrument.detector import gate_duration, noise_budget, noisy_scan, speckle_modes
+from lidar_mi.instrument.detection import noise_budget, noisy_scan
+from lidar_mi.instrument.detector import gate_duration
 from lidar_mi.instrument.eye_safety import assess_pulses, scan_hazard_distance
 from lidar_mi.instrument.products import linear_depolarization, with_products
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
+from lidar_mi.instrument.speckle import speckle_modes
 from lidar_mi.io import exr
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.rendering.backscatter import extrude, render_scans

@@ -1,0 +1,282 @@
+"""Reading a detector: counted photoelectrons, their noise by cause, scans with noise.
+
+Counts are the charge collected in a gate, in units of one mean photoelectron: an analogue
+receiver, as the paper's light levels need (10^5 photoelectrons in 17 ns leave no single pulses to
+count). Saturation, dead time, afterpulses and the steps of a digitiser are left out.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+
+from lidar_mi.errors import InputError
+from lidar_mi.instrument.detector import (
+    Detector,
+    background_photoelectrons,
+    dark_counts,
+    efficiency,
+    gate_duration,
+    signal_photoelectrons,
+)
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.signal import apparent_backscatter
+from lidar_mi.instrument.speckle import speckle_modes
+
+
+class Detection(NamedTuple):
+    """One noisy reading: ``counts`` (photoelectrons), estimated ``s0`` and its ``s0_std``."""
+
+    counts: np.ndarray
+    s0: np.ndarray
+    s0_std: np.ndarray
+
+
+def noise_terms(
+    signal: np.ndarray,
+    background: np.ndarray,
+    dark: np.ndarray,
+    modes: float | np.ndarray,
+    detector: Detector,
+) -> dict[str, np.ndarray]:
+    """Variances of the counts by cause: shot, speckle, background, dark, readout.
+
+    Counts of partly coherent light are Poisson with a Gamma distributed mean, that is negative
+    binomial: variance n + n^2 / M (Mandel 1959; Goodman, Statistical Optics, section 9.2). Gain
+    noise multiplies the Poisson part by F, never the speckle's: the variance of a sum of N gains of
+    mean 1 is <N> (F - 1) + var N.
+
+    Parameters
+    ----------
+    signal, background, dark : array
+        Mean photoelectrons.
+    modes : array
+        Degrees of freedom of the signal's speckle; infinite: none.
+    """
+    factor = detector.excess_noise_factor
+    return {
+        "shot": factor * signal,
+        "speckle": signal**2 / modes,
+        "background": factor * background,
+        "dark": factor * dark,
+        "readout": np.asarray(detector.readout_noise**2),
+    }
+
+
+def noise_variance(
+    signal: np.ndarray,
+    background: np.ndarray,
+    dark: np.ndarray,
+    modes: float | np.ndarray,
+    detector: Detector,
+) -> np.ndarray:
+    """Variance of the counts, the sum of `noise_terms`."""
+    terms = noise_terms(signal, background, dark, modes, detector)
+    return np.asarray(sum(terms.values()))
+
+
+def detect(
+    s0: ArrayLike,
+    lidar: BackscatterLidar,
+    detector: Detector,
+    duration: ArrayLike,
+    distance: ArrayLike,
+    seed: int | Sequence[int],
+    polarization: ArrayLike = 1.0,
+) -> Detection:
+    """Read the detector once, every pixel with noise of its own.
+
+    The signal's mean is drawn from a Gamma distribution (speckle), photoelectrons of signal,
+    background and dark current together from a Poisson one, their summed gain from a Gamma one of
+    mean N and variance N (F - 1), and read-out noise is Gaussian. Known means of background and
+    dark counts are subtracted, so the estimate is unbiased and may be negative.
+
+    Parameters
+    ----------
+    s0 : array
+        Received energy over emitted pulse energy, without noise.
+    duration : array
+        Time in which the gate is recorded, s.
+    distance : array
+        Range of the gate, m.
+    seed : int or sequence of int
+        Images with independent noise need different ones.
+    polarization : array
+        Degree of polarisation of the received light, 0 to 1.
+
+    Returns
+    -------
+    Detection
+        All of one shape. ``s0_std`` is the exact standard deviation of ``s0`` for this mean; from
+        measured counts alone, `noise_variance` of the estimated signal is its estimate.
+
+    Raises
+    ------
+    InputError
+        S0 negative or not finite, light beyond 10^15 photoelectrons, duration, distance,
+        polarisation or seed out of range.
+    """
+    s0 = np.asarray(s0, float)
+    _check("S0", s0, s0 >= 0, "finite values, 0 or more")
+    for name, value in (("duration", duration), ("distance", distance)):
+        value = np.asarray(value, float)
+        _check(name, value, value > 0, "finite values above 0")
+    polarization = np.asarray(polarization, float)
+    within = (polarization >= 0) & (polarization <= 1)
+    _check("polarization", polarization, within, "0 to 1")
+    random = _generator(seed)
+    signal, background, dark, modes = _means(s0, lidar, detector, duration, distance, polarization)
+    if signal.size and (signal + background + dark).max() > 1e15:
+        raise InputError(
+            f"lidar.pulse_energy: {lidar.pulse_energy:g} J is not allowed; it gives up to "
+            f"{(signal + background + dark).max():g} photoelectrons a gate, expected 1e15 at most"
+        )
+    light = random.gamma(modes, signal / modes) if detector.speckle else signal
+    counts = np.asarray(random.poisson(light + background + dark), float)
+    spread = detector.excess_noise_factor - 1
+    if spread > 0:
+        counts = random.gamma(counts / spread, spread)
+    if detector.readout_noise > 0:
+        counts = counts + random.normal(0, detector.readout_noise, counts.shape)
+    sensitivity = signal_photoelectrons(1, lidar.pulse_energy, lidar.wavelength, detector)
+    variance = noise_variance(signal, background, dark, modes, detector)
+    return Detection(
+        counts, (counts - background - dark) / sensitivity, np.sqrt(variance) / sensitivity
+    )
+
+
+def noisy_scan(
+    scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector, seed: int | Sequence[int]
+) -> xr.Dataset:
+    """A scan with the detector's noise, in addition to the noise-free image.
+
+    Adds ``S0_noisy`` and ``S0_noise_std`` (gate, z, y), ``Y_noisy`` and ``Y_noise_std`` (z, y), the
+    attenuated backscatter of the first gate; and the detector as attributes ``detector_...``. The
+    rendered image's Monte Carlo error (``S0_stderr``) comes on top of ``S0_noise_std``. Speckle
+    of gates, pixels and scans is independent (the air moves by more than a wavelength from scan
+    to scan; between gates that holds for lines wider than 1 / gate duration).
+
+    Parameters
+    ----------
+    scan : xr.Dataset
+        As rendered or read from EXR.
+    seed : int or sequence of int
+        Different ones for the scans of a pair.
+
+    Raises
+    ------
+    InputError
+        The scan does not state its gates; see `detect` for the rest.
+    """
+    plan = _plan(scan)
+    scan = scan.transpose("gate", "z", "y", ...)
+    s0 = scan["S0"].values
+    ranges = np.broadcast_to(plan.ranges(), s0.shape)
+    duration = np.broadcast_to(gate_duration(plan.gate_length()), s0.shape)
+    counted = detect(s0, lidar, detector, duration, ranges, seed, _polarization(scan))
+    scene = (plan, lidar.aperture_area, scan.attrs["environment_extinction"])
+    y, y_std = (apparent_backscatter(x, *scene)[0] for x in (counted.s0, counted.s0_std))
+    image, pixel = ("gate", "z", "y"), ("z", "y")
+    noise = {
+        "S0_noisy": (image, counted.s0, "S0 with the detector's noise", "1"),
+        "S0_noise_std": (image, counted.s0_std, "standard deviation of the noise of S0_noisy", "1"),
+        "Y_noisy": (pixel, y, "attenuated backscatter with the detector's noise", "m-1 sr-1"),
+        "Y_noise_std": (pixel, y_std, "standard deviation of the noise of Y_noisy", "m-1 sr-1"),
+    }
+    fields = detector.model_dump(exclude_none=True)
+    attributes = {f"detector_{name}": float(value) for name, value in fields.items()}
+    attributes["detector_pulse_energy"] = lidar.pulse_energy
+    return scan.assign(
+        {
+            name: (dims, values.astype(np.float32), {"long_name": text, "units": unit})
+            for name, (dims, values, text, unit) in noise.items()
+        }
+    ).assign_attrs(attributes)
+
+
+def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) -> dict[str, float]:
+    """What the noise of a scan is made of: medians over all pixels and gates.
+
+    Keys ``photons`` (at the telescope), ``signal``, ``background``, ``dark`` (photoelectrons),
+    ``speckle_modes`` (not without speckle), and the relative standard deviation of S0 by cause,
+    ``noise.shot``, ``.speckle``, ``.background``, ``.dark``, ``.readout``, and ``noise.all``.
+
+    Raises
+    ------
+    InputError
+        The scan does not state its gates, or is dark.
+    """
+    plan = _plan(scan)
+    scan = scan.transpose("gate", "z", "y", ...)
+    s0 = scan["S0"].values.astype(float)
+    if not np.nanmax(s0, initial=0) > 0:
+        raise InputError("S0: 0 everywhere is not allowed; expected a scan with light in it")
+    duration = gate_duration(plan.gate_length())
+    signal, background, dark, modes = _means(
+        s0, lidar, detector, duration, plan.ranges(), _polarization(scan)
+    )
+    terms = noise_terms(signal, background, dark, modes, detector)
+    lit = signal > 0
+    budget = {
+        "photons": signal / efficiency(detector),
+        "signal": signal,
+        "background": background,
+        "dark": dark,
+    }
+    if detector.speckle:
+        budget["speckle_modes"] = modes
+    terms["all"] = noise_variance(signal, background, dark, modes, detector)
+    for name, variance in terms.items():
+        spread = np.sqrt(np.broadcast_to(variance, s0.shape)[lit])
+        budget[f"noise.{name}"] = spread / signal[lit]
+    return {name: float(np.median(value)) for name, value in budget.items()}
+
+
+def _means(s0, lidar, detector, duration, distance, polarization):
+    """Signal, background and dark photoelectrons, and modes; the first three of one shape."""
+    signal = signal_photoelectrons(s0, lidar.pulse_energy, lidar.wavelength, detector)
+    background = background_photoelectrons(
+        detector, duration, lidar.aperture_area, lidar.fov_half, lidar.wavelength
+    )
+    dark = dark_counts(detector, duration)
+    modes = speckle_modes(detector, lidar, duration, distance, polarization)
+    shape = np.broadcast_shapes(signal.shape, background.shape, np.shape(modes))
+    return *(np.broadcast_to(x, shape) for x in (signal, background, dark)), modes
+
+
+def _polarization(scan: xr.Dataset) -> np.ndarray:
+    """Degree of polarisation; 1, the most speckle, where the rendering was unpolarised."""
+    s0 = scan["S0"].values
+    if not scan.attrs.get("polarized"):
+        return np.ones_like(s0)
+    polarized = np.sqrt(sum(scan[name].values.astype(float) ** 2 for name in ("S1", "S2", "S3")))
+    # Monte Carlo rounding may leave a little more than all of the light
+    return np.minimum(1, np.divide(polarized, s0, out=np.ones(s0.shape), where=s0 > 0))
+
+
+def _plan(scan: xr.Dataset) -> ScanPlan:
+    """Where the gates of a scan lie, from the attributes of the scan."""
+    names = ("gate_start", "gate_stop", "gate_kind", "gate_count")
+    for name in (*names, "environment_extinction"):
+        if name not in scan.attrs:
+            raise InputError(f"scan: attribute {name} is missing; expected a scan rendered here")
+    gates = {name: scan.attrs[name] for name in names}
+    return ScanPlan(scan["y"].values, scan["z"].values, **gates, position=0.0)
+
+
+def _generator(seed) -> np.random.Generator:
+    try:
+        return np.random.default_rng(np.random.SeedSequence(seed))
+    except (TypeError, ValueError):
+        raise InputError(
+            f"seed: {seed!r} is not allowed; expected an integer of 0 or more, or several"
+        ) from None
+
+
+def _check(name: str, values: np.ndarray, good: np.ndarray, allowed: str) -> None:
+    good = good & np.isfinite(values)
+    if not good.all():
+        raise InputError(f"{name}: {values[~good].flat[0]:g} is not allowed; expected {allowed}")
