@@ -81,3 +81,38 @@ class Way:
 def quarter_turn(axis, direction):
     """A direction turned by 90 degrees about an axis."""
     return axis * dr.dot(axis, direction) + dr.cross(axis, direction)
+
+
+def closing_distance(offset, direction, path):
+    """Where a flight must end for the rest of its path to be ``path`` long.
+
+    From ``offset`` (start minus goal) along ``direction`` to t, and from there to the goal:
+    t + |offset + t direction| = path, t = (path^2 - |offset|^2) / (2 (path + offset.direction)).
+    -1 where the path is shorter than the straight line.
+    """
+    length = dr.norm(offset)
+    end = (path - length) * (path + length) / (2 * (path + dr.dot(offset, direction)))
+    return dr.select(path > length, end, -1)
+
+
+def sample_near(least, most, scale, sample, again):
+    """Distance of a vertex from where a flight along the beam would close the path.
+
+    Of directions of isotropic scattering there, weighted by the length they close at, a fraction of
+    ln(1 + (scale / left)^2) leads back into view. Uniform, if that falls out of the range.
+    """
+    left = scale * sample.x * dr.tan(0.5 * dr.pi * sample.y)
+    return dr.select((left > least) & (left < most), left, dr.lerp(least, most, again))
+
+
+def near_density(left, least, most, scale):
+    """Of `sample_near`, per metre."""
+    outside = 1 - _near_chance(most, scale) + _near_chance(least, scale)
+    density = dr.log(1 + dr.square(scale / left)) / (dr.pi * scale)
+    return density + outside / (most - least)
+
+
+def _near_chance(left, scale):
+    """Integral of ln(1 + (scale / left)^2) / (pi scale) from 0 on."""
+    value = left * dr.log(1 + dr.square(scale / left)) + 2 * scale * dr.atan(left / scale)
+    return dr.select(left > 0, value / (dr.pi * scale), 0)

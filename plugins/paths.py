@@ -7,10 +7,11 @@ and sees whether they do. Both bring back Stokes vectors about the instrument's 
 import drjit as dr
 import mitsuba as mi
 
-from .closed_paths import Way, quarter_turn
+from .closed_paths import Way, closing_distance, near_density, quarter_turn, sample_near
 from .media import Air, coefficients, collision, interaction, slabs, transmittance
-from .polarization import rotate_stokes, transverse
+from .polarization import apply_phase_function, rotate_stokes, transverse
 from .random_numbers import generator, pair
+from .resampling import choose
 
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
@@ -91,7 +92,7 @@ class Lidar:
         medium = mi.MediumPtr(self.sensor.get_medium())
         offset = photon.origin - photon.aperture
         path = dr.lerp(low, high, share)
-        closure = _closing(offset, photon.direction, path)
+        closure = closing_distance(offset, photon.direction, path)
         home = dr.normalize(photon.aperture - (photon.origin + photon.direction * closure))
         volume = (high - low) / (1 - dr.dot(photon.direction, home))
         total = self._connect(
@@ -174,18 +175,18 @@ class Lidar:
 
     def _first_flight(self, rng, origin, direction, aperture, path):
         """Length of a first flight and one over its density; -1 where the beam meets no air."""
-        reach = _closing(origin - aperture, direction, path)
+        reach = closing_distance(origin - aperture, direction, path)
         enters, leaves = slabs(self.low, self.high, origin, direction)
         least, most = reach - dr.minimum(leaves, reach), reach - dr.maximum(enters, 0)
         # half the field of view's radius where the path turns back
         scale = 0.25 * path * self.sensor.m_fov_tan
-        choice, near = pair(rng), _sample_near(least, most, scale, pair(rng), rng.next_float32())
+        choice, near = pair(rng), sample_near(least, most, scale, pair(rng), rng.next_float32())
         # steeper phase functions than the isotropic one fall later
         steps = dr.log((most + scale) / (least + scale))
         far = (least + scale) * dr.exp(steps * choice.y) - scale
         left = dr.select(choice.x < NEAR_SHARE, near, far)
         density = dr.lerp(
-            dr.rcp((left + scale) * steps), _near_density(left, least, most, scale), NEAR_SHARE
+            dr.rcp((left + scale) * steps), near_density(left, least, most, scale), NEAR_SHARE
         )
         return dr.select((path > 0) & (most > least), reach - left, -1), dr.rcp(density)
 
@@ -221,7 +222,7 @@ class Lidar:
         axis = dr.select(by_phase, -mei.wi, dr.select(by_back, axes.n, way.away))
         tried = []
         for wo in (first, quarter_turn(axis, first)):
-            end = photon.aperture + wo * _closing(photon.aperture - mei.p, wo, path)
+            end = photon.aperture + wo * closing_distance(photon.aperture - mei.p, wo, path)
             wo = dr.select(by_back, dr.normalize(end - mei.p), wo)
             raised = way.raised(wo)
             leg = way.leg(way.budget, raised)
@@ -241,7 +242,7 @@ class Lidar:
             worth = (0.95 * received[0] + 0.05 * bent[0] * chance) * volume
             worth = dr.select(seen & (density > 0), worth, 0)
             tried.append((worth, density, (wo, bent, leg, volume)))
-        (wo, bent, leg, volume), weight = _choose(rng, *tried)
+        (wo, bent, leg, volume), weight = choose(rng, *tried)
         return wo, bent, leg, volume * weight
 
     def _next_flight(self, rng, medium, mei, stokes, way, active):
@@ -251,9 +252,9 @@ class Lidar:
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
         # optical paths to the gate differ little, so that any use of the budget is about as likely
         most, scale = 0.5 * way.budget, 0.5 * way.distance * self.sensor.m_fov_tan
-        choice, near = pair(rng), _sample_near(0, most, scale, pair(rng), rng.next_float32(active))
+        choice, near = pair(rng), sample_near(0, most, scale, pair(rng), rng.next_float32(active))
         left = dr.select(choice.x < NEAR_FLIGHT_SHARE, near, most * choice.y)
-        spread = dr.lerp(dr.rcp(most), _near_density(left, 0, most, scale), NEAR_FLIGHT_SHARE)
+        spread = dr.lerp(dr.rcp(most), near_density(left, 0, most, scale), NEAR_FLIGHT_SHARE)
         spread *= 0.5
         used = way.budget - 2 * left
         sample = pair(rng)
@@ -273,7 +274,7 @@ class Lidar:
             inside = active & (leg > 0) & dr.all((end > self.low) & (end < self.high))
             worth = dr.select(inside & (density > 0), bent[0], 0)
             tried.append((worth, density, (wo, bent, leg)))
-        (wo, bent, leg), weight = _choose(rng, *tried)
+        (wo, bent, leg), weight = choose(rng, *tried)
         kept = dr.select(weight > 0, stokes[0] / bent[0], 0)
         return wo, _scaled(bent, kept), leg, dr.select(kept > 0, weight / kept, 0)
 
@@ -345,7 +346,7 @@ class Lidar:
     def _scatter(self, medium, mei, stokes, wo, active):
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
-        return _apply(value, stokes, self.channel), pdf
+        return apply_phase_function(value, stokes, self.channel), pdf
 
     @dr.syntax
     def analog(self, photon, max_order, base, gates, sums, products, split, by_order):
@@ -397,7 +398,7 @@ class Lidar:
             onward, value, density = medium.phase_function().sample(
                 self.context, mei, rng.next_float32(active), pair(rng), active
             )
-            stokes = _apply(value, stokes, self.channel)
+            stokes = apply_phase_function(value, stokes, self.channel)
             direction = mi.Vector3f(onward)
             active &= (density > 0) & (stokes[0] > 0)
             _deposit(sums, products, base + gate, held, began & ~active)
@@ -415,74 +416,6 @@ def _deposit(sums, products, cell, held, active):
         _add(total, value, cell, active)
     for (i, j), total in products.items():
         _add(total, held[i] * held[j], cell, active)
-
-
-def _closing(offset, direction, path):
-    """Where a flight must end for the rest of its path to be ``path`` long.
-
-    From ``offset`` (start minus goal) along ``direction`` to t, and from there to the goal:
-    t + |offset + t direction| = path, t = (path^2 - |offset|^2) / (2 (path + offset.direction)).
-    -1 where the path is shorter than the straight line.
-    """
-    length = dr.norm(offset)
-    end = (path - length) * (path + length) / (2 * (path + dr.dot(offset, direction)))
-    return dr.select(path > length, end, -1)
-
-
-def _sample_near(least, most, scale, sample, again):
-    """Distance of a vertex from where a flight along the beam would close the path.
-
-    Of directions of isotropic scattering there, weighted by the length they close at, a fraction of
-    ln(1 + (scale / left)^2) leads back into view. Uniform, if that falls out of the range.
-    """
-    left = scale * sample.x * dr.tan(0.5 * dr.pi * sample.y)
-    return dr.select((left > least) & (left < most), left, dr.lerp(least, most, again))
-
-
-def _near_density(left, least, most, scale):
-    outside = 1 - _near_chance(most, scale) + _near_chance(least, scale)
-    density = dr.log(1 + dr.square(scale / left)) / (dr.pi * scale)
-    return density + outside / (most - least)
-
-
-def _near_chance(left, scale):
-    """Integral of ln(1 + (scale / left)^2) / (pi scale) from 0 on."""
-    value = left * dr.log(1 + dr.square(scale / left)) + 2 * scale * dr.atan(left / scale)
-    return dr.select(left > 0, value / (dr.pi * scale), 0)
-
-
-def _choose(rng, first, second):
-    """One of two candidates and its weight (resampled importance sampling, Talbot et al. 2005).
-
-    A candidate is its target value, to which its contribution should be proportional, its density,
-    and the values to return.
-    """
-    (target, density, one), (other_target, other_density, other) = first, second
-    weight = dr.select(target > 0, target / density, 0)
-    other_weight = dr.select(other_target > 0, other_target / other_density, 0)
-    total = weight + other_weight
-    second_chosen = rng.next_float32() * total >= weight
-    target = dr.select(second_chosen, other_target, target)
-    return _either(second_chosen, other, one), dr.select(target > 0, 0.5 * total / target, 0)
-
-
-def _either(condition, yes, no):
-    if isinstance(yes, list | tuple):
-        return [_either(condition, y, n) for y, n in zip(yes, no, strict=True)]
-    return dr.select(condition, yes, no)
-
-
-def _apply(value, stokes, channel):
-    """A phase function's value (Mueller matrix or number) times a Stokes vector."""
-    if not mi.is_polarized:
-        return [value[channel] * stokes[0]]
-    matrix = [[value[row, column][channel] for column in range(4)] for row in range(4)]
-    scattered = [sum(m * s for m, s in zip(row, stokes, strict=True)) for row in matrix]
-    # scalar phase functions return a multiple of the unit matrix in *any* pair of axes
-    scalar = matrix[0][0]
-    depolarises = (matrix[0][1] == 0) & (matrix[1][0] == 0)
-    depolarises &= (matrix[1][1] == scalar) & (matrix[2][2] == scalar) & (matrix[3][3] == scalar)
-    return [scattered[0], *(dr.select(depolarises, 0, s) for s in scattered[1:])]
 
 
 def _copied(stokes):

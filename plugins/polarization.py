@@ -120,3 +120,16 @@ def rotate_stokes(stokes, direction, current_axis, target_axis):
     cos2, sin2 = cosine * cosine - sine * sine, 2 * cosine * sine
     i, q, u, v = stokes
     return i, cos2 * q + sin2 * u, cos2 * u - sin2 * q, v
+
+
+def apply_phase_function(value, stokes, channel):
+    """A phase function's value (Mueller matrix or number) times a Stokes vector."""
+    if not mi.is_polarized:
+        return [value[channel] * stokes[0]]
+    matrix = [[value[row, column][channel] for column in range(4)] for row in range(4)]
+    scattered = [sum(m * s for m, s in zip(row, stokes, strict=True)) for row in matrix]
+    # scalar phase functions return a multiple of the unit matrix in *any* pair of axes
+    scalar = matrix[0][0]
+    depolarises = (matrix[0][1] == 0) & (matrix[1][0] == 0)
+    depolarises &= (matrix[1][1] == scalar) & (matrix[2][2] == scalar) & (matrix[3][3] == scalar)
+    return [scattered[0], *(dr.select(depolarises, 0, s) for s in scattered[1:])]
