@@ -35,8 +35,8 @@ def rings(
 ) -> None:
     """Measure the rings of an etalon in any image: centre, radii, orders, quality of the fit."""
     from lidar_mi.assessment.figures.rings import draw_rings
-    from lidar_mi.io.atomic import write_atomically
     from lidar_mi.io.images import read_picture
+    from lidar_mi.io.png import write_png
     from lidar_mi.retrieval.rings.analysis import analyse, describe
 
     path = out or Path(f"{image.stem}_rings.png")
@@ -48,7 +48,7 @@ def rings(
     except InputError as error:
         raise InputError(f"{image}: {error}") from None
     figure = draw_rings(values, found, image.name)
-    write_atomically(path, lambda part: figure.savefig(part, dpi=110, format="png"))
+    write_png(figure, path)
     for title, rows in describe(found):
         print_rows(title, rows)
     output.print(f"picture  {path}")

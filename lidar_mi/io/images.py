@@ -1,5 +1,6 @@
 """Reading pictures of any common kind into an array of light."""
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -119,6 +120,26 @@ def read_noise(
         return noise
     known = f"{layer}_stderr"
     return read_image(path, known, spacing) if known in layers else None
+
+
+def as_webp(path: str | Path) -> bytes:
+    """An image file in colours as lossless WebP, two thirds of its PNG.
+
+    Raises
+    ------
+    InputError
+        No readable image.
+    """
+    from PIL import Image
+
+    content = BytesIO()
+    try:
+        with Image.open(path) as image:
+            # more effort takes twice as long for 3 % less
+            image.convert("RGB").save(content, "WEBP", lossless=True, quality=25, method=1)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: no readable image ({_short(error)})") from None
+    return content.getvalue()
 
 
 def _is_exr(path: str | Path) -> bool:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from lidar_mi.cli import app as cli
 from lidar_mi.errors import InputError
-from lidar_mi.io.images import read_image, read_picture
+from lidar_mi.io.images import as_webp, read_image, read_picture
 from lidar_mi.retrieval.rings import analysis as rings
 from lidar_mi.retrieval.velocimetry import wind
 
@@ -147,3 +147,13 @@ def test_the_command(tmp_path, values, monkeypatch, capsys):
     assert np.asarray(Image.open("rings_rings.png")).std() > 10
     code, _, err = call("rings", "even.png")
     assert code == 2 and err.startswith("lidar-mi: even.png: ") and err.count("\n") == 1
+
+
+def test_webp_is_lossless(tmp_path):
+    pixels = np.random.default_rng(3).integers(0, 256, (20, 30, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    (tmp_path / "a.webp").write_bytes(as_webp(tmp_path / "a.png"))
+    with Image.open(tmp_path / "a.webp") as image:
+        np.testing.assert_array_equal(np.asarray(image), pixels)
+    with pytest.raises(InputError, match="no.png: no readable image"):
+        as_webp(tmp_path / "no.png")

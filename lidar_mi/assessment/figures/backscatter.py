@@ -15,6 +15,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.errors import deviations, error_by_quality
+from lidar_mi.io.png import write_png
 
 METHOD_NAMES = {
     "cc": "cross-correlation",
@@ -148,19 +149,13 @@ def draw_all(
 
 
 def save_all(folder: Path, plates, log: Callable) -> list[Drawn]:
-    """Save plates, each (file name, title, (figure, caption)), as PNG, by temporary names."""
+    """Save plates, each (file name, title, (figure, caption)), as PNG."""
     folder.mkdir(exist_ok=True)
     drawn = []
     for index, (name, title, (figure, caption)) in enumerate(plates):
         log.bar(f"drawing {title.lower()}", index / len(plates))
         path = folder / f"{name}.png"
-        temporary = path.with_name(f".{path.name}")
-        try:
-            # panels of equal scales leave more room around them than any other page needs
-            figure.savefig(temporary, dpi=110, format="png", bbox_inches="tight", pad_inches=0.1)
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_png(figure, path, cropped=True)
         drawn.append(Drawn(path, title, caption))
     return drawn
 

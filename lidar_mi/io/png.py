@@ -1,0 +1,21 @@
+"""Figures as PNG files."""
+
+from pathlib import Path
+
+from matplotlib.figure import Figure
+
+from lidar_mi.io.atomic import write_atomically
+
+
+def write_png(figure: Figure, path: str | Path, *, cropped: bool = False) -> None:
+    """Write a figure, 110 dots per inch, whole or not at all.
+
+    Parameters
+    ----------
+    figure : matplotlib.figure.Figure
+    path : str or Path
+    cropped : bool
+        Without the room around the panels, but for 0.1 inch: panels of equal scales leave much.
+    """
+    room = {"bbox_inches": "tight", "pad_inches": 0.1} if cropped else {}
+    write_atomically(path, lambda part: figure.savefig(part, dpi=110, format="png", **room))
