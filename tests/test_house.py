@@ -18,7 +18,7 @@ PACKAGE = ROOT / "lidar_mi"
 ARROWS = {
     "system": set(),
     "atmosphere": set(),
-    "instrument": set(),
+    "instrument": {"atmosphere.line"},
     "retrieval": {"atmosphere.vortex"},
     "io": {
         "atmosphere.aerosols",
@@ -42,8 +42,8 @@ ARROWS = {
     },
 }
 """What a room may import beside `errors` and `units`: a room, or modules of one. `atmosphere`,
-`instrument` and `retrieval` share nothing but the vortex model; `io` builds the descriptions that
-its files hold; only `experiment` and what lies above it see all."""
+`instrument` and `retrieval` share descriptions alone: a vortex, a spectral line; `io` builds those
+that its files hold; only `experiment` and what lies above it see all."""
 
 OPENS = {
     "assessment/report/page.py": "its own script, a resource of the package",
