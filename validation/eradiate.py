@@ -36,8 +36,6 @@ def provenance(python: str | None = None) -> str:
     versions = ", ".join(f"{name} {number}" for name, number in stored["versions"].items())
     return (
         f"The stored numbers of Eradiate were computed by `{stored['command']}` with {versions}, "
-        "in the variant "
-        f"`{stored['variant']}`; `make validate ARGS='--eradiate PYTHON'` computes new ones with "
-        "an "
-        "interpreter that has eradiate-mitsuba."
+        f"in the variant `{stored['variant']}`; `make validate ARGS='--eradiate PYTHON'` computes "
+        "new ones with an interpreter that has eradiate-mitsuba."
     )

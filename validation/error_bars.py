@@ -83,8 +83,7 @@ def single_scattering(effort):
     return Check(
         "Single scattering, beam by beam",
         f"219 x 139 beams over 12.4 by 7.8 degrees, {photons} samples each, slab of 0.02 / m, "
-        "gate of "
-        "2.5 m at 500 m.",
+        "gate of 2.5 m at 500 m.",
         tuple(rows),
     )
 

@@ -74,9 +74,8 @@ def derivatives(effort):
     return Check(
         "Extinction grid",
         "Relative change of the signal of a gate from 500 to 508 m with the extinction of each "
-        "of ten "
-        "planes of cells (4 m thick, summed over the plane): attenuation in front of the gate, "
-        "scattering and attenuation in it, no contribution behind it.",
+        "of ten planes of cells (4 m thick, summed over the plane): attenuation in front of the "
+        "gate, scattering and attenuation in it, no contribution behind it.",
         tuple(rows),
     )
 

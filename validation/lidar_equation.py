@@ -13,10 +13,9 @@ from .scenes import ENVIRONMENT, box, grid, layer, medium, render, scene, secant
 
 TITLE = "Single scattering"
 INTRODUCTION = (
-    "The lidar equation, integrated over each gate by Gauss-Legendre quadrature, for beams "
-    "inside the "
-    "field of view. It neglects the finite beam and telescope, which are 1e-6 of the signal at "
-    "500 m; ranges in single precision contribute about as much."
+    "The lidar equation, integrated over each gate by Gauss-Legendre quadrature, for beams inside "
+    "the field of view. It neglects the finite beam and telescope, which are 1e-6 of the signal "
+    "at 500 m; ranges in single precision contribute about as much."
 )
 EQUATION = "lidar equation (Weitkamp 2005, chap. 1)"
 
@@ -139,8 +138,7 @@ def profile_through_layers(effort):
     return Check(
         "Profile through nested layers",
         "100 gates of 2.5 m; a slab of 0.005 / m from 300 to 450 m around one of 0.02 / m from "
-        "350 to "
-        "416.25 m (inside a gate), environment of 0.001 / m.",
+        "350 to 416.25 m (inside a gate), environment of 0.001 / m.",
         tuple(compared("100 gates", found, truth)),
         ((place.name, "Signal of every gate, and its difference from the lidar equation."),),
     )

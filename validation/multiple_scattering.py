@@ -183,8 +183,8 @@ def molecules(effort):
     return Check(
         "Dense slab of molecules",
         "Extinction 0.02 / m, albedo 1, Rayleigh scattering of light polarised along e_h; "
-        "Gaussian beam "
-        "of 0.1 m radius and 1 mrad half divergence, telescope 0.5 m, field of view 50 mrad half.",
+        "Gaussian beam of 0.1 m radius and 1 mrad half divergence, telescope 0.5 m, field of "
+        "view 50 mrad half.",
         rows,
         drawn,
     )

@@ -23,8 +23,7 @@ TITLE = "Scattering matrices"
 INTRODUCTION = (
     "Tables of randomly oriented spheroids and spheres, made with "
     "[scatrs](https://pypi.org/project/scatrs/): rows (a1, b1, 0, 0), (b1, a2, 0, 0), (0, 0, a3, "
-    "b2), "
-    "(0, 0, -b2, a4), where a1 has the mean one."
+    "b2), (0, 0, -b2, a4), where a1 has the mean one."
 )
 GREEN = 532e-9
 
@@ -97,8 +96,7 @@ def laws(effort):
         "Worst values over the 361 angles of each shipped table (seven digits are written). The "
         "coherency matrix of a sum of Mueller-Jones matrices has no negative eigenvalue; this "
         "includes all inequalities between the elements. At 0 degrees a2 = a3, at 180 degrees a2 "
-        "= -a3 and "
-        "a4 = a1 - 2 a2, b1 = b2 = 0 at both. Linear interpolation between the angles "
+        "= -a3 and a4 = a1 - 2 a2, b1 = b2 = 0 at both. Linear interpolation between the angles "
         "overestimates a1 near a peak: the mean may exceed one by 0.1 % (the plugins normalise "
         "it).",
         tuple(rows),
@@ -199,12 +197,10 @@ def published(effort):
     return Check(
         "Published table of randomly oriented spheroids",
         "Oblate spheroids, 2 to 1, wavelength 0.5 um, index 1.53 + 0.008i, power law r^-3 of "
-        "effective "
-        "variance 0.1, at the same sizes. The published computation was stopped when "
-        "cross-sections had "
-        "converged to 1e-3, and has four decimals: the error of its elements may be a few 1e-3. "
-        "It tests the solver that computes the tables, at larger size parameters (up to 20) than "
-        "theirs.",
+        "effective variance 0.1, at the same sizes. The published computation was stopped when "
+        "cross-sections had converged to 1e-3, and has four decimals: the error of its elements "
+        "may be a few 1e-3. It tests the solver that computes the tables, at larger size "
+        "parameters (up to 20) than theirs.",
         tuple(rows),
         ((drawn.name, "Elements over a1 (a1 itself top left): line computed, points published."),),
     )

@@ -168,12 +168,10 @@ def energy(effort):
         )
     return Check(
         "Conservation of energy",
-        "Albedo 1, isotropic scattering, 40 orders, a field of view of 80 degrees half angle. The "
-        f"transmission of the slab ({below.sum() + direct:.4f}) and the reflection beyond 80 "
-        "degrees "
-        f"({grazing:.4f}) are from the integral equation; with the rendered reflection the sum "
-        "must be "
-        "one.",
+        "Albedo 1, isotropic scattering, 40 orders, a field of view of 80 degrees half angle. "
+        f"The transmission of the slab ({below.sum() + direct:.4f}) and the reflection beyond 80 "
+        f"degrees ({grazing:.4f}) are from the integral equation; with the rendered reflection "
+        "the sum must be one.",
         tuple(rows),
     )
 
