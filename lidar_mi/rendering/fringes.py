@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -86,7 +87,7 @@ def scene_dict(etalon: Etalon, camera: FringeCamera, line: Line, settings: Fring
     x, y = camera.centre_pixel
     corner = math.hypot(max(x, camera.width - 1 - x) + 0.5, max(y, camera.height - 1 - y) + 0.5)
     field = math.atan(corner * camera.pixel / camera.focal_length)
-    lens = "ideal"
+    lens: Any = "ideal"
     if settings.lens == "singlet":
         rows = singlet(camera.focal_length, wavelength, settings.stop_radius, field)
         lens = mi.TensorXf(rows.ravel())  # three rows of anything are tried as a colour first

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -55,7 +56,8 @@ def render_file(
         if " is not allowed; expected " in str(error):
             raise
         raise InputError(f"{scene_path}: {_reason(error)}") from None
-    sensor, integrator = next(iter(scene.sensors()), None), scene.integrator()
+    sensor: Any = next(iter(scene.sensors()), None)
+    integrator = scene.integrator()
     scans, fringes = hasattr(sensor, "beam_frame"), hasattr(sensor, "sample_towards_scene")
     if not (scans or fringes):
         raise InputError(
@@ -71,8 +73,8 @@ def render_file(
         image.attrs["scene"] = scene_path.name
         write_fringes(out, image)
         return image
-    image = np.array(mi.render(scene, spp=samples, seed=seed))
-    scan = _as_dataset(image, integrator.quantities(), sensor)
+    tensor = np.array(mi.render(scene, spp=samples, seed=seed))
+    scan = _as_dataset(tensor, integrator.quantities(), sensor)
     scan.attrs |= {
         "software": f"lidar-mi {__version__}",
         "scene": scene_path.name,

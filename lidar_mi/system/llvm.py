@@ -93,7 +93,7 @@ def find_llvm(folders: Iterable[str | os.PathLike] | None = None) -> list[tuple[
     list of (path, major version)
         Newest first, each file once (links resolved), links to nowhere left out.
     """
-    found = {}
+    found: dict[Path, int] = {}
     for folder in library_folders() if folders is None else folders:
         for path in sorted(Path(folder).glob("libLLVM*")):
             version = version_of(path)

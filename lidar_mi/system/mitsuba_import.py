@@ -41,7 +41,7 @@ class _Finder:
             execute(module)
             _register()
 
-        spec.loader.exec_module = execute_and_register
+        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
         return spec
 
 
