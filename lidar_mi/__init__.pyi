@@ -4,30 +4,40 @@ from .errors import InputError
 from .experiment.reading import load_experiment
 from .experiment.schema import Experiment
 from .experiment.shipped import experiments
+from .experiment.truth import make_truth
 from .io.exr import read_scan
-from .io.images import read_image
+from .io.images import read_image, read_noise
 from .io.vortex_file import read_vortices
 from .plugins import register_plugins
+from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.velocimetry.common_grid import on_one_grid
+from .retrieval.velocimetry.quality import Flag
 from .retrieval.velocimetry.volume import retrieve_wind_volume
 from .retrieval.velocimetry.wind import retrieve_wind
 from .retrieval.vortices.image_fit import fit_vortices
 from .retrieval.vortices.pair import VortexPairFit
 from .retrieval.vortices.vector_fit import fit_vortices_to_wind
+from .system.doctor import doctor
 
 __version__: str
 
 __all__ = [
     "Experiment",
+    "Flag",
     "InputError",
+    "Rings",
     "VortexPairFit",
     "__version__",
+    "analyse_rings",
+    "doctor",
     "experiments",
     "fit_vortices",
     "fit_vortices_to_wind",
     "load_experiment",
+    "make_truth",
     "on_one_grid",
     "read_image",
+    "read_noise",
     "read_scan",
     "read_vortices",
     "register_plugins",

@@ -5,6 +5,7 @@ no documentation, or differs between the stub that editors read and the program.
 """
 
 import ast
+import doctest
 import importlib
 import inspect
 import json
@@ -82,6 +83,32 @@ def test_public_name_is_there_and_documented(name):
     assert described and described.splitlines()[0].endswith(".")
     if inspect.isfunction(public) and inspect.signature(public).parameters:
         assert "Parameters\n-----" in described
+
+
+EXAMPLES = [
+    example
+    for name in lm.__all__
+    if name != "__version__"
+    for example in doctest.DocTestFinder(recurse=False).find(getattr(lm, name), name)
+]
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda example: example.name)
+def test_examples_of_the_documentation_run(example, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
+    said = []
+    assert runner.run(example, out=said.append).failed == 0, "".join(said)
+
+
+@pytest.mark.parametrize(
+    "name", sorted(n for n in lm.__all__ if n != "__version__" and not n.startswith("fit_vortices"))
+)
+def test_public_function_has_an_example(name):
+    public = getattr(lm, name)
+    if not inspect.isclass(public):
+        examples = doctest.DocTestParser().get_examples(inspect.getdoc(public))
+        assert any(f"lm.{name}(" in example.source for example in examples)
 
 
 def test_unknown_name_is_an_attribute_error():

@@ -10,22 +10,22 @@ EXAMPLES = "Example: `lidar-mi doctor` (exit code 0: everything that is needed i
 
 def doctor() -> None:
     """Explain what this machine can run, and what to install for the rest."""
-    from lidar_mi.system.doctor import examine
+    from lidar_mi.system.doctor import doctor as examine
 
     console = Console()
     with console.status("examining this machine"):
-        checks = examine()
+        found = examine()
     marks = {True: Text("ok", "green"), False: Text("FAILED", "bold red"), None: Text("-", "dim")}
     table = Table(box=None, pad_edge=False)
     for heading in ("", "what", "found"):
         table.add_column(heading, overflow="fold")
-    for check in checks:
+    for check in found.checks:
         table.add_row(marks[check.ok], Text(check.name), Text(check.detail))
     console.print(table)
-    for check in checks:
+    for check in found.checks:
         if check.remedy:
             kind = "to repair" if check.ok is False else "optional"
             console.print(Text(f"{kind}: {check.name}: {check.remedy}"), soft_wrap=True)
-    failed = sum(check.ok is False for check in checks)
-    console.print(f"{failed} of {len(checks)} checks failed" if failed else "all checks passed")
+    failed, number = len(found.failed), len(found.checks)
+    console.print(f"{failed} of {number} checks failed" if failed else "all checks passed")
     raise typer.Exit(1 if failed else 0)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.terminal import output, print_rows
+from lidar_mi.cli.terminal import output, print_table
 from lidar_mi.errors import InputError
 
 EXAMPLES = (
@@ -37,18 +37,18 @@ def rings(
     from lidar_mi.assessment.figures.rings import draw_rings
     from lidar_mi.io.images import read_picture
     from lidar_mi.io.png import write_png
-    from lidar_mi.retrieval.rings.analysis import analyse, describe
+    from lidar_mi.retrieval.rings.analysis import analyse_rings
 
     path = out or Path(f"{image.stem}_rings.png")
     if not path.parent.is_dir():
         raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
     values = read_picture(image, layer)
     try:
-        found = analyse(values, centre, saturation)
+        found = analyse_rings(values, centre, saturation)
     except InputError as error:
         raise InputError(f"{image}: {error}") from None
     figure = draw_rings(values, found, image.name)
     write_png(figure, path)
-    for title, rows in describe(found):
-        print_rows(title, rows)
+    for table in found.tables():
+        print_table(table)
     output.print(f"picture  {path}")

@@ -1,18 +1,29 @@
 """What commands print, to the terminal or into a pipe."""
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 
+import rich.table
 from rich.console import Console
-from rich.table import Table
+
+from lidar_mi.tables import Table
 
 # names in files and folders may hold brackets and colons: they are no markup
 output = Console(markup=False, emoji=False)
 errors = Console(stderr=True, markup=False, emoji=False)
 
 
-def print_rows(title: str, rows: Iterable[tuple[str, ...]]) -> None:
+def print_rows(title: str, rows: Sequence[Sequence[str]]) -> None:
     """A table without a head: a name and what there is to say of it, line by line."""
-    table = Table(title=title, title_justify="left", show_header=False)
-    for row in rows:
-        table.add_row(*row)
-    output.print(table)
+    print_table(Table(title, rows))
+
+
+def print_table(table: Table) -> None:
+    """Any table, in a frame."""
+    framed = rich.table.Table(
+        title=table.title, title_justify="left", show_header=bool(table.heads)
+    )
+    for k, head in enumerate(table.heads or ("",) * len(next(iter(table.rows), ()))):
+        framed.add_column(head, justify="right" if k and table.heads else "left")
+    for row in table.rows:
+        framed.add_row(*row)
+    output.print(framed)

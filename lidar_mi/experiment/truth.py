@@ -52,6 +52,25 @@ def make_truth(
         Folder in which the wake's file is looked for first.
     flows : optional
         From `read_flows` of an experiment that differs in extinction and texture alone.
+
+    Returns
+    -------
+    Truth
+        ``wind`` (Dataset, m/s), ``extinction`` (at t1 and at t2, 1/m); ``image(k)`` is the
+        extinction over (z, y) as the lidar sees it.
+
+    Raises
+    ------
+    InputError
+        A file that is not there or not as the experiment says.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> experiment = lm.load_experiment("wake_backscatter")
+    >>> truth = lm.make_truth(experiment)
+    >>> truth.wind["v"].dims, len(truth.extinction)
+    (('z', 'y'), 2)
     """
     first, second = flows or read_flows(experiment, beside)
     mapping = experiment.wake.extinction

@@ -103,8 +103,34 @@ def read_noise(
 ) -> xr.DataArray | None:
     """Standard deviation of an image's noise, as `read_image` gives the image; None if unsaid.
 
-    For ``Y`` and ``Y_noisy`` of our scans: the light transport's standard error and, with a
+    For ``Y`` and ``Y_noisy`` of a run's scans: the light transport's standard error and, with a
     detector, its noise. For any other layer: the one of the same name with ``_stderr``.
+
+    Parameters
+    ----------
+    path : path
+    layer, spacing
+        As of `read_image`.
+
+    Returns
+    -------
+    xr.DataArray, dims (z, y), m, or None
+        In the image's unit; None where the file does not say.
+
+    Raises
+    ------
+    InputError
+        As `read_image`.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> import OpenEXR
+    >>> layers = {"G": np.full((4, 6), 10.0, "f4"), "G_stderr": np.full((4, 6), 0.5, "f4")}
+    >>> OpenEXR.File({}, layers).write("camera.exr")
+    >>> float(lm.read_noise("camera.exr", "G", spacing=1.0).max())
+    0.5
     """
     if not _is_exr(path):
         return None

@@ -19,6 +19,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from lidar_mi.system import llvm
+from lidar_mi.tables import Table, Tabular
 
 LLVM_VARIANTS = (
     "llvm_ad_rgb",
@@ -99,8 +100,46 @@ class Check:
     remedy: str = ""
 
 
-def examine() -> list[Check]:
-    """Examine this machine: versions, LLVM, every Mitsuba variant, plugins, torch, resources."""
+@dataclass(frozen=True, repr=False)
+class Checkup(Tabular):
+    """What was found on this machine."""
+
+    checks: tuple[Check, ...]
+
+    @property
+    def failed(self) -> list[Check]:
+        """Checks of something that is needed and does not work."""
+        return [check for check in self.checks if check.ok is False]
+
+    def tables(self) -> list[Table]:
+        """A line for each check, then what to type."""
+        marks = {True: "ok", False: "FAILED", None: "-"}
+        found = [(marks[c.ok], c.name, c.detail) for c in self.checks]
+        verdict = f"{len(self.failed)} of {len(found)} checks failed"
+        tables = [Table(verdict if self.failed else "all checks passed", found)]
+        remedies = [
+            ("to repair" if c.ok is False else "optional", c.name, c.remedy)
+            for c in self.checks
+            if c.remedy
+        ]
+        return [*tables, Table("what to type", remedies)] if remedies else tables
+
+
+def doctor() -> Checkup:
+    """Examine this machine: versions, LLVM, every Mitsuba variant, plugins, torch, resources.
+
+    Returns
+    -------
+    Checkup
+        Shows itself as a table. ``failed`` is empty where everything that is needed works.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> checkup = lm.doctor()  # doctest: +SKIP
+    >>> checkup.failed         # doctest: +SKIP
+    []
+    """
     trials: list[Callable[[], Check]] = [
         *(partial(_check_variant, variant) for variant in LLVM_VARIANTS),
         _check_cuda,
@@ -111,7 +150,8 @@ def examine() -> list[Check]:
     checks = [_check_python(), *_check_dependencies(), _check_llvm()]
     with ThreadPoolExecutor(max_workers=_cores()) as pool:
         checks += pool.map(lambda trial: trial(), trials)
-    return [*checks, _check_cores(), _check_memory(), _check_disk(), _check_exr_tools()]
+    checks += [_check_cores(), _check_memory(), _check_disk(), _check_exr_tools()]
+    return Checkup(tuple(checks))
 
 
 def _check_python() -> Check:

@@ -17,6 +17,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.centre import gradient_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
 from lidar_mi.retrieval.rings.peak_fit import peaks
+from lidar_mi.tables import Table, Tabular, with_error
 
 STEPS = 1200  # annuli out to the farthest corner
 SECTORS = 48
@@ -28,8 +29,8 @@ LINES = 3  # most that a line may be split into
 LAW = 0.02  # of an order: farther off equal steps, rms, is no etalon's pattern
 
 
-@dataclass(frozen=True, eq=False)
-class Rings:
+@dataclass(frozen=True, eq=False, repr=False)
+class Rings(Tabular):
     """What a picture's rings are; lengths in pixels, errors are standard deviations.
 
     Attributes
@@ -104,11 +105,47 @@ class Rings:
         r = r + radius**2 * (self.tilt[0] * cosine + self.tilt[1] * sine)
         return self.centre[0] + r * cosine, self.centre[1] + r * sine
 
+    def tables(self) -> list[Table]:
+        """Pattern and rings, with standard errors."""
+        (x, y), (x_std, y_std) = self.centre, self.centre_std
+        given = "" if any(self.centre_std) else " (given)"
+        whole = [
+            ("centre x, y", f"{with_error(x, x_std)}, {with_error(y, y_std)} px{given}"),
+            ("r^2 from order to order", with_error(self.spacing, self.spacing_std, "px^2")),
+        ]
+        for line, (value, std) in enumerate(zip(self.fraction, self.fraction_std)):
+            of = f", line {line}" if len(self.fraction) > 1 else ""
+            whole.append((f"fractional order at the centre{of}", with_error(value, std)))
+        for split in self.splitting:
+            for line, value in enumerate(split, 1):
+                whole.append(
+                    (
+                        f"splitting, line {line} from 0",
+                        (f"{value:.6g} px^2, {value / self.spacing:.4f} orders"),
+                    )
+                )
+        steps = (
+            "no ring left over to test" if math.isnan(self.misfit) else f"{self.misfit:.2g} orders"
+        )
+        whole += [
+            ("rms deviation from equal steps", steps),
+            ("rms deviation of crests from the rings", f"{self.roundness:.2g} px"),
+            (
+                "ellipticity, tilt",
+                (f"{math.hypot(*self.ellipticity):.2g}, {math.hypot(*self.tilt):.2g} / px"),
+            ),
+        ]
+        single = [
+            (str(order), str(line), with_error(radius, std, "px"))
+            for order, line, radius, std in zip(self.order, self.line, self.radius, self.radius_std)
+        ]
+        return [Table("pattern", whole), Table("rings", single, ("order", "line", "radius"))]
 
-def analyse(
+
+def analyse_rings(
     image, centre: tuple[float, float] | None = None, saturation: float | None = None
 ) -> Rings:
-    """Find and measure the rings of a picture.
+    """Find and measure the rings of an etalon in any image.
 
     Parameters
     ----------
@@ -128,6 +165,18 @@ def analyse(
     InputError
         A picture that is not finite, saturated, shows fewer than two rings, has its centre
         outside, or whose rings do not follow one another by equal steps of r^2.
+
+    Examples
+    --------
+    Rings of equal steps of 4000 px^2, with order 0 a quarter of a step from the centre:
+
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:200, :300]
+    >>> order = ((x - 150.5) ** 2 + (y - 99.0) ** 2) / 4000
+    >>> rings = lm.analyse_rings(1 / (1 + 60 * np.sin(np.pi * (order - 0.25)) ** 2))
+    >>> print("{:.1f} {:.1f}".format(*rings.centre), f"{rings.spacing:.0f}")
+    150.5 99.0 4000
     """
     image = checked(image, saturation)
     if len(image) != 1:
@@ -166,44 +215,6 @@ def analyse(
         r2=sectors.r2,
         profile=sectors.mean,
     )
-
-
-def describe(rings: Rings) -> list[tuple[str, list[tuple[str, ...]]]]:
-    """What `analyse` found as tables of text: title, and rows of cells."""
-    (x, y), (x_std, y_std) = rings.centre, rings.centre_std
-    given = "" if any(rings.centre_std) else " (given)"
-    whole = [
-        ("centre x, y", f"{x:.2f} +- {x_std:.2f}, {y:.2f} +- {y_std:.2f} px{given}"),
-        ("r^2 from order to order", f"{rings.spacing:.6g} +- {rings.spacing_std:.2g} px^2"),
-    ]
-    for line, (value, std) in enumerate(zip(rings.fraction, rings.fraction_std)):
-        of = f", line {line}" if len(rings.fraction) > 1 else ""
-        whole.append((f"fractional order at the centre{of}", f"{value:.4f} +- {std:.4f}"))
-    for split in rings.splitting:
-        for line, value in enumerate(split, 1):
-            whole.append(
-                (
-                    f"splitting, line {line} from 0",
-                    (f"{value:.6g} px^2, {value / rings.spacing:.4f} orders"),
-                )
-            )
-    steps = (
-        "no ring left over to test" if math.isnan(rings.misfit) else f"{rings.misfit:.2g} orders"
-    )
-    whole += [
-        ("rms deviation from equal steps", steps),
-        ("rms deviation of crests from the rings", f"{rings.roundness:.2g} px"),
-        (
-            "ellipticity, tilt",
-            (f"{math.hypot(*rings.ellipticity):.2g}, {math.hypot(*rings.tilt):.2g} / px"),
-        ),
-    ]
-    single = [("order", "line", "radius")]
-    single += [
-        (str(order), str(line), f"{radius:.3f} +- {std:.3f} px")
-        for order, line, radius, std in zip(rings.order, rings.line, rings.radius, rings.radius_std)
-    ]
-    return [("pattern", whole), ("rings", single)]
 
 
 class _Sectors:

@@ -163,6 +163,21 @@ def retrieve_wind(
     ------
     InputError
         Images on different or unsuitable grids, or a parameter out of its range.
+
+    Examples
+    --------
+    Air that moves by two pixels of 0.5 m along y in 0.1 s:
+
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from scipy.ndimage import gaussian_filter
+    >>> air = 1 + gaussian_filter(np.random.default_rng(1).normal(size=(32, 50)), 1.5)
+    >>> axes = {d: (d, 0.5 * np.arange(n), {"units": "m"}) for d, n in (("z", 32), ("y", 48))}
+    >>> image1, image2 = (xr.DataArray(air[:, k : k + 48], axes, ("z", "y")) for k in (2, 0))
+    >>> wind = lm.retrieve_wind(image1, image2, dt=0.1)
+    >>> print(f"{float(wind['v'].median()):.1f} {wind['v'].units}")
+    10.0 m s-1
     """
     if method not in METHODS:
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.analysis import analyse, describe
+from lidar_mi.retrieval.rings.analysis import analyse_rings
 from tests.support import ring_reference as reference
 
 LABORATORY = Path(__file__).parents[4] / "shared" / "data" / "fringes"
@@ -35,7 +35,7 @@ def split_rings(shape, centre, spacing, fractions, finesse=60.0, ellipticity=0.0
 
 def test_rings_of_the_emitted_laser():
     """0.02 px: what quarter-pixel sectors and a Gaussian for Airy's peak leave."""
-    found = analyse(reference.picture(0.0, temperature=None))
+    found = analyse_rings(reference.picture(0.0, temperature=None))
     np.testing.assert_allclose(found.centre, (479.5, 389.5), atol=0.01)
     np.testing.assert_allclose(found.radius, RADII[: len(found.radius)], atol=0.06)
     assert list(found.order) == list(range(len(found.order))) and not found.line.any()
@@ -49,7 +49,7 @@ def test_noisy_backscatter_off_centre():
     mean = reference.picture(0.0, 1.3e7, (431.7, 402.2))
     pulls, fractions = [], []
     for _ in range(4):
-        found = analyse(reference.noisy(mean, rng, 5.0))
+        found = analyse_rings(reference.noisy(mean, rng, 5.0))
         pulls.append(np.subtract(found.centre, (431.7, 402.2)) / found.centre_std)
         fractions.append(found.fraction[0])
     # 4 sigma of a chi-square with 8 degrees of freedom, the error bars good to a third
@@ -60,7 +60,7 @@ def test_noisy_backscatter_off_centre():
 @pytest.mark.parametrize("fractions", [(0.75,), (0.59, 0.89), (0.2, 0.45, 0.7)])
 def test_lines_and_orders_are_told_apart(fractions):
     image = split_rings((500, 640), (300.3, 262.8), 20000.0, fractions)
-    found = analyse(image)
+    found = analyse_rings(image)
     np.testing.assert_allclose(found.centre, (300.3, 262.8), atol=0.03)
     assert found.spacing == pytest.approx(20000, rel=3e-3)
     np.testing.assert_allclose(found.fraction, fractions, atol=5e-3)
@@ -84,7 +84,7 @@ def test_laboratory_like_picture():
     for fractions in ((0.74,), (0.59, 0.89)):
         rings = split_rings(size, centre, 49900.0, fractions, 20.0, 0.008, 4e-5)
         grey = 12 + 60 * rings * slope + rng.normal(0, 1, size)
-        found.append(analyse(grey.round().clip(0, 255).astype(np.uint8)))
+        found.append(analyse_rings(grey.round().clip(0, 255).astype(np.uint8)))
     single, split = found
     for one in found:
         np.testing.assert_allclose(one.centre, centre, atol=0.6)
@@ -101,7 +101,7 @@ def test_laboratory_like_picture():
 def test_laboratory_pictures():
     """Real pictures of one line, single and split: what any right analysis must find."""
     single, split = (
-        analyse(np.array(Image.open(LABORATORY / f"fabry_perot_{name}.jpg")))
+        analyse_rings(np.array(Image.open(LABORATORY / f"fabry_perot_{name}.jpg")))
         for name in ("single", "split")
     )
     assert np.hypot(*np.subtract(single.centre, split.centre)) < 1.0
@@ -118,11 +118,13 @@ def test_laboratory_pictures():
 
 def test_given_centre_stays():
     image = split_rings((500, 640), (300.3, 262.8), 20000.0, (0.5,))
-    found = analyse(image, (300.3, 262.8))
+    found = analyse_rings(image, (300.3, 262.8))
     assert found.centre == (300.3, 262.8) and found.centre_std == (0.0, 0.0)
     assert found.fraction[0] == pytest.approx(0.5, abs=5e-3)
-    title, rows = describe(found)[0]
-    assert title == "pattern" and dict(rows)["centre x, y"].endswith("(given)")
+    pattern = found.tables()[0]
+    assert pattern.title == "pattern"
+    assert dict(pattern.rows)["centre x, y"] == "300.3, 262.8 px (given)"
+    assert "300.3, 262.8 px (given)" in repr(found)
 
 
 # --- bad input ------------------------------------------------------------------------------
@@ -155,12 +157,12 @@ def images():
 def test_refused(kind):
     image, message = images()[kind]
     with pytest.raises(InputError, match=message) as stop:
-        analyse(image)
+        analyse_rings(image)
     assert "\n" not in str(stop.value)
 
 
 def test_arguments():
     with pytest.raises(InputError, match="2 pictures are not allowed"):
-        analyse(np.zeros((2, 30, 30)))
+        analyse_rings(np.zeros((2, 30, 30)))
     with pytest.raises(InputError, match="centre: .900.0, 3.0. px"):
-        analyse(split_rings((300, 400), (190.0, 160.0), 8000.0, (0.5,)), (900.0, 3.0))
+        analyse_rings(split_rings((300, 400), (190.0, 160.0), 8000.0, (0.5,)), (900.0, 3.0))

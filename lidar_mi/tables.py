@@ -1,0 +1,86 @@
+"""Small tables of numbers, as text and as HTML: what results show of themselves."""
+
+import math
+from base64 import b64encode
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from html import escape
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of text under a title; heads are optional."""
+
+    title: str
+    rows: Sequence[Sequence[str]]
+    heads: Sequence[str] = ()
+
+
+class Tabular:
+    """A result that shows itself as tables, on a terminal and in a notebook."""
+
+    def tables(self) -> list[Table]:
+        """The numbers that are asked for first."""
+        raise NotImplementedError
+
+    def thumbnail(self) -> bytes | None:
+        """A small PNG image of it, for notebooks; None: it has none."""
+        return None
+
+    def __repr__(self) -> str:
+        return as_text(self.tables())
+
+    def _repr_html_(self) -> str:
+        return as_html(self.tables(), self.thumbnail())
+
+
+def with_error(value: float, stderr: float, unit: str = "") -> str:
+    """A number and its standard error, both to two digits of the latter: ``312.4 ± 5.1 m²/s``.
+
+    A standard error that is not finite or not above 0 is left out.
+    """
+    if not math.isfinite(value):
+        shown = "-"
+    elif math.isfinite(stderr) and stderr > 0:
+        decimals = max(0, 1 - math.floor(math.log10(stderr)))
+        shown = f"{value:.{decimals}f} ± {stderr:.{decimals}f}"
+    else:
+        shown = f"{value:.4g}"
+    return f"{shown} {unit}".rstrip()
+
+
+def as_text(tables: Iterable[Table]) -> str:
+    """Tables one below the other, columns aligned: the first to the left, others to the right."""
+    blocks = []
+    for table in tables:
+        lines = [*([table.heads] if table.heads else []), *table.rows]
+        widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+        aligned = (
+            "  ".join(
+                cell.rjust(width) if k and table.heads else cell.ljust(width)
+                for k, (cell, width) in enumerate(zip(line, widths, strict=True))
+            )
+            for line in lines
+        )
+        blocks.append("\n".join([table.title, *(f"  {line}".rstrip() for line in aligned)]))
+    return "\n".join(blocks)
+
+
+def as_html(tables: Iterable[Table], image: bytes | None = None) -> str:
+    """The same for a notebook, with a PNG image before them."""
+    parts = []
+    if image is not None:
+        source = b64encode(image).decode()
+        parts.append(f'<img alt="" style="max-width: 100%" src="data:image/png;base64,{source}">')
+    for table in tables:
+        head = "".join(f"<th>{escape(cell)}</th>" for cell in table.heads)
+        body = "".join(
+            "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
+            for row in table.rows
+        )
+        parts.append(
+            f"<table><caption>{escape(table.title)}</caption>"
+            + (f"<thead><tr>{head}</tr></thead>" if head else "")
+            + f"<tbody>{body}</tbody></table>"
+        )
+    return "".join(parts)
