@@ -17,11 +17,14 @@ setup: ## make .venv, install the package and an LLVM for it (nothing to do: doe
 demo: setup ## run the main experiment; another: make demo EXPERIMENT=turbine
 	.venv/bin/lidar-mi run scenes/$(EXPERIMENT).yaml -o outputs/$(EXPERIMENT) $(ARGS)
 
+# One process for each core, eight at most (1.5 GiB each). In this process: make test ARGS=-n0
+IN_PARALLEL := -n auto --maxprocesses 8 --dist loadgroup
+
 test: setup ## run the tests, without those marked slow
-	$(PYTHON_ENV) -m pytest -m "not slow" $(ARGS)
+	$(PYTHON_ENV) -m pytest $(IN_PARALLEL) -m "not slow" $(ARGS)
 
 test-all: setup ## run all tests
-	$(PYTHON_ENV) -m pytest -m "slow or not slow" $(ARGS)
+	$(PYTHON_ENV) -m pytest $(IN_PARALLEL) -m "slow or not slow" $(ARGS)
 
 bench: setup ## compare with other programs, side by side
 	@$(PYTHON_ENV) -c "from importlib.util import find_spec as f; exit(not (all(map(f, ('mitransient', 'openpiv', 'cv2', 'skimage')))))" \

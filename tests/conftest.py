@@ -1,11 +1,37 @@
-"""What every test may ask for: Mitsuba in a given variant."""
+# ruff: noqa: E402 - numpy and torch count their threads when they are imported
+"""What every test may ask for: Mitsuba in a given variant; one thread for each of many processes.
+
+With pytest-xdist (`make test`) every process runs on one thread. The tests of a module go to one
+process, which builds the module's fixtures once; so do all tests that look at the run of the demo.
+Processes share Dr.Jit's kernel cache: it writes a kernel nameless and links it into place.
+"""
 
 import gc
+import os
+
+IS_WORKER = "PYTEST_XDIST_WORKER" in os.environ
+if IS_WORKER:  # before anything imports numpy or torch
+    for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
+        os.environ[f"{library}_NUM_THREADS"] = "1"
 
 import pytest
 
 # the package chooses Dr.Jit's LLVM, so it comes before anything that imports drjit
 import lidar_mi  # noqa: F401
+
+
+def pytest_configure():
+    if IS_WORKER:
+        import drjit
+
+        drjit.set_thread_count(1)
+
+
+def pytest_collection_modifyitems(items):
+    """Groups for ``--dist loadgroup``."""
+    for item in items:
+        group = "demo" if "demo" in item.fixturenames else item.path.as_posix()
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(scope="session")
