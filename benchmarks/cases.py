@@ -6,15 +6,17 @@ the air of every pixel came from: no interpolation, so all error is the method's
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import xarray as xr
 
 from lidar_mi.atmosphere.vortex import Vortex, velocity, vortex_pair
+from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
 SPACING, DT = 0.5, 0.1
 CIRCULATION, SEPARATION, CORE_RADIUS = 400.0, 47.1, 3.0
-CORRELATION_LENGTH, CONTRAST, WAVES = 3.0, 0.2, 600
+CORRELATION_LENGTH, CONTRAST = 3.0, 0.2
 
 
 @dataclass(frozen=True)
@@ -75,57 +77,14 @@ def vortex_pair_images(
     vortices : sequence of Vortex, optional
         In place of the pair of 47.1 m separation and 3 m core radius in the image's middle.
     """
-    y, z = ((np.arange(n) - (n - 1) / 2) * SPACING for n in (columns, rows))
-    vertical, lateral = np.meshgrid(z, y, indexing="ij")
+    y, z = axes(columns, rows, SPACING)
+    grid = np.meshgrid(y, z)
     if vortices is None:
         vortices = vortex_pair(circulation, SEPARATION, CORE_RADIUS)
-    waves = plane_waves(seed, correlation_length)
-    images = [
-        texture(waves, lateral, vertical, contrast),
-        texture(waves, *origin(vortices, lateral, vertical, DT), contrast),
-    ]
+    wind = partial(velocity, vortices)
+    waves = plane_waves(seed, correlation_length, SPACING)
+    images = [texture(waves, *grid, contrast), texture(waves, *origin(wind, *grid, DT), contrast)]
     random = np.random.default_rng([seed, 1])
     images = [image + noise * random.standard_normal(image.shape) for image in images]
-    fields = [data_array(a, y, z) for a in (*images, *velocity(vortices, lateral, vertical))]
+    fields = [data_array(a, y, z) for a in (*images, *wind(*grid))]
     return Pair(*fields, tuple(vortices), noise)
-
-
-def plane_waves(seed: int, correlation_length: float) -> tuple[np.ndarray, np.ndarray]:
-    """Wave vectors (rad m^-1) and phases of a texture that correlates over so many pixels."""
-    random = np.random.default_rng(seed)
-    vectors = random.standard_normal((WAVES, 2)) * np.sqrt(2) / correlation_length
-    phases = random.uniform(0, 2 * np.pi, WAVES)
-    seen = np.hypot(*vectors.T) < np.pi  # the image can hold no wave shorter than 2 px
-    return vectors[seen] / SPACING, phases[seen]
-
-
-def texture(waves, y: np.ndarray, z: np.ndarray, contrast: float = CONTRAST) -> np.ndarray:
-    """1 + texture of rms `contrast` at the points (y, z)."""
-    vectors, phases = waves
-    total = np.zeros(np.shape(y))
-    for (a, b), phase in zip(vectors, phases, strict=True):
-        total += np.cos(a * y + b * z + phase)
-    return 1 + contrast * np.sqrt(2 / len(phases)) * total
-
-
-def origin(vortices, y: np.ndarray, z: np.ndarray, dt: float, steps: int = 8) -> np.ndarray:
-    """Where air now at (y, z) was dt ago (Runge-Kutta, 4th order)."""
-    here = np.array([y, z], float)
-    h = -dt / steps
-
-    def wind(place):
-        return np.array(velocity(vortices, *place))
-
-    for _ in range(steps):
-        k1 = wind(here)
-        k2 = wind(here + h / 2 * k1)
-        k3 = wind(here + h / 2 * k2)
-        k4 = wind(here + h * k3)
-        here = here + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-    return here
-
-
-def data_array(values: np.ndarray, y: np.ndarray, z: np.ndarray) -> xr.DataArray:
-    """An image as retrievals take it: dims (z, y), axes in metres."""
-    coordinates = {"z": ("z", z, {"units": "m"}), "y": ("y", y, {"units": "m"})}
-    return xr.DataArray(values, coordinates, ("z", "y"))

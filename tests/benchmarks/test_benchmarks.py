@@ -39,7 +39,7 @@ from benchmarks import (
     transient,
     velocimetry,
 )
-from lidar_mi.atmosphere.vortex import Vortex, velocity
+from lidar_mi.atmosphere.vortex import velocity
 
 
 def lines(comparison):
@@ -254,16 +254,6 @@ def test_mitransient_renders_the_same_signal(variant, monkeypatch):
     share = math.exp(-0.0484 - 1.8e-3 * 15) * -math.expm1(-1.8e-3 * 2.5)
     assert variance.other == pytest.approx(1 / share, rel=0.2)
     assert found[case, "samples a beam for 1 %"].other == pytest.approx(1e4 * variance.other)
-
-
-def test_air_turns_around_a_single_vortex():
-    vortex = Vortex(400.0, 3.0, 1.0, -2.0)
-    y, z = np.array([2.0, 4.0, -9.0]), np.array([-2.5, 1.0, 7.0])
-    before = cases.origin((vortex,), y, z, 0.1)
-    now, then = (a + 1j * b for a, b in ((y - 1, z + 2), (before[0] - 1, before[1] + 2)))
-    r = np.abs(now)
-    swirl = 400 / (2 * np.pi * r) * (1 - np.exp(-1.2564 * r**2 / 9))
-    np.testing.assert_allclose(then, now * np.exp(-1j * swirl / r * 0.1), atol=1e-5)
 
 
 def test_errors_are_zero_for_the_true_wind_wherever_the_grids_begin():

@@ -19,23 +19,18 @@ from lidar_mi.assessment.metrics.error_budget import (
 from lidar_mi.assessment.report.error_budget import budget_chapter, draw_all, limit_sentence
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from tests.support.flows import axes, data_array, plane_waves, texture
 
 DT, H = 0.1, 0.5
 
 
 def field(values):
     rows, columns = values.shape
-    y, z = (np.arange(columns) - (columns - 1) / 2) * H, (np.arange(rows) - (rows - 1) / 2) * H
-    metres = {"units": "m"}
-    return xr.DataArray(values, {"z": ("z", z, metres), "y": ("y", y, metres)}, ("z", "y"))
+    return data_array(values, *axes(columns, rows, H))
 
 
 def flow(v, w, columns=81, rows=61):
-    z, y = np.meshgrid(
-        (np.arange(rows) - (rows - 1) / 2) * H,
-        (np.arange(columns) - (columns - 1) / 2) * H,
-        indexing="ij",
-    )
+    y, z = np.meshgrid(*axes(columns, rows, H))
     return xr.Dataset({"v": field(v(y, z) + 0 * y), "w": field(w(y, z) + 0 * y)})
 
 
@@ -245,35 +240,20 @@ def test_the_method_is_what_it_does_to_perfect_pictures():
 # --- through the retrieval
 
 
-@pytest.fixture(scope="module")
-def texture():
-    """Band-limited structure as a function of place (rms 0.2, 3 px), and the images' places."""
-    rng = np.random.default_rng(7)
-    vectors = rng.standard_normal((400, 2)) * np.sqrt(2) / 3 / H
-    phases = rng.uniform(0, 2 * np.pi, 400)
-
-    def at(y, z):
-        waves = (np.cos(a * y + b * z + p) for (a, b), p in zip(vectors, phases))
-        return 1 + 0.2 * np.sqrt(2 / 400) * sum(waves)
-
-    return at
+WAVES = plane_waves(7, 3.0, H)
 
 
-def carried(texture, move, columns=81, rows=61):
+def carried(move, columns=81, rows=61):
     """Images at t1 and t2; `move` takes places dt back."""
-    z, y = np.meshgrid(
-        (np.arange(rows) - (rows - 1) / 2) * H,
-        (np.arange(columns) - (columns - 1) / 2) * H,
-        indexing="ij",
-    )
-    return [field(texture(y, z)), field(texture(*move(y, z)))]
+    grid = np.meshgrid(*axes(columns, rows, H))
+    return [field(texture(WAVES, *at)) for at in (grid, move(*grid))]
 
 
 @pytest.mark.parametrize("method", ["cc", "multipass"])
-def test_noise_alone_has_all_of_it(texture, method):
+def test_noise_alone_has_all_of_it(method):
     """An even wind of a whole pixel, 10 % white noise: without the noise hardly anything is
     left, as correlation sees whole pixels exactly."""
-    sharp = carried(texture, lambda y, z: (y - H, z + H))
+    sharp = carried(lambda y, z: (y - H, z + H))
     rng = np.random.default_rng(11)
     seen = [i + 0.1 * rng.standard_normal(i.shape) for i in sharp]
     pictures = pictures_without(seen, sharp, sharp, sharp)
@@ -293,31 +273,33 @@ def test_noise_alone_has_all_of_it(texture, method):
 
 
 @pytest.mark.parametrize("method", ["cc", "multipass"])
-def test_share_of_noise_is_what_noise_drawn_anew_scatters_winds_by(texture, method):
-    """Noise added to the same pictures a second time moves winds by the root of two of what noise makes
-    of the error: taken away as it fell, or drawn anew, its share is one (0.07 of some hundred
-    independent vectors)."""
-    sharp = carried(texture, lambda y, z: (y - 0.7 * H, z + 0.4 * H))
+def test_share_of_noise_is_what_noise_drawn_anew_scatters_winds_by(method):
+    """Noise taken away as it fell, or drawn anew six times: its share of the error is the same.
+
+    The difference of the two scatters by 0.02 over sets of six draws; four times that is allowed.
+    """
+    sharp = carried(lambda y, z: (y - 0.7 * H, z + 0.4 * H))
     blurred = [i.copy(data=gaussian_filter(i.values, 1.0, mode="nearest")) for i in sharp]
     rng = np.random.default_rng(29)
-    noisy = [[i + 0.04 * rng.standard_normal(i.shape) for i in blurred] for _ in range(3)]
+    noisy = [[i + 0.04 * rng.standard_normal(i.shape) for i in blurred] for _ in range(6)]
     truth = flow(lambda y, z: 0.7 * H / DT + 0 * y, lambda y, z: -0.4 * H / DT + 0 * y)
-    settings = {"dt": DT, "method": method, "stride": 2, "noise": 0.04}
-    found, again, once_more = (retrieve_wind(*pair, **settings) for pair in noisy)
-    without = retrieve_wind(*blurred, **settings | {"noise": 0.0})
-    budget = error_budget(found, {"detector_noise": without}, truth, [], flagged=True)
-    scatter = sum(float(((again[n] - once_more[n]) ** 2).mean()) / 2 for n in "vw")
-    error = budget["rmse_v"] ** 2 + budget["rmse_w"] ** 2
-    assert budget["detector_noise.share"] > 0.3
-    assert budget["detector_noise.share"] == pytest.approx(scatter / error, abs=0.1)
+    settings = {"dt": DT, "method": method, "stride": 4, "noise": 0.04}
+    without = {"detector_noise": retrieve_wind(*blurred, **settings | {"noise": 0.0})}
+    found = [retrieve_wind(*pair, **settings) for pair in noisy]
+    budgets = [error_budget(one, without, truth, [], flagged=True) for one in found]
+    error = np.array([b["rmse_v"] ** 2 + b["rmse_w"] ** 2 for b in budgets])
+    share = np.average([b["detector_noise.share"] for b in budgets], weights=error)
+    scatter = sum(np.nanmean(np.nanvar([one[n] for one in found], axis=0, ddof=1)) for n in "vw")
+    assert share > 0.3
+    assert share == pytest.approx(scatter / error.mean(), abs=0.08)
 
 
 @pytest.mark.parametrize("shear", [0.0, 4.0])
-def test_shear_within_the_window(texture, shear):
+def test_shear_within_the_window(shear):
     """A simple shear (closed form) of 4 / s deforms a window of 8 px by 1.6 px on either side. With
     windows that move as one, correlation errs as in an even wind, by 0.13 px or
     0.65 m/s."""
-    sharp = carried(texture, lambda y, z: (y - DT * (5 + shear * z), z), 57, 41)
+    sharp = carried(lambda y, z: (y - DT * (5 + shear * z), z), 57, 41)
     rng = np.random.default_rng(4)
     seen = [i + 0.02 * rng.standard_normal(i.shape) for i in sharp]
     truth = flow(lambda y, z: 5 + shear * z, lambda y, z: 0 * y, 57, 41)

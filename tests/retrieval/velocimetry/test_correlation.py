@@ -12,6 +12,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.velocimetry.correlation import correlate, cross_correlation
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.windows import Windows
+from tests.support.flows import plane_waves, texture
 
 
 def direct(image1, image2, template, search, stride):
@@ -84,12 +85,12 @@ def test_does_not_depend_on_gain_and_offset_of_either_image():
     np.testing.assert_allclose(correlate(3e-6 * first + 0.02, 7 - second, 5, 10), -plain, atol=1e-7)
 
 
-def test_bright_neighbourhood_does_not_draw_the_peak(synthetic):
+def test_bright_neighbourhood_does_not_draw_the_peak():
     """Brightness doubles across a template, texture is 20 %: a plain product goes to the rim."""
     y, z = np.meshgrid(np.arange(64.0), np.arange(48.0))
     gain = np.exp(y / 12)
-    first = gain * synthetic.texture(y, z, 1, 3.0, 0.2)
-    second = gain * synthetic.texture(y - 2, z + 1, 1, 3.0, 0.2)
+    first = gain * texture(plane_waves(1, 3.0), y, z)
+    second = gain * texture(plane_waves(1, 3.0), y - 2, z + 1)
     found = cross_correlation(torch.as_tensor(first), torch.as_tensor(second))
     assert abs(float(found.dy.nanmedian()) - 2) < 0.15
     assert abs(float(found.dz.nanmedian()) + 1) < 0.15
@@ -108,10 +109,10 @@ def test_tiles_change_nothing(monkeypatch):
 
 
 @pytest.mark.parametrize("shift_z, shift_y", [(0, 0), (1, -2), (-3, 3), (2, 0)])
-def test_whole_pixels_are_found_everywhere(synthetic, shift_z, shift_y):
+def test_whole_pixels_are_found_everywhere(shift_z, shift_y):
     y, z = np.meshgrid(np.arange(60.0), np.arange(50.0))
-    first = torch.as_tensor(synthetic.texture(y, z, 2, 3.0, 0.2))
-    second = torch.as_tensor(synthetic.texture(y - shift_y, z - shift_z, 2, 3.0, 0.2))
+    first = torch.as_tensor(texture(plane_waves(2, 3.0), y, z))
+    second = torch.as_tensor(texture(plane_waves(2, 3.0), y - shift_y, z - shift_z))
     found = cross_correlation(first, second)
     assert (found.flag & ~Flag.NO_SUBPIXEL_FIT == 0).all()
     np.testing.assert_allclose(found.score, 1, atol=1e-9)
@@ -122,7 +123,7 @@ def test_whole_pixels_are_found_everywhere(synthetic, shift_z, shift_y):
 
 @pytest.mark.parametrize("fraction", [0.0, 0.2, 0.5, 0.7])
 @pytest.mark.parametrize("axis", ["y", "z"])
-def test_subpixel_shift_has_little_bias(synthetic, fraction, axis):
+def test_subpixel_shift_has_little_bias(fraction, axis):
     """Mean over some 300 independent windows, single errors below 0.15 px: 0.03 px is 3.5 sigma.
 
     Single errors: texture of 3 px correlation length makes peaks that are elongated and tilted,
@@ -131,8 +132,8 @@ def test_subpixel_shift_has_little_bias(synthetic, fraction, axis):
     """
     y, z = np.meshgrid(np.arange(219.0), np.arange(139.0))
     shift = {"y": 0.0, "z": 0.0} | {axis: 1 + fraction}
-    first = synthetic.texture(y, z, 3, 3.0, 0.2)
-    second = synthetic.texture(y - shift["y"], z - shift["z"], 3, 3.0, 0.2)
+    first = texture(plane_waves(3, 3.0), y, z)
+    second = texture(plane_waves(3, 3.0), y - shift["y"], z - shift["z"])
     found = cross_correlation(torch.as_tensor(first), torch.as_tensor(second), stride=2)
     for displacement, name in ((found.dz, "z"), (found.dy, "y")):
         error = displacement[torch.isfinite(displacement)] - shift[name]
@@ -157,10 +158,10 @@ def test_gaussian_blob(dy, dz):
     assert found.flag[i, j] == 0
 
 
-def test_beyond_the_search_range_is_flagged_not_clipped(synthetic):
+def test_beyond_the_search_range_is_flagged_not_clipped():
     y, z = np.meshgrid(np.arange(80.0), np.arange(60.0))
-    first = torch.as_tensor(synthetic.texture(y, z, 4, 6.0, 0.2))
-    second = torch.as_tensor(synthetic.texture(y - 4.4, z, 4, 6.0, 0.2))
+    first = torch.as_tensor(texture(plane_waves(4, 6.0), y, z))
+    second = torch.as_tensor(texture(plane_waves(4, 6.0), y - 4.4, z))
     found = cross_correlation(first, second)
     rim = (found.flag & Flag.PEAK_ON_RIM.value) > 0
     assert rim.double().mean() > 0.9

@@ -6,21 +6,14 @@ is no arc, an aperture problem that is not admitted.
 """
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from benchmarks.cases import (
-    DT,
-    SPACING,
-    data_array,
-    origin,
-    plane_waves,
-    texture,
-    vortex_pair_images,
-)
+from benchmarks.cases import DT, SPACING, vortex_pair_images
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.velocimetry.block_tridiagonal import factor
@@ -37,6 +30,7 @@ from lidar_mi.retrieval.velocimetry.variational import (
 from lidar_mi.retrieval.velocimetry.warping import band_limited
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.velocimetry.windows import Windows
+from tests.support.flows import data_array, origin, plane_waves, texture
 
 
 def rms(values):
@@ -105,10 +99,10 @@ def burst(number, noise, columns=90, rows=80, seed=3):
     vertical, lateral = np.meshgrid(z, y, indexing="ij")
     vortices = vortex_pair(200.0, 30.0, 4.0)[:1]
     random = np.random.default_rng(seed)
-    waves = plane_waves(seed, 3.0)
+    waves = plane_waves(seed, 3.0, SPACING)
     images = []
     for k in range(number):
-        came = origin(vortices, lateral, vertical, k * DT / 2)
+        came = origin(partial(velocity, vortices), lateral, vertical, k * DT / 2)
         image = texture(waves, *came) + noise * random.standard_normal(vertical.shape)
         images.append(torch.tensor(image))
     windows = Windows((rows, columns))
@@ -134,7 +128,7 @@ def test_a_burst_tells_more_than_a_pair_and_unlike_brightness_costs_nothing():
 def test_noise_of_a_burst_is_what_still_images_differ_by(number, spread):
     """The variance to 4 times its relative spread over textures and noises of 12 seeds."""
     random = np.random.default_rng(8)
-    z, y = (SPACING * np.arange(n) for n in (80, 90))
+    z, y = np.arange(80), np.arange(90)
     still = texture(plane_waves(8, 3.0), *np.meshgrid(y, z))
     stack = [
         torch.tensor(still + 0.05 * random.standard_normal(still.shape)) for _ in range(number)
@@ -182,7 +176,7 @@ def test_stripes_leave_one_direction_open():
 def waves(seed, length):
     """Texture of rms 1 at places (y, z) in px, of a correlation length in px."""
     about = plane_waves(seed, length)
-    return lambda y, z: (texture(about, y * SPACING, z * SPACING) - 1) / 0.2
+    return lambda y, z: texture(about, y, z, 1.0) - 1
 
 
 def grid(rows, columns):

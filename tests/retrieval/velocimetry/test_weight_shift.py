@@ -13,6 +13,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.weight_shift import mass, weight_shift
 from lidar_mi.retrieval.velocimetry.windows import Windows
+from tests.support.flows import plane_waves, texture
 
 
 def direct(image1, image2, template, search, stride):
@@ -99,10 +100,10 @@ def test_nothing_to_weigh_is_no_match():
         assert torch.isnan(found.dy).all() and torch.isnan(found.dz).all()
 
 
-def test_rim_and_nan_are_flagged(synthetic):
+def test_rim_and_nan_are_flagged():
     y, z = np.meshgrid(np.arange(50.0), np.arange(40.0))
-    first = torch.as_tensor(synthetic.texture(y, z, 4, 12.0, 0.2))
-    second = torch.as_tensor(synthetic.texture(y - 5, z, 4, 12.0, 0.2))
+    first = torch.as_tensor(texture(plane_waves(4, 12.0), y, z))
+    second = torch.as_tensor(texture(plane_waves(4, 12.0), y - 5, z))
     second[20, 30] = torch.inf
     found = weight_shift(first, second)
     rim = (found.flag & Flag.PEAK_ON_RIM.value) > 0

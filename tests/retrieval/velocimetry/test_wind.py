@@ -4,27 +4,30 @@ Detects an error of 0.1 m in where a vector belongs (half a pixel is 0.25 m), of
 error that a plain correlation has, a wrong sign, axis, spacing or unit, and confident nonsense.
 """
 
+from functools import partial
+
 import numpy as np
 import pytest
 import xarray as xr
 from scipy.optimize import least_squares
 
+from benchmarks.cases import CORE_RADIUS, DT, vortex_pair_images
+from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.wind import METHODS, retrieve_wind, wind_bound
-
-DT = 0.1
-CIRCULATION, SEPARATION, RADIUS = 400.0, 47.1, 3.0
+from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
 
-def moved(synthetic, v, w, spacing_y=0.5, spacing_z=0.5, length=3.0, rows=60, columns=80, seed=1):
-    """A texture carried by a uniform wind; correlation length in m."""
+def moved(v, w, spacing_y=0.5, spacing_z=0.5, rows=60, columns=80):
+    """A texture of 3 m correlation length carried by a uniform wind."""
     y = np.arange(columns) * spacing_y
     z = np.arange(rows) * spacing_z
     grid = np.meshgrid(y, z)
-    first = synthetic.texture(*grid, seed, length, 0.2)
-    second = synthetic.texture(grid[0] - v * DT, grid[1] - w * DT, seed, length, 0.2)
-    return [synthetic.data_array(image, y, z) for image in (first, second)]
+    waves = plane_waves(1, 6.0, 0.5)
+    first = texture(waves, *grid)
+    second = texture(waves, grid[0] - v * DT, grid[1] - w * DT)
+    return [data_array(image, y, z) for image in (first, second)]
 
 
 def rms(values):
@@ -32,40 +35,22 @@ def rms(values):
 
 
 @pytest.fixture(scope="module")
-def vortex_pairs(synthetic):
-    """Two Lamb-Oseen vortices on 219 x 139 px, texture of 3 px correlation length and 20 %."""
-
-    def wind(y, z):
-        port = synthetic.lamb_oseen(y, z, CIRCULATION, RADIUS, (SEPARATION / 2, 0.0))
-        starboard = synthetic.lamb_oseen(y, z, -CIRCULATION, RADIUS, (-SEPARATION / 2, 0.0))
-        return port[0] + starboard[0], port[1] + starboard[1]
-
-    y, z = synthetic.axes(219, 139)
-    grid = np.meshgrid(y, z)
-    before = synthetic.origin(wind, *grid, DT)
-    pairs = [
-        [
-            synthetic.data_array(synthetic.texture(*at, seed, 1.5, 0.2), y, z)
-            for at in (grid, before)
-        ]
-        for seed in (1, 2, 3, 4)
-    ]
-    return pairs, wind
+def pairs():
+    return [vortex_pair_images(seed=seed) for seed in (1, 2, 3, 4)]
 
 
-def scores(vortex_pairs, method):
+def scores(pairs, method):
     """Mean over pairs and components of the rms error: all, far, good; and of the wind itself.
 
     Far is beyond two core radii, good is unflagged; then the mean error and the good fraction.
     """
-    pairs, wind = vortex_pairs
     rows = []
     for pair in pairs:
-        dataset = retrieve_wind(*pair, DT, method)
+        dataset = retrieve_wind(pair.first, pair.second, DT, method)
         y, z = dataset.y_vector.values, dataset.z_vector.values
-        far = np.minimum(*(np.hypot(y - s * SEPARATION / 2, z) for s in (-1, 1))) > 2 * RADIUS
+        far = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) > 2 * CORE_RADIUS
         good = dataset.flag.values == 0
-        for found, true in zip((dataset.v.values, dataset.w.values), wind(y, z)):
+        for found, true in zip((dataset.v.values, dataset.w.values), velocity(pair.vortices, y, z)):
             error = found - true
             rows.append(
                 [
@@ -80,31 +65,31 @@ def scores(vortex_pairs, method):
     return np.mean(rows, axis=0)
 
 
-def test_cc_of_a_vortex_pair(vortex_pairs):
+def test_cc_of_a_vortex_pair(pairs):
     """A plain CC, programmed independently, came to 0.85 m/s, 0.65 beyond two core radii.
 
     The rms of one component of one pair scatters by 0.09 m/s (0.02 far from the cores) from one
     texture to the next, the mean of eight by 0.03 m/s; the other programme's number scatters
     too, and its texture is the same only in correlation length: 15 %.
     """
-    everywhere, far, good, _, bias, fraction = scores(vortex_pairs, "cc")
+    everywhere, far, good, _, bias, fraction = scores(pairs, "cc")
     assert everywhere == pytest.approx(0.85, rel=0.15)
     assert far == pytest.approx(0.65, rel=0.15)
     assert abs(bias) < 0.05
     assert good < 0.95 * everywhere and fraction > 0.95
 
 
-def test_ws_of_a_vortex_pair(vortex_pairs):
+def test_ws_of_a_vortex_pair(pairs):
     """No better than reporting no wind, but better than the 5.4 m/s of matching centres alone.
 
     The median test finds most of the wrong matches; what it leaves tells something of the wind.
     """
-    everywhere, _, good, no_wind, _, fraction = scores(vortex_pairs, "ws")
+    everywhere, _, good, no_wind, _, fraction = scores(pairs, "ws")
     assert 0.9 * no_wind < everywhere < 5.4
     assert good < 0.75 * no_wind and 0.5 < fraction < 0.9
 
 
-def test_vortex_core_comes_out_where_it_is(synthetic):
+def test_vortex_core_comes_out_where_it_is():
     """A vortex in a wind of (10, -6) m/s: at mid-time its core is V dt/2 further on.
 
     The core is found by fitting the closed form to the vectors. Right: within 0.1 m. Vectors left
@@ -112,22 +97,21 @@ def test_vortex_core_comes_out_where_it_is(synthetic):
     centred on a pixel move it by half a pixel, 0.25 m in both.
     """
     mean = np.array([10.0, -6.0])
-    y, z = synthetic.axes(120, 110)
+    y, z = axes(120, 110)
     grid = np.meshgrid(y, z)
 
-    def swirl(y, z):
-        return synthetic.lamb_oseen(y, z, 200.0, RADIUS)
-
-    first = synthetic.texture(*grid, 5, 1.5, 0.2)
+    swirl = partial(velocity, [Vortex(200.0, 3.0, 0.0, 0.0)])
+    waves = plane_waves(5, 3.0, 0.5)
+    first = texture(waves, *grid)
     carried = grid[0] - mean[0] * DT, grid[1] - mean[1] * DT  # frame that goes with the vortex
-    second = synthetic.texture(*synthetic.origin(swirl, *carried, DT), 5, 1.5, 0.2)
-    dataset = retrieve_wind(*(synthetic.data_array(i, y, z) for i in (first, second)), DT)
+    second = texture(waves, *origin(swirl, *carried, DT))
+    dataset = retrieve_wind(*(data_array(i, y, z) for i in (first, second)), DT)
     good = dataset.flag.values == 0
     v, w = dataset.v.values[good], dataset.w.values[good]
 
     def core(y, z):
         def misfit(p):
-            model = synthetic.lamb_oseen(y, z, p[2], p[3], p[:2])
+            model = velocity([Vortex(p[2], p[3], *p[:2])], y, z)
             return np.concatenate([model[0] + p[4] - v, model[1] + p[5] - w])
 
         return least_squares(misfit, [0.3, 0.3, 150.0, 3.5, 8.0, -4.0], loss="soft_l1").x
@@ -144,15 +128,15 @@ def test_vortex_core_comes_out_where_it_is(synthetic):
 
 
 @pytest.mark.parametrize("v, w", [(6.0, 0.0), (-6.0, 0.0), (0.0, 4.0), (0.0, -4.0)])
-def test_sign_and_axis(synthetic, v, w):
-    dataset = retrieve_wind(*moved(synthetic, v, w), DT, stride=2)
+def test_sign_and_axis(v, w):
+    dataset = retrieve_wind(*moved(v, w), DT, stride=2)
     good = dataset.where(dataset.flag == 0)
     assert float(good.v.mean()) == pytest.approx(v, abs=0.2)
     assert float(good.w.mean()) == pytest.approx(w, abs=0.2)
 
 
-def test_unequal_spacings(synthetic):
-    images = moved(synthetic, 5.0, 8.0, spacing_y=0.4, spacing_z=0.8)
+def test_unequal_spacings():
+    images = moved(5.0, 8.0, spacing_y=0.4, spacing_z=0.8)
     dataset = retrieve_wind(*images, DT, template=7, search=14, stride=3)
     good = dataset.where(dataset.flag == 0)
     assert float(good.v.mean()) == pytest.approx(5.0, abs=0.3)
@@ -162,8 +146,8 @@ def test_unequal_spacings(synthetic):
     np.testing.assert_allclose(dataset.z[:3], 0.8 * np.array([6, 9, 12]))
 
 
-def test_vectors_belong_half_their_displacement_further_on(synthetic):
-    dataset = retrieve_wind(*moved(synthetic, 6.0, -3.0), DT)
+def test_vectors_belong_half_their_displacement_further_on():
+    dataset = retrieve_wind(*moved(6.0, -3.0), DT)
     np.testing.assert_allclose(dataset.y[0], 0.5 * (4 + 3.5))
     shift_y = (dataset.y_vector - dataset.y).transpose("z", "y")
     shift_z = (dataset.z_vector - dataset.z).transpose("z", "y")
@@ -172,16 +156,16 @@ def test_vectors_belong_half_their_displacement_further_on(synthetic):
     np.testing.assert_allclose(dataset.v, dataset.displacement_y / DT, rtol=1e-5)
 
 
-def test_blob_moved_by_one_and_a_half_metres(synthetic):
+def test_blob_moved_by_one_and_a_half_metres():
     """+1 m in y and +0.5 m in z, to 0.05 px, with both methods."""
-    y, z = synthetic.axes(64, 56)
+    y, z = axes(64, 56)
     grid = np.meshgrid(y, z)
 
     def blob(cy, cz, floor):
         return floor + np.exp(-((grid[0] - cy) ** 2 + (grid[1] - cz) ** 2) / (2 * 0.5**2))
 
     for method, floor in (("cc", 0.1), ("ws", 0.0)):
-        pair = (synthetic.data_array(blob(*c, floor), y, z) for c in ((0, 0), (1.0, 0.5)))
+        pair = (data_array(blob(*c, floor), y, z) for c in ((0, 0), (1.0, 0.5)))
         at_blob = retrieve_wind(*pair, DT, method).sel(y=0, z=0, method="nearest")
         assert float(at_blob.displacement_y) == pytest.approx(1.0, abs=0.025)
         assert float(at_blob.displacement_z) == pytest.approx(0.5, abs=0.025)
@@ -190,10 +174,10 @@ def test_blob_moved_by_one_and_a_half_metres(synthetic):
 
 
 @pytest.mark.parametrize("method", list(METHODS))
-def test_constant_images_are_flagged_throughout(synthetic, method):
-    y, z = synthetic.axes(50, 40)
+def test_constant_images_are_flagged_throughout(method):
+    y, z = axes(50, 40)
     for value in (0.0, 1e-4):
-        flat = synthetic.data_array(np.full((40, 50), value), y, z)
+        flat = data_array(np.full((40, 50), value), y, z)
         dataset = retrieve_wind(flat, flat, DT, method, min_texture=0.0, min_isotropy=0.0)
         assert (dataset.flag & Flag.LOW_TEXTURE.value > 0).all()
         assert (dataset.flag & Flag.NO_MATCH.value > 0).all()
@@ -206,13 +190,13 @@ def test_constant_images_are_flagged_throughout(synthetic, method):
         pytest.param("vortex_fit", marks=pytest.mark.slow),
     ],
 )
-def test_no_vector_is_good_without_a_number(synthetic, method):
+def test_no_vector_is_good_without_a_number(method):
     """Noise against noise, with a hole: whatever is not flagged is finite."""
     rng = np.random.default_rng(8)
-    y, z = synthetic.axes(70, 60)
+    y, z = axes(70, 60)
     first, second = 1 + 0.1 * rng.standard_normal((2, 60, 70))
     second[30, 30] = np.nan
-    pair = [synthetic.data_array(image, y, z) for image in (first, second)]
+    pair = [data_array(image, y, z) for image in (first, second)]
     dataset = retrieve_wind(*pair, DT, method, noise=0.0)
     good = dataset.flag == 0
     for name in ("v", "w", "y_vector", "z_vector"):
@@ -222,16 +206,16 @@ def test_no_vector_is_good_without_a_number(synthetic, method):
     assert float((dataset.flag == 0).mean()) < 0.01
 
 
-def test_beyond_the_search_range_nothing_is_good(synthetic):
+def test_beyond_the_search_range_nothing_is_good():
     """22 m/s are 4.4 px; 8 in 16 sees up to 3.5 px."""
-    dataset = retrieve_wind(*moved(synthetic, 22.0, 0.0), DT)
+    dataset = retrieve_wind(*moved(22.0, 0.0), DT)
     assert float((dataset.flag & Flag.PEAK_ON_RIM.value > 0).mean()) > 0.8
     assert float((dataset.flag == 0).mean()) < 0.1
     assert not (np.abs(dataset.v) > 17.5).any()
 
 
-def test_data_set_is_cf_and_survives_a_file(synthetic, tmp_path):
-    pair = moved(synthetic, 6.0, -3.0)
+def test_data_set_is_cf_and_survives_a_file(tmp_path):
+    pair = moved(6.0, -3.0)
     for method, score in (("cc", "correlation"), ("ws", "mismatch")):
         dataset = retrieve_wind(*pair, DT, method, stride=2)
         assert dataset.attrs["Conventions"] == "CF-1.11"
@@ -262,16 +246,16 @@ def test_data_set_is_cf_and_survives_a_file(synthetic, tmp_path):
             assert len(flag.attrs["flag_masks"]) == len(flag.attrs["flag_meanings"].split())
 
 
-def test_transposed_and_single_precision_images(synthetic):
-    pair = moved(synthetic, 6.0, -3.0)
+def test_transposed_and_single_precision_images():
+    pair = moved(6.0, -3.0)
     plain = retrieve_wind(*pair, DT)
     xr.testing.assert_identical(retrieve_wind(pair[0].T, pair[1], DT), plain)
     single = retrieve_wind(*(image.astype(np.float32) for image in pair), DT)
     np.testing.assert_allclose(single.v, plain.v, atol=1e-3)
 
 
-def test_bad_input_is_named(synthetic):
-    one, two = moved(synthetic, 1.0, 1.0, rows=30, columns=40)
+def test_bad_input_is_named():
+    one, two = moved(1.0, 1.0, rows=30, columns=40)
     uneven = two.assign_coords(y=("y", np.r_[0, 0.7, two.y.values[2:]], {"units": "m"}))
     bare = two.assign_coords(y=("y", two.y.values))
     off = two.assign_coords(y=("y", two.y.values + 0.2, {"units": "m"}))
@@ -305,24 +289,25 @@ def test_bad_input_is_named(synthetic):
         assert str(error.value).startswith(start) and "\n" not in str(error.value), start
 
 
-def burst(synthetic, number, noise, seed=7):
+def burst(number, noise, seed=7):
     """A texture in a uniform wind of (3, -2) m/s, seen `number` times."""
     y, z = np.arange(70) * 0.5, np.arange(60) * 0.5
     grid = np.meshgrid(y, z)
     random = np.random.default_rng(seed)
+    waves = plane_waves(seed, 3.0, 0.5)
     for k in range(number):
-        picture = synthetic.texture(grid[0] - 3 * k * DT, grid[1] + 2 * k * DT, seed, 1.5, 0.2)
+        picture = texture(waves, grid[0] - 3 * k * DT, grid[1] + 2 * k * DT)
         picture += noise * random.standard_normal(picture.shape)
-        yield synthetic.data_array(picture, y, z)
+        yield data_array(picture, y, z)
 
 
-def test_more_images_of_a_burst_lower_the_error(synthetic):
+def test_more_images_of_a_burst_lower_the_error():
     """N images in uniform wind hold N (N^2 - 1) / 6 times the information of two: 10 for four.
 
     The standard error falls by sqrt(10) where noise alone limits it; half of that is asked for, as
     the prior helps the pair more.
     """
-    first, second, *more = burst(synthetic, 4, 0.1)
+    first, second, *more = burst(4, 0.1)
     stderr, error = [], []
     for rest in ([], more):
         wind = retrieve_wind(first, second, DT, "variational", noise=0.1, more=rest)
@@ -333,8 +318,8 @@ def test_more_images_of_a_burst_lower_the_error(synthetic):
     assert error[1] < 0.63 * error[0]
 
 
-def test_a_burst_needs_a_method_that_takes_it(synthetic):
-    first, second, third = burst(synthetic, 3, 0.0)
+def test_a_burst_needs_a_method_that_takes_it():
+    first, second, third = burst(3, 0.0)
     with pytest.raises(InputError, match="more: 3 images are not allowed with method 'cc'"):
         retrieve_wind(first, second, DT, more=[third])
     with pytest.raises(InputError, match="differ"):

@@ -5,12 +5,14 @@ circulation, and fits that claim success without a vortex signature. Slow: inter
 points too little or too much.
 """
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 import xarray as xr
 
-from benchmarks.cases import data_array, origin, plane_waves, texture, vortex_pair_images
+from benchmarks.cases import vortex_pair_images
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading as config
@@ -19,6 +21,7 @@ from lidar_mi.retrieval.velocimetry.warping import band_limited
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.model import PROFILES, advected, path_sensitivity
 from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
+from tests.support.flows import axes, data_array, origin, plane_waves, texture
 from tests.support.vortex_pairs import uneven, vector
 
 DT = 0.1
@@ -117,13 +120,13 @@ def test_profile_gain_offset_and_unlike_spacings(profile):
     mean = np.array([6.0, -3.0])
     y, z = (np.arange(140) - 69.5) * 0.4, (np.arange(80) - 39.5) * 0.6
     vertical, lateral = np.meshgrid(z, y, indexing="ij")
-    waves = plane_waves(7, 3.0)
+    waves = plane_waves(7, 3.0, 0.5)
     # in the frame that goes with the mean wind the vortices stand still
     back = lateral - mean[0] * DT / 2, vertical - mean[1] * DT / 2
     on = lateral + mean[0] * DT / 2, vertical + mean[1] * DT / 2
     images = [
-        texture(waves, *origin(pair, *on, -DT / 2)),
-        texture(waves, *origin(pair, *back, DT / 2)),
+        texture(waves, *origin(partial(velocity, pair), *on, -DT / 2)),
+        texture(waves, *origin(partial(velocity, pair), *back, DT / 2)),
     ]
     first, second = (data_array(i, y, z) for i in (images[0], 1.3 * images[1] + 0.4))
     found = fit_vortices(first, second, DT, noise=0.0, profile=profile)
@@ -194,7 +197,7 @@ def test_nothing_is_made_up():
     random = np.random.default_rng(4)
     flat = data_array(np.ones((60, 80)), y, z)
     one, two = (data_array(1 + 0.1 * random.standard_normal((60, 80)), y, z) for _ in range(2))
-    still = data_array(texture(plane_waves(1, 3.0), *np.meshgrid(y, z)), y, z)
+    still = data_array(texture(plane_waves(1, 3.0, 0.5), *np.meshgrid(y, z)), y, z)
     shaken = [still + 0.05 * random.standard_normal(still.shape) for _ in range(2)]
     missing = flat.where(flat.y < 15)
     for images, reason in (
@@ -293,27 +296,22 @@ def stirred(seed, rms, length):
     phases = random.uniform(0, 2 * np.pi, 60)
     scale = rms * np.sqrt(2 / 60) / np.sqrt((vectors**2).mean())
 
-    def flow(place):
-        v, w = np.array(velocity(uneven(), *place))
+    def flow(y, z):
+        v, w = velocity(uneven(), y, z)
         for (a, b), phase in zip(vectors, phases):
-            slope = -scale * np.sin(a * place[0] + b * place[1] + phase)
+            slope = -scale * np.sin(a * y + b * z + phase)
             v, w = v - b * slope, w + a * slope
-        return np.array([v, w])
+        return v, w
 
-    y, z = ((np.arange(n) - (n - 1) / 2) * 0.5 for n in SMALL.values())
-    here = np.array(np.meshgrid(y, z))
-    place, h = here, -DT / 2
-    for _ in range(2):
-        k1 = flow(place)
-        k2 = flow(place + h / 2 * k1)
-        k3 = flow(place + h / 2 * k2)
-        place = place + h / 6 * (k1 + 2 * k2 + 2 * k3 + flow(place + h * k3))
-    waves = plane_waves(seed, 3.0)
+    y, z = axes(**SMALL)
+    here = np.meshgrid(y, z)
+    place = origin(flow, *here, DT, 2)
+    waves = plane_waves(seed, 3.0, 0.5)
     images = [
         texture(waves, *where, 0.1) + 0.01 * random.standard_normal(here[0].shape)
         for where in (here, place)
     ]
-    return [data_array(image, y, z) for image in images], flow(here)
+    return [data_array(image, y, z) for image in images], flow(*here)
 
 
 def test_a_disturbed_flow_is_admitted():

@@ -6,12 +6,12 @@ import pytest
 import torch
 import xarray as xr
 
-from benchmarks.cases import data_array
 from lidar_mi.atmosphere.vortex import velocity
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices import vector_fit
 from lidar_mi.retrieval.vortices.model import wind
 from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
+from tests.support.flows import data_array
 from tests.support.vortex_pairs import uneven, vector
 
 
