@@ -47,16 +47,14 @@ that its files hold; only `experiment` and what lies above it see all."""
 
 OPENS = {
     "assessment/report/page.py": "its own script, a resource of the package",
-    "experiment/run_folder.py": "the log, and checksums of what a run depends on",
+    "experiment/log.py": "the log, line by line",
+    "experiment/run_folder.py": "checksums of what a run depends on",
     "system/doctor.py": "a file of its own in a program that it tries; /proc",
     "system/llvm.py": "/proc",
 }
 """Who reads or writes a file beside `io`, and which."""
 
 NOT_YET = {
-    "lidar_mi/assessment/figures/backscatter.py: long",
-    "lidar_mi/experiment/stages/fringes.py: long",
-    "lidar_mi/experiment/stages/sensor.py: long",
     "lidar_mi/retrieval/velocimetry/variational.py: long",
     "lidar_mi/retrieval/velocimetry/volume_variational.py: long",
 }

@@ -38,9 +38,8 @@ def info(
     single-scattering albedo, lidar ratio, depolarisation ratio.
     """
     from lidar_mi.experiment.info import sections
-    from lidar_mi.experiment.run_folder import failure
+    from lidar_mi.experiment.run_folder import failure, read_metrics, read_record
     from lidar_mi.experiment.study import RECORD
-    from lidar_mi.io.json import read_json
 
     with progress() as notice:
         found = list(
@@ -55,13 +54,13 @@ def info(
         print_rows(title, rows)
     folder = Path(what)
     if folder.is_dir():
+        metrics = read_metrics(folder)
         if reason := failure(folder):
             output.print(f"failed: {reason}", soft_wrap=True)
-        elif (folder / RECORD).is_file():
-            if not (folder / "metrics.json").is_file():
-                output.print("unfinished: no metrics.json yet; run it again to go on")
-            output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)
-        elif (folder / "metrics.json").is_file():
-            print_metrics(read_json(folder / "metrics.json", "metrics"))
-        else:
+        elif metrics is None:
             output.print("unfinished: no metrics.json yet; run it again to go on")
+        elif not (folder / RECORD).is_file():
+            doppler = read_record(folder)["experiment"].get("doppler")
+            print_metrics(metrics, doppler["retrieval"]["averaged"] if doppler else ())
+        if (folder / RECORD).is_file() and not reason:
+            output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)

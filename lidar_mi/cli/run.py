@@ -33,38 +33,30 @@ def run(
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
     A run that was stopped goes on with the images it has.
     """
-    from lidar_mi.experiment import reading as config
-    from lidar_mi.experiment import run as chain
-    from lidar_mi.experiment import study
+    from lidar_mi.experiment import reading, study
+    from lidar_mi.experiment.run import run as start
+    from lidar_mi.experiment.run_folder import RESULTS
 
     path, changes = experiment_file(experiment), list(set_ or [])
-    variants = config.load_variants(path, changes)
-    loaded = next(iter(variants.values())) if variants else config.load(path, changes)
+    variants = reading.load_variants(path, changes)
+    loaded = next(iter(variants.values())) if variants else reading.load(path, changes)
     if variant:
         sections = {"render": loaded.wake, "doppler.render": loaded.doppler}
         changes += [f"{key}.variant={variant}" for key, asked in sections.items() if asked]
     if variants:
-        _run_study(config.load_variants(path, changes), out, path, overwrite, study.run)
+        _run_study(reading.load_variants(path, changes), out, path, overwrite, study.run)
         return
-    loaded = config.load(path, changes)
+    loaded = reading.load(path, changes)
     folder = out or Path("outputs") / loaded.name
     with progress() as notice:
-        metrics = chain.run(loaded, folder, path.parent, overwrite, notice)
-    print_metrics(metrics)
+        done = start(loaded, folder, beside=path.parent, overwrite=overwrite, notice=notice)
+    print_metrics(done.metrics, _averaged(loaded))
     output.print(f"report   {folder / 'report.html'}")
     output.print(f"figures  {folder / 'figures'}")
-    winds = "wind_volume.nc" if loaded.volume else "wind.nc"
-    found = "sensor.rmse_u" in metrics
-    for name, asked in (
-        (winds, loaded.wake),
-        ("v_los.nc", loaded.doppler),
-        ("lines_of_sight.nc", loaded.sensor),
-        ("wind3d.nc", found),
-    ):
-        if asked:
-            output.print(f"winds    {folder / name}")
-    if "timing.vortex_s" in metrics:
-        output.print(f"vortices {folder / 'vortex.json'}")
+    for result, file in RESULTS.items():
+        if done.results.get(result) is not None:
+            label = "vortices" if result == "vortices" else "winds   "
+            output.print(f"{label} {folder / file}")
 
 
 def _run_study(variants, out, path, overwrite, start) -> None:
@@ -76,5 +68,10 @@ def _run_study(variants, out, path, overwrite, start) -> None:
         metrics = start(name, variants, folder, path.parent, overwrite, notice)
     for variant, found in metrics.items():
         output.print(f"\n{variant}", style="bold")
-        print_metrics(found)
+        print_metrics(found, _averaged(variants[variant]))
     output.print(f"report   {folder / 'report.html'}")
+
+
+def _averaged(experiment) -> tuple[int, ...]:
+    """How many images of rings an experiment averages."""
+    return experiment.doppler.retrieval.averaged if experiment.doppler else ()

@@ -1,6 +1,6 @@
 """What an experiment will do, before it does it: checked as a run would, and told in numbers."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -8,16 +8,16 @@ import numpy as np
 from lidar_mi.assessment.metrics.requirements import look_ahead
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.info import Section
-from lidar_mi.experiment.run_folder import Notice
+from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
-from lidar_mi.experiment.stages import sensor as sensor_chain
-from lidar_mi.experiment.truth import make_truth
+from lidar_mi.experiment.truth import Truth
 from lidar_mi.instrument.doppler import photons
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.retrieval.methods import ImageMethod
 
 
 def sections(
-    asked: Experiment, beside: str | Path = ".", notice: Notice = lambda text, share: None
+    asked: Experiment, beside: str | Path = ".", notice: Notice = silent
 ) -> Iterator[Section]:
     """Titled tables of what an experiment looks at, and with what; nothing is written.
 
@@ -34,17 +34,16 @@ def sections(
     InputError
         Whatever a run would refuse before it starts.
     """
-    experiment.prepare(asked, beside, notice)
+    ahead = experiment.prepare(asked, beside, notice).results
     if asked.wake:
-        yield from _backscatter(asked, beside)
+        yield from _backscatter(asked, ahead["truth"], ahead["plans"][0])
     if asked.doppler:
         yield _doppler(asked)
     if asked.sensor:
-        yield _sensor(asked, beside)
+        yield _sensor(asked, ahead["requirements"])
 
 
-def _backscatter(asked: Experiment, beside) -> Iterator[Section]:
-    truth = make_truth(asked, beside)
+def _backscatter(asked: Experiment, truth: Truth, plan: ScanPlan) -> Iterator[Section]:
     wind, (air, _) = truth.wind, truth.extinction
     rows = [(axis, _span(wind[axis].values, "m")) for axis in ("y", "z")]
     rows += [(name, _span(wind[name].values, "m/s")) for name in ("u", "v", "w") if name in wind]
@@ -54,7 +53,6 @@ def _backscatter(asked: Experiment, beside) -> Iterator[Section]:
     yield f"{asked.name}: the air in the gates ({title}, about the scan's axis)", rows
 
     scan, lidar, platform = asked.scan, asked.lidar, asked.platform
-    plan = backscatter_chain.scan_plans(asked, truth)[0]
     pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
     rows = [
         ("wavelength", f"{1e9 * lidar.wavelength:g} nm"),
@@ -79,7 +77,7 @@ def _displacements(asked: Experiment, wind, pixel: float) -> list[tuple[str, str
     reach = ((settings.search - settings.template) // 2 - 0.5) * pixel / asked.platform.dt
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
     rows = [("methods", ", ".join(settings.methods))]
-    if {"cc", "ws"} & set(settings.methods):
+    if {ImageMethod.CC, ImageMethod.WS} & set(settings.methods):
         verdict = "" if fastest <= reach else "; larger retrieval.search or smaller platform.dt"
         rows.append(
             ("fastest wind windows follow", f"{reach:.3g} m/s, here {fastest:.3g}{verdict}")
@@ -97,8 +95,8 @@ def _doppler(asked: Experiment) -> Section:
     ]
 
 
-def _sensor(asked: Experiment, beside) -> Section:
-    sensor, tables = asked.sensor, sensor_chain.requirement_tables(asked, beside)
+def _sensor(asked: Experiment, tables: Mapping) -> Section:
+    sensor = asked.sensor
     columns, rows = sensor.directions.columns, sensor.directions.rows
     count = columns * rows
     # a run tells the rest

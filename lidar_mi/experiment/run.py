@@ -1,42 +1,43 @@
-"""One experiment, start to end: truth, sensor, picture, estimate, verdict.
+"""One experiment, start to end: truth, sensor, images, estimate, verdict.
 
-A run lives in one folder. Pictures are kept as soon as they are there; a run that was stopped
-goes on with those, and everything after them is made again.
+A run may live in a folder. Images are kept there as soon as they are rendered; a run that was
+stopped goes on with those, and everything after them is computed again.
 """
 
-from collections.abc import Callable
+import time
 from pathlib import Path
 
 from lidar_mi import __version__
-from lidar_mi.assessment.report import page as report
+from lidar_mi.assessment.metrics.names import timing_key
+from lidar_mi.assessment.report.page import page
 from lidar_mi.errors import is_interrupt
-from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.run_folder import Log, Notice, claim, read_record
+from lidar_mi.experiment.log import Log, Notice, silent
+from lidar_mi.experiment.measure import measure
+from lidar_mi.experiment.pipeline import stages_of
+from lidar_mi.experiment.reading import dump
+from lidar_mi.experiment.report import chapters
+from lidar_mi.experiment.results import Run
+from lidar_mi.experiment.run_folder import RunFolder
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
-from lidar_mi.experiment.stages import error_budget as budget_chain
-from lidar_mi.experiment.stages import fringes as fringe_chain
-from lidar_mi.experiment.stages import sensor as sensor_chain
-from lidar_mi.experiment.stages import volume as volume_chain
-from lidar_mi.experiment.stages import vortices as vortex_chain
-from lidar_mi.io.json import write_json
-from lidar_mi.io.text import write_text
+from lidar_mi.experiment.stage import Stage, result_of
 
 
 def run(
     experiment: Experiment,
-    folder: str | Path,
+    folder: str | Path | None = None,
+    *,
     beside: str | Path = ".",
     overwrite: bool = False,
-    notice: Notice = lambda text, share: None,
-) -> dict[str, float]:
-    """Run an experiment into a folder and return its metrics.
+    notice: Notice = silent,
+) -> Run:
+    """Run an experiment, in memory or into a folder.
 
     Parameters
     ----------
     experiment : Experiment
-    folder : path
-        Made if missing. If it holds a run of the same experiment, its pictures are used again.
+    folder : path, optional
+        Made if missing. If it holds a run of the same experiment, its images are used again. Figures
+        and a report are made for a folder alone.
     beside : path
         Folder in which files named by the experiment are looked for first.
     overwrite : bool
@@ -49,54 +50,81 @@ def run(
     InputError
         Bad input, or the folder holds another experiment.
     """
-    return prepare(experiment, beside, notice)(folder, overwrite, notice)
+    return complete(prepare(experiment, beside, notice), folder, overwrite=overwrite)
 
 
-def prepare(
-    experiment: Experiment, beside: str | Path = ".", notice: Notice = lambda text, share: None
-) -> Callable[[str | Path, bool, Notice], dict[str, float]]:
-    """Check all that can be checked before anything is written; what it returns runs the rest.
+def prepare(experiment: Experiment, beside: str | Path = ".", notice: Notice = silent) -> Run:
+    """Check all that can be checked before anything is rendered or written.
 
-    It takes ``folder``, ``overwrite`` and ``notice`` as `run` does, which see for errors.
+    Returns
+    -------
+    Run
+        With the truth and what else is computed ahead; `complete` runs the rest.
+
+    Raises
+    ------
+    InputError
+        Bad input.
     """
-    chains = []
-    if experiment.wake:
-        looking = volume_chain if experiment.volume else backscatter_chain
-        chains.append(looking.prepare(experiment, beside, notice))
-    if experiment.wake and experiment.retrieval.error_budget:
-        chains.append(budget_chain.prepare(experiment, beside))
-    if experiment.doppler:
-        chains.append(fringe_chain.prepare(experiment))
-    if experiment.sensor:
-        chains.append(sensor_chain.prepare(experiment, beside))
-    if experiment.wake and (experiment.sensor or "vortex_fit" in experiment.retrieval.methods):
-        chains.append(vortex_chain.prepare(experiment, beside))
-
-    def start(folder: str | Path, overwrite: bool, notice: Notice) -> dict[str, float]:
-        folder = Path(folder)
-        claim(folder, experiment, beside, overwrite)
-        log = Log(folder / "log.txt", notice)
-        log(f"lidar-mi {__version__}, experiment {experiment.name}, seed {experiment.seed}")
-        try:
-            return _run(experiment, chains, folder, log)
-        except Exception as error:
-            if not is_interrupt(error):
-                log.fail(error)
-            raise
-
-    return start
+    prepared = Run(experiment, {"beside": beside}, Log(notice))
+    stages = stages_of(experiment)
+    for stage in stages:
+        if stage.ahead:
+            _carry_out(stage, prepared)
+    for stage in stages:
+        if stage.check:
+            there = [prepared.results[n] for n in stage.needs if n in prepared.results]
+            stage.check(experiment, *there)
+    return prepared
 
 
-def _run(experiment, chains, folder: Path, log: Log) -> dict[str, float]:
-    metrics, chapters = {}, []
-    for chain in chains:
-        found, chapter = chain(folder, log)
-        metrics |= found
-        chapters.append(chapter)
-    write_json(folder / "metrics.json", metrics)
-    versions = read_record(folder)["versions"]
-    resolved = config.dump(experiment)
-    page = report.page(experiment, resolved, versions, metrics, chapters, log.warnings)
-    write_text(folder / "report.html", page)
-    log("done")
-    return metrics
+def complete(prepared: Run, folder: str | Path | None = None, *, overwrite: bool = False) -> Run:
+    """Run the rest of a prepared experiment; parameters and errors as of `run`."""
+    if folder is None:
+        return _complete(prepared, None)
+    prepared.folder = Path(folder)
+    kept = RunFolder(folder, prepared.experiment, prepared.results["beside"])
+    kept.claim(overwrite)
+    log = prepared.log
+    log.path = kept.log
+    log(
+        f"lidar-mi {__version__}, experiment {prepared.experiment.name}, "
+        f"seed {prepared.experiment.seed}"
+    )
+    try:
+        return _complete(prepared, kept)
+    except Exception as error:
+        if not is_interrupt(error):
+            log.fail(error)
+        raise
+
+
+def _complete(run: Run, kept: RunFolder | None) -> Run:
+    for stage in stages_of(run.experiment):
+        if stage.name not in run.results:
+            _carry_out(stage, run, kept)
+    if run.scans:
+        # of images from an earlier run what they took then
+        run.seconds["render"] = sum(scan.attrs["render_seconds"] for scan in run.scans)
+    run.metrics = measure(run.experiment, run.results, run.seconds)
+    if kept is not None:
+        _report(run, kept)
+    run.log("done")
+    return run
+
+
+def _carry_out(stage: Stage, run: Run, kept: RunFolder | None = None) -> None:
+    start = time.perf_counter()
+    run.results[stage.name] = result_of(stage, run.experiment, run.results, run.log, kept)
+    if stage.timing:
+        run.seconds[stage.timing] += time.perf_counter() - start
+
+
+def _report(run: Run, kept: RunFolder) -> None:
+    """Draw the figures; write them, the metrics and the report."""
+    told, seconds = chapters(run.experiment, run.results, run.metrics, kept.figures, run.log)
+    run.seconds |= seconds
+    run.metrics |= {timing_key(step): round(value, 3) for step, value in seconds.items()}
+    resolved, versions = dump(run.experiment), kept.record["versions"]
+    html = page(run.experiment, resolved, versions, run.metrics, told, run.warnings)
+    kept.keep_verdict(run.metrics, html)

@@ -9,15 +9,17 @@ from pathlib import Path
 
 import xarray as xr
 
-from lidar_mi.assessment.report.comparison import draw_comparison, page
+from lidar_mi.assessment.figures.comparison import draw_comparison
+from lidar_mi.assessment.report.comparison import page
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment.run_folder import IMAGES, VOLUME, Log, Notice, read_record
+from lidar_mi.experiment.log import Log, Notice, silent
+from lidar_mi.experiment.reading import dump
+from lidar_mi.experiment.results import Run
+from lidar_mi.experiment.run_folder import FIGURES, LOG, METRICS, REPORT, read_metrics, read_record
+from lidar_mi.experiment.run_folder import RECORD as RUN
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.io import exr
-from lidar_mi.io.json import read_json, write_json
-from lidar_mi.io.netcdf import open_netcdf
+from lidar_mi.io.json import write_json
 from lidar_mi.io.text import write_text
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
 
@@ -30,7 +32,7 @@ def run(
     folder: str | Path,
     beside: str | Path = ".",
     overwrite: bool = False,
-    notice: Notice = lambda text, share: None,
+    notice: Notice = silent,
 ) -> dict[str, dict[str, float]]:
     """Run all variants into sub-folders and compare them; metrics by variant.
 
@@ -41,7 +43,7 @@ def run(
     variants : mapping
         From `lidar_mi.experiment.reading.load_variants`.
     folder, beside, overwrite, notice
-        As in `lidar_mi.experiment.run`.
+        As in `lidar_mi.experiment.run.run`.
 
     Raises
     ------
@@ -56,27 +58,25 @@ def run(
     ready = {
         key: experiment.prepare(one, beside, _of(key, notice)) for key, one in variants.items()
     }
-    settings = {key: parse_yaml(config.dump(one), key) for key, one in variants.items()}
+    settings = {key: parse_yaml(dump(one), key) for key, one in variants.items()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
-    record = to_yaml({"name": name, "variants": list(variants)})
-    write_text(folder / RECORD, record)
-    metrics = {key: one(folder / key, overwrite, _of(key, notice)) for key, one in ready.items()}
-    log = Log(folder / "log.txt", notice)
+    write_text(folder / RECORD, to_yaml({"name": name, "variants": list(variants)}))
+    metrics, rows = {}, {}
+    for key in variants:
+        done = experiment.complete(ready.pop(key), folder / key, overwrite=overwrite)
+        metrics[key] = done.metrics
+        # a variant without a wake has rings only, which the table compares
+        if done.wind is not None:
+            rows[key] = _shown(done)
+    log = Log(notice, folder / LOG)
     log(f"comparing {', '.join(variants)}")
-    # a variant without a wake has rings only, which the table compares
-    rows = {
-        key: _pictures(folder / key, VOLUME if one.volume else "wind.nc", metrics[key])
-        for key, one in variants.items()
-        if one.wake
-    }
-    drawn = draw_comparison(folder / "figures", rows, log) if rows else []
+    drawn = draw_comparison(folder / FIGURES, rows, log) if rows else []
     merged = {f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()}
-    html = page(name, settings, metrics, drawn)
-    write_json(folder / "metrics.json", merged)
-    write_text(folder / "report.html", html)
+    write_json(folder / METRICS, merged)
+    write_text(folder / REPORT, page(name, settings, metrics, drawn))
     log("done")
     return metrics
 
@@ -108,30 +108,23 @@ def read_study(
         raise InputError(
             f"{folder / RECORD}: not written by a study; expected its folder"
         ) from None
-    started = {key: (folder / key / "experiment.yaml").is_file() for key in variants}
+    started = {key: (folder / key / RUN).is_file() for key in variants}
     records = {key: read_record(folder / key) if started[key] else None for key in variants}
-    metrics = {}
-    for key in variants:
-        path = folder / key / "metrics.json"
-        if path.is_file():
-            metrics[key] = read_json(path, "metrics of a run")
-    return name, records, metrics
+    metrics = {key: read_metrics(folder / key) for key in variants}
+    return name, records, {key: one for key, one in metrics.items() if one is not None}
 
 
 def _of(variant: str, notice: Notice) -> Notice:
     return lambda text, share: notice(f"{variant}: {text}", share)
 
 
-def _pictures(folder: Path, file: str, metrics) -> tuple[xr.DataArray, xr.Dataset, list]:
-    """First picture as the instrument gives it, wind by the first method, places of true cores.
+def _shown(run: Run) -> tuple[xr.DataArray, xr.Dataset, list[tuple[float, float]]]:
+    """First image as the instrument gives it, wind by the first method, places of true cores.
 
-    Of winds in three dimensions the layer nearest to the first gate, whose picture it is.
+    Of winds in three dimensions the layer nearest to the first gate, whose image it is.
     """
-    scan = exr.read_scan(folder / IMAGES[0])
-    with open_netcdf(folder / file) as winds:
-        source = winds["source"].values[-1]  # behind the detector, where there is one
-        wind = winds.sel(source=source).isel(algorithm=0)
-        wind = (wind.isel(x=0) if "x" in wind.dims else wind).load()
-    sides = [f"wake.{side}_core" for side in ("port", "starboard")]
-    cores = [(metrics[f"{one}.y"], metrics[f"{one}.z"]) for one in sides if f"{one}.y" in metrics]
+    scan = run.scans[0]
+    wind = run.wind.isel(source=-1, algorithm=0)  # behind the detector, where there is one
+    wind = wind.isel(x=0) if "x" in wind.dims else wind
+    cores = [(core.y, core.z) for core in run.cores]
     return scan["Y_noisy" if "Y_noisy" in scan else "Y"], wind, cores

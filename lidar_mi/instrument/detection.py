@@ -149,7 +149,11 @@ def detect(
 
 
 def noisy_scan(
-    scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector, seed: int | Sequence[int]
+    scan: xr.Dataset,
+    lidar: BackscatterLidar,
+    detector: Detector,
+    seed: int | Sequence[int],
+    plan: ScanPlan | None = None,
 ) -> xr.Dataset:
     """A scan with the detector's noise, in addition to the noise-free image.
 
@@ -165,13 +169,16 @@ def noisy_scan(
         As rendered or read from EXR.
     seed : int or sequence of int
         Different ones for the scans of a pair.
+    plan : ScanPlan, optional
+        Where the gates lie; left out: as the scan states, in single precision where it was read
+        from a file.
 
     Raises
     ------
     InputError
         The scan does not state its gates; see `detect` for the rest.
     """
-    plan = _plan(scan)
+    plan = plan or _plan(scan)
     scan = scan.transpose("gate", "z", "y", ...)
     s0 = scan["S0"].values
     ranges = np.broadcast_to(plan.ranges(), s0.shape)
@@ -195,6 +202,14 @@ def noisy_scan(
             for name, (dims, values, text, unit) in noise.items()
         }
     ).assign_attrs(attributes)
+
+
+def without_noise(scan: xr.Dataset) -> xr.Dataset:
+    """A scan without what `noisy_scan` adds to it."""
+    noise = ("S0_noisy", "S0_noise_std", "Y_noisy", "Y_noise_std")
+    kept = scan.drop_vars(noise, errors="ignore")
+    kept.attrs = {k: value for k, value in scan.attrs.items() if not k.startswith("detector_")}
+    return kept
 
 
 def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) -> dict[str, float]:

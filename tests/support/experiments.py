@@ -1,14 +1,15 @@
 """Small experiments and wakes of the system tests, and what the demo writes."""
 
 from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import OpenEXR
 import pytest
 import xarray as xr
 
+from lidar_mi.experiment import pipeline
 from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
 
 SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
 
@@ -76,10 +77,22 @@ def as_seen(path):
         return np.array(file.channels()["Y"].pixels)
 
 
+def leave_out_figures(patch):
+    """Take the backscatter lidar's figures and its texture sweep out of all runs."""
+    patch.setattr("lidar_mi.assessment.figures.backscatter.draw_all", lambda *_: [])
+    patch.setattr("lidar_mi.experiment.stages.texture.LEVELS", ())
+
+
+def replace_stages(patch, **computes):
+    """Let stages of all runs compute something else; None: leave the stage out."""
+    left = [stage for stage in pipeline.STAGES if computes.get(stage.name, True) is not None]
+    changed = [replace(s, compute=computes[s.name]) if s.name in computes else s for s in left]
+    patch.setattr(pipeline, "STAGES", tuple(changed))
+
+
 @contextmanager
 def without_figures():
     """Runs without figures and texture sweep, most of a small run's time: the demo has them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
-        patch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
+        leave_out_figures(patch)
         yield

@@ -23,10 +23,10 @@ def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo") / "run"
     loaded = config.load(SCENES / "wake_backscatter.yaml")
     told = []
-    metrics = experiment.run(
-        loaded, folder, SCENES, notice=lambda text, share: told.append((text, share))
+    done = experiment.run(
+        loaded, folder, beside=SCENES, notice=lambda text, share: told.append((text, share))
     )
-    return SimpleNamespace(folder=folder, experiment=loaded, metrics=metrics, told=told)
+    return SimpleNamespace(folder=folder, experiment=loaded, metrics=done.metrics, told=told)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -27,7 +27,7 @@ def blob_run(tmp_path_factory):
         "render": {"samples_per_beam": 256, "max_order": 1},
     }
     with without_figures():
-        run(check(data), beside / "run", beside)
+        run(check(data), beside / "run", beside=beside)
     return beside / "run"
 
 
@@ -97,7 +97,7 @@ def test_volume_shows_the_planes_in_the_gate(tmp_path, quick):
         data = small()
         data["wake"] = {"file": name, "depth": "volume", "x": plane, "texture": {"rms": 0}}
         folder = tmp_path / f"run{plane:g}"
-        run(check(data), folder, tmp_path)
+        run(check(data), folder, beside=tmp_path)
         picture = as_seen(folder / IMAGES[0])
         dark = np.median(picture)
         peak = np.unravel_index(picture.argmax(), picture.shape)
@@ -116,7 +116,7 @@ def test_true_wind_is_as_strong_as_it_is(tmp_path, quick):
     """A uniform wind of 10 and 5 m/s: an error of as much is no skill."""
     data = small()
     data["wake"] = {"file": write_wake(tmp_path / "w.nc", blob(8, -4)), "texture": {"rms": 0}}
-    metrics = run(check(data), tmp_path / "run", tmp_path)
+    metrics = run(check(data), tmp_path / "run", beside=tmp_path).metrics
     assert metrics["true_wind.rms_v"] == pytest.approx(10)
     assert metrics["true_wind.rms_w"] == pytest.approx(5)
     assert "true_wind.outside_cores.rms_v" not in metrics

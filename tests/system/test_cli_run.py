@@ -39,7 +39,7 @@ def test_run_folder_is_named_after_the_experiment(there, lidar_mi, quick):
     assert lidar_mi("run", "tiny.yaml")[0] == 0
     assert (there / "outputs" / "tiny" / "wind.nc").is_file()
     code, _, err = lidar_mi("run", "tiny.yaml")
-    assert code == 0 and "using 2 of 2 pictures" in err
+    assert code == 0 and "using 2 of 2 images" in err
     code, _, err = lidar_mi("run", "tiny.yaml", "--set", "seed=2")
     assert code == 2 and "--overwrite" in err
     assert lidar_mi("run", "tiny.yaml", "--set", "seed=2", "--overwrite")[0] == 0

@@ -13,8 +13,9 @@ from lidar_mi.assessment.metrics.errors import truth_at_vectors
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.run_folder import IMAGES
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
 from lidar_mi.experiment.stages.error_budget import budgets
+from lidar_mi.experiment.stages.rendering import scan_plans
+from lidar_mi.experiment.stages.winds import apparent_noise
 from lidar_mi.experiment.truth import blur_by_beam, make_truth
 from lidar_mi.io import exr
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
@@ -37,7 +38,7 @@ def ran(tmp_path_factory):
     folder = tmp_path_factory.mktemp("budget")
     (folder / "small.yaml").write_text(SMALL)
     experiment = config.load(folder / "small.yaml")
-    metrics = run(experiment, folder / "out", folder)
+    metrics = run(experiment, folder / "out", beside=folder).metrics
     yield experiment, folder, metrics
     gc.collect()
     gc.collect()
@@ -76,7 +77,7 @@ def test_winds_of_the_run_are_used_as_they_would_be_found_again(ran):
 def noise_free_scans(experiment, truth):
     """What would be rendered of the slab, with hardly any noise."""
     scans = []
-    for k, plan in enumerate(backscatter_chain.scan_plans(experiment, truth)):
+    for k, plan in enumerate(scan_plans(experiment, truth)):
         image = 0.013 * blur_by_beam(truth.image(k), experiment.lidar, plan.centre, 2.5)
         s0 = image.expand_dims("gate") * 1e-3
         scans.append(xr.Dataset({"Y": image, "S0": s0, "S0_stderr": 1e-6 * s0}))
@@ -93,7 +94,7 @@ def test_blur_is_undone_where_there_is_some(tmp_path):
     scans = noise_free_scans(experiment, truth)
     budget = budgets(experiment, truth, scans, cores=[], flagged=True)["variational"]
     settings = {"dt": 0.1, "method": "variational", "stride": 2}
-    level = backscatter_chain.apparent_noise(scans[0])
+    level = apparent_noise(scans[0])
     # half of the beam's 1/e^2 radius where the slab's middle is
     width = float(experiment.lidar.radius_at(501.25)) / 2
     seen = retrieve_wind(*(scan["Y"] for scan in scans), noise=level, blur=width, **settings)

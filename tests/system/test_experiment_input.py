@@ -28,7 +28,7 @@ from tests.support.experiments import check, small, write_wake
 def test_bad_input_is_told_before_anything_is_written(tmp_path, change, words):
     (tmp_path / "text.nc").write_text("no NetCDF")
     with pytest.raises(InputError, match=words) as caught:
-        run(check(small() | change), tmp_path / "run", tmp_path)
+        run(check(small() | change), tmp_path / "run", beside=tmp_path)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
 
@@ -38,7 +38,7 @@ def test_volume_needs_a_plane_when_one_is_to_be_extruded(tmp_path):
     data = small()
     data["wake"] = {"file": name}
     with pytest.raises(InputError, match=r"wake\.x: missing; v\.nc has 4 planes"):
-        run(check(data), tmp_path / "run", tmp_path)
+        run(check(data), tmp_path / "run", beside=tmp_path)
 
 
 def test_gates_that_reach_beyond_the_wake(tmp_path):
@@ -47,7 +47,7 @@ def test_gates_that_reach_beyond_the_wake(tmp_path):
     data = small()
     data["wake"] = {"file": name, "depth": "volume", "x": 0.5, "texture": {"rms": 0}}
     with pytest.raises(InputError, match="gates from 500 to 502.5 m .* fill 500.75 to 504.75 m"):
-        run(check(data), tmp_path / "run", tmp_path)
+        run(check(data), tmp_path / "run", beside=tmp_path)
     assert not (tmp_path / "run").exists()
 
 
@@ -56,7 +56,7 @@ def test_beams_wider_than_a_template_are_told_of(tmp_path, quick):
     report says so."""
     told = []
     data = small() | {"scan": {"range": "5 km"}}
-    metrics = run(check(data), tmp_path / "run", notice=lambda text, _: told.append(text))
+    metrics = run(check(data), tmp_path / "run", notice=lambda text, _: told.append(text)).metrics
     warnings = [text for text in told if text.startswith("warning: ")]
     assert len(warnings) == 2
     assert "beams are 10 m wide at 5001" in warnings[0] and "template of 4 m" in warnings[0]
@@ -73,7 +73,7 @@ def test_air_without_vortices_is_told_of(tmp_path, quick):
     data = small(texture={"rms": 0.3, "outer_scale": "5 m"})
     data["wake"]["vortex_pair"]["circulation"] = 1e-3
     data["retrieval"] = {"methods": ["vortex_fit"]}
-    metrics = run(check(data), tmp_path / "run")
+    metrics = run(check(data), tmp_path / "run").metrics
     page = (tmp_path / "run" / "report.html").read_text()
     assert "Warning: no vortex pair from the images: " in page
     assert "No pair from the images: " in page and "How well the vortices are known" in page

@@ -24,9 +24,10 @@ from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.fringes import summed
+from lidar_mi.experiment.stages.ring_images import summed
 from lidar_mi.instrument.fringe_camera import CCD, expose
 from lidar_mi.io.exr import read_fringes
+from tests.support.experiments import leave_out_figures
 
 # a quarter of the default camera's pixels see the same four rings
 CAMERA = {"width": 480, "height": 390, "pixel": "14.8 um"}
@@ -76,7 +77,7 @@ def check(**changes):
 def small(tmp_path_factory):
     """Folder and metrics of the small experiment."""
     folder = tmp_path_factory.mktemp("fringes") / "run"
-    return folder, run(check(), folder)
+    return folder, run(check(), folder).metrics
 
 
 @pytest.fixture(scope="module")
@@ -283,17 +284,17 @@ def without_times(metrics):
 
 def test_a_stopped_run_goes_on_with_its_pictures(tmp_path, quick):
     settings = check(**QUICK | {"v_los": [0, 20]})
-    first = run(settings, tmp_path / "run")
+    first = run(settings, tmp_path / "run").metrics
     before, last = written(tmp_path / "run"), "fringes_received_01.exr"
     whole = read_fringes(tmp_path / "run" / last)
     (tmp_path / "run" / last).unlink()
     (tmp_path / "run" / "metrics.json").unlink()
-    again = run(settings, tmp_path / "run")
+    again = run(settings, tmp_path / "run").metrics
     after = written(tmp_path / "run")
     assert {name for name in before if before[name] == after[name]} == set(before) - {last}
     xr.testing.assert_equal(read_fringes(tmp_path / "run" / last), whole)
     assert without_times(again) == without_times(first)
-    assert "using 2 of 3 pictures of rings" in (tmp_path / "run" / "log.txt").read_text()
+    assert "using 2 of 3 ring images" in (tmp_path / "run" / "log.txt").read_text()
 
 
 def test_another_experiment_is_refused_or_replaces(tmp_path, quick):
@@ -308,8 +309,7 @@ def test_another_experiment_is_refused_or_replaces(tmp_path, quick):
 
 
 def test_both_lidars_in_one_experiment(tmp_path, quick, monkeypatch):
-    monkeypatch.setattr("lidar_mi.experiment.stages.backscatter.figures.draw_all", lambda *_: [])
-    monkeypatch.setattr("lidar_mi.experiment.stages.backscatter.TEXTURE_SWEEP", ())
+    leave_out_figures(monkeypatch)
     both = config.check(
         {
             "name": "both",
@@ -323,7 +323,7 @@ def test_both_lidars_in_one_experiment(tmp_path, quick, monkeypatch):
         },
         "both",
     )
-    metrics = run(both, tmp_path)
+    metrics = run(both, tmp_path).metrics
     assert {"wind.nc", "v_los.nc", "image_t1.exr", "fringes_emitted.exr"} <= {
         path.name for path in tmp_path.iterdir()
     }
@@ -394,7 +394,7 @@ class Caught(Exception):
 
 @pytest.mark.parametrize("wake", [False, True])
 def test_the_variant_option_reaches_the_lidar(tmp_path, monkeypatch, wake):
-    def caught(loaded, *_):
+    def caught(loaded, *_, **__):
         raise Caught(loaded)
 
     monkeypatch.setattr(experiment, "run", caught)

@@ -13,10 +13,9 @@ from lidar_mi.experiment import run_folder
 from lidar_mi.experiment import truth as truth_module
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.run_folder import IMAGES
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
 from lidar_mi.io.exr import read_scan
 from lidar_mi.io.wake_file import read_wake
-from tests.support.experiments import blob, check, small, write_wake
+from tests.support.experiments import blob, check, replace_stages, small, write_wake
 
 
 def leftovers(folder):
@@ -41,21 +40,21 @@ def test_the_wake_is_read_once(tmp_path, monkeypatch):
     monkeypatch.setattr(
         truth_module, "read_wake", lambda *a, **k: read.append(a) or read_wake(*a, **k)
     )
-    monkeypatch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
+    monkeypatch.setattr("lidar_mi.assessment.figures.backscatter.draw_all", lambda *_: [])
     data = small()
     data["wake"] = {"file": write_wake(tmp_path / "w.nc", blob(8, -4))}
-    metrics = run(check(data), tmp_path / "run", tmp_path)
+    metrics = run(check(data), tmp_path / "run", beside=tmp_path).metrics
     assert len(read) == 1 and "texture_sweep.40_percent.rmse_v" in metrics
 
 
 def test_a_rerun_uses_the_pictures(tmp_path, quick):
     folder = tmp_path / "run"
-    before = run(check(small()), folder)
+    before = run(check(small()), folder).metrics
     stamps = pictures_of(folder)
     (folder / "wind.nc").unlink()
-    after = run(check(small()), folder)
+    after = run(check(small()), folder).metrics
     assert pictures_of(folder) == stamps
-    assert "using 2 of 2 pictures" in (folder / "log.txt").read_text()
+    assert "using 2 of 2 images" in (folder / "log.txt").read_text()
     assert (folder / "wind.nc").is_file()
     assert without_timing(after) == without_timing(before)
 
@@ -104,11 +103,11 @@ def test_a_changed_wake_file_is_another_experiment(tmp_path, quick):
     """Same name, other content: the old pictures must not be taken for it."""
     data = small()
     data["wake"] = {"file": write_wake(tmp_path / "w.nc", blob(8, -4)), "texture": {"rms": 0}}
-    run(check(data), tmp_path / "run", tmp_path)
-    run(check(data), tmp_path / "run", tmp_path)
+    run(check(data), tmp_path / "run", beside=tmp_path)
+    run(check(data), tmp_path / "run", beside=tmp_path)
     write_wake(tmp_path / "w.nc", blob(8, 4))
     with pytest.raises(InputError, match="another experiment"):
-        run(check(data), tmp_path / "run", tmp_path)
+        run(check(data), tmp_path / "run", beside=tmp_path)
 
 
 def test_overwriting_leaves_nothing_of_the_old_run(tmp_path, quick):
@@ -164,7 +163,7 @@ def test_stopped_anywhere_it_goes_on(tmp_path, quick, step):
         read_scan(path)
     assert leftovers(folder) == [] and not (folder / "metrics.json").exists()
     stamps = [path.stat().st_mtime_ns for path in done]
-    metrics = run(check(small()), folder)
+    metrics = run(check(small()), folder).metrics
     assert [path.stat().st_mtime_ns for path in done] == stamps
     expected = {
         "reading the wake": 0,
@@ -173,13 +172,15 @@ def test_stopped_anywhere_it_goes_on(tmp_path, quick, step):
         "retrieving winds": 2,
     }[step]
     assert len(done) == expected
-    assert without_timing(metrics) == without_timing(run(check(small()), tmp_path / "whole"))
+    assert without_timing(metrics) == without_timing(
+        run(check(small()), tmp_path / "whole").metrics
+    )
 
 
 def test_the_seed_decides(tmp_path, quick):
     runs = {}
     for name, seed in (("one", 1), ("again", 1), ("other", 2)):
-        metrics = run(check(small() | {"seed": seed}), tmp_path / name)
+        metrics = run(check(small() | {"seed": seed}), tmp_path / name).metrics
         runs[name] = (without_timing(metrics), layers(tmp_path / name))
     assert runs["one"][0] == runs["again"][0]
     for same, again, other in zip(*(runs[name][1] for name in ("one", "again", "other"))):
@@ -193,11 +194,11 @@ def test_a_run_that_fails_says_so_in_its_log(tmp_path, quick, monkeypatch):
     """And one that is stopped does not; see `test_stopped_anywhere_it_goes_on`."""
     folder = tmp_path / "run"
 
-    def broken(*_):
+    def broken(*_, log):
         raise InputError("wind: 7 is not allowed;\nexpected 8")
 
     with monkeypatch.context() as patch:
-        patch.setattr(backscatter_chain, "winds", broken)
+        replace_stages(patch, wind=broken)
         with pytest.raises(InputError):
             run(check(small()), folder)
     assert run_folder.failure(folder) == "wind: 7 is not allowed; expected 8"

@@ -15,17 +15,18 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.requirements import read_requirements
+from lidar_mi.assessment.metrics.sensor import limit_metrics, vector_metrics
 from lidar_mi.assessment.report import sensor as sensor_report
-from lidar_mi.assessment.report.page import page
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import check
 from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.run import run
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
-from lidar_mi.experiment.stages import fringes as fringe_chain
-from lidar_mi.experiment.stages import sensor as sensor_chain
+from lidar_mi.experiment.measure import measured
+from lidar_mi.experiment.run import prepare, run
+from lidar_mi.experiment.stages import lines as line_stage
+from lidar_mi.experiment.stages.sensor import mean_squares_without, with_truth
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
+from tests.support.experiments import leave_out_figures, replace_stages
 
 # a coarse wake, single scattering, a CCD of a sixteenth of the pixels
 SMALL = {
@@ -70,7 +71,7 @@ def whole(tmp_path_factory):
     """Folder and metrics of one run."""
     mi.set_variant("llvm_ad_mono_polarized")
     folder = tmp_path_factory.mktemp("whole") / "run"
-    return folder, run(changed(), folder)
+    return folder, run(changed(), folder).metrics
 
 
 def test_the_whole_chain(whole):
@@ -181,20 +182,11 @@ def again(whole, tmp_path, monkeypatch, spoil):
     wind = xr.open_dataset(folder / "wind.nc", engine="h5netcdf").load()
     wind, kept = spoil(wind, kept)
 
-    monkeypatch.setattr(sensor_chain, "measure_lines", lambda *_: kept)
-    monkeypatch.setattr(backscatter_chain, "winds", lambda *_: wind)
-    monkeypatch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
-    monkeypatch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
-    monkeypatch.setattr(fringe_chain, "prepare", lambda _: lambda *_: ({}, None))
-    monkeypatch.setattr("lidar_mi.experiment.run.report.page", lambda *a: page(*without(a)))
+    without = dict.fromkeys(("ring_images", "lit_rings", "v_los", "ring_budget", "exposure"))
+    replace_stages(monkeypatch, lines=lambda *_, log: kept, wind=lambda *_, log: wind, **without)
+    leave_out_figures(monkeypatch)
     run(changed(), tmp_path / "run")
     return (tmp_path / "run" / "report.html").read_text(), tmp_path / "run"
-
-
-def without(arguments):
-    """A report's arguments without the chapter that was not run."""
-    *others, chapters, warnings = arguments
-    return *others, [chapter for chapter in chapters if chapter], warnings
 
 
 @pytest.mark.usefixtures("variant")
@@ -263,7 +255,7 @@ def test_two_lines_give_no_vector_and_that_is_said(whole, tmp_path, monkeypatch)
 def test_interpolation_is_exact_for_polynomials():
     nodes = np.cos(np.pi * (np.arange(9) + 0.5) / 9)
     places = np.array([-1.0, -0.3, nodes[4], 0.77])
-    weights = sensor_chain._lagrange(nodes, places)
+    weights = line_stage._lagrange(nodes, places)
     for power in range(9):
         np.testing.assert_allclose(weights @ nodes**power, places**power, atol=1e-12)
 
@@ -287,7 +279,7 @@ def test_errors_of_a_known_field():
             "flag": (one * (one.y == 9)).astype(np.uint8),
         }
     )
-    metrics = sensor_chain.errors(found, [Core(y=0.0, z=0.0, radius=0.3, circulation=400.0)])
+    metrics = vector_metrics(found, [Core(y=0.0, z=0.0, radius=0.3, circulation=400.0)])
     assert metrics["sensor.vectors"] == 9 and metrics["sensor.good_fraction"] == 0.9
     assert metrics["sensor.rmse_u"] == pytest.approx(0.5) == metrics["sensor.bias_u"]
     assert metrics["sensor.coverage_68_u"] == 1 and metrics["sensor.coverage_95_v"] == 0
@@ -329,8 +321,8 @@ def test_what_limits_u_is_found(amplitude, noise, errors, limit):
     )
     crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), np.zeros(waves.shape, np.uint8)))
     crossflow.attrs = {"template": 4, "stride": 1}
-    found = sensor_chain._combined(experiment, truth, lines, crossflow)
-    metrics = sensor_chain.budget_of_u(experiment, truth, lines, crossflow, found, [])
+    found = with_truth(experiment, truth, lines, crossflow)
+    metrics = limit_metrics(mean_squares_without(experiment, truth, lines, crossflow, found, []))
     causes = [
         "line_noise",
         "range_bin",
@@ -370,8 +362,10 @@ def test_the_share_of_noise_is_between_what_draws_and_the_lines_say():
     winds, gained = [], []
     for seed in range(8):
         lines = scan_wind(truth, directions, experiment.doppler.lidar, noise, seed, 70.0)
-        found = sensor_chain._combined(experiment, truth, lines, crossflow)
-        metrics = sensor_chain.budget_of_u(experiment, truth, lines, crossflow, found, [])
+        found = with_truth(experiment, truth, lines, crossflow)
+        metrics = limit_metrics(
+            mean_squares_without(experiment, truth, lines, crossflow, found, [])
+        )
         good = found["flag"].values == 0
         full = ((found["u"] - found["u_true"]).values[good] ** 2).mean()
         gained.append(full - metrics["sensor.error_budget.line_noise.rmse_u"] ** 2)
@@ -389,7 +383,7 @@ def test_points_are_counted_as_each_table_means_them():
     metrics = {"sensor.lines_read": 15, "sensor.vectors": 1000}
     tables = read_requirements()
     for application, points in (("disturbance", 15), ("flight_control", 62)):
-        found = sensor_chain.measured(changed(), metrics, tables[application, "landing"])
+        found = measured(changed(), metrics, tables[application, "landing"])
         assert found["points_per_slab"] == points  # (2 / 8)^2 of 1000
         assert found["range"] == 150 and found["error_u"] is None
 
@@ -428,13 +422,14 @@ def test_bad_descriptions_are_named(sections, message):
 )
 def test_what_does_not_go_together_is_said_ahead(sections, start):
     with pytest.raises(InputError) as error:
-        sensor_chain.prepare(changed(**sections), ".")
+        prepare(changed(**sections))
     assert str(error.value).startswith(start) and "\n" not in str(error.value)
 
 
+@pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize(("columns", "rows", "told"), [(5, 3, False), (5, 1, True), (1, 3, True)])
 def test_a_check_tells_of_lines_in_one_plane(columns, rows, told):
-    directions = {"columns": columns, "rows": rows}
-    _, ((_, lines), *_) = check._sensor(changed(sensor={"directions": directions}), ".")
+    directions = SMALL["sensor"]["directions"] | {"columns": columns, "rows": rows}
+    *_, (_, ((_, lines), *_)) = check.sections(changed(sensor={"directions": directions}))
     assert lines.startswith(f"{columns * rows}, 20 pulses each")
     assert ("in one plane: no wind" in lines) == told

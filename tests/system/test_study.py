@@ -23,9 +23,7 @@ from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment import study
 from lidar_mi.experiment.info import sections
-from lidar_mi.experiment.stages import backscatter as backscatter_chain
-from lidar_mi.experiment.stages import fringes as fringe_chain
-from lidar_mi.experiment.stages import volume as volume_chain
+from tests.support.experiments import leave_out_figures
 
 SCENES = Path(str(files("lidar_mi.scenes"))).resolve()
 PAIR = {"circulation": 150, "separation": 16, "core_radius": 2, "width": 30, "height": 20}
@@ -110,8 +108,7 @@ def test_faults_name_the_variant(file, variants, message):
 
 @pytest.mark.usefixtures("variant")
 def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
-    monkeypatch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
-    monkeypatch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
+    leave_out_figures(monkeypatch)
     folder, told = tmp_path / "out", []
     variants = config.load_variants(file())
     found = study.run("two", variants, folder, notice=lambda text, _: told.append(text))
@@ -171,7 +168,7 @@ VOLUME = {
 @pytest.mark.usefixtures("variant")
 def test_volumes_are_compared(file, tmp_path, monkeypatch):
     """Their wind is another file with a layer more: drawn is the one nearest to the picture."""
-    monkeypatch.setattr(volume_chain, "draw_all", lambda *_: [])
+    monkeypatch.setattr("lidar_mi.assessment.figures.volume.draw_all", lambda *_: [])
     drawn, draw = {}, study.draw_comparison
     monkeypatch.setattr(
         study,
@@ -211,7 +208,7 @@ def test_doppler_lidars_alone_are_compared(tmp_path, monkeypatch):
             "far": {"doppler": {"lidar": {"range": "76 m"}}},
         },
     }
-    monkeypatch.setattr(fringe_chain.doppler_figures, "draw_all", lambda *_: [])
+    monkeypatch.setattr("lidar_mi.assessment.figures.doppler.draw_all", lambda *_: [])
     path = tmp_path / "rings.yaml"
     path.write_text(yaml.safe_dump(data, sort_keys=False))
     metrics = study.run("rings", config.load_variants(path), tmp_path / "out")
@@ -308,12 +305,11 @@ def small_run(name, folder, more=()):
     path = SCENES / f"{name}.yaml"
     sets = [*SMALLER, *more]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(backscatter_chain.figures, "draw_all", lambda *_: [])
-        patch.setattr(backscatter_chain, "TEXTURE_SWEEP", ())
+        leave_out_figures(patch)
         variants = config.load_variants(path, sets)
         if variants:
             return study.run(name, variants, folder, SCENES)
-        return experiment.run(config.load(path, sets), folder, SCENES)
+        return experiment.run(config.load(path, sets), folder, beside=SCENES).metrics
 
 
 @pytest.mark.usefixtures("variant")

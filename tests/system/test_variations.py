@@ -33,7 +33,7 @@ def variation(tmp_path_factory):
             ["retrieval.methods=[cc]", "render.max_order=1", *overrides],
         )
         with without_figures():
-            return folder, run(changed, folder, SCENES)
+            return folder, run(changed, folder, beside=SCENES).metrics
 
     return vary
 
@@ -117,7 +117,7 @@ def test_aiming_by_angles_is_as_good(plain, variation):
 def test_vortex_pair(tmp_path):
     """No file at all: analytic flow, even air, texture only. With figures, whose sweep meets air
     without any structure and so without any vector."""
-    metrics = run(check(small()), tmp_path / "run")
+    metrics = run(check(small()), tmp_path / "run").metrics
     drawn = {path.stem for path in (tmp_path / "run" / "figures").iterdir()}
     assert drawn == FIGURES - {"fig15_multiple_scattering"}
     # Lamb-Oseen: 1 - e^-1.2564 of 150 m^2/s at the core radius of 2 m
@@ -161,7 +161,7 @@ def test_whole_simulation_as_a_volume(tmp_path, quick):
         "wake": {"file": "wake_les_40s.nc", "time": "40 s", "depth": "volume"},
         "retrieval": {"methods": ["cc"]},
     }
-    metrics = run(check(volume), tmp_path / "run", data)
+    metrics = run(check(volume), tmp_path / "run", beside=data).metrics
     for name in ("v", "w"):
         assert metrics[f"extinction.cc.rmse_{name}"] < 0.8
         assert metrics[f"backscatter.cc.rmse_{name}"] < 1.0

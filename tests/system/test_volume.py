@@ -13,7 +13,7 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.run import run
+from lidar_mi.experiment.run import prepare, run
 from lidar_mi.experiment.stages import volume as volume_chain
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
@@ -44,7 +44,7 @@ def changed(**sections):
 
 @pytest.mark.usefixtures("variant")
 def test_the_whole_chain(tmp_path):
-    metrics = run(changed(), tmp_path / "run")
+    metrics = run(changed(), tmp_path / "run").metrics
     wind = xr.open_dataset(tmp_path / "run" / "wind_volume.nc", engine="h5netcdf")
     assert wind["u"].dims == ("source", "algorithm", "x", "z", "y")
     assert wind.attrs["Conventions"] == "CF-1.11" and {"u_stderr", "w_true"} <= set(wind)
@@ -134,5 +134,5 @@ def test_bad_descriptions_are_named(sections, message):
 )
 def test_what_does_not_go_together_is_said_ahead(sections, start):
     with pytest.raises(InputError) as error:
-        volume_chain.prepare(changed(**sections), ".", lambda text, share: None)
+        prepare(changed(**sections))
     assert str(error.value).startswith(start) and "\n" not in str(error.value)

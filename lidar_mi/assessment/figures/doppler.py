@@ -7,7 +7,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.backscatter import Drawn, save_all
+from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.metrics.names import bound_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
 from lidar_mi.instrument.fringe_camera import ring_radii
 from lidar_mi.retrieval.rings.centre import circular_average
@@ -42,12 +43,12 @@ def draw_all(
     Parameters
     ----------
     doppler : lidar_mi.experiment.schema.Doppler
-    exposure : lidar_mi.experiment.stages.fringes.Exposure
+    exposure : lidar_mi.experiment.stages.ring_images.Exposure
         Pictures of the laser and of the air at the first speed, without and with noise.
     photons : xr.Dataset or None
         Picture of the laser's light, photon by photon.
     found, metrics
-        From `lidar_mi.experiment.stages.fringes.velocities`, `lidar_mi.assessment.metrics.velocities`.
+        From `lidar_mi.experiment.stages.ring_velocities.velocities`, `lidar_mi.assessment.metrics.velocities`.
     """
     plates = [
         ("fig03_fringes", "Rings on the CCD", _rings(doppler, exposure, photons)),
@@ -154,9 +155,9 @@ def _errors(doppler, metrics):
     for column, centre in zip(axes.T, settings.centre):
         for name in settings.methods:
             for axis, quantity in zip(column, ("std", "bias")):
-                key = f"doppler.{name}.centre_{centre}.averaged_{{}}.{quantity}"
+                keys = [ring_key(name, centre, n, quantity) for n in settings.averaged]
                 values, bars = (
-                    np.array([metrics.get(key.format(n) + end, np.nan) for n in settings.averaged])
+                    np.array([metrics.get(key + end, np.nan) for key in keys])
                     for end in ("", "_stderr")
                 )
                 axis.errorbar(
@@ -170,9 +171,7 @@ def _errors(doppler, metrics):
                     lw=1.2,
                     label=READERS[name],
                 )
-        bound = [
-            metrics[f"doppler.bound.centre_{centre}.averaged_{n}.std"] for n in settings.averaged
-        ]
+        bound = [metrics[bound_key(centre, n)] for n in settings.averaged]
         column[0].plot(settings.averaged, bound, "k--", label="Cramer-Rao bound")
         column[0].axhline(REQUIRED, color="0.5", ls=":", label="required (table 1)")
         for axis, quantity in zip(column, ("std", "bias")):

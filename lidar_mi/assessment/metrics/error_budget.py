@@ -13,6 +13,7 @@ from scipy import ndimage
 
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
+from lidar_mi.retrieval.methods import ImageMethod
 
 CAUSES = {
     "detector_noise": "noise of the detector",
@@ -26,10 +27,16 @@ CAUSES = {
 }
 """Causes of error by key, and how they are called."""
 
+PLACES = {"": "all", "outside_cores.": "beyond two core radii"}
+"""Which vectors keys of `error_budget` are about, and how these are called."""
+
+Budgets = Mapping[str, Mapping[str, float]]
+"""From `error_budget`, by method."""
+
 Pair = Sequence[xr.DataArray]
 
 # Methods that compare windows as they are, shifted: a vector is the mean chord over one.
-_BOXES = ("cc", "ws")
+_BOXES = (ImageMethod.CC, ImageMethod.WS)
 
 
 def picture_unit(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, float]:
@@ -167,7 +174,7 @@ def window_mean(truth: xr.Dataset, template: int, method: str) -> xr.Dataset | N
         "cc", "ws": the mean over the template. "multipass": a Gaussian of a third of the template
         (the value of a weighted affine fit in its middle).
     """
-    if method == "multipass":
+    if method == ImageMethod.MULTIPASS:
         smooth = {
             name: truth[name].copy(
                 data=ndimage.gaussian_filter(truth[name].values, template / 3, mode="nearest")
@@ -331,3 +338,13 @@ def _shares(errors: Mapping[str, np.ndarray], chosen: np.ndarray) -> dict[str, f
             metrics |= {f"{cause}.share_{name}": float(x) for name, x in zip("vw", parts)}
             metrics[f"{cause}.share"] = float(1 - rest.sum() / full.sum())
     return metrics
+
+
+def causes_of(budget: Mapping[str, float]) -> list[str]:
+    """Causes that a budget from `error_budget` knows of."""
+    return [cause for cause in CAUSES if f"{cause}.share" in budget]
+
+
+def component_rmse(budget: Mapping[str, float], place: str) -> float:
+    """Rms error of v and w together, a component, m s^-1; ``place`` of `PLACES`."""
+    return float(np.hypot(budget[f"{place}rmse_v"], budget[f"{place}rmse_w"]) / np.sqrt(2))

@@ -5,7 +5,6 @@ import xarray as xr
 from scipy.interpolate import RectBivariateSpline
 
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
-from lidar_mi.assessment.report.digits import percent
 
 
 def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
@@ -50,6 +49,47 @@ def deviations(wind: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
     )
 
 
+def error_statistics(error, stderr=None, where=True) -> dict[str, float]:
+    """Statistics of errors, and whether they are what their standard errors say.
+
+    Parameters
+    ----------
+    error : array
+        Estimate less truth; NaN where there is no estimate.
+    stderr : array, optional
+        Standard errors as stated, of the same shape and unit. Errors without a positive, finite one
+        count in ``rmse`` and ``bias`` alone.
+    where : array of bool, optional
+        Which errors count.
+
+    Returns
+    -------
+    dict
+        ``rmse`` and ``bias`` (unit of the error); with ``stderr`` also ``stderr`` (rms of those
+        stated), ``reduced_variance`` (mean square of error over standard error, 1 where errors are
+        as stated), ``coverage_68`` and ``coverage_95`` (fraction within 1 and 1.96 standard errors,
+        0.683 and 0.950 for Gaussian errors). Empty where no error counts.
+    """
+    error = np.asarray(error)
+    chosen = np.isfinite(error) & where
+    if not chosen.any():
+        return {}
+    values = error[chosen]
+    found = {"rmse": np.sqrt(np.mean(values**2)), "bias": np.mean(values)}
+    if stderr is not None:
+        stated = np.broadcast_to(stderr, error.shape)[chosen]
+        known = np.isfinite(stated) & (stated > 0)
+        if known.any():
+            normalised = values[known] / stated[known]
+            found |= {
+                "stderr": np.sqrt(np.mean(stated[known] ** 2)),
+                "reduced_variance": np.mean(normalised**2),
+                "coverage_68": np.mean(np.abs(normalised) < 1),
+                "coverage_95": np.mean(np.abs(normalised) < 1.96),
+            }
+    return {name: float(value) for name, value in found.items()}
+
+
 def wind_metrics(wind: xr.Dataset, truth: xr.Dataset, cores: list[Core]) -> dict[str, float]:
     """Errors of one retrieval, as flat keys.
 
@@ -78,11 +118,11 @@ def _statistics(error: xr.Dataset, chosen: np.ndarray) -> dict[str, float]:
         return {}
     statistics = {}
     for name in ("v", "w", "speed", "direction"):
-        values = error[name].values[chosen]
-        statistics[f"rmse_{name}"] = float(np.sqrt(np.mean(values**2)))
-        statistics[f"bias_{name}"] = float(np.mean(values))
+        found = error_statistics(error[name].values, where=chosen)
+        statistics |= {f"{key}_{name}": value for key, value in found.items()}
         for rank in (50, 90):
-            statistics[f"p{rank}_{name}"] = float(np.percentile(np.abs(values), rank))
+            percentile = np.percentile(np.abs(error[name].values[chosen]), rank)
+            statistics[f"p{rank}_{name}"] = float(percentile)
     return statistics
 
 
@@ -119,4 +159,4 @@ def commonest_flag(flag: xr.DataArray) -> str:
         text: float(((flag.values & mask) != 0).mean()) for text, mask in zip(meanings, masks)
     }
     worst = max(shares, key=shares.get)
-    return f"{percent(shares[worst])} have the flag {worst}"
+    return f"{round(100 * shares[worst])} % have the flag {worst}"

@@ -5,20 +5,23 @@ import math
 import numpy as np
 import xarray as xr
 
+from lidar_mi.assessment.metrics.names import ring_key
+from lidar_mi.retrieval.methods import RingCentre, RingMethod
+
 READERS = {
-    "annular": "all rings, full model",
-    "pixels": "all rings, every pixel",
-    "ca": "CA, peak in r",
-    "ca_r2": "CA, peak in r²",
-    "ml": "ML, peak in r",
-    "sg": "Savitzky-Golay, peak in r",
+    RingMethod.ANNULAR: "all rings, full model",
+    RingMethod.PIXELS: "all rings, every pixel",
+    RingMethod.CA: "CA, peak in r",
+    RingMethod.CA_R2: "CA, peak in r²",
+    RingMethod.ML: "ML, peak in r",
+    RingMethod.SG: "Savitzky-Golay, peak in r",
 }
 """What the methods are called in figures and tables."""
 
-PEAK_READERS = ("ca", "ca_r2", "ml", "sg")
+PEAK_READERS = (RingMethod.CA, RingMethod.CA_R2, RingMethod.ML, RingMethod.SG)
 """Those that read the peak of the innermost ring."""
 
-CENTRES = {"free": "centre found", "known": "centre known"}
+CENTRES = {RingCentre.FREE: "centre found", RingCentre.KNOWN: "centre known"}
 
 
 def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
@@ -48,13 +51,13 @@ def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
         for centre in found["centre"].values:
             for averaged in found["averaged"].values:
                 case = found.sel(algorithm=algorithm, centre=centre, averaged=averaged)
-                key = f"doppler.{algorithm}.centre_{centre}.averaged_{averaged}"
                 error = (case["v"] - case["v_los"]).transpose("v_los", "image").values
-                for name, value in _spread(error, tried).items():
-                    metrics[f"{key}.{name}"] = value
+                measures = _spread(error, tried)
                 stated = case["v_std"].values[np.isfinite(case["v_std"].values)]
                 if stated.size:
-                    metrics[f"{key}.expected_std"] = float(np.sqrt((stated**2).mean()))
+                    measures["expected_std"] = float(np.sqrt((stated**2).mean()))
+                for name, value in measures.items():
+                    metrics[ring_key(algorithm, centre, averaged, name)] = value
     return metrics
 
 

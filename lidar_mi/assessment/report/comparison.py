@@ -1,21 +1,17 @@
 """Several variants of one experiment side by side: what differs, and what comes of it."""
 
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
-
-import numpy as np
-import xarray as xr
-from matplotlib.figure import Figure
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import product
 
 from lidar_mi import __version__
-from lidar_mi.assessment.figures.backscatter import BACKSCATTER, METHOD_NAMES, Drawn, save_all
+from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.labels import METHOD_NAMES
+from lidar_mi.assessment.metrics.names import RENDERED, Source, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, READERS
 from lidar_mi.assessment.report.digits import fixed, three
 from lidar_mi.assessment.report.page import embedded, template
 from lidar_mi.io.yaml import to_yaml
-
-_SPEED = "m s$^{-1}$"
+from lidar_mi.retrieval.methods import ImageMethod, RingCentre, RingMethod, VolumeMethod
 
 # rows of the comparison: key, name, unit; {} stands for a method's winds
 _ROWS = (
@@ -49,7 +45,9 @@ _ROWS = (
 
 # of the Doppler lidar's readings of single pulses: measure of `velocity_metrics`, name
 _READINGS = (("bias", "bias"), ("std", "standard deviation"), ("found_fraction", "share read"))
-_SINGLE = re.compile(r"(doppler\.(\w+)\.centre_(\w+)\.averaged_1)\.found_fraction")
+
+
+_METHODS = dict.fromkeys((*ImageMethod, *VolumeMethod))
 
 
 def flat(settings: Mapping, prefix: str = "") -> dict[str, object]:
@@ -108,31 +106,25 @@ def page(
 
 def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, str, list[str]]]:
     """What comes of variants: (name, unit, one text a variant), where any of them has a number."""
-    winds = dict.fromkeys(
-        key.removesuffix(".valid_fraction")
-        for one in metrics.values()
-        for key in one
-        if key.startswith("backscatter") and key.endswith(".valid_fraction")
-    )
     for pattern, label, unit in _ROWS:
-        for wind in winds if "{}" in pattern else (None,):
-            key = pattern.format(wind)
-            values = [one.get(key) for one in metrics.values()]
-            if any(value is not None for value in values):
-                yield (f"{_named(wind)}: {label}" if wind else label), unit, _shown(values, unit)
-    readings = dict.fromkeys(
-        found.groups()
-        for one in metrics.values()
-        for key in one
-        if (found := _SINGLE.fullmatch(key))
-    )
-    for key, reader, centre in readings:
+        if "{}" not in pattern:
+            yield from _row(metrics, pattern, label, unit)
+            continue
+        for source, method in product(RENDERED, _METHODS):
+            key = pattern.format(f"{source}.{method}")
+            yield from _row(metrics, key, f"{_named(source, method)}: {label}", unit)
+    for method, centre in product(RingMethod, RingCentre):
         for measure, label in _READINGS:
-            values = [one.get(f"{key}.{measure}") for one in metrics.values()]
-            if any(value is not None for value in values):
-                title = f"{READERS.get(reader, reader)}, {CENTRES.get(centre, centre)}"
-                unit = "%" if measure == "found_fraction" else "m/s"
-                yield f"one pulse by {title}: {label}", unit, _shown(values, unit)
+            unit = "%" if measure == "found_fraction" else "m/s"
+            title = f"one pulse by {READERS[method]}, {CENTRES[centre]}: {label}"
+            yield from _row(metrics, ring_key(method, centre, 1, measure), title, unit)
+
+
+def _row(metrics: Mapping[str, Mapping[str, float]], key: str, label: str, unit: str):
+    """A metric of all variants, if any of them has it."""
+    values = [one.get(key) for one in metrics.values()]
+    if any(value is not None for value in values):
+        yield label, unit, _shown(values, unit)
 
 
 def _shown(values: Sequence[float | None], unit: str) -> list[str]:
@@ -140,10 +132,9 @@ def _shown(values: Sequence[float | None], unit: str) -> list[str]:
     return ["-" if value is None else style(value) for value in values]
 
 
-def _named(wind: str) -> str:
-    source, method = wind.split(".")
-    title = METHOD_NAMES.get(method, method.replace("_", " "))
-    return f"{title}, with the detector's noise" if source.endswith("noisy") else title
+def _named(source: str, method: str) -> str:
+    title = METHOD_NAMES[method]
+    return f"{title}, with the detector's noise" if source == Source.NOISY else title
 
 
 def setting(value) -> str:
@@ -157,64 +148,3 @@ def setting(value) -> str:
         return f"{float(number):.6g}{blank}{unit}"
     except ValueError:
         return str(value)
-
-
-def draw_comparison(
-    folder: Path, rows: Mapping[str, tuple[xr.DataArray, xr.Dataset, Sequence]], log: Callable
-) -> list[Drawn]:
-    """One row a variant: its first picture, the w found in the pair, and its error.
-
-    Parameters
-    ----------
-    rows : mapping of variant to (picture, winds, cores)
-        Apparent backscatter (m^-1 sr^-1) and winds on (z, y), these with w_true and flag; places
-        (y, z) of the true cores, m.
-    """
-    figure = Figure(figsize=(19, 4.0 * len(rows)), layout="compressed")
-    axes = figure.subplots(len(rows), 3, squeeze=False)
-    limit = max(float(abs(wind["w_true"]).quantile(0.995)) for _, wind, _ in rows.values()) or 1.0
-    speeds = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
-    errors = {
-        name: (wind["w"] - wind["w_true"]).where(wind["flag"] == 0)
-        for name, (_, wind, _) in rows.items()
-    }
-    largest = [
-        float(abs(error).quantile(0.99)) for error in errors.values() if error.notnull().any()
-    ]
-    # one variant without skill must not hide the errors of those that have some
-    top = min(float(np.median(largest)) if largest else 0.0, limit) or limit
-    for row, (name, (picture, wind, cores)) in zip(axes, rows.items()):
-        low, high = (float(1e6 * picture.quantile(share)) for share in (0.002, 0.998))
-        good, place = (
-            wind["flag"] == 0,
-            {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"},
-        )
-        columns = (
-            (
-                1e6 * picture.sel(place),
-                {"cmap": "cividis", "vmin": low, "vmax": high},
-                f"{name}: picture",
-                BACKSCATTER,
-            ),
-            (wind["w"].where(good), speeds, f"{name}: w found", _SPEED),
-            (errors[name], speeds | {"vmin": -top, "vmax": top}, f"{name}: error of w", _SPEED),
-        )
-        for panel, (field, style, title, label) in zip(row, columns):
-            y, z = field["y"].values, field["z"].values
-            mesh = panel.pcolormesh(
-                y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
-            )
-            panel.set(title=title, aspect="equal", xlim=(y.max(), y.min()), ylim=(z.min(), z.max()))
-            for core in cores:
-                panel.plot(*core, "k+", ms=8)
-            figure.colorbar(mesh, ax=panel, label=label, pad=0.02, extend="both")
-        row[0].set_ylabel("z / m")
-    for panel in axes[-1]:
-        panel.set_xlabel("y / m (port is left)")
-    caption = (
-        "Each variant's first picture, the vertical wind found by its first method (white: flagged "
-        "vectors), and its error; winds are on one scale, errors on another, that of the middle variant. Crosses: true cores. Of "
-        "several gates the first, of winds in three dimensions the layer nearest to it."
-    )
-    plate = ("fig00_comparison", "The variants side by side", (figure, caption))
-    return save_all(folder, [plate], log)

@@ -35,6 +35,11 @@ def percent(share: float) -> str:
     return f"{text} %"
 
 
+def whole_percent(share: float) -> str:
+    """A fraction as whole per cent, without a sign before 0."""
+    return f"{round(100 * share) + 0} %"
+
+
 def with_error(value: float, stderr: float) -> str:
     """A value and its standard error, to the second digit of the error: 0.65 ± 0.12."""
     digits = max(0, 1 - math.floor(math.log10(stderr))) if stderr > 0 else 3

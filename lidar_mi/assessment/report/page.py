@@ -10,38 +10,11 @@ from typing import NamedTuple
 import jinja2
 from markupsafe import Markup
 
-from lidar_mi.assessment.figures.backscatter import METHOD_NAMES, SOURCE_NAMES, Drawn
-from lidar_mi.assessment.metrics.cores import Core
-from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
-from lidar_mi.assessment.report.digits import fixed, in_row, percent, three, with_error
+from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.labels import METHOD_NAMES
+from lidar_mi.assessment.metrics.units import unit_of
+from lidar_mi.assessment.report.digits import percent
 from lidar_mi.io.images import as_webp
-from lidar_mi.retrieval.vortices.pair import MEANING
-
-# rows of the table of results: key, name, unit
-_ROWS = (
-    ("rmse_v", "rms error of v", "m/s"),
-    ("rmse_w", "rms error of w", "m/s"),
-    ("bias_v", "bias of v", "m/s"),
-    ("bias_w", "bias of w", "m/s"),
-    ("rmse_speed", "rms error of speed", "m/s"),
-    ("p50_direction", "median error of direction", "rad"),
-    ("outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
-    ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
-    ("all.rmse_v", "rms error of v, flagged vectors too", "m/s"),
-    ("all.rmse_w", "rms error of w, flagged vectors too", "m/s"),
-    ("valid_fraction", "share of valid vectors", "%"),
-)
-
-_DOPPLER_UNITS = {
-    "doppler.line_width": "Hz",
-    "doppler.free_spectral_range": "Hz",
-    "doppler.velocity_range": "m/s",
-    "doppler.render.largest_error": "m/s",
-}
-
-_VORTEX_UNITS = {
-    name: units.replace(" s-1", "/s").replace("m2", "m²") for name, (units, _) in MEANING.items()
-} | {"flow_error": "m/s"}
 
 
 class Tables(NamedTuple):
@@ -171,7 +144,7 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
         )
         rows.append(("light", light))
         chosen = experiment.volume or experiment.retrieval
-        methods = ", ".join(METHOD_NAMES.get(name, name) for name in chosen.methods)
+        methods = ", ".join(METHOD_NAMES[name] for name in chosen.methods)
         rows.append(("winds by", methods))
     if experiment.doppler:
         lidar = experiment.doppler.lidar
@@ -192,177 +165,6 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
     return rows
 
 
-def backscatter_chapter(
-    experiment,
-    metrics: dict[str, float],
-    cores: Sequence[Core],
-    drawn: Sequence[Drawn],
-    vectors: dict | None = None,
-) -> Chapter:
-    """What the backscatter lidar tells.
-
-    Parameters
-    ----------
-    experiment : lidar_mi.experiment.schema.Experiment
-    metrics : dict
-        From `lidar_mi.experiment.stages.backscatter.verdict`.
-    vectors : dict, optional
-        From `vector_map.map_data`.
-    """
-    lead = [
-        "A backscatter lidar looks at a wake twice; cross-flow winds follow from the two images."
-    ]
-    if cores:
-        places = ", ".join(
-            f"a vortex at y = {core.y:.1f} m, z = {core.z:.1f} m (core radius {core.radius:.1f} m)"
-            for core in cores
-        )
-        lead.append(f"The true flow holds {places}.")
-    else:
-        lead.append("No vortex is found in the true flow.")
-    numbers = Tables(
-        heading="How good the cross-flow winds are",
-        legend="Valid vectors against the truth at their place and time. Columns: what the winds "
-        "were retrieved from. Blurred is the extinction as wide beams see it, without noise: its "
-        "difference to the extinction is what the beam's width costs. The last column says how "
-        "strong the true wind is there: an error near it means no skill, as no wind at all would "
-        "be no worse.",
-        tables=list(_tables(experiment, metrics)),
-    )
-    if vectors:
-        vectors = {"title": "The wind from the backscatter pair, vector by vector"} | vectors
-    return Chapter(
-        "The backscatter lidar",
-        [*lead, _noise(experiment, metrics)],
-        drawn,
-        numbers,
-        vectors=vectors,
-    )
-
-
-def doppler_chapter(doppler, metrics: dict[str, float], drawn: Sequence[Drawn]) -> Chapter:
-    """What the Doppler lidar tells.
-
-    Parameters
-    ----------
-    doppler : lidar_mi.experiment.schema.Doppler
-    metrics : dict
-        From `lidar_mi.experiment.stages.fringes`.
-    """
-    purpose = (
-        "A Doppler lidar sends its backscatter through an etalon onto a CCD; the wind along the "
-        "line of sight follows from the radii of the rings."
-    )
-    modes = metrics.get("doppler.speckle_modes")
-    speckle = f"speckle has {three(modes)} modes a pixel" if modes else "there is no speckle"
-    light = (
-        f"A pulse gives {three(metrics['doppler.photons'])} photons from {doppler.lidar.range:g} m and "
-        f"{three(metrics['doppler.background_photons'])} of sunlight; {speckle}, read-out "
-        f"{doppler.ccd.read_noise:g} photoelectrons of noise."
-    )
-    rings = (
-        f"The line is {metrics['doppler.line_width'] / 1e9:.2f} GHz wide, the etalon's free "
-        f"spectral range {metrics['doppler.free_spectral_range'] / 1e9:.2f} GHz, its finesse "
-        f"{metrics['doppler.finesse']:.1f}: winds are told apart over "
-        f"{metrics['doppler.velocity_range']:.0f} m/s. Without noise, the rendered pictures give "
-        f"the true winds to {metrics['doppler.render.largest_error']:.2g} m/s."
-    )
-    numbers = Tables(
-        heading="How good the line-of-sight winds are",
-        legend="Winds that each method reads from noisy pictures, or from averages of several "
-        f"(columns), over all speeds, with standard errors. {_abbreviations(doppler.retrieval.methods)}"
-        "The bound (Cramér-Rao) is the least standard deviation without bias; its row says nothing "
-        "of any method.",
-        tables=[
-            _doppler_table(doppler.retrieval, centre, metrics)
-            for centre in doppler.retrieval.centre
-        ],
-    )
-    return Chapter("The Doppler lidar", [purpose, light, rings], drawn, numbers)
-
-
-def _abbreviations(methods: Sequence[str]) -> str:
-    """What the names of those methods mean that read the peaks of the innermost ring."""
-    names = {"ca": "CA: circular averaging", "ml": "ML: midpoint lines"}
-    used = [text for key, text in names.items() if any(m.partition("_")[0] == key for m in methods)]
-    if not set(methods) & set(PEAK_READERS):
-        return ""
-    return "; ".join([*used, "peaks are those of the innermost ring, emitted and received"]) + ". "
-
-
-def _doppler_table(settings, centre, metrics):
-    rows = []
-    for method in settings.methods:
-        for quantity, label in (("std", "standard deviation"), ("bias", "bias")):
-            shown = []
-            for n in settings.averaged:
-                key = f"doppler.{method}.centre_{centre}.averaged_{n}.{quantity}"
-                value, error = metrics.get(key), metrics.get(f"{key}_stderr")
-                known = "-" if value is None else fixed(value)
-                shown.append(known if error is None else with_error(value, error))
-            rows.append((f"{READERS[method]}: {label}", "m/s", shown))
-    key = f"doppler.bound.centre_{centre}.averaged_{{}}.std"
-    rows.append(("bound", "m/s", [fixed(metrics[key.format(n)]) for n in settings.averaged]))
-    heads = [f"{n} picture{'s' * (n > 1)}" for n in settings.averaged]
-    return CENTRES[centre], heads, rows
-
-
-def _tables(experiment, metrics):
-    sources = ["backscatter", "extinction", "extinction_blurred", "extinction_without_texture"]
-    if experiment.detector:
-        sources.insert(0, "backscatter_noisy")
-    for method in experiment.retrieval.methods:
-        rows = []
-        for key, label, unit in _ROWS:
-            values = [metrics.get(f"{source}.{method}.{key}") for source in sources]
-            # what zero wind instead of the found one would be off by
-            nothing = key.replace("rmse_", "rms_").removeprefix("all.")
-            values.append(metrics.get(f"true_wind.{nothing}"))
-            rows.append((label, unit, in_row(values, unit)))
-        heads = [SOURCE_NAMES[source] for source in sources]
-        yield METHOD_NAMES[method], [*heads, "true wind, rms"], rows
-
-
-def _noise(experiment, metrics) -> str:
-    """What the pictures' noise is made of, in one line."""
-    line = (
-        "Noise of the first picture, relative to a pixel's light (medians): simulation "
-        f"{percent(metrics['backscatter.mc_relative_error'])} "
-        f"({experiment.render.samples_per_beam} photons a beam)"
-    )
-    if not experiment.detector:
-        return f"{line}; no detector."
-    causes = {
-        "shot": "photons",
-        "speckle": "speckle",
-        "background": "sky",
-        "dark": "dark current",
-        "readout": "read-out",
-    }
-    parts = ", ".join(
-        f"{name} {percent(metrics[f'detector.noise.{key}'])}"
-        for key, name in causes.items()
-        if metrics.get(f"detector.noise.{key}", 0) >= 5e-5
-    )
-    return (
-        f"{line}; detector {percent(metrics['detector.noise.all'])} with "
-        f"{three(metrics['detector.signal'])} photoelectrons ({parts or 'each below 0.01 %'})."
-    )
-
-
 def _rounded(key: str, value: float) -> str:
     """A metric with four digits and its unit."""
-    *_, parent, name = ("", *key.split("."))
-    quantity = name.rpartition("_")[2]
-    described = _VORTEX_UNITS.get(name.removesuffix("_stderr"))
-    if name.startswith(("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_std")):
-        unit = "rad" if quantity == "direction" else "m/s"
-    elif key in _DOPPLER_UNITS:
-        unit = _DOPPLER_UNITS[key]
-    elif key.startswith("vortex.") and described:
-        unit = described
-    elif parent.endswith("_core"):
-        unit = "m²/s" if name == "circulation" else "m"
-    else:
-        unit = {"timing": "s"}.get(parent, "")
-    return f"{value:.4g} {unit}".strip()
+    return f"{value:.4g} {unit_of(key)}".strip()

@@ -1,198 +1,17 @@
-"""The combined sensor's chapter of a report: its figures, its verdict, its numbers."""
+"""The combined sensor's chapter of a report: its verdict, its numbers."""
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 
-import numpy as np
-import xarray as xr
-from matplotlib.figure import Figure
-from scipy import stats
-
-from lidar_mi.assessment.figures.backscatter import Drawn, save_all
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.requirements import as_rows, fulfilled, look_ahead
 from lidar_mi.assessment.report.digits import in_row, percent, three
 from lidar_mi.assessment.report.page import Chapter, Tables
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
 
-_SPEED = "m s$^{-1}$"
-
-
-def draw_all(
-    folder: Path, found: xr.Dataset | None, lines: xr.Dataset, cores: Sequence[Core], log: Callable
-) -> list[Drawn]:
-    """Draw the combined sensor's figures as PNG into ``folder``.
-
-    Parameters
-    ----------
-    found : xr.Dataset or None
-        From `lidar_mi.retrieval.lines.combine.combine`, with the truth as u_true, v_true, w_true. None:
-        there is no wind.
-    lines : xr.Dataset
-        From `lidar_mi.experiment.stages.sensor.measure_lines`.
-    """
-    plates = [("fig19_lines_of_sight", "The scan of the Doppler lidar", _scan(lines, cores))]
-    if found is not None:
-        plates += [
-            ("fig20_wind3d", "The wind from both lidars", _maps(found, lines, cores)),
-            ("fig21_uncertainty", "How certain it is", _uncertainty(found)),
-        ]
-    return save_all(folder, plates, log)
-
-
-def _scan(lines, cores):
-    figure = Figure(figsize=(13.6, 4.6), layout="compressed")
-    panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    place = (lines["range"] * lines["direction"]).transpose("line", "axis").values
-    speed, true = lines["v_los"].values, lines["v_los_true"].values
-    reduced = (speed - true) / lines["v_los_std"].values
-    read = np.isfinite(speed)
-    span = np.quantile(np.where(read, speed, true), (0.0, 1.0))
-    for panel, values, title, label, style in (
-        (
-            panels[0],
-            speed,
-            "velocity along the line of sight",
-            _SPEED,
-            {"cmap": "cividis", "vmin": span[0], "vmax": span[1]},
-        ),
-        (
-            panels[1],
-            reduced,
-            "its error over its standard error",
-            "reduced error",
-            {"cmap": "RdBu_r", "vmin": -4, "vmax": 4},
-        ),
-    ):
-        dots = panel.scatter(
-            place[read, 1],
-            place[read, 2],
-            c=values[read],
-            s=90,
-            edgecolors="0.3",
-            linewidths=0.5,
-            **style,
-        )
-        panel.plot(place[~read, 1], place[~read, 2], "kx", ms=6)
-        for core in cores:
-            panel.plot(core.y, core.z, "+", color="crimson", ms=9)
-        panel.set(title=title, aspect="equal", xlabel="y / m (port is left)", ylabel="z / m")
-        figure.colorbar(dots, ax=panel, label=label, pad=0.02)
-    # at least as wide as high, also for lines above each other
-    middle, half = (
-        (place[:, 1].max() + place[:, 1].min()) / 2,
-        np.ptp(place[:, 1:], axis=0).max() / 2,
-    )
-    panels[0].set_xlim(middle + half + 4, middle - half - 4)
-    return figure, (
-        "Middles of the range bins; what the aircraft flies is part of the velocity. Black crosses: "
-        "lines of sight whose rings could not be read. Red crosses: true cores."
-    )
-
-
-def _maps(found, lines, cores):
-    figure = Figure(figsize=(17, 10.5), layout="compressed")
-    axes = figure.subplots(3, 3, sharex=True, sharey=True)
-    good = found["flag"] == 0
-    y, z = found["y"], found["z"]
-    place = (lines["range"] * lines["direction"]).transpose("line", "axis").values
-    for row, name in zip(axes, COMPONENTS):
-        true, value = found[f"{name}_true"], found[name].where(good)
-        error = value - true
-        both = np.concatenate([true.values.ravel(), value.values.ravel()])
-        columns = (
-            (true, _colours(both), f"{name}, true"),
-            (value, _colours(both), f"{name}, found"),
-            (error, _colours(error.values), f"{name}, error"),
-        )
-        for panel, (field, colours, title) in zip(row, columns):
-            mesh = panel.pcolormesh(
-                y,
-                z,
-                field.transpose("z", "y").values,
-                shading="nearest",
-                rasterized=True,
-                **colours,
-            )
-            panel.set(title=title, aspect="equal")
-            figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
-            for core in cores:
-                panel.plot(core.y, core.z, "+", color="k", ms=8)
-    # lines of sight where they are used
-    axes[0, 1].plot(place[:, 1], place[:, 2], "k.", ms=2)
-    axes[0, 0].set_xlim(float(y.max()), float(y.min()))
-    axes[0, 0].set_ylim(float(z.min()), float(z.max()))
-    for panel in axes[-1]:
-        panel.set_xlabel("y / m (port is left)")
-    for panel in axes[:, 0]:
-        panel.set_ylabel("z / m")
-    return figure, (
-        "Rows: u from the lines of sight (dots: their middles) with the cross-flow wind of the "
-        "images taken out, v and w from the images. Good vectors alone; crosses: true cores."
-    )
-
-
-def _uncertainty(found):
-    figure = Figure(figsize=(17, 4.3), layout="compressed")
-    axes = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 1))
-    good = (found["flag"] == 0).transpose("z", "y").values
-    y, z = found["y"], found["z"]
-    for panel, name in zip(axes, ("u", "w")):
-        stderr = found[f"{name}_stderr"].transpose("z", "y").values
-        top = float(np.quantile(stderr[good], 0.99)) if good.any() else 1.0
-        mesh = panel.pcolormesh(
-            y,
-            z,
-            np.where(good, stderr, np.nan),
-            shading="nearest",
-            rasterized=True,
-            cmap="viridis",
-            vmin=0,
-            vmax=top,
-        )
-        panel.set(
-            title=f"standard error of {name}",
-            aspect="equal",
-            xlabel="y / m (port is left)",
-            ylabel="z / m",
-        )
-        panel.set_xlim(float(y.max()), float(y.min()))
-        figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="max")
-    axes = axes[-1]
-    edges = np.linspace(-5, 5, 51)
-    for name in COMPONENTS:
-        error = (found[name] - found[f"{name}_true"]) / found[f"{name}_stderr"]
-        values = error.transpose("z", "y").values[good]
-        axes.hist(
-            np.clip(values[np.isfinite(values)], -5, 5),
-            edges,
-            density=True,
-            histtype="step",
-            label=name,
-        )
-    middle = (edges[1:] + edges[:-1]) / 2
-    axes.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
-    axes.set(title="errors over standard errors", xlabel="reduced error", ylabel="density")
-    axes.legend()
-    return figure, (
-        "Left, middle: standard errors of good vectors. Right: how errors against the truth, in "
-        "units of their standard errors, are distributed; the last bins hold all beyond."
-    )
-
-
-def _colours(values: np.ndarray) -> dict:
-    """Two-sided about 0, or of the values' own range where all of them point the same way."""
-    known = values[np.isfinite(values)]
-    low, high = np.quantile(known, (0.005, 0.995)) if known.size else (0.0, 0.0)
-    if low > 0 or high < 0:
-        return {"cmap": "viridis", "vmin": low, "vmax": high}
-    limit = (float(np.quantile(np.abs(known), 0.995)) if known.size else 0.0) or 1.0
-    return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
-
 
 def sensor_chapter(
     experiment,
-    metrics: dict[str, float],
+    metrics: Mapping[str, float],
     judged: Sequence[tuple],
     drawn: Sequence[Drawn],
     vectors: dict | None = None,
@@ -202,8 +21,8 @@ def sensor_chapter(
     Parameters
     ----------
     experiment : lidar_mi.experiment.schema.Experiment
-    metrics : dict
-        From `lidar_mi.experiment.stages.sensor`.
+    metrics : mapping
+        From `lidar_mi.experiment.measure.measure`.
     judged : sequence of (RequirementTable, list of Finding)
         Empty: nothing is asked for.
     drawn : sequence of Drawn

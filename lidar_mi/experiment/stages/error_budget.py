@@ -1,8 +1,6 @@
 """What limits the cross-flow wind of an experiment: found again without each cause of error."""
 
-import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -14,50 +12,31 @@ from lidar_mi.assessment.metrics.error_budget import (
     picture_unit,
     pictures_without,
 )
-from lidar_mi.assessment.report.error_budget import budget_chapter, draw_all
-from lidar_mi.assessment.report.page import Chapter
+from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.atmosphere.advection import advect
-from lidar_mi.experiment.run_folder import IMAGES, Log
+from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.backscatter import (
-    NOISY,
-    known_blur,
-    rendered_pairs,
-    scan_plans,
-    window_settings,
-)
-from lidar_mi.experiment.truth import Truth, blur_by_beam, make_truth
-from lidar_mi.io import exr
-from lidar_mi.io.netcdf import open_netcdf
+from lidar_mi.experiment.stages.rendering import scan_plans
+from lidar_mi.experiment.stages.winds import known_blur, rendered_pairs, window_settings
+from lidar_mi.experiment.truth import Truth, blur_by_beam
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
 # Pictures of air as it is: a method that undoes the beam's blur has none to undo there.
 _SHARP = ("perfect", "beam_blur")
 
 
-def prepare(
-    experiment: Experiment, beside: str | Path
-) -> Callable[[Path, Log], tuple[dict[str, float], Chapter]]:
-    """What it returns reads the pictures that the backscatter chain leaves in the folder."""
-    truth = make_truth(experiment, beside)
-    return lambda folder, log: _run(experiment, truth, folder, log)
-
-
-def _run(experiment, truth, folder, log) -> tuple[dict[str, float], Chapter]:
-    start = time.perf_counter()
+def error_budgets(
+    experiment: Experiment,
+    truth: Truth,
+    scans: Sequence[xr.Dataset],
+    wind: xr.Dataset,
+    cores: Sequence[Core],
+    *,
+    log: Log,
+) -> dict[str, dict[str, float]]:
+    """`budgets` from a run's winds, where these need not be retrieved again."""
     log("finding what limits the wind")
-    scans = [exr.read_scan(folder / name) for name in IMAGES]
-    with open_netcdf(folder / "wind.nc") as winds:
-        known = winds.load()
-    methods = experiment.retrieval.methods
-    metrics = {
-        f"error_budget.{method}.{key}": value
-        for method, budget in budgets(experiment, truth, scans, log.bar, known).items()
-        for key, value in budget.items()
-    }
-    drawn = draw_all(folder / "figures", metrics, methods, log)
-    metrics["timing.error_budget_s"] = round(time.perf_counter() - start, 3)
-    return metrics, budget_chapter(metrics, methods, drawn)
+    return budgets(experiment, truth, scans, log.bar, wind, cores)
 
 
 def budgets(
@@ -77,7 +56,7 @@ def budgets(
     progress : callable, optional
         Told what is done, and its share.
     known : xr.Dataset, optional
-        Winds that need not be found again, from `lidar_mi.experiment.stages.backscatter.winds`.
+        Winds that need not be found again, from `lidar_mi.experiment.stages.winds.cross_flow_winds`.
     cores, flagged : optional
         See `error_budget`; cores left out: those of the true wind.
     """
@@ -86,9 +65,9 @@ def budgets(
     methods = experiment.retrieval.methods
     settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
     blur = known_blur(experiment, scan_plans(experiment, truth)[0])
-    sources = {"seen": "backscatter", "perfect": "extinction"}
+    sources = {"seen": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if experiment.detector:
-        sources |= {"seen": NOISY, "detector_noise": "backscatter"}
+        sources |= {"seen": Source.NOISY, "detector_noise": Source.BACKSCATTER}
     found = {}
     for index, method in enumerate(methods):
         progress(f"finding what limits {method}", index / len(methods))
@@ -96,8 +75,8 @@ def budgets(
         for cause, (pair, noise) in pictures.items():
             source = sources.get(cause)
             if known is not None and source:
-                wind = known.sel(source=source, algorithm=method)
-                winds[cause] = wind.assign_attrs(method=method, **settings)
+                kept = known.sel(source=source, algorithm=method)
+                winds[cause] = kept.assign_attrs(method=method, **settings)
             else:
                 undone = 0.0 if cause in _SHARP else blur
                 winds[cause] = retrieve_wind(
@@ -124,8 +103,8 @@ def _pictures(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataA
     Beside them the air as beams see it.
     """
     rendered = rendered_pairs(experiment, scans)
-    pair, noise = rendered["backscatter"]
-    seen, level = rendered.get(NOISY, (pair, noise))
+    pair, noise = rendered[Source.BACKSCATTER]
+    seen, level = rendered.get(Source.NOISY, (pair, noise))
     gain = offset = None
 
     def as_seen(images, blurred=True):

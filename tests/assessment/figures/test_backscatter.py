@@ -5,8 +5,9 @@ import pytest
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.backscatter import _bright, by_factors
-from lidar_mi.assessment.report.sensor import _colours
+from lidar_mi.assessment.figures.backscatter import _bright
+from lidar_mi.assessment.figures.plates import by_factors
+from lidar_mi.assessment.figures.sensor import _colours
 
 
 def test_winds_of_one_direction_are_coloured_over_their_own_range():

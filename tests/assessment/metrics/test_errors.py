@@ -13,6 +13,7 @@ from lidar_mi.assessment.metrics.errors import (
     deviations,
     direction,
     error_by_quality,
+    error_statistics,
     truth_at_vectors,
     wind_metrics,
 )
@@ -186,3 +187,40 @@ def test_the_commonest_flag_is_named():
     }
     flag = xr.DataArray(np.array([[1, 3], [2, 6]], np.uint8), dims=("z", "y"), attrs=attributes)
     assert commonest_flag(flag) == "75 % have the flag no_texture"
+
+
+def test_statistics_of_gaussian_errors_are_the_closed_forms():
+    """100 000 errors of 0.3 m/s about a bias of 0.2: rms 0.36 and, over stated errors of their rms,
+    68.3 % and 95 % coverage about 0. Within 4 sigma: of a mean 1 / sqrt(n), of a mean square
+    sqrt(2 / n), of a fraction p sqrt(p (1 - p) / n)."""
+    n = 100_000
+    random = np.random.default_rng(5)
+    noise = 0.3 * random.standard_normal(n)
+    found = error_statistics(0.2 + noise)
+    assert set(found) == {"rmse", "bias"}
+    assert found["bias"] == pytest.approx(0.2, abs=4 * 0.3 / np.sqrt(n))
+    # variance of the mean square: 2 s^4 + 4 b^2 s^2
+    spread = np.sqrt((2 * 0.3**4 + 4 * 0.2**2 * 0.3**2) / n)
+    assert found["rmse"] ** 2 == pytest.approx(0.3**2 + 0.2**2, abs=4 * spread)
+
+    stated = random.uniform(0.1, 2.0, n)
+    found = error_statistics(stated * noise / 0.3, stated)
+    assert found["stderr"] == pytest.approx(np.sqrt(np.mean(stated**2)))
+    assert found["reduced_variance"] == pytest.approx(1, abs=4 * np.sqrt(2 / n))
+    for key, share in (("coverage_68", 0.6827), ("coverage_95", 0.9500)):
+        assert found[key] == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / n)), key
+
+
+def test_statistics_of_a_few_known_errors():
+    error = np.array([1.0, -2.0, np.nan, 3.0, 100.0])
+    stderr = np.array([2.0, 1.0, 1.0, np.nan, 1.0])
+    found = error_statistics(error, stderr, np.array([True, True, True, True, False]))
+    assert found["rmse"] == pytest.approx(np.sqrt(14 / 3))
+    assert found["bias"] == pytest.approx(2 / 3)
+    # the third has no error, the fourth no standard error
+    assert found["reduced_variance"] == pytest.approx((0.25 + 4) / 2)
+    assert found["stderr"] == pytest.approx(np.sqrt(2.5))
+    assert found["coverage_68"] == 0.5 and found["coverage_95"] == 0.5
+    assert error_statistics(error, stderr, np.zeros(5, bool)) == {}
+    assert error_statistics([np.nan]) == {}
+    assert set(error_statistics([1.0], [0.0])) == {"rmse", "bias"}

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from lidar_mi.experiment.reading import load
-from lidar_mi.experiment.stages.backscatter import scan_plans, window_settings
+from lidar_mi.experiment.stages.rendering import scan_plans
+from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.experiment.truth import blur_by_beam, make_truth
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 

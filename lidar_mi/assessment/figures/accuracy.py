@@ -1,0 +1,108 @@
+"""Figures of the errors of winds: beside what the noise allows, and by the structure of the air."""
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from lidar_mi.assessment.figures.plates import by_factors
+from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
+from lidar_mi.assessment.metrics.errors import error_by_quality
+from lidar_mi.assessment.metrics.names import RENDERED, Source
+from lidar_mi.retrieval.methods import ImageMethod
+
+
+def truth_vectors(wind: xr.Dataset) -> xr.Dataset:
+    """True wind at the places of a retrieval's vectors, as a retrieval without flags."""
+    true = wind[["v_true", "w_true", "y_vector", "z_vector"]].rename(v_true="v", w_true="w")
+    return true.assign(flag=xr.zeros_like(wind["flag"]))
+
+
+def error_and_bound(found: xr.Dataset):
+    """Rms errors in groups of vectors of like Cramer-Rao bound; None where no noise bounds any."""
+    figure = Figure(figsize=(13, 4.6), layout="constrained")
+    span = []
+    for axes, name in zip(figure.subplots(1, 2), ("v", "w")):
+        for source in (s for s in found["source"].values if s in RENDERED):
+            for method in found["algorithm"].values:
+                wind = found.sel(source=source, algorithm=method)
+                bound = wind[f"{name}_bound"].values
+                error = (wind[name] - wind[f"{name}_true"]).values
+                used = (wind["flag"].values == 0) & np.isfinite(error) & np.isfinite(bound)
+                used &= bound > 0
+                if used.sum() < 100:
+                    continue
+                groups = np.array_split(np.argsort(bound[used]), 12)
+                least, rms = (
+                    [float(np.sqrt(np.mean(values[used][g].astype(float) ** 2))) for g in groups]
+                    for values in (bound, error)
+                )
+                label = f"{METHOD_NAMES[method]} from {SOURCE_NAMES[source]}"
+                axes.plot(least, rms, "o-", ms=4, label=label)
+                span += [min(least), max(least)]
+        if not span:
+            return None
+        axes.plot([0, max(span)], [0, max(span)], "k--", lw=1, label="bound")
+        axes.set(
+            xlabel=f"Cramer-Rao bound of {name} / m s$^{{-1}}$",
+            xlim=(0, None),
+            ylim=(0, None),
+            ylabel=f"rms error of {name} / m s$^{{-1}}$",
+            title=f"valid vectors, {name}",
+        )
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    return figure, (
+        "Errors of valid vectors, in groups by what the pictures' noise allows any unbiased method "
+        "that uses one template alone. Below the line: methods that use more than a template. "
+        "Far above it on the left: errors that are not the noise's, as of flow that a window or a "
+        "smooth field cannot follow."
+    )
+
+
+def error_by_texture(found: xr.Dataset, sweep: xr.Dataset):
+    """Errors by sub-grid texture, and of this run's vectors by the isotropy of their windows."""
+    figure = Figure(figsize=(13, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for name, marker in (("v", "o"), ("w", "s")):
+        # air without any structure gives no displacement, hence no error either
+        left.plot(100 * sweep["texture"], sweep[f"rmse_{name}"], marker=marker, label=name)
+    left.set(
+        xlabel="sub-grid texture, rms / %",
+        ylabel="rms error / m s$^{-1}$",
+        title="cross-correlation from extinction, all vectors",
+    )
+    for source, marker in (
+        (Source.EXTINCTION, "o"),
+        (Source.BACKSCATTER, "s"),
+        (Source.WITHOUT_TEXTURE, "^"),
+    ):
+        for method in found["algorithm"].values:
+            wind = found.sel(source=source, algorithm=method)
+            groups = error_by_quality(wind, truth_vectors(wind), "isotropy")
+            if not np.isfinite(groups["rmse"]).any():
+                continue
+            right.plot(
+                groups["isotropy"],
+                groups["rmse"],
+                marker=marker,
+                ms=5,
+                ls="-" if method == ImageMethod.CC else ":",
+                label=f"{METHOD_NAMES[method]} from {SOURCE_NAMES[source]}",
+            )
+    right.set(
+        xlabel="isotropy: weakest over strongest rms slope in a window",
+        ylabel="rms error of v and w / m s$^{-1}$",
+        title="all vectors, in groups by their local isotropy",
+    )
+    for axes in (left, right):
+        by_factors(axes)
+        axes.grid(alpha=0.3, which="both")
+    left.legend(fontsize=8)
+    # many lines: there is room below alone
+    right.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+    return figure, (
+        "Winds can only be as good as the structure that moves with them. Left: the extinction "
+        "pair with more and less sub-grid texture. Right: this run's vectors, grouped by whether "
+        "their windows have structure in both directions; along a mere edge nothing can be told "
+        "(aperture problem)."
+    )

@@ -1,0 +1,74 @@
+"""The figure of several variants of one experiment side by side."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+
+from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.labels import BACKSCATTER
+
+_SPEED = "m s$^{-1}$"
+
+
+def draw_comparison(
+    folder: Path, rows: Mapping[str, tuple[xr.DataArray, xr.Dataset, Sequence]], log: Callable
+) -> list[Drawn]:
+    """One row a variant: its first picture, the w found in the pair, and its error.
+
+    Parameters
+    ----------
+    rows : mapping of variant to (picture, winds, cores)
+        Apparent backscatter (m^-1 sr^-1) and winds on (z, y), these with w_true and flag; places
+        (y, z) of the true cores, m.
+    """
+    figure = Figure(figsize=(19, 4.0 * len(rows)), layout="compressed")
+    axes = figure.subplots(len(rows), 3, squeeze=False)
+    limit = max(float(abs(wind["w_true"]).quantile(0.995)) for _, wind, _ in rows.values()) or 1.0
+    speeds = {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
+    errors = {
+        name: (wind["w"] - wind["w_true"]).where(wind["flag"] == 0)
+        for name, (_, wind, _) in rows.items()
+    }
+    largest = [
+        float(abs(error).quantile(0.99)) for error in errors.values() if error.notnull().any()
+    ]
+    # one variant without skill must not hide the errors of those that have some
+    top = min(float(np.median(largest)) if largest else 0.0, limit) or limit
+    for row, (name, (picture, wind, cores)) in zip(axes, rows.items()):
+        low, high = (float(1e6 * picture.quantile(share)) for share in (0.002, 0.998))
+        good, place = (
+            wind["flag"] == 0,
+            {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"},
+        )
+        columns = (
+            (
+                1e6 * picture.sel(place),
+                {"cmap": "cividis", "vmin": low, "vmax": high},
+                f"{name}: picture",
+                BACKSCATTER,
+            ),
+            (wind["w"].where(good), speeds, f"{name}: w found", _SPEED),
+            (errors[name], speeds | {"vmin": -top, "vmax": top}, f"{name}: error of w", _SPEED),
+        )
+        for panel, (field, style, title, label) in zip(row, columns):
+            y, z = field["y"].values, field["z"].values
+            mesh = panel.pcolormesh(
+                y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
+            )
+            panel.set(title=title, aspect="equal", xlim=(y.max(), y.min()), ylim=(z.min(), z.max()))
+            for core in cores:
+                panel.plot(*core, "k+", ms=8)
+            figure.colorbar(mesh, ax=panel, label=label, pad=0.02, extend="both")
+        row[0].set_ylabel("z / m")
+    for panel in axes[-1]:
+        panel.set_xlabel("y / m (port is left)")
+    caption = (
+        "Each variant's first picture, the vertical wind found by its first method (white: flagged "
+        "vectors), and its error; winds are on one scale, errors on another, that of the middle variant. Crosses: true cores. Of "
+        "several gates the first, of winds in three dimensions the layer nearest to it."
+    )
+    plate = ("fig00_comparison", "The variants side by side", (figure, caption))
+    return save_all(folder, [plate], log)

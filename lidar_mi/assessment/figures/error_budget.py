@@ -1,0 +1,80 @@
+"""The figure of what limits the cross-flow wind."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.labels import METHOD_NAMES
+from lidar_mi.assessment.metrics.error_budget import (
+    CAUSES,
+    PLACES,
+    Budgets,
+    causes_of,
+    component_rmse,
+)
+from lidar_mi.assessment.report.digits import whole_percent
+
+
+def draw_all(folder: Path, budgets: Budgets, log: Callable) -> list[Drawn]:
+    """Draw the shares of all causes as a PNG into ``folder``; nothing where none is known.
+
+    Parameters
+    ----------
+    budgets : mapping of str to mapping
+        From `lidar_mi.assessment.metrics.error_budget.error_budget`, by method.
+    """
+    known = {method: budget for method, budget in budgets.items() if causes_of(budget)}
+    if not known:
+        return []
+    plates = [("fig23_error_budget", "What limits the wind", _bars(known))]
+    return save_all(folder, plates, log)
+
+
+def _bars(budgets: Budgets):
+    used = [c for c in CAUSES if any(c in causes_of(budget) for budget in budgets.values())]
+    size = (3.4 + 3.2 * len(budgets), 1.9 + 0.5 * len(used))
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(1, len(budgets), sharey=True, squeeze=False)[0]
+    rows = np.arange(len(used))[::-1]
+    least = min(
+        budget.get(f"{place}{cause}.share", 0.0)
+        for budget in budgets.values()
+        for place in PLACES
+        for cause in used
+    )
+    bars = {}
+    for panel, (method, budget) in zip(panels, budgets.items(), strict=True):
+        title = []
+        for number, (place, where) in enumerate(PLACES.items()):
+            if f"{place}rmse_v" not in budget:
+                continue
+            title.append(f"{where}: {component_rmse(budget, place):.2g} m/s")
+            shares = np.array([budget.get(f"{place}{cause}.share", np.nan) for cause in used])
+            at = rows + 0.2 - 0.4 * number
+            bars[where] = panel.barh(at, shares, 0.36, color=f"C{number}")
+            for y, share in zip(at, shares):
+                if np.isfinite(share):
+                    end = min(max(share, 0), 1) + 0.015
+                    panel.text(end, y, whole_percent(share), va="center", fontsize=7)
+        for y, cause in zip(rows, used):
+            if cause not in causes_of(budget):
+                panel.text(0.015, y, "does not apply", va="center", color="0.5", fontsize=8)
+        panel.set_title("\n".join([METHOD_NAMES[method], *title]), fontsize=10)
+        panel.set_xlabel("share of the mean square error")
+        panel.axvline(0, color="k", lw=0.8)
+        panel.grid(alpha=0.3, axis="x")
+        panel.set_axisbelow(True)
+        panel.xaxis.set_major_formatter(PercentFormatter(1.0))
+        # what makes things many times worse must not flatten the others: its number stands there
+        panel.set_xlim(min(-0.35, 1.1 * max(least, -1)), 1.15)
+    panels[0].set_yticks(rows, [CAUSES[cause] for cause in used])
+    figure.legend(bars.values(), bars.keys(), loc="outside lower right", ncols=2, fontsize=9)
+    return figure, (
+        "By how much the mean square error of v and w falls without each cause of error in turn, and "
+        "the rms error with all of them (of a component). Shares need not add up to 100 %; below 0 "
+        "the wind is worse without the cause."
+    )

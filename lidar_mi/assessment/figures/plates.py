@@ -1,0 +1,73 @@
+"""What all figures share: files, panels as the pilot sees the slab, axes by factors."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+
+from lidar_mi.io.png import write_png
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure file and what it shows."""
+
+    path: Path
+    title: str
+    caption: str
+
+
+def save_all(folder: Path, plates, log: Callable) -> list[Drawn]:
+    """Save plates, each (file name, title, (figure, caption)), as PNG."""
+    folder.mkdir(exist_ok=True)
+    drawn = []
+    for index, (name, title, (figure, caption)) in enumerate(plates):
+        log.bar(f"drawing {title.lower()}", index / len(plates))
+        path = folder / f"{name}.png"
+        write_png(figure, path, cropped=True)
+        drawn.append(Drawn(path, title, caption))
+    return drawn
+
+
+def sheet(rows: int, columns: int) -> tuple[Figure, np.ndarray]:
+    """A figure with panels for slabs as wide as the samples, (rows, columns)."""
+    figure = Figure(figsize=(6.8 * columns, 4.3 * rows), layout="compressed")
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def frame(axes, y, z, title: str) -> None:
+    """The pilot's view: port on the left, up at the top, metres true to scale."""
+    axes.set(title=title, xlabel="y / m (port is left)", ylabel="z / m", aspect="equal")
+    axes.set_xlim(float(y.max()), float(y.min()))
+    axes.set_ylim(float(z.min()), float(z.max()))
+
+
+def image_panel(
+    axes, field: xr.DataArray, title: str, label: str, extend="neither", **style
+) -> None:
+    """A field (z, y) in colours, with its bar."""
+    y, z = field["y"], field["z"]
+    mesh = axes.pcolormesh(
+        y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
+    )
+    frame(axes, y, z, title)
+    bar = axes.figure.colorbar(mesh, ax=axes, label=label, pad=0.02, extend=extend)
+    # whole numbers, not what they have beyond one that stands elsewhere
+    bar.formatter.set_useOffset(False)
+
+
+def by_factors(axes) -> None:
+    """A logarithmic upward axis where values differ by more than a factor of 3, plain numbers on it."""
+    values = np.concatenate(
+        [np.ravel(line.get_ydata()).astype(float) for line in axes.lines] or [[]]
+    )
+    values = values[np.isfinite(values) & (values > 0)]
+    if values.size and values.max() > 3 * values.min():
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 3, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())

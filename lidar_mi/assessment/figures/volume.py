@@ -1,0 +1,177 @@
+"""The figures of a run with volumes: what the lidar sees, the wind, its errors."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+from scipy import stats
+
+from lidar_mi.assessment.figures.plates import Drawn, by_factors, save_all
+from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES
+from lidar_mi.assessment.metrics.cores import Core
+
+_SPEED = "m s$^{-1}$"
+_COMPONENTS = ("u", "v", "w")
+
+
+def draw_all(
+    folder: Path,
+    found: xr.Dataset,
+    volumes: Sequence[xr.DataArray],
+    cores: Sequence[Core],
+    log: Callable,
+) -> list[Drawn]:
+    """Draw the figures of a run with volumes as PNG into ``folder``.
+
+    Parameters
+    ----------
+    found : xr.Dataset
+        From `lidar_mi.experiment.stages.volume.volume_winds`.
+    volumes : sequence of xr.DataArray, dims (x, z, y)
+        Apparent backscatter at both times.
+    """
+    source = found["source"].values[-1]
+    best = found.sel(source=source).isel(algorithm=-1)
+    plates = (
+        ("fig30_volume", "What the lidar sees of the volume", _seen(volumes, cores)),
+        ("fig31_wind_in_three_dimensions", "The wind in three dimensions", _cuts(best, cores)),
+        ("fig32_wind_along_x", "The wind along the flight path", _along_x(best, cores)),
+        ("fig33_volume_errors", "How good the winds are", _errors(found.sel(source=source))),
+    )
+    return save_all(folder, plates, log)
+
+
+def _seen(volumes, cores):
+    figure = Figure(figsize=(16, 6.4), layout="compressed")
+    axes = figure.subplots(2, 2, height_ratios=(3.2, 1))
+    values = [1e6 * volume for volume in volumes]
+    limits = [float(values[0].quantile(q)) for q in (0.01, 0.995)]
+    z = float(values[0]["z"].sel(z=cores[0].z if cores else 0, method="nearest"))
+    for column, (volume, when) in enumerate(zip(values, ("first", "second"))):
+        middle = volume.isel(x=volume.sizes["x"] // 2)
+        mesh = _map(axes[0, column], middle, "y", "z", "viridis", *limits)
+        axes[0, column].set_title(f"{when} scan, x = {float(middle['x']):.2f} m")
+        _map(axes[1, column], volume.sel(z=z), "y", "x", "viridis", *limits)
+        axes[1, column].set_title(f"{when} scan, z = {z:.1f} m")
+        figure.colorbar(mesh, ax=axes[:, column], label=BACKSCATTER, pad=0.02, extend="both")
+    return figure, (
+        "Top: one of the gates, as the pilot sees it. Bottom: a cut through all gates from above at "
+        "the height of a vortex, the flight path upwards."
+    )
+
+
+def _cuts(wind, cores):
+    figure = Figure(figsize=(17, 10.5), layout="compressed")
+    axes = figure.subplots(3, 3, sharex=True, sharey=True)
+    cut = wind.isel(x=wind.sizes["x"] // 2)
+    for row, name in zip(axes, _COMPONENTS):
+        _row(row, cut, name, "y", "z")
+        for panel in row:
+            for core in cores:
+                panel.plot(core.y, core.z, "+", color="k", ms=8)
+    for panel in axes[:-1].ravel():
+        panel.set_xlabel("")
+    return figure, (
+        f"A cut across the flight path at x = {float(cut['x']):.2f} m, by the last method of the "
+        "experiment. Good vectors alone; crosses: true cores. The errors have scales of their own."
+    )
+
+
+def _along_x(wind, cores):
+    figure = Figure(figsize=(17, 5.4), layout="compressed")
+    axes = figure.subplots(3, 3, sharex=True, sharey=True)
+    cut = wind.sel(z=cores[0].z if cores else 0, method="nearest")
+    for row, name in zip(axes, _COMPONENTS):
+        _row(row, cut, name, "y", "x", stretch=2)
+    for panel in axes[:-1].ravel():
+        panel.set_xlabel("")
+    return figure, (
+        f"The same from above, at z = {float(cut['z']):.1f} m, the height of a vortex, x twice as "
+        "large as y: what no single slab shows."
+    )
+
+
+def _row(panels, cut, name, across, up, stretch=1):
+    true, value = cut[f"{name}_true"], cut[name].where(cut["flag"] == 0)
+    error = value - true
+    limit, small = _limit(true), _limit(error)
+    for panel, field, bound, title in (
+        (panels[0], true, limit, f"{name}, true"),
+        (panels[1], value, limit, f"{name}, found"),
+        (panels[2], error, small, f"{name}, error"),
+    ):
+        mesh = _map(panel, field, across, up, "RdBu_r", -bound, bound)
+        panel.set(title=title, aspect=stretch)
+        bar = panel.figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
+        # few numbers beside low panels
+        bar.locator = MaxNLocator(7 if stretch == 1 else 3)
+
+
+def _map(panel, field, across, up, colours, low, high):
+    mesh = panel.pcolormesh(
+        field[across],
+        field[up],
+        field.transpose(up, across).values,
+        shading="nearest",
+        rasterized=True,
+        cmap=colours,
+        vmin=low,
+        vmax=high,
+    )
+    half = float(field[across][1] - field[across][0]) / 2
+    panel.set(aspect="equal", xlabel=f"{across} / m (port is left)", ylabel=f"{up} / m")
+    panel.set_xlim(float(field[across].max()) + half, float(field[across].min()) - half)
+    return mesh
+
+
+def _errors(found):
+    figure = Figure(figsize=(17, 8.4), layout="compressed")
+    axes = figure.subplots(2, 3)
+    colours = dict(zip(found["algorithm"].values, ("tab:orange", "tab:blue")))
+    edges = np.linspace(-5, 5, 51)
+    middle = (edges[1:] + edges[:-1]) / 2
+    for column, name in enumerate(_COMPONENTS):
+        profile, density = axes[:, column]
+        rms = np.sqrt((found[f"{name}_true"] ** 2).mean(("y", "z")))
+        profile.plot(found["x"], rms, "k:", label="the wind itself, rms")
+        for method, colour in colours.items():
+            wind = found.sel(algorithm=method)
+            good = wind["flag"] == 0
+            error = (wind[name] - wind[f"{name}_true"]).where(good)
+            stated = wind[f"{name}_stderr"].where(good)
+            for values, style, text in ((error, "-", "error"), (stated, "--", "as stated")):
+                level = np.sqrt((values**2).mean(("y", "z")))
+                profile.plot(
+                    found["x"], level, style, color=colour, label=f"{METHOD_NAMES[method]}, {text}"
+                )
+            reduced = (error / stated).values
+            density.hist(
+                np.clip(reduced[np.isfinite(reduced)], -5, 5),
+                edges,
+                density=True,
+                histtype="step",
+                color=colour,
+                label=METHOD_NAMES[method],
+            )
+        profile.set(title=f"rms error of {name}", xlabel="x / m", ylabel=_SPEED)
+        by_factors(profile)
+        density.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
+        density.set(
+            title=f"errors of {name} over standard errors", xlabel="reduced error", ylabel="density"
+        )
+    # between the errors and the wind, of which v and w have much
+    axes[0, 1].legend(fontsize="small", loc="center")
+    axes[1, 0].legend(fontsize="small")
+    return figure, (
+        "Top: rms errors of good vectors against the truth, gate by gate, the standard errors that "
+        "the methods state, and how strong the wind itself is: an error above that line means no "
+        "skill. Bottom: errors over standard errors; the last bins hold all beyond."
+    )
+
+
+def _limit(values: xr.DataArray) -> float:
+    known = np.abs(values.values[np.isfinite(values.values)])
+    return (float(np.quantile(known, 0.995)) if known.size else 0.0) or 1.0

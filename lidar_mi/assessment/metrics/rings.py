@@ -1,0 +1,68 @@
+"""What the images of a Doppler lidar are made of, and what can be read from them at best."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from lidar_mi.assessment.metrics.names import bound_key
+
+
+@dataclass(frozen=True)
+class RingBudget:
+    """Light, line and etalon of a Doppler lidar, and limits of the velocities that it can read.
+
+    Attributes
+    ----------
+    photons, background_photons, signal : float
+        Of a pulse on the whole image: of the laser, of the sun; photoelectrons of the laser's.
+    line_width, free_spectral_range : float
+        Hz.
+    finesse : float
+    velocity_range : float
+        Unambiguous range of line-of-sight velocities, m s^-1.
+    speckle_modes : float
+        Degrees of freedom of the speckle in a pixel; inf: no speckle.
+    bound : mapping of str to float
+        Cramer-Rao bound of the standard deviation of one image's velocity, m s^-1, by whether the
+        centre is "free" or "known"; of averages by the root of their number.
+    relative_error : float
+        Monte Carlo standard error of a rendered image's pixel over its signal, median.
+    largest_error : float
+        Of velocities read from the rendered images without noise, m s^-1.
+    """
+
+    photons: float
+    background_photons: float
+    signal: float
+    line_width: float
+    free_spectral_range: float
+    finesse: float
+    velocity_range: float
+    speckle_modes: float
+    bound: Mapping[str, float]
+    relative_error: float
+    largest_error: float
+
+
+def ring_budget_metrics(budget: RingBudget, averaged: tuple[int, ...]) -> dict[str, float]:
+    """Flat, ``doppler.photons`` and so on; bounds of averages of so many images."""
+    metrics = {
+        f"doppler.{name}": getattr(budget, name)
+        for name in (
+            "photons",
+            "background_photons",
+            "signal",
+            "line_width",
+            "free_spectral_range",
+            "finesse",
+            "velocity_range",
+        )
+    }
+    if math.isfinite(budget.speckle_modes):
+        metrics["doppler.speckle_modes"] = budget.speckle_modes
+    metrics["doppler.render.mc_relative_error"] = budget.relative_error
+    metrics["doppler.render.largest_error"] = budget.largest_error
+    for centre, std in budget.bound.items():
+        for number in averaged:
+            metrics[bound_key(centre, number)] = std / math.sqrt(number)
+    return metrics

@@ -1,0 +1,36 @@
+"""Eye safety of a scan as metrics."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class ScanSafety:
+    """From where on eyes may look into the backscatter lidar's beams.
+
+    Attributes
+    ----------
+    permissible_exposure : float
+        Of each pulse, J m^-2.
+    hazard_distance, aided_hazard_distance : float
+        Of one beam, naked eye and with binoculars, m.
+    scan_hazard_distance : float
+        Of the whole scan, naked eye, m.
+    scan_power : float
+        Average power of all beams, W.
+    """
+
+    permissible_exposure: float
+    hazard_distance: float
+    aided_hazard_distance: float
+    scan_hazard_distance: float
+    scan_power: float
+
+
+def safety_metrics(safety: ScanSafety | None) -> dict[str, float]:
+    """``safety.hazard_distance`` and so on; infinite distances are left out; None: no limits."""
+    if safety is None:
+        return {}
+    numbers = asdict(safety)
+    return {f"safety.{key}": value for key, value in numbers.items() if np.isfinite(value)}

@@ -1,0 +1,156 @@
+"""Verdict on both lidars as one sensor: vectors, lines of sight, what the lidars cost."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.metrics.cores import Core, outside_cores
+from lidar_mi.assessment.metrics.errors import error_statistics
+from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable
+
+COMPONENTS = ("u", "v", "w")
+
+
+@dataclass(frozen=True)
+class LidarCost:
+    """What a scan takes of a lidar, and from where on eyes are safe.
+
+    Attributes
+    ----------
+    pulses_per_second : float
+    average_power : float
+        W.
+    beams : int
+        Directions that must be looked into at the same time, as light is on its way.
+    photons_per_direction : float, optional
+    permissible_exposure : float, optional
+        J m^-2, of each pulse; None: its pulses have no duration, hence no limit.
+    hazard_distance, aided_hazard_distance : float, optional
+        m, naked eye and with binoculars; None: none, or infinite.
+    """
+
+    pulses_per_second: float
+    average_power: float
+    beams: int
+    photons_per_direction: float | None = None
+    permissible_exposure: float | None = None
+    hazard_distance: float | None = None
+    aided_hazard_distance: float | None = None
+
+
+def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, float]:
+    """Errors of good vectors (flag 0) of both lidars, as of `errors.error_statistics`.
+
+    ``sensor.rmse_*``, ``bias_*`` (m/s), ``reduced_variance_*``, ``coverage_68_*``, ``coverage_95_*``;
+    ``outside_cores.rmse_*`` beyond two core radii, and ``outside_cores.rms_*`` of the true wind there.
+
+    Parameters
+    ----------
+    found : xr.Dataset or None
+        From `lidar_mi.retrieval.lines.combine.combine`, with u_true, v_true, w_true; None: there is
+        no wind.
+    """
+    if found is None:
+        return {"sensor.good_fraction": 0.0, "sensor.vectors": 0}
+    good = found["flag"].values == 0
+    z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
+    far = good & outside_cores(y, z, list(cores))
+    metrics = {"sensor.good_fraction": float(good.mean()), "sensor.vectors": int(good.sum())}
+    for name in COMPONENTS:
+        true = found[f"{name}_true"].values
+        error = found[name].values - true
+        here = error_statistics(error, found[f"{name}_stderr"].values, good)
+        for key in ("rmse", "bias", "reduced_variance", "coverage_68", "coverage_95"):
+            if key in here:
+                metrics[f"sensor.{key}_{name}"] = here[key]
+        beyond = far & np.isfinite(error)
+        if beyond.any():
+            rmse = error_statistics(error, where=beyond)["rmse"]
+            metrics[f"sensor.outside_cores.rmse_{name}"] = rmse
+            strength = float(np.sqrt((true[beyond] ** 2).mean()))
+            metrics[f"sensor.outside_cores.rms_{name}"] = strength
+    return metrics
+
+
+def line_metrics(lines: xr.Dataset) -> dict[str, float]:
+    """How many lines of sight were read, and their errors; m/s.
+
+    Parameters
+    ----------
+    lines : xr.Dataset, dim (line)
+        ``v_los``, ``v_los_true``, ``v_los_std`` (m s^-1); NaN where nothing was read.
+    """
+    error = (lines["v_los"] - lines["v_los_true"]).values
+    metrics = {"sensor.lines": len(error), "sensor.lines_read": int(np.isfinite(error).sum())}
+    found = error_statistics(error, lines["v_los_std"].values)
+    for key in ("rmse", "bias", "reduced_variance"):
+        if key in found:
+            metrics[f"sensor.{key}_v_los"] = found[key]
+    return metrics
+
+
+def doppler_alone_metrics(winds: Mapping[str, xr.Dataset], truth: xr.Dataset) -> dict[str, float]:
+    """Errors of the Doppler lidar's vectors alone, ``sensor.triples.rmse_u`` and so on, m/s.
+
+    Parameters
+    ----------
+    winds : mapping of str to xr.Dataset
+        By how lines of sight are put together: u, v, w, flag at z, y.
+    truth : xr.Dataset
+        u, v, w on (z, y).
+    """
+    metrics = {}
+    for key, found in winds.items():
+        good = found["flag"].values == 0
+        for name in COMPONENTS:
+            true = truth[name].interp(z=found["z"], y=found["y"])
+            errors = error_statistics((found[name] - true).values, where=good)
+            if errors:
+                metrics[f"sensor.{key}.rmse_{name}"] = errors["rmse"]
+    return metrics
+
+
+def limit_metrics(left: Mapping[str, float]) -> dict[str, float]:
+    """What limits u, ``sensor.error_budget.CAUSE.rmse_u`` (m/s) and ``.share_u``.
+
+    Parameters
+    ----------
+    left : mapping of str to float
+        Mean square error of u (m^2 s^-2): with all causes as "", without each of them, and
+        "between_lines", what is left without all. Empty: not known.
+    """
+    if not left:
+        return {}
+    metrics = {}
+    for cause, square in left.items():
+        if cause:
+            share = square / left[""]
+            key = f"sensor.error_budget.{cause}"
+            metrics[f"{key}.rmse_u"] = math.sqrt(square)
+            metrics[f"{key}.share_u"] = share if cause == "between_lines" else 1 - share
+    return metrics
+
+
+def cost_metrics(costs: Mapping[str, LidarCost]) -> dict[str, float]:
+    """What the lidars take, ``sensor.LIDAR.pulses_per_second`` and so on."""
+    return {
+        f"sensor.{lidar}.{name}": value
+        for lidar, cost in costs.items()
+        for name, value in asdict(cost).items()
+        if value is not None
+    }
+
+
+def margin_metrics(
+    judged: Sequence[tuple[RequirementTable, Sequence[Finding]]],
+) -> dict[str, float]:
+    """Margins to what is required, ``sensor.APPLICATION.PHASE.QUANTITY.margin``."""
+    return {
+        f"sensor.{table.application}.{table.phase}.{row.quantity}.margin": row.margin
+        for table, findings in judged
+        for row in findings
+        if not math.isnan(row.margin)
+    }

@@ -1,0 +1,28 @@
+"""Units of metrics, by the quantity that their names end with."""
+
+from lidar_mi.retrieval.vortices.pair import MEANING
+
+_WIND = ("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_std")
+_DOPPLER = {
+    "doppler.line_width": "Hz",
+    "doppler.free_spectral_range": "Hz",
+    "doppler.velocity_range": "m/s",
+    "doppler.render.largest_error": "m/s",
+}
+_VORTEX = {
+    name: units.replace(" s-1", "/s").replace("m2", "m²") for name, (units, _) in MEANING.items()
+} | {"flow_error": "m/s"}
+
+
+def unit_of(key: str) -> str:
+    """Unit of a metric as reports write it; empty for numbers without one."""
+    *_, parent, name = ("", *key.split("."))
+    if name.startswith(_WIND):
+        return "rad" if name.endswith("_direction") else "m/s"
+    if key in _DOPPLER:
+        return _DOPPLER[key]
+    if key.startswith("vortex."):
+        return _VORTEX.get(name.removesuffix("_stderr"), "")
+    if parent.endswith("_core"):
+        return "m²/s" if name == "circulation" else "m"
+    return {"timing": "s"}.get(parent, "")

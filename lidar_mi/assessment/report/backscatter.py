@@ -1,0 +1,120 @@
+"""The backscatter lidar's chapter of a report."""
+
+from collections.abc import Mapping, Sequence
+
+from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
+from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.metrics.names import Source, wind_key
+from lidar_mi.assessment.report.digits import in_row, percent, three
+from lidar_mi.assessment.report.page import Chapter, Tables
+
+# rows of the table of results: key, name, unit
+_ROWS = (
+    ("rmse_v", "rms error of v", "m/s"),
+    ("rmse_w", "rms error of w", "m/s"),
+    ("bias_v", "bias of v", "m/s"),
+    ("bias_w", "bias of w", "m/s"),
+    ("rmse_speed", "rms error of speed", "m/s"),
+    ("p50_direction", "median error of direction", "rad"),
+    ("outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
+    ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
+    ("all.rmse_v", "rms error of v, flagged vectors too", "m/s"),
+    ("all.rmse_w", "rms error of w, flagged vectors too", "m/s"),
+    ("valid_fraction", "share of valid vectors", "%"),
+)
+
+
+def backscatter_chapter(
+    experiment,
+    metrics: Mapping[str, float],
+    cores: Sequence[Core],
+    drawn: Sequence[Drawn],
+    vectors: dict | None = None,
+) -> Chapter:
+    """What the backscatter lidar tells.
+
+    Parameters
+    ----------
+    experiment : lidar_mi.experiment.schema.Experiment
+    metrics : mapping
+        From `lidar_mi.experiment.measure.measure`.
+    vectors : dict, optional
+        From `vector_map.map_data`.
+    """
+    lead = [
+        "A backscatter lidar looks at a wake twice; cross-flow winds follow from the two images."
+    ]
+    if cores:
+        places = ", ".join(
+            f"a vortex at y = {core.y:.1f} m, z = {core.z:.1f} m (core radius {core.radius:.1f} m)"
+            for core in cores
+        )
+        lead.append(f"The true flow holds {places}.")
+    else:
+        lead.append("No vortex is found in the true flow.")
+    numbers = Tables(
+        heading="How good the cross-flow winds are",
+        legend="Valid vectors against the truth at their place and time. Columns: what the winds "
+        "were retrieved from. Blurred is the extinction as wide beams see it, without noise: its "
+        "difference to the extinction is what the beam's width costs. The last column says how "
+        "strong the true wind is there: an error near it means no skill, as no wind at all would "
+        "be no worse.",
+        tables=list(_tables(experiment, metrics)),
+    )
+    if vectors:
+        vectors = {"title": "The wind from the backscatter pair, vector by vector"} | vectors
+    return Chapter(
+        "The backscatter lidar",
+        [*lead, _noise(experiment, metrics)],
+        drawn,
+        numbers,
+        vectors=vectors,
+    )
+
+
+def _tables(experiment, metrics):
+    sources = [
+        *([Source.NOISY] if experiment.detector else []),
+        Source.BACKSCATTER,
+        Source.EXTINCTION,
+        Source.BLURRED,
+        Source.WITHOUT_TEXTURE,
+    ]
+    for method in experiment.retrieval.methods:
+        rows = []
+        for key, label, unit in _ROWS:
+            values = [metrics.get(wind_key(source, method, key)) for source in sources]
+            # what zero wind instead of the found one would be off by
+            nothing = key.replace("rmse_", "rms_").removeprefix("all.")
+            values.append(metrics.get(f"true_wind.{nothing}"))
+            rows.append((label, unit, in_row(values, unit)))
+        heads = [SOURCE_NAMES[source] for source in sources]
+        yield METHOD_NAMES[method], [*heads, "true wind, rms"], rows
+
+
+def _noise(experiment, metrics) -> str:
+    """What the pictures' noise is made of, in one line."""
+    line = (
+        "Noise of the first picture, relative to a pixel's light (medians): simulation "
+        f"{percent(metrics['backscatter.mc_relative_error'])} "
+        f"({experiment.render.samples_per_beam} photons a beam)"
+    )
+    if not experiment.detector:
+        return f"{line}; no detector."
+    causes = {
+        "shot": "photons",
+        "speckle": "speckle",
+        "background": "sky",
+        "dark": "dark current",
+        "readout": "read-out",
+    }
+    parts = ", ".join(
+        f"{name} {percent(metrics[f'detector.noise.{key}'])}"
+        for key, name in causes.items()
+        if metrics.get(f"detector.noise.{key}", 0) >= 5e-5
+    )
+    return (
+        f"{line}; detector {percent(metrics['detector.noise.all'])} with "
+        f"{three(metrics['detector.signal'])} photoelectrons ({parts or 'each below 0.01 %'})."
+    )

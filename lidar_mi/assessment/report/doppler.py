@@ -1,0 +1,76 @@
+"""The Doppler lidar's chapter of a report."""
+
+from collections.abc import Mapping, Sequence
+
+from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.metrics.names import bound_key, ring_key
+from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
+from lidar_mi.assessment.report.digits import fixed, three, with_error
+from lidar_mi.assessment.report.page import Chapter, Tables
+
+
+def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn]) -> Chapter:
+    """What the Doppler lidar tells.
+
+    Parameters
+    ----------
+    doppler : lidar_mi.experiment.schema.Doppler
+    metrics : mapping
+        From `lidar_mi.experiment.measure.measure`.
+    """
+    purpose = (
+        "A Doppler lidar sends its backscatter through an etalon onto a CCD; the wind along the "
+        "line of sight follows from the radii of the rings."
+    )
+    modes = metrics.get("doppler.speckle_modes")
+    speckle = f"speckle has {three(modes)} modes a pixel" if modes else "there is no speckle"
+    light = (
+        f"A pulse gives {three(metrics['doppler.photons'])} photons from {doppler.lidar.range:g} m and "
+        f"{three(metrics['doppler.background_photons'])} of sunlight; {speckle}, read-out "
+        f"{doppler.ccd.read_noise:g} photoelectrons of noise."
+    )
+    rings = (
+        f"The line is {metrics['doppler.line_width'] / 1e9:.2f} GHz wide, the etalon's free "
+        f"spectral range {metrics['doppler.free_spectral_range'] / 1e9:.2f} GHz, its finesse "
+        f"{metrics['doppler.finesse']:.1f}: winds are told apart over "
+        f"{metrics['doppler.velocity_range']:.0f} m/s. Without noise, the rendered pictures give "
+        f"the true winds to {metrics['doppler.render.largest_error']:.2g} m/s."
+    )
+    numbers = Tables(
+        heading="How good the line-of-sight winds are",
+        legend="Winds that each method reads from noisy pictures, or from averages of several "
+        f"(columns), over all speeds, with standard errors. {_abbreviations(doppler.retrieval.methods)}"
+        "The bound (Cramér-Rao) is the least standard deviation without bias; its row says nothing "
+        "of any method.",
+        tables=[
+            _doppler_table(doppler.retrieval, centre, metrics)
+            for centre in doppler.retrieval.centre
+        ],
+    )
+    return Chapter("The Doppler lidar", [purpose, light, rings], drawn, numbers)
+
+
+def _abbreviations(methods: Sequence[str]) -> str:
+    """What the names of those methods mean that read the peaks of the innermost ring."""
+    names = {"ca": "CA: circular averaging", "ml": "ML: midpoint lines"}
+    used = [text for key, text in names.items() if any(m.partition("_")[0] == key for m in methods)]
+    if not set(methods) & set(PEAK_READERS):
+        return ""
+    return "; ".join([*used, "peaks are those of the innermost ring, emitted and received"]) + ". "
+
+
+def _doppler_table(settings, centre, metrics):
+    rows = []
+    for method in settings.methods:
+        for quantity, label in (("std", "standard deviation"), ("bias", "bias")):
+            shown = []
+            for n in settings.averaged:
+                key = ring_key(method, centre, n, quantity)
+                value, error = metrics.get(key), metrics.get(f"{key}_stderr")
+                known = "-" if value is None else fixed(value)
+                shown.append(known if error is None else with_error(value, error))
+            rows.append((f"{READERS[method]}: {label}", "m/s", shown))
+    bounds = [fixed(metrics[bound_key(centre, n)]) for n in settings.averaged]
+    rows.append(("bound", "m/s", bounds))
+    heads = [f"{n} picture{'s' * (n > 1)}" for n in settings.averaged]
+    return CENTRES[centre], heads, rows

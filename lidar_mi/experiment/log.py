@@ -1,0 +1,57 @@
+"""What a run says while it runs: to its log file and to the person in front of the screen."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+FAILED = "failed: "
+
+Notice = Callable[[str, float | None], None]
+"""Called with what is running and how far it is (0 to 1, None: unknown)."""
+
+
+def silent(text: str, share: float | None) -> None:
+    """The `Notice` of those who do not want to know."""
+
+
+class Log:
+    """Lines, progress and warnings of a run.
+
+    Attributes
+    ----------
+    path : Path or None
+        File that lines are added to, once there is one.
+    warnings : list of str
+        What a reader of the results must know.
+    """
+
+    def __init__(self, notice: Notice = silent, path: Path | None = None):
+        self.path, self.notice = path, notice
+        self.warnings: list[str] = []
+
+    def __call__(self, text: str) -> None:
+        """Say a line, and write it into the file."""
+        if self.path is not None:
+            with self.path.open("a") as file:
+                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
+        self.notice(text, None)
+
+    def remark(self, text: str) -> None:
+        """Warn of something that a reader of the results must know."""
+        self.warnings.append(text)
+        self(f"warning: {text}")
+
+    def fail(self, error: Exception) -> None:
+        """Say why the run ended, so that nobody takes it for one that was stopped and can go on."""
+        self(f"{FAILED}{' '.join(str(error).split()) or type(error).__name__}")
+
+    def bar(self, text: str, share: float | None) -> None:
+        """Show progress within a step; not written."""
+        self.notice(text, share)
+
+
+def failure(path: Path) -> str | None:
+    """What the run of a log file failed from; None: it did not, or was only stopped."""
+    lines = path.read_text().splitlines() if path.is_file() else []
+    _, _, text = lines[-1].split(" ", 2) if lines else ("", "", "")  # behind date and time
+    return text.removeprefix(FAILED) if text.startswith(FAILED) else None

@@ -1,0 +1,121 @@
+"""From the results of a run to its metrics: which result is measured by what."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from lidar_mi.assessment.metrics.images import light_metrics, noise_metrics
+from lidar_mi.assessment.metrics.names import budget_key, timing_key
+from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
+from lidar_mi.assessment.metrics.rings import ring_budget_metrics
+from lidar_mi.assessment.metrics.safety import safety_metrics
+from lidar_mi.assessment.metrics.sensor import (
+    COMPONENTS,
+    cost_metrics,
+    doppler_alone_metrics,
+    limit_metrics,
+    line_metrics,
+    margin_metrics,
+    vector_metrics,
+)
+from lidar_mi.assessment.metrics.velocities import velocity_metrics
+from lidar_mi.assessment.metrics.volume import volume_metrics
+from lidar_mi.assessment.metrics.vortices import core_metrics, vortex_metrics
+from lidar_mi.assessment.metrics.winds import cross_flow_metrics, sweep_metrics, true_wind_metrics
+from lidar_mi.experiment.schema import Experiment
+
+Results = Mapping[str, Any]
+"""Results of stages by name."""
+
+
+def measure(
+    experiment: Experiment, results: Results, seconds: Mapping[str, float]
+) -> dict[str, float]:
+    """All metrics of a run, flat.
+
+    Parameters
+    ----------
+    results : mapping
+        Of the stages of the experiment, by name.
+    seconds : mapping of str to float
+        What steps took.
+    """
+    metrics: dict[str, float] = {}
+    if "wind" in results:
+        metrics |= _images(results)
+    if "wind_volume" in results:
+        metrics |= volume_metrics(results["wind_volume"], results["cores"])
+        metrics |= noise_metrics(results["scans"][0])
+    if "error_budget" in results:
+        for method, budget in results["error_budget"].items():
+            metrics |= {budget_key(method, key): value for key, value in budget.items()}
+    if "v_los" in results:
+        settings = experiment.doppler.retrieval
+        metrics |= ring_budget_metrics(results["ring_budget"], settings.averaged)
+        metrics |= velocity_metrics(results["v_los"])
+    if "lines" in results:
+        metrics |= _sensor(results)
+        metrics |= margin_metrics(judged(experiment, results, metrics))
+    if "vortices" in results:
+        truth, pairs = results["truth"].wind, results["vortices"].pairs
+        metrics |= vortex_metrics(pairs, truth, results["cores"])
+    return metrics | {timing_key(step): round(value, 3) for step, value in seconds.items()}
+
+
+def _images(results: Results) -> dict[str, float]:
+    found, cores = results["wind"], results["cores"]
+    place = {axis: slice(found[axis].min(), found[axis].max()) for axis in ("y", "z")}
+    noise = results.get("detector_noise", {})
+    return (
+        cross_flow_metrics(found, cores)
+        | light_metrics(results["scans"][0])
+        | core_metrics(cores)
+        | true_wind_metrics(results["truth"].wind.sel(place), cores)
+        | sweep_metrics(results["texture_sweep"])
+        | {f"detector.{key}": value for key, value in noise.items()}
+        | safety_metrics(results["eye_safety"])
+    )
+
+
+def _sensor(results: Results) -> dict[str, float]:
+    needed = results["pulses_needed"]
+    return (
+        line_metrics(results["lines"])
+        | vector_metrics(results["wind3d"], results["cores"])
+        | limit_metrics(results["u_limits"])
+        | doppler_alone_metrics(results["doppler_alone"], results["slab_wind"])
+        | cost_metrics(results["costs"])
+        | ({} if needed is None else {"sensor.doppler.pulses_needed": needed})
+    )
+
+
+def judged(
+    experiment: Experiment, results: Results, metrics: Mapping[str, float]
+) -> list[tuple[RequirementTable, list[Finding]]]:
+    """The sensor compared with every requirement table."""
+    return [
+        (table, judge(table, measured(experiment, metrics, table)))
+        for table in results["requirements"].values()
+    ]
+
+
+def measured(
+    experiment: Experiment, metrics: Mapping[str, float], table: RequirementTable
+) -> dict[str, float | None]:
+    """What the sensor does, as `requirements.judge` takes it; errors beyond two core radii.
+
+    Points are lines of sight where velocities along them are asked for, else good vectors whose
+    windows do not overlap.
+    """
+    retrieval, depth = experiment.retrieval, experiment.doppler.lidar.range_bin
+    overlap = min(1.0, retrieval.stride / retrieval.template) ** 2
+    along = any(row.quantity == "error_v_los" for row in table.rows)
+    vectors = math.floor(overlap * metrics["sensor.vectors"])
+    return {
+        "range": experiment.scan.range + experiment.scan.thickness / 2,
+        "points_per_slab": metrics["sensor.lines_read"] if along else vectors,
+        "slabs_per_second": experiment.sensor.slabs_per_second,
+        "slab_depth": depth if along else max(depth, experiment.scan.thickness),
+        "error_v_los": metrics.get("sensor.rmse_v_los"),
+        **{f"error_{n}": metrics.get(f"sensor.outside_cores.rmse_{n}") for n in COMPONENTS},
+    }

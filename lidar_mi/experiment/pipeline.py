@@ -1,0 +1,192 @@
+"""The stages of an experiment: what is computed from what."""
+
+from collections.abc import Callable
+from typing import Any
+
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stage import Stage, in_order
+from lidar_mi.experiment.stages.error_budget import error_budgets
+from lidar_mi.experiment.stages.eye_safety import scan_safety
+from lidar_mi.experiment.stages.lines import (
+    check_lines,
+    measure_lines,
+    requirement_tables,
+    slab_wind,
+)
+from lidar_mi.experiment.stages.rendering import (
+    IMAGES,
+    check_light,
+    detect_images,
+    detector_noise,
+    read_truth,
+    render_images,
+    scan_plans,
+    scattering_air,
+    true_cores,
+)
+from lidar_mi.experiment.stages.ring_images import (
+    check_rings,
+    exposure,
+    render_ring_images,
+    ring_image_names,
+    ring_images,
+    ring_instrument,
+)
+from lidar_mi.experiment.stages.ring_velocities import line_of_sight_winds, ring_budget
+from lidar_mi.experiment.stages.sensor import combined_wind, doppler_alone, limits_of_u
+from lidar_mi.experiment.stages.sensor_cost import lidar_costs, pulses_needed
+from lidar_mi.experiment.stages.texture import texture_sweep
+from lidar_mi.experiment.stages.volume import check_volume, scan_volumes, volume_winds
+from lidar_mi.experiment.stages.vortices import combined_vectors, fit_pairs, image_vectors
+from lidar_mi.experiment.stages.winds import check_windows, cross_flow_winds
+from lidar_mi.experiment.truth import make_truth
+from lidar_mi.retrieval.methods import ImageMethod
+
+GIVEN = ("beside",)
+"""What is there from the start: the folder in which files of an experiment are looked for first."""
+
+RINGS_READ = "doppler_retrieve"
+
+
+def has_wake(experiment: Experiment) -> bool:
+    """Whether a backscatter lidar looks at a wake."""
+    return experiment.wake is not None
+
+
+def has_images(experiment: Experiment) -> bool:
+    """Whether cross-flow winds are retrieved from the two images."""
+    return has_wake(experiment) and experiment.volume is None
+
+
+def has_volume(experiment: Experiment) -> bool:
+    """Whether winds are retrieved from two volumes."""
+    return experiment.volume is not None
+
+
+def has_detector(experiment: Experiment) -> bool:
+    """Whether the backscatter lidar has a detector whose noise is simulated."""
+    return has_images(experiment) and experiment.detector is not None
+
+
+def has_error_budget(experiment: Experiment) -> bool:
+    """Whether winds are retrieved without each cause of error, too."""
+    return has_wake(experiment) and experiment.retrieval.error_budget
+
+
+def has_rings(experiment: Experiment) -> bool:
+    """Whether there is a Doppler lidar."""
+    return experiment.doppler is not None
+
+
+def has_sensor(experiment: Experiment) -> bool:
+    """Whether both lidars work as one sensor."""
+    return experiment.sensor is not None
+
+
+def has_vortices_without_sensor(experiment: Experiment) -> bool:
+    """Whether vortex pairs are fitted to what the backscatter lidar measures alone."""
+    fitted = has_images(experiment) and ImageMethod.VORTEX_FIT in experiment.retrieval.methods
+    return fitted and not has_sensor(experiment)
+
+
+def has_vortices(experiment: Experiment) -> bool:
+    """Whether vortex pairs are fitted."""
+    return has_sensor(experiment) or has_vortices_without_sensor(experiment)
+
+
+def _quiet(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A stage's ``compute`` from a function that has nothing to say while it runs."""
+    return lambda *needed, log: function(*needed)
+
+
+STAGES = (
+    # the truth, the scans, the air
+    Stage("flows", read_truth, ("beside",), has_wake, ahead=True, timing="truth"),
+    Stage("truth", _quiet(make_truth), ("beside", "flows"), has_wake, ahead=True, timing="truth"),
+    Stage("plans", _quiet(scan_plans), ("truth",), has_wake, ahead=True, timing="truth"),
+    Stage("air", scattering_air, ("beside",), has_wake, ahead=True),
+    Stage("cores", _quiet(true_cores), ("truth",), has_wake, timing="retrieve"),
+    # the backscatter lidar
+    Stage(
+        "images",
+        render_images,
+        ("truth", "plans", "air"),
+        has_wake,
+        check=check_light,
+        parts=lambda experiment: IMAGES,
+    ),
+    Stage("scans", _quiet(detect_images), ("images", "plans"), has_wake),
+    Stage(
+        "wind",
+        cross_flow_winds,
+        ("truth", "plans", "scans"),
+        has_images,
+        check=check_windows,
+        timing="retrieve",
+    ),
+    Stage("texture_sweep", texture_sweep, ("flows",), has_images, timing="retrieve"),
+    Stage("detector_noise", _quiet(detector_noise), ("scans",), has_detector),
+    Stage("eye_safety", _quiet(scan_safety), ("plans",), has_images),
+    Stage(
+        "volumes",
+        _quiet(scan_volumes),
+        ("flows", "plans", "scans"),
+        has_volume,
+        check=check_volume,
+        timing="retrieve",
+    ),
+    Stage("wind_volume", volume_winds, ("flows", "volumes"), has_volume, timing="retrieve"),
+    Stage(
+        "error_budget",
+        error_budgets,
+        ("truth", "scans", "wind", "cores"),
+        has_error_budget,
+        timing="error_budget",
+    ),
+    # the Doppler lidar
+    Stage("rings", _quiet(lambda asked: ring_instrument(asked.doppler)), (), has_rings, ahead=True),
+    Stage(
+        "ring_images",
+        render_ring_images,
+        ("rings",),
+        has_rings,
+        check=check_rings,
+        parts=ring_image_names,
+        timing="doppler_render",
+    ),
+    Stage("lit_rings", _quiet(ring_images), ("ring_images",), has_rings),
+    Stage("v_los", line_of_sight_winds, ("rings", "lit_rings"), has_rings, timing=RINGS_READ),
+    Stage("ring_budget", ring_budget, ("rings", "lit_rings"), has_rings, timing=RINGS_READ),
+    Stage("exposure", _quiet(exposure), ("rings", "lit_rings"), has_rings),
+    # both as one sensor
+    Stage("requirements", _quiet(requirement_tables), ("beside",), has_sensor, ahead=True),
+    Stage("slab_wind", _quiet(slab_wind), ("truth",), has_sensor, ahead=True),
+    Stage(
+        "lines",
+        measure_lines,
+        ("slab_wind", "rings"),
+        has_sensor,
+        check=check_lines,
+        timing="sensor",
+    ),
+    Stage("wind3d", combined_wind, ("slab_wind", "lines", "wind"), has_sensor, timing="sensor"),
+    Stage(
+        "u_limits",
+        _quiet(limits_of_u),
+        ("slab_wind", "lines", "wind", "wind3d", "cores"),
+        has_sensor,
+        timing="sensor",
+    ),
+    Stage("doppler_alone", doppler_alone, ("lines",), has_sensor, timing="sensor"),
+    Stage("costs", _quiet(lidar_costs), ("slab_wind",), has_sensor),
+    Stage("pulses_needed", _quiet(pulses_needed), ("requirements", "lines"), has_sensor),
+    # the vortices, fitted to the best vectors that there are
+    Stage("vectors", _quiet(combined_vectors), ("wind3d",), has_sensor),
+    Stage("vectors", _quiet(image_vectors), ("wind",), has_vortices_without_sensor),
+    Stage("vortices", fit_pairs, ("scans", "vectors"), has_vortices, timing="vortex"),
+)
+
+
+def stages_of(experiment: Experiment) -> list[Stage]:
+    """The stages of an experiment, each behind those it needs."""
+    return in_order([stage for stage in STAGES if stage.wanted(experiment)], GIVEN)

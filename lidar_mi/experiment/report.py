@@ -1,0 +1,123 @@
+"""Figures and report of a run, at its end and from its results alone."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from lidar_mi.assessment.figures import backscatter as backscatter_figures
+from lidar_mi.assessment.figures import doppler as doppler_figures
+from lidar_mi.assessment.figures import error_budget as budget_figures
+from lidar_mi.assessment.figures import sensor as sensor_figures
+from lidar_mi.assessment.figures import volume as volume_figures
+from lidar_mi.assessment.figures import vortices as vortex_figures
+from lidar_mi.assessment.metrics.names import Source
+from lidar_mi.assessment.metrics.sensor import COMPONENTS
+from lidar_mi.assessment.report.backscatter import backscatter_chapter
+from lidar_mi.assessment.report.doppler import doppler_chapter
+from lidar_mi.assessment.report.error_budget import budget_chapter
+from lidar_mi.assessment.report.page import Chapter
+from lidar_mi.assessment.report.sensor import sensor_chapter
+from lidar_mi.assessment.report.vector_map import map_data
+from lidar_mi.assessment.report.volume import volume_chapter
+from lidar_mi.assessment.report.vortices import vortex_chapter
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.measure import Results, judged
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.winds import rendered_pairs
+
+Metrics = Mapping[str, float]
+
+
+def chapters(
+    experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
+) -> tuple[list[Chapter], dict[str, float]]:
+    """Draw all figures into a folder and say what the results tell.
+
+    Parameters
+    ----------
+    results : mapping
+        Of the stages of the experiment, by name.
+    metrics : mapping
+        From `lidar_mi.experiment.measure.measure`.
+
+    Returns
+    -------
+    chapters : list of Chapter
+        One for each instrument, in the order in which they are read.
+    seconds : dict
+        What drawing took, by step.
+    """
+    found: list[Chapter] = []
+    seconds: dict[str, float] = defaultdict(float)
+    log("drawing figures")
+    for result, step, tell in _CHAPTERS:
+        if result in results:
+            start = time.perf_counter()
+            found.append(tell(experiment, results, metrics, folder, log))
+            seconds[step] += time.perf_counter() - start
+    return found, seconds
+
+
+def _backscatter(experiment, results, metrics, folder, log) -> Chapter:
+    found, cores = results["wind"], results["cores"]
+    drawn = backscatter_figures.draw_all(
+        folder, results["truth"], results["scans"], found, cores, results["texture_sweep"], log
+    )
+    source = Source.NOISY if experiment.detector else Source.BACKSCATTER
+    vectors = map_data(found.sel(source=source).isel(algorithm=0), ("v", "w"), cores)
+    return backscatter_chapter(experiment, metrics, cores, drawn, vectors)
+
+
+def _volume(experiment, results, metrics, folder, log) -> Chapter:
+    pair = results["volumes"].pairs[Source.BACKSCATTER]
+    drawn = volume_figures.draw_all(folder, results["wind_volume"], pair, results["cores"], log)
+    return volume_chapter(experiment, metrics, drawn)
+
+
+def _error_budget(experiment, results, metrics, folder, log) -> Chapter:
+    drawn = budget_figures.draw_all(folder, results["error_budget"], log)
+    return budget_chapter(results["error_budget"], drawn)
+
+
+def _doppler(experiment, results, metrics, folder, log) -> Chapter:
+    doppler = experiment.doppler
+    drawn = doppler_figures.draw_all(
+        folder,
+        doppler,
+        results["exposure"],
+        results["lit_rings"].photons,
+        results["v_los"],
+        metrics,
+        log,
+    )
+    return doppler_chapter(doppler, metrics, drawn)
+
+
+def _sensor(experiment, results, metrics, folder, log) -> Chapter:
+    found, cores = results["wind3d"], results["cores"]
+    shown = found if metrics["sensor.vectors"] else None
+    drawn = sensor_figures.draw_all(folder, shown, results["lines"], cores, log)
+    vectors = None if found is None else map_data(found, COMPONENTS, cores)
+    verdicts = judged(experiment, results, metrics)
+    return sensor_chapter(experiment, metrics, verdicts, drawn, vectors)
+
+
+def _vortices(experiment, results, metrics, folder, log) -> Chapter:
+    fits, truth = results["vortices"], results["truth"].wind
+    (image, _), _ = list(rendered_pairs(experiment, results["scans"]).values())[-1]
+    drawn = vortex_figures.draw_all(
+        folder, image, results["vectors"], truth, fits.pairs, results["cores"], log
+    )
+    return vortex_chapter(metrics, fits.pairs, fits.refused, drawn)
+
+
+# result that a chapter is about, step that its figures are counted for
+_CHAPTERS: tuple[tuple[str, str, Callable[..., Chapter]], ...] = (
+    ("wind", "figures", _backscatter),
+    ("wind_volume", "figures", _volume),
+    ("error_budget", "figures", _error_budget),
+    ("v_los", "doppler_figures", _doppler),
+    ("lines", "figures", _sensor),
+    ("vortices", "figures", _vortices),
+)

@@ -1,0 +1,86 @@
+"""What a run holds: an experiment, its results, its metrics."""
+
+from collections import defaultdict
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.vortices import VortexFits
+from lidar_mi.experiment.truth import Truth
+
+
+@dataclass
+class Run:
+    """An experiment with its results.
+
+    Attributes
+    ----------
+    experiment : Experiment
+    results : dict
+        Of the stages that are done, by name; `lidar_mi.experiment.pipeline` says which there are.
+    metrics : dict of str to float
+        Flat; empty until everything is done.
+    folder : Path or None
+        Where results are kept.
+    log : Log
+        What the run said; ``log.warnings`` is what a reader of the results must know.
+    seconds : dict of str to float
+        What steps took.
+    """
+
+    experiment: Experiment
+    results: dict[str, Any]
+    log: Log
+    metrics: dict[str, float] = field(default_factory=dict)
+    folder: Path | None = None
+    seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+    @property
+    def warnings(self) -> list[str]:
+        """What a reader of the results must know."""
+        return self.log.warnings
+
+    @property
+    def truth(self) -> Truth | None:
+        """Extinction at both times and the true wind."""
+        return self.results.get("truth")
+
+    @property
+    def cores(self) -> list[Core]:
+        """True vortex cores."""
+        return self.results.get("cores", [])
+
+    @property
+    def scans(self) -> list[xr.Dataset]:
+        """Both scans of the backscatter lidar."""
+        return self.results.get("scans", [])
+
+    @property
+    def wind(self) -> xr.Dataset | None:
+        """Wind from the images or volumes of the backscatter lidar, by source and algorithm."""
+        return self.results.get("wind", self.results.get("wind_volume"))
+
+    @property
+    def v_los(self) -> xr.Dataset | None:
+        """Line-of-sight velocities read from images of rings of the Doppler lidar."""
+        return self.results.get("v_los")
+
+    @property
+    def lines(self) -> xr.Dataset | None:
+        """Lines of sight of the Doppler lidar through the slab, in a sensor of both lidars."""
+        return self.results.get("lines")
+
+    @property
+    def wind3d(self) -> xr.Dataset | None:
+        """Wind in three dimensions from both lidars."""
+        return self.results.get("wind3d")
+
+    @property
+    def vortices(self) -> VortexFits | None:
+        """Vortex pairs fitted to images and to wind vectors."""
+        return self.results.get("vortices")

@@ -1,0 +1,130 @@
+"""Stages: the steps of an experiment, put in order by what they need, each computed once."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.schema import Experiment
+
+
+def _always(experiment: Experiment) -> bool:
+    return True
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One step of an experiment, from results to a result.
+
+    It knows no folder: it neither reads nor writes what a run keeps, nor draws.
+
+    Attributes
+    ----------
+    name : str
+        Of its result.
+    compute : callable
+        ``compute(experiment, *results that it needs, log=log)``, returns the result.
+    needs : tuple of str
+        Names of the results it needs, in the order in which it takes them.
+    wanted : callable
+        ``wanted(experiment)``: whether the experiment has this stage.
+    ahead : bool
+        Computed before anything is written: cheap, and needed to say what would fail later.
+    check : callable, optional
+        ``check(experiment, *those of needs that are computed ahead)`` raises InputError for what
+        would otherwise fail after hours.
+    parts : callable, optional
+        ``parts(experiment)``, names of the parts of a result that takes long. Then ``compute`` also
+        takes ``missing=``, the names of those to be made, and yields (name, part) one by one: each
+        can be kept as soon as it is there. The result is a dictionary of all parts.
+    timing : str, optional
+        Step that the time it takes is counted for.
+    """
+
+    name: str
+    compute: Callable[..., Any]
+    needs: tuple[str, ...] = ()
+    wanted: Callable[[Experiment], bool] = _always
+    ahead: bool = False
+    check: Callable[..., None] | None = None
+    parts: Callable[[Experiment], Sequence[str]] | None = None
+    timing: str | None = None
+
+
+class Keeper(Protocol):
+    """Where results are kept while a run goes on."""
+
+    def kept(self, part: str) -> Any:
+        """A part that is there from an earlier run; None: it is not."""
+
+    def keep_part(self, part: str, value: Any) -> Any:
+        """Keep a part; returns it as `kept` would."""
+
+    def keep(self, name: str, value: Any) -> None:
+        """Keep a result, if it is one of those that are kept."""
+
+
+def in_order(stages: Sequence[Stage], given: Sequence[str] = ()) -> list[Stage]:
+    """Stages so that each stands behind those it needs, else as they are.
+
+    Parameters
+    ----------
+    stages : sequence of Stage
+    given : sequence of str
+        Names of results that are there from the start.
+
+    Raises
+    ------
+    ValueError
+        Two stages of one name, a need that no stage gives, needs in a circle, a stage that is
+        computed ahead and needs one that is not.
+    """
+    names = [*given, *(stage.name for stage in stages)]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"stages: {', '.join(twice)} given twice")
+    late = {stage.name for stage in stages if not stage.ahead}
+    for stage in stages:
+        unknown = [need for need in stage.needs if need not in names]
+        if unknown:
+            raise ValueError(f"stage {stage.name}: nothing gives {', '.join(unknown)}")
+        if stage.ahead and late.intersection(stage.needs):
+            raise ValueError(f"stage {stage.name}: is ahead of what it needs")
+    ordered: list[Stage] = []
+    there, waiting = set(given), list(stages)
+    while waiting:
+        ready = next((stage for stage in waiting if there.issuperset(stage.needs)), None)
+        if ready is None:
+            raise ValueError(f"stages: {', '.join(s.name for s in waiting)} need each other")
+        waiting.remove(ready)
+        ordered.append(ready)
+        there.add(ready.name)
+    return ordered
+
+
+def result_of(
+    stage: Stage,
+    experiment: Experiment,
+    results: dict[str, Any],
+    log: Log,
+    keeper: Keeper | None = None,
+) -> Any:
+    """The result of one stage from those it needs, kept if there is a keeper."""
+    needed = [results[need] for need in stage.needs]
+    if stage.parts is None:
+        result = stage.compute(experiment, *needed, log=log)
+        if keeper:
+            keeper.keep(stage.name, result)
+        return result
+    names = stage.parts(experiment)
+    there = {name: keeper.kept(name) if keeper else None for name in names}
+    missing = [name for name in names if there[name] is None]
+    if len(missing) < len(names):
+        log(
+            f"using {len(names) - len(missing)} of {len(names)} {stage.name.replace('_', ' ')} from "
+            "an earlier run"
+        )
+    if missing:
+        for name, part in stage.compute(experiment, *needed, log=log, missing=missing):
+            there[name] = keeper.keep_part(name, part) if keeper else part
+    return there

@@ -1,0 +1,36 @@
+"""Eye safety of the backscatter lidar's beams."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidar_mi.assessment.metrics.safety import ScanSafety
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.instrument.eye_safety import assess_pulses, scan_hazard_distance
+from lidar_mi.instrument.scan import ScanPlan
+
+EXPOSURE = 10.0
+"""Time of looking into the beams, s, where no sensor says another."""
+
+
+def scan_safety(experiment: Experiment, plans: Sequence[ScanPlan]) -> ScanSafety | None:
+    """From where on eyes are safe; None: pulses have no duration, so that no limit applies.
+
+    Every direction has a pulse each ``platform.dt``.
+    """
+    lidar, plan, rate = experiment.lidar, plans[0], 1 / experiment.platform.dt
+    if lidar.pulse_duration == 0:
+        return None
+    exposure = experiment.sensor.exposure if experiment.sensor else EXPOSURE
+    pulse = (lidar.wavelength, lidar.pulse_energy, lidar.pulse_duration)
+    beam = (float(lidar.radius_at(0)), lidar.divergence_full)
+    one = assess_pulses(*pulse, *beam, rate, exposure)
+    spacing = float(np.mean([np.diff(plan.y).mean(), np.diff(plan.z).mean()])) / plan.centre
+    beams = len(plan.y) * len(plan.z)
+    return ScanSafety(
+        permissible_exposure=one.limit.exposure,
+        hazard_distance=one.hazard_distance,
+        aided_hazard_distance=one.aided_hazard_distance,
+        scan_hazard_distance=scan_hazard_distance(*pulse, *beam, spacing, beams, rate, exposure),
+        scan_power=lidar.pulse_energy * beams * rate,
+    )

@@ -1,0 +1,156 @@
+"""Lines of sight of the Doppler lidar through the slab, each read from images of rings."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi.assessment.metrics.requirements import RequirementTable, read_requirements
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames, summed_noise
+from lidar_mi.experiment.stages.ring_velocities import FRAMES, fitted_speeds
+from lidar_mi.experiment.truth import Truth, find_file
+from lidar_mi.instrument.doppler import photons
+from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_at
+from lidar_mi.instrument.fringe_camera import fringe_image
+from lidar_mi.retrieval.lines.vectors import COMPONENTS
+from lidar_mi.retrieval.methods import RingCentre, RingMethod
+
+# Speeds at which images without noise are made; those between are interpolated (Chebyshev).
+_NODES = 7
+# First number of the lines' images, which make their random streams.
+_STREAMS = 1 << 24
+
+
+def requirement_tables(
+    experiment: Experiment, beside
+) -> Mapping[tuple[str, str], RequirementTable]:
+    """The tables that the sensor is compared with, as `read_requirements` gives them.
+
+    Raises
+    ------
+    InputError
+        A requirement table that is missing or not one.
+    """
+    path = experiment.sensor.requirements
+    if path:
+        return read_requirements(find_file(path, beside, "sensor.requirements"))
+    # the paper's are those of flight control: nothing to ask of a platform that stands
+    return read_requirements() if experiment.platform.speed else {}
+
+
+def slab_wind(experiment: Experiment, truth: Truth) -> xr.Dataset:
+    """True u, v, w (m s^-1) on (z, y), averaged over the slab; u is 0 in a wake that has none."""
+    wind = truth.wind
+    return wind if "u" in wind else wind.assign(u=xr.zeros_like(wind["v"]))
+
+
+def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
+    """Say whether both lidars look at the same air, and the Doppler lidar can tell its winds.
+
+    Raises
+    ------
+    InputError
+        Lidars that do not look at the same slab, lines that leave the wake, speeds beyond the
+        unambiguous range.
+    """
+    lidar = experiment.doppler.lidar
+    middle = experiment.scan.range + experiment.scan.thickness / 2
+    if abs(lidar.range - middle) > lidar.range_bin / 2:
+        raise InputError(
+            f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected the slab of "
+            f"scan, {middle - lidar.range_bin / 2:g} to {middle + lidar.range_bin / 2:g} m"
+        )
+    # lines that leave the wake, bins that reach the telescope
+    directions = experiment.sensor.directions
+    try:
+        volumes = sight_volumes(directions.directions(), directions.ranges(lidar), lidar)[0]
+        wind_at(wind, volumes)
+    except InputError as error:
+        raise InputError(f"sensor.directions: {error}") from None
+    fastest = experiment.platform.speed + float(
+        np.sqrt(sum(wind[n] ** 2 for n in COMPONENTS)).max()
+    )
+    limit = rings.model.velocity_range / 2
+    if fastest > limit:
+        raise InputError(
+            f"platform.speed: {experiment.platform.speed:g} m/s is not allowed with sensor; expected "
+            f"less than {limit:.0f} m/s with the wind, half an order of doppler.etalon"
+        )
+
+
+def measure_lines(
+    experiment: Experiment, truth: xr.Dataset, rings: Rings, *, log: Log
+) -> xr.Dataset:
+    """Line-of-sight velocities as the Doppler lidar reads them from its rings.
+
+    Pictures without noise are made at a few speeds and interpolated between them (their rings
+    move by far less than an order); each line's are drawn by the CCD and read by the annular fit,
+    which says how good it is.
+
+    Returns
+    -------
+    xr.Dataset, dim (line)
+        From `scan_wind`, with ``v_los`` and ``v_los_std`` (m s^-1) as they were read; NaN where an
+        image cannot be read.
+    """
+    sensor, doppler = experiment.sensor, experiment.doppler
+    lines = scan_wind(
+        truth,
+        sensor.directions,
+        doppler.lidar,
+        0.0,
+        experiment.seed,
+        experiment.platform.speed,
+        sensor.errors,
+    )
+    true = lines["v_los_true"].values
+    log(f"measuring {len(true)} lines of sight, {sensor.pulses} pulses each")
+    middle, half = (true.max() + true.min()) / 2, max(np.ptp(true) / 2, 1e-3)
+    nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
+    light, counted = photons(doppler.lidar), doppler.lidar.counted
+    images = torch.stack(
+        [
+            fringe_image(doppler.camera, doppler.etalon, rings.line, speed, light, counted)
+            for speed in middle + half * nodes
+        ]
+    )
+    noise = summed_noise(doppler.ccd, rings.modes, sensor.pulses)
+    weights = torch.from_numpy(_lagrange(nodes, (true - middle) / half)).to(images.dtype)
+    read = np.empty((2, len(true)))
+    for start in range(0, len(true), FRAMES):
+        log.bar(f"reading line of sight {start + 1} of {len(true)}", start / len(true))
+        chunk = range(start, min(start + FRAMES, len(true)))
+        frames = []
+        for index in chunk:
+            farther = doppler.lidar.model_copy(update={"range": float(lines["range"][index])})
+            image = torch.tensordot(weights[index], images, 1) * (photons(farther) / light)
+            # numbers of their own, apart from those of the images of the Doppler lidar's chapter
+            frames.append(
+                exposed_frames(
+                    doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
+                )
+            )
+        read[:, start : chunk.stop] = fitted_speeds(
+            torch.cat(frames), doppler, rings.model, noise, RingMethod.ANNULAR, RingCentre.FREE
+        )
+    v_los, std = read
+    return lines.assign(
+        v_los=("line", v_los, lines["v_los"].attrs),
+        v_los_std=("line", std, lines["v_los_std"].attrs),
+    )
+
+
+def _lagrange(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Weights (places, nodes) of values at the nodes in the polynomial through them, at places."""
+    others = ~np.eye(len(nodes), dtype=bool)
+    return np.stack(
+        [
+            ((places[:, None] - nodes[o]) / (node - nodes[o])).prod(1)
+            for node, o in zip(nodes, others)
+        ],
+        axis=1,
+    )

@@ -1,0 +1,162 @@
+"""From the truth to the two images of the backscatter lidar: scan geometry, light, detector."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import xarray as xr
+
+from lidar_mi.assessment.metrics.cores import Core, find_cores
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.truth import Flows, Truth, read_flows
+from lidar_mi.instrument.detection import noise_budget, noisy_scan
+from lidar_mi.instrument.detector import gate_duration
+from lidar_mi.instrument.products import with_products
+from lidar_mi.instrument.scan import ScanPlan, plan_scans
+from lidar_mi.instrument.speckle import speckle_modes
+from lidar_mi.rendering.backscatter import extrude, render_scans
+from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
+from lidar_mi.rendering.variant import use_variant
+
+IMAGES = ("image_t1", "image_t2")
+"""Parts of the result of `render_images`."""
+
+
+def scan_plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
+    """The scans of both images."""
+    flown = (experiment.platform.speed - experiment.scan.follow) * experiment.platform.dt
+    return plan_scans(experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown))
+
+
+def read_truth(experiment: Experiment, beside: str | Path, *, log: Log) -> Flows:
+    """The flow at both times; see `read_flows`."""
+    log.bar("reading the wake", None)
+    return read_flows(experiment, beside)
+
+
+def true_cores(experiment: Experiment, truth: Truth) -> list[Core]:
+    """The vortices of the true wind."""
+    return find_cores(truth.wind)
+
+
+def scattering_air(experiment: Experiment, beside: str | Path, *, log: Log) -> Scatterer:
+    """Phase function and albedo of the air; tables are read, or computed where they are missing.
+
+    Raises
+    ------
+    InputError
+        A scattering table that is missing or not one.
+    """
+    use_variant(experiment.render.variant)
+    log.bar("reading how the air scatters", None)
+    return scatterer(experiment.scattering, beside, experiment.lidar.wavelength, log.bar)
+
+
+def environment_extinction(experiment: Experiment) -> float:
+    """Extinction coefficient around the slab and on the way, m^-1."""
+    mapping = experiment.wake.extinction
+    return mapping.background + mapping.molecules
+
+
+def check_light(
+    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], air: Scatterer
+) -> None:
+    """Say what would leave the images dark or their noise undetermined.
+
+    Raises
+    ------
+    InputError
+        Air that does not scatter, a detector that does not go with the pulse, beams wider than a
+        medium can be made for.
+    """
+    _media(experiment, truth, plans)
+    if experiment.detector:
+        for plan in plans:
+            duration = gate_duration(plan.gate_length())
+            speckle_modes(experiment.detector, experiment.lidar, duration, plan.ranges())
+    if not max(float(field.max()) for field in truth.extinction) > 0:
+        raise InputError(
+            "wake.extinction: 0 everywhere is not allowed; expected air that scatters, by its "
+            "background, tracer or aerosol"
+        )
+    if not air.albedo > 0:
+        raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
+
+
+def render_images(
+    experiment: Experiment,
+    truth: Truth,
+    plans: Sequence[ScanPlan],
+    air: Scatterer,
+    *,
+    log: Log,
+    missing: Sequence[str] = IMAGES,
+) -> Iterator[tuple[str, xr.Dataset]]:
+    """Render the scans of both times without a detector's noise, one after the other.
+
+    Yields
+    ------
+    name : str
+        Of `IMAGES`.
+    scan : xr.Dataset, dims (gate, z, y)
+        From `render_scans`, with the depolarisation and what else it gives.
+    """
+    use_variant(experiment.render.variant)
+    wanted = [IMAGES.index(name) for name in missing]
+    log(f"rendering {len(wanted)} scans of {len(plans[0].y)} x {len(plans[0].z)} beams")
+
+    def progress(scan: int, done: int, total: int) -> None:
+        log.bar(f"rendering scan {scan + 1} of {len(plans)}", done / total)
+
+    mapping = experiment.wake.extinction
+    rendered = render_scans(
+        _media(experiment, truth, plans),
+        plans,
+        experiment.lidar,
+        environment_extinction(experiment),
+        *air,
+        experiment.render,
+        experiment.seed,
+        progress,
+        wanted,
+        molecules(mapping.molecules, experiment.lidar.wavelength, experiment.scattering.band),
+    )
+    platform = {"platform_speed": experiment.platform.speed, "dt": experiment.platform.dt}
+    for index, scan in zip(wanted, rendered, strict=True):
+        scan = with_products(scan)
+        scan.attrs |= platform
+        yield IMAGES[index], scan
+
+
+def detect_images(
+    experiment: Experiment, images: Mapping[str, xr.Dataset], plans: Sequence[ScanPlan]
+) -> list[xr.Dataset]:
+    """The scans behind the detector: noisy images beside those without noise; or as they are."""
+    scans = [images[name] for name in IMAGES]
+    if experiment.detector is None:
+        return scans
+    lidar, detector, seed = experiment.lidar, experiment.detector, experiment.seed
+    # of what a file holds, geometry and air are single precision: here they are known
+    air = {"environment_extinction": environment_extinction(experiment)}
+    # random numbers of their own, apart from those of the light transport
+    return [
+        noisy_scan(scan.assign_attrs(air), lidar, detector, [seed, index, 1], plan)
+        for index, (scan, plan) in enumerate(zip(scans, plans, strict=True))
+    ]
+
+
+def detector_noise(experiment: Experiment, scans: Sequence[xr.Dataset]) -> dict[str, float]:
+    """What the noise of the first scan is made of, as of `noise_budget`."""
+    return noise_budget(scans[0], experiment.lidar, experiment.detector)
+
+
+def _media(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan]) -> list[xr.DataArray]:
+    """The extinction at both times as deep and wide as the beams need it."""
+    fields = truth.extinction
+    if fields[0].sizes["x"] > 1:
+        return list(fields)
+    reach = max(plans, key=lambda plan: plan.gate_stop)
+    return [
+        extrude(field.isel(x=0).transpose("z", "y"), reach, experiment.lidar) for field in fields
+    ]

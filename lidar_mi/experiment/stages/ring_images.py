@@ -1,0 +1,248 @@
+"""From the Doppler lidar to its images of rings: rendered without noise, exposed on the CCD."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
+from lidar_mi.atmosphere.molecules import standard_atmosphere
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.ring_instrument import air_rings, pixel_noise
+from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.instrument.doppler import photons, solar_background, speckle_modes
+from lidar_mi.instrument.fringe_camera import CCD, expose, fringe_image, ring_radii
+from lidar_mi.rendering.fringes import render_fringes, scene_dict
+from lidar_mi.rendering.variant import use_variant
+from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
+
+EMITTED, PHOTONS = "fringes_emitted", "fringes_photons"
+
+
+class Rings(NamedTuple):
+    """What the images of a Doppler lidar follow from."""
+
+    line: Line
+    model: RingModel
+    photons: float
+    background: float
+    modes: float
+
+
+@dataclass(frozen=True)
+class RingImages:
+    """Rendered images: of the laser itself, of air at every speed, and photon by photon."""
+
+    emitted: xr.Dataset
+    received: list[xr.Dataset]
+    photons: xr.Dataset | None
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Images without noise, and one by the CCD: photoelectrons a pixel of one pulse.
+
+    ``received`` and ``noisy`` are of air at the first speed.
+    """
+
+    emitted: np.ndarray
+    received: np.ndarray
+    noisy: np.ndarray
+
+
+def ring_instrument(doppler: Doppler) -> Rings:
+    """What the images follow from, checked.
+
+    Raises
+    ------
+    InputError
+        Winds beyond the unambiguous range, fewer than two rings on the CCD, pixels that overflow.
+    """
+    lidar, etalon, camera, ccd = doppler.lidar, doppler.etalon, doppler.camera, doppler.ccd
+    pressure, temperature = standard_atmosphere(lidar.altitude)
+    line = backscatter_line(
+        lidar.wavelength,
+        temperature,
+        pressure,
+        lidar.laser_width,
+        lidar.aerosol_share,
+        lidar.line_shape,
+    )
+    model = air_rings(lidar, etalon, camera)
+    for speed in doppler.v_los:
+        if not abs(speed) < model.velocity_range / 2:
+            raise InputError(
+                f"doppler.v_los: {speed:g} m/s is not allowed; expected less than "
+                f"{model.velocity_range / 2:.0f} m/s each way, half an order of the etalon"
+            )
+        radii = ring_radii(camera, etalon, lidar.wavelength, speed)
+        if len(radii) < 2:
+            raise InputError(
+                f"doppler.camera: {len(radii)} ring(s) at {speed:g} m/s are not allowed; expected "
+                "2 or more: a larger CCD, a shorter focal_length or a wider gap of the etalon"
+            )
+    modes = doppler.speckle_modes
+    if modes == "derived":
+        modes = speckle_modes(lidar, camera, etalon, line)
+    image = fringe_image(
+        camera, etalon, line, doppler.v_los[0], photons(lidar), lidar.counted, subsamples=1
+    )
+    background = solar_background(lidar, etalon) / (camera.width * camera.height)
+    crest = ccd.quantum_efficiency * (float(image.max()) + background)
+    digits = math.inf if ccd.bits is None else (2**ccd.bits - 1 - ccd.bias) * ccd.gain
+    full = min(ccd.full_well, digits)
+    # crests of the noisiest pixels stay below
+    if not crest + 6 * math.sqrt(crest + crest**2 / modes + ccd.read_noise**2) < full:
+        raise InputError(
+            f"doppler.ccd: a pixel that holds {full:.3g} photoelectrons is not allowed; expected "
+            f"more, as the rings' crests have {crest:.3g}"
+        )
+    return Rings(line, model, float(image.sum()), background, modes)
+
+
+def check_rings(experiment: Experiment, rings: Rings) -> None:
+    """Say whether scenes of the rings can be made.
+
+    Raises
+    ------
+    InputError
+        Settings of etalon, camera and rendering that do not go together.
+    """
+    use_variant(experiment.doppler.render.variant)
+    for line, settings in ((rings.line, experiment.doppler.render), _photon_by_photon(experiment)):
+        scene_dict(experiment.doppler.etalon, experiment.doppler.camera, line, settings)
+
+
+def ring_image_names(experiment: Experiment) -> list[str]:
+    """Parts of the result of `render_ring_images`."""
+    photons_too = [PHOTONS] if experiment.doppler.photon_samples else []
+    return [EMITTED, *photons_too, *_received(experiment)]
+
+
+def render_ring_images(
+    experiment: Experiment, rings: Rings, *, log: Log, missing: Sequence[str]
+) -> Iterator[tuple[str, xr.Dataset]]:
+    """Render the laser's own light, that of single photons, and that of air at every speed.
+
+    Yields
+    ------
+    name : str
+        Of `ring_image_names`.
+    image : xr.Dataset, dims (y, x)
+        From `render_fringes`.
+    """
+    doppler = experiment.doppler
+    use_variant(doppler.render.variant)
+    laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
+    # what to render: line, settings, speeds, names
+    plan = [(laser, doppler.render, (0.0,), [EMITTED])]
+    if doppler.photon_samples:
+        plan.append((*_photon_by_photon(experiment), (0.0,), [PHOTONS]))
+    plan.append((rings.line, doppler.render, doppler.v_los, _received(experiment)))
+    total = sum(len(names) for *_, names in plan)
+    before = 0
+    for line, settings, speeds, names in plan:
+        absent = [k for k, name in enumerate(names) if name in missing]
+        if absent:
+            size = f"{doppler.camera.width} x {doppler.camera.height}"
+            log(f"rendering {names[absent[0]]} ... {names[absent[-1]]}, {size} pixels")
+            # the number of an image makes its seed: a resumed run renders the same ones
+            first, number = absent[0], before + absent[0]
+            rendered = render_fringes(
+                doppler.etalon,
+                doppler.camera,
+                line,
+                speeds[first:],
+                settings,
+                (experiment.seed + (number << 16)) % 2**31,
+                lambda k, done, paths, n=number: log.bar(
+                    f"rendering rings {n + k + 1} of {total}", done / paths
+                ),
+            )
+            for k, image in enumerate(rendered, first):
+                if k in absent:
+                    yield names[k], image
+        before += len(names)
+
+
+def ring_images(experiment: Experiment, parts: Mapping[str, xr.Dataset]) -> RingImages:
+    """The images by what they show."""
+    received = [parts[name] for name in _received(experiment)]
+    return RingImages(parts[EMITTED], received, parts.get(PHOTONS))
+
+
+def exposure(experiment: Experiment, rings: Rings, images: RingImages) -> Exposure:
+    """Images at the first speed as the CCD records one pulse, with and without noise."""
+    received = expected_image(images.received[0], rings.photons)
+    noisy = exposed_frames(experiment.doppler, rings, received, 1, experiment.seed, [0])[0]
+    emitted = expected_image(images.emitted, rings.photons)
+    return Exposure(emitted.numpy(), received.numpy(), noisy.numpy())
+
+
+def _received(experiment: Experiment) -> list[str]:
+    return [f"fringes_received_{k:02d}" for k in range(len(experiment.doppler.v_los))]
+
+
+def _photon_by_photon(experiment: Experiment):
+    """The laser's line, and how single photons of it are sent through a real lens."""
+    doppler = experiment.doppler
+    laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
+    if not doppler.photon_samples:
+        return laser, doppler.render
+    return laser, doppler.render.model_copy(
+        update={
+            "estimator": "analog",
+            "line_shape": "sampled",
+            "lens": "singlet",
+            "samples_per_pixel": doppler.photon_samples,
+        }
+    )
+
+
+def expected_image(image: xr.Dataset, total: float) -> torch.Tensor:
+    """Mean photons a pixel of an image of ``total`` photons."""
+    light = torch.from_numpy(image["S0"].values.astype(float))
+    return light * (total / light.sum())
+
+
+def exposed_frames(doppler, rings, expected, averaged, seed, numbers) -> torch.Tensor:
+    """Sums of so many noisy images each, photoelectrons."""
+    mean, ccd = averaged * expected, summed(doppler.ccd, averaged)
+    modes, background = averaged * rings.modes, averaged * rings.background
+
+    def one(number: int) -> torch.Tensor:
+        return expose(mean, ccd, seed, [number], modes, background)
+
+    # every image has a stream of its own, so that it is the same from any thread
+    with ThreadPoolExecutor(torch.get_num_threads()) as pool:
+        return torch.cat(list(pool.map(one, numbers)))
+
+
+def summed(ccd: CCD, images: int) -> CCD:
+    """A CCD whose single image has the statistics of the sum of several by the given one.
+
+    Poisson numbers, speckle and read noise of several pulses add up to numbers of the same kind;
+    rounding by the digitiser is taken as Gaussian noise of a twelfth of a squared step, which holds
+    where the read noise is half a step or more. For pixels that are not full.
+    """
+    if images == 1:
+        return ccd
+    return ccd.model_copy(
+        update={
+            "read_noise": math.sqrt(images) * pixel_noise(ccd).read_noise,
+            "integration_time": images * ccd.integration_time,
+            "full_well": images * ccd.full_well,
+            "bits": None,
+        }
+    )
+
+
+def summed_noise(ccd: CCD, modes: float, images: int) -> PixelNoise:
+    """The noise of the sum of so many images by the CCD."""
+    return PixelNoise(math.sqrt(images) * pixel_noise(ccd).read_noise, images * modes)

@@ -1,0 +1,287 @@
+"""From images of rings to the wind along the line of sight, by every method."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi import __version__
+from lidar_mi.assessment.metrics.rings import RingBudget
+from lidar_mi.atmosphere.line import laser_line
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.ring_instrument import pixel_noise, ring_model
+from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.experiment.stages.ring_images import (
+    RingImages,
+    Rings,
+    expected_image,
+    exposed_frames,
+    summed_noise,
+)
+from lidar_mi.instrument.etalon import finesse
+from lidar_mi.retrieval.methods import RingCentre, RingMethod
+from lidar_mi.retrieval.rings import peaks as ring_peaks
+from lidar_mi.retrieval.rings.fit import fit_rings
+from lidar_mi.retrieval.rings.model import cramer_rao
+
+FITS = (RingMethod.ANNULAR, RingMethod.PIXELS)
+# way to the radius and coordinate of the fit, as `ring_peaks.ring_radius` takes them
+PEAKS = {
+    RingMethod.CA: ("ca", "r"),
+    RingMethod.CA_R2: ("ca", "r2"),
+    RingMethod.ML: ("ml", "r"),
+    RingMethod.SG: ("sg", "r"),
+}
+
+# half widths of the fitted piece, in radii, for which the bias of peak fits is looked at
+PIECES = tuple(np.linspace(0.1, 0.5, 9).round(3).tolist())
+
+FRAMES = 16  # noisy images in memory at a time
+
+
+def line_of_sight_winds(
+    experiment: Experiment, rings: Rings, images: RingImages, *, log: Log
+) -> xr.Dataset:
+    """What every method reads from noisy images, and from averages of several; see `velocities`."""
+    expected = [expected_image(image, rings.photons) for image in images.received]
+    found = velocities(experiment.doppler, rings, images, expected, experiment.seed, log)
+    found.attrs |= {
+        "title": f"Line-of-sight wind of the experiment {experiment.name}",
+        "source": f"lidar-mi {__version__}",
+    }
+    _warn_of_failures(found, log)
+    return found
+
+
+def ring_budget(
+    experiment: Experiment, rings: Rings, images: RingImages, *, log: Log
+) -> RingBudget:
+    """Light, line and etalon of the lidar, and limits of what can be read from its images."""
+    log("computing the Cramer-Rao bound")
+    doppler = experiment.doppler
+    expected = [expected_image(image, rings.photons) for image in images.received]
+    v = fit_rings(torch.stack(expected), rings.model).v_los.numpy()
+    errors = v - [image.attrs["v_los"] for image in images.received]
+    first = images.received[0]
+    relative = (first["S0_stderr"] / first["S0"].where(first["S0"] > 0)).median()
+    return RingBudget(
+        photons=rings.photons,
+        background_photons=rings.background * doppler.camera.width * doppler.camera.height,
+        signal=doppler.ccd.quantum_efficiency * rings.photons,
+        line_width=rings.line.width,
+        free_spectral_range=doppler.etalon.free_spectral_range(doppler.lidar.wavelength),
+        finesse=finesse(doppler.etalon, doppler.lidar.wavelength),
+        velocity_range=rings.model.velocity_range,
+        speckle_modes=rings.modes,
+        bound={centre: _bound(doppler, rings, centre) for centre in doppler.retrieval.centre},
+        relative_error=float(relative),
+        largest_error=float(abs(errors).max()),
+    )
+
+
+def _bound(doppler: Doppler, rings: Rings, centre: str) -> float:
+    """Cramer-Rao bound of one image at the first speed, m/s."""
+    efficiency = doppler.ccd.quantum_efficiency
+    floor = efficiency * rings.background + doppler.ccd.dark_current * doppler.ccd.integration_time
+    unknown = [
+        name
+        for name in rings.model.parameters
+        if centre == RingCentre.FREE or name not in ("x", "y")
+    ]
+    return cramer_rao(
+        rings.model,
+        efficiency * rings.photons,
+        pixel_noise(doppler.ccd, rings.modes),
+        v_los=doppler.v_los[0],
+        background=floor,
+        free=unknown,
+    )["v_los"]
+
+
+def velocities(
+    doppler: Doppler,
+    rings: Rings,
+    seen: RingImages,
+    expected: Sequence[torch.Tensor],
+    seed: int,
+    log: Log,
+) -> xr.Dataset:
+    """What every method reads from noisy images, and from averages of several.
+
+    Returns
+    -------
+    xr.Dataset
+        ``tried`` (algorithm), the images of every case that were given to it; ``v`` and its standard deviation ``v_std`` as the fit says, m/s, dims (algorithm, centre,
+        averaged, v_los, image), NaN where nothing was read; and ``peak_bias`` (coordinate, piece)
+        of the innermost ring's peak without any noise, m/s, at the first speed.
+    """
+    settings, speeds = doppler.retrieval, doppler.v_los
+    shape = (
+        len(settings.methods),
+        len(settings.centre),
+        len(settings.averaged),
+        len(speeds),
+        settings.images,
+    )
+    v, v_std = np.full((2, *shape), np.nan)
+    emitted = seen.emitted["S0"].values.astype(float)
+    reference = _emitted_velocity(doppler, seen.emitted, rings.photons)
+    radii = {centre: _peak_radii(emitted, doppler, centre) for centre in settings.centre}
+    fits = [m for m in settings.methods if m in FITS]
+    peaks = [m for m in settings.methods if m in PEAKS]
+    places = {name: settings.methods.index(name) for name in settings.methods}
+    tried = [
+        settings.images if m == RingMethod.ANNULAR else settings.slow_images
+        for m in settings.methods
+    ]
+    done, total = 0, math.prod(shape[2:])
+    for j, n in enumerate(settings.averaged):
+        noise = summed_noise(doppler.ccd, rings.modes, n)
+        for k, speed in enumerate(speeds):
+            for first in range(0, settings.images, FRAMES):
+                text = f"reading averages of {n} images at {speed:g} m/s"
+                log.bar(text, done / total)
+                images = range(first, min(first + FRAMES, settings.images))
+                numbers = [(j * len(speeds) + k) * settings.images + i for i in images]
+                frames = exposed_frames(doppler, rings, expected[k], n, seed, numbers)
+                few = max(0, min(settings.slow_images - first, len(images)))
+                for c, centre in enumerate(settings.centre):
+                    for name in fits:
+                        count = len(images) if name == RingMethod.ANNULAR else few
+                        if count:
+                            place = places[name], c, j, k, slice(first, first + count)
+                            read = fitted_speeds(
+                                frames[:count], doppler, rings.model, noise, name, centre
+                            )
+                            v[place], v_std[place] = read
+                            v[place] -= reference
+                    for i in range(few if peaks else 0):
+                        found = _peak_radii(frames[i].numpy(), doppler, centre)
+                        for name in peaks:
+                            v[places[name], c, j, k, first + i] = ring_peaks.velocity_from_radii(
+                                found[name],
+                                radii[centre][name],
+                                doppler.camera.focal_length,
+                                doppler.camera.pixel,
+                            )
+                done += len(images)
+    dims = ("algorithm", "centre", "averaged", "v_los", "image")
+    return xr.Dataset(
+        {
+            "v": (dims, v, {"units": "m s-1", "long_name": "line-of-sight wind that is read"}),
+            "v_std": (
+                dims,
+                v_std,
+                {"units": "m s-1", "long_name": "standard deviation that the fit expects"},
+            ),
+            "tried": ("algorithm", tried, {"units": "1", "long_name": "images of every case"}),
+            "peak_bias": (
+                ("coordinate", "piece"),
+                _peak_bias(doppler, seen),
+                {
+                    "units": "m s-1",
+                    "long_name": "error of the innermost ring's peak by circular averaging, no noise",
+                },
+            ),
+        },
+        coords={
+            "algorithm": list(settings.methods),
+            "centre": list(settings.centre),
+            "averaged": (
+                "averaged",
+                list(settings.averaged),
+                {"units": "1", "long_name": "images of an average"},
+            ),
+            "v_los": ("v_los", list(speeds), {"units": "m s-1", "long_name": "true wind"}),
+            "coordinate": list(ring_peaks.COORDINATES),
+            "piece": (
+                "piece",
+                list(PIECES),
+                {"units": "1", "long_name": "half width of the fitted piece in radii"},
+            ),
+        },
+        attrs={"Conventions": "CF-1.11", "title": "Line-of-sight winds read from rings"},
+    )
+
+
+def fitted_speeds(frames, doppler, model, noise, method, centre) -> tuple[np.ndarray, np.ndarray]:
+    """v_LOS and its standard deviation by `fit_rings`; NaN of images that it refuses."""
+    known = {}
+    if centre == RingCentre.KNOWN:
+        free = [name for name in model.parameters if name not in ("x", "y")]
+        known = {"centre": doppler.camera.centre_pixel, "free": free}
+    try:
+        fit = fit_rings(frames, model, noise, method=method, **known)
+    except InputError:
+        if len(frames) == 1:
+            return np.array([np.nan]), np.array([np.nan])
+        alone = [fitted_speeds(f[None], doppler, model, noise, method, centre) for f in frames]
+        v, std = zip(*alone)
+        return np.concatenate(v), np.concatenate(std)
+    return fit.v_los.numpy(), fit.v_los_std.numpy()
+
+
+def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, float]:
+    """Innermost ring's radius (px) by all peak methods wanted; NaN where one finds none."""
+    methods = [name for name in doppler.retrieval.methods if name in PEAKS]
+    centres, radii, near = {}, {}, None
+    for name in methods:
+        way, coordinate = PEAKS[name]
+        finder = "ml" if way == "ml" else "ca"
+        try:
+            if finder not in centres:
+                known = centre == RingCentre.KNOWN
+                centres[finder] = (
+                    doppler.camera.centre_pixel if known else ring_peaks.find_centre(image, finder)
+                )
+            place = centres[finder]
+            # the crest to a pixel: what a fit in r is off by goes with the piece about it
+            near = near or ring_peaks.ring_radius(image, place, "ca", "r2")
+            radii[name] = ring_peaks.ring_radius(image, place, way, coordinate, near)
+        except InputError:
+            radii[name] = math.nan
+    return radii
+
+
+def _peak_bias(doppler: Doppler, seen: RingImages) -> np.ndarray:
+    """Error of the first speed by the innermost ring's peak, (coordinates, PIECES), m/s.
+
+    From images without noise, about the true centre; NaN where a piece holds no peak.
+    """
+    camera = doppler.camera
+    images = [p["S0"].values.astype(float) for p in (seen.received[0], seen.emitted)]
+
+    def error(coordinate, piece):
+        try:
+            radii = [
+                ring_peaks.ring_radius(i, camera.centre_pixel, "ca", coordinate, piece=piece)
+                for i in images
+            ]
+        except InputError:
+            return math.nan
+        v = ring_peaks.velocity_from_radii(*radii, camera.focal_length, camera.pixel)
+        return v - doppler.v_los[0]
+
+    return np.array([[error(c, p) for p in PIECES] for c in ring_peaks.COORDINATES])
+
+
+def _emitted_velocity(doppler: Doppler, emitted: xr.Dataset, total: float) -> float:
+    """What the fit reads from the laser's own image: the zero of all speeds.
+
+    As many of its images can be averaged as one likes: it has no noise here.
+    """
+    line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
+    model = ring_model(doppler.etalon, doppler.camera, line)
+    return float(fit_rings(expected_image(emitted, total)[None], model).v_los)
+
+
+def _warn_of_failures(found: xr.Dataset, log: Log) -> None:
+    for name in found["algorithm"].values:
+        one = found.sel(algorithm=name)
+        tried = int(one["tried"]) * one["v"][..., 0].size
+        missing = tried - int(one["v"].count())
+        if missing:
+            log.remark(f"{name}: reads no wind from {missing} of {tried} images")

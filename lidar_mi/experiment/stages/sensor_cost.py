@@ -1,0 +1,84 @@
+"""What both lidars take: pulses, power, beams at a time, distances from which eyes are safe."""
+
+import math
+from collections.abc import Mapping
+
+import xarray as xr
+
+from lidar_mi.assessment.metrics.requirements import RequirementTable
+from lidar_mi.assessment.metrics.sensor import LidarCost
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.instrument.budget import pulse_budget, pulses_for_error
+from lidar_mi.instrument.doppler import photons
+from lidar_mi.instrument.eye_safety import assess_pulses
+from lidar_mi.instrument.scan import plan_scans
+
+
+def lidar_costs(experiment: Experiment, truth: xr.Dataset) -> dict[str, LidarCost]:
+    """Cost of the scan of each lidar, "doppler" and "backscatter"; of the latter one pulse a beam."""
+    sensor, doppler, lidar = experiment.sensor, experiment.doppler.lidar, experiment.lidar
+    far = float(sensor.directions.ranges(doppler).max()) + doppler.range_bin / 2
+    directions = sensor.directions.columns * sensor.directions.rows
+    rate = sensor.slabs_per_second
+    lines = pulse_budget(
+        directions, rate, sensor.pulses, doppler.pulse_energy, far, photons(doppler)
+    )
+    plan = plan_scans(experiment.scan, truth["y"].values, truth["z"].values, (0.0,))[0]
+    images = pulse_budget(
+        len(plan.y) * len(plan.z),
+        1 / experiment.platform.dt,
+        1,
+        lidar.pulse_energy,
+        float((plan.ranges()[-1] + plan.gate_length() / 2).max()),
+    )
+    radius = float(lidar.radius_at(0))
+    safe = (
+        _eye_safety(doppler, doppler.beam_radius, sensor.pulses * rate, sensor.exposure),
+        _eye_safety(lidar, radius, rate, sensor.exposure),
+    )
+    return {
+        "doppler": LidarCost(
+            lines.pulses_per_second,
+            lines.average_power,
+            lines.beams,
+            lines.photons_per_direction,
+            **safe[0],
+        ),
+        "backscatter": LidarCost(
+            images.pulses_per_second, images.average_power, images.beams, **safe[1]
+        ),
+    }
+
+
+def pulses_needed(
+    experiment: Experiment, tables: Mapping[tuple[str, str], RequirementTable], lines: xr.Dataset
+) -> int | None:
+    """Pulses a direction takes for the least error of v_LOS that is required; None: none is."""
+    rows = (row for table in tables.values() for row in table.rows)
+    limits = [r.maximum for r in rows if r.quantity == "error_v_los" and math.isfinite(r.maximum)]
+    stated = lines["v_los_std"].where(lines["v_los"].notnull(), drop=True)
+    if not limits or not stated.size:
+        return None
+    one = math.sqrt(experiment.sensor.pulses * float((stated.values**2).mean()))
+    return pulses_for_error(one, min(limits))
+
+
+def _eye_safety(beam, radius: float, rate: float, exposure: float) -> dict[str, float]:
+    """Limits of one beam, as `LidarCost` calls them; none of pulses without a duration."""
+    if not beam.pulse_duration > 0:
+        return {}
+    safety = assess_pulses(
+        beam.wavelength,
+        beam.pulse_energy,
+        beam.pulse_duration,
+        radius,
+        beam.divergence_full,
+        rate,
+        exposure,
+    )
+    distances = {
+        name: getattr(safety, name)
+        for name in ("hazard_distance", "aided_hazard_distance")
+        if math.isfinite(getattr(safety, name))
+    }
+    return {"permissible_exposure": safety.limit.exposure} | distances

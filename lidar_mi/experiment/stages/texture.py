@@ -1,0 +1,57 @@
+"""How well winds are retrieved from the extinction by how much sub-grid texture it has."""
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.metrics.errors import error_statistics, truth_at_vectors
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.winds import window_settings
+from lidar_mi.experiment.truth import Flows, make_truth
+from lidar_mi.retrieval.methods import ImageMethod
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+
+LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
+"""Relative rms of the texture."""
+
+
+def texture_sweep(experiment: Experiment, flows: Flows, *, log: Log) -> xr.Dataset:
+    """Errors of cross-correlation on extinction pairs of more and less sub-grid texture.
+
+    Returns
+    -------
+    xr.Dataset, dim (texture)
+        ``rmse_v``, ``rmse_w`` (m s^-1) over every vector with a displacement, NaN where there is
+        none; ``valid_fraction``.
+    """
+    points = []
+    for index, rms in enumerate(LEVELS):
+        log.bar(f"retrieving winds at {rms:.0%} texture", index / len(LEVELS))
+        texture = experiment.wake.texture.model_copy(update={"rms": rms})
+        wake = experiment.wake.model_copy(update={"texture": texture})
+        truth = make_truth(experiment.model_copy(update={"wake": wake}), flows=flows)
+        wind = retrieve_wind(
+            truth.image(0),
+            truth.image(1),
+            dt=experiment.platform.dt,
+            method=ImageMethod.CC,
+            **window_settings(experiment.retrieval),
+        )
+        true = truth_at_vectors(wind, truth.wind)
+        v, w = (wind[name].values - true[name].values for name in ("v", "w"))
+        known = np.isfinite(v) & np.isfinite(w)
+        rmse = [error_statistics(e, where=known).get("rmse", np.nan) for e in (v, w)]
+        points.append([*rmse, float((known & (wind["flag"].values == 0)).mean())])
+    values = np.array(points).reshape(len(LEVELS), 3).T
+    about = (
+        ("rmse_v", "rms error of v", "m s-1"),
+        ("rmse_w", "rms error of w", "m s-1"),
+        ("valid_fraction", "fraction of valid vectors", "1"),
+    )
+    return xr.Dataset(
+        {
+            name: ("texture", column, {"long_name": text, "units": unit})
+            for (name, text, unit), column in zip(about, values, strict=True)
+        },
+        {"texture": ("texture", list(LEVELS), {"long_name": "relative rms", "units": "1"})},
+    )

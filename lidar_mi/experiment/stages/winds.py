@@ -1,0 +1,170 @@
+"""From two images to the cross-flow wind, by every method and from every source."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi import __version__
+from lidar_mi.assessment.metrics.errors import commonest_flag, truth_at_vectors
+from lidar_mi.assessment.metrics.names import EXACT, RENDERED, Source
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.schema import Experiment, Retrieval
+from lidar_mi.experiment.truth import Truth, blur_by_beam
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
+from lidar_mi.retrieval.velocimetry.wind import METHODS, retrieve_wind, wind_bound
+from lidar_mi.retrieval.velocimetry.windows import Windows
+
+
+def check_windows(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan]) -> None:
+    """Say whether windows fit into the images.
+
+    Raises
+    ------
+    InputError
+        A search region larger than the images.
+    """
+    settings, image = experiment.retrieval, (len(plans[0].z), len(plans[0].y))
+    Windows(image, settings.template, settings.search, settings.stride)
+
+
+def cross_flow_winds(
+    experiment: Experiment,
+    truth: Truth,
+    plans: Sequence[ScanPlan],
+    scans: Sequence[xr.Dataset],
+    *,
+    log: Log,
+) -> xr.Dataset:
+    """Winds by every method from every image pair, with the truth at their places.
+
+    Sources are the extinction itself, the same without sub-grid texture, the extinction blurred by
+    the beam's width (what a noise-free lidar would see), the rendered backscatter and, with a
+    detector, the same with its noise.
+
+    Returns
+    -------
+    xr.Dataset, dims (source, algorithm, z, y)
+        What `retrieve_wind` gives, ``score`` in place of what each method calls its own;
+        ``v_true``, ``w_true`` and, from `wind_bound`, ``v_bound``, ``w_bound`` (m s^-1).
+    """
+    log("retrieving winds")
+    _warn_of_wide_beams(experiment, truth, plans, log)
+    settings, blur = experiment.retrieval, known_blur(experiment, plans[0])
+    pairs = _image_pairs(experiment, truth, plans, scans)
+    sources = []
+    for index, (source, (pair, noise)) in enumerate(pairs.items()):
+        log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
+        sizes = {name: getattr(settings, name) for name in ("template", "search", "stride")}
+        bound = wind_bound(*pair, experiment.platform.dt, noise, **sizes)
+        methods = []
+        for method in settings.methods:
+            wind = retrieve_wind(
+                *pair,
+                dt=experiment.platform.dt,
+                method=method,
+                **window_settings(settings),
+                noise=noise,
+                # the extinction itself has passed no instrument
+                blur=0.0 if source in EXACT else blur,
+            )
+            wind = wind.assign(
+                {name: (field.dims, field.data, field.attrs) for name, field in bound.items()}
+            )
+            true = truth_at_vectors(wind, truth.wind)
+            wind = wind.assign(v_true=true["v"], w_true=true["w"])
+            wind = wind.rename({METHODS[method].score[0]: "score"})
+            methods.append(wind.reset_coords(["y_vector", "z_vector"]))
+        sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
+    found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
+    found = found.assign_coords(source=list(pairs), algorithm=list(settings.methods))
+    found["score"].attrs = {
+        "long_name": "cc: correlation at the peak; ws: misfit of weight and centre of mass",
+        "units": "1",
+    }
+    found.attrs["title"] = f"Cross-flow wind of the experiment {experiment.name}"
+    found.attrs["source"] = f"lidar-mi {__version__}"
+    _warn_of_no_vectors(found, log)
+    return found
+
+
+def _image_pairs(experiment, truth, plans, scans) -> dict[str, tuple[list[xr.DataArray], Any]]:
+    """Both images and their noise by source: of the truth, then of the lidar."""
+    lidar = experiment.lidar
+    exact = {
+        Source.EXTINCTION: [truth.image(k) for k in (0, 1)],
+        Source.WITHOUT_TEXTURE: [truth.image(k, smooth=True) for k in (0, 1)],
+        Source.BLURRED: [blur_by_beam(truth.image(k), lidar, plans[k].centre) for k in (0, 1)],
+    }
+    rendered = rendered_pairs(experiment, scans)
+    if experiment.scan.aim == "angles":
+        grid = rendered[Source.BACKSCATTER][0][0]
+        exact = {
+            name: [image.interp(y=grid["y"], z=grid["z"]) for image in pair]
+            for name, pair in exact.items()
+        }
+    return {name: (pair, 0.0) for name, pair in exact.items()} | rendered
+
+
+def rendered_pairs(
+    experiment: Experiment, scans: Sequence[xr.Dataset]
+) -> dict[str, tuple[list[xr.DataArray], Any]]:
+    """Images that winds are retrieved from, on one grid, and their noise (a map or its level).
+
+    By source: the rendered backscatter, and with a detector the same with its noise.
+    """
+    noise = apparent_noise(scans[0])
+    pairs = {Source.BACKSCATTER: ([scan["Y"] for scan in scans], noise)}
+    if experiment.detector:
+        noisy = np.hypot(noise, scans[0]["Y_noise_std"])
+        pairs[Source.NOISY] = [scan["Y_noisy"] for scan in scans], noisy
+    if experiment.scan.aim == "angles":
+        # the noise has no structure to interpolate: its level goes along, the rms, as few pixels
+        # have most of it where photons are few
+        pairs = {
+            name: (resample_pair(*pair, experiment.wake.spacing), float((level**2).mean() ** 0.5))
+            for name, (pair, level) in pairs.items()
+        }
+    return pairs
+
+
+def apparent_noise(scan: xr.Dataset) -> xr.DataArray:
+    """Standard error of the apparent backscatter Y, same unit."""
+    first = scan.isel(gate=0)
+    lit = first["S0"] > 0
+    return (scan["Y"] * first["S0_stderr"] / first["S0"].where(lit)).fillna(0.0)
+
+
+def known_blur(experiment: Experiment, plan: ScanPlan) -> float:
+    """Standard deviation (m) of the blur that `retrieval.blur` tells methods of."""
+    blur = experiment.retrieval.blur
+    return float(experiment.lidar.radius_at(plan.centre)) / 2 if blur == "beam" else blur
+
+
+def window_settings(settings: Retrieval) -> dict[str, Any]:
+    """Window sizes and thresholds, as `retrieve_wind` takes them."""
+    return settings.model_dump(exclude={"methods", "error_budget", "blur"})
+
+
+def _warn_of_wide_beams(experiment, truth, plans, log) -> None:
+    width = 2 * float(experiment.lidar.radius_at(plans[0].centre))
+    y = truth.wind["y"].values
+    template = experiment.retrieval.template * float(y[1] - y[0])
+    if width > template:
+        log.remark(
+            f"beams are {width:.3g} m wide at {plans[0].centre:g} m, wider than a template of "
+            f"{template:g} m: structure that winds could be found from is blurred"
+        )
+
+
+def _warn_of_no_vectors(found: xr.Dataset, log) -> None:
+    """Sources of rendered images that gave no valid vector, and which flags say why."""
+    for source in (name for name in found["source"].values if name in RENDERED):
+        for method in found["algorithm"].values:
+            wind = found.sel(source=source, algorithm=method)
+            valid = (wind["flag"] == 0) & np.isfinite(wind["v"]) & np.isfinite(wind["w"])
+            if not valid.any():
+                why = commonest_flag(wind["flag"])
+                log.remark(f"{source}, {method}: no vector is valid; {why}")
