@@ -60,8 +60,8 @@ def aerosol(
     largest: Annotated[
         str | None,
         typer.Option(
-            help="Largest radius. Time and memory grow steeply with it for spheroids; beyond a size "
-            "parameter (circumference over wavelength) of about 24 they are refused."
+            help="Largest radius. Time and memory grow steeply with it for spheroids; beyond a "
+            "size parameter (circumference over wavelength) of about 24 they are refused."
         ),
     ] = None,
     number_density: Annotated[

@@ -21,8 +21,8 @@ def info(
     what: Annotated[
         str,
         typer.Argument(
-            help="EXR, NetCDF or scattering-table file (.txt), folder of a run or of variants, or a name: molecules, "
-            "spheroids, spheres, continental, sea_salt, dust, droplets, soot."
+            help="EXR, NetCDF or scattering-table file (.txt), folder of a run or of variants, or "
+            "a name: molecules, spheroids, spheres, continental, sea_salt, dust, droplets, soot."
         ),
     ],
     wavelength: Annotated[

@@ -1,6 +1,6 @@
 """Arguments and options that several commands take."""
 
-from typing import Annotated
+from typing import Annotated, overload
 
 import typer
 
@@ -25,6 +25,10 @@ Variant = Annotated[
 ]
 
 
+@overload
+def quantity(option: str, text: str, unit: str, example: str) -> float: ...
+@overload
+def quantity(option: str, text: str | None, unit: str, example: str) -> float | None: ...
 def quantity(option: str, text: str | None, unit: str, example: str) -> float | None:
     """An option's value in SI; None where it is not given."""
     from lidar_mi.units import to_si

@@ -1,7 +1,7 @@
 """``lidar-mi retrieve``: the cross-flow wind in images of the same air."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -55,11 +55,12 @@ def retrieve(
 
     images = [read_image(path, layer, spacing) for path in (first, second, *(more or []))]
     pair = on_one_grid(*images[:2])
+    level: Any = noise
     if noise is None:
-        noise = read_noise(first, layer, spacing)
-        if noise is not None and pair[0] is not images[0]:
-            # noise has no structure to interpolate: its level goes along
-            noise = float(noise.median())
+        level = read_noise(first, layer, spacing)
+        if level is not None and pair[0] is not images[0]:
+            # noise has no structure to interpolate: its median is taken
+            level = float(level.median())
     wind = retrieve_wind(
         *pair,
         dt=dt,
@@ -68,7 +69,7 @@ def retrieve(
         search=search,
         stride=stride,
         device=device,
-        noise=noise,
+        noise=level,
         more=images[2:],
     )
     write_netcdf(wind, out)

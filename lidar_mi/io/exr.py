@@ -13,6 +13,7 @@ camera's file has the layers ``S0`` ... ``S3``, ``S0_stderr`` and ``Y``, seen as
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -183,7 +184,7 @@ def read_scan(path: str | Path) -> xr.Dataset:
             f"{path}: header axes of {len(y)} x {len(z)} values do not fit the image of "
             f"{columns} x {rows} pixels"
         )
-    variables = {
+    variables: dict[str, Any] = {
         quantity: (
             ("gate", "z", "y"),
             np.stack([gates[g][quantity][::-1, ::-1] for g in sorted(gates)]),
@@ -200,12 +201,14 @@ def read_scan(path: str | Path) -> xr.Dataset:
 
 def _quantities(scan: xr.Dataset) -> list[str]:
     """What a scan holds of every gate."""
-    return [name for name, variable in scan.data_vars.items() if "gate" in variable.dims]
+    return [str(name) for name, variable in scan.data_vars.items() if "gate" in variable.dims]
 
 
 def _pictures(scan: xr.Dataset) -> list[str]:
     """What a scan holds once: Y, and Y_noisy with its standard deviation behind a detector."""
-    return [name for name, variable in scan.data_vars.items() if set(variable.dims) == {"z", "y"}]
+    return [
+        str(name) for name, variable in scan.data_vars.items() if set(variable.dims) == {"z", "y"}
+    ]
 
 
 def unpack(image: np.ndarray, names: list[str], gates: int) -> dict[str, tuple]:

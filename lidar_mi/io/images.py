@@ -13,7 +13,7 @@ FITS = (".fits", ".fit", ".fts")
 
 
 def read_picture(path: str | Path, layer: str | None = None) -> np.ndarray:
-    """Picture of an EXR, PNG, TIFF, BMP, JPEG or FITS file, float64, (height, width), top row first.
+    """Image of an EXR, PNG, TIFF, BMP, JPEG or FITS file, float64, (height, width), top row first.
 
     Colours are averaged, transparency is left out. Values are those of the file: 8 or 16 bit
     numbers, floats. A FITS image is taken as it is stored, first row first.
@@ -142,7 +142,8 @@ def read_noise(
         )
         noise = (scaled * stderr / signal.where(signal > 0)).fillna(0.0)
         if layer == "Y_noisy" and "Y_noise_std" in layers:
-            noise = np.hypot(noise, read_image(path, "Y_noise_std", spacing))
+            detector = read_image(path, "Y_noise_std", spacing)
+            noise = noise.copy(data=np.hypot(noise.values, detector.values))
         return noise
     known = f"{layer}_stderr"
     return read_image(path, known, spacing) if known in layers else None
@@ -210,9 +211,9 @@ def _image(path):
 
     try:
         with Image.open(path) as file:
-            if file.mode in ("P", "CMYK", "YCbCr", "HSV", "LAB"):
-                file = file.convert("RGB")
-            bands, picture = file.getbands(), np.asarray(file)
+            indirect = file.mode in ("P", "CMYK", "YCbCr", "HSV", "LAB")
+            image = file.convert("RGB") if indirect else file
+            bands, picture = image.getbands(), np.asarray(image)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: no readable image ({_short(error)})") from None
     if picture.ndim == 2:

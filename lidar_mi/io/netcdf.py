@@ -1,6 +1,7 @@
 """NetCDF files."""
 
 from pathlib import Path
+from typing import Any
 
 import xarray as xr
 
@@ -78,6 +79,7 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
     path = Path(path)
     if not path.parent.is_dir():
         raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
+    packed: dict[Any, dict[str, Any]]
     packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
     # CF 2.5.1: no missing values in coordinate variables
     packed |= {name: {"_FillValue": None} for name in data.coords if name in data.dims}

@@ -1,6 +1,7 @@
 """Figures as PNG files."""
 
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -17,5 +18,5 @@ def write_png(figure: Figure, path: str | Path, *, cropped: bool = False) -> Non
     cropped : bool
         Without the room around the panels, but for 0.1 inch: panels of equal scales leave much.
     """
-    room = {"bbox_inches": "tight", "pad_inches": 0.1} if cropped else {}
+    room: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.1} if cropped else {}
     write_atomically(path, lambda part: figure.savefig(part, dpi=110, format="png", **room))

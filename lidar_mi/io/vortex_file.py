@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -32,7 +32,12 @@ def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about:
     about
         What else the file says of itself, such as ``source``.
     """
-    data = {"format": FORMAT, **about, "frame": _FRAME, "parameters": list(PARAMETERS)}
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        **about,
+        "frame": _FRAME,
+        "parameters": list(PARAMETERS),
+    }
     data["fits"] = {name: _as_data(fit) for name, fit in fits.items()}
     write_json(path, data)
 
@@ -96,7 +101,7 @@ def _from_data(data: dict, where: str) -> VortexPairFit:
     try:
         parameters = np.array(data["parameters"], dtype=float)
         covariance = np.array(data["covariance"], dtype=float)
-        numbers = [math.nan if data[name] is None else float(data[name]) for name in _NUMBERS]
+        numbers = {n: math.nan if data[n] is None else float(data[n]) for n in _NUMBERS}
         profile, reasons = data["profile"], tuple(map(str, data["reasons"]))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
@@ -119,4 +124,4 @@ def _from_data(data: dict, where: str) -> VortexPairFit:
             raise InputError(
                 f"{where}.covariance: not symmetric and finite; expected that of a fit"
             )
-    return VortexPairFit(parameters, covariance, profile, *numbers, reasons)
+    return VortexPairFit(parameters, covariance, profile, **numbers, reasons=reasons)

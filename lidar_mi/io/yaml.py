@@ -9,7 +9,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.io.text import read_text
 
 
-class _Loader(yaml.SafeLoader):
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
     """PyYAML would take the last of two equal keys without a word."""
 
     def construct_mapping(self, node, deep=False):

@@ -177,7 +177,7 @@ class TestTools:
         means = [float(v) for v in re.search(r"Stats Avg: (.*?)\(float\)", text)[1].split()]
         scan = make_scan(gates=2, rows=5, columns=7)
         assert len(names) == len(means) == 11
-        for name, mean in zip(names, means):
+        for name, mean in zip(names, means, strict=True):
             gate, _, quantity = name.rpartition(".")
             values = scan[quantity] if not gate else scan[quantity][int(gate[4:])]
             assert mean == pytest.approx(float(values.mean()), abs=2e-6)

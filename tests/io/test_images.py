@@ -155,5 +155,5 @@ def test_webp_is_lossless(tmp_path):
     (tmp_path / "a.webp").write_bytes(as_webp(tmp_path / "a.png"))
     with Image.open(tmp_path / "a.webp") as image:
         np.testing.assert_array_equal(np.asarray(image), pixels)
-    with pytest.raises(InputError, match="no.png: no readable image"):
+    with pytest.raises(InputError, match=r"no.png: no readable image"):
         as_webp(tmp_path / "no.png")

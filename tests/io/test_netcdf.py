@@ -41,7 +41,7 @@ def test_damaged_files_give_one_line(tmp_path, cut):
 
 
 def test_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match="no.nc: cannot be read .No such file"):
+    with pytest.raises(InputError, match=r"no.nc: cannot be read .No such file"):
         open_netcdf(tmp_path / "no.nc")
 
 

@@ -1,5 +1,8 @@
-"""YAML and JSON files: unit tests. Detect a key taken twice, a value changed by writing and reading,
-and any broken file that does not give one clear line."""
+"""YAML and JSON files: unit tests.
+
+Detect a key taken twice, a value changed by writing and reading, and any broken file that does not
+give one clear line.
+"""
 
 import math
 
@@ -45,10 +48,10 @@ def test_bad_yaml_gives_one_line(text, message):
 @pytest.mark.parametrize("read", [read_yaml, read_json])
 def test_unreadable_files_are_named(tmp_path, read):
     path = tmp_path / "a"
-    with pytest.raises(InputError, match="a: No such file or directory; expected a table$"):
+    with pytest.raises(InputError, match=r"a: No such file or directory; expected a table$"):
         read(path, "a table")
     path.write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="a: not a text file; expected a table$"):
+    with pytest.raises(InputError, match=r"a: not a text file; expected a table$"):
         read(path, "a table")
 
 
@@ -60,5 +63,5 @@ def test_json(tmp_path):
         write_json(path, {"b": math.nan})
     assert read_json(path, "metrics") == {"b": 0.1, "a": None}
     path.write_text("{")
-    with pytest.raises(InputError, match="a.json: not JSON; expected metrics"):
+    with pytest.raises(InputError, match=r"a.json: not JSON; expected metrics"):
         read_json(path, "metrics")

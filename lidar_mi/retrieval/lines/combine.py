@@ -65,15 +65,16 @@ def combine(
         From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`: `v`, `w`, `v_stderr`, `w_stderr`,
         `vw_correlation`, `flag`. Vectors are taken at the nodes.
     scan : xr.Dataset, dim line
-        Line-of-sight velocities of the same air, as for `lidar_mi.retrieval.lines.vectors.wind_from_triples`, with
-        `range_bin`. A line of sight averages the wind over its bin, along its oblique way through
-        the (y, z) plane; the wind is taken to be the same along x. Lines that leave the grid, or
-        have no velocity, are not used.
+        Line-of-sight velocities of the same air, as for
+        `lidar_mi.retrieval.lines.vectors.wind_from_triples`, with `range_bin`. A line of sight
+        averages the wind over its bin, along its oblique way through the (y, z) plane; the wind is
+        taken to be the same along x. Lines that leave the grid, or have no velocity, are not used.
     crossflow_std : float, optional
         Standard error of v and w, m/s, in place of the data set's own (methods that give none).
     window : float, optional
-        Size of the windows, m, over which errors of v and w are correlated: by the fraction by which
-        two windows overlap. By default the data set's ``template`` in metres; 0: not correlated.
+        Size of the windows, m, over which errors of v and w are correlated: by the fraction by
+        which two windows overlap. By default the data set's ``template`` in metres; 0: not
+        correlated.
     u_std, u_length : float, optional
         Standard deviation of u about its mean, m/s, and its correlation length, m. Default:
         averaged over values of both, weighted by their posterior probability, from 0.05 to 10 m/s
@@ -83,8 +84,8 @@ def combine(
         u's standard deviation is proportional to this power of the local shear of v and w, with
         the rms ``u_std`` over the lines; 0: uniform. Default: averaged over 0, 0.5 and 1 likewise.
     u_exponent : float, optional
-        a of u's correlation, exp(-(|dy|^a + |dz|^a) / length^a), above 0 and up to 2: 1 is rough, as
-        turbulence is, 2 smooth. Default: averaged over 1 and 2 likewise.
+        a of u's correlation, exp(-(|dy|^a + |dz|^a) / length^a), above 0 and up to 2: 1 is rough,
+        as turbulence is, 2 smooth. Default: averaged over 1 and 2 likewise.
     distance : float, optional
         Of the images' plane x = const from the telescope, m: air that moves along x by dx relative
         to the gates shifts by -y / distance dx, -z / distance dx in the images, since beams are

@@ -69,7 +69,7 @@ def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridL
         for dz in (0, 1)
         for dy in (0, 1)
     ]
-    row, column, weight = (np.concatenate(p, axis=1)[used] for p in zip(*parts))
+    row, column, weight = (np.concatenate(p, axis=1)[used] for p in zip(*parts, strict=True))
     variance = scan["v_los_std"].values[used] ** 2
     middle = np.stack([scan["range"].values * direction[:, k] for k in (1, 2)], -1)
     direction = direction[used]
@@ -114,7 +114,7 @@ def covariance_of_lines(lines: GridLines, weight: np.ndarray, over_z, over_y) ->
 def covariance_with_nodes(
     rows: slice, lines: GridLines, weight: np.ndarray, over_z, over_y
 ) -> np.ndarray:
-    """Covariance of the sums of `covariance_of_lines` with the nodes of rows, (parts, z, y, lines)."""
+    """Covariance of the sums of `covariance_of_lines` with nodes of rows, (parts, z, y, lines)."""
     along_z = over_z[rows][:, lines.z].swapaxes(0, 1)
     along_y = over_y[:, lines.y].swapaxes(0, 1)
     return np.stack(

@@ -52,7 +52,7 @@ def relative_std(field, lines, z, y, spacing, power) -> dict[float, np.ndarray]:
     square, known = np.zeros(field.valid.shape), np.zeros(field.valid.shape)
     for axis, nodes in enumerate((z, y)):
         step = np.diff(nodes).mean()
-        both = np.stack([np.roll(field.valid, shift, axis) for shift in (1, -1)]).all(0)
+        both = np.roll(field.valid, 1, axis) & np.roll(field.valid, -1, axis)
         edge = np.arange(len(nodes))[[0, -1]]
         both[(slice(None),) * axis + (edge,)] = False
         change = np.roll(field.value, -1, axis) - np.roll(field.value, 1, axis)
@@ -101,7 +101,9 @@ def probable_statistics(
     choices, shapes, evidence = [], [], []
     for one_exponent, one_length in itertools.product(exponents, lengths):
         correlations = [correlation(axis, one_length, one_exponent) for axis in (z, y)]
-        for power, shape in zip(relative_stds, covariance_of_lines(lines, weight, *correlations)):
+        for power, shape in zip(
+            relative_stds, covariance_of_lines(lines, weight, *correlations), strict=True
+        ):
             for one_std in stds:
                 factor = cho_factor(fixed + one_std**2 * shape, lower=True)
                 square = float(residual @ cho_solve(factor, residual))
@@ -128,6 +130,6 @@ def probable_statistics(
             probability=times / _DRAWN,
             factor=cho_factor(fixed + choices[k].std ** 2 * shapes[k], lower=True),
         )
-        for k, times in zip(*np.unique(drawn, return_counts=True))
+        for k, times in zip(*np.unique(drawn, return_counts=True), strict=True)
     ]
     return found, choices[int(np.argmax(evidence))]

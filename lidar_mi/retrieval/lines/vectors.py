@@ -248,5 +248,5 @@ def flag_attributes(flags: type[enum.IntFlag]) -> dict:
         "long_name": "reasons to reject the vector, 0 = good",
         "standard_name": "quality_flag",
         "flag_masks": np.array([bit.value for bit in flags], dtype=np.uint8),
-        "flag_meanings": " ".join(bit.name.lower() for bit in flags),
+        "flag_meanings": " ".join(str(bit.name).lower() for bit in flags),
     }

@@ -1,10 +1,10 @@
 """The combined wind of both lidars.
 
-Detects an estimate or a covariance that differs from generalised least squares written out over
-all nodes (1e-7), information that does not add up (1e-7), errors that are not what the covariance
-says (reduced errors and coverage over many draws, 4 sigma), errors of the platform that have another
-effect than the geometry says, a field without uncertainty where
-nothing was measured, and input that has no answer.
+Detects an estimate or a covariance that differs from generalised least squares written out over all
+nodes (1e-7), information that does not add up (1e-7), errors that are not what the covariance says
+(reduced errors and coverage over many draws, 4 sigma), errors of the platform that have another
+effect than the geometry says, a field without uncertainty where nothing was measured, and input
+that has no answer.
 """
 
 import math
@@ -82,7 +82,7 @@ def written_out(flow, scan, u_std, length, window, exponent, mean_std=100.0):
         d = scan.direction.values[k]
         nodes, weights = np.polynomial.legendre.leggauss(5)
         hat = np.zeros(n)
-        for node, weight in zip(nodes, weights / 2):
+        for node, weight in zip(nodes, weights / 2, strict=True):
             y, z = (float(scan.range[k]) + float(scan.range_bin) / 2 * node) * d[1:]
             hat += weight * (np.clip(1 - abs(y - yy), 0, None) * np.clip(1 - abs(z - zz), 0, None))
         rows.append(np.concatenate([d[0] * hat, d[1] * hat, d[2] * hat]))
@@ -132,7 +132,7 @@ def test_generalised_least_squares_written_out(window, range_bin, exponent):
 
 
 def test_images_that_see_motion_along_x():
-    """Images of v - (u - c) y / D and w - (u - c) z / D, and lines: least squares over all nodes."""
+    """Images of v - (u - c) y / D and w - (u - c) z / D, and lines: least squares over nodes."""
     random = np.random.default_rng(5)
     shape, distance, gates = (len(Z), len(Y)), 10.0, 1.7
     flow = crossflow(random.normal(0, 3, shape), random.normal(0, 3, shape), 0.6, 0.3)
@@ -328,8 +328,11 @@ def uneven_scene(random, follows):
 
 @pytest.mark.parametrize("follows", [True, False])
 def test_u_may_vary_where_the_cross_flow_does(follows):
-    """Stated variances of u over those of its errors, half by half: 1 to 4 sigma of the scatter of 12
-    draws, and to 30 %, as 63 lines say it. An even prior would state a third where u varies most."""
+    """Stated variances of u over those of its errors, half by half: 1.
+
+    To 4 sigma of the scatter of 12 draws, and to 30 %, as 63 lines determine it. An even prior
+    would state a third where u varies most.
+    """
     random, quiet, wild = np.random.default_rng(21), [], []
     for _ in range(12):
         wind, flow, scan = uneven_scene(random, follows)
@@ -416,8 +419,10 @@ def still_air(errors, seed, std=0.02):
 
 
 def test_an_error_of_the_attitude_is_not_in_the_stated_errors():
-    """Yaw by e tilts u by e (V - u) / D along y, to 1 %: lines cannot tell it from wind. What is stated
-    stays far below."""
+    """Yaw by e tilts u by e (V - u) / D along y, to 1 %: lines do not distinguish it from wind.
+
+    The stated errors are far smaller.
+    """
     flow, scan = still_air({"yaw": "5 mrad"}, 1)
     found = combine(flow, scan)
     inside = found.flag == 0
@@ -429,8 +434,11 @@ def test_an_error_of_the_attitude_is_not_in_the_stated_errors():
 
 
 def test_jitter_of_the_lines_is_taken_for_a_scatter_of_u():
-    """5 mrad rms of every line's own, 0.05 m/s of velocity, unknown to its stated 0.02 m/s: the scatter
-    is found, and is in the stated errors, which are above the true ones then (3 draws)."""
+    """5 mrad rms of every line, 0.05 m/s of velocity, not contained in its stated 0.02 m/s.
+
+    The scatter is retrieved and contained in the stated errors, which are then above the true ones
+    (3 draws).
+    """
     square, stated = [], []
     for seed in range(3):
         found = combine(*still_air({"jitter": "5 mrad"}, seed))
@@ -498,7 +506,7 @@ def test_methods_that_know_no_errors():
     bare = flow.assign(
         {n: np.nan * flow.v for n in ("v_stderr", "w_stderr", "vw_correlation")}
     ).assign_attrs(method="cc")
-    with pytest.raises(InputError, match="crossflow.v_stderr: not known by method 'cc'; give"):
+    with pytest.raises(InputError, match=r"crossflow.v_stderr: not known by method 'cc'; give"):
         combine(bare, scan)
     found = combine(bare, scan, crossflow_std=0.7)
     assert float(found.v_stderr.mean()) == pytest.approx(0.7, rel=0.02)

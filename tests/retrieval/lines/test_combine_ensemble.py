@@ -1,13 +1,13 @@
 """Whether the stated errors of u hold over many flows, ranges and draws of noise.
 
-Vectors of one slab share 63 lines of sight: coverage of one run is that of few independent errors. Here
-it is averaged over an ensemble: slabs of the simulated wake, turbulence of several scales, smooth
-fields, jets in vortex cores, a turbine's wake; 76, 150 and 500 m ahead with the line noise of
-each. v and w are the truth plus errors of the covariance that is stated.
+Vectors of one slab share 63 lines of sight: coverage of one run is that of few independent errors.
+Here it is averaged over an ensemble: slabs of the simulated wake, turbulence of several scales,
+smooth fields, jets in vortex cores, a turbine's wake; 76, 150 and 500 m ahead with the line noise
+of each. v and w are the truth plus errors of the covariance that is stated.
 
 Detects standard errors that do not hold over a class of flows: shares within 1 and 1.96 of them off
-by more than 5 points of 68 and 95 % plus 2 standard errors of the mean over draws. What lines cannot
-tell is said below, class by class.
+by more than 5 points of 68 and 95 % plus 2 standard errors of the mean over draws. What lines
+cannot tell is said below, class by class.
 """
 
 import functools
@@ -79,7 +79,7 @@ def turbulence(outer_scale):
     def flow(random):
         rms, around = speeds(random), velocity(pair(random), GRID_Y, GRID_Z)
         u, *across = (gusts(random, outer_scale, rms) for _ in "uvw")
-        return [u + random.normal(0, 5), *(a + b for a, b in zip(across, around))]
+        return [u + random.normal(0, 5), *(a + b for a, b in zip(across, around, strict=True))]
 
     return flow
 
@@ -151,15 +151,15 @@ FLOWS = {
     "even": even,
 }
 # Flows whose errors are stated too large: of lines 7 to 11 m apart none can tell that u has nothing
-# finer than that, errors near zero but for a few large ones have no normal distribution, and that an
-# even wind is even is known to the lines' noise alone.
+# finer than that, errors near zero but for a few large ones have no normal distribution, and that
+# an even wind is even is known to the lines' noise alone.
 TOO_LARGE = {"smooth 5 m", "jets", "even"}
 
 
 def measured(winds, distance, random):
     azimuth, elevation, std = SCANS[distance]
     wind = xr.Dataset(
-        {n: (("z", "y"), f) for n, f in zip("uvw", winds)},
+        {n: (("z", "y"), f) for n, f in zip("uvw", winds, strict=True)},
         coords={"y": ("y", Y, METRES), "z": ("z", Z, METRES)},
     )
     lidar = DopplerLidar(range=f"{distance} m")

@@ -2,8 +2,8 @@
 
 Detects a wrong sign, a wind that is not exact where it is uniform (1e-9), covariances that differ
 from the closed form for a cone (1e-9) or from another solver (1e-9), errors that are not what the
-covariance says (variance of reduced errors and coverage within 4 sigma of 20 000 draws), an error of
-pointing with another effect than geometry gives it (exact), and input that has no answer.
+covariance says (variance of reduced errors and coverage within 4 sigma of 20 000 draws), an error
+of pointing with another effect than geometry gives it (exact), and input that has no answer.
 """
 
 import math
@@ -31,7 +31,7 @@ DRAWS = 20_000
 def scanned(std=0.5, seed=1, speed=150.0, errors=None, noisy=True, **scan):
     y, z = np.linspace(-60, 60, 5), np.linspace(-45, 45, 5)
     wind = xr.Dataset(
-        {n: (("z", "y"), np.full((5, 5), value)) for n, value in zip("uvw", TRUE)},
+        {n: (("z", "y"), np.full((5, 5), value)) for n, value in zip("uvw", TRUE, strict=True)},
         coords={"y": y, "z": z},
     )
     found = scan_wind(wind, DopplerScan(**scan), LIDAR, std, seed, speed, errors)
