@@ -5,6 +5,7 @@ or colour that is taken for another or read by two rules, a wrong spacing, and f
 traceback.
 """
 
+import re
 import sys
 
 import numpy as np
@@ -116,7 +117,7 @@ def test_a_colour_picture_is_the_same_to_both_commands(tmp_path, monkeypatch):
         given.append(np.asarray(image))
         raise InputError("that was it")
 
-    monkeypatch.setattr(rings, "analyse", stop)
+    monkeypatch.setattr(rings, "analyse_rings", stop)
     monkeypatch.setattr(wind, "retrieve_wind", stop)
     for command in (
         ["rings", "colours.png"],
@@ -143,7 +144,10 @@ def test_the_command(tmp_path, values, monkeypatch, capsys):
         return stop.value.code or 0, *capsys.readouterr()
 
     code, out, _ = call("rings", "rings.png")
-    assert code == 0 and "160.3" in out and "0.40" in out
+    centre, fraction = (re.search(rf"{row}[^\d]*([\d.]+) ±", out) for row in ("x, y", "order at"))
+    assert code == 0 and centre and fraction, out
+    assert float(centre[1]) == pytest.approx(160.3, abs=0.01)
+    assert float(fraction[1]) == pytest.approx(0.4, abs=0.001)
     assert np.asarray(Image.open("rings_rings.png")).std() > 10
     code, _, err = call("rings", "even.png")
     assert code == 2 and err.startswith("lidar-mi: even.png: ") and err.count("\n") == 1
