@@ -1,5 +1,7 @@
 """What every retrieval asks of its images: one uniform grid in metres, real numbers."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 import xarray as xr
@@ -9,22 +11,26 @@ from lidar_mi.errors import InputError
 _METRES = ("m", "metre", "metres", "meter", "meters")
 
 
-def checked_pair(
-    image1: xr.DataArray, image2: xr.DataArray, noise: float | xr.DataArray | None = None
-) -> tuple[xr.DataArray, xr.DataArray, float | xr.DataArray | None]:
-    """Both images, and the noise if it is an image, as (z, y) on one uniform grid.
+def checked_stack(
+    stack: Sequence[xr.DataArray],
+    noise: float | xr.DataArray | None = None,
+    axes: Sequence[str] = ("z", "y"),
+    name: str = "image",
+) -> tuple[list[xr.DataArray], float | xr.DataArray | None]:
+    """All images, and the noise if it is an image, with these dims on one uniform grid.
 
     Raises
     ------
     InputError
         Naming image and axis: not an image, other dims, units, spacing, size or places.
     """
-    image1, image2 = checked_image("image1", image1), checked_image("image2", image2)
-    same_grid(image1, image2)
+    stack = [checked_image(f"{name}{n}", image, axes) for n, image in enumerate(stack, 1)]
+    others = {f"{name}{n}": image for n, image in enumerate(stack[1:], 2)}
     if isinstance(noise, xr.DataArray):
-        noise = checked_image("noise", noise)
-        same_grid(image1, noise, "noise")
-    return image1, image2, noise
+        noise = others["noise"] = checked_image("noise", noise, axes)
+    for other, image in others.items():
+        same_grid(stack[0], image, other, f"{name}1")
+    return stack, noise
 
 
 def on_device(image: xr.DataArray, device: str | torch.device) -> torch.Tensor:
@@ -48,15 +54,15 @@ def positive(name: str, value: float) -> float:
     return number
 
 
-def checked_image(name: str, image: xr.DataArray) -> xr.DataArray:
-    """The image as (z, y), its grid known to be in metres, ascending and uniform."""
+def checked_image(name: str, image: xr.DataArray, axes: Sequence[str] = ("z", "y")) -> xr.DataArray:
+    """The image with these dims in this order, its grid in metres, ascending and uniform."""
     if not isinstance(image, xr.DataArray):
         raise InputError(f"{name}: {type(image).__name__} is not an xarray.DataArray")
-    if set(image.dims) != {"z", "y"} or image.ndim != 2:
-        raise InputError(f"{name}: dims {tuple(image.dims)} are not ('z', 'y')")
+    if set(image.dims) != set(axes) or image.ndim != len(axes):
+        raise InputError(f"{name}: dims {tuple(image.dims)} are not {tuple(axes)}")
     if image.dtype.kind not in "fiu":
         raise InputError(f"{name}: values of type {image.dtype} are not real numbers")
-    for axis in ("z", "y"):
+    for axis in axes:
         if axis not in image.coords:
             raise InputError(f"{name}.{axis}: coordinate missing; give it in m")
         coordinate = image[axis]
@@ -71,18 +77,22 @@ def checked_image(name: str, image: xr.DataArray) -> xr.DataArray:
                 f"{name}.{axis}: spacing from {steps.min():g} to {steps.max():g} m is not "
                 "uniform (to 0.1 %)"
             )
-    return image.transpose("z", "y")
+    return image.transpose(*axes)
 
 
-def same_grid(image1: xr.DataArray, image2: xr.DataArray, name: str = "image2") -> None:
+def same_grid(
+    image1: xr.DataArray, image2: xr.DataArray, name: str = "image2", first: str = "image1"
+) -> None:
     """Raise unless the two lie on the same pixels."""
     if image1.shape != image2.shape:
-        sizes = " and ".join(f"{z} x {y}" for z, y in (image1.shape, image2.shape))
-        raise InputError(f"{name}: sizes {sizes} px (z x y) differ; both must have one grid")
-    for axis in ("z", "y"):
-        first, second = (image[axis].values.astype(float) for image in (image1, image2))
-        off = np.abs(first - second).max()
-        if off > 1e-3 * np.diff(first).mean():
+        sizes = " and ".join(" x ".join(map(str, shape)) for shape in (image1.shape, image2.shape))
+        unit = "px" if image1.ndim == 2 else "voxels"
+        axes = " x ".join(map(str, image1.dims))
+        raise InputError(f"{name}: sizes {sizes} {unit} ({axes}) differ; both must have one grid")
+    for axis in image1.dims:
+        one, other = (image[axis].values.astype(float) for image in (image1, image2))
+        off = np.abs(one - other).max()
+        if off > 1e-3 * np.diff(one).mean():
             raise InputError(
-                f"{name}.{axis}: up to {off:g} m off image1's; resample both onto one grid"
+                f"{name}.{axis}: up to {off:g} m off {first}'s; resample both onto one grid"
             )

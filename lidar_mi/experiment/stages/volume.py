@@ -23,7 +23,7 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.signal import apparent_backscatter
 from lidar_mi.retrieval.velocimetry.common_grid import resample
 from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
-from lidar_mi.retrieval.velocimetry.volume_windows import VolumeWindows
+from lidar_mi.retrieval.velocimetry.windows import Windows
 
 PASSED = 0.76
 """Fraction of the variance of white noise that bicubic splines pass, mean over all places."""
@@ -58,7 +58,7 @@ def check_volume(experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan]
         raise InputError("wake.file: no wind along x (u) in it; expected u, v and w for volume")
     _check_gates(experiment, flows[0])
     settings, shape = experiment.volume, tuple(map(len, grid(experiment, plans)))
-    VolumeWindows(shape, settings.template, settings.search, settings.stride)
+    Windows(shape, settings.template, settings.search, settings.stride)
 
 
 def _check_gates(experiment: Experiment, flow: xr.Dataset) -> None:

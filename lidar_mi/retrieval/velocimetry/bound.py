@@ -3,7 +3,8 @@
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.velocimetry.warping import band_limited, levelled, rms
+from lidar_mi.retrieval.velocimetry.brightness import normalised, rms
+from lidar_mi.retrieval.velocimetry.warping import band_limited
 from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, working
 
 
@@ -57,7 +58,7 @@ def displacement_bound(
             f"{image1.shape[0]} x {image1.shape[1]} (z x y) px"
         )
     level = noise if noise is None else rms(noise)
-    spline, level = band_limited(levelled([image1, image2]), level)
+    spline, level = band_limited(normalised([image1, image2]), level)
     places = [
         torch.arange(n, dtype=spline.coefficients.dtype, device=image1.device) for n in image1.shape
     ]

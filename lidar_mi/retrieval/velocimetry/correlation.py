@@ -74,16 +74,14 @@ def cross_correlation(
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)
     chosen = _choose(algorithm, windows)
-    bad = non_finite(image1, image2, windows)
+    bad = non_finite([image1, image2], windows)
     floors = [_rounding(image) for image in (image1, image2)]
     image1, image2 = working(filled(image1)), working(filled(image2))
     found = Displacement.empty(windows, image1)
     for tile in windows.tiles(_bytes_per_window(windows, chosen)):
         coefficient = _correlate(image1[tile.pixels], image2[tile.pixels], windows, chosen, floors)
-        for whole, part in zip(found[:4], _peak(coefficient, windows, min_correlation)):
-            whole[tile.vectors] = part
-    for displacement in (found.dz, found.dy):
-        displacement[bad] = torch.nan
+        found.fill(_peak(coefficient, windows, min_correlation), tile.vectors)
+    found.d[:, bad] = torch.nan
     found.flag[bad] |= Flag.NON_FINITE_INPUT.value
     return found
 
@@ -241,17 +239,14 @@ def _peak(coefficient: torch.Tensor, windows: Windows, min_correlation: float) -
     inside = matched & ~rim
     centre = torch.where(inside, index, shifts + 1)  # any inner place, where neighbours exist
     offsets, fitted = zip(*(_gaussian_fit(flat, centre, step) for step in (shifts, 1)))
-    dz, dy = (
-        torch.where(inside, shift + offset, torch.nan)
-        for shift, offset in zip((shift_z, shift_y), offsets)
-    )
+    d = torch.stack([shift_z, shift_y]) + torch.stack(offsets)
     flag = (
         Flag.PEAK_ON_RIM * (matched & rim)
         + Flag.LOW_CORRELATION * (matched & (best < min_correlation))
         + Flag.NO_SUBPIXEL_FIT * (inside & ~(fitted[0] & fitted[1]))
         + Flag.NO_MATCH * ~matched
     )
-    return Displacement(dz, dy, best, flag.to(torch.uint8))
+    return Displacement(torch.where(inside, d, torch.nan), best, flag.to(torch.uint8))
 
 
 def _gaussian_fit(

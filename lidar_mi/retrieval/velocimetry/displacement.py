@@ -1,4 +1,4 @@
-"""What a method finds: one displacement per window, in pixels."""
+"""What a method retrieves: one displacement per window, in pixels."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -15,30 +15,47 @@ class Displacement(NamedTuple):
 
     Attributes
     ----------
-    dz, dy : torch.Tensor
-        Pixels, positive toward higher indices; NaN where no displacement was found.
+    d : torch.Tensor, shape (components, *windows.count)
+        Pixels along the axes, (z, y) of images and (x, z, y) of volumes, positive toward higher
+        indices; NaN where no displacement was found.
     score : torch.Tensor
         How well the windows match: correlation or mismatch, as the method says.
     flag : torch.Tensor of uint8
         `quality.Flag` bits.
-    covariance : torch.Tensor of shape (3, *windows.count), optional
-        Variances of dz and of dy and their covariance, px^2, of methods that tell.
+    covariance : torch.Tensor, shape (components, components, *windows.count), optional
+        Of the components' errors, px^2, from methods that know it.
     quantities : mapping, optional
         Numbers with standard errors that describe the whole, by name (`quantity.Quantity`).
     attributes : mapping, optional
         What else a method says about its result.
     """
 
-    dz: torch.Tensor
-    dy: torch.Tensor
+    d: torch.Tensor
     score: torch.Tensor
     flag: torch.Tensor
     covariance: torch.Tensor | None = None
     quantities: Mapping[str, Quantity] = MappingProxyType({})
     attributes: Mapping[str, str] = MappingProxyType({})
 
+    @property
+    def dz(self) -> torch.Tensor:
+        """Displacement along z."""
+        return self.d[-2]
+
+    @property
+    def dy(self) -> torch.Tensor:
+        """Displacement along y."""
+        return self.d[-1]
+
     @classmethod
     def empty(cls, windows: Windows, like: torch.Tensor) -> "Displacement":
         """Room for the result, to be filled tile by tile."""
-        values = [like.new_empty(windows.count) for _ in range(3)]
-        return cls(*values, like.new_empty(windows.count, dtype=torch.uint8))
+        flag = like.new_empty(windows.count, dtype=torch.uint8)
+        return cls(
+            like.new_empty(windows.dims, *windows.count), like.new_empty(windows.count), flag
+        )
+
+    def fill(self, part: "Displacement", vectors: tuple[slice, ...]) -> None:
+        """Put the displacements, scores and flags of some windows in their place."""
+        self.d[:, *vectors] = part.d
+        self.score[vectors], self.flag[vectors] = part.score, part.flag

@@ -1,14 +1,15 @@
-"""What a displacement vector is worth: flags, the texture of its window, the median test."""
+"""The quality of a displacement vector: flags, the texture of its window, its uncertainty."""
 
 import enum
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from kornia.filters import spatial_gradient
 from scipy.special import chdtri
+from torch.nn.functional import max_pool2d, max_pool3d
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.velocimetry import windows as geometry
 from lidar_mi.retrieval.velocimetry.windows import Windows, working
 
 
@@ -164,10 +165,16 @@ def low_texture(
 def uncertain(covariance: torch.Tensor, limit: float = 0.5) -> torch.Tensor:
     """Where a displacement's standard error is beyond `limit` px in its worst direction.
 
-    `covariance` (3, ...) holds the variances of dz and dy and their covariance, px^2.
+    `covariance` (components, components, ...) in px^2; also where it is not known (NaN).
     """
-    zz, yy, zy = covariance
-    return (zz + yy) / 2 + torch.hypot((zz - yy) / 2, zy) > limit**2
+    return worst_variance(covariance.nan_to_num(torch.inf, torch.inf)) > limit**2
+
+
+def worst_variance(covariance: torch.Tensor) -> torch.Tensor:
+    """Variance in the direction where it is largest, of matrices (components, components, ...)."""
+    known = covariance.isfinite().all(0).all(0)
+    matrices = torch.where(known, covariance, 0.0).movedim((0, 1), (-2, -1))
+    return torch.where(known, torch.linalg.eigvalsh(matrices)[..., -1], torch.inf)
 
 
 def misfit_variance(misfit: torch.Tensor, number: int) -> float:
@@ -179,10 +186,19 @@ def misfit_variance(misfit: torch.Tensor, number: int) -> float:
     return float(misfit.median()) / chdtri(number - 1, 0.5) if misfit.numel() else 0.0
 
 
-def non_finite(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """Windows with a NaN or an infinity anywhere in the search region of either image."""
-    bad = working(~(torch.isfinite(image1) & torch.isfinite(image2)))
-    return windows.of_regions(bad) > 0
+def non_finite(images: Sequence[torch.Tensor], windows: Windows) -> torch.Tensor:
+    """Windows with a NaN or an infinity in some image: in the search region, of volumes the template."""
+    bad = torch.stack([~torch.isfinite(image) for image in images]).any(0)
+    return windows.of_regions(working(bad)) > 0
+
+
+def usable(images: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Pixels (images, ...) that are three or more away from a non-finite one."""
+    bad = torch.stack([~torch.isfinite(image) for image in images])
+    if not bool(bad.any()):
+        return ~bad
+    pool = max_pool2d if bad.ndim == 3 else max_pool3d
+    return pool(bad.float()[:, None], 7, stride=1, padding=3)[:, 0] == 0
 
 
 def filled(image: torch.Tensor) -> torch.Tensor:
@@ -194,103 +210,3 @@ def filled(image: torch.Tensor) -> torch.Tensor:
     if bool(finite.all()):
         return image
     return torch.where(finite, image, image[finite].mean() if bool(finite.any()) else 0.0)
-
-
-def median_outliers(
-    dz: torch.Tensor,
-    dy: torch.Tensor,
-    size: int = 3,
-    spacing: int = 1,
-    threshold: float = 2.0,
-    epsilon: float = 0.1,
-) -> torch.Tensor:
-    """Normalised median test of Westerweel & Scarano (2005, Exp. Fluids 39, 1096-1100).
-
-    A vector's difference to the median of its neighbours, over the median of the neighbours' own
-    differences plus `epsilon`; both components together must not exceed `threshold`.
-
-    Parameters
-    ----------
-    dz, dy : torch.Tensor, shape (rows, columns)
-        Displacements in pixels; NaN where there is none.
-    size : int
-        Neighbourhood of size x size vectors, 3 or 5.
-    spacing : int
-        Vectors from one neighbour to the next. Vectors whose windows nearly coincide share their
-        errors and cannot judge each other: the test expects windows to overlap by half or less.
-    threshold : float
-        2 in the paper.
-    epsilon : float
-        Expected noise of a displacement, px.
-
-    Returns
-    -------
-    torch.Tensor of bool
-        False also where the vector or all but two of its neighbours are missing.
-
-    Raises
-    ------
-    InputError
-        size not 3 or 5; spacing below 1; threshold or epsilon not positive.
-    """
-    if size not in (3, 5):
-        raise InputError(f"median_size: {size!r} is not 3 or 5")
-    if spacing < 1:
-        raise InputError(f"spacing: {spacing!r} is not an integer >= 1")
-    for name, value in (("median_threshold", threshold), ("median_epsilon", epsilon)):
-        if not value > 0:
-            raise InputError(f"{name}: {value!r} is not > 0")
-    rim = size // 2 * spacing
-    padded = [torch.nn.functional.pad(d, (rim,) * 4, value=torch.nan) for d in (dz, dy)]
-    rows = max(1, geometry.TILE_BYTES // (8 * 5 * size**2 * dz.shape[1]))
-    bands = []
-    for top in range(0, dz.shape[0], rows):
-        part = slice(top, top + rows)
-        wider = slice(top, top + rows + 2 * rim)
-        residuals = [
-            _normalised_residual(d[part], _neighbours(p[wider], rim, spacing), epsilon)
-            for d, p in zip((dz, dy), padded)
-        ]
-        bands.append(torch.hypot(*residuals) > threshold)
-    return torch.cat(bands)
-
-
-def neighbour_median(values: torch.Tensor) -> torch.Tensor:
-    """Median of the eight neighbours of each value of a field, NaN where all are missing."""
-    padded = torch.nn.functional.pad(values, (1,) * 4, value=torch.nan)
-    return _median(_neighbours(padded, 1, 1))
-
-
-def _normalised_residual(
-    values: torch.Tensor, around: torch.Tensor, epsilon: float
-) -> torch.Tensor:
-    """|u - median| / (median of |neighbour - median| + epsilon); 0 with two neighbours or less."""
-    middle = _median(around)
-    spread = _median((around - middle).abs())
-    enough = (~torch.isnan(around)).sum(0) > 2
-    return torch.where(enough, (values - middle).abs() / (spread + epsilon), 0.0)
-
-
-def _neighbours(padded: torch.Tensor, rim: int, spacing: int) -> torch.Tensor:
-    """All neighbours of each value inside a margin of `rim`, shape (neighbours, rows, columns)."""
-    rows, columns = (size - 2 * rim for size in padded.shape)
-    steps = range(0, 2 * rim + 1, spacing)
-    return torch.stack(
-        [
-            padded[i : i + rows, j : j + columns]
-            for i in steps
-            for j in steps
-            if (i, j) != (rim, rim)
-        ]
-    )
-
-
-def _median(values: torch.Tensor) -> torch.Tensor:
-    """Median over the first axis without NaN; the mean of the middle two of an even number.
-
-    (torch.nanmedian takes the lower of the two, which biases a test with 8 neighbours.)
-    """
-    ranked = values.sort(dim=0).values  # NaN last
-    number = (~torch.isnan(values)).sum(0, keepdim=True)
-    middle = torch.cat([(number - 1).clamp(min=0) // 2, number // 2])
-    return ranked.gather(0, middle.clamp(max=len(values) - 1)).mean(0)

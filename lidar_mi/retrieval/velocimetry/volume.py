@@ -2,33 +2,27 @@
 
 from collections.abc import Callable, Mapping, Sequence
 
-import numpy as np
 import torch
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.checks import on_device, positive
-from lidar_mi.retrieval.velocimetry.quality import Flag, check_between
-from lidar_mi.retrieval.velocimetry.volume_correlation import correlated
-from lidar_mi.retrieval.velocimetry.volume_field import Volumes, prepared
-from lidar_mi.retrieval.velocimetry.volume_variational import fitted_flow
-from lidar_mi.retrieval.velocimetry.volume_windows import AXES, VolumeDisplacement, VolumeWindows
+from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
+from lidar_mi.retrieval.velocimetry.displacement import Displacement
+from lidar_mi.retrieval.velocimetry.multipass import multipass
+from lidar_mi.retrieval.velocimetry.outliers import median_outliers
+from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, uncertain
+from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
+from lidar_mi.retrieval.velocimetry.variational import variational
+from lidar_mi.retrieval.velocimetry.windows import Windows, working
 
-COMPONENTS = {"x": "u", "z": "w", "y": "v"}
-"""Wind along each axis."""
+AXES = ("x", "z", "y")
 
-_STANDARD_NAMES = {"u": "x_wind", "v": "y_wind", "w": "upward_air_velocity"}
-
-
-def _correlation(images: Volumes, windows, spacing, min_correlation) -> VolumeDisplacement:
-    return correlated(images, windows, min_correlation)
-
-
-METHODS: Mapping[str, Callable[..., VolumeDisplacement]] = {
-    "correlation": _correlation,
-    "variational": fitted_flow,
+METHODS: Mapping[str, Callable[..., Displacement]] = {
+    "correlation": multipass,
+    "variational": variational,
 }
-"""(volumes, windows, spacing, min_correlation) -> VolumeDisplacement, by name."""
+"""Methods by name."""
 
 
 def retrieve_wind_volume(
@@ -44,6 +38,7 @@ def retrieve_wind_volume(
     more: Sequence[xr.DataArray] = (),
     min_correlation: float = 0.5,
     noise: float | xr.DataArray | None = None,
+    settings: MultipassSettings | VariationalSettings | None = None,
 ) -> xr.Dataset:
     """Wind in three dimensions from two volumes of the same air, dt apart.
 
@@ -56,7 +51,8 @@ def retrieve_wind_volume(
     dt : float
         Time from volume to volume, s.
     method : {"correlation", "variational"}
-        Correlation of deformed windows, or a smooth flow fitted to the volumes as a whole.
+        Correlation of deformed windows (`multipass.multipass`), or a smooth flow fitted to the
+        volumes as a whole (`variational.variational`).
     template, search, stride : int
         Voxels: windows of template^3 (>= 4), displacements up to (search - template) / 2 in each
         direction, a vector every `stride`.
@@ -65,18 +61,21 @@ def retrieve_wind_volume(
     more : sequence of xr.DataArray
         Further volumes, each dt after the one before ("variational" only).
     min_correlation : float
-        Flag vectors whose volumes, carried to mid-time, correlate less over a window (variational:
+        Flag vectors whose volumes, warped to mid-time, correlate less over a window (variational:
         by less than half way from this to 1).
     noise : float or xr.DataArray, optional
         Standard deviation of a voxel's noise in volume 1, in its unit. Left out: from the spectra.
+    settings : MultipassSettings or VariationalSettings, optional
+        Of "correlation" or "variational", see `settings`. Left out: the defaults of volumes.
 
     Returns
     -------
     xr.Dataset, dims (x, z, y)
         At the windows' centres at mid-time: `u`, `v`, `w` and `u_stderr`, `v_stderr`, `w_stderr`
-        (m s-1), `correlation`, `flag` (bits of `quality.Flag`, 0 = good; low texture means a
-        standard error beyond half a voxel). Rejected vectors keep their value, or NaN where there
-        is none.
+        (m s-1), `uv_correlation`, `uw_correlation`, `vw_correlation` of their errors,
+        `correlation`, `flag` (bits of `quality.Flag`, 0 = good; low texture means a standard error
+        beyond half a voxel in some direction). Rejected vectors keep their value, or NaN where
+        there is none.
 
     Raises
     ------
@@ -105,18 +104,28 @@ def retrieve_wind_volume(
         raise InputError(f"more: {len(more)} volumes are not allowed with {method}; expected none")
     dt = positive("dt", dt)
     check_between("min_correlation", min_correlation, -1, 1)
-    stack = [_checked(f"volume{n}", v) for n, v in enumerate((volume1, volume2, *more), 1)]
-    for number, other in enumerate(stack[1:], 2):
-        _same_grid(stack[0], other, f"volume{number}")
+    stack, noise = checked_stack([volume1, volume2, *more], noise, AXES, "volume")
+    windows = Windows(tuple(stack[0].shape), template, search, stride)
+    volumes = [on_device(volume, device) for volume in stack]
     if isinstance(noise, xr.DataArray):
-        noise = _checked("noise", noise)
-        _same_grid(stack[0], noise, "noise")
         noise = on_device(noise, device)
-    windows = VolumeWindows(tuple(stack[0].shape), template, search, stride)
-    images = prepared([on_device(volume, device) for volume in stack], noise)
-    spacing = tuple(_spacing(stack[0], axis) for axis in AXES)
-    found = METHODS[method](images, windows, spacing, min_correlation)
-    settings = {
+    volumes, noise = without_attenuation(volumes, noise)
+    steps = spacing(stack[0])
+    options = {"min_correlation": min_correlation, "noise": noise, "settings": settings}
+    if method == "variational":
+        options |= {"more": volumes[2:], "spacing": steps}
+    found = METHODS[method](*volumes[:2], template, search, stride, **options)
+    flag = found.flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.uint8)
+    if method == "correlation":
+        apart = max(1, round(template / 2 / stride))
+        outlier = median_outliers(found.d, spacing=apart, continued=True)
+        flag = flag | (Flag.MEDIAN_OUTLIER * outlier).to(torch.uint8)
+    found = found._replace(flag=flag)
+    variables = winds(found, AXES, steps, dt)
+    long_name = "correlation of the volumes warped to mid-time"
+    variables["correlation"] = field(AXES, found.score, long_name, "1")
+    variables["flag"] = flags(found, AXES)
+    attributes = {
         "method": method,
         "template": template,
         "search": search,
@@ -124,101 +133,53 @@ def retrieve_wind_volume(
         "dt": dt,
         "min_correlation": min_correlation,
     }
-    return _dataset(stack[0], windows, found, spacing, settings)
+    coords = centres(stack[0], windows, "window")
+    return dataset(variables, coords, "Wind from two volumes", attributes, found)
 
 
-def _dataset(volume, windows, found: VolumeDisplacement, spacing, settings) -> xr.Dataset:
-    dt, variables = settings["dt"], {}
-    for number, axis in enumerate(AXES):
-        name, scale = COMPONENTS[axis], spacing[number] / dt
-        standard = _STANDARD_NAMES[name]
-        variables[name] = _field(
-            found.d[number] * scale, f"wind along {axis}", "m s-1", standard_name=standard
+def without_attenuation(
+    volumes: Sequence[torch.Tensor], noise: float | torch.Tensor | None = None
+) -> tuple[list[torch.Tensor], torch.Tensor | None]:
+    """Volumes over their own brightness c exp(a x) less 1, and the noise of the first alike.
+
+    The brightness is fitted to the means of the gates: so attenuation on the way through the
+    volume is no motion. Non-finite voxels stay so.
+
+    Parameters
+    ----------
+    volumes : sequence of torch.Tensor, shape (x, z, y)
+    noise : float or torch.Tensor, optional
+        Of a voxel of the first volume, in its unit.
+
+    Raises
+    ------
+    InputError
+        A volume that is not bright in some gate; noise below 0.
+    """
+    brightness = [_brightness(volume, n) for n, volume in enumerate(volumes, 1)]
+    if noise is not None:
+        noise = torch.as_tensor(noise, dtype=volumes[0].dtype, device=volumes[0].device)
+        if not bool((noise[noise.isfinite()] >= 0).all()):
+            raise InputError("noise: below 0 is not allowed; expected standard deviations >= 0")
+        noise = (noise / brightness[0]).expand_as(volumes[0])
+    return [volume / level - 1 for volume, level in zip(volumes, brightness)], noise
+
+
+def _brightness(volume: torch.Tensor, number: int) -> torch.Tensor:
+    """c exp(a x), shape (x, 1, 1)."""
+    values = working(volume)
+    known = torch.isfinite(values)
+    values = torch.where(known, values, 0.0)
+    count = known.sum((1, 2))
+    gates = values.sum((1, 2)) / count.clamp(min=1)
+    if not bool((gates[count > 0] > 0).all()) or not bool(count.any()):
+        raise InputError(
+            f"volume{number}: gates that are 0, negative or not finite on the whole are not "
+            "allowed; expected a brightness above 0 in every gate"
         )
-        variables[f"{name}_stderr"] = _field(
-            found.variance[number].sqrt() * scale,
-            f"standard error of {name}",
-            "m s-1",
-            standard_name=f"{standard} standard_error",
-        )
-    variables["correlation"] = _field(
-        found.score, "correlation of the volumes carried to mid-time", "1"
-    )
-    variables["flag"] = (
-        AXES,
-        found.flag.cpu().numpy(),
-        {
-            "long_name": "reasons to reject the vector, 0 = good",
-            "standard_name": "quality_flag",
-            "flag_masks": np.array([bit.value for bit in Flag], dtype=np.uint8),
-            "flag_meanings": " ".join(bit.name.lower() for bit in Flag),
-        },
-    )
-    about = {
-        "x": {"long_name": "window centre, ahead", "axis": "X"},
-        "z": {"long_name": "window centre, up", "axis": "Z", "positive": "up"},
-        "y": {"long_name": "window centre, left", "axis": "Y"},
-    }
-    coords = {}
-    for number, axis in enumerate(AXES):
-        place = float(volume[axis][0]) + spacing[number] * windows.centres(number).numpy()
-        coords[axis] = (axis, place, {"units": "m", **about[axis]})
-    dataset = xr.Dataset(
-        variables,
-        coords,
-        {"Conventions": "CF-1.11", "title": "Wind from two volumes", **settings, "dt_units": "s"},
-    )
-    for axis in AXES:
-        dataset[axis].encoding["_FillValue"] = None
-    return dataset[["u", "v", "w", "u_stderr", "v_stderr", "w_stderr", "correlation", "flag"]]
-
-
-def _field(values: torch.Tensor, long_name: str, units: str, **more: str):
-    attrs = {"long_name": long_name, "units": units, **more}
-    return AXES, values.cpu().numpy().astype(np.float32), attrs
-
-
-def _spacing(volume: xr.DataArray, axis: str) -> float:
-    nodes = volume[axis].values.astype(float)
-    return float((nodes[-1] - nodes[0]) / (len(nodes) - 1))
-
-
-def _checked(name: str, volume: xr.DataArray) -> xr.DataArray:
-    """The volume as (x, z, y), its grid known to be in metres, ascending and uniform."""
-    if not isinstance(volume, xr.DataArray):
-        raise InputError(f"{name}: {type(volume).__name__} is not an xarray.DataArray")
-    if set(volume.dims) != set(AXES) or volume.ndim != 3:
-        raise InputError(f"{name}: dims {tuple(volume.dims)} are not ('x', 'z', 'y')")
-    if volume.dtype.kind not in "fiu":
-        raise InputError(f"{name}: values of type {volume.dtype} are not real numbers")
-    for axis in AXES:
-        if axis not in volume.coords:
-            raise InputError(f"{name}.{axis}: coordinate missing; give it in m")
-        units = volume[axis].attrs.get("units")
-        if units not in ("m", "metre", "metres", "meter", "meters"):
-            raise InputError(f"{name}.{axis}: units {units!r} are not 'm'")
-        nodes = volume[axis].values.astype(float)
-        steps = np.diff(nodes)
-        if not steps.size or not np.isfinite(steps).all() or steps.min() <= 0:
-            raise InputError(
-                f"{name}.{axis}: {len(nodes)} value{'s' * (len(nodes) != 1)}, not at least two "
-                "finite, ascending ones"
-            )
-        if np.ptp(steps) > 1e-3 * steps.mean():
-            raise InputError(
-                f"{name}.{axis}: spacing from {steps.min():g} to {steps.max():g} m is not "
-                "uniform (to 0.1 %)"
-            )
-    return volume.transpose(*AXES)
-
-
-def _same_grid(first: xr.DataArray, other: xr.DataArray, name: str) -> None:
-    if first.shape != other.shape:
-        sizes = " and ".join(" x ".join(map(str, v.shape)) for v in (first, other))
-        raise InputError(f"{name}: sizes {sizes} voxels (x, z, y) differ; expected one grid")
-    for axis in AXES:
-        off = np.abs(first[axis].values.astype(float) - other[axis].values.astype(float)).max()
-        if off > 1e-3 * _spacing(first, axis):
-            raise InputError(
-                f"{name}.{axis}: up to {off:g} m off volume1's; resample both onto one grid"
-            )
+    x = torch.arange(len(gates)).to(gates)
+    x = x - (x * count).sum() / count.sum()
+    logarithm = torch.where(count > 0, gates.clamp(min=1e-300).log(), 0.0)
+    decay = (count * x * logarithm).sum() / (count * x * x).sum().clamp(min=1e-30)
+    level = (decay * x).exp()[:, None, None]
+    return level * (values / level).sum() / count.sum()

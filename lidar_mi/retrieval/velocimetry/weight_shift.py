@@ -48,7 +48,7 @@ def weight_shift(
     """
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)
-    bad = non_finite(image1, image2, windows)
+    bad = non_finite([image1, image2], windows)
     # Spreads below the rounding of the images' own numbers are none.
     rounding = 4 * max(
         (torch.finfo(i.dtype).eps for i in (image1, image2) if i.is_floating_point()), default=0.0
@@ -57,10 +57,8 @@ def weight_shift(
     found = Displacement.empty(windows, image1)
     for tile in windows.tiles(8 * 8 * windows.shifts**2 + 64 * (template + 4) * stride**2):
         part = _best_match(image1[tile.pixels], image2[tile.pixels], windows, rounding)
-        for whole, values in zip(found[:4], part):
-            whole[tile.vectors] = values
-    for displacement in (found.dz, found.dy):
-        displacement[bad] = torch.nan
+        found.fill(part, tile.vectors)
+    found.d[:, bad] = torch.nan
     found.flag[bad] |= Flag.NON_FINITE_INPUT.value
     return found
 
@@ -102,9 +100,8 @@ def _best_match(
     best, index = misfit.min(0)
     shift_z, shift_y, rim = windows.unravel(index)
     matched = best.isfinite()
-    dz, dy = (
-        torch.where(matched & ~rim, shift + rest.flatten(0, 1).gather(0, index[None])[0], torch.nan)
-        for shift, rest in ((shift_z, centre_z), (shift_y, centre_y))
-    )
+    rest = [part.flatten(0, 1).gather(0, index[None])[0] for part in (centre_z, centre_y)]
+    d = torch.stack([shift_z, shift_y]) + torch.stack(rest)
+    d = torch.where(matched & ~rim, d, torch.nan)
     flag = Flag.PEAK_ON_RIM * (matched & rim) + Flag.NO_MATCH * ~matched
-    return Displacement(dz, dy, best.sqrt(), flag.to(torch.uint8))
+    return Displacement(d, best.sqrt(), flag.to(torch.uint8))

@@ -8,20 +8,15 @@ import torch
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.checks import checked_pair, on_device, positive
+from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.velocimetry.bound import displacement_bound
 from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
+from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.multipass import multipass
-from lidar_mi.retrieval.velocimetry.quality import (
-    Flag,
-    Texture,
-    filled,
-    low_texture,
-    median_outliers,
-    non_finite,
-    uncertain,
-)
+from lidar_mi.retrieval.velocimetry.outliers import median_outliers
+from lidar_mi.retrieval.velocimetry.quality import Flag, filled, low_texture, non_finite, uncertain
+from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
 from lidar_mi.retrieval.velocimetry.variational import variational
 from lidar_mi.retrieval.velocimetry.weight_shift import weight_shift
 from lidar_mi.retrieval.velocimetry.windows import Windows
@@ -66,13 +61,13 @@ METHODS: Mapping[str, Method] = {
     "multipass": Method(
         multipass,
         ("correlation", "normalised cross-correlation of the deformed windows"),
-        ("min_correlation", "noise"),
+        ("min_correlation", "noise", "settings"),
         centred=True,
     ),
     "variational": Method(
         variational,
-        ("correlation", "normalised cross-correlation of the images carried to mid-time"),
-        ("min_correlation", "noise", "more", "blur"),
+        ("correlation", "normalised cross-correlation of the images warped to mid-time"),
+        ("min_correlation", "noise", "more", "blur", "settings"),
         centred=True,
         local=False,
     ),
@@ -106,6 +101,7 @@ def retrieve_wind(
     median_size: int = 3,
     median_threshold: float = 2.0,
     median_epsilon: float = 0.1,
+    settings: MultipassSettings | VariationalSettings | None = None,
 ) -> xr.Dataset:
     """Wind in the image plane from two images of the same air, dt apart.
 
@@ -144,6 +140,8 @@ def retrieve_wind(
     median_size, median_threshold, median_epsilon
         Normalised median test, see `quality.median_outliers`. Neighbours are taken half a
         template apart (or a stride, if that is more): closer ones share their pixels.
+    settings : MultipassSettings or VariationalSettings, optional
+        Of the method of that name, see `settings`. Left out: its defaults.
 
     Returns
     -------
@@ -182,8 +180,8 @@ def retrieve_wind(
     if method not in METHODS:
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
     dt = positive("dt", dt)
-    image1, image2, noise = checked_pair(image1, image2, noise)
-    more = [checked_pair(image1, image)[1] for image in more]
+    stack, noise = checked_stack([image1, image2, *more], noise)
+    image1 = stack[0]
     if more and "more" not in METHODS[method].options:
         takes = ", ".join(name for name, known in METHODS.items() if "more" in known.options)
         raise InputError(
@@ -192,7 +190,7 @@ def retrieve_wind(
         )
     windows = Windows(image1.shape, template, search, stride)
     blurred = _blur_px(image1, blur)
-    pixels1, pixels2 = (on_device(image, device) for image in (image1, image2))
+    pixels1, pixels2, *rest = (on_device(image, device) for image in stack)
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
 
@@ -203,17 +201,16 @@ def retrieve_wind(
         "noise": noise,
         "axes": axes,
         "dt": dt,
-        "more": [on_device(image, device) for image in more],
+        "more": rest,
         "blur": blurred,
+        "settings": settings,
     }
     options = {name: offered[name] for name in chosen.options}
     found = chosen.find(pixels1, pixels2, template, search, stride, **options)
     level = 0.0 if noise is None else noise
     texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
-    spacing = max(1, round(template / 2 / stride))
-    outlier = median_outliers(
-        found.dz, found.dy, median_size, spacing, median_threshold, median_epsilon
-    )
+    apart = max(1, round(template / 2 / stride))
+    outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
     flag = found.flag
     if found.covariance is not None:
         flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.uint8)
@@ -236,7 +233,29 @@ def retrieve_wind(
         attributes["blur"] = blur
     if "min_correlation" in options:
         attributes["min_correlation"] = min_correlation
-    return _dataset(image1, windows, found._replace(flag=flag), texture, attributes)
+    found = found._replace(flag=flag)
+    steps = spacing(image1)
+    variables = winds(found, image1.dims, steps, dt)
+    moved = dict(zip(image1.dims, found.d.cpu().numpy() * np.reshape(steps, (2, 1, 1))))
+    for axis in ("y", "z"):
+        about = f"displacement along {axis}", "m"
+        variables[f"displacement_{axis}"] = field(image1.dims, moved[axis], *about)
+    score, meaning = chosen.score
+    slope = "weakest rms slope relative to the mean, per pixel"
+    isotropy = "weakest over strongest rms slope"
+    variables |= {
+        score: field(image1.dims, found.score, meaning, "1"),
+        "texture": field(image1.dims, texture.slope, slope, "1"),
+        "isotropy": field(image1.dims, texture.isotropy, isotropy, "1"),
+        "flag": flags(found, image1.dims),
+    }
+    coords = centres(image1, windows, "template")
+    for axis, place in zip(image1.dims, np.meshgrid(*(coords[a][1] for a in "zy"), indexing="ij")):
+        vector = place + (0.0 if chosen.centred else 0.5) * moved[axis]
+        about = f"{axis} of the vector at mid-time", "m"
+        coords[f"{axis}_vector"] = field(image1.dims, vector, *about)
+    title = "Wind in the image plane from an image pair"
+    return dataset(variables, coords, title, attributes, found)
 
 
 def wind_bound(
@@ -266,7 +285,7 @@ def wind_bound(
         As `retrieve_wind`.
     """
     dt = positive("dt", dt)
-    image1, image2, noise = checked_pair(image1, image2, noise)
+    (image1, image2), noise = checked_stack([image1, image2], noise)
     windows = Windows(image1.shape, template, search, stride)
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise.clip(min=1e-3 * float(noise.median())), "cpu")
@@ -274,21 +293,12 @@ def wind_bound(
     covariance = displacement_bound(*(filled(image) for image in pair), noise, template)
     rows, columns = (torch.as_tensor(windows.starts(axis)) for axis in (0, 1))
     root = covariance[:2, rows][:, :, columns].sqrt()
-    root = torch.where(non_finite(*pair, windows), torch.nan, root).numpy()
-    axes = {axis: image1[axis].values.astype(float) for axis in ("z", "y")}
+    root = torch.where(non_finite(pair, windows), torch.nan, root).numpy()
     found = {}
-    for name, axis, values in (("w", "z", root[0]), ("v", "y", root[1])):
-        spacing = (axes[axis][-1] - axes[axis][0]) / (len(axes[axis]) - 1)
-        about = {"long_name": f"Cramer-Rao bound of {name} from one template", "units": "m s-1"}
-        found[f"{name}_bound"] = ("z", "y"), (values * spacing / dt).astype(np.float32), about
-    half = (template - 1) / 2
-    coords = {
-        axis: np.interp(
-            np.asarray(windows.starts(k)) + half, np.arange(len(axes[axis])), axes[axis]
-        )
-        for k, axis in enumerate(("z", "y"))
-    }
-    return xr.Dataset(found, coords)
+    for name, values, step in zip("wv", root, spacing(image1)):
+        about = f"Cramer-Rao bound of {name} from one template", "m s-1"
+        found[f"{name}_bound"] = field(image1.dims, values * step / dt, *about)
+    return xr.Dataset(found, centres(image1, windows, "template"))
 
 
 def _blur_px(image: xr.DataArray, blur: float) -> float:
@@ -302,105 +312,3 @@ def _blur_px(image: xr.DataArray, blur: float) -> float:
             "square ones"
         )
     return float(blur / y)
-
-
-def _dataset(
-    image: xr.DataArray, windows: Windows, found: Displacement, texture: Texture, attributes: dict
-) -> xr.Dataset:
-    centre, spacing = {}, {}
-    for axis, name in enumerate(("z", "y")):
-        pixel = image[name].values.astype(float)
-        start = np.asarray(windows.starts(axis))
-        centre[name] = (pixel[start] + pixel[start + windows.template - 1]) / 2
-        spacing[name] = (pixel[-1] - pixel[0]) / (len(pixel) - 1)
-    moved = {"z": found.dz.cpu().numpy() * spacing["z"], "y": found.dy.cpu().numpy() * spacing["y"]}
-    method = METHODS[attributes["method"]]
-    further = 0.0 if method.centred else 0.5
-    shape = windows.count
-    vector = {
-        "z": np.broadcast_to(centre["z"][:, None], shape) + further * moved["z"],
-        "y": np.broadcast_to(centre["y"][None, :], shape) + further * moved["y"],
-    }
-    dt = attributes["dt"]
-    score, score_name = method.score
-    stderr, correlation = _spread(found, spacing, dt)
-
-    def field(values: np.ndarray | torch.Tensor, long_name: str, units: str, **more: str):
-        values = values.cpu().numpy() if isinstance(values, torch.Tensor) else values
-        attrs = {"long_name": long_name, "units": units, **more}
-        return ("z", "y"), values.astype(np.float32), attrs
-
-    dataset = xr.Dataset(
-        {
-            "v": field(moved["y"] / dt, "wind along y", "m s-1", standard_name="y_wind"),
-            "w": field(
-                moved["z"] / dt, "wind along z", "m s-1", standard_name="upward_air_velocity"
-            ),
-            "v_stderr": field(
-                stderr["y"], "standard error of v", "m s-1", standard_name="y_wind standard_error"
-            ),
-            "w_stderr": field(
-                stderr["z"],
-                "standard error of w",
-                "m s-1",
-                standard_name="upward_air_velocity standard_error",
-            ),
-            "vw_correlation": field(correlation, "correlation of the errors of v and w", "1"),
-            "displacement_y": field(moved["y"], "displacement along y", "m"),
-            "displacement_z": field(moved["z"], "displacement along z", "m"),
-            score: field(found.score, score_name, "1"),
-            "texture": field(
-                texture.slope, "weakest rms slope relative to the mean, per pixel", "1"
-            ),
-            "isotropy": field(texture.isotropy, "weakest over strongest rms slope", "1"),
-            "flag": (
-                ("z", "y"),
-                found.flag.cpu().numpy(),
-                {
-                    "long_name": "reasons to reject the vector, 0 = good",
-                    "standard_name": "quality_flag",
-                    "flag_masks": np.array([bit.value for bit in Flag], dtype=np.uint8),
-                    "flag_meanings": " ".join(bit.name.lower() for bit in Flag),
-                },
-            ),
-        },
-        coords={
-            "z": ("z", centre["z"], {"long_name": "template centre, up", "units": "m"}),
-            "y": ("y", centre["y"], {"long_name": "template centre, left", "units": "m"}),
-            "z_vector": field(vector["z"], "z of the vector at mid-time", "m"),
-            "y_vector": field(vector["y"], "y of the vector at mid-time", "m"),
-        },
-        attrs={
-            "Conventions": "CF-1.11",
-            "title": "Wind in the image plane from an image pair",
-            **attributes,
-            "dt_units": "s",
-        },
-    )
-    for name, quantity in found.quantities.items():
-        about = {"long_name": quantity.long_name, "units": quantity.units}
-        dataset[name] = (), quantity.value, about
-        about = about | {"long_name": f"standard error of {quantity.long_name}"}
-        dataset[f"{name}_stderr"] = (), quantity.stderr, about
-    dataset.attrs |= found.attributes
-    dataset["z"].attrs |= {"axis": "Z", "positive": "up"}
-    dataset["y"].attrs |= {"axis": "Y"}
-    for name in ("z", "y"):
-        dataset[name].encoding["_FillValue"] = None
-    return dataset
-
-
-def _spread(
-    found: Displacement, spacing: Mapping[str, float], dt: float
-) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Standard errors of the wind along z and y, m/s, and their correlation; NaN if not known."""
-    if found.covariance is None:
-        nothing = np.full(found.dz.shape, np.nan)
-        return {"z": nothing, "y": nothing}, nothing
-    zz, yy, zy = (
-        torch.where(found.dz.isnan(), torch.nan, part).cpu().numpy() for part in found.covariance
-    )
-    root = {"z": np.sqrt(zz), "y": np.sqrt(yy)}
-    both = root["z"] * root["y"]
-    correlation = np.divide(zy, both, out=np.zeros_like(both), where=both != 0)
-    return {axis: root[axis] * spacing[axis] / dt for axis in root}, correlation

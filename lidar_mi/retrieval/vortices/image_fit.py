@@ -12,9 +12,10 @@ import torch
 import xarray as xr
 from kornia.filters import gaussian_blur2d
 
-from lidar_mi.retrieval.checks import checked_pair, on_device, positive
+from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.quality import filled
-from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, levelled
+from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited
 from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
     TOLERANCE,
@@ -147,7 +148,7 @@ def fit_vortices(
         Images on different or unsuitable grids, a parameter out of its range.
     """
     dt = positive("dt", dt)
-    image1, image2, noise = checked_pair(image1, image2, noise)
+    (image1, image2), noise = checked_stack([image1, image2], noise)
     check_profile(profile)
     axes = [image1[name].values.astype(float) for name in ("z", "y")]
     pixels = [on_device(image, device) for image in (image1, image2)]
@@ -171,7 +172,7 @@ def fit_pixels(
     if float(finite.double().mean()) < 0.5:
         return no_fit(profile, f"{float(finite.double().mean()):.0%} of the pixels are finite")
     # in units of image 1's own structure, so that no constant depends on the images' unit
-    pair = levelled([image1.double(), image2.double()])
+    pair = normalised([image1.double(), image2.double()])
     contrast = pair[0][finite].std()
     scale = filled(image1.double()).abs().max()
     if not bool(contrast > 1e-9 * scale) or not bool(pair[1][finite].std() > 0):

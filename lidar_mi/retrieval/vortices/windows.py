@@ -54,25 +54,19 @@ def vortex_windows(
         return torch.as_tensor(np.ascontiguousarray(array), device=image1.device)
 
     v, w = tensor(values)
-    variances = tensor(covariance)
+    variance_v, variance_w, both = tensor(covariance)
+    vv, ww, wv = variance_v / pixel_y**2, variance_w / pixel_z**2, both / (pixel_y * pixel_z)
     flag = torch.zeros(windows.count, dtype=torch.uint8, device=image1.device)
-    flag[non_finite(image1, image2, windows)] |= Flag.NON_FINITE_INPUT.value
+    flag[non_finite([image1, image2], windows)] |= Flag.NON_FINITE_INPUT.value
     if not found.success:
         flag |= Flag.NO_MATCH.value
     if "an image is constant" in found.reasons:
         flag |= Flag.LOW_TEXTURE.value
     return Displacement(
-        w / pixel_z,
-        v / pixel_y,
+        torch.stack([w / pixel_z, v / pixel_y]),
         torch.full_like(v, found.correlation),
         flag,
-        torch.stack(
-            [
-                variances[1] / pixel_z**2,
-                variances[0] / pixel_y**2,
-                variances[2] / (pixel_y * pixel_z),
-            ]
-        ),
+        torch.stack([torch.stack([ww, wv]), torch.stack([wv, vv])]),
         found.quantities,
         {
             "profile": found.profile,

@@ -14,7 +14,7 @@ import torch
 from benchmarks.cases import DT, vortex_pair_images
 from lidar_mi.atmosphere.vortex import velocity
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.velocimetry.multipass import multipass, travelled, validated, window_sums
+from lidar_mi.retrieval.velocimetry.multipass import multipass, travelled
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from tests.support.flows import data_array, plane_waves, texture
@@ -97,32 +97,6 @@ def test_paths_in_a_solid_rotation_are_arcs():
     assert np.abs(found.numpy() - rate @ place).max() < 0.02 * straight < 0.02
 
 
-def test_window_sums_are_weighted_sums():
-    random = torch.Generator().manual_seed(4)
-    fields = torch.randn(2, 31, 150, generator=random, dtype=torch.float64)
-    kernels = [torch.randn(7, generator=random, dtype=torch.float64) for _ in range(2)]
-    for axis, step in ((1, 1), (1, 3), (2, 2), (2, 1)):
-        found = window_sums(fields, kernels, step, axis)
-        pieces = fields.unfold(axis, 7, step)
-        for sums, kernel in zip(found, kernels):
-            torch.testing.assert_close(sums, pieces @ kernel)
-
-
-def test_outliers_and_gaps_take_their_neighbours_median():
-    z, y = torch.meshgrid(torch.arange(9.0), torch.arange(12.0), indexing="ij")
-    true = torch.stack([0.02 * z, 0.03 * y])
-    d = true.clone()
-    d[:, 4, 5] = torch.tensor([6.0, -3.0])
-    d[:, 0:2, 0:3] = torch.nan
-    found, wrong = validated(d, 1)
-    assert wrong.sum() == 7 and wrong[4, 5] and wrong[:2, :3].all()
-    assert torch.equal(found[:, ~wrong], true[:, ~wrong])
-    torch.testing.assert_close(found[:, 4, 5], true[:, 4, 5])
-    assert (found - true).abs().max() < 0.1
-    nothing, wrong = validated(torch.full((2, 3, 3), torch.nan), 1)
-    assert wrong.all() and (nothing == 0).all()
-
-
 def test_stripes_leave_one_direction_open():
     """Waves nearly along (1, 1): the covariance is large along (1, -1) and says so."""
 
@@ -134,7 +108,7 @@ def test_stripes_leave_one_direction_open():
         image + 0.01 * torch.tensor(random.standard_normal(image.shape))
         for image in shifted(0.4, 0.3, stripes)
     ]
-    zz, yy, zy = multipass(*pair, noise=0.01).covariance
+    (zz, zy), (_, yy) = multipass(*pair, noise=0.01).covariance
     assert float((zy / (zz * yy).sqrt()).median()) < -0.9
 
 
@@ -166,7 +140,7 @@ def test_large_scans_are_worked_off_in_bands(monkeypatch):
     whole = multipass(*pair)
     monkeypatch.setattr("lidar_mi.retrieval.velocimetry.windows.TILE_BYTES", 1 << 19)
     banded = multipass(*pair)
-    for one, other in zip(whole, banded):
+    for one, other in zip(whole[:4], banded[:4], strict=True):
         torch.testing.assert_close(one, other, equal_nan=True)
 
 

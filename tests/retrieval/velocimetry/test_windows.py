@@ -5,7 +5,15 @@ import pytest
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.velocimetry.windows import Windows, box_sum, candidates
+from lidar_mi.retrieval.velocimetry.windows import (
+    Windows,
+    averaged,
+    box_sum,
+    candidates,
+    linear_weights,
+    separable,
+    window_sums,
+)
 
 
 @pytest.mark.parametrize("size", range(1, 14))
@@ -33,6 +41,59 @@ def test_regions_lie_inside_and_templates_in_their_middle(template, search, stri
         assert 0 <= after - before <= 1
         assert starts[0] - before == 0
         assert starts[-1] + template + after <= size < starts[-1] + template + after + stride
+        np.testing.assert_array_equal(windows.centres(axis), starts + (template - 1) / 2)
+
+
+def test_window_sums_are_weighted_sums():
+    random = torch.Generator().manual_seed(4)
+    fields = torch.randn(2, 31, 150, generator=random, dtype=torch.float64)
+    kernels = [torch.randn(7, generator=random, dtype=torch.float64) for _ in range(2)]
+    for axis, step in ((1, 1), (1, 3), (2, 2), (2, 1)):
+        found = window_sums(fields, kernels, step, axis)
+        pieces = fields.unfold(axis, 7, step)
+        for sums, kernel in zip(found, kernels):
+            torch.testing.assert_close(sums, pieces @ kernel)
+
+
+def test_averaged_is_a_gaussian_mean_of_what_is_known():
+    random = torch.Generator().manual_seed(5)
+    for shape in ((13, 17), (9, 10, 11)):
+        field = torch.randn(shape, generator=random, dtype=torch.float64)
+        known = torch.rand(shape, generator=random) > 0.3
+        found = averaged(field, known, 1.5)
+        at = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij")).flatten(1).T
+        for place in (0, 40, len(at) - 1):
+            off = (at - at[place]).double()
+            weight = torch.exp(-off.square().sum(1) / (2 * 1.5**2)) * known.flatten()
+            weight *= (off.abs() <= 5).all(1)
+            expected = (weight * field.flatten()).sum() / weight.sum()
+            torch.testing.assert_close(found.flatten()[place], expected)
+
+
+def test_separable_and_linear_weights_are_those_of_numpy():
+    random = torch.Generator().manual_seed(6)
+    known = torch.tensor([1.0, 3.0, 5.0], dtype=torch.float64)
+    places = torch.tensor([0.0, 1.5, 4.0, 9.0], dtype=torch.float64)
+    values = torch.randn(3, dtype=torch.float64, generator=random)
+    expected = np.interp(places.numpy(), known.numpy(), values.numpy())
+    np.testing.assert_allclose((linear_weights(known, places) @ values).numpy(), expected)
+    field = torch.randn(2, 3, 4, 5, generator=random)
+    matrices = [torch.randn(m, n, generator=random) for m, n in ((6, 3), (7, 4), (2, 5))]
+    expected = torch.einsum("nijk,ai,bj,ck->nabc", field, *matrices)
+    torch.testing.assert_close(separable(field, matrices), expected)
+    expected = torch.einsum("njk,bj,ck->nbc", field[:, 0], *matrices[1:])
+    torch.testing.assert_close(separable(field[:, 0], matrices[1:]), expected)
+
+
+def test_windows_of_volumes_share_what_the_stride_leaves_over():
+    """Templates lie inside, search regions need not."""
+    windows = Windows((10, 12, 17), 8, 16, 4)
+    assert windows.count == (1, 2, 3) and windows.reach == 4
+    assert [list(windows.starts(axis)) for axis in range(3)] == [[1], [0, 4], [0, 4, 8]]
+    assert windows.centres(0).tolist() == [4.5]
+    volume = torch.arange(10 * 12 * 17, dtype=torch.float64).reshape(10, 12, 17)
+    found = windows.of_templates(volume)
+    assert found[0, 1, 2] == volume[1:9, 4:12, 8:16].mean()
 
 
 def test_template_mean_and_candidates_are_the_right_pixels():

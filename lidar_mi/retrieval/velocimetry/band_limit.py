@@ -1,0 +1,221 @@
+"""The filter that passes the texture of images or volumes and stops their noise."""
+
+import math
+from collections.abc import Sequence
+from functools import reduce
+from typing import NamedTuple
+
+import scipy.fft
+import torch
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.velocimetry.settings import FilterSettings
+
+# Shells of the power spectrum with fewer waves say too little about their mean.
+_SHELL_WAVES = 200
+# Shells in a cycle per pixel, at the least.
+_SHELLS = 16
+
+
+class Filter(NamedTuple):
+    """A filter by shells of wavenumber, and what it makes of texture and noise.
+
+    Attributes
+    ----------
+    gain : torch.Tensor, shape (shells,)
+    level : float
+        Standard deviation of the white noise before the filter.
+    passed : float
+        Fraction of the variance of white noise that the filter lets pass.
+    excess : float
+        Variance of a displacement over what the slopes would allow, were they free of noise.
+    efficiency : float
+        Fraction of the information in the slopes that is left: 1 but where blur is undone, which
+        makes the noise of short waves stronger.
+    """
+
+    gain: torch.Tensor
+    level: float
+    passed: float
+    excess: float
+    efficiency: float
+
+
+def best_filter(
+    images: torch.Tensor,
+    sizes: Sequence[int],
+    settings: FilterSettings,
+    noise: float | None = None,
+    mismatch: torch.Tensor | None = None,
+    weight: torch.Tensor | None = None,
+    blur: float = 0.0,
+) -> Filter:
+    """The filter of least variance of a displacement between images.
+
+    With texture of spectral density S and white noise N the filter is sqrt(S / (S + N / 2)): of
+    all filters applied to both images of a pair before their differences are squared, the one
+    with the least variance of the displacement (a wave k tells k^2 S of it, against a variance of
+    4 S N + 2 N^2, so its weight S / (2 S + N) is the square of this filter but for a factor).
+
+    Parameters
+    ----------
+    images : torch.Tensor, shape (images, ...)
+        Finite.
+    sizes : sequence of int
+        Odd lengths of the Fourier transforms.
+    settings : FilterSettings
+    noise, mismatch, weight, blur
+        See `warping.band_limited`.
+    """
+    shape = images.shape[1:]
+    frequency = frequencies(sizes, images)
+    radius = _radius(frequency)
+    shell = shells(frequency, shape)
+    density, uncertainty = shell_means(
+        images if weight is None else images * weight, shell, sizes, settings.smoothing
+    )
+    below = 1 + settings.threshold * uncertainty
+    if mismatch is not None:
+        # shells that were stopped before stay stopped
+        floor = torch.where(mismatch.isfinite(), mismatch, density)
+        floor = floor.clamp(min=max(1e-9 * float(density.max()), 1e-30))
+    elif noise is None:
+        # the lowest shells are low by chance as well: the mean of all that may be as low
+        floor = (density * below).min()
+        share = uncertainty**-2 * (density <= floor * below)
+        floor = (share * density).sum() / share.sum()
+    else:
+        floor = torch.as_tensor(noise**2, dtype=images.dtype, device=images.device)
+    # shells of noise alone must not pass because their mean happens to be a little higher
+    texture = torch.where(density > floor * below, density - floor, 0.0)
+    tiny = torch.finfo(images.dtype).tiny
+    response = texture / (texture + floor / 2 + tiny)
+    # as if all noise were white and of this variance
+    level = floor if mismatch is None else torch.as_tensor(noise**2).to(floor)
+    if blur:
+        wave = (torch.arange(len(response)).to(response) + 0.5) / _per_cycle(shape)
+        sharper = torch.exp(2 * (torch.pi * blur * wave).square()).clamp(max=settings.sharpening)
+        response = torch.where(response > 0, (response * sharper).square(), 0.0)
+    passed = response[shell]
+    # of a real field's transform all but the first column stand for two waves
+    passed = float(passed[..., :1].sum() + 2 * passed[..., 1:].sum()) / math.prod(sizes)
+    white = level / floor if mismatch is not None else torch.ones_like(response)
+    gain = (response * white).sqrt()
+    # the slopes' power with noise and filter, what of it is informed by texture, and its variance
+    both = texture + floor / 2
+    steep = radius**2 * gain[shell] ** 2
+    power, informed, spread = (
+        float((steep * spectrum[shell]).sum()) for spectrum in (both, texture, response * both)
+    )
+    return Filter(
+        gain,
+        float(level.sqrt()),
+        passed,
+        power / informed if informed > 0 else 1.0,
+        informed / spread if informed > 0 else 1.0,
+    )
+
+
+def checked_noise(noise: float | None) -> None:
+    """Raise an `InputError` unless a standard deviation, if given, is one."""
+    if noise is not None and not noise >= 0:
+        raise InputError(f"noise: {noise!r} is not a standard deviation >= 0")
+
+
+def odd_fast_len(least: int) -> int:
+    """A length, fast to transform, at which no wave is its own mirror image."""
+    size = scipy.fft.next_fast_len(least, real=True)
+    while size % 2 == 0:
+        size = scipy.fft.next_fast_len(size + 1, real=True)
+    return size
+
+
+def frequencies(sizes: Sequence[int], like: torch.Tensor) -> list[torch.Tensor]:
+    """Cycles per pixel along the axes of a real Fourier transform, as they broadcast."""
+    *others, last = sizes
+    kind = {"dtype": like.dtype, "device": like.device}
+    along = [torch.fft.fftfreq(n, **kind) for n in others] + [torch.fft.rfftfreq(last, **kind)]
+    return [f.reshape(-1, *[1] * (len(sizes) - 1 - axis)) for axis, f in enumerate(along)]
+
+
+def shells(frequency: Sequence[torch.Tensor], shape: Sequence[int]) -> torch.Tensor:
+    """Wavenumber in whole cycles per shortest side of the image (at least 16 px)."""
+    return (_radius(frequency) * _per_cycle(shape)).long()
+
+
+def _per_cycle(shape: Sequence[int]) -> int:
+    return max(min(shape), _SHELLS)
+
+
+def _radius(frequency: Sequence[torch.Tensor]) -> torch.Tensor:
+    return reduce(torch.hypot, frequency)
+
+
+def shell_means(
+    images: torch.Tensor, shell: torch.Tensor, sizes: Sequence[int], smoothing: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Power spectrum by shells of wavenumber, mean over the images; white noise gives its variance.
+
+    Each shell's value is a mean over `smoothing` neighbours. Returns these means and their
+    relative standard errors.
+    """
+    shape = images.shape[1:]
+    dims = tuple(range(1, images.ndim))
+    window = torch.ones((), dtype=images.dtype, device=images.device)
+    for n in shape:
+        hann = torch.hann_window(n + 2, periodic=False, dtype=images.dtype, device=images.device)
+        window = window[..., None] * hann[1:-1]
+    mean = (images * window).sum(dims, keepdim=True) / window.sum()
+    power = torch.fft.rfftn((images - mean) * window, s=list(sizes), dim=dims)
+    power = power.abs().square().mean(0)
+    power = power / window.square().sum()
+    number = torch.bincount(shell.flatten())
+    total = torch.bincount(shell.flatten(), weights=power.flatten())
+    kernel = torch.ones(1, 1, smoothing, dtype=images.dtype, device=images.device)
+    total, number = (
+        torch.nn.functional.conv1d(sums.to(images)[None], kernel, padding=smoothing // 2)[0]
+        for sums in (total, number)
+    )
+    density = total / number.clamp(min=1)
+    # the last shells are cut by the corners: they take the last full shell's value
+    most = int(number.argmax())
+    last = most + int((number[most:] >= min(_SHELL_WAVES, float(number[most]))).sum()) - 1
+    density[last + 1 :] = density[last]
+    # independent waves: an image has as many as pixels, tapering leaves two fifths of them
+    share = 0.4 ** (len(shape) / 2) * len(images) * math.prod(shape) / math.prod(sizes)
+    return density, (share * number.clamp(min=1)).rsqrt()
+
+
+def faded(
+    images: torch.Tensor, sizes: Sequence[int], margin: int, antisymmetric: bool
+) -> torch.Tensor:
+    """Images or volumes of mean 0, mirrored at their edges, fading to 0 over the margin.
+
+    A Fourier transform goes on from the last pixel to the first. Were one side brighter than the
+    other, a filter that stops short waves would ring from that step into the image.
+
+    Parameters
+    ----------
+    images : torch.Tensor, shape (number, ...)
+    sizes : sequence of int
+        Of the result along all axes but the first; `margin` pixels of it come before the image.
+    margin : int
+    antisymmetric : bool
+        Mirrored about the edge's value as well, so that the slope goes on.
+    """
+    for axis, size in enumerate(sizes, 1):
+        n = images.shape[axis]
+        place = torch.arange(-margin, size - margin, device=images.device)
+        beyond = torch.maximum(-place, place - (n - 1)).clamp(0, margin).to(images)
+        fade = (1 + torch.cos(torch.pi * beyond / margin)) / 2
+        edge = place.clamp(0, n - 1)
+        place = place % max(2 * n - 2, 1)
+        mirrored = images.index_select(axis, torch.minimum(place, (2 * n - 2 - place) % (2 * n)))
+        if antisymmetric:
+            mirrored = torch.where(
+                (beyond > 0).reshape(-1, *[1] * (len(sizes) - axis)),
+                2 * images.index_select(axis, edge) - mirrored,
+                mirrored,
+            )
+        images = mirrored * fade.reshape(-1, *[1] * (len(sizes) - axis))
+    return images

@@ -1,0 +1,48 @@
+"""One brightness for images of the same air: over the whole, and over what is valid in all."""
+
+from collections.abc import Sequence
+
+import torch
+
+from lidar_mi.retrieval.velocimetry.quality import filled
+from lidar_mi.retrieval.velocimetry.windows import stored, working
+
+
+def normalised(images: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Images of one texture but unlike brightness: all with mean 0 and the first one's contrast."""
+    images = [stored(filled(image)) for image in images]
+    images = torch.stack([image - image.mean() for image in images])
+    dims = tuple(range(1, images.ndim))
+    contrast = images.square().mean(dims, keepdim=True).sqrt()
+    return images * torch.where(contrast > 0, contrast[:1] / contrast, 1.0)
+
+
+def of_one_brightness(
+    value: torch.Tensor, weight: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Warped images (images, ...) with one mean and contrast, and what each was multiplied by.
+
+    Of air that is valid in all images, weighted as its noise deserves: bright air that enters an
+    image changes its mean by little, but by more than the noise of dark air. Volumes, which may be
+    attenuated unlike, lose their linear trend along x as well.
+    """
+    dims = tuple(range(1, value.ndim))
+    share = weight / weight.sum().clamp(min=1e-30)
+    value = value - (share * value).sum(dims, keepdim=True)
+    if len(dims) > 2:
+        x = torch.arange(len(weight)).to(value)[:, None, None]
+        x = x - (share * x).sum()
+        trend = share * x / (share * x * x).sum().clamp(min=1e-30)
+        value = value - x * (trend * value).sum(dims, keepdim=True)
+    contrast = (share * value.square()).sum(dims, keepdim=True).sqrt()
+    # images come with nearly one contrast: what asks for more has none
+    gain = (contrast[:1] / contrast).nan_to_num(1.0).clamp(0.5, 2.0)
+    return gain * value, gain
+
+
+def rms(noise: float | torch.Tensor) -> float:
+    """One standard deviation for an image, from its own or those of its pixels (NaN left out)."""
+    if not isinstance(noise, torch.Tensor):
+        return noise
+    finite = working(noise[torch.isfinite(noise)])
+    return float(finite.square().mean().sqrt()) if finite.numel() else 0.0

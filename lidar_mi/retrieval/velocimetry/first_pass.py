@@ -1,0 +1,180 @@
+"""The first displacement of a coarse-to-fine retrieval: correlation of large windows."""
+
+import math
+from itertools import combinations_with_replacement, product
+from typing import NamedTuple
+
+import torch
+from torch.nn.functional import avg_pool3d, pad
+
+from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
+from lidar_mi.retrieval.velocimetry.outliers import validated
+from lidar_mi.retrieval.velocimetry.quality import Flag
+from lidar_mi.retrieval.velocimetry.warping import Spline
+from lidar_mi.retrieval.velocimetry.windows import Windows, separable
+
+
+class Grid(NamedTuple):
+    """Places one pixel apart that the windows' centres are among: pixels, or half way between.
+
+    Attributes
+    ----------
+    shape : tuple of int
+    offset : float
+        Of the first place from the first pixel, 0 or 1/2 px.
+    like : torch.Tensor
+        Empty, of the type and device to work in.
+    """
+
+    shape: tuple[int, ...]
+    offset: float
+    like: torch.Tensor
+
+    @classmethod
+    def of(cls, windows: Windows, like: torch.Tensor) -> "Grid":
+        even = windows.template % 2 == 0
+        return cls(tuple(n - even for n in windows.shape), even / 2, like[:0])
+
+    def windows(self, windows: Windows) -> list[torch.Tensor]:
+        """Numbers, along each axis of this grid, of the places of the windows' centres."""
+        device = self.like.device
+        return [
+            torch.tensor(windows.starts(axis), device=device) + (windows.template - 1) // 2
+            for axis in range(windows.dims)
+        ]
+
+    def places(self, rows: slice = slice(None)) -> list[torch.Tensor]:
+        """Coordinates (px) along each axis, as they broadcast, of some of the first axis' places."""
+        along = [torch.arange(n).to(self.like) + self.offset for n in self.shape]
+        along[0] = along[0][rows]
+        dims = len(along)
+        return [p.reshape(-1, *[1] * (dims - 1 - axis)) for axis, p in enumerate(along)]
+
+    def interpolated(self, values: torch.Tensor, known: list[torch.Tensor]) -> torch.Tensor:
+        """Values (fields, ...) at some evenly spaced places, on all, by cubics.
+
+        Places outside take the nearest value.
+        """
+        weights = [
+            _cubic_weights(at.to(self.like), torch.arange(n).to(self.like))
+            for n, at in zip(self.shape, known)
+        ]
+        return separable(values.to(self.like), weights)
+
+
+def first_pass(
+    images: list[torch.Tensor], spline: Spline | None, windows: Windows, grid: Grid
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Displacement (components, *grid.shape) by large windows, and where it was replaced.
+
+    Windows that the correlation flags or their neighbours contradict take the neighbours' median.
+
+    Parameters
+    ----------
+    images : list of torch.Tensor
+        The first two of them count.
+    spline : Spline, optional
+        Through the images, band-limited: what volumes are correlated by.
+    windows : Windows
+        Of the last pass.
+    grid : Grid
+    """
+    search = _of_images if windows.dims == 2 else _of_volumes
+    d, centres = search(images, spline, windows)
+    d, wrong = validated(d, 1, continued=windows.dims > 2)
+    known = [at.to(grid.like) - grid.offset for at in centres]
+    replaced = grid.interpolated(wrong[None].to(d), known)[0] > 0.5
+    return grid.interpolated(d, known), replaced
+
+
+def _of_images(images, _, windows: Windows) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Windows twice as large over twice the range, where the image holds such search regions."""
+    double = 2 if min(windows.shape) >= 2 * windows.search else 1
+    template, search = double * windows.template, double * windows.search
+    coarse = Windows(windows.shape, template, search, max(1, template // 2))
+    found = cross_correlation(*images[:2], template, search, coarse.stride)
+    usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
+    d = torch.where(usable, found.d, torch.nan)
+    return d, [coarse.centres(axis).to(d.device) for axis in (0, 1)]
+
+
+def _of_volumes(images, spline: Spline, windows: Windows):
+    """Windows about twice as large, as far as the volume holds them, over the same range.
+
+    Normalised cross-correlation of volumes averaged over 2 x 2 x 2 voxels at all whole shifts, and
+    the top of a quadratic through the peak and its 26 neighbours. NaN where the peak lies on the
+    rim of the search.
+    """
+    finite = torch.stack([torch.isfinite(image) for image in images[:2]])
+    axes = [torch.arange(n).to(spline.coefficients) for n in windows.shape]
+    whole = [place.expand(2, *place.shape) for place in torch.meshgrid(*axes, indexing="ij")]
+    values = avg_pool3d((spline.sample(*whole)[0] * finite)[:, None], 2)[:, 0]
+    shape = tuple(values.shape[1:])
+    reach = max(1, round(windows.reach / 2))
+    size = [min(windows.template, n) for n in shape]
+    step = max(1, windows.template // 2)
+
+    def sums(field):
+        return avg_pool3d(field[None], size, step)[0]
+
+    first, second = values
+    fields = pad(torch.stack([second, second**2, torch.ones_like(first)]), (reach,) * 6)
+    contrast1 = sums(first**2) - sums(first) ** 2
+    scores = []
+    for shift in product(range(2 * reach + 1), repeat=3):
+        moved = fields[(slice(None), *(slice(s, s + n) for s, n in zip(shift, shape)))]
+        inside = sums(moved[2])
+        # of image 1 the part that is compared
+        parts = [moved[0], moved[1], first * moved[0], first * moved[2], first**2 * moved[2]]
+        mean2, square2, cross, mean1, square1 = (sums(part) / inside for part in parts)
+        contrast = (square1 - mean1**2) * (square2 - mean2**2)
+        score = (cross - mean1 * mean2) / contrast.clamp(min=1e-12).sqrt()
+        scores.append(torch.where(inside > 0.5, score, -1.0))
+    scores = torch.where(contrast1 > 1e-10, torch.stack(scores), torch.nan)
+    d = 2 * _peaks(scores, reach)
+    centres = [n - 0.5 + 2 * step * torch.arange(m) for n, m in zip(size, d.shape[1:])]
+    return d, [at.to(d.device) for at in centres]
+
+
+def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
+    """Place (3, ...) of the highest of scores over the shifts, between shifts; NaN on the rim."""
+    side = 2 * reach + 1
+    flat = scores.nan_to_num(-2.0).reshape(len(scores), -1)
+    best = flat.argmax(0)
+    place = torch.stack([best // side**2, best // side % side, best % side])
+    rim = ((place == 0) | (place == side - 1)).any(0)
+    # values about a peak as a + b x + x' C x / 2: least squares over the 27 places
+    around = torch.tensor(list(product((-1.0, 0.0, 1.0), repeat=3))).to(flat)
+    pairs = list(combinations_with_replacement(range(3), 2))
+    squares = [around[:, a] * around[:, b] / (1 + (a == b)) for a, b in pairs]
+    quadratic = torch.linalg.pinv(
+        torch.cat([torch.ones_like(around[:, :1]), around, torch.stack(squares, 1)], 1)
+    )
+    number = (around.long()[:, :, None] + place.clamp(1, side - 2)).unbind(1)
+    terms = quadratic @ flat.gather(0, (number[0] * side + number[1]) * side + number[2])
+    slope = terms[1:4].T
+    bend = slope.new_zeros(len(slope), 3, 3)
+    for (a, b), term in zip(pairs, terms[4:]):
+        bend[:, a, b] = bend[:, b, a] = term
+    peaked = torch.linalg.eigvalsh(bend)[:, -1] < 0
+    bend = torch.where(peaked[:, None, None], bend, -torch.eye(3).to(bend))
+    rest = -torch.linalg.solve(bend, slope[..., None])[..., 0]
+    rest = torch.where((peaked & (rest.abs() < 1).all(1))[:, None], rest, 0.0).T
+    d = torch.where(rim | ~(flat.amax(0) > -1), torch.nan, place - reach + rest)
+    return d.reshape(3, *scores.shape[1:])
+
+
+def _cubic_weights(known: torch.Tensor, places: torch.Tensor) -> torch.Tensor:
+    """Matrix (place, known) of cubic convolution (a = -3/4; Keys 1981, IEEE ASSP 29, 1153-1160)."""
+    matrix = places.new_zeros(len(places), len(known))
+    step = float(known[1] - known[0]) if len(known) > 1 else math.inf
+    at = (places - known[0]) / step
+    low = at.floor()
+    for shift in (-1, 0, 1, 2):
+        x = (at - low - shift).abs()
+        inner = (1.25 * x - 2.25) * x * x + 1
+        outer = ((-0.75 * x + 3.75) * x - 6.0) * x + 3.0
+        weight = torch.where(x <= 1, inner, outer)
+        column = (low.long() + shift).clamp(0, len(known) - 1)
+        matrix.scatter_add_(1, column[:, None], weight[:, None])
+    return matrix

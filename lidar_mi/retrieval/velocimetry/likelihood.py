@@ -1,0 +1,179 @@
+"""What images or volumes say on a flow: warped to mid-time, of one brightness, noise weighed."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from lidar_mi.retrieval.velocimetry.brightness import normalised, of_one_brightness, rms
+from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
+from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
+from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
+from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, mismatch, nearest
+from lidar_mi.retrieval.velocimetry.windows import averaged, stored
+
+
+class Images(NamedTuple):
+    """What the flow has to explain.
+
+    Attributes
+    ----------
+    spline : Spline
+        Of the images, band-limited.
+    usable : torch.Tensor of bool, shape (images, ...)
+        Away from non-finite pixels.
+    time : torch.Tensor, shape (images,)
+        From mid-time, in units of dt.
+    noise : float
+        Standard deviation of the images' white noise.
+    weight : torch.Tensor, shape of an image
+        Inverse-variance weight: mean variance of the noise over its own at each pixel.
+    stack : torch.Tensor, shape (images, ...)
+        The images, of one brightness.
+    blur : float
+        Standard deviation of the Gaussian that blurred the images, px.
+    weighed : bool
+        Whether noise holds the misfit at each place already.
+    """
+
+    spline: Spline
+    usable: torch.Tensor
+    time: torch.Tensor
+    noise: float
+    weight: torch.Tensor
+    stack: torch.Tensor
+    blur: float
+    weighed: bool = False
+
+
+class Linear(NamedTuple):
+    """The images about a flow: what they say on its change.
+
+    Attributes
+    ----------
+    slope : torch.Tensor, shape (components, ...)
+        Of the mean of the warped images.
+    gradient : torch.Tensor, shape (components, ...)
+        Of the log-likelihood by the flow at each pixel.
+    weight : torch.Tensor
+        Of the slopes' products in the second derivative.
+    variance : float
+        Of the noise.
+    warped : torch.Tensor, shape (images, ...)
+        The images at mid-time, of one brightness.
+    valid : torch.Tensor of bool
+        Where all of them are.
+    """
+
+    slope: torch.Tensor
+    gradient: torch.Tensor
+    weight: torch.Tensor
+    variance: float
+    warped: torch.Tensor
+    valid: torch.Tensor
+
+
+def prepared(
+    stack: Sequence[torch.Tensor],
+    noise: float | torch.Tensor | None,
+    blur: float,
+    settings: VariationalSettings,
+) -> Images:
+    """The images, normalised and band-limited, with what is known of their noise."""
+    known_at = usable(stack)
+    weight = torch.ones_like(stored(stack[0]))
+    if isinstance(noise, torch.Tensor) and noise.ndim:
+        known = torch.isfinite(noise)
+        known_at = known_at & usable([noise])
+        # a level that few photons determine is lowest where an image is too dark by chance
+        square = averaged(stored(noise).nan_to_num(0.0).square(), known, settings.noise_width)
+        weight = torch.where(square > 0, rms(noise) ** 2 / square, weight)
+        # no pixel may outweigh a window of others
+        weight = weight.clamp(max=100.0)
+    images = normalised(stack)
+    spline, level = band_limited(
+        images,
+        noise if noise is None else rms(noise),
+        weight=weight.sqrt(),
+        blur=blur,
+        settings=settings.filter,
+    )
+    time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
+    time = time - time.mean()
+    return Images(spline, known_at, time, level, weight, images, blur)
+
+
+def weighed(images: Images, linear: Linear, width: float, coloured: bool) -> Images:
+    """The images with noise as large, at each place and wave, as what they do not share.
+
+    Where no flow of the splines explains the images there is more than their noise: structure
+    that moved through the plane or that is lost between pixels, motion on too small scales. What
+    is known of the noise is the least.
+    """
+    rest = (linear.warped - linear.warped.mean(0)) * linear.valid
+    free = (len(rest) - 1) * max(images.spline.passed, 1e-6)
+    # what counts is the misfit where slopes are steep, and there it is largest (White 1980,
+    # Econometrica 48, 817-838)
+    steep = linear.slope.square().sum(0)
+    steep = steep + 1e-3 * steep.mean() + 1e-30
+    local = averaged(rest.square().sum(0) * images.weight * steep / free, linear.valid, width)
+    local = local / averaged(steep, linear.valid, width)
+    mean = float(local[linear.valid].mean()) if linear.valid.any() else 0.0
+    level = max(images.noise**2, mean, 1e-30)
+    least = max(images.noise**2, 0.5 * level)
+    weight = images.weight * (level / local.clamp(min=least))
+    density = None
+    if coloured:
+        density = mismatch(images.spline, rest * weight.sqrt()).clamp(min=least)
+    spline, noise = band_limited(
+        images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
+    )
+    return images._replace(spline=spline, noise=noise, weight=weight, weighed=True)
+
+
+def linearised(
+    images: Images, mesh: Mesh, coefficients: torch.Tensor, settings: VariationalSettings
+) -> Linear:
+    """The images about a flow; `mesh` is that of the pixels."""
+    places = path(mesh, coefficients, images.time, settings.path_order)
+    value, *slopes = images.spline.sample(*places)
+    valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
+    value, gain = of_one_brightness(value, images.weight * valid)
+    slope = torch.stack([(gain * part).mean(0) for part in slopes])
+    rest = (value - value.mean(0)) * images.weight.sqrt()
+    passed = max(images.spline.passed, 1e-6)
+    misfit = rest.square().sum(0)
+    # what no flow explains counts as noise: images are never taken to be better than they fit
+    variance = max(images.noise**2, 1e-30)
+    if not images.weighed:
+        variance = max(variance, misfit_variance(misfit[valid], len(value)) / passed)
+    off = (misfit / ((len(value) - 1) * passed * variance)).sqrt()
+    weight = images.weight * (settings.robust / off.clamp(min=settings.robust)) * valid
+    time = images.time.reshape(-1, *[1] * mesh.dims)
+    downhill = -(time * (value - value.mean(0))).sum(0) * slope
+    informed = images.spline.efficiency * weight / variance
+    second = images.time.square().sum() * informed / images.spline.excess
+    return Linear(slope, informed * downhill, second, variance, value, valid)
+
+
+def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int) -> torch.Tensor:
+    """Where air that is at the pixels at mid-time is at other times, (components, images, ...), px.
+
+    Lie series x + sum t^k / k! (u . grad)^(k - 1) u for a wind that stands still: with six terms,
+    where air turns by an angle a in t, the place is off by a^7 / 5040 of the radius.
+    """
+    flow = mesh.field(coefficients)
+    time = time.reshape(-1, *[1] * mesh.dims)
+    term = flow
+    change = time * term[:, None]
+    for k in range(2, terms + 1):
+        if k == 2:
+            along = mesh.slopes(coefficients)
+        else:
+            along = torch.gradient(term, dim=tuple(range(1, term.ndim)))
+        term = sum(u * part for u, part in zip(flow, along))
+        change = change + time**k / math.factorial(k) * term[:, None]
+    for axis, place in enumerate(mesh.places):
+        change[axis] += place.reshape(-1, *[1] * (mesh.dims - 1 - axis))
+    return change
