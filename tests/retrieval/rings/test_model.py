@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.cells import annular_average, annular_sectors, pixels
+from lidar_mi.retrieval.rings.cells import annular_sectors, pixels
 from lidar_mi.retrieval.rings.model import (
     PARAMETERS,
     PixelNoise,
@@ -78,35 +78,6 @@ def test_derivatives_are_differences(kind):
         slack = {"x": 5e-2, "y": 5e-2, "falloff": 5e-3}.get(name, 1e-4)
         worst = (jacobian[:, place] - difference).abs().amax(1) / difference.abs().amax(1)
         assert (worst < slack).all(), (name, worst)
-
-
-def test_cells_know_their_pixels_about_any_centre():
-    shape, centre, other = (50, 70), (31.4, 22.8), (33.1, 21.5)
-    cells = annular_sectors(shape, centre, 90.0, 12)
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    index = cells.index.numpy()
-    r2 = ((x - other[0]) ** 2 + (y - other[1]) ** 2).ravel()
-    dx, dy = (o - c for o, c in zip(other, centre))
-    mean = cells.r2 - 2 * (cells.x * dx + cells.y * dy) + dx**2 + dy**2
-    by = torch.tensor([-2 * dx, -2 * dy, 1.0], dtype=torch.float64)
-    spread = torch.einsum("i,cij,j->c", by, cells.spread, by)
-    for cell in range(0, len(cells.count), 7):
-        inside = r2[index == cell]
-        assert len(inside) == cells.count[cell]
-        assert float(mean[cell]) == pytest.approx(inside.mean(), rel=1e-12)
-        assert float(spread[cell]) == pytest.approx(inside.var(), abs=1e-8 * inside.mean())
-
-
-def test_annular_average_is_the_mean_of_its_pixels():
-    rng = np.random.default_rng(3)
-    images = torch.as_tensor(rng.random((2, 40, 30)))
-    r2, mean, count = annular_average(images, (10.0, 44.0), 120.0)
-    y, x = np.mgrid[:40, :30]
-    true = (x - 10.0) ** 2 + (y - 44.0) ** 2
-    for k, ring in enumerate(np.unique(true // 120)):
-        inside = true // 120 == ring
-        assert count[k] == inside.sum() and float(r2[k]) == pytest.approx(true[inside].mean())
-        np.testing.assert_allclose(mean[:, k], images.numpy()[:, inside].mean(1), rtol=1e-12)
 
 
 # --- the bound ------------------------------------------------------------------------------

@@ -10,13 +10,7 @@ import pytest
 from scipy.signal import savgol_coeffs
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.centre import (
-    circular_average,
-    circular_centre,
-    gradient_centre,
-    midpoint_line_centre,
-)
-from lidar_mi.retrieval.rings.peak_fit import peak, peaks
+from lidar_mi.retrieval.rings.centre import circular_centre, gradient_centre, midpoint_line_centre
 from lidar_mi.retrieval.rings.peaks import (
     PIECE,
     find_centre,
@@ -53,14 +47,6 @@ def paper_velocity(received, emitted, method="ca", coordinate="r", centre=None, 
     return velocity_from_radii(*radii, *OPTICS)
 
 
-def test_circular_average_of_a_cone():
-    """r averaged at r is r, to the second order of linear weights: 1 / 6 of a pixel over r."""
-    y, x = np.mgrid[:80, :90]
-    r, mean, weight = circular_average(np.hypot(x - 30.3, y - 41.6), (30.3, 41.6))
-    np.testing.assert_allclose(mean[5:60], r[5:60], atol=0.05)
-    assert weight.sum() == pytest.approx(80 * 90)
-
-
 @pytest.mark.parametrize("kind", ["still", "emitted"])
 def test_centres_without_noise(pictures, kind):
     image = pictures[kind]
@@ -93,18 +79,6 @@ def test_radial_cuts_and_their_filter():
     impulse[0, 30] = 1
     found = savitzky_golay(impulse, 31, 2)[0, 15:46]
     np.testing.assert_allclose(found, savgol_coeffs(31, 2)[::-1], atol=1e-12)
-
-
-def test_peaks_that_overlap():
-    """Two Gaussians of one width on a slope, one width apart: exact when fitted together."""
-    x = np.linspace(0, 100, 400)
-    values = (
-        3 + 0.01 * x + sum(h * np.exp(-(((x - p) / 8) ** 2) / 2) for p, h in ((42, 5), (60, 4)))
-    )
-    np.testing.assert_allclose(peaks(x, values, [44, 58], 25, slope=True), [42, 60], atol=1e-6)
-    assert abs(peak(x, values, 44, 12) - 42) > 0.05
-    with pytest.raises(InputError, match="no peak within"):
-        peak(x, -values, 44, 12)
 
 
 def test_wind_of_a_radius():
