@@ -35,14 +35,14 @@ def rings(
 ) -> None:
     """Measure the rings of an etalon in any image: centre, radii, orders, quality of the fit."""
     from lidar_mi.assessment.figures.rings import draw_rings
-    from lidar_mi.io.images import read_picture
+    from lidar_mi.io.images import read_pixels
     from lidar_mi.io.png import write_png
     from lidar_mi.retrieval.rings.analysis import analyse_rings
 
     path = out or Path(f"{image.stem}_rings.png")
     if not path.parent.is_dir():
         raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
-    values = read_picture(image, layer)
+    values = read_pixels(image, layer)
     try:
         found = analyse_rings(values, centre, saturation)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Reading pictures of any common kind into an array of light."""
+"""Images of any common kind: pixels, axes, noise; and packed for a report."""
 
 from io import BytesIO
 from pathlib import Path
@@ -12,7 +12,7 @@ from lidar_mi.io.exr import read_layers
 FITS = (".fits", ".fit", ".fts")
 
 
-def read_picture(path: str | Path, layer: str | None = None) -> np.ndarray:
+def read_pixels(path: str | Path, layer: str | None = None) -> np.ndarray:
     """Image of an EXR, PNG, TIFF, BMP, JPEG or FITS file, float64, (height, width), top row first.
 
     Colours are averaged, transparency is left out. Values are those of the file: 8 or 16 bit
@@ -34,22 +34,22 @@ def read_picture(path: str | Path, layer: str | None = None) -> np.ndarray:
             f"{path}: no such file; expected an EXR, PNG, TIFF, BMP, JPEG or FITS image"
         )
     if _is_exr(path):
-        picture = _exr(path, layer)
+        image = _exr(path, layer)
     elif layer is not None:
         raise InputError(f"layer: {layer!r} is not allowed for {path}; only EXR files have layers")
     else:
-        picture = _fits(path) if path.suffix.lower() in FITS else _image(path)
-    return np.array(picture, dtype=float)
+        image = _fits(path) if path.suffix.lower() in FITS else _image(path)
+    return np.array(image, dtype=float)
 
 
 def read_image(
     path: str | Path, layer: str | None = None, spacing: float | None = None
 ) -> xr.DataArray:
-    """A picture as `read_picture` gives it, as an image (z, y), ascending, in metres.
+    """Pixels as `read_pixels` gives them, on axes (z, y), ascending, in metres.
 
     The top row has the largest z and the left column the largest y. Axes come from the header
     attributes ``y`` and ``z`` that the EXR files of our scans carry; for other files ``spacing``
-    (m, from pixel to pixel) puts the picture's middle at zero.
+    (m, from pixel to pixel) puts the image's middle at zero.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ def read_image(
     """
     if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"{path}: spacing: {spacing} m is not allowed; expected a number above 0")
-    pixels = read_picture(path, layer)
+    pixels = read_pixels(path, layer)
     rows, columns = pixels.shape
     header = read_layers(path)[0] if _is_exr(path) else {}
     if spacing is not None:
@@ -213,13 +213,13 @@ def _image(path):
         with Image.open(path) as file:
             indirect = file.mode in ("P", "CMYK", "YCbCr", "HSV", "LAB")
             image = file.convert("RGB") if indirect else file
-            bands, picture = image.getbands(), np.asarray(image)
+            bands, pixels = image.getbands(), np.asarray(image)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: no readable image ({_short(error)})") from None
-    if picture.ndim == 2:
-        return picture
+    if pixels.ndim == 2:
+        return pixels
     colours = [k for k, band in enumerate(bands) if band != "A"]
-    return picture[..., colours].mean(-1)
+    return pixels[..., colours].mean(-1)
 
 
 def _short(error: Exception) -> str:

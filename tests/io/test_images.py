@@ -15,7 +15,7 @@ from PIL import Image
 
 from lidar_mi.cli import app as cli
 from lidar_mi.errors import InputError
-from lidar_mi.io.images import as_webp, read_image, read_picture
+from lidar_mi.io.images import as_webp, read_image, read_pixels
 from lidar_mi.retrieval.rings import analysis as rings
 from lidar_mi.retrieval.velocimetry import wind
 
@@ -46,10 +46,10 @@ def test_every_kind_holds_the_same(tmp_path, values):
     write_exr(tmp_path / "a.exr", Y=values, noise=0 * values)
     write_exr(tmp_path / "rgb.exr", R=values - 1, G=values, B=values + 1)
     for path in sorted(tmp_path.iterdir()):
-        np.testing.assert_array_equal(read_picture(path), values, err_msg=path.name)
+        np.testing.assert_array_equal(read_pixels(path), values, err_msg=path.name)
     grey.save(tmp_path / "a.jpg", quality=95)
-    assert np.abs(read_picture(tmp_path / "a.jpg") - values).max() < 12
-    assert not read_picture(tmp_path / "a.exr", "noise").any()
+    assert np.abs(read_pixels(tmp_path / "a.jpg") - values).max() < 12
+    assert not read_pixels(tmp_path / "a.exr", "noise").any()
 
 
 def test_files_that_are_none(tmp_path, values):
@@ -67,7 +67,7 @@ def test_files_that_are_none(tmp_path, values):
         ("two.exr", "c", "layer 'c' is not there; expected one of a, b"),
     ):
         with pytest.raises(InputError, match=message) as stop:
-            read_picture(tmp_path / name, layer)
+            read_pixels(tmp_path / name, layer)
         assert "\n" not in str(stop.value)
 
 

@@ -1,4 +1,4 @@
-"""Rings in any picture: centre, radii, orders, and how well they follow the etalon's law.
+"""Rings in any image: centre, radii, orders, and their deviation from the law of an etalon.
 
 Nothing needs to be known of the instrument. Rings are found in the average over circles, measured
 in sectors, and one centre is fitted to all of them; then r^2 must rise by one step from order to
@@ -21,17 +21,17 @@ from lidar_mi.tables import Table, Tabular, with_error
 
 STEPS = 1200  # annuli out to the farthest corner
 SECTORS = 48
-SEEN = 8.0  # standard deviations of the smoothed average that a ring stands out by
+SIGNIFICANT = 8.0  # standard deviations of the smoothed average, the least height of a ring
 PROMINENT = 0.1  # and of the tallest ring's height
-LEAST = 3  # sectors, in which a ring must be seen to be one
-ALL_AROUND = 0.5  # of the sectors, in which a ring must be seen to tell its shape
+LEAST = 3  # sectors in which a ring must be detected
+ALL_AROUND = 0.5  # of the sectors, in which a ring must be detected to determine its shape
 LINES = 3  # most that a line may be split into
 LAW = 0.02  # of an order: farther off equal steps, rms, is no etalon's pattern
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rings(Tabular):
-    """What a picture's rings are; lengths in pixels, errors are standard deviations.
+    """The rings of an image; lengths in pixels, errors are standard deviations.
 
     Attributes
     ----------
@@ -59,10 +59,10 @@ class Rings(Tabular):
         half the relative difference of its diameters.
     tilt : (float, float)
         Shift of a ring's middle from the centre over its squared radius, 1/px; its size is
-        tan(tilt of the camera) over the focal length. 0, as the ellipticity, where the rings that
-        are seen do not tell it.
+        tan(tilt of the camera) over the focal length. 0, as the ellipticity, where the
+        detected rings do not determine it.
     r2, profile : arrays
-        Mean over circles, for the picture.
+        Mean over circles, for the image.
     """
 
     shape: tuple[int, int]
@@ -163,7 +163,7 @@ def analyse_rings(
     Raises
     ------
     InputError
-        A picture that is not finite, saturated, shows fewer than two rings, has its centre
+        An image that is not finite, saturated, shows fewer than two rings, has its centre
         outside, or whose rings do not follow one another by equal steps of r^2.
 
     Examples
@@ -180,7 +180,7 @@ def analyse_rings(
     """
     image = checked(image, saturation)
     if len(image) != 1:
-        raise InputError(f"image: {len(image)} pictures are not allowed; expected one")
+        raise InputError(f"image: {len(image)} images are not allowed; expected one")
     image = image[0].double().cpu().numpy()
     free = centre is None
     centre = gradient_centre(image) if free else tuple(map(float, centre))
@@ -220,7 +220,7 @@ def analyse_rings(
 class _Sectors:
     """Averages over sectors of annuli of equal steps in r^2.
 
-    Out to where the last sector leaves the picture: `parts` (SECTORS, annuli) with NaN where a
+    Out to where the last sector leaves the image: `parts` (SECTORS, annuli) with NaN where a
     sector is not all inside, `mean` over those that are, `r2` the annuli's middles, `angle` the
     sectors'.
     """
@@ -237,7 +237,7 @@ class _Sectors:
         count = np.bincount(label.ravel(), minlength=size).reshape(STEPS, SECTORS)
         total = np.bincount(label.ravel(), image.ravel(), size).reshape(STEPS, SECTORS)
         self.angle = (np.arange(SECTORS) + 0.5) * (2 * np.pi / SECTORS)
-        # a sector that the rim cuts through would see another part of the picture
+        # a sector cut by the rim would average another part of the image
         r = np.sqrt((np.arange(STEPS) + 1) * self.step)[:, None, None]
         around = (np.arange(SECTORS)[:, None] + np.linspace(0, 1, 5)) * (2 * np.pi / SECTORS)
         x, y = centre[0] + r * np.cos(around), centre[1] + r * np.sin(around)
@@ -247,29 +247,29 @@ class _Sectors:
         self.parts = np.where(full, total / np.maximum(count, 1), np.nan)[:last].T
         count, total = np.where(full, count, 0).sum(1), np.where(full, total, 0).sum(1)
         self.r2 = (np.arange(last) + 0.5) * self.step
-        seen = np.flatnonzero(count[:last])
-        self.mean = np.interp(self.r2, self.r2[seen], total[seen] / count[seen])
+        known = np.flatnonzero(count[:last])
+        self.mean = np.interp(self.r2, self.r2[known], total[known] / count[known])
 
 
 def _crests(sectors: _Sectors) -> tuple[np.ndarray, np.ndarray]:
-    """r^2 of every ring in every sector, (rings, SECTORS), NaN where it is not seen; the angles."""
+    """r^2 of every ring in every sector, (rings, SECTORS), NaN where it is not detected; the angles."""
     mean = sectors.mean
     smooth = savgol_filter(mean, 15, 2)
     # smoothing by 15 steps leaves 0.4 of white noise
     noise = 0.4 * 1.4826 * np.median(np.abs(mean - smooth - np.median(mean - smooth)))
-    height = max(SEEN * noise, PROMINENT * np.ptp(smooth))
-    if not np.ptp(smooth) > SEEN * noise:
-        raise InputError("rings: none seen; expected at least 2")
+    height = max(SIGNIFICANT * noise, PROMINENT * np.ptp(smooth))
+    if not np.ptp(smooth) > SIGNIFICANT * noise:
+        raise InputError("rings: none detected; expected at least 2")
     places, _ = find_peaks(smooth, prominence=height)
     if len(places) < 2:
-        raise InputError(f"rings: {len(places)} seen; expected at least 2")
+        raise InputError(f"rings: {len(places)} detected; expected at least 2")
     width = peak_widths(smooth, places, rel_height=0.5)[0] * sectors.step
     crests = np.full((len(places), SECTORS), np.nan)
     for group in np.split(np.arange(len(places)), _gaps(smooth, places)):
         starts = sectors.r2[places[group]]
         reach = max(1.05 * width[group].max(), 4 * sectors.step)
         for sector, part in enumerate(sectors.parts):
-            # where a sector's last rings lie outside, the first may still be seen
+            # where a sector's last rings lie outside, the first may still be inside
             for many in range(len(group), 0, -1):
                 if np.isfinite(np.interp(starts[many - 1] + reach, sectors.r2, part)):
                     break
@@ -277,14 +277,14 @@ def _crests(sectors: _Sectors) -> tuple[np.ndarray, np.ndarray]:
                 crests[group[:many], sector] = peaks(sectors.r2, part, starts[:many], reach, True)
             except InputError:
                 continue
-    seen = np.logical_and.accumulate(np.isfinite(crests).sum(1) >= LEAST)
-    if seen.sum() < 2:
-        raise InputError(f"rings: {seen.sum()} seen; expected at least 2")
-    return crests[seen], sectors.angle
+    detected = np.logical_and.accumulate(np.isfinite(crests).sum(1) >= LEAST)
+    if detected.sum() < 2:
+        raise InputError(f"rings: {detected.sum()} detected; expected at least 2")
+    return crests[detected], sectors.angle
 
 
 def _gaps(smooth: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Which crests begin a new group: between groups the profile falls to a fifth or below."""
+    """Which crests begin a new group: between groups the profile falls to 0.2 or below."""
     valleys = [smooth[a:b].min() for a, b in itertools.pairwise(places)]
     lower = np.minimum(smooth[places[:-1]], smooth[places[1:]]) - smooth.min()
     return 1 + np.flatnonzero(valleys - smooth.min() < 0.2 * lower)
@@ -296,7 +296,7 @@ def _circles(crests: np.ndarray, angle: np.ndarray, free: bool):
     Least squares of r = a + shift . u + a ellipticity . u2 + a^2 tilt . u with u = (cos, sin) of
     the angle and u2 of twice the angle: what a tilted camera makes of circles to first order in
     the tilt (each ring's own shift goes with its area), and pixels or lenses that are not as wide
-    as high. Where fewer than two rings are seen all around, only the shift is fitted.
+    as high. Where fewer than two rings are detected all around, only the shift is fitted.
     """
     rings = len(crests)
     radius = np.sqrt(np.nanmedian(crests, 1))
@@ -324,10 +324,10 @@ def _circles(crests: np.ndarray, angle: np.ndarray, free: bool):
     shape = np.zeros(6)
     shape[: len(found) - rings] = (found / np.where(scale > 0, scale, 1))[rings:]
     # rings beyond a lost one could not be counted
-    held = np.logical_and.accumulate(np.bincount(ring[kept], minlength=rings) >= LEAST)
-    if held.sum() < 2:
-        raise InputError(f"rings: {held.sum()} seen; expected at least 2")
-    return found[:rings][held], std[:rings][held], shape, std[rings : rings + 2], rms
+    kept_rings = np.logical_and.accumulate(np.bincount(ring[kept], minlength=rings) >= LEAST)
+    if kept_rings.sum() < 2:
+        raise InputError(f"rings: {kept_rings.sum()} detected; expected at least 2")
+    return found[:rings][kept_rings], std[:rings][kept_rings], shape, std[rings : rings + 2], rms
 
 
 def _law(square: np.ndarray, error: np.ndarray):

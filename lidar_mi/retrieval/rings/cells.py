@@ -1,10 +1,10 @@
-"""Pictures of rings in few numbers: sums over sectors of annuli of equal width in r^2.
+"""Images of rings in few numbers: sums over sectors of annuli of equal width in r^2.
 
 An etalon's order falls linearly with r^2 (to 1e-4 on a camera), so annuli of equal steps in r^2
 are equal steps in order: every ring gets as many as every other. Sectors keep the direction, from
 which the centre follows. A cell remembers where its pixels lie, to second moments, about the
 centre it was made with; about any other centre its mean r^2 is then exact, and the spread of r^2
-in it exact too but for third moments. A picture is so binned once, however often a fit moves the
+in it exact too but for third moments. An image is so binned once, however often a fit moves the
 centre, as long as it moves by a few pixels.
 """
 
@@ -47,9 +47,9 @@ class Cells(NamedTuple):
         if self.index is None:
             return flat.double()
         sums = flat.new_zeros((*flat.shape[:-1], len(self.count)))
-        # one picture at a time: four times faster than a sum along the last axis of all
-        for total, picture in zip(sums.view(-1, sums.shape[-1]), flat.view(-1, flat.shape[-1])):
-            total.index_add_(0, self.index, picture)
+        # one image at a time: four times faster than a sum along the last axis of all
+        for total, image in zip(sums.view(-1, sums.shape[-1]), flat.view(-1, flat.shape[-1])):
+            total.index_add_(0, self.index, image)
         return sums.double() / self.count
 
 
@@ -75,8 +75,8 @@ def annular_sectors(
     centre : (float, float)
         (x, y), pixels; may lie outside.
     step : float
-        px^2. A fit loses (2 pi n step / order)^2 / 12 of what the n-th harmonic of the ring
-        profile knows, with `order` the step of r^2 from ring to ring.
+        px^2. A fit loses (2 pi n step / order)^2 / 12 of the information of the n-th harmonic of
+        the ring profile, with `order` the step of r^2 from ring to ring.
     sectors : int
         Per turn; 1 for whole annuli.
 

@@ -17,8 +17,8 @@ def gradient_centre(image) -> tuple[float, float]:
     The gradient of rings points to or from their centre wherever a pixel lies, so that every
     edge votes and no ring needs to be found or closed: least squares of the distances between the
     point and the lines, weighted by the squared gradient (Parthasarathy 2012, Nature Methods 9,
-    724), here of the smoothed picture. Noise of white pixels draws the point toward the
-    picture's middle, by its share of the squared gradient: below 0.1 % for the paper's 1.3e7
+    724), here of the smoothed image. Noise of white pixels draws the point toward the
+    image's middle, by its fraction of the squared gradient: below 0.1 % for the paper's 1.3e7
     photons.
 
     Parameters
@@ -34,7 +34,7 @@ def gradient_centre(image) -> tuple[float, float]:
     Raises
     ------
     InputError
-        A picture without gradients, or with all of them along one direction.
+        An image without gradients, or with all of them along one direction.
     """
     image = torch.as_tensor(image)
     block = max(1, min(image.shape) // 192)
@@ -73,11 +73,11 @@ def circular_average(image: np.ndarray, centre: tuple[float, float]) -> tuple:
     upper = r - low
     value = np.asarray(image, float).ravel()
     weight, total = np.zeros((2, low.max() + 2))
-    for index, share in ((low, 1 - upper), (low + 1, upper)):
-        weight += np.bincount(index, share, len(weight))
-        total += np.bincount(index, share * value, len(weight))
-    seen = weight > 0
-    return np.flatnonzero(seen).astype(float), total[seen] / weight[seen], weight[seen]
+    for index, part in ((low, 1 - upper), (low + 1, upper)):
+        weight += np.bincount(index, part, len(weight))
+        total += np.bincount(index, part * value, len(weight))
+    known = weight > 0
+    return np.flatnonzero(known).astype(float), total[known] / weight[known], weight[known]
 
 
 def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[float, float]:
@@ -138,11 +138,11 @@ def midpoint_points(
     -------
     array (2, 2, bands, 2)
         Direction (along x, along y), side (before, behind the centre), band, and (x, y) in px.
-        NaN where the line leaves the picture or has no crest.
+        NaN where the line leaves the image or has no crest.
     """
     found = np.full((2, 2, bands, 2), np.nan)
     for direction in range(2):
-        # lines along x of the picture, or along y of it: the same on the transposed picture
+        # lines along x of the image, or along y of it: the same on the transposed image
         lines = image if direction == 0 else image.T
         along, across = centre if direction == 0 else centre[::-1]
         edges = across + np.linspace(-radius / 2, radius / 2, bands + 1)
@@ -178,7 +178,7 @@ def midpoint_line_centre(
     Raises
     ------
     InputError
-        No chord along one of the directions lies in the picture.
+        No chord along one of the directions lies in the image.
     """
     for _ in range(2):
         points = midpoint_points(image, start, radius, half_width)
@@ -186,7 +186,7 @@ def midpoint_line_centre(
         if not all(np.isfinite(middle[k, :, k]).any() for k in range(2)):
             raise InputError(
                 f"image: no chord of a ring of {radius:.0f} px about ({start[0]:.0f}, "
-                f"{start[1]:.0f}) px; expected a ring within the picture"
+                f"{start[1]:.0f}) px; expected a ring within the image"
             )
         start = tuple(float(np.nanmean(middle[k, :, k])) for k in range(2))
     return start

@@ -1,13 +1,13 @@
-"""Line-of-sight wind from all rings of a picture at once: maximum likelihood, many pictures a call.
+"""Line-of-sight wind from all rings of an image at once: maximum likelihood, many images per call.
 
-Every parameter of `ring_model` that is not known is fitted along: the rings' centre, the level of
+Every parameter of `lidar_mi.retrieval.rings.model` that is not known is fitted along: the rings' centre, the level of
 the light, its fall-off, the background and the air's temperature. Two ways, one fit:
 
-annular  pictures are first averaged over sectors of annuli of equal steps in r^2: a hundred
+annular  images are first averaged over sectors of annuli of equal steps in r^2: a hundred
          times fewer numbers, 0.3 % of the information lost
 pixels   every pixel takes part (2-D fit), from where the annular fit ended
 
-Pictures are in electrons, so that their noise follows from their mean.
+Images are in electrons, so that their noise follows from their mean.
 """
 
 import math
@@ -35,19 +35,19 @@ from lidar_mi.retrieval.rings.model import (
 
 METHODS = ("annular", "pixels")
 
-# Annuli an order of interference, for each harmonic that matters: pi^2 / 3 / 16^2 = 1.3 % of the
-# information of the highest is lost, which holds next to nothing.
+# Annuli per order of interference, for each harmonic that matters: pi^2 / 3 / 16^2 = 1.3 % of the
+# information of the highest is lost, which is hardly any.
 STEPS_PER_HARMONIC = 16
 SECTORS = 16
 REACH = 0.025  # of the first ring's size, how far off a centre may lie from the sectors' own
 ITERATIONS = 40
 CLOSE = 1e-3  # standard deviations, the last step of a fit that has converged
 CHUNK_BYTES = 256e6
-SEEN = 5.0  # standard deviations that rings must stand out by
+SIGNIFICANT = 5.0  # standard deviations, the least amplitude of rings
 
 
 class RingFit(NamedTuple):
-    """What pictures tell, tensors of shape (images,), float64.
+    """Retrieved values, tensors of shape (images,), float64.
 
     Attributes
     ----------
@@ -57,7 +57,7 @@ class RingFit(NamedTuple):
     x, y : torch.Tensor
         Centre of the rings, pixels to the right and down from the top left pixel's centre.
     level, background : torch.Tensor
-        Electrons a pixel.
+        Electrons per pixel.
     temperature : torch.Tensor
         K; NaN where the model has none.
     falloff : torch.Tensor
@@ -66,7 +66,7 @@ class RingFit(NamedTuple):
     chi_square : torch.Tensor
         Squared misfit over its expectation: 1 where model and noise are right.
     rings : torch.Tensor
-        Rings that were seen.
+        Rings that were detected.
     """
 
     v_los: torch.Tensor
@@ -93,10 +93,10 @@ def fit_rings(
     saturation: float | None = None,
     max_chi_square: float = 2.0,
 ) -> RingFit:
-    """v_LOS and its standard deviation from every picture on its own.
+    """v_LOS and its standard deviation from every image on its own.
 
     Unambiguous over `RingModel.velocity_range` about 0, +-970 m/s for the default instrument: the
-    first harmonic of the picture over the order gives the start.
+    first harmonic of the image over the order gives the start.
 
     Parameters
     ----------
@@ -108,16 +108,16 @@ def fit_rings(
     method : {"annular", "pixels"}
     centre : (float, float), optional
         (x, y) of the rings, pixels: where the fit starts, and where it stays if x and y are not
-        free. Found from the pictures' gradients if not given.
-    free : names out of `ring_model.PARAMETERS`, optional
+        free. Found from the images' gradients if not given.
+    free : names out of `lidar_mi.retrieval.rings.model.PARAMETERS`, optional
         What is fitted; everything the model has if not given. The others stay at the model's
         values, the background at 0.
     saturation : float, optional
-        Electrons from which on a pixel is full. Pictures that end in a plateau are refused even
+        Electrons from which on a pixel is full. Images that end in a plateau are refused even
         if it is not given.
     max_chi_square : float
-        A picture that fits worse is refused: whatever it shows, the model is not it. Infinite
-        lets all through. The default tells a wrong line or noise, not a good one: chi_square
+        An image that fits worse is refused: whatever it shows, the model is not it. Infinite
+        lets all through. The default detects a wrong line or noise, not a small error: chi_square
         scatters by (2 / cells)^(1/2) = 1 to 2 %.
 
     Returns
@@ -127,7 +127,7 @@ def fit_rings(
     Raises
     ------
     InputError
-        Sizes, method or names that are not allowed; a picture that is not finite or saturated,
+        Sizes, method or names that are not allowed; an image that is not finite or saturated,
         shows fewer than two rings, has its centre outside or does not fit the model.
     """
     if method not in METHODS:
@@ -150,16 +150,16 @@ def fit_rings(
 
 
 def difference(received: RingFit, emitted: RingFit) -> tuple[torch.Tensor, torch.Tensor]:
-    """v_LOS and its standard deviation between received pictures and those of the laser itself.
+    """v_LOS and its standard deviation between received images and those of the laser itself.
 
-    What the instrument's order at the centre is off by, drift of etalon or laser, drops out.
+    An error of the order at the centre, by a drift of etalon or laser, cancels.
     """
     std = torch.hypot(received.v_los_std, emitted.v_los_std)
     return received.v_los - emitted.v_los, std
 
 
 def _chunk(model: RingModel, method: str) -> int:
-    """Pictures at a time: about 250 bytes a cell for Jacobian and waves."""
+    """Images at once: about 250 bytes per cell for Jacobian and waves."""
     cells = math.prod(model.shape)
     if method == "annular":
         cells = min(cells, _steps(model) * SECTORS * (1 + cells // model.order_spacing))
@@ -167,13 +167,13 @@ def _chunk(model: RingModel, method: str) -> int:
 
 
 def _steps(model: RingModel) -> int:
-    """Annuli an order of interference."""
+    """Annuli per order of interference."""
     strong = (abs(model.harmonics) > 0.01).any(0).nonzero()[0]
     return STEPS_PER_HARMONIC * int(strong[-1])
 
 
 class _Task(NamedTuple):
-    """What is the same for all pictures of a call."""
+    """Whatever is the same for all images of a call."""
 
     model: RingModel
     noise: PixelNoise
@@ -183,10 +183,10 @@ class _Task(NamedTuple):
 
 
 def _fit(images, task: _Task, number: int, method: str) -> RingFit:
-    """`fit_rings` for some of the pictures, from the ``number``-th on.
+    """`fit_rings` for some of the images, from the ``number``-th on.
 
     They share their cells, about the centre of their mean. Where one of them shows no rings about
-    that, or its centre turns out to lie farther off than sectors bear, it gets cells of its own.
+    that, or its centre lies farther off than sectors allow, it gets cells of its own.
     """
     centre = task.centre or gradient_centre(images.mean(0, dtype=torch.float32))
     try:
@@ -241,11 +241,13 @@ def _fit_about(centre, images, task: _Task, number: int, method: str) -> RingFit
     v, dx, dy, level, background, temperature, falloff = parameters.unbind(1)
     x, y = dx + centre[0], dy + centre[1]
     found = (values.tolist() for values in (x, y, rings, chi_square))
-    for name, *place, seen, misfit in zip((f"images[{number + k}]" for k in range(len(x))), *found):
+    for name, *place, detected, misfit in zip(
+        (f"images[{number + k}]" for k in range(len(x))), *found
+    ):
         inside(*place, model.shape, f"{name}: centre")
-        if seen < 2:
+        if detected < 2:
             raise InputError(
-                f"{name}: {seen} ring(s) seen; expected at least 2 that follow the model"
+                f"{name}: {detected} ring(s) detected; expected at least 2 that follow the model"
             )
         if not misfit <= task.max_chi_square:
             raise InputError(
@@ -270,14 +272,14 @@ def _start(model, cells, means, noise, number) -> torch.Tensor:
     weight = cells.count
     inverse = torch.linalg.pinv((waves * weight) @ waves.T, hermitian=True)
     found = (means * weight) @ waves.T @ inverse
-    # the noise as the picture's mean has it
+    # the noise as the image's mean has it
     spread = noise.variance(found[:, :1].clamp(min=0), found[:, :1].clamp(min=0))
     size = found[:, 1:].norm(dim=1)
     error = (spread[:, 0] * inverse.diagonal()[1:].mean()).sqrt()
     for k in range(len(means)):
-        if not (found[k, 0] > 0 and size[k] > SEEN * error[k]):
+        if not (found[k, 0] > 0 and size[k] > SIGNIFICANT * error[k]):
             raise InputError(
-                f"images[{number + k}]: no rings seen (contrast {float(size[k]):.3g} electrons "
+                f"images[{number + k}]: no rings detected (contrast {float(size[k]):.3g} electrons "
                 f"with {float(error[k]):.2g} of noise); expected rings"
             )
     blank = means.new_tensor([[0, 0, 0, 1, 0, model.middle_temperature, model.falloff]])
@@ -337,7 +339,7 @@ def _scoring(model, cells, means, parameters, noise, indices, number):
 
 
 def _rings(model, cells, means, parameters, mean, variance) -> torch.Tensor:
-    """Orders whose rings stand out of the noise and are at least half as strong as the fit says."""
+    """Orders whose rings are significant and at least half as strong as fitted."""
     v, dx, dy, level, background, _, falloff = parameters.T[..., None]
     r2 = squared_radius(cells, dx, dy)
     order = orders(model, r2, v)[1].round().long()
@@ -348,4 +350,4 @@ def _rings(model, cells, means, parameters, mean, variance) -> torch.Tensor:
     strength = sums[0].scatter_add_(1, order, weight * ring**2)
     misfit = sums[1].scatter_add_(1, order, weight * ring * (means - mean))
     amplitude = 1 + misfit / strength
-    return ((amplitude > 0.5) & (amplitude * strength.sqrt() > SEEN)).sum(1)
+    return ((amplitude > 0.5) & (amplitude * strength.sqrt() > SIGNIFICANT)).sum(1)

@@ -1,12 +1,12 @@
-"""Which pictures may be analysed: finite ones that are not saturated."""
+"""Which images may be analysed: finite ones that are not saturated."""
 
 import numpy as np
 import torch
 
 from lidar_mi.errors import InputError
 
-# A pixel's value that so many share, several times as many as share the next lower one, is the
-# end of the scale. Of a smooth crest, rounded to integers, the top value has at most 2.4 times as
+# A value that so large a fraction of the pixels has, several times as many as have the next lower
+# one, is the end of the scale. Of a smooth crest, rounded to integers, the top value has at most 2.4 times as
 # many pixels as the one below it, for the area above a level grows with the root of the depth.
 PLATEAU = 1e-3
 EXCESS = 4.0
@@ -18,7 +18,7 @@ def checked(images: torch.Tensor, saturation: float | None = None) -> torch.Tens
     Raises
     ------
     InputError
-        Other shapes, pictures below 16 px, NaN or infinity, saturated pixels.
+        Other shapes, images below 16 px, NaN or infinity, saturated pixels.
     """
     if not isinstance(images, torch.Tensor):
         images = torch.as_tensor(np.array(images))
@@ -34,15 +34,15 @@ def checked(images: torch.Tensor, saturation: float | None = None) -> torch.Tens
     for number, image in enumerate(images):
         total = image.sum()
         if not torch.isfinite(total) and not torch.isfinite(image).all():
-            share = int((~torch.isfinite(image)).sum())
+            number_bad = int((~torch.isfinite(image)).sum())
             raise InputError(
-                f"images[{number}]: {share} pixel(s) of NaN or infinity; expected finite values"
+                f"images[{number}]: {number_bad} pixel(s) of NaN or infinity; expected finite values"
             )
         top = image.max()
         if saturation is not None and top >= saturation:
-            share = int((image >= saturation).sum())
+            number_full = int((image >= saturation).sum())
             raise InputError(
-                f"images[{number}]: saturated, {share} pixel(s) at or above {saturation:g}; "
+                f"images[{number}]: saturated, {number_full} pixel(s) at or above {saturation:g}; "
                 "expected all below"
             )
         full = image == top
@@ -58,10 +58,10 @@ def checked(images: torch.Tensor, saturation: float | None = None) -> torch.Tens
 
 
 def inside(x: float, y: float, shape: tuple[int, int], name: str = "centre") -> None:
-    """Raise InputError unless (x, y) lies in a picture of (height, width)."""
+    """Raise InputError unless (x, y) lies in an image of (height, width)."""
     height, width = shape
     if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
         raise InputError(
-            f"{name}: ({x:.1f}, {y:.1f}) px is not allowed; expected inside the picture of "
+            f"{name}: ({x:.1f}, {y:.1f}) px is not allowed; expected inside the image of "
             f"{width} x {height} px"
         )

@@ -1,11 +1,11 @@
-"""What a picture of an etalon's rings must look like, and what it can tell at best.
+"""Mean image of the rings of an etalon, and the smallest possible errors of its parameters.
 
-The mean picture is, in electrons a pixel,
+The mean image is, in electrons per pixel,
 
     level exp(-falloff r^2 / R^2) g(m) / A_0 + background,
     g(m) = A_0 + 2 sum_n Re(A_n exp(2 pi i n m)),   m = m_0 (1 + 2 v_LOS / c) cos(theta),
 
-with r the distance from the rings' centre, R half the picture's diagonal, tan(theta) = r / f and
+with r the distance from the rings' centre, R half the image's diagonal, tan(theta) = r / f and
 m the order of interference; the A_n are the etalon's harmonics times the line's characteristic
 function (Airy function convolved with the line). Only the part of m_0 beyond its integer enters:
 m = m_0 (cos(theta) - 1) + ..., in float64 throughout. Averages over a pixel, and over all pixels
@@ -25,8 +25,8 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.cells import Cells, pixels
 
 PARAMETERS = ("v_los", "x", "y", "level", "background", "temperature", "falloff")
-"""What a picture depends on: m/s, px, px, electrons a pixel (mean over an order, at the centre),
-electrons a pixel, K, and the exponent of the illumination's fall-off from centre to corner."""
+"""Parameters of an image: m/s, px, px, electrons per pixel (mean over an order, at the centre),
+electrons per pixel, K, and the exponent of the illumination's fall-off from centre to corner."""
 
 PIXEL_R2 = 1 / 6  # px^2, mean squared distance of a pixel's points from its centre
 NEGLIGIBLE = 1e-7  # harmonics below this part of A_0 change no velocity by 1e-4 m/s
@@ -34,7 +34,7 @@ NEGLIGIBLE = 1e-7  # harmonics below this part of A_0 change no velocity by 1e-4
 
 @dataclass(frozen=True, eq=False)
 class RingModel:
-    """An instrument and a line, as far as the rings know them.
+    """The properties of an instrument and a line on which the rings depend.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class RingModel:
 
     @property
     def velocity_range(self) -> float:
-        """Width of the range of v_LOS that is told apart from its neighbours by the order, m/s."""
+        """Unambiguous range of v_LOS, one order wide, m/s."""
         return speed_of_light / (2 * self.order_at_centre)
 
     @property
@@ -207,14 +207,14 @@ def illumination(model: RingModel, r2: torch.Tensor, falloff: torch.Tensor) -> t
 
 
 def _corner(model: RingModel) -> float:
-    """Squared half of the picture's diagonal, px^2."""
+    """Squared half of the image's diagonal, px^2."""
     return (model.shape[0] ** 2 + model.shape[1] ** 2) / 4
 
 
 def mean_and_jacobian(
     model: RingModel, cells: Cells, parameters: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean electrons a pixel in every cell, and their derivatives.
+    """Mean electrons per pixel in every cell, and their derivatives.
 
     Parameters
     ----------
@@ -277,7 +277,7 @@ def parameter_vector(
     background: float = 0.0,
     temperature: float | None = None,
 ) -> torch.Tensor:
-    """Parameters (1, 7) of a picture about the cells' centre that holds so many signal electrons.
+    """Parameters (1, 7) of an image about the cells' centre that holds so many signal electrons.
 
     Raises
     ------
@@ -303,8 +303,8 @@ def parameter_vector(
         dtype=torch.float64,
         device=cells.x.device,
     )
-    shares = mean_and_jacobian(model, cells, vector)[0]
-    vector[0, 3] = photons / (shares * cells.count).sum()
+    level_one = mean_and_jacobian(model, cells, vector)[0]
+    vector[0, 3] = photons / (level_one * cells.count).sum()
     vector[0, 4] = background
     return vector
 
@@ -318,16 +318,16 @@ def expected(
     temperature: float | None = None,
     device="cpu",
 ) -> torch.Tensor:
-    """Mean picture, electrons, shape (height, width), float64.
+    """Mean image, electrons, shape (height, width), float64.
 
     Parameters
     ----------
     v_los : float
         m/s, positive toward the instrument.
     photons : float
-        Signal electrons in the whole picture (photons detected).
+        Signal electrons in the whole image (photons detected).
     background : float
-        Electrons a pixel that have no rings: sky, dark current.
+        Electrons per pixel that have no rings: sky, dark current.
     centre : (float, float), optional
         (x, y), pixels; the model's if not given.
     temperature : float, optional
@@ -382,7 +382,7 @@ def cramer_rao(
     temperature: float | None = None,
     free: Sequence[str] | None = None,
 ) -> dict[str, float]:
-    """Smallest standard deviation that an unbiased estimate from one picture can have.
+    """Smallest standard deviation that an unbiased estimate from one image can have.
 
     The inverse of the Fisher matrix F = sum over pixels of J J^T / variance, J the derivatives
     of the mean by all free parameters: none of them is taken as known. Exact for Poisson noise
@@ -392,23 +392,23 @@ def cramer_rao(
     Parameters
     ----------
     photons : float
-        Detected, in the whole picture.
+        Detected, in the whole image.
     noise : PixelNoise
         Poisson alone if not given.
     v_los, background, centre, temperature
-        Where the bound is wanted; see `expected`. The centre may lie outside the picture.
+        Where the bound is wanted; see `expected`. The centre may lie outside the image.
     free : names out of `PARAMETERS`, optional
         What is not known; everything the model has if not given.
 
     Returns
     -------
     dict
-        Standard deviation by name of each free parameter: m/s, px, electrons a pixel, K.
+        Standard deviation by name of each free parameter: m/s, px, electrons per pixel, K.
 
     Raises
     ------
     InputError
-        Numbers out of range, or a picture that does not determine the free parameters.
+        Numbers out of range, or an image that does not determine the free parameters.
     """
     indices = free_indices(model, free)
     cells = pixels(model.shape, centre or model.centre)
@@ -418,5 +418,5 @@ def cramer_rao(
     found = standard_deviations(fisher_matrix(jacobian, 1 / variance, indices))[0]
     if not torch.isfinite(found).all():
         names = ", ".join(PARAMETERS[i] for i in indices)
-        raise InputError(f"free: the picture does not determine {names} all together")
+        raise InputError(f"free: the image does not determine {names} all together")
     return {PARAMETERS[i]: float(value) for i, value in zip(indices, found)}

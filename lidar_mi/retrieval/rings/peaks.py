@@ -1,4 +1,4 @@
-"""The paper's way to the wind: the radius of the innermost ring, in the emitted and the received picture.
+"""The paper's retrieval of the wind: radius of the innermost ring, emitted and received.
 
 Profiles come from circular averaging (CA), from crests along midpoint lines (ML) or, as the
 baseline, from 360 radial cuts behind a Savitzky-Golay filter; a Gaussian fitted by
@@ -7,7 +7,7 @@ leaves their detail to Hirschberger & Ehret 2011 (Appl. Phys. B 103, 207-222); w
 there is chosen here and documented.
 
 A line that is broadened symmetrically in frequency is symmetric in order, hence in r^2, not in r:
-in r its outer flank is steeper. A Gaussian fitted in r takes the skew for a shift, by -10 to
+in r its outer flank is steeper. A Gaussian fitted in r turns the skew into a shift, by -10 to
 -40 m/s for air at 233 K, as wide as the fitted piece is; fitted in r^2 the same chain is free of
 it. Both are here, ``coordinate`` says which.
 """
@@ -37,7 +37,7 @@ PIECE = 0.35  # of the ring's radius to both sides is fitted: about half way to 
 def radial_cuts(image: np.ndarray, centre: tuple[float, float], cuts: int = 360) -> np.ndarray:
     """Values along rays from the centre, (cuts, radii), 1 px apart, linear between pixels.
 
-    As far as the farthest corner; NaN outside the picture.
+    As far as the farthest corner; NaN outside the image.
     """
     height, width = image.shape
     far = np.hypot(*(max(c, size - 1 - c) for c, size in zip(centre, (width, height))))
@@ -57,13 +57,13 @@ def find_centre(
 ) -> tuple[float, float]:
     """Centre of the rings by the paper's circular averaging or midpoint lines.
 
-    Both start from `ring_centre.gradient_centre`; ``radius`` is that of the innermost ring (px),
+    Both start from `lidar_mi.retrieval.rings.centre.gradient_centre`; ``radius`` is that of the innermost ring (px),
     which midpoint lines need.
 
     Raises
     ------
     InputError
-        No rings, or a centre outside the picture.
+        No rings, or a centre outside the image.
     """
     start = gradient_centre(image)
     inside(*start, image.shape)
@@ -147,7 +147,7 @@ def ring_radius(
 def velocity_from_radii(
     received: float, emitted: float, focal_length: float, pixel: float
 ) -> float:
-    """v_LOS, m/s, from one ring's radii (px) in the received and the emitted picture.
+    """v_LOS, m/s, from one ring's radii (px) in the received and the emitted image.
 
     The ring keeps its order: nu cos(theta) is the same, so 1 + 2 v / c is the ratio of the
     cosines. Exact, as tan(theta) = r / f is.

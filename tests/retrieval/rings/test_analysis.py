@@ -141,8 +141,8 @@ def images():
         "noise": (rng.normal(100, 5, (300, 400)), "rings: |centre: |no common centre"),
         "even": (np.full((300, 400), 3.0), "no common centre"),
         "ramp": (x + 0.0, "no common centre"),
-        "blob": (np.exp(-(r**2) / 5000), "rings: 0 seen|none seen"),
-        "one ring": (np.exp(-(((r - 90) / 12) ** 2)), "rings: 1 seen; expected at least 2"),
+        "blob": (np.exp(-(r**2) / 5000), "rings: 0 detected|none detected"),
+        "one ring": (np.exp(-(((r - 90) / 12) ** 2)), "rings: 1 detected; expected at least 2"),
         "unequal": (
             sum(np.exp(-(((r - a) / 3) ** 2)) for a in (60, 75, 100, 110, 140)),
             "equal steps",
@@ -162,7 +162,7 @@ def test_refused(kind):
 
 
 def test_arguments():
-    with pytest.raises(InputError, match="2 pictures are not allowed"):
+    with pytest.raises(InputError, match="2 images are not allowed"):
         analyse_rings(np.zeros((2, 30, 30)))
     with pytest.raises(InputError, match="centre: .900.0, 3.0. px"):
         analyse_rings(split_rings((300, 400), (190.0, 160.0), 8000.0, (0.5,)), (900.0, 3.0))

@@ -182,7 +182,7 @@ def refused(image, message, noise=None, **options):
 def test_no_rings(method):
     rng = np.random.default_rng(1)
     y, x = np.mgrid[:195, :240]
-    message = "no rings seen|ring.s. seen|chi-square|centre|fit"
+    message = "no rings detected|ring.s. detected|chi-square|centre|fit"
     for mean in (
         np.full((195, 240), 500.0),  # even light
         500 + 2.0 * x,  # a ramp
@@ -206,7 +206,7 @@ def test_one_ring():
     # and a camera that is too small for two
     small = {"shape": (70, 70), "pixel": 4 * reference.PIXEL}
     image = torch.as_tensor(rng.poisson(reference.picture(0.0, 1e6, **small)).astype(float))
-    with pytest.raises(InputError, match=r"images\[0\]: 1 ring\(s\) seen; expected at least 2"):
+    with pytest.raises(InputError, match=r"images\[0\]: 1 ring\(s\) detected; expected at least 2"):
         fit_rings(image, ring_model(**small))
 
 
