@@ -16,7 +16,14 @@ project = "lidar-mi"
 author = "The lidar-mi developers"
 release = metadata.version("lidar-mi")
 
-extensions = ["myst_parser"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+
+# as docstrings are written: numpydoc, shapes and units in words
+napoleon_google_docstring = False
+napoleon_use_rtype = False
+autodoc_typehints = "none"
+autodoc_class_signature = "separated"
+autodoc_inherit_docstrings = False
 source_suffix = {".md": "markdown"}
 
 # as GitHub reads the same files

@@ -2,12 +2,14 @@
 
 from .errors import InputError
 from .experiment.reading import load_experiment
+from .experiment.results import Run
+from .experiment.run import run
 from .experiment.schema import Experiment
 from .experiment.shipped import experiments
 from .experiment.truth import make_truth
 from .io.exr import read_scan
 from .io.images import read_image, read_noise
-from .io.vortex_file import read_vortices
+from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
 from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.velocimetry.common_grid import on_one_grid
@@ -26,6 +28,7 @@ __all__ = [
     "Flag",
     "InputError",
     "Rings",
+    "Run",
     "VortexPairFit",
     "__version__",
     "analyse_rings",
@@ -43,4 +46,6 @@ __all__ = [
     "register_plugins",
     "retrieve_wind",
     "retrieve_wind_volume",
+    "run",
+    "write_vortices",
 ]

@@ -9,11 +9,12 @@ from html import escape
 
 @dataclass(frozen=True)
 class Table:
-    """Rows of text under a title; heads are optional."""
+    """Rows of text under a title; heads, and a note below, are optional."""
 
     title: str
     rows: Sequence[Sequence[str]]
     heads: Sequence[str] = ()
+    note: str = ""
 
 
 class Tabular:
@@ -29,6 +30,9 @@ class Tabular:
 
     def __repr__(self) -> str:
         return as_text(self.tables())
+
+    def __str__(self) -> str:
+        return repr(self)
 
     def _repr_html_(self) -> str:
         return as_html(self.tables(), self.thumbnail())
@@ -62,7 +66,8 @@ def as_text(tables: Iterable[Table]) -> str:
             )
             for line in lines
         )
-        blocks.append("\n".join([table.title, *(f"  {line}".rstrip() for line in aligned)]))
+        note = [table.note] if table.note else []
+        blocks.append("\n".join([table.title, *(f"  {line}".rstrip() for line in aligned), *note]))
     return "\n".join(blocks)
 
 
@@ -82,5 +87,6 @@ def as_html(tables: Iterable[Table], image: bytes | None = None) -> str:
             f"<table><caption>{escape(table.title)}</caption>"
             + (f"<thead><tr>{head}</tr></thead>" if head else "")
             + f"<tbody>{body}</tbody></table>"
+            + (f"<p>{escape(table.note)}</p>" if table.note else "")
         )
     return "".join(parts)

@@ -9,6 +9,7 @@ import doctest
 import importlib
 import inspect
 import json
+import re
 import subprocess
 import sys
 from importlib.resources import files
@@ -101,14 +102,18 @@ def test_examples_of_the_documentation_run(example, tmp_path, monkeypatch):
     assert runner.run(example, out=said.append).failed == 0, "".join(said)
 
 
-@pytest.mark.parametrize(
-    "name", sorted(n for n in lm.__all__ if n != "__version__" and not n.startswith("fit_vortices"))
-)
+@pytest.mark.parametrize("name", sorted(set(lm.__all__) - {"__version__"}))
 def test_public_function_has_an_example(name):
     public = getattr(lm, name)
     if not inspect.isclass(public):
         examples = doctest.DocTestParser().get_examples(inspect.getdoc(public))
         assert any(f"lm.{name}(" in example.source for example in examples)
+
+
+def test_every_public_name_has_its_place_in_the_documentation():
+    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text()
+    named = re.findall(r"^\.\. auto\w+:: lidar_mi\.(\w+)$", page, re.MULTILINE)
+    assert sorted([*named, "__version__"]) == sorted(lm.__all__)
 
 
 def test_unknown_name_is_an_attribute_error():

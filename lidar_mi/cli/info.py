@@ -5,9 +5,8 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.metric_tables import print_metrics
 from lidar_mi.cli.options import quantity
-from lidar_mi.cli.terminal import output, print_rows
+from lidar_mi.cli.terminal import output, print_rows, print_table
 from lidar_mi.progress import progress
 
 EXAMPLES = (
@@ -37,6 +36,7 @@ def info(
     Of scatterers: extinction and backscatter coefficient and the number of particles they go with,
     single-scattering albedo, lidar ratio, depolarisation ratio.
     """
+    from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment.info import sections
     from lidar_mi.experiment.run_folder import failure, read_metrics, read_record
     from lidar_mi.experiment.study import RECORD
@@ -61,6 +61,8 @@ def info(
             output.print("unfinished: no metrics.json yet; run it again to go on")
         elif not (folder / RECORD).is_file():
             doppler = read_record(folder)["experiment"].get("doppler")
-            print_metrics(metrics, doppler["retrieval"]["averaged"] if doppler else ())
+            averaged = doppler["retrieval"]["averaged"] if doppler else ()
+            for table in summary(metrics, averaged):
+                print_table(table)
         if (folder / RECORD).is_file() and not reason:
             output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)

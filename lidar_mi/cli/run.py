@@ -5,9 +5,8 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.metric_tables import print_metrics
 from lidar_mi.cli.options import Changes, ExperimentName, Variant
-from lidar_mi.cli.terminal import output
+from lidar_mi.cli.terminal import output, print_table
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
 
@@ -33,6 +32,7 @@ def run(
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
     A run that was stopped goes on with the images it has.
     """
+    from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment import reading, study
     from lidar_mi.experiment.run import run as start
     from lidar_mi.experiment.run_folder import RESULTS
@@ -50,7 +50,8 @@ def run(
     folder = out or Path("outputs") / loaded.name
     with progress() as notice:
         done = start(loaded, folder, beside=path.parent, overwrite=overwrite, notice=notice)
-    print_metrics(done.metrics, _averaged(loaded))
+    for table in summary(done.metrics, _averaged(loaded)):
+        print_table(table)
     output.print(f"report   {folder / 'report.html'}")
     output.print(f"figures  {folder / 'figures'}")
     for result, file in RESULTS.items():
@@ -61,6 +62,8 @@ def run(
 
 def _run_study(variants, out, path, overwrite, start) -> None:
     """Variants of one experiment, each in a folder of its own, and their comparison."""
+    from lidar_mi.assessment.report.summary import summary
+
     first, experiment = next(iter(variants.items()))
     name = experiment.name.removesuffix(f".{first}")
     folder = out or Path("outputs") / name
@@ -68,7 +71,8 @@ def _run_study(variants, out, path, overwrite, start) -> None:
         metrics = start(name, variants, folder, path.parent, overwrite, notice)
     for variant, found in metrics.items():
         output.print(f"\n{variant}", style="bold")
-        print_metrics(found, _averaged(variants[variant]))
+        for table in summary(found, _averaged(variants[variant])):
+            print_table(table)
     output.print(f"report   {folder / 'report.html'}")
 
 

@@ -27,3 +27,5 @@ def print_table(table: Table) -> None:
     for row in table.rows:
         framed.add_row(*row)
     output.print(framed)
+    if table.note:
+        output.print(table.note)

@@ -1,13 +1,11 @@
 """What a run says while it runs: to its log file and to the person in front of the screen."""
 
 import time
-from collections.abc import Callable
 from pathlib import Path
 
-FAILED = "failed: "
+from lidar_mi.progress import Notice
 
-Notice = Callable[[str, float | None], None]
-"""Called with what is running and how far it is (0 to 1, None: unknown)."""
+FAILED = "failed: "
 
 
 def silent(text: str, share: float | None) -> None:

@@ -1,22 +1,31 @@
 """What a run holds: an experiment, its results, its metrics."""
 
+import webbrowser
 from collections import defaultdict
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import xarray as xr
+from rich.console import Console
 
+from lidar_mi.assessment.figures.backscatter import overview
 from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.report.summary import summary
 from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.run_folder import REPORT
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.vortices import VortexFits
 from lidar_mi.experiment.truth import Truth
+from lidar_mi.io.png import png_bytes
+from lidar_mi.tables import Table, Tabular
 
 
-@dataclass
-class Run:
+@dataclass(repr=False)
+class Run(Tabular):
     """An experiment with its results.
+
+    Shows itself as the errors that people ask for first; `show` adds an image.
 
     Attributes
     ----------
@@ -84,3 +93,40 @@ class Run:
     def vortices(self) -> VortexFits | None:
         """Vortex pairs fitted to images and to wind vectors."""
         return self.results.get("vortices")
+
+    def tables(self) -> list[Table]:
+        """What was run, and the errors that people ask for first."""
+        doppler = self.experiment.doppler
+        seconds = sum(self.seconds.values())
+        rows = [("experiment", self.experiment.name), ("computed in", f"{seconds:.1f} s")]
+        if self.folder is not None:
+            rows.append(("folder", str(self.folder)))
+        rows += [("warning", text) for text in self.warnings]
+        averaged = doppler.retrieval.averaged if doppler else ()
+        fits = self.vortices.pairs if self.vortices else {}
+        vortices = [
+            replace(pair.tables()[0], title=f"vortex pair fitted to {origin}")
+            for origin, pair in fits.items()
+        ]
+        return [Table("run", rows), *summary(self.metrics, averaged), *vortices]
+
+    def thumbnail(self) -> bytes | None:
+        """Image of the backscatter lidar and cross-flow wind, where there are any, as PNG."""
+        if "wind" not in self.results or not self.scans:
+            return None
+        figure, _ = overview(self.truth, self.scans, self.results["wind"], self.cores)
+        return png_bytes(figure)
+
+    def show(self) -> None:
+        """Show the results: in a notebook with an image, else as text, and the report in a browser.
+
+        A run in memory alone has no report.
+        """
+        if Console().is_jupyter:
+            from IPython.display import display
+
+            display(self)
+            return
+        print(self)
+        if self.folder is not None:
+            webbrowser.open((self.folder / REPORT).resolve().as_uri())

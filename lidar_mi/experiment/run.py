@@ -11,7 +11,7 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.names import timing_key
 from lidar_mi.assessment.report.page import page
 from lidar_mi.errors import is_interrupt
-from lidar_mi.experiment.log import Log, Notice, silent
+from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.measure import measure
 from lidar_mi.experiment.pipeline import stages_of
 from lidar_mi.experiment.reading import dump
@@ -20,15 +20,16 @@ from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.run_folder import RunFolder
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Stage, result_of
+from lidar_mi.progress import Notice, progress
 
 
 def run(
     experiment: Experiment,
     folder: str | Path | None = None,
     *,
-    beside: str | Path = ".",
+    beside: str | Path | None = None,
     overwrite: bool = False,
-    notice: Notice = silent,
+    notice: Notice | None = None,
 ) -> Run:
     """Run an experiment, in memory or into a folder.
 
@@ -38,22 +39,48 @@ def run(
     folder : path, optional
         Made if missing. If it holds a run of the same experiment, its images are used again. Figures
         and a report are made for a folder alone.
-    beside : path
-        Folder in which files named by the experiment are looked for first.
+    beside : path, optional
+        Folder in which files named by the experiment are looked for first. Default: the one that
+        the experiment was read from.
     overwrite : bool
         Replace a run of a different experiment instead of refusing.
-    notice : callable
-        Told what is running.
+    notice : callable, optional
+        Told what is running, and how far it is (0 to 1, or None). Default: shown on the terminal
+        or in the notebook.
+
+    Returns
+    -------
+    Run
+        ``metrics`` (flat, SI units), ``wind`` (Dataset), ``scans``, ``truth``, ``vortices``, ...;
+        shows itself as tables, and by ``show()`` as an image or a report.
 
     Raises
     ------
     InputError
         Bad input, or the folder holds another experiment.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> experiment = lm.load_experiment(
+    ...     "wake_backscatter",
+    ...     wake={"spacing": "1 m"},
+    ...     render={"samples_per_beam": 4, "max_order": 1},
+    ...     retrieval={"methods": ["cc"], "stride": 8},
+    ... )
+    >>> result = lm.run(experiment)                        # doctest: +SKIP
+    >>> result.metrics["backscatter.cc.rmse_v"]            # doctest: +SKIP
+    >>> result.wind.sel(source="backscatter")["v"]         # doctest: +SKIP
     """
+    if notice is None:
+        with progress() as notice:
+            return run(experiment, folder, beside=beside, overwrite=overwrite, notice=notice)
     return complete(prepare(experiment, beside, notice), folder, overwrite=overwrite)
 
 
-def prepare(experiment: Experiment, beside: str | Path = ".", notice: Notice = silent) -> Run:
+def prepare(
+    experiment: Experiment, beside: str | Path | None = None, notice: Notice = silent
+) -> Run:
     """Check all that can be checked before anything is rendered or written.
 
     Returns
@@ -66,6 +93,7 @@ def prepare(experiment: Experiment, beside: str | Path = ".", notice: Notice = s
     InputError
         Bad input.
     """
+    beside = experiment.folder if beside is None else beside
     prepared = Run(experiment, {"beside": beside}, Log(notice))
     stages = stages_of(experiment)
     for stage in stages:

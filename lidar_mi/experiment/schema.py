@@ -1,6 +1,7 @@
 """What an experiment file may say: every key, its unit, its default and its limits."""
 
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -15,6 +16,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings
 from lidar_mi.retrieval.methods import ImageMethod, RingCentre, RingMethod, VolumeMethod
+from lidar_mi.tables import Table, Tabular
 from lidar_mi.units import Circulation, Extinction, Frequency, Length, Number, Speed, Time, to_si
 
 
@@ -318,7 +320,7 @@ NAME = "[A-Za-z0-9][A-Za-z0-9_.-]*"
 """What an experiment or a variant may be called: both name folders."""
 
 
-class Experiment(_Section):
+class Experiment(Tabular, _Section):
     """One experiment, start to end: a wake for the backscatter lidar, a Doppler lidar, or both."""
 
     name: str = Field(pattern=f"^{NAME}$")
@@ -342,6 +344,11 @@ class Experiment(_Section):
     def folder(self) -> Path:
         """Where it was read from: files that it names are looked for there first."""
         return self._folder
+
+    def tables(self) -> list[Table]:
+        """Keys that are not left to their defaults, in SI units."""
+        given = self.model_dump(mode="json", exclude_defaults=True, exclude={"name"})
+        return [Table(f"experiment {self.name}; keys without their default", _rows(given))]
 
     def read_from(self, folder: str | Path) -> "Experiment":
         """The same experiment, with another folder for the files that it names."""
@@ -428,3 +435,16 @@ class Experiment(_Section):
                 f"{flown:g} m flown in platform.dt"
             )
         return self
+
+
+def _rows(section: dict, above: str = "") -> list[tuple[str, str]]:
+    """Dotted keys of a section and their values, numbers to four digits."""
+    rows = []
+    for key, value in section.items():
+        if isinstance(value, dict) and value:
+            rows += _rows(value, f"{above}{key}.")
+        else:
+            text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            shown = re.sub(r"\d+\.\d+(e-?\d+)?", lambda number: f"{float(number[0]):.4g}", text)
+            rows.append((f"{above}{key}", shown))
+    return rows

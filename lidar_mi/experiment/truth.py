@@ -41,15 +41,15 @@ class Truth:
 
 
 def make_truth(
-    experiment: Experiment, beside: str | Path = ".", flows: Flows | None = None
+    experiment: Experiment, beside: str | Path | None = None, flows: Flows | None = None
 ) -> Truth:
     """The flow and the extinction at both times, on the scan's grid, in the lidar's frame.
 
     Parameters
     ----------
     experiment : Experiment
-    beside : path
-        Folder in which the wake's file is looked for first.
+    beside : path, optional
+        Folder in which the wake's file is looked for first. Default: the experiment's.
     flows : optional
         From `read_flows` of an experiment that differs in extinction and texture alone.
 
@@ -72,6 +72,7 @@ def make_truth(
     >>> truth.wind["v"].dims, len(truth.extinction)
     (('z', 'y'), 2)
     """
+    beside = experiment.folder if beside is None else beside
     first, second = flows or read_flows(experiment, beside)
     mapping = experiment.wake.extinction
     smooth1 = _extinction(first, mapping, first, second)

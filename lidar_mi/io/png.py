@@ -1,5 +1,6 @@
 """Figures as PNG files."""
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -20,3 +21,10 @@ def write_png(figure: Figure, path: str | Path, *, cropped: bool = False) -> Non
     """
     room: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.1} if cropped else {}
     write_atomically(path, lambda part: figure.savefig(part, dpi=110, format="png", **room))
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """A figure as a small PNG file in memory, 70 dots per inch, cropped."""
+    buffer = BytesIO()
+    figure.savefig(buffer, dpi=70, format="png", bbox_inches="tight", pad_inches=0.1)
+    return buffer.getvalue()

@@ -23,14 +23,28 @@ _NUMBERS = ("chi2", "correlation", "flow_error", "flow_error_length")
 
 
 def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about: str) -> None:
-    """Write fits by name, with their covariance and derived quantities; numbers that are not: null.
+    """Write vortex pairs by name, with their covariance and derived quantities.
+
+    Numbers that are not finite become null.
 
     Parameters
     ----------
     path : path
     fits : mapping of str to VortexPairFit
-    about
+    **about
         What else the file says of itself, such as ``source``.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> vortices = [300.0, np.log(3.0), 15.0, 0.0, -300.0, np.log(3.0), -15.0, 0.0, 0.0, 0.0]
+    >>> pair = lm.VortexPairFit(
+    ...     np.array(vortices), np.eye(10), "lamb_oseen", 1.0, 1.0, flow_error=0.0, flow_error_length=0.0
+    ... )
+    >>> lm.write_vortices("vortex.json", {"mine": pair})
+    >>> lm.read_vortices("vortex.json")["mine"].port.circulation
+    300.0
     """
     data: dict[str, Any] = {
         "format": FORMAT,
@@ -86,8 +100,14 @@ def read_vortices(path: str | Path) -> dict[str, VortexPairFit]:
     Examples
     --------
     >>> import lidar_mi as lm
-    >>> pairs = lm.read_vortices("outputs/wake_sensor/vortex.json")  # doctest: +SKIP
-    >>> pairs["images"].port.circulation                             # doctest: +SKIP
+    >>> import numpy as np
+    >>> vortices = [300.0, np.log(3.0), 15.0, 0.0, -300.0, np.log(3.0), -15.0, 0.0, 0.0, 0.0]
+    >>> pair = lm.VortexPairFit(
+    ...     np.array(vortices), np.eye(10), "lamb_oseen", 1.0, 1.0, flow_error=0.0, flow_error_length=0.0
+    ... )
+    >>> lm.write_vortices("vortex.json", {"mine": pair})
+    >>> lm.read_vortices("vortex.json")["mine"].port.circulation
+    300.0
     """
     data = read_json(path, "a file of vortex pairs")
     if not isinstance(data, dict) or data.get("format") != FORMAT:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from matplotlib.colors import Normalize, TwoSlopeNorm
+from matplotlib.figure import Figure
 
 from lidar_mi.assessment.figures.accuracy import error_and_bound, error_by_texture, truth_vectors
 from lidar_mi.assessment.figures.plates import Drawn, frame, image_panel, save_all, sheet
@@ -59,7 +60,7 @@ def draw_all(
         (
             "fig00_overview",
             "What the lidar sees, and the wind found in it",
-            _overview(scans, found, cores, scale),
+            overview(truth, scans, found, cores),
         ),
         ("fig05_extinction", "Extinction", _extinction(truth)),
         (
@@ -154,7 +155,9 @@ def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale)
     axes.figure.colorbar(arrows, ax=axes, label="speed / m s$^{-1}$", pad=0.02, extend="max")
 
 
-def _overview(scans, found, cores, scale):
+def overview(truth, scans, found: xr.Dataset, cores: list[Core]) -> tuple[Figure, str]:
+    """First image of the lidar beside the wind retrieved from two, and a caption; as `draw_all`."""
+    scale = _scale(truth)
     figure, axes = sheet(1, 2)
     detected = "Y_noisy" in scans[0]
     first = scans[0]["Y_noisy" if detected else "Y"] * 1e6

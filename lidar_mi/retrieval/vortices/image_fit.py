@@ -146,6 +146,29 @@ def fit_vortices(
     ------
     InputError
         Images on different or unsuitable grids, a parameter out of its range.
+
+    Examples
+    --------
+    Textured air in the wind of a pair, 0.05 s before and after mid-time:
+
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from scipy.ndimage import gaussian_filter, map_coordinates
+    >>> from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+    >>> y, z = np.arange(-40.0, 41.0), np.arange(-25.0, 26.0)
+    >>> v, w = velocity(vortex_pair(300.0, separation=30.0, core_radius=3.0), y, z[:, None])
+    >>> air = 1 + gaussian_filter(np.random.default_rng(1).normal(size=(z.size, y.size)), 1.5)
+    >>> row, column = np.mgrid[: z.size, : y.size]
+    >>> axes = {"z": ("z", z, {"units": "m"}), "y": ("y", y, {"units": "m"})}
+    >>> moved = [
+    ...     map_coordinates(air, [row - t * w, column - t * v], mode="nearest")
+    ...     for t in (-0.05, 0.05)
+    ... ]
+    >>> image1, image2 = (xr.DataArray(image, axes, ("z", "y")) for image in moved)
+    >>> pair = lm.fit_vortices(image1, image2, dt=0.1)
+    >>> pair.success, abs(pair.port.circulation - 300) < 10
+    (True, True)
     """
     dt = positive("dt", dt)
     (image1, image2), noise = checked_stack([image1, image2], noise)

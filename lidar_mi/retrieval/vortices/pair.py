@@ -11,10 +11,11 @@ import xarray as xr
 from lidar_mi.atmosphere.vortex import Vortex
 from lidar_mi.retrieval.quantity import Quantity
 from lidar_mi.retrieval.vortices.model import Profile, angular_velocity, drift, sensitivity, wind
+from lidar_mi.tables import Table, Tabular, with_error
 
 
-@dataclass(frozen=True, eq=False)
-class VortexPairFit:
+@dataclass(frozen=True, eq=False, repr=False)
+class VortexPairFit(Tabular):
     """Two vortices in a mean wind, at mid-time.
 
     Attributes
@@ -62,6 +63,24 @@ class VortexPairFit:
     @property
     def starboard(self) -> Vortex:
         return self._vortex(4)
+
+    def tables(self) -> list[Table]:
+        """Both vortices and the pair, with standard errors; first of all whether it is a fit."""
+        found = self.quantities
+
+        def shown(name):
+            return with_error(found[name].value, found[name].stderr, _SIGNS[found[name].units])
+
+        sides = [
+            (name.replace("_", " "), shown(f"port_{name}"), shown(f"starboard_{name}"))
+            for name in ("circulation", "circulation_5_15", "core_radius", "y", "z")
+        ]
+        names = [name for name in found if not name.startswith(("port_", "starboard_"))]
+        verdict = f"no fit: {', '.join(self.reasons)}" if self.reasons else "vortex pair"
+        return [
+            Table(f"{verdict} ({self.profile})", sides, ("", "port", "starboard")),
+            Table("as a pair", [(name.replace("_", " "), shown(name)) for name in names]),
+        ]
 
     @property
     def mean_wind(self) -> tuple[float, float]:
@@ -195,6 +214,8 @@ MEANING = {
     "drift_w": ("m s-1", "velocity of the pair along z, mean wind included"),
 }
 """Units and long name of every quantity of a pair."""
+
+_SIGNS = {"m2 s-1": "m²/s", "m s-1": "m/s", "m": "m", "s": "s"}
 
 
 def circulation_5_15(circulation, core_radius, profile: Profile = "lamb_oseen"):

@@ -69,6 +69,21 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     ------
     InputError
         Variables missing, or fewer than 20 vectors.
+
+    Examples
+    --------
+    The wind of a pair, as vectors without errors:
+
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+    >>> y, z = np.arange(-40.0, 41.0, 2.0), np.arange(-24.0, 25.0, 2.0)
+    >>> v, w = velocity(vortex_pair(300.0, separation=30.0, core_radius=3.0), y, z[:, None])
+    >>> vectors = xr.Dataset({"v": (("z", "y"), v), "w": (("z", "y"), w)}, {"z": z, "y": y})
+    >>> pair = lm.fit_vortices_to_wind(vectors)
+    >>> pair.success, round(pair.port.circulation), round(pair.port.y)
+    (True, 300, 15)
     """
     check_profile(profile)
     for name in ("v", "w"):

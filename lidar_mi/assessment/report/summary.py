@@ -1,0 +1,98 @@
+"""The few numbers of a run that people ask for first, as tables: for terminals and notebooks."""
+
+from collections.abc import Mapping, Sequence
+from itertools import product
+
+from lidar_mi.assessment.metrics.names import Source, bound_key, ring_key, wind_key
+from lidar_mi.retrieval.methods import ImageMethod, RingCentre, RingMethod, VolumeMethod
+from lidar_mi.tables import Table
+
+_METHODS = tuple(dict.fromkeys((*ImageMethod, *VolumeMethod)))
+
+
+def summary(metrics: Mapping[str, float], averaged: Sequence[int] = ()) -> list[Table]:
+    """Errors of the line-of-sight velocities, of the winds, and of the wind from both lidars.
+
+    Parameters
+    ----------
+    metrics : mapping of str to float
+        Of a run.
+    averaged : sequence of int
+        How many images of rings the experiment averages, ``doppler.retrieval.averaged``.
+
+    Returns
+    -------
+    list of Table
+        Of what the run has.
+    """
+    tables = []
+    if averaged:
+        tables.append(_line_of_sight(metrics, sorted(averaged)))
+    if f"{Source.BACKSCATTER}.mc_relative_error" in metrics:
+        tables.append(_winds(metrics))
+    if "sensor.vectors" in metrics:
+        tables.append(_sensor(metrics))
+    return [table for table in tables if table.rows]
+
+
+def _line_of_sight(metrics: Mapping[str, float], numbers: Sequence[int]) -> Table:
+    """Standard deviation and bias of every method, for every number of images averaged."""
+    heads = ("method", "centre", *(f"{n}: {name}" for n in numbers for name in ("std", "bias")))
+    rows = []
+    for centre in RingCentre:
+        bounds = [key for n in numbers for key in (bound_key(centre, n), "")]
+        rows.append(("(bound)", centre, bounds))
+    for method, centre in product(RingMethod, RingCentre):
+        keys = [ring_key(method, centre, n, name) for n in numbers for name in ("std", "bias")]
+        rows.append((method, centre, keys))
+    return Table(
+        "line-of-sight wind from averages of so many images, m/s",
+        [
+            (str(name), str(centre), *(_shown(metrics.get(key), 3) for key in keys))
+            for name, centre, keys in rows
+            if any(key in metrics for key in keys)
+        ],
+        heads,
+    )
+
+
+def _winds(metrics: Mapping[str, float]) -> Table:
+    """Rms errors of the winds from every source, by every method."""
+    components = "uvw" if "true_wind.rms_u" in metrics else "vw"
+    wanted = [(place, name) for place in ("", "outside_cores.") for name in components]
+    rows = []
+    for source, method in product(Source, _METHODS):
+        valid = metrics.get(wind_key(source, method, "valid_fraction"))
+        if valid is not None:
+            keys = [wind_key(source, method, f"{place}rmse_{name}") for place, name in wanted]
+            label = source.replace("_", " ").replace("extinction ", "")
+            errors = (_shown(metrics.get(key)) for key in keys)
+            rows.append((label, str(method), *errors, f"{valid:.0%}"))
+    strength = [_shown(metrics.get(f"true_wind.{place}rms_{name}")) for place, name in wanted]
+    return Table(
+        "rms error of the wind in m/s, valid vectors (far: beyond two core radii)",
+        [*rows, ("true wind", "", *strength, "")],
+        ("winds from", "method", *components, *(f"far {name}" for name in components), "valid"),
+        "An error near the rms of the true wind (last row) means no skill: zero would be as good.",
+    )
+
+
+def _sensor(metrics: Mapping[str, float]) -> Table:
+    """Rms errors of the wind from both lidars, beyond two core radii where there are any."""
+    far = any(key.startswith("sensor.outside_cores.") for key in metrics)
+    place = "outside_cores." if far else ""
+    rows = []
+    for label, key in (
+        ("both lidars", f"sensor.{place}rmse_"),
+        ("lines of sight alone, all over", "sensor.triples.rmse_"),
+        ("true wind (rms)", f"sensor.{place}rms_"),
+    ):
+        values = [metrics.get(f"{key}{name}") for name in "uvw"]
+        if any(value is not None for value in values):
+            rows.append((label, *map(_shown, values)))
+    title = f"rms error of the wind from both lidars{', beyond cores' if far else ''}, m/s"
+    return Table(title, rows, ("", "u", "v", "w"))
+
+
+def _shown(value: float | None, decimals: int = 2) -> str:
+    return "-" if value is None else f"{value:.{decimals}f}"

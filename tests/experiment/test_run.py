@@ -1,0 +1,97 @@
+"""A run in memory and what it shows of itself. System tier.
+
+Detects: a run without a folder that writes a file, a file beside the experiment that is not found,
+numbers that are not those of the metrics, a result that a notebook or a terminal cannot show.
+"""
+
+import webbrowser
+
+import pytest
+from rich.console import Console
+
+import lidar_mi as lm
+from lidar_mi.experiment import results
+from lidar_mi.experiment.reading import dump
+from tests.support.experiments import check, small, write_wake
+
+WORDS = "name: windy\nwake: {file: mine.nc}\nrender: {samples_per_beam: 4, max_order: 1}\n"
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """A small run in memory; its only file is that of the wake, beside the experiment."""
+    folder = tmp_path_factory.mktemp("run")
+    write_wake(folder / "mine.nc", lambda y, z: 1.0 + 0.0 * y * z)
+    (folder / "windy.yaml").write_text(WORDS)
+    experiment = lm.load_experiment(folder / "windy.yaml", **{"retrieval.methods": ["cc"]})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("elsewhere"))
+
+        return lm.run(experiment, notice=lambda text, share: None)
+
+
+def test_a_run_without_a_folder_writes_nothing(done):
+    assert [path.name for path in sorted(done.experiment.folder.iterdir())] == [
+        "mine.nc",
+        "windy.yaml",
+    ]
+    assert done.folder is None
+    assert len(done.scans) == 2 and done.truth is not None
+    assert done.wind["v"].sel(source="backscatter").notnull().any()
+
+
+def test_it_shows_its_numbers(done):
+    said = repr(done)
+    assert said == str(done)
+    for name in ("v", "w"):
+        assert f"{done.metrics[f'backscatter.cc.rmse_{name}']:.2f}" in said
+    assert "windy" in said and "no skill" in said
+    page = done._repr_html_()
+    assert page.startswith('<img alt="" style="max-width: 100%" src="data:image/png;base64,iVBOR')
+    assert f"<td>{done.metrics['backscatter.cc.rmse_v']:.2f}</td>" in page
+
+
+def test_show_prints_and_opens_the_report(done, monkeypatch, capsys, tmp_path):
+    opened = []
+    monkeypatch.setattr(webbrowser, "open", opened.append)
+    done.show()
+    assert capsys.readouterr().out == f"{done}\n" and opened == []
+    monkeypatch.setattr(done, "folder", tmp_path)
+    done.show()
+    assert opened == [(tmp_path / "report.html").resolve().as_uri()]
+
+
+def test_show_displays_in_a_notebook(done, monkeypatch):
+    display = pytest.importorskip("IPython.display", reason="IPython is not installed")
+    shown = []
+    monkeypatch.setattr(display, "display", shown.append)
+    monkeypatch.setattr(Console, "is_jupyter", True, raising=False)
+    monkeypatch.setattr(results, "Console", lambda: type("_", (), {"is_jupyter": True})())
+    done.show()
+    assert shown == [done]
+
+
+def test_progress_is_shown_unless_someone_listens(done, monkeypatch, capsys):
+    """One line a step where standard error is no terminal."""
+    steps = []
+
+    def complete(prepared, folder, *, overwrite):
+        prepared.log("rendering")
+        return prepared
+
+    monkeypatch.setattr("lidar_mi.experiment.run.complete", complete)
+    lm.run(done.experiment)
+    assert "rendering" in capsys.readouterr().err.splitlines()
+    lm.run(done.experiment, notice=lambda text, share: steps.append(text))
+    assert capsys.readouterr().err == "" and "rendering" in steps
+
+
+def test_an_experiment_shows_what_is_not_default():
+    experiment = check(small("shown", spacing=0.25) | {"seed": 3})
+    said = repr(experiment).splitlines()
+    assert said[0] == "experiment shown; keys without their default"
+    keys = {line.split()[0]: " ".join(line.split()[1:]) for line in said[1:]}
+    assert keys["wake.spacing"] == "0.25 m" and keys["seed"] == "3"
+    assert keys["render.samples_per_beam"] == "8"
+    assert not any(key.startswith(("scan.", "platform.")) for key in keys)
+    assert "name: shown" in dump(experiment)
