@@ -26,7 +26,7 @@ def modules_after(code: str) -> set[str]:
     """Modules that a fresh interpreter has loaded after running some code."""
     code += "\nimport json, sys; print(json.dumps(list(sys.modules)))"
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
     )
     return set(json.loads(done.stdout.splitlines()[-1]))
 

@@ -39,8 +39,10 @@ def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about:
     >>> import lidar_mi as lm
     >>> import numpy as np
     >>> vortices = [300.0, np.log(3.0), 15.0, 0.0, -300.0, np.log(3.0), -15.0, 0.0, 0.0, 0.0]
+    >>> chi2, correlation, flow_error, flow_error_length = 1.0, 1.0, 0.0, 0.0
     >>> pair = lm.VortexPairFit(
-    ...     np.array(vortices), np.eye(10), "lamb_oseen", 1.0, 1.0, flow_error=0.0, flow_error_length=0.0
+    ...     np.array(vortices), np.eye(10), "lamb_oseen",
+    ...     chi2, correlation, flow_error, flow_error_length,
     ... )
     >>> lm.write_vortices("vortex.json", {"mine": pair})
     >>> lm.read_vortices("vortex.json")["mine"].port.circulation
@@ -102,8 +104,10 @@ def read_vortices(path: str | Path) -> dict[str, VortexPairFit]:
     >>> import lidar_mi as lm
     >>> import numpy as np
     >>> vortices = [300.0, np.log(3.0), 15.0, 0.0, -300.0, np.log(3.0), -15.0, 0.0, 0.0, 0.0]
+    >>> chi2, correlation, flow_error, flow_error_length = 1.0, 1.0, 0.0, 0.0
     >>> pair = lm.VortexPairFit(
-    ...     np.array(vortices), np.eye(10), "lamb_oseen", 1.0, 1.0, flow_error=0.0, flow_error_length=0.0
+    ...     np.array(vortices), np.eye(10), "lamb_oseen",
+    ...     chi2, correlation, flow_error, flow_error_length,
     ... )
     >>> lm.write_vortices("vortex.json", {"mine": pair})
     >>> lm.read_vortices("vortex.json")["mine"].port.circulation
