@@ -129,4 +129,4 @@ class Run(Tabular):
             return
         print(self)
         if self.folder is not None:
-            webbrowser.open((self.folder / REPORT).resolve().as_uri())
+            webbrowser.open_new_tab((self.folder / REPORT).resolve().as_uri())

@@ -53,7 +53,7 @@ def test_it_shows_its_numbers(done):
 
 def test_show_prints_and_opens_the_report(done, monkeypatch, capsys, tmp_path):
     opened = []
-    monkeypatch.setattr(webbrowser, "open", opened.append)
+    monkeypatch.setattr(webbrowser, "open_new_tab", opened.append)
     done.show()
     assert capsys.readouterr().out == f"{done}\n" and opened == []
     monkeypatch.setattr(done, "folder", tmp_path)
