@@ -419,4 +419,4 @@ def cramer_rao(
     if not torch.isfinite(found).all():
         names = ", ".join(PARAMETERS[i] for i in indices)
         raise InputError(f"free: the image does not determine {names} all together")
-    return {PARAMETERS[i]: float(value) for i, value in zip(indices, found)}
+    return {PARAMETERS[i]: float(value) for i, value in zip(indices, found, strict=True)}

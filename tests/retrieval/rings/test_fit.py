@@ -118,7 +118,7 @@ def test_nuisances_do_no_harm():
     fit = fit_rings(torch.as_tensor(images), ring_model(**COARSE), PixelNoise(5))
     truth = (-35.0, 121.3, 95.1, None, 40.0, 250.0, 2 * half2 / radius**2)
     values = (fit.v_los, fit.x, fit.y, fit.level, fit.background, fit.temperature, fit.falloff)
-    for place, (true, value) in enumerate(zip(truth, values)):
+    for place, (true, value) in enumerate(zip(truth, values, strict=True)):
         if true is not None:
             pull = (value - true) / fit.std[:, place]
             assert abs(pull.mean()) < 4 / np.sqrt(32), place
@@ -160,7 +160,7 @@ def test_emitted_picture_takes_the_instrument_off():
         torch.as_tensor(reference.picture(v, temperature=t, **COARSE))
         for v, t in ((33.0, reference.TEMPERATURE), (0.0, None))
     ]
-    received, emitted = (fit_rings(p, m) for p, m in zip(pictures, (air, laser)))
+    received, emitted = (fit_rings(p, m) for p, m in zip(pictures, (air, laser), strict=True))
     assert float(emitted.v_los) == pytest.approx(-0.03 * air.velocity_range, abs=0.05)
     v, std = difference(received, emitted)
     assert abs(float(v) - 33) < 0.05
