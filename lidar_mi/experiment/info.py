@@ -64,8 +64,8 @@ def sections(
             yield _scatterer(what, aerosol_table(what, wavelength, notice))
     elif not path.exists():
         raise InputError(
-            f"{what}: no such file; expected .exr, .nc, .txt, .json, a run folder, {MOLECULES} or one "
-            f"of the aerosols {', '.join(AEROSOLS)}"
+            f"{what}: no such file; expected .exr, .nc, .txt, .json, a run folder, {MOLECULES} or "
+            f"one of the aerosols {', '.join(AEROSOLS)}"
         )
     elif path.is_dir():
         yield from _folder(path)
@@ -105,7 +105,7 @@ def _molecules(wavelength: float, altitude: float) -> Iterator[Section]:
     """The whole band of Rayleigh scattering beside the line that a narrow receiver sees."""
     pressure, temperature = standard_atmosphere(altitude)
     bands = [molecular_scattering(wavelength, pressure, temperature, band) for band in BANDS]
-    rows = [("", *(f"{band} {kind}" for band, kind in zip(BANDS, ("line", "band"))))]
+    rows = [("", *(f"{band} {kind}" for band, kind in zip(BANDS, ("line", "band"), strict=True)))]
     for label, name, unit in (
         ("extinction coefficient", "extinction", "m^-1"),
         ("single-scattering albedo", "albedo", ""),
@@ -170,7 +170,7 @@ def _study(folder: Path) -> Iterator[Section]:
     }
     done = {key: one for key, one in settings.items() if one}
     for key, values in differences(done).items():
-        shown = dict(zip(done, map(setting, values)))
+        shown = dict(zip(done, map(setting, values), strict=True))
         rows.append((key, *(shown.get(variant, "-") for variant in records)))
     yield f"{folder}: study {name}", rows
     found = [

@@ -1,4 +1,4 @@
-"""Reading experiments: from a YAML file and its variants to a checked description, faults in words."""
+"""Reading experiments: from a YAML file and its variants to a checked description."""
 
 import copy
 import difflib
@@ -53,7 +53,7 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
     if variant not in (variants or (None,)):
         wanted = f"one of {', '.join(variants)}" if variants else f"none, as {name} has no variants"
         raise InputError(f"variant: {variant!r} is not allowed; expected {wanted}")
-    found = variants[variant] if variants else load(path)
+    found = variants[str(variant)] if variants else load(path)
     if changes:
         data = parse_yaml(dump(found), str(name))
         for key, value in changes.items():
@@ -125,7 +125,7 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
     return found
 
 
-def _merged(data: dict, changes: dict) -> dict:
+def _merged(data: Any, changes: dict) -> dict:
     """``data`` with ``changes`` in it, section by section; null: without. Neither is touched."""
     merged = copy.deepcopy(data)
     for key, value in changes.items():
@@ -147,7 +147,8 @@ def _read(path: str | Path) -> dict:
         )
     if path.suffix in (".nc", ".nc4", ".cdf"):
         raise InputError(
-            f"{path}: a wake, not an experiment; expected a YAML file that says wake: {{file: {path}}}"
+            f"{path}: a wake, not an experiment; expected a YAML file that says wake: "
+            f"{{file: {path}}}"
         )
     data = read_yaml(path, "an experiment file")
     if not isinstance(data, dict):
@@ -238,7 +239,8 @@ _LIMITS = {
 
 def _unit_at(location: tuple) -> str:
     """The SI unit of the key at a location, empty if it has none."""
-    model, field = Experiment, None
+    model: Any = Experiment
+    field: Any = None
     for part in location:
         if model and part in model.model_fields:
             field = model.model_fields[part]

@@ -48,7 +48,7 @@ def ring_model(
         raise InputError("line: expected one wavelength at all temperatures")
     rows = [harmonics(etalon, wavelength, one) for one in lines]
     table = np.zeros((len(rows), max(map(len, rows))), complex)
-    for row, values in zip(table, rows):
+    for row, values in zip(table, rows, strict=True):
         row[: len(values)] = values
     diagonal2 = (camera.width**2 + camera.height**2) / 4 * camera.pixel**2
     return RingModel(
@@ -65,7 +65,7 @@ def ring_model(
 
 
 def air_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> RingModel:
-    """Rings of the backscatter at the lidar's altitude, within a quarter of the temperature there."""
+    """Rings of the backscatter at the lidar's altitude, for its temperature within a quarter."""
     pressure, temperature = standard_atmosphere(lidar.altitude)
 
     def line(kelvin: float) -> Line:

@@ -37,8 +37,8 @@ def run(
     ----------
     experiment : Experiment
     folder : path, optional
-        Made if missing. If it holds a run of the same experiment, its images are used again. Figures
-        and a report are made for a folder alone.
+        Made if missing. If it holds a run of the same experiment, its images are used again.
+        Figures and a report are made for a folder alone.
     beside : path, optional
         Folder in which files named by the experiment are looked for first. Default: the one that
         the experiment was read from.

@@ -173,7 +173,7 @@ def _checksums(experiment: Experiment, beside: str | Path) -> dict[str, str]:
 
 
 def read_record(folder: str | Path) -> dict:
-    """What a run folder says it holds: ``experiment`` (resolved), ``files`` (checksums), ``versions``.
+    """Record of a run folder: ``experiment`` (resolved), ``files`` (checksums), ``versions``.
 
     Raises
     ------

@@ -3,7 +3,7 @@
 import math
 import re
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, field_validator, model_validator
 
@@ -17,7 +17,17 @@ from lidar_mi.instrument.scan import Scan
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings
 from lidar_mi.retrieval.methods import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table, Tabular
-from lidar_mi.units import Circulation, Extinction, Frequency, Length, Number, Speed, Time, to_si
+from lidar_mi.units import (
+    Circulation,
+    Extinction,
+    Frequency,
+    Length,
+    Number,
+    Speed,
+    Time,
+    quantity,
+    to_si,
+)
 
 
 class _Section(BaseModel):
@@ -66,8 +76,10 @@ class ExtinctionMapping(_Section):
     source: Literal["tracer", "speed"] = "tracer"
     tracer: str | None = Field("tracer", description="exhaust tracer, or null for none")
     aerosol: str | None = Field("aerosol", description="background aerosol, or null for a flat one")
-    background: Extinction = Field("0.1 / km", ge=0, description="also of the environment")
-    maximum: Extinction = Field("1.8 / km", gt=0)
+    background: Extinction = Field(
+        quantity("0.1 / km"), ge=0, description="also of the environment"
+    )
+    maximum: Extinction = Field(quantity("1.8 / km"), gt=0)
     molecules: Extinction = Field(
         0.0, ge=0, description="on top of it, in slab and environment: by air, which has no texture"
     )
@@ -103,7 +115,7 @@ class Wake(_Section):
 
     @field_validator("second", mode="before")
     @classmethod
-    def _advect_or_time(cls, value):
+    def _advect_or_time(cls, value: object) -> object:
         if value == "advect":
             return value
         try:
@@ -148,7 +160,7 @@ class _Scatterer(_Section):
     table: str | None = Field(None, description="scattering-matrix file, see the mueller plugin")
 
     @model_validator(mode="after")
-    def _named_what_it_needs(self):
+    def _named_what_it_needs(self: Any) -> Any:  # kinds of scatterers have a phase
         for name in ("table", "aerosol"):
             value = getattr(self, name)
             if (self.phase == name) != (value is not None):
@@ -186,7 +198,7 @@ class Scattering(_Scatterer):
 class Retrieval(_Section):
     """How winds are found in the image pair."""
 
-    methods: tuple[ImageMethod, ...] = Field(("cc", "ws"), min_length=1)
+    methods: tuple[ImageMethod, ...] = Field((ImageMethod.CC, ImageMethod.WS), min_length=1)
     template: int = Field(8, ge=2)
     search: int = Field(16, ge=4)
     stride: int = Field(1, ge=1)
@@ -217,8 +229,11 @@ def _once(key: str, values: tuple) -> None:
 class RingRetrieval(_Section):
     """How the wind is read from pictures of rings, and how often, to know how well."""
 
-    methods: tuple[RingMethod, ...] = Field(("annular", "ca", "ca_r2", "ml", "sg"), min_length=1)
-    centre: tuple[RingCentre, ...] = Field(("free", "known"), min_length=1)
+    methods: tuple[RingMethod, ...] = Field(
+        (RingMethod.ANNULAR, RingMethod.CA, RingMethod.CA_R2, RingMethod.ML, RingMethod.SG),
+        min_length=1,
+    )
+    centre: tuple[RingCentre, ...] = Field((RingCentre.FREE, RingCentre.KNOWN), min_length=1)
     averaged: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = Field(
         (1, 5, 20), min_length=1, description="numbers of pictures averaged before they are read"
     )
@@ -243,7 +258,7 @@ class Doppler(_Section):
     """The fringe-imaging Doppler lidar and the winds along its line of sight."""
 
     v_los: tuple[Speed, ...] = Field(
-        ("50 m/s", "-300 m/s", "-100 m/s", "0 m/s", "300 m/s"),
+        (50.0, -300.0, -100.0, 0.0, 300.0),
         min_length=1,
         max_length=100,
         description="positive: the air approaches; figures show the first",
@@ -263,7 +278,7 @@ class Doppler(_Section):
 
     @field_validator("speckle_modes", mode="before")
     @classmethod
-    def _derived_or_number(cls, value):
+    def _derived_or_number(cls, value: object) -> object:
         if value == "derived":
             return value
         try:
@@ -288,7 +303,9 @@ class Sensor(_Section):
     directions: DopplerScan = DopplerScan()
     pulses: int = Field(20, ge=1, le=10_000, description="averaged in a direction of a slab")
     slabs_per_second: Frequency = Field(10.0, gt=0, description="that are measured")
-    method: ImageMethod = Field("variational", description="that the cross-flow wind is taken from")
+    method: ImageMethod = Field(
+        ImageMethod.VARIATIONAL, description="that the cross-flow wind is taken from"
+    )
     crossflow_std: Speed | None = Field(
         None, gt=0, description="standard error of v and w; default: as the method says"
     )
@@ -300,7 +317,9 @@ class Sensor(_Section):
 class Volume(_Section):
     """Wind in three dimensions, from all gates of both scans as two volumes."""
 
-    methods: tuple[VolumeMethod, ...] = Field(("correlation", "variational"), min_length=1)
+    methods: tuple[VolumeMethod, ...] = Field(
+        (VolumeMethod.CORRELATION, VolumeMethod.VARIATIONAL), min_length=1
+    )
     template: int = Field(8, ge=4, description="voxels along each side of a window")
     search: int = Field(16, ge=6)
     stride: int = Field(4, ge=1)
@@ -398,7 +417,8 @@ class Experiment(Tabular, _Section):
             )
         if method in (ImageMethod.CC, ImageMethod.WS) and self.sensor.crossflow_std is None:
             raise ValueError(
-                f"sensor.crossflow_std: missing; expected a speed, as method {method} knows no errors"
+                f"sensor.crossflow_std: missing; expected a speed, as method {method} knows no "
+                "errors"
             )
         return self
 
@@ -411,8 +431,8 @@ class Experiment(Tabular, _Section):
             and phase in ("isotropic", "henyey_greenstein")
         ):
             raise ValueError(
-                f"wake.extinction.molecules: not allowed with scattering.phase {phase}, which knows no "
-                "polarisation; expected 0"
+                f"wake.extinction.molecules: not allowed with scattering.phase {phase}, which "
+                "knows no polarisation; expected 0"
             )
         return self
 

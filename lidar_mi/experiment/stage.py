@@ -121,8 +121,8 @@ def result_of(
     missing = [name for name in names if there[name] is None]
     if len(missing) < len(names):
         log(
-            f"using {len(names) - len(missing)} of {len(names)} {stage.name.replace('_', ' ')} from "
-            "an earlier run"
+            f"using {len(names) - len(missing)} of {len(names)} {stage.name.replace('_', ' ')} "
+            "from an earlier run"
         )
     if missing:
         for name, part in stage.compute(experiment, *needed, log=log, missing=missing):

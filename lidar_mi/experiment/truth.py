@@ -241,7 +241,7 @@ def _extinction(flow, mapping, first, second) -> xr.DataArray:
 
 
 def _slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
-    """Mean over the depth of planar gates, (z, y); linear between planes, as the renderer's grid."""
+    """Mean over the depth of planar gates, (z, y); linear between planes, as in the renderer."""
     x = field["x"].values
     weights = np.ones(1)
     if len(x) > 1:
@@ -291,7 +291,7 @@ def blur_by_beam(image: xr.DataArray, lidar, distance: float, depth: float = 0.0
     metres = lidar.radius_at(distance) / 2
     steps, weights = _depths(lidar, depth)
     total = 0.0
-    for step, weight in zip(steps, weights):
+    for step, weight in zip(steps, weights, strict=True):
         values = image.values
         for axis, name in enumerate(image.dims):
             matrix = _beam_weights(image[name].values, 1 + step / distance, metres)

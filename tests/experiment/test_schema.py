@@ -156,7 +156,8 @@ FAULTS = [
     ),
     (
         "scattering={phase: mixture, parts: [{phase: hg, share: 1}]}",
-        "scattering.parts.0.phase: 'hg' is not allowed; expected 'rayleigh', 'molecules', 'aerosol' or",
+        "scattering.parts.0.phase: 'hg' is not allowed; expected 'rayleigh', 'molecules', "
+        "'aerosol' or",
     ),
     (
         "scattering={phase: mixture, parts: [{phase: aerosol, share: 1}]}",
@@ -269,7 +270,8 @@ FAULTS = [
     ("wake.depth=line", "wake.depth: 'line' is not allowed; expected 'plane' or 'volume'"),
     (
         "retrieval.methods=[cc, xx]",
-        "retrieval.methods.1: 'xx' is not allowed; expected 'cc', 'ws', 'multipass', 'variational' or 'vortex_fit'",
+        "retrieval.methods.1: 'xx' is not allowed; expected 'cc', 'ws', 'multipass', "
+        "'variational' or 'vortex_fit'",
     ),
     ("retrieval.methods=[]", "retrieval.methods: [] is not allowed; expected 1 or more"),
     ("retrieval.methods=cc", "retrieval.methods: 'cc' is not allowed; expected a list in brackets"),
@@ -355,7 +357,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 
 
 def test_checking_a_dictionary_names_its_origin():
-    with pytest.raises(InputError, match="^here: expected wake, doppler or both$"):
+    with pytest.raises(InputError, match=r"^here: expected wake, doppler or both$"):
         check({"name": "a"}, "here")
     assert isinstance(check({"name": "a", "wake": {"file": "b.nc"}}, "here"), Experiment)
 
@@ -363,7 +365,7 @@ def test_checking_a_dictionary_names_its_origin():
 def test_a_key_that_is_there_twice_is_a_fault(write):
     """YAML's libraries take the last one silently."""
     path = write("name: a\nwake: {file: a.nc}\nscan: {range: 300 m}\nscan: {thickness: 3 m}\n")
-    with pytest.raises(InputError, match="line 4 not valid YAML .key 'scan' is there twice"):
+    with pytest.raises(InputError, match=r"line 4 not valid YAML .key 'scan' is there twice"):
         load(path)
     with pytest.raises(InputError, match="is not a YAML value"):
         load(write(), ["scan={range: 300 m, range: 400 m}"])

@@ -24,7 +24,9 @@ def gate_mean(image, lidar, distance, depth, photons=512):
     air = RegularGridInterpolator((z, y), image.values)
     zz, yy = np.meshgrid(z[6:-6], y[6:-6], indexing="ij")
     stretch = 1 + place[kept] / distance
-    return sum(air((zz * k + b, yy * k + a)) for a, b, k in zip(dy, dz, stretch)) / len(dy)
+    return sum(
+        air((zz * k + b, yy * k + a)) for a, b, k in zip(dy, dz, stretch, strict=True)
+    ) / len(dy)
 
 
 @pytest.mark.parametrize("duration", [0.0, 10e-9])

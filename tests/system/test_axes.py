@@ -34,7 +34,7 @@ def blob_run(tmp_path_factory):
 def test_blob_is_where_it_should_be_in_the_exr(blob_run):
     """Top row = largest z (15 m), left column = largest y (20 m), 0.5 m a pixel; t2 one metre to
     port and half a metre up. 0.05 px allowed; noise moves the centroid by less than 0.01 px."""
-    for name, (y, z) in zip(IMAGES, ((8.25, -3.75), (9.25, -3.25))):
+    for name, (y, z) in zip(IMAGES, ((8.25, -3.75), (9.25, -3.25)), strict=True):
         picture = as_seen(blob_run / name)
         assert picture.shape == (61, 81)
         bright = picture - np.median(picture)

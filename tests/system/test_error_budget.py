@@ -1,6 +1,6 @@
-"""The error budget of an experiment. Detects causes switched off in the wrong picture, a slab's depth
-that is forgotten, winds found again that are not those of the run, and a report that does not say
-what limits."""
+"""The error budget of an experiment. Detects causes switched off in the wrong picture, a slab's
+depth that is forgotten, winds found again that are not those of the run, and a report that does not
+say what limits."""
 
 import gc
 import json
@@ -23,7 +23,8 @@ from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 SMALL = """
 name: small
 wake:
-  vortex_pair: {circulation: 100 m^2/s, separation: 16 m, core_radius: 2 m, width: 40 m, height: 24 m}
+  vortex_pair:
+    {circulation: 100 m^2/s, separation: 16 m, core_radius: 2 m, width: 40 m, height: 24 m}
   texture: {rms: 0.2, outer_scale: 10 m}
 detector: {}
 lidar: {pulse_energy: 1 mJ}
@@ -115,7 +116,10 @@ def test_wind_that_changes_through_the_slab_is_a_cause(tmp_path):
     dims = ("x", "y", "z")
     wake = xr.Dataset(
         {"v": (dims, v, {"units": "m/s"}), "w": (dims, np.zeros(shape), {"units": "m/s"})},
-        {axis: (axis, values, {"units": "m"}) for axis, values in zip(dims, (x, y, z))},
+        {
+            axis: (axis, values, {"units": "m"})
+            for axis, values in zip(dims, (x, y, z), strict=True)
+        },
     )
     wake.to_netcdf(tmp_path / "sheared.nc", engine="h5netcdf")
     (tmp_path / "sheared.yaml").write_text(

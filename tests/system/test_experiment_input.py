@@ -46,7 +46,7 @@ def test_gates_that_reach_beyond_the_wake(tmp_path):
     name = write_wake(tmp_path / "v.nc", lambda x, y, z: y * 0 + 1, x=np.arange(0.5, 4))
     data = small()
     data["wake"] = {"file": name, "depth": "volume", "x": 0.5, "texture": {"rms": 0}}
-    with pytest.raises(InputError, match="gates from 500 to 502.5 m .* fill 500.75 to 504.75 m"):
+    with pytest.raises(InputError, match=r"gates from 500 to 502.5 m .* fill 500.75 to 504.75 m"):
         run(check(data), tmp_path / "run", beside=tmp_path)
     assert not (tmp_path / "run").exists()
 

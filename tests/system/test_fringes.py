@@ -130,7 +130,7 @@ def mean_r2(picture, low, high):
     ],
 )
 def test_rings_lie_where_the_wind_puts_them(small, name, v):
-    """The second ring's middle, from the light itself, against cos(theta) = m / (m_0 (1 + 2 v / c)).
+    """The second ring's middle, from the light itself: cos(theta) = m / (m_0 (1 + 2 v / c)).
 
     To 1 m/s: an order of r^2 is 1940 m/s, summed in 101 steps of it.
     """
@@ -158,8 +158,8 @@ def test_pictures_say_what_they_are(small):
 @pytest.mark.parametrize("centre", ["free", "known"])
 @pytest.mark.parametrize("averaged", [1, 9])
 def test_winds_scatter_as_the_bound_says(small, found, centre, averaged):
-    """Squared errors over the bound's variance follow chi-square: bias and spread at once, 12 images;
-    to 1e-4 on each side."""
+    """Squared errors over the bound's variance follow chi-square: bias and spread at once, 12
+    images; to 1e-4 on each side."""
     case = found.sel(algorithm="annular", centre=centre, averaged=averaged)
     bound = small[1][f"doppler.bound.centre_{centre}.averaged_{averaged}.std"]
     error = (case["v"] - case["v_los"]).values.ravel()

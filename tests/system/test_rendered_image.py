@@ -41,7 +41,7 @@ def footprint_mean(image, lidar, distance, count=4096):
     y, z = image["y"].values, image["z"].values
     air = RegularGridInterpolator((z, y), image.values)
     zz, yy = np.meshgrid(z[6:-6], y[6:-6], indexing="ij")
-    return sum(air((zz + b, yy + a)) for a, b in zip(dy, dz)) / count
+    return sum(air((zz + b, yy + a)) for a, b in zip(dy, dz, strict=True)) / count
 
 
 @pytest.fixture

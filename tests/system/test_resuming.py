@@ -66,7 +66,7 @@ def test_a_missing_picture_is_rendered_again_and_the_same(tmp_path, quick):
     (folder / IMAGES[1]).unlink()
     run(check(small()), folder)
     assert pictures_of(folder)[0] == stamps[0] and pictures_of(folder)[1] != stamps[1]
-    for one, other in zip(before, layers(folder)):
+    for one, other in zip(before, layers(folder), strict=True):
         xr.testing.assert_identical(one, other)
 
 
@@ -79,7 +79,7 @@ def test_another_experiment_is_kept_out(tmp_path, quick):
         run(check(other), folder)
     assert pictures_of(folder) == stamps
     run(check(other), folder, overwrite=True)
-    assert all(new != old for new, old in zip(pictures_of(folder), stamps))
+    assert all(new != old for new, old in zip(pictures_of(folder), stamps, strict=True))
     assert yaml.safe_load((folder / "experiment.yaml").read_text())["experiment"]["seed"] == 2
 
 
@@ -90,7 +90,7 @@ def test_pictures_of_another_version_are_kept_out(tmp_path, quick):
     record["versions"]["mitsuba"] = "3.5.0"
     (folder / "experiment.yaml").write_text(yaml.safe_dump(record))
     stamps = pictures_of(folder)
-    with pytest.raises(InputError, match="a run of mitsuba 3.5.0, this is 3.*; expected"):
+    with pytest.raises(InputError, match=r"a run of mitsuba 3.5.0, this is 3.*; expected"):
         run(check(small()), folder)
     assert pictures_of(folder) == stamps
     run(check(small()), folder, overwrite=True)
@@ -128,7 +128,7 @@ def test_overwriting_leaves_nothing_of_the_old_run(tmp_path, quick):
 def test_a_folder_that_is_no_run_folder_is_refused(tmp_path, content):
     (tmp_path / content).write_text("name: mine\n")
     for overwrite in (False, True):
-        with pytest.raises(InputError, match="run folder|not written by a run"):
+        with pytest.raises(InputError, match=r"run folder|not written by a run"):
             run(check(small()), tmp_path, overwrite=overwrite)
     assert [p.name for p in tmp_path.iterdir()] == [content]
 
@@ -183,7 +183,9 @@ def test_the_seed_decides(tmp_path, quick):
         metrics = run(check(small() | {"seed": seed}), tmp_path / name).metrics
         runs[name] = (without_timing(metrics), layers(tmp_path / name))
     assert runs["one"][0] == runs["again"][0]
-    for same, again, other in zip(*(runs[name][1] for name in ("one", "again", "other"))):
+    for same, again, other in zip(
+        *(runs[name][1] for name in ("one", "again", "other")), strict=True
+    ):
         xr.testing.assert_identical(same, again)
         # other texture and other photons
         assert not np.array_equal(same["S0"], other["S0"])

@@ -61,7 +61,7 @@ def test_figures_show_what_the_pilot_sees(demo, figure, of):
         assert drawn.shape[1] / drawn.shape[0] == pytest.approx(219 / 139, rel=0.03)
         rows, columns = (
             ((np.arange(n) + 0.5) * size / n).astype(int)
-            for n, size in zip(field.shape, brightness.shape)
+            for n, size in zip(field.shape, brightness.shape, strict=True)
         )
         seen = brightness[np.ix_(rows, columns)].ravel()
         values = field.transpose("z", "y").values
@@ -97,7 +97,9 @@ def test_report_needs_nothing_else(demo):
     page = (demo.folder / "report.html").read_text()
     links = Links(page)
     assert len(links.targets) == len(FIGURES)
-    for target, path in zip(links.targets, sorted((demo.folder / "figures").iterdir())):
+    for target, path in zip(
+        links.targets, sorted((demo.folder / "figures").iterdir()), strict=True
+    ):
         kind, _, code = target.partition(",")
         assert kind == "data:image/webp;base64"
         with Image.open(io.BytesIO(base64.b64decode(code))) as held, Image.open(path) as drawn:

@@ -299,8 +299,8 @@ def test_errors_of_a_known_field():
     ],
 )
 def test_what_limits_u_is_found(amplitude, noise, errors, limit):
-    """An even u is limited by the noise of its lines, or by a yaw that is not known; a u of 4 m waves
-    by what lies between them."""
+    """An even u is limited by the noise of its lines, or by a yaw that is not known; a u of 4 m
+    waves by what lies between them."""
     experiment = changed(sensor={"errors": errors})
     y, z = np.arange(-54, 54.1, 1.0), np.arange(-34, 34.1, 1.0)
     waves = amplitude * np.sin(2 * np.pi * z[:, None] / 4) * np.sin(2 * np.pi * y / 4)
@@ -342,9 +342,9 @@ def test_what_limits_u_is_found(amplitude, noise, errors, limit):
 
 @pytest.mark.slow
 def test_the_share_of_noise_is_between_what_draws_and_the_lines_say():
-    """Mean square error less that without noise, over 8 draws: no less than the variance of u over the
-    draws (less 3 sigma), as the estimate also gains by knowing that noise is gone; no more than one
-    line's variance."""
+    """Mean square error less that without noise, over 8 draws: no less than the variance of u over
+    the draws (less 3 sigma), as the estimate also gains by knowing that noise is gone; no more than
+    one line's variance."""
     experiment, noise = changed(), 0.4
     y, z = np.arange(-54, 54.1, 2.0), np.arange(-34, 34.1, 2.0)
     waves = np.sin(2 * np.pi * z[:, None] / 40) * np.sin(2 * np.pi * y / 60)

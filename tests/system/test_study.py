@@ -235,7 +235,7 @@ def test_info_on_a_study_that_was_stopped(tmp_path):
         ("variant", "near (not run)", "far (not run)")
     ]
     (folder / "study.yaml").write_text("[1]")
-    with pytest.raises(InputError, match="study.yaml: not written by a study"):
+    with pytest.raises(InputError, match=r"study.yaml: not written by a study"):
         list(sections(str(folder)))
 
 
@@ -277,7 +277,7 @@ def test_shipped_experiments_are_documented():
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize(("name", "one"), list(shipped()))
 def test_shipped_experiments_fit_together(name, one):
-    """Everything that a run checks before it writes: files, tables, lines of sight within the wake."""
+    """Everything that a run checks before it writes: files, tables, lines within the wake."""
     experiment.prepare(one, SCENES)
 
 
@@ -332,7 +332,7 @@ def test_turbine_is_seen_by_both(tmp_path):
 @pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_nearer_light_is_stronger(tmp_path):
-    """Photons of a direction go with 1 / r^2 and the air between; lines are read better by as much."""
+    """Photons of a direction vary as 1 / r^2 times the transmittance; errors of lines with them."""
     found = small_run("near_range", tmp_path / "run", SMALLER_SENSOR)
     far, near = found["at_150m"], found["at_76m"]
     ratio = (

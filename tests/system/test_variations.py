@@ -63,7 +63,7 @@ def test_second_snapshot_agrees_with_advection(plain, variation):
     first = [as_seen(path / IMAGES[0]) for path in (plain[0], folder)]
     second = [as_seen(path / IMAGES[1]) for path in (plain[0], folder)]
     np.testing.assert_array_equal(*first)
-    assert np.corrcoef(*((b - a).ravel() for a, b in zip(first, second)))[0, 1] > 0.98
+    assert np.corrcoef(*((b - a).ravel() for a, b in zip(first, second, strict=True)))[0, 1] > 0.98
     for name in ("v", "w"):
         key = f"backscatter.cc.rmse_{name}"
         assert metrics[key] == pytest.approx(plain[1][key], rel=0.1)
@@ -105,7 +105,9 @@ def test_aiming_by_angles_is_as_good(plain, variation):
     top = [read_scan(folder / name)["z"].values[-1] for name in IMAGES]
     distances = (501.25, 486.25)
     np.testing.assert_allclose(
-        top, [d * np.tan(np.radians(a)) for d, a in zip(distances, (3.9, 4.1))], rtol=1e-6
+        top,
+        [d * np.tan(np.radians(a)) for d, a in zip(distances, (3.9, 4.1), strict=True)],
+        rtol=1e-6,
     )
     assert top[1] - top[0] == pytest.approx(0.68, abs=0.01)
     for name in ("v", "w"):

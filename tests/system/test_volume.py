@@ -71,7 +71,7 @@ def test_the_whole_chain(tmp_path):
 
 
 def test_gates_are_put_where_their_air_is():
-    """A pattern in space, seen by beams that spread: back on the grid it is itself, at both times."""
+    """A pattern in space, seen by diverging beams: on the grid it is itself, at both times."""
     lidar, axis = BackscatterLidar(), np.arange(-30, 31.0)
     scan = Scan(range=200.0, thickness=8.0, gate_count=8)
     plans = plan_scans(scan, axis, axis, (0.0, 30.0))

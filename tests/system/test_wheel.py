@@ -1,5 +1,5 @@
-"""The wheel. Detects a module, a scene or a file of the report that it lacks, and code that works in
-the source tree only.
+"""The wheel. Detects a module, a scene or a file of the report that it lacks, and code that works
+in the source tree only.
 """
 
 import shutil

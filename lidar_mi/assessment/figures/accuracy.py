@@ -17,11 +17,11 @@ def truth_vectors(wind: xr.Dataset) -> xr.Dataset:
     return true.assign(flag=xr.zeros_like(wind["flag"]))
 
 
-def error_and_bound(found: xr.Dataset):
+def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
     """Rms errors in groups of vectors of like Cramer-Rao bound; None where no noise bounds any."""
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     span = []
-    for axes, name in zip(figure.subplots(1, 2), ("v", "w")):
+    for axes, name in zip(figure.subplots(1, 2), ("v", "w"), strict=True):
         for source in (s for s in found["source"].values if s in RENDERED):
             for method in found["algorithm"].values:
                 wind = found.sel(source=source, algorithm=method)
@@ -59,7 +59,7 @@ def error_and_bound(found: xr.Dataset):
     )
 
 
-def error_by_texture(found: xr.Dataset, sweep: xr.Dataset):
+def error_by_texture(found: xr.Dataset, sweep: xr.Dataset) -> tuple[Figure, str]:
     """Errors by sub-grid texture, and of this run's vectors by the isotropy of their windows."""
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)

@@ -22,8 +22,15 @@ from lidar_mi.assessment.metrics.names import Source
 
 @dataclass(frozen=True)
 class Scale:
-    """What all wind maps of a run share: ``limit``, the speed (m/s) at the end of the colours and
-    drawn as an arrow one step long, and the plane's axes ``y``, ``z`` (m)."""
+    """What all wind maps of a run have in common.
+
+    Attributes
+    ----------
+    limit : float
+        Speed at the end of the colours, drawn as an arrow one step long, m/s.
+    y, z : array
+        Axes of the plane, m.
+    """
 
     limit: float
     y: np.ndarray
@@ -50,10 +57,9 @@ def draw_all(
 
     Parameters
     ----------
-    truth : lidar_mi.experiment.truth.Truth
-    scans : the two rendered scans
-    found : winds with dims (source, algorithm, z, y), from `lidar_mi.experiment.stages.winds.cross_flow_winds`
-    sweep : errors by texture, from `lidar_mi.experiment.stages.texture.texture_sweep`
+    truth : lidar_mi.experiment.truth.Truth scans : the two rendered scans found : winds with dims
+    (source, algorithm, z, y), from `lidar_mi.experiment.stages.winds.cross_flow_winds` sweep :
+    errors by texture, from `lidar_mi.experiment.stages.texture.texture_sweep`
     """
     scale = _scale(truth)
     plates = (
@@ -102,7 +108,8 @@ def draw_all(
                     scans[0],
                     "depolarization",
                     "linear depolarisation ratio",
-                    "Linear depolarisation ratio of the first picture, cross- over co-polarised light.",
+                    "Linear depolarisation ratio of the first picture, cross- over co-polarised "
+                    "light.",
                 ),
             ),
         )
@@ -229,7 +236,7 @@ def _retrieved_into(axes, found, source, cores, scale):
     methods = [str(method) for method in found["algorithm"].values]
     for axis in axes[len(methods) :]:
         axis.set_axis_off()
-    for axis, method in zip(axes, methods):
+    for axis, method in zip(axes[: len(methods)], methods, strict=True):
         wind = found.sel(source=source, algorithm=method)
         _arrows(axis, wind, cores, f"{METHOD_NAMES[method]}, {source}", scale)
 
@@ -238,15 +245,15 @@ def _retrieved(found, source, cores, scale):
     figure, axes = sheet(1, max(2, found.sizes["algorithm"]))
     _retrieved_into(axes[0], found, source, cores, scale)
     return figure, (
-        f"Winds retrieved from the rendered {source} pair, unfiltered: grey vectors are flagged, red "
-        "crosses mark the true cores."
+        f"Winds retrieved from the rendered {source} pair, unfiltered: grey vectors are flagged, "
+        "red crosses mark the true cores."
     )
 
 
 def _deviation_maps(found, source, reference):
     methods = [str(m) for m in found["algorithm"].values]
     figure, axes = sheet(len(methods), 2)
-    for row, method in zip(axes, methods):
+    for row, method in zip(axes, methods, strict=True):
         wind = found.sel(source=source, algorithm=method)
         other = (
             truth_vectors(wind)

@@ -37,7 +37,7 @@ def draw_comparison(
     ]
     # one variant without skill must not hide the errors of those that have some
     top = min(float(np.median(largest)) if largest else 0.0, limit) or limit
-    for row, (name, (picture, wind, cores)) in zip(axes, rows.items()):
+    for row, (name, (picture, wind, cores)) in zip(axes, rows.items(), strict=True):
         low, high = (float(1e6 * picture.quantile(share)) for share in (0.002, 0.998))
         good, place = (
             wind["flag"] == 0,
@@ -53,7 +53,7 @@ def draw_comparison(
             (wind["w"].where(good), speeds, f"{name}: w found", _SPEED),
             (errors[name], speeds | {"vmin": -top, "vmax": top}, f"{name}: error of w", _SPEED),
         )
-        for panel, (field, style, title, label) in zip(row, columns):
+        for panel, (field, style, title, label) in zip(row, columns, strict=True):
             y, z = field["y"].values, field["z"].values
             mesh = panel.pcolormesh(
                 y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
@@ -66,9 +66,10 @@ def draw_comparison(
     for panel in axes[-1]:
         panel.set_xlabel("y / m (port is left)")
     caption = (
-        "Each variant's first picture, the vertical wind found by its first method (white: flagged "
-        "vectors), and its error; winds are on one scale, errors on another, that of the middle variant. Crosses: true cores. Of "
-        "several gates the first, of winds in three dimensions the layer nearest to it."
+        "Each variant's first picture, the vertical wind found by its first method (white: "
+        "flagged vectors), and its error; winds are on one scale, errors on another, that of the "
+        "middle variant. Crosses: true cores. Of several gates the first, of winds in three "
+        "dimensions the layer nearest to it."
     )
     plate = ("fig00_comparison", "The variants side by side", (figure, caption))
     return save_all(folder, [plate], log)

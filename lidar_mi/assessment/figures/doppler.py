@@ -24,9 +24,9 @@ PUBLISHED = {
 REQUIRED = 0.5
 """Largest standard deviation of v_LOS that the paper's table 1 allows, m/s."""
 
-_COLOURS = dict(zip(READERS, ("C0", "C9", "C3", "C2", "C1", "C4")))
+_COLOURS = dict(zip(READERS, ("C0", "C9", "C3", "C2", "C1", "C4"), strict=True))
 _BY_COORDINATE = {"r": _COLOURS["ca"], "r2": _COLOURS["ca_r2"]}
-_MARKERS = dict(zip(READERS, "oXs^Dv"))
+_MARKERS = dict(zip(READERS, "oXs^Dv", strict=True))
 
 
 def draw_all(
@@ -48,7 +48,8 @@ def draw_all(
     photons : xr.Dataset or None
         Picture of the laser's light, photon by photon.
     found, metrics
-        From `lidar_mi.experiment.stages.ring_velocities.velocities`, `lidar_mi.assessment.metrics.velocities`.
+        From `lidar_mi.experiment.stages.ring_velocities.velocities`,
+        `lidar_mi.assessment.metrics.velocities`.
     """
     plates = [
         ("fig03_fringes", "Rings on the CCD", _rings(doppler, exposure, photons)),
@@ -80,7 +81,7 @@ def _rings(doppler, exposure, photons):
         # every path carries the same energy
         hits = photons["S0"].values * photons["S0"].size * photons.attrs["samples_per_pixel"]
         shown.append((hits, "the laser's light, photon by photon through a lens", "photons"))
-    for axis, (image, title, label) in zip(axes, shown):
+    for axis, (image, title, label) in zip(axes, shown, strict=True):
         # single noisy pixels must not darken all others
         mesh = axis.imshow(image, cmap="inferno", vmin=0, vmax=np.quantile(image, 0.998))
         axis.set(title=title, xlabel="x / px", ylabel="y / px")
@@ -152,9 +153,9 @@ def _errors(doppler, metrics):
     settings = doppler.retrieval
     figure = Figure(figsize=(6.2 * len(settings.centre), 8.2), layout="constrained")
     axes = figure.subplots(2, len(settings.centre), sharex=True, sharey="row", squeeze=False)
-    for column, centre in zip(axes.T, settings.centre):
+    for column, centre in zip(axes.T, settings.centre, strict=True):
         for name in settings.methods:
-            for axis, quantity in zip(column, ("std", "bias")):
+            for axis, quantity in zip(column, ("std", "bias"), strict=True):
                 keys = [ring_key(name, centre, n, quantity) for n in settings.averaged]
                 values, bars = (
                     np.array([metrics.get(key + end, np.nan) for key in keys])
@@ -174,7 +175,7 @@ def _errors(doppler, metrics):
         bound = [metrics[bound_key(centre, n)] for n in settings.averaged]
         column[0].plot(settings.averaged, bound, "k--", label="Cramer-Rao bound")
         column[0].axhline(REQUIRED, color="0.5", ls=":", label="required (table 1)")
-        for axis, quantity in zip(column, ("std", "bias")):
+        for axis, quantity in zip(column, ("std", "bias"), strict=True):
             stated = PUBLISHED[centre]
             axis.plot(
                 stated["averaged"],
@@ -209,7 +210,7 @@ def _bias(doppler, exposure, found):
     radius, mean, _ = circular_average(exposure.received, camera.centre_pixel)
     true = ring_radii(camera, doppler.etalon, doppler.lidar.wavelength, doppler.v_los[0])[0]
     names = {"r": ("r", "px"), "r2": ("r$^2$", "px$^2$")}
-    for axis, power, (coordinate, (name, unit)) in zip(rings, (1, 2), names.items()):
+    for axis, power, (coordinate, (name, unit)) in zip(rings, (1, 2), names.items(), strict=True):
         x, crest = radius**power, true**power
         near = np.abs(x - crest) < 0.6 * power * crest
         axis.plot(x[near], mean[near], "k", label="innermost ring, no noise")
@@ -272,7 +273,9 @@ def _speeds(found):
     right.set_yscale("symlog", linthresh=1.0)
     ticks = [sign * value for sign in (-1, 1) for value in (0.5, 1, 10, 100)]
     low, high = right.get_ylim()
-    right.set_yticks(*zip(*((t, f"{t:g}") for t in sorted([0, *ticks]) if low <= t <= high)))
+    right.set_yticks(
+        *zip(*((t, f"{t:g}") for t in sorted([0, *ticks]) if low <= t <= high), strict=True)
+    )
     n, centre = int(case["averaged"]), CENTRES[str(case["centre"].values)]
     for axis in (left, right):
         axis.set_title(f"{'single pictures' if n == 1 else f'averages of {n} pictures'}, {centre}")

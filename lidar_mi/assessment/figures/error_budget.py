@@ -56,11 +56,11 @@ def _bars(budgets: Budgets):
             shares = np.array([budget.get(f"{place}{cause}.share", np.nan) for cause in used])
             at = rows + 0.2 - 0.4 * number
             bars[where] = panel.barh(at, shares, 0.36, color=f"C{number}")
-            for y, share in zip(at, shares):
+            for y, share in zip(at, shares, strict=True):
                 if np.isfinite(share):
                     end = min(max(share, 0), 1) + 0.015
                     panel.text(end, y, whole_percent(share), va="center", fontsize=7)
-        for y, cause in zip(rows, used):
+        for y, cause in zip(rows, used, strict=True):
             if cause not in causes_of(budget):
                 panel.text(0.015, y, "does not apply", va="center", color="0.5", fontsize=8)
         panel.set_title("\n".join([METHOD_NAMES[method], *title]), fontsize=10)
@@ -74,7 +74,7 @@ def _bars(budgets: Budgets):
     panels[0].set_yticks(rows, [CAUSES[cause] for cause in used])
     figure.legend(bars.values(), bars.keys(), loc="outside lower right", ncols=2, fontsize=9)
     return figure, (
-        "By how much the mean square error of v and w falls without each cause of error in turn, and "
-        "the rms error with all of them (of a component). Shares need not add up to 100 %; below 0 "
-        "the wind is worse without the cause."
+        "By how much the mean square error of v and w falls without each cause of error in turn, "
+        "and the rms error with all of them (of a component). Shares need not add up to 100 %; "
+        "below 0 the wind is worse without the cause."
     )

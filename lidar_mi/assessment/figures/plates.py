@@ -61,7 +61,7 @@ def image_panel(
 
 
 def by_factors(axes) -> None:
-    """A logarithmic upward axis where values differ by more than a factor of 3, plain numbers on it."""
+    """A logarithmic vertical axis where values differ by more than a factor of 3."""
     values = np.concatenate(
         [np.ravel(line.get_ydata()).astype(float) for line in axes.lines] or [[]]
     )

@@ -19,7 +19,7 @@ def draw_rings(image: np.ndarray, rings: Rings, title: str = "") -> Figure:
     low, high = np.percentile(image, (0.5, 99.8))
     picture.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
     angle = np.linspace(0, 2 * np.pi, 721)
-    for radius, line in zip(rings.radius, rings.line):
+    for radius, line in zip(rings.radius, rings.line, strict=True):
         x, y = rings.curve(radius, angle)
         picture.plot(x, y, "--", color=LINE_COLOURS[line], lw=0.9)
     picture.plot(*rings.centre, "+", color="yellow", ms=12)
@@ -31,7 +31,7 @@ def draw_rings(image: np.ndarray, rings: Rings, title: str = "") -> Figure:
         title=f"{title}\ncentre ({rings.centre[0]:.2f}, {rings.centre[1]:.2f}) px".strip(),
     )
     profile.plot(rings.r2 * 1e-3, rings.profile, color="0.3", lw=0.9)
-    for radius, line in zip(rings.radius, rings.line):
+    for radius, line in zip(rings.radius, rings.line, strict=True):
         profile.axvline(radius**2 * 1e-3, color=LINE_COLOURS[line], ls="--", lw=0.9)
     profile.set(
         xlabel="$r^2$ / 1000 px$^2$", ylabel="mean over circles", title="rings about the centre"

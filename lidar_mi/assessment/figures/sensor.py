@@ -23,8 +23,8 @@ def draw_all(
     Parameters
     ----------
     found : xr.Dataset or None
-        From `lidar_mi.retrieval.lines.combine.combine`, with the truth as u_true, v_true, w_true. None:
-        there is no wind.
+        From `lidar_mi.retrieval.lines.combine.combine`, with the truth as u_true, v_true, w_true.
+        None: there is no wind.
     lines : xr.Dataset
         From `lidar_mi.experiment.stages.lines.measure_lines`.
     """
@@ -82,8 +82,8 @@ def _scan(lines, cores):
     )
     panels[0].set_xlim(middle + half + 4, middle - half - 4)
     return figure, (
-        "Middles of the range bins; what the aircraft flies is part of the velocity. Black crosses: "
-        "lines of sight whose rings could not be read. Red crosses: true cores."
+        "Middles of the range bins; what the aircraft flies is part of the velocity. Black "
+        "crosses: lines of sight whose rings could not be read. Red crosses: true cores."
     )
 
 
@@ -93,7 +93,7 @@ def _maps(found, lines, cores):
     good = found["flag"] == 0
     y, z = found["y"], found["z"]
     place = (lines["range"] * lines["direction"]).transpose("line", "axis").values
-    for row, name in zip(axes, COMPONENTS):
+    for row, name in zip(axes, COMPONENTS, strict=True):
         true, value = found[f"{name}_true"], found[name].where(good)
         error = value - true
         both = np.concatenate([true.values.ravel(), value.values.ravel()])
@@ -102,7 +102,7 @@ def _maps(found, lines, cores):
             (value, _colours(both), f"{name}, found"),
             (error, _colours(error.values), f"{name}, error"),
         )
-        for panel, (field, colours, title) in zip(row, columns):
+        for panel, (field, colours, title) in zip(row, columns, strict=True):
             mesh = panel.pcolormesh(
                 y,
                 z,
@@ -134,7 +134,7 @@ def _uncertainty(found):
     axes = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 1))
     good = (found["flag"] == 0).transpose("z", "y").values
     y, z = found["y"], found["z"]
-    for panel, name in zip(axes, ("u", "w")):
+    for panel, name in zip(axes[:2], ("u", "w"), strict=True):
         stderr = found[f"{name}_stderr"].transpose("z", "y").values
         top = float(np.quantile(stderr[good], 0.99)) if good.any() else 1.0
         mesh = panel.pcolormesh(

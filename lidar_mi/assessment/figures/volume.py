@@ -50,7 +50,7 @@ def _seen(volumes, cores):
     values = [1e6 * volume for volume in volumes]
     limits = [float(values[0].quantile(q)) for q in (0.01, 0.995)]
     z = float(values[0]["z"].sel(z=cores[0].z if cores else 0, method="nearest"))
-    for column, (volume, when) in enumerate(zip(values, ("first", "second"))):
+    for column, (volume, when) in enumerate(zip(values, ("first", "second"), strict=True)):
         middle = volume.isel(x=volume.sizes["x"] // 2)
         mesh = _map(axes[0, column], middle, "y", "z", "viridis", *limits)
         axes[0, column].set_title(f"{when} scan, x = {float(middle['x']):.2f} m")
@@ -58,8 +58,8 @@ def _seen(volumes, cores):
         axes[1, column].set_title(f"{when} scan, z = {z:.1f} m")
         figure.colorbar(mesh, ax=axes[:, column], label=BACKSCATTER, pad=0.02, extend="both")
     return figure, (
-        "Top: one of the gates, as the pilot sees it. Bottom: a cut through all gates from above at "
-        "the height of a vortex, the flight path upwards."
+        "Top: one of the gates, as the pilot sees it. Bottom: a cut through all gates from above "
+        "at the height of a vortex, the flight path upwards."
     )
 
 
@@ -67,7 +67,7 @@ def _cuts(wind, cores):
     figure = Figure(figsize=(17, 10.5), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     cut = wind.isel(x=wind.sizes["x"] // 2)
-    for row, name in zip(axes, _COMPONENTS):
+    for row, name in zip(axes, _COMPONENTS, strict=True):
         _row(row, cut, name, "y", "z")
         for panel in row:
             for core in cores:
@@ -84,7 +84,7 @@ def _along_x(wind, cores):
     figure = Figure(figsize=(17, 5.4), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     cut = wind.sel(z=cores[0].z if cores else 0, method="nearest")
-    for row, name in zip(axes, _COMPONENTS):
+    for row, name in zip(axes, _COMPONENTS, strict=True):
         _row(row, cut, name, "y", "x", stretch=2)
     for panel in axes[:-1].ravel():
         panel.set_xlabel("")
@@ -130,7 +130,8 @@ def _map(panel, field, across, up, colours, low, high):
 def _errors(found):
     figure = Figure(figsize=(17, 8.4), layout="compressed")
     axes = figure.subplots(2, 3)
-    colours = dict(zip(found["algorithm"].values, ("tab:orange", "tab:blue")))
+    # an experiment may have one method alone
+    colours = dict(zip(found["algorithm"].values, ("tab:orange", "tab:blue"), strict=False))
     edges = np.linspace(-5, 5, 51)
     middle = (edges[1:] + edges[:-1]) / 2
     for column, name in enumerate(_COMPONENTS):

@@ -68,7 +68,7 @@ def find_cores(wind: xr.Dataset, least_circulation: float = 20.0) -> list[Core]:
 
 
 class Rings(NamedTuple):
-    """What rings around a vortex say of it: its circulation (m^2 s^-1), the wind that carries it."""
+    """Circulation (m^2 s^-1) and advecting wind of a vortex, from the wind on rings around it."""
 
     circulation: float
     v: float
@@ -124,7 +124,9 @@ def _ring_means(v, w, y, z, cy: float, cz: float, rings: np.ndarray) -> np.ndarr
     return np.stack([field.mean(1) for field in (on_v, on_w, swirl)])
 
 
-def outside_cores(y, z, cores: list[Core], radii: float = 2.0):
+def outside_cores(
+    y: np.ndarray, z: np.ndarray, cores: Sequence[Core], radii: float = 2.0
+) -> np.ndarray:
     """True where a point lies beyond ``radii`` core radii of every core."""
     outside = np.ones(np.broadcast(y, z).shape, bool)
     for core in cores:

@@ -88,7 +88,7 @@ def pictures_without(
         Pairs by cause: `monte_carlo`, `beam_blur`, with `rendered` `detector_noise`, with
         `carried` `slab`.
     """
-    found = {} if rendered is None else {"detector_noise": list(rendered)}
+    found: dict[str, Pair] = {} if rendered is None else {"detector_noise": rendered}
     found["monte_carlo"] = _plus_difference(blurred, seen, rendered or seen)
     found["beam_blur"] = _plus_difference(seen, sharp, blurred)
     if carried is not None:
@@ -97,8 +97,11 @@ def pictures_without(
 
 
 def _plus_difference(base: Pair, more: Pair, less: Pair) -> list[xr.DataArray]:
-    """base + more - less; all lie on one grid, whose coordinates may differ in their last digits."""
-    return [a.copy(data=a.values + (b.values - c.values)) for a, b, c in zip(base, more, less)]
+    """Sums base + more - less of images on one grid, up to rounding of its coordinates."""
+    return [
+        a.copy(data=a.values + (b.values - c.values))
+        for a, b, c in zip(base, more, less, strict=True)
+    ]
 
 
 def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.ndarray, np.ndarray]:
@@ -128,13 +131,13 @@ def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.n
     # in nodes and nodes per second, along z and y
     speeds = [
         ndimage.spline_filter(truth[name].transpose("z", "y").values / h, mode="mirror")
-        for name, h in zip(("w", "v"), spacing)
+        for name, h in zip(("w", "v"), spacing, strict=True)
     ]
     place = np.stack([z, y]).astype(float)
     known = np.isfinite(place).all(0)
     middle = place = (place[:, known] - np.array([axis[0] for axis in axes])[:, None]) / spacing
 
-    def wind(here):
+    def wind(here: np.ndarray) -> np.ndarray:
         return np.stack(
             [
                 ndimage.map_coordinates(speed, here, prefilter=False, mode="nearest")
@@ -142,7 +145,7 @@ def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.n
             ]
         )
 
-    def moved(here, time):
+    def moved(here: np.ndarray, time: float) -> np.ndarray:
         h = time / steps
         for _ in range(steps):
             k1 = wind(here)
@@ -182,8 +185,10 @@ def window_mean(truth: xr.Dataset, template: int, method: str) -> xr.Dataset | N
             for name in ("v", "w")
         }
         return xr.Dataset(smooth)
-    if method not in _BOXES:
-        return None
+    return _box_mean(truth, template) if method in _BOXES else None
+
+
+def _box_mean(truth: xr.Dataset, template: int) -> xr.Dataset:
     axes = {name: sliding_window_view(truth[name].values, template).mean(1) for name in ("z", "y")}
     windows = {
         name: sliding_window_view(truth[name].transpose("z", "y").values, (template, template))
@@ -201,10 +206,10 @@ def moved_as_one(
 ) -> xr.Dataset | None:
     """The wind found where the air of every window moves as one, by the window's mean wind.
 
-    Shear deforms what a window holds, so that its two pictures do not match at any shift. Here every
-    window's search region is a picture of its own, all of them laid side by side: the second shows
-    the blurred air of the first, carried by the mean wind over the template, and what the second
-    picture seen has besides its own blurred air.
+    Shear deforms what a window holds, so that its two pictures do not match at any shift. Here
+    every window's search region is a picture of its own, all of them laid side by side: the second
+    shows the blurred air of the first, carried by the mean wind over the template, and what the
+    second picture seen has besides its own blurred air.
 
     Parameters
     ----------
@@ -225,7 +230,7 @@ def moved_as_one(
     if found.attrs["method"] not in _BOXES:
         return None
     template, search, stride, dt = (found.attrs[n] for n in ("template", "search", "stride", "dt"))
-    mean = truth_at_vectors(found, window_mean(truth, template, found.attrs["method"]))
+    mean = truth_at_vectors(found, _box_mean(truth, template))
     regions = sliding_window_view(np.zeros(seen[0].shape), (search, search))[::stride, ::stride]
     places = []
     for axis, (name, component) in enumerate((("z", "w"), ("y", "v"))):
@@ -253,7 +258,7 @@ def _side_by_side(blocks: np.ndarray, like: xr.DataArray) -> xr.DataArray:
         blocks.shape[0] * blocks.shape[2], blocks.shape[1] * blocks.shape[3]
     )
     axes = {}
-    for name, size in zip(("z", "y"), image.shape):
+    for name, size in zip(("z", "y"), image.shape, strict=True):
         spacing = float(like[name][1] - like[name][0])
         axes[name] = (name, np.arange(size) * spacing, {"units": "m"})
     return xr.DataArray(image, axes, ("z", "y"))
@@ -269,14 +274,15 @@ def error_budget(
 ) -> dict[str, float]:
     """Errors of a wind with all causes of error, and without each of them in turn.
 
-    The share of a cause is 1 - (rms error without it)^2 / (rms error with it)^2. Shares need not add
-    up to 1: causes act together, and one alone may even help (noise smooths what adapts to it),
+    The share of a cause is 1 - (rms error without it)^2 / (rms error with it)^2. Shares need not
+    add up to 1: causes act together, and one alone may even help (noise smooths what adapts to it),
     which makes its share negative.
 
     Parameters
     ----------
     found : xr.Dataset
-        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`; its attributes say method, template and dt.
+        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`; its attributes say method,
+        template and dt.
     without : mapping of xr.Dataset
         The same from `pictures_without`, by cause, and from `moved_as_one` as `shear`.
     truth : xr.Dataset
@@ -305,8 +311,8 @@ def error_budget(
     if averaged is not None:
         errors["window"] = _difference(found, truth_at_vectors(found, averaged))
     if method in _BOXES:
-        places = (found[name].values for name in ("y_vector", "z_vector"))
-        errors["time_step"] = _difference(found, dict(zip("vw", chord_wind(truth, *places, dt))))
+        chord = chord_wind(truth, found["y_vector"].values, found["z_vector"].values, dt)
+        errors["time_step"] = _difference(found, dict(zip("vw", chord, strict=True)))
     if perfect is not None:
         bias = _difference(perfect, truth_at_vectors(perfect, truth))
         errors["method"] = errors[""] - bias
@@ -329,13 +335,18 @@ def _shares(errors: Mapping[str, np.ndarray], chosen: np.ndarray) -> dict[str, f
         return {}
     square = {cause: (e[:, chosen] ** 2).mean(1) for cause, e in errors.items()}
     full = square.pop("")
-    metrics = {"vectors": int(chosen.sum())}
-    metrics |= {f"rmse_{name}": float(value**0.5) for name, value in zip("vw", full)}
+    metrics: dict[str, float] = {"vectors": int(chosen.sum())}
+    metrics |= {f"rmse_{name}": float(value**0.5) for name, value in zip("vw", full, strict=True)}
     for cause, rest in square.items():
-        metrics |= {f"{cause}.rmse_{name}": float(value**0.5) for name, value in zip("vw", rest)}
+        metrics |= {
+            f"{cause}.rmse_{name}": float(value**0.5)
+            for name, value in zip("vw", rest, strict=True)
+        }
         if (full > 0).all():
             parts = 1 - rest / full
-            metrics |= {f"{cause}.share_{name}": float(x) for name, x in zip("vw", parts)}
+            metrics |= {
+                f"{cause}.share_{name}": float(x) for name, x in zip("vw", parts, strict=True)
+            }
             metrics[f"{cause}.share"] = float(1 - rest.sum() / full.sum())
     return metrics
 

@@ -1,5 +1,7 @@
 """Errors of retrieved winds against the truth."""
 
+from typing import Any
+
 import numpy as np
 import xarray as xr
 from scipy.interpolate import RectBivariateSpline
@@ -31,7 +33,7 @@ def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
     return xr.Dataset(found)
 
 
-def direction(v, w):
+def direction(v: xr.DataArray, w: xr.DataArray) -> Any:
     """Direction of the cross-flow wind, radians from +y towards +z."""
     return np.arctan2(w, v)
 
@@ -116,7 +118,7 @@ def wind_metrics(wind: xr.Dataset, truth: xr.Dataset, cores: list[Core]) -> dict
 def _statistics(error: xr.Dataset, chosen: np.ndarray) -> dict[str, float]:
     if not chosen.any():
         return {}
-    statistics = {}
+    statistics: dict[str, float] = {}
     for name in ("v", "w", "speed", "direction"):
         found = error_statistics(error[name].values, where=chosen)
         statistics |= {f"{key}_{name}": value for key, value in found.items()}
@@ -156,7 +158,8 @@ def commonest_flag(flag: xr.DataArray) -> str:
     """Which flag most vectors have, in words; ``flag`` has its CF attributes."""
     meanings, masks = flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"])
     shares = {
-        text: float(((flag.values & mask) != 0).mean()) for text, mask in zip(meanings, masks)
+        text: float(((flag.values & mask) != 0).mean())
+        for text, mask in zip(meanings, masks, strict=True)
     }
-    worst = max(shares, key=shares.get)
+    worst = max(shares, key=shares.__getitem__)
     return f"{round(100 * shares[worst])} % have the flag {worst}"

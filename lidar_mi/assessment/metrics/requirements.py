@@ -5,6 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 
 from lidar_mi.errors import InputError
@@ -76,7 +77,9 @@ class Finding:
     margin: float
 
 
-def read_requirements(path: str | Path = PAPER) -> dict[tuple[str, str], RequirementTable]:
+def read_requirements(
+    path: str | Path | Traversable = PAPER,
+) -> dict[tuple[str, str], RequirementTable]:
     """Requirement tables by (application, phase of flight), from a YAML file like the shipped one.
 
     Raises

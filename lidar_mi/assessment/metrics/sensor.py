@@ -44,8 +44,9 @@ class LidarCost:
 def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, float]:
     """Errors of good vectors (flag 0) of both lidars, as of `errors.error_statistics`.
 
-    ``sensor.rmse_*``, ``bias_*`` (m/s), ``reduced_variance_*``, ``coverage_68_*``, ``coverage_95_*``;
-    ``outside_cores.rmse_*`` beyond two core radii, and ``outside_cores.rms_*`` of the true wind there.
+    ``sensor.rmse_*``, ``bias_*`` (m/s), ``reduced_variance_*``, ``coverage_68_*``,
+    ``coverage_95_*``; ``outside_cores.rmse_*`` beyond two core radii, and ``outside_cores.rms_*``
+    of the true wind there.
 
     Parameters
     ----------
@@ -84,7 +85,10 @@ def line_metrics(lines: xr.Dataset) -> dict[str, float]:
         ``v_los``, ``v_los_true``, ``v_los_std`` (m s^-1); NaN where nothing was read.
     """
     error = (lines["v_los"] - lines["v_los_true"]).values
-    metrics = {"sensor.lines": len(error), "sensor.lines_read": int(np.isfinite(error).sum())}
+    metrics: dict[str, float] = {
+        "sensor.lines": len(error),
+        "sensor.lines_read": int(np.isfinite(error).sum()),
+    }
     found = error_statistics(error, lines["v_los_std"].values)
     for key in ("rmse", "bias", "reduced_variance"):
         if key in found:

@@ -30,7 +30,8 @@ def true_pair(wind: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
     (`cores.ring_averages`); what is undetermined (one vortex only, rings beyond the field) is left
     out. Circulation far from the core is that of a model, not of a flow.
     """
-    true, carried = {}, []
+    true: dict[str, float] = {}
+    carried = []
     for core in cores:
         side = "port" if core.circulation > 0 else "starboard"
         true |= {f"{side}_core_radius": core.radius, f"{side}_y": core.y, f"{side}_z": core.z}

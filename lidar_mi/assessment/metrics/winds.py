@@ -16,11 +16,12 @@ def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, fl
     Parameters
     ----------
     found : xr.Dataset, dims (source, algorithm, z, y)
-        v, w, ``v_true``, ``w_true``, ``v_bound``, ``w_bound`` (m s^-1), flag and the vectors' places.
+        v, w, ``v_true``, ``w_true``, ``v_bound``, ``w_bound`` (m s^-1), flag and the vectors'
+        places.
     cores : sequence of Core
         True vortices.
     """
-    metrics = {}
+    metrics: dict[str, float] = {}
     for source in found["source"].values:
         for method in found["algorithm"].values:
             wind = found.sel(source=source, algorithm=method)
@@ -36,7 +37,7 @@ def efficiency(wind: xr.Dataset) -> dict[str, float]:
     ``bound_*``: rms of the Cramer-Rao bound of one template, m/s. ``efficiency_*``: that over the
     rms error; above 1 where a method smooths over more than a template. Nothing without noise.
     """
-    metrics = {}
+    metrics: dict[str, float] = {}
     for name in ("v", "w"):
         error = (wind[name] - wind[f"{name}_true"]).values
         bound = wind[f"{name}_bound"].values
@@ -59,7 +60,7 @@ def true_wind_metrics(
         The true wind where vectors are looked for.
     """
     far = outside_cores(wind["y"].values, wind["z"].values[:, None], list(cores))
-    metrics = {}
+    metrics: dict[str, float] = {}
     for name in components:
         square = wind[name].transpose(..., "z", "y").values ** 2
         metrics[f"true_wind.rms_{name}"] = float(np.sqrt(square.mean()))
@@ -75,12 +76,12 @@ def sweep_metrics(sweep: xr.Dataset) -> dict[str, float]:
     Parameters
     ----------
     sweep : xr.Dataset, dim (texture)
-        ``rmse_v``, ``rmse_w`` (m s^-1), ``valid_fraction``; NaN, where nothing was retrieved, is left
-        out.
+        ``rmse_v``, ``rmse_w`` (m s^-1), ``valid_fraction``; NaN, where nothing was retrieved, is
+        left out.
     """
-    metrics = {}
+    metrics: dict[str, float] = {}
     for rms in sweep["texture"].values:
         for name, value in sweep.sel(texture=rms).data_vars.items():
             if np.isfinite(value):
-                metrics[sweep_key(rms, name)] = float(value)
+                metrics[sweep_key(rms, str(name))] = float(value)
     return metrics

@@ -72,7 +72,7 @@ def page(
     metrics: Mapping[str, Mapping[str, float]],
     drawn: Sequence[Drawn],
 ) -> str:
-    """What differs between the variants of a study and what comes of it, as HTML that needs nothing else.
+    """Settings, metrics and figures of the variants of a study, as self-contained HTML.
 
     Parameters
     ----------
@@ -88,8 +88,8 @@ def page(
         for key, values in differences({key: flat(one) for key, one in settings.items()}).items()
     ]
     legend = (
-        "Errors are those of valid vectors against the truth; an error near the true wind's own rms "
-        "means no skill. A variant without a number has a dash."
+        "Errors are those of valid vectors against the truth; an error near the true wind's own "
+        "rms means no skill. A variant without a number has a dash."
     )
     return template("comparison.html").render(
         name=name,

@@ -8,7 +8,7 @@ _BLANK = "\N{NO-BREAK SPACE}"
 
 
 def fixed(value: float) -> str:
-    """Three digits, but no more than three decimals: for errors in a column, 0.122, -0.001, 11.2."""
+    """Three digits, at most three decimals: for errors in a column, 0.122, -0.001, 11.2."""
     size = abs(value)
     decimals = min(3, max(0, 2 - math.floor(math.log10(size)))) if size > 0 else 0
     # a number that is rounded to 0 has no sign
@@ -16,7 +16,7 @@ def fixed(value: float) -> str:
 
 
 def three(value: float) -> str:
-    """Three digits at most: 0.0044, 83800; powers of ten where there were more noughts than that."""
+    """Three digits at most: 0.0044, 83800; powers of ten for numbers with more zeros."""
     text = f"{value:.3g}"
     if value and not 1e-4 <= abs(float(text)) < 1e6:
         mantissa, exponent = f"{value:.2e}".split("e")

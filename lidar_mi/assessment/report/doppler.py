@@ -25,8 +25,8 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
     modes = metrics.get("doppler.speckle_modes")
     speckle = f"speckle has {three(modes)} modes a pixel" if modes else "there is no speckle"
     light = (
-        f"A pulse gives {three(metrics['doppler.photons'])} photons from {doppler.lidar.range:g} m and "
-        f"{three(metrics['doppler.background_photons'])} of sunlight; {speckle}, read-out "
+        f"A pulse gives {three(metrics['doppler.photons'])} photons from {doppler.lidar.range:g} m "
+        f"and {three(metrics['doppler.background_photons'])} of sunlight; {speckle}, read-out "
         f"{doppler.ccd.read_noise:g} photoelectrons of noise."
     )
     rings = (
@@ -39,9 +39,9 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
     numbers = Tables(
         heading="How good the line-of-sight winds are",
         legend="Winds that each method reads from noisy pictures, or from averages of several "
-        f"(columns), over all speeds, with standard errors. {_abbreviations(doppler.retrieval.methods)}"
-        "The bound (Cramér-Rao) is the least standard deviation without bias; its row says nothing "
-        "of any method.",
+        "(columns), over all speeds, with standard errors. "
+        f"{_abbreviations(doppler.retrieval.methods)}The bound (Cramér-Rao) is the least standard "
+        "deviation without bias; its row says nothing of any method.",
         tables=[
             _doppler_table(doppler.retrieval, centre, metrics)
             for centre in doppler.retrieval.centre

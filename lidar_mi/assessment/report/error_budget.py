@@ -33,8 +33,8 @@ def limit_sentence(budget: Mapping[str, float], method: str) -> str:
     error = f"{component_rmse(budget, place):.2f} m/s"
     if not parts:
         return (
-            f"The wind by {name} is off by {error} rms{where}; no single cause has {whole_percent(_LEAST)} "
-            "of the mean square error."
+            f"The wind by {name} is off by {error} rms{where}; no single cause has "
+            f"{whole_percent(_LEAST)} of the mean square error."
         )
     text = (
         f"The wind by {name} is off by {error} rms{where}, limited by "
@@ -42,7 +42,10 @@ def limit_sentence(budget: Mapping[str, float], method: str) -> str:
         + ")."
     )
     if ranked[0] == "monte_carlo":
-        text += " That noise is not the lidar's: more photons a beam (render.samples_per_beam) lower it."
+        text += (
+            " That noise is not the lidar's: more Monte Carlo samples per beam "
+            "(render.samples_per_beam) lower it."
+        )
     return text
 
 
@@ -57,10 +60,10 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
     """
     numbers = Tables(
         heading="Errors without each cause in turn",
-        legend="Rms errors in m/s of v and w, and the share of the mean square error of both that goes "
-        "with the cause: over valid vectors, always the same, and over those beyond two core radii. "
-        "Noise is taken out as it fell, not drawn anew. The method itself: what it is off by "
-        "on pictures of the air as it is, without blur and noise.",
+        legend="Rms errors in m/s of v and w, and the share of the mean square error of both that "
+        "goes with the cause: over valid vectors, always the same, and over those beyond two core "
+        "radii. Noise is taken out as it fell, not drawn anew. The method itself: what it is off "
+        "by on pictures of the air as it is, without blur and noise.",
         tables=[_table(budget, method) for method, budget in budgets.items()],
     )
     lead = [limit_sentence(budget, method) for method, budget in budgets.items()]
@@ -69,8 +72,8 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
     if whole:
         lead.append(
             "There is no window, no shear within one and no straight path to take away for "
-            f"{' and '.join(whole)}, fitted to whole pictures along curved paths: how smooth the flow is "
-            "belongs to the method itself."
+            f"{' and '.join(whole)}, fitted to whole pictures along curved paths: how smooth the "
+            "flow is belongs to the method itself."
         )
     return Chapter("What limits the cross-flow wind", lead, drawn, numbers)
 

@@ -18,7 +18,7 @@ from lidar_mi.io.images import as_webp
 
 
 class Tables(NamedTuple):
-    """Tables under one heading; each is (title, heads, rows), a row (name, unit, values as text)."""
+    """Tables under one heading: (title, heads, rows), a row being (name, unit, values as text)."""
 
     heading: str
     legend: str
@@ -74,7 +74,9 @@ def page(
     """
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]
-        pictures = dict(zip(drawn, pool.map(lambda figure: embedded(figure.path), drawn)))
+        pictures = dict(
+            zip(drawn, pool.map(lambda figure: embedded(figure.path), drawn), strict=True)
+        )
     return template("report.html").render(
         name=experiment.name,
         simulated=simulated(experiment, versions),
@@ -118,29 +120,31 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
         elif wake.turbine:
             rotor = wake.turbine
             flow = (
-                f"wake of a turbine of {rotor.diameter:g} m, thrust coefficient {rotor.thrust:g}, in wind "
-                f"of {rotor.wind_speed:g} m/s with a turbulence of {percent(rotor.turbulence)}"
+                f"wake of a turbine of {rotor.diameter:g} m, thrust coefficient {rotor.thrust:g}, "
+                f"in wind of {rotor.wind_speed:g} m/s with a turbulence of "
+                f"{percent(rotor.turbulence)}"
             )
         else:
             when = "" if wake.time is None else f" at {wake.time:g} s"
             flow = f"{wake.file}{when}, {wake.spacing:g} m grid"
         texture = "no texture added"
         if wake.texture.rms:
-            texture = f"texture of {percent(wake.texture.rms)} rms, outer scale {wake.texture.outer_scale:g} m"
+            scale = f"outer scale {wake.texture.outer_scale:g} m"
+            texture = f"texture of {percent(wake.texture.rms)} rms, {scale}"
         rows.append(("wake", f"{flow}; {texture}"))
         platform = experiment.platform
         rows.append(("platform", f"{platform.speed:g} m/s, pictures {platform.dt:g} s apart"))
         beam = (
             f"{lidar.wavelength * 1e9:.5g} nm, {lidar.pulse_energy * 1e3:g} mJ, divergence "
-            f"{lidar.divergence_full * 1e3:g} mrad, telescope of {2 * lidar.aperture_radius:g} m; slab "
-            f"of {scan.thickness:g} m from {scan.range:g} m"
+            f"{lidar.divergence_full * 1e3:g} mrad, telescope of {2 * lidar.aperture_radius:g} m; "
+            f"slab of {scan.thickness:g} m from {scan.range:g} m"
         )
         detector = "with the noise of a detector" if experiment.detector else "no detector"
         rows.append(("backscatter lidar", f"{beam}; {detector}"))
         air, render = experiment.scattering, experiment.render
         light = (
-            f"scattering by {air.aerosol or air.table or air.phase.replace('_', ' ')}, orders up to "
-            f"{render.max_order}, {render.samples_per_beam} photons a beam, {render.variant}"
+            f"scattering by {air.aerosol or air.table or air.phase.replace('_', ' ')}, orders up "
+            f"to {render.max_order}, {render.samples_per_beam} photons a beam, {render.variant}"
         )
         rows.append(("light", light))
         chosen = experiment.volume or experiment.retrieval
@@ -149,15 +153,15 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
     if experiment.doppler:
         lidar = experiment.doppler.lidar
         beam = (
-            f"{lidar.wavelength * 1e9:.5g} nm, {lidar.pulse_energy * 1e3:g} mJ, {lidar.range_bin:g} m "
-            f"at {lidar.range:g} m, in air of {lidar.altitude:g} m altitude"
+            f"{lidar.wavelength * 1e9:.5g} nm, {lidar.pulse_energy * 1e3:g} mJ, "
+            f"{lidar.range_bin:g} m at {lidar.range:g} m, in air of {lidar.altitude:g} m altitude"
         )
         rows.append(("Doppler lidar", beam))
     if experiment.sensor:
         scan = experiment.sensor.directions
         both = (
-            f"{scan.columns} x {scan.rows} lines of sight of {experiment.sensor.pulses} pulses, v and "
-            f"w by {METHOD_NAMES[experiment.sensor.method]}"
+            f"{scan.columns} x {scan.rows} lines of sight of {experiment.sensor.pulses} pulses, v "
+            f"and w by {METHOD_NAMES[experiment.sensor.method]}"
         )
         rows.append(("both together", both))
     rows.append(("seed", str(experiment.seed)))

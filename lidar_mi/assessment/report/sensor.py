@@ -68,19 +68,20 @@ def sensor_chapter(
             "Whether it does what flight control asks for"
             if speed
             else "Whether it does what is asked for",
-            "Errors of u, v, w are rms errors of good vectors beyond two core radii, those of v_LOS "
-            "rms errors of lines of sight, in this run for all phases of flight. A margin is the "
-            "distance from the limit, as a share of it.",
+            "Errors of u, v, w are rms errors of good vectors beyond two core radii, those of "
+            "v_LOS rms errors of lines of sight, in this run for all phases of flight. A margin "
+            "is the distance from the limit, as a share of it.",
             tables,
         )
         if judged
         else None,
         numbers=Tables(
             "How good the wind from both lidars is",
-            f"{metrics['sensor.lines_read']} of {metrics['sensor.lines']} lines of sight were read; "
-            f"{metrics['sensor.vectors']} vectors, {percent(metrics['sensor.good_fraction'])}, are good. "
-            "Errors over standard errors have a variance of 1 where they are as stated; then 68 % "
-            "lie within one standard error and 95 % within 1.96.",
+            f"{metrics['sensor.lines_read']} of {metrics['sensor.lines']} lines of sight were "
+            f"read; {metrics['sensor.vectors']} vectors, "
+            f"{percent(metrics['sensor.good_fraction'])}, are good. Errors over standard errors "
+            "have a variance of 1 where they are as stated; then 68 % lie within one standard "
+            "error and 95 % within 1.96.",
             [_numbers(metrics)],
         ),
         vectors=vectors,
@@ -119,8 +120,8 @@ def _not_stated(errors) -> list[str]:
     if errors == type(errors)():
         return []
     text = (
-        "The platform's attitude, pointing or speed is not what it is taken for (sensor.errors). Standard "
-        "errors do not know of this: what turns all lines alike is on top of them."
+        "The platform's attitude, pointing or speed is not what it is taken for (sensor.errors). "
+        "Standard errors do not know of this: what turns all lines alike is on top of them."
     )
     return [text]
 
@@ -155,7 +156,7 @@ def _costs(metrics) -> list[str]:
 
 
 def _rate(metrics, name: str) -> str:
-    """Pulses a second of all directions of a lidar, what they carry, how many must be there at once."""
+    """Pulse rate of all directions of a lidar, its power, and beams needed at the same time."""
     rate, power, beams = (
         metrics[f"sensor.{name}.{key}"] for key in ("pulses_per_second", "average_power", "beams")
     )

@@ -17,9 +17,9 @@ def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core])
     Parameters
     ----------
     wind : xr.Dataset, dims (z, y)
-        ``NAME`` and ``NAME_true`` of every component, m/s, v and w among them; ``NAME_stderr`` where
-        there are any; ``flag`` with its CF attributes. Vectors stand at y_vector, z_vector or, where
-        these are missing, at the nodes.
+        ``NAME`` and ``NAME_true`` of every component, m/s, v and w among them; ``NAME_stderr``
+        where there are any; ``flag`` with its CF attributes. Vectors stand at y_vector, z_vector
+        or, where these are missing, at the nodes.
     components : sequence of str
     cores : sequence of Core
         True vortices.
@@ -60,7 +60,8 @@ def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core])
         ],
         "flag": [int(bits) for bits in thin["flag"].values.ravel()],
         "flags": {
-            str(int(mask)): text for mask, text in zip(np.ravel(flag["flag_masks"]), meanings)
+            str(int(mask)): text
+            for mask, text in zip(np.ravel(flag["flag_masks"]), meanings, strict=True)
         },
         "cores": [[round(core.y, 2), round(core.z, 2)] for core in cores],
     }

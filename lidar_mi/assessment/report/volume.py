@@ -22,18 +22,19 @@ def volume_chapter(experiment, metrics: Mapping[str, float], drawn: Sequence[Dra
     scan = experiment.scan
     purpose = (
         f"A backscatter lidar looks twice at {scan.gate_count} slabs of "
-        f"{scan.thickness / scan.gate_count:g} m; the wind in all three directions follows from the "
-        "two volumes that they make."
+        f"{scan.thickness / scan.gate_count:g} m; the wind in all three directions follows from "
+        "the two volumes that they make."
     )
     noise = (
         "Noise of the simulation in a voxel, relative to its light (median): "
-        f"{percent(metrics['backscatter.mc_relative_error'])} ({experiment.render.samples_per_beam} "
-        f"photons a beam); {'with the noise of a detector' if experiment.detector else 'no detector'}."
+        f"{percent(metrics['backscatter.mc_relative_error'])} "
+        f"({experiment.render.samples_per_beam} photons a beam); "
+        f"{'with the noise of a detector' if experiment.detector else 'no detector'}."
     )
     numbers = Tables(
         heading="How good the winds in three dimensions are",
-        legend="Good vectors against the truth at their place. The true wind's own rms stands beside "
-        "the errors: an error near it means no skill.",
+        legend="Good vectors against the truth at their place. The true wind's own rms stands "
+        "beside the errors: an error near it means no skill.",
         tables=list(_tables(experiment, metrics)),
     )
     return Chapter("Wind in three dimensions", [purpose, noise], drawn, numbers)

@@ -56,7 +56,8 @@ def budgets(
     progress : callable, optional
         Told what is done, and its share.
     known : xr.Dataset, optional
-        Winds that need not be found again, from `lidar_mi.experiment.stages.winds.cross_flow_winds`.
+        Winds that need not be found again, from
+        `lidar_mi.experiment.stages.winds.cross_flow_winds`.
     cores, flagged : optional
         See `error_budget`; cores left out: those of the true wind.
     """
@@ -113,7 +114,7 @@ def _pictures(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataA
         if blurred:
             images = [
                 blur_by_beam(image, experiment.lidar, plan.centre, depth)
-                for image, plan in zip(images, scan_plans(experiment, truth))
+                for image, plan in zip(images, scan_plans(experiment, truth), strict=True)
             ]
         if experiment.scan.aim == "angles":
             images = [image.interp(y=pair[0]["y"], z=pair[0]["z"]) for image in images]

@@ -61,8 +61,8 @@ def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
     middle = experiment.scan.range + experiment.scan.thickness / 2
     if abs(lidar.range - middle) > lidar.range_bin / 2:
         raise InputError(
-            f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected the slab of "
-            f"scan, {middle - lidar.range_bin / 2:g} to {middle + lidar.range_bin / 2:g} m"
+            f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected the slab "
+            f"of scan, {middle - lidar.range_bin / 2:g} to {middle + lidar.range_bin / 2:g} m"
         )
     # lines that leave the wake, bins that reach the telescope
     directions = experiment.sensor.directions
@@ -77,8 +77,8 @@ def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
     limit = rings.model.velocity_range / 2
     if fastest > limit:
         raise InputError(
-            f"platform.speed: {experiment.platform.speed:g} m/s is not allowed with sensor; expected "
-            f"less than {limit:.0f} m/s with the wind, half an order of doppler.etalon"
+            f"platform.speed: {experiment.platform.speed:g} m/s is not allowed with sensor; "
+            f"expected less than {limit:.0f} m/s with the wind, half an order of doppler.etalon"
         )
 
 
@@ -150,7 +150,7 @@ def _lagrange(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
     return np.stack(
         [
             ((places[:, None] - nodes[o]) / (node - nodes[o])).prod(1)
-            for node, o in zip(nodes, others)
+            for node, o in zip(nodes, others, strict=True)
         ],
         axis=1,
     )

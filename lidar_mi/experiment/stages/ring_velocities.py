@@ -114,9 +114,10 @@ def velocities(
     Returns
     -------
     xr.Dataset
-        ``tried`` (algorithm), the images of every case that were given to it; ``v`` and its standard deviation ``v_std`` as the fit says, m/s, dims (algorithm, centre,
-        averaged, v_los, image), NaN where nothing was read; and ``peak_bias`` (coordinate, piece)
-        of the innermost ring's peak without any noise, m/s, at the first speed.
+        ``tried`` (algorithm), the images of every case that were given to it; ``v`` and its
+        standard deviation ``v_std`` as the fit says, m/s, dims (algorithm, centre, averaged, v_los,
+        image), NaN where nothing was read; and ``peak_bias`` (coordinate, piece) of the innermost
+        ring's peak without any noise, m/s, at the first speed.
     """
     settings, speeds = doppler.retrieval, doppler.v_los
     shape = (
@@ -183,7 +184,8 @@ def velocities(
                 _peak_bias(doppler, seen),
                 {
                     "units": "m s-1",
-                    "long_name": "error of the innermost ring's peak by circular averaging, no noise",
+                    "long_name": "error of the innermost ring's peak by circular averaging, "
+                    "no noise",
                 },
             ),
         },
@@ -219,7 +221,7 @@ def fitted_speeds(frames, doppler, model, noise, method, centre) -> tuple[np.nda
         if len(frames) == 1:
             return np.array([np.nan]), np.array([np.nan])
         alone = [fitted_speeds(f[None], doppler, model, noise, method, centre) for f in frames]
-        v, std = zip(*alone)
+        v, std = zip(*alone, strict=True)
         return np.concatenate(v), np.concatenate(std)
     return fit.v_los.numpy(), fit.v_los_std.numpy()
 

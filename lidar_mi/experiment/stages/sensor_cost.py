@@ -15,7 +15,7 @@ from lidar_mi.instrument.scan import plan_scans
 
 
 def lidar_costs(experiment: Experiment, truth: xr.Dataset) -> dict[str, LidarCost]:
-    """Cost of the scan of each lidar, "doppler" and "backscatter"; of the latter one pulse a beam."""
+    """Cost of the scans of "doppler" and "backscatter", the latter with one pulse per beam."""
     sensor, doppler, lidar = experiment.sensor, experiment.doppler.lidar, experiment.lidar
     far = float(sensor.directions.ranges(doppler).max()) + doppler.range_bin / 2
     directions = sensor.directions.columns * sensor.directions.rows

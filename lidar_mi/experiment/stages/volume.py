@@ -125,14 +125,14 @@ def scan_volume(
         s0.transpose("gate", "z", "y").values, plan, lidar.aperture_area, environment
     )
     volume = np.empty((len(x), len(z), len(y)))
-    for gate, (row, column) in enumerate(zip(_places(plan, "z"), _places(plan, "y"))):
+    for gate, (row, column) in enumerate(zip(_places(plan, "z"), _places(plan, "y"), strict=True)):
         image = xr.DataArray(
             values[gate],
             {"z": ("z", row, {"units": "m"}), "y": ("y", column, {"units": "m"})},
             ("z", "y"),
         )
         volume[gate] = resample(image, y, z).values
-    coords = {name: (name, axis, {"units": "m"}) for name, axis in zip("xzy", nodes)}
+    coords = {name: (name, axis, {"units": "m"}) for name, axis in zip("xzy", nodes, strict=True)}
     about = {"long_name": "apparent backscatter coefficient", "units": "m-1 sr-1"}
     return xr.DataArray(volume, coords, ("x", "z", "y"), attrs=about)
 
@@ -207,7 +207,7 @@ def volume_winds(experiment: Experiment, flows: Flows, volumes: Volumes, *, log:
 def true_wind(flow: xr.Dataset, places: xr.Dataset) -> dict[str, xr.DataArray]:
     """u, v, w of a flow on (x, y, z) at the places x, z, y of a data set, by cubic splines."""
     axes = [flow[axis].values for axis in ("x", "y", "z")]
-    at = [(places[axis].values - n[0]) / (n[1] - n[0]) for axis, n in zip("xyz", axes)]
+    at = [(places[axis].values - n[0]) / (n[1] - n[0]) for axis, n in zip("xyz", axes, strict=True)]
     mesh = np.stack(np.meshgrid(*at, indexing="ij"))
     coords = {axis: places[axis] for axis in ("x", "z", "y")}
     found = {}

@@ -46,7 +46,7 @@ def combined_vectors(experiment: Experiment, wind3d: xr.Dataset | None) -> xr.Da
 
 
 def image_vectors(experiment: Experiment, wind: xr.Dataset) -> xr.Dataset | None:
-    """Cross-flow wind of the first method that does not fit vortices itself; None: there is none."""
+    """Cross-flow wind of the first method that does not fit vortices itself, or None."""
     local = [name for name in experiment.retrieval.methods if name != ImageMethod.VORTEX_FIT]
     if not local:
         return None

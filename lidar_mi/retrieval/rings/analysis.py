@@ -113,7 +113,7 @@ class Rings(Tabular):
             ("centre x, y", f"{with_error(x, x_std)}, {with_error(y, y_std)} px{given}"),
             ("r^2 from order to order", with_error(self.spacing, self.spacing_std, "px^2")),
         ]
-        for line, (value, std) in enumerate(zip(self.fraction, self.fraction_std)):
+        for line, (value, std) in enumerate(zip(self.fraction, self.fraction_std, strict=True)):
             of = f", line {line}" if len(self.fraction) > 1 else ""
             whole.append((f"fractional order at the centre{of}", with_error(value, std)))
         for split in self.splitting:
@@ -137,7 +137,9 @@ class Rings(Tabular):
         ]
         single = [
             (str(order), str(line), with_error(radius, std, "px"))
-            for order, line, radius, std in zip(self.order, self.line, self.radius, self.radius_std)
+            for order, line, radius, std in zip(
+                self.order, self.line, self.radius, self.radius_std, strict=True
+            )
         ]
         return [Table("pattern", whole), Table("rings", single, ("order", "line", "radius"))]
 
@@ -189,7 +191,7 @@ def analyse_rings(
         sectors = _Sectors(image, centre)
         radius, error, distortion, moved_std, rms = _circles(*_crests(sectors), free)
         if free:
-            centre = tuple(float(c + m) for c, m in zip(centre, distortion[:2]))
+            centre = tuple(float(c + m) for c, m in zip(centre, distortion[:2], strict=True))
             inside(*centre, image.shape)
         if np.abs(distortion[:2]).max() < 0.02:
             break
@@ -252,7 +254,7 @@ class _Sectors:
 
 
 def _crests(sectors: _Sectors) -> tuple[np.ndarray, np.ndarray]:
-    """r^2 of every ring in every sector, (rings, SECTORS), NaN where it is not detected; the angles."""
+    """r^2 of every ring, (rings, SECTORS), NaN where it is not detected; the sectors' angles."""
     mean = sectors.mean
     smooth = savgol_filter(mean, 15, 2)
     # smoothing by 15 steps leaves 0.4 of white noise

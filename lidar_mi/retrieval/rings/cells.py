@@ -48,7 +48,9 @@ class Cells(NamedTuple):
             return flat.double()
         sums = flat.new_zeros((*flat.shape[:-1], len(self.count)))
         # one image at a time: four times faster than a sum along the last axis of all
-        for total, image in zip(sums.view(-1, sums.shape[-1]), flat.view(-1, flat.shape[-1])):
+        for total, image in zip(
+            sums.view(-1, sums.shape[-1]), flat.view(-1, flat.shape[-1]), strict=True
+        ):
             total.index_add_(0, self.index, image)
         return sums.double() / self.count
 
@@ -100,7 +102,7 @@ def annular_sectors(
         return total.index_add_(0, index, values) / count
 
     means = [mean(values) for values in (x, y, r2)]
-    off = [values - middle[index] for values, middle in zip((x, y, r2), means)]
+    off = [values - middle[index] for values, middle in zip((x, y, r2), means, strict=True)]
     spread = torch.stack([torch.stack([mean(a * b) for a in off], -1) for b in off], -1)
     return Cells(index, count.double(), centre, *means, spread)
 
@@ -123,6 +125,6 @@ def annular_average(
 def _positions(shape, centre, device):
     y, x = (
         torch.arange(size, dtype=torch.float64, device=device) - middle
-        for size, middle in zip(shape, reversed(centre))
+        for size, middle in zip(shape, reversed(centre), strict=True)
     )
     return torch.broadcast_tensors(x[None, :], y[:, None])

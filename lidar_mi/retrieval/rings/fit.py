@@ -1,7 +1,8 @@
 """Line-of-sight wind from all rings of an image at once: maximum likelihood, many images per call.
 
-Every parameter of `lidar_mi.retrieval.rings.model` that is not known is fitted along: the rings' centre, the level of
-the light, its fall-off, the background and the air's temperature. Two ways, one fit:
+Every parameter of `lidar_mi.retrieval.rings.model` that is not known is fitted along: the rings'
+centre, the level of the light, its fall-off, the background and the air's temperature. Two ways,
+one fit:
 
 annular  images are first averaged over sectors of annuli of equal steps in r^2: a hundred
          times fewer numbers, 0.3 % of the information lost
@@ -146,7 +147,7 @@ def fit_rings(
     task = _Task(model, noise or PixelNoise(), indices, max_chi_square, centre)
     size = _chunk(model, method)
     parts = [_fit(images[k : k + size], task, k, method) for k in range(0, len(images), size)]
-    return RingFit(*(torch.cat(values) for values in zip(*parts)))
+    return RingFit(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def difference(received: RingFit, emitted: RingFit) -> tuple[torch.Tensor, torch.Tensor]:
@@ -195,13 +196,13 @@ def _fit(images, task: _Task, number: int, method: str) -> RingFit:
         if len(images) == 1:
             raise
         alone = [_fit(one[None], task, number + k, method) for k, one in enumerate(images)]
-        return RingFit(*(torch.cat(values) for values in zip(*alone)))
+        return RingFit(*(torch.cat(values) for values in zip(*alone, strict=True)))
     if method == "annular":
         far = torch.hypot(fit.x - centre[0], fit.y - centre[1])
         for k in (far > REACH * math.sqrt(task.model.order_spacing)).nonzero()[:, 0].tolist():
             own = float(fit.x[k]), float(fit.y[k])
             again = _fit_about(own, images[k, None], task, number + k, method)
-            for values, value in zip(fit, again):
+            for values, value in zip(fit, again, strict=True):
                 values[k] = value[0]
     return fit
 
@@ -242,7 +243,7 @@ def _fit_about(centre, images, task: _Task, number: int, method: str) -> RingFit
     x, y = dx + centre[0], dy + centre[1]
     found = (values.tolist() for values in (x, y, rings, chi_square))
     for name, *place, detected, misfit in zip(
-        (f"images[{number + k}]" for k in range(len(x))), *found
+        (f"images[{number + k}]" for k in range(len(x))), *found, strict=True
     ):
         inside(*place, model.shape, f"{name}: centre")
         if detected < 2:
@@ -334,7 +335,8 @@ def _scoring(model, cells, means, parameters, noise, indices, number):
         converged = (step.abs() <= CLOSE * std).all(1)
     bad = number + int((~converged).nonzero()[0])
     raise InputError(
-        f"images[{bad}]: the fit does not converge; expected two rings or more as the model has them"
+        f"images[{bad}]: the fit does not converge; expected two rings or more as the model has "
+        "them"
     )
 
 

@@ -6,8 +6,9 @@ import torch
 from lidar_mi.errors import InputError
 
 # A value that so large a fraction of the pixels has, several times as many as have the next lower
-# one, is the end of the scale. Of a smooth crest, rounded to integers, the top value has at most 2.4 times as
-# many pixels as the one below it, for the area above a level grows with the root of the depth.
+# one, is the end of the scale. Of a smooth crest, rounded to integers, the top value has at most
+# 2.4 times as many pixels as the one below it, for the area above a level grows with the root of
+# the depth.
 PLATEAU = 1e-3
 EXCESS = 4.0
 
@@ -36,7 +37,8 @@ def checked(images: torch.Tensor, saturation: float | None = None) -> torch.Tens
         if not torch.isfinite(total) and not torch.isfinite(image).all():
             number_bad = int((~torch.isfinite(image)).sum())
             raise InputError(
-                f"images[{number}]: {number_bad} pixel(s) of NaN or infinity; expected finite values"
+                f"images[{number}]: {number_bad} pixel(s) of NaN or infinity; expected finite "
+                "values"
             )
         top = image.max()
         if saturation is not None and top >= saturation:

@@ -126,6 +126,7 @@ class RingModel:
 
     @property
     def middle_temperature(self) -> float:
+        """The temperature, K, in the middle of those that the model knows."""
         return float(self.temperatures[len(self.temperatures) // 2])
 
     def at_temperature(self, temperature: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -347,7 +348,7 @@ def fisher_matrix(
 
 
 def standard_deviations(fisher: torch.Tensor) -> torch.Tensor:
-    """Square roots of the diagonal of the inverse, NaN where there is none, shape (images, free)."""
+    """Roots of the diagonal of the inverse, NaN where there is none, shape (images, free)."""
     scale = fisher.diagonal(dim1=1, dim2=2).rsqrt()
     inverse, info = torch.linalg.inv_ex(fisher * scale[:, :, None] * scale[:, None, :])
     found = inverse.diagonal(dim1=1, dim2=2).sqrt() * scale
@@ -419,4 +420,4 @@ def cramer_rao(
     if not torch.isfinite(found).all():
         names = ", ".join(PARAMETERS[i] for i in indices)
         raise InputError(f"free: the image does not determine {names} all together")
-    return {PARAMETERS[i]: float(value) for i, value in zip(indices, found)}
+    return {PARAMETERS[i]: float(value) for i, value in zip(indices, found, strict=True)}

@@ -40,7 +40,7 @@ def radial_cuts(image: np.ndarray, centre: tuple[float, float], cuts: int = 360)
     As far as the farthest corner; NaN outside the image.
     """
     height, width = image.shape
-    far = np.hypot(*(max(c, size - 1 - c) for c, size in zip(centre, (width, height))))
+    far = np.hypot(*(max(c, size - 1 - c) for c, size in zip(centre, (width, height), strict=True)))
     angle = 2 * np.pi * np.arange(cuts)[:, None] / cuts
     r = np.arange(int(far) + 1)
     place = (centre[1] + r * np.sin(angle), centre[0] + r * np.cos(angle))
@@ -57,8 +57,8 @@ def find_centre(
 ) -> tuple[float, float]:
     """Centre of the rings by the paper's circular averaging or midpoint lines.
 
-    Both start from `lidar_mi.retrieval.rings.centre.gradient_centre`; ``radius`` is that of the innermost ring (px),
-    which midpoint lines need.
+    Both start from `lidar_mi.retrieval.rings.centre.gradient_centre`; ``radius`` is that of the
+    innermost ring (px), which midpoint lines need.
 
     Raises
     ------

@@ -48,7 +48,7 @@ class Band:
         first: tuple[int, int] = (0, 0),
         second: tuple[int, int] = (0, 0),
     ) -> torch.Tensor:
-        """Covariance (..., *mesh.shape) of two derivatives of components, from `covariance`'s band."""
+        """Covariance (..., *mesh.shape) of two derivatives of components, from `covariance`."""
         along = [mesh.products(axis, first[axis], second[axis]).flatten(0, 1) for axis in (0, 1)]
         return along[0].T @ band.flatten(-4, -3).flatten(-2, -1) @ along[1]
 
@@ -68,7 +68,8 @@ class Band:
         below = band.new_zeros(self._blocks - 1, *shape)
         for shift in range(-REACH, REACH + 1):
             rows = slice(max(0, -shift), knots - max(0, shift))
-            # (block, y, shift y, z, component, component) to (.., component there, component here, z)
+            # (block, y, shift y, z, component, component) to (.., component there, component here,
+            # z)
             part = band[:, :, REACH + shift, rows].permute(4, 5, 3, 1, 0, 2)
             here, next_ = (blocks.diagonal(-shift, 3, 6) for blocks in (diagonal, below))
             for p in range(REACH):

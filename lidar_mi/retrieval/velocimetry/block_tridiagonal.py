@@ -1,4 +1,4 @@
-"""Symmetric positive definite block tridiagonal matrices: solve, determinant, inverse in the band."""
+"""Symmetric positive definite block tridiagonal matrices: solution, determinant, inverse."""
 
 from typing import NamedTuple
 
@@ -22,9 +22,12 @@ class Factor(NamedTuple):
     def solve(self, right: torch.Tensor) -> torch.Tensor:
         """The solution x of A x = right, both of shape (blocks, n, columns)."""
         middle = [right[0]]
-        for ratio, part in zip(self.ratio, right[1:]):
+        for ratio, part in zip(self.ratio, right[1:], strict=True):
             middle.append(part - ratio @ middle[-1])
-        middle = [torch.cholesky_solve(part, root) for part, root in zip(middle, self.diagonal)]
+        middle = [
+            torch.cholesky_solve(part, root)
+            for part, root in zip(middle, self.diagonal, strict=True)
+        ]
         for k in range(len(self.ratio) - 1, -1, -1):
             middle[k] = middle[k] - self.ratio[k].T @ middle[k + 1]
         return torch.stack(middle)
@@ -36,7 +39,7 @@ class Factor(NamedTuple):
         """
         diagonal = [torch.cholesky_inverse(self.diagonal[-1])]
         below = []
-        for root, ratio in zip(reversed(self.diagonal[:-1]), reversed(self.ratio)):
+        for root, ratio in zip(reversed(self.diagonal[:-1]), reversed(self.ratio), strict=True):
             last = diagonal[-1]
             below.append(-last @ ratio)
             diagonal.append(torch.cholesky_inverse(root) - ratio.T @ below[-1])
@@ -53,7 +56,7 @@ def factor(diagonal: torch.Tensor, below: torch.Tensor) -> Factor:
         The matrix is not positive definite.
     """
     roots, ratios = [torch.linalg.cholesky(diagonal[0])], []
-    for here, side in zip(diagonal[1:], below):
+    for here, side in zip(diagonal[1:], below, strict=True):
         half = torch.linalg.solve_triangular(roots[-1], side.T, upper=False)
         ratios.append(torch.linalg.solve_triangular(roots[-1].T, half, upper=True).T)
         roots.append(torch.linalg.cholesky(here - half.T @ half))

@@ -197,7 +197,7 @@ def _covariance_dense(
     mean2: torch.Tensor,
     windows: Windows,
 ) -> torch.Tensor:
-    """<f g_s> - <f> <g_s> from the images' product at each shift, boxed; one row of shifts a time."""
+    """<f g_s> - <f> <g_s> from box means of the product at each shift, one row of shifts a time."""
     n, stride = windows.template, windows.stride
     height, width = (size - windows.search + n for size in windows.shape)
     fixed = image1[windows.lead :, windows.lead :][:height, :width] / n**2
@@ -238,7 +238,7 @@ def _peak(coefficient: torch.Tensor, windows: Windows, min_correlation: float) -
     matched = best != 0
     inside = matched & ~rim
     centre = torch.where(inside, index, shifts + 1)  # any inner place, where neighbours exist
-    offsets, fitted = zip(*(_gaussian_fit(flat, centre, step) for step in (shifts, 1)))
+    offsets, fitted = zip(*(_gaussian_fit(flat, centre, step) for step in (shifts, 1)), strict=True)
     d = torch.stack([shift_z, shift_y]) + torch.stack(offsets)
     flag = (
         Flag.PEAK_ON_RIM * (matched & rim)

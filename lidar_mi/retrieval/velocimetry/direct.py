@@ -70,7 +70,7 @@ def solved(
 def _prior_form(band: Band, prior: Prior, ridge: float) -> torch.Tensor:
     """The prior's quadratic form; rigid motion and what else it leaves free is just not inf."""
     form = prior.local.new_zeros(2, 2, 7, band.z.knots, 4, band.y.knots)
-    for terms, strength in zip(_kinds(prior), prior.strength):
+    for terms, strength in zip(_kinds(prior), prior.strength, strict=True):
         for a, first, one in terms:
             for b, second, other in terms:
                 part = band.form(prior.cell * strength, prior.mesh, first, second)

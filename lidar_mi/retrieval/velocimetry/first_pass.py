@@ -32,6 +32,7 @@ class Grid(NamedTuple):
 
     @classmethod
     def of(cls, windows: Windows, like: torch.Tensor) -> "Grid":
+        """The grid of the windows' centres, at every pixel."""
         even = windows.template % 2 == 0
         return cls(tuple(n - even for n in windows.shape), even / 2, like[:0])
 
@@ -44,7 +45,7 @@ class Grid(NamedTuple):
         ]
 
     def places(self, rows: slice = slice(None)) -> list[torch.Tensor]:
-        """Coordinates (px) along each axis, as they broadcast, of some of the first axis' places."""
+        """Coordinates (px) along each axis, as they broadcast, of some rows of the first axis."""
         along = [torch.arange(n).to(self.like) + self.offset for n in self.shape]
         along[0] = along[0][rows]
         dims = len(along)
@@ -57,7 +58,7 @@ class Grid(NamedTuple):
         """
         weights = [
             _cubic_weights(at.to(self.like), torch.arange(n).to(self.like))
-            for n, at in zip(self.shape, known)
+            for n, at in zip(self.shape, known, strict=True)
         ]
         return separable(values.to(self.like), weights)
 
@@ -122,7 +123,7 @@ def _of_volumes(images, spline: Spline, windows: Windows):
     contrast1 = sums(first**2) - sums(first) ** 2
     scores = []
     for shift in product(range(2 * reach + 1), repeat=3):
-        moved = fields[(slice(None), *(slice(s, s + n) for s, n in zip(shift, shape)))]
+        moved = fields[(slice(None), *(slice(s, s + n) for s, n in zip(shift, shape, strict=True)))]
         inside = sums(moved[2])
         # of image 1 the part that is compared
         parts = [moved[0], moved[1], first * moved[0], first * moved[2], first**2 * moved[2]]
@@ -132,7 +133,7 @@ def _of_volumes(images, spline: Spline, windows: Windows):
         scores.append(torch.where(inside > 0.5, score, -1.0))
     scores = torch.where(contrast1 > 1e-10, torch.stack(scores), torch.nan)
     d = 2 * _peaks(scores, reach)
-    centres = [n - 0.5 + 2 * step * torch.arange(m) for n, m in zip(size, d.shape[1:])]
+    centres = [n - 0.5 + 2 * step * torch.arange(m) for n, m in zip(size, d.shape[1:], strict=True)]
     return d, [at.to(d.device) for at in centres]
 
 
@@ -154,7 +155,7 @@ def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:
     terms = quadratic @ flat.gather(0, (number[0] * side + number[1]) * side + number[2])
     slope = terms[1:4].T
     bend = slope.new_zeros(len(slope), 3, 3)
-    for (a, b), term in zip(pairs, terms[4:]):
+    for (a, b), term in zip(pairs, terms[4:], strict=True):
         bend[:, a, b] = bend[:, b, a] = term
     peaked = torch.linalg.eigvalsh(bend)[:, -1] < 0
     bend = torch.where(peaked[:, None, None], bend, -torch.eye(3).to(bend))

@@ -30,14 +30,16 @@ class Axis:
 
     @property
     def cells(self) -> int:
+        """Number of intervals between knots."""
         return max(1, math.floor((self.size - 1) / self.spacing))
 
     @property
     def knots(self) -> int:
+        """Number of splines."""
         return self.cells + REACH
 
     def basis(self, place: torch.Tensor, order: int = 0) -> torch.Tensor:
-        """Matrix (place, knot) of the splines' derivatives of this order, 0 to 3, at places (px)."""
+        """Matrix (place, knot) of derivatives of the splines, order 0 to 3, at places (px)."""
         width = (self.size - 1) / self.cells
         scaled = place / width
         cell = scaled.floor().clamp(0, self.cells - 1)
@@ -103,7 +105,7 @@ class Mesh:
         return self._products[key]
 
     def field(self, coefficients: torch.Tensor, order: Sequence[int] | None = None) -> torch.Tensor:
-        """Derivative of these orders along the axes, (..., *shape), of coefficients (..., knots)."""
+        """Derivatives of these orders, (..., *shape), from coefficients (..., knots)."""
         orders = order or (0,) * self.dims
         return separable(coefficients, [self.basis(axis, n) for axis, n in enumerate(orders)])
 
@@ -121,7 +123,7 @@ class Mesh:
 
     def slopes_transposed(self, values: Sequence[torch.Tensor]) -> torch.Tensor:
         """The transpose of `slopes`: coefficients from one field for each axis."""
-        return sum(self.transposed(v, order) for v, order in zip(values, self._first))
+        return sum(self.transposed(v, order) for v, order in zip(values, self._first, strict=True))
 
     @property
     def _first(self) -> list[tuple[int, ...]]:
@@ -151,4 +153,4 @@ def interpolated(
     values: torch.Tensor, known: Sequence[torch.Tensor], places: Sequence[torch.Tensor]
 ) -> torch.Tensor:
     """Values (..., known places) at other places of a rectangular mesh, linearly between."""
-    return separable(values, [linear_weights(k, p) for k, p in zip(known, places)])
+    return separable(values, [linear_weights(k, p) for k, p in zip(known, places, strict=True)])

@@ -109,7 +109,9 @@ def solved(
 ) -> Posterior:
     """One Gauss-Newton step; the number of the turn seeds the flows drawn from the posterior."""
     ridge, solver = settings.ridge, settings.solver
-    lumps = [linear_weights(m.to(p), p).T for m, p in zip(prior.mesh.places, mesh.places)]
+    lumps = [
+        linear_weights(m.to(p), p).T for m, p in zip(prior.mesh.places, mesh.places, strict=True)
+    ]
     # on the knots in the precision of the prior, which may be strong; on the voxels in theirs
     coefficients, voxels = coefficients.to(prior.local), linear.slope.dtype
     dims = mesh.dims
@@ -166,7 +168,7 @@ def _preconditioner(
         return separable(values, [bases[a == axis][a] for a in range(dims)])
 
     block = diagonal(bend)
-    for weight, (_, motion) in zip(prior.weights, prior.motions):
+    for weight, (_, motion) in zip(prior.weights, prior.motions, strict=True):
         for a, b, scale in motion:
             block[a, a] += diagonal(weight, b) * scale**2
     for a in range(dims):

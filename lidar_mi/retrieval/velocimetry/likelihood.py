@@ -172,7 +172,7 @@ def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int)
             along = mesh.slopes(coefficients)
         else:
             along = torch.gradient(term, dim=tuple(range(1, term.ndim)))
-        term = sum(u * part for u, part in zip(flow, along))
+        term = sum(u * part for u, part in zip(flow, along, strict=True))
         change = change + time**k / math.factorial(k) * term[:, None]
     for axis, place in enumerate(mesh.places):
         change[axis] += place.reshape(-1, *[1] * (mesh.dims - 1 - axis))

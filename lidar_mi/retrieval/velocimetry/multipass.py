@@ -228,7 +228,7 @@ def _fit(
         within = slice(max(0, top), min(stop, grid.shape[0]))
         fields = _products(pair, flow[:, within], grid.places(within))
         rims = [(within.start - top, stop - within.stop)]
-        for at, n in zip(places[1:], grid.shape[1:]):
+        for at, n in zip(places[1:], grid.shape[1:], strict=True):
             first, last = int(at[0]), int(at[-1]) + 1
             low, high = max(0, first - reach), min(n, last + reach)
             fields = fields.narrow(len(rims) + 1, low, high - low)
@@ -239,7 +239,7 @@ def _fit(
         ]
         plain = _moments(fields[squares + dims :], kernels[0], steps, rims, 0)[(0,) * dims]
         bands.append(_solved(*summed, plain, sigma, pair, whole))
-    return _Fit(*(torch.cat(parts, dim=-dims) for parts in zip(*bands)))
+    return _Fit(*(torch.cat(parts, dim=-dims) for parts in zip(*bands, strict=True)))
 
 
 def _products(pair: Pair, flow: torch.Tensor, places: Sequence[torch.Tensor]) -> torch.Tensor:
@@ -247,7 +247,7 @@ def _products(pair: Pair, flow: torch.Tensor, places: Sequence[torch.Tensor]) ->
 
     Zero where one of the images is not valid.
     """
-    at = [torch.stack([p - d / 2, p + d / 2]) for p, d in zip(places, flow)]
+    at = [torch.stack([p - d / 2, p + d / 2]) for p, d in zip(places, flow, strict=True)]
     value, *slopes = pair.spline.sample(*at)
     valid = (pair.spline.holds(*at) & nearest(pair.usable, at)).all(0)
     if pair.rebalanced:
@@ -272,7 +272,7 @@ def _moments(
     Up to `order` of them together; beyond the rims the fields are zero.
     """
     found = {(): fields}
-    for axis, (step, rim) in enumerate(zip(steps, rims)):
+    for axis, (step, rim) in enumerate(zip(steps, rims, strict=True)):
         after = {}
         for powers, sums in found.items():
             sums = pad(sums, (0, 0) * (sums.ndim - 2 - axis) + rim)
@@ -296,7 +296,9 @@ def _normal(moments: dict[tuple[int, ...], torch.Tensor], dims: int) -> torch.Te
     number = {pair: i for i, pair in enumerate(_pairs(dims))}
     unknowns = [(a, term) for a in range(dims) for term in _terms(dims)]
     rows = [
-        moments[tuple(i + j for i, j in zip(first, second))][number[min(a, b), max(a, b)]]
+        moments[tuple(i + j for i, j in zip(first, second, strict=True))][
+            number[min(a, b), max(a, b)]
+        ]
         for a, first in unknowns
         for b, second in unknowns
     ]
@@ -322,7 +324,7 @@ def _solved(
     share = number / whole
     number = number.clamp(min=1e-12)
     covary = cross - means[0] * means[1] / number
-    contrast = [s - mean**2 / number for s, mean in zip((square1, square2), means)]
+    contrast = [s - mean**2 / number for s, mean in zip((square1, square2), means, strict=True)]
     scale = (contrast[0].clamp(min=0) * contrast[1].clamp(min=0)).sqrt()
     normal = _normal(once, dims)
     first = len(_pairs(dims))

@@ -70,7 +70,7 @@ def median_outliers(
                 _neighbours(wider[top : top + rows + 2 * rim], rim, spacing),
                 epsilon,
             )
-            for part, wider in zip(d, padded)
+            for part, wider in zip(d, padded, strict=True)
         ]
         bands.append(torch.stack(residuals).norm(dim=0) > threshold)
     return torch.cat(bands)
@@ -127,7 +127,7 @@ def _neighbours(padded: torch.Tensor, rim: int, spacing: int) -> torch.Tensor:
     steps = product(range(0, 2 * rim + 1, spacing), repeat=padded.ndim)
     return torch.stack(
         [
-            padded[tuple(slice(i, i + n) for i, n in zip(step, sizes))]
+            padded[tuple(slice(i, i + n) for i, n in zip(step, sizes, strict=True))]
             for step in steps
             if any(i != rim for i in step)
         ]

@@ -100,7 +100,7 @@ class Prior(NamedTuple):
         ]
 
     def rates(self, coefficients: torch.Tensor) -> torch.Tensor:
-        """Every motion of flows (..., components, knots) on the mesh: (..., motions, *mesh.shape)."""
+        """Motions of flows (..., components, knots) on the mesh: (..., motions, *mesh.shape)."""
         slopes = self.mesh.slopes(coefficients)
         component = -1 - self.mesh.dims
         return torch.stack(
@@ -118,7 +118,7 @@ class Prior(NamedTuple):
         shape = list(values.shape)
         shape[component] = dims
         parts = [values.new_zeros(shape) for _ in range(dims)]
-        for (_, motion), value in zip(self.motions, values.unbind(component)):
+        for (_, motion), value in zip(self.motions, values.unbind(component), strict=True):
             for a, b, scale in motion:
                 parts[b].select(component, a).add_(value, alpha=scale)
         return self.mesh.slopes_transposed(parts)
@@ -127,7 +127,7 @@ class Prior(NamedTuple):
         """(..., motions, *mesh.shape) summed to (..., kinds, *mesh.shape)."""
         component = -1 - self.mesh.dims
         parts: list = [0.0] * len(KINDS[self.mesh.dims])
-        for (kind, _), square in zip(self.motions, squares.unbind(component)):
+        for (kind, _), square in zip(self.motions, squares.unbind(component), strict=True):
             parts[kind] = parts[kind] + square
         return torch.stack(parts, component)
 
@@ -162,6 +162,7 @@ class Prior(NamedTuple):
         return self._replace(local=self.local.to(like), mesh=mesh)
 
     def smooth(self, values: torch.Tensor) -> torch.Tensor:
+        """Gaussian mean over the mesh, of standard deviation `width`."""
         kernels = []
         for place in self.mesh.places:
             kernel = torch.exp(-((place[:, None] - place) / self.width).square() / 2)

@@ -34,7 +34,7 @@ class Flag(enum.IntFlag):
     NO_MATCH = 64
     """No candidate could be compared (no contrast, no positive weight). No displacement."""
     REPLACED = 128
-    """The pass before found an outlier, and this one began at its neighbours' median (multi-pass)."""
+    """The previous pass found an outlier; this one began at its neighbours' median (multi-pass)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:
@@ -187,7 +187,7 @@ def misfit_variance(misfit: torch.Tensor, number: int) -> float:
 
 
 def non_finite(images: Sequence[torch.Tensor], windows: Windows) -> torch.Tensor:
-    """Windows with a NaN or an infinity in some image: in the search region, of volumes the template."""
+    """Windows not finite in the search region of an image or the template of a volume."""
     bad = torch.stack([~torch.isfinite(image) for image in images]).any(0)
     return windows.of_regions(working(bad)) > 0
 

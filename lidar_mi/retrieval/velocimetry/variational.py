@@ -81,8 +81,8 @@ def variational(
     Returns
     -------
     Displacement
-        Wind times dt at the windows' centres at mid-time. `score` is the smallest correlation of
-        an image with the mean of the others, `covariance` that of the posterior: what the noise, and
+        Wind times dt at the windows' centres at mid-time. `score` is the smallest correlation of an
+        image with the mean of the others, `covariance` that of the posterior: what the noise, and
         what else the images do not share, leaves open and the prior does not know. What splines
         cannot follow shows in neither: 0.02 px in vortex cores without noise. Where pixels are too
         coarse displacements are off by a fraction of a pixel that neighbours share: up to 0.04 px
@@ -106,7 +106,7 @@ def variational(
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
     last, prior = len(settings.knots) - 1, None
-    for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds)):
+    for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
         axes = [Axis(n, max(2.0, knots * template)) for n in windows.shape]
         mesh = Mesh(axes, pixels)
         coefficients = mesh.fitted(flow)

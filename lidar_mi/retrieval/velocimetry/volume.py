@@ -162,7 +162,7 @@ def without_attenuation(
         if not bool((noise[noise.isfinite()] >= 0).all()):
             raise InputError("noise: below 0 is not allowed; expected standard deviations >= 0")
         noise = (noise / brightness[0]).expand_as(volumes[0])
-    return [volume / level - 1 for volume, level in zip(volumes, brightness)], noise
+    return [volume / level - 1 for volume, level in zip(volumes, brightness, strict=True)], noise
 
 
 def _brightness(volume: torch.Tensor, number: int) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""Images and volumes as smooth functions of place: band-limited, read anywhere with their slopes."""
+"""Images and volumes as band-limited functions of place: values and gradients anywhere."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -60,7 +60,7 @@ class Spline(NamedTuple):
     def holds(self, *place: torch.Tensor) -> torch.Tensor:
         """Which places lie on the images, up to the outer pixels' centres."""
         inside = torch.ones_like(place[0], dtype=torch.bool)
-        for p, n in zip(place, self.shape):
+        for p, n in zip(place, self.shape, strict=True):
             inside &= (p >= 0) & (p <= n - 1)
         return inside
 
@@ -78,7 +78,10 @@ class Spline(NamedTuple):
         value, *slopes : torch.Tensor, shape (images, ...)
         """
         finer, margin = self.settings.nodes, self.settings.margin
-        at = [finer * (p.clamp(0, size - 1) + margin) - 1 for p, size in zip(place, self.shape)]
+        at = [
+            finer * (p.clamp(0, size - 1) + margin) - 1
+            for p, size in zip(place, self.shape, strict=True)
+        ]
         read = _read_images if len(at) == 2 else _read_volumes
         value, *slopes = read(self.coefficients, *at)
         return value, *(finer * slope for slope in slopes)
@@ -121,7 +124,7 @@ def _read_volumes(coefficients: torch.Tensor, *place: torch.Tensor):
 def _read_volume(volume: torch.Tensor, *at: torch.Tensor) -> torch.Tensor:
     _, height, width = volume.shape
     low = [p.floor() for p in at]
-    x, z, y = (spline_weights(p - below) for p, below in zip(at, low))
+    x, z, y = (spline_weights(p - below) for p, below in zip(at, low, strict=True))
     # whole numbers of half the size, and no new memory, take half the time
     kind = torch.int32 if volume.numel() < 2**31 else torch.int64
     corner = (low[0].to(kind) * height + low[1].to(kind)) * width + low[2].to(kind)
@@ -152,7 +155,7 @@ def nearest(mask: torch.Tensor, place: Sequence[torch.Tensor]) -> torch.Tensor:
     """A mask (images, ...) at the pixels nearest to places (images, ...)."""
     if bool(mask.all()):
         return torch.ones_like(place[0], dtype=torch.bool)
-    at = [p.round().long().clamp(0, n - 1) for p, n in zip(place, mask.shape[1:])]
+    at = [p.round().long().clamp(0, n - 1) for p, n in zip(place, mask.shape[1:], strict=True)]
     number = torch.arange(len(mask), device=mask.device).reshape(-1, *[1] * (mask.ndim - 1))
     return mask[number, *at]
 

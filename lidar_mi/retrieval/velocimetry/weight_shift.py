@@ -89,7 +89,7 @@ def _best_match(
     inner = image1[lead:, lead:][tuple(slice(s - windows.search + n) for s in windows.shape)]
     reference = [strided(strided(v, windows.stride, 0), windows.stride, 1) for v in mass(inner, n)]
     regions = [candidates(v, windows) for v in mass(image2, n)]
-    weight, centre_z, centre_y = (r - f for r, f in zip(regions, reference))
+    weight, centre_z, centre_y = (r - f for r, f in zip(regions, reference, strict=True))
     spread = [region.var((0, 1), correction=0) for region in regions]
     spread_weight, spread_centre = spread[0], spread[1] + spread[2]
     contrast = (spread_weight > (rounding * reference[0]) ** 2) & (

@@ -148,14 +148,14 @@ def retrieve_wind(
     xr.Dataset, dims (z, y)
         At the template centres (an even template's lies between pixels): `v`, `w` (m s-1),
         `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
-        their correlation (NaN from methods that know none: "cc", "ws"),
-        `displacement_y`, `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1),
-        `isotropy`, `flag` (bits of `quality.Flag`, 0 = good; also without texture counts a vector
-        whose standard error is beyond half a pixel in some direction). The auxiliary coordinates `y_vector`,
-        `z_vector` are where the vector belongs, at mid-time: the centre and, with "cc" and "ws",
-        half the displacement. "vortex_fit" adds the pair's numbers (`port_circulation` and so on,
-        each with `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or NaN if there is none);
-        nothing is replaced.
+        their correlation (NaN from methods that know none: "cc", "ws"), `displacement_y`,
+        `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1), `isotropy`, `flag`
+        (bits of `quality.Flag`, 0 = good; also without texture counts a vector whose standard error
+        is beyond half a pixel in some direction). The auxiliary coordinates `y_vector`, `z_vector`
+        are where the vector belongs, at mid-time: the centre and, with "cc" and "ws", half the
+        displacement. "vortex_fit" adds the pair's numbers (`port_circulation` and so on, each with
+        `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or NaN if
+        there is none); nothing is replaced.
 
     Raises
     ------
@@ -236,7 +236,9 @@ def retrieve_wind(
     found = found._replace(flag=flag)
     steps = spacing(image1)
     variables = winds(found, image1.dims, steps, dt)
-    moved = dict(zip(image1.dims, found.d.cpu().numpy() * np.reshape(steps, (2, 1, 1))))
+    moved = dict(
+        zip(image1.dims, found.d.cpu().numpy() * np.reshape(steps, (2, 1, 1)), strict=True)
+    )
     for axis in ("y", "z"):
         about = f"displacement along {axis}", "m"
         variables[f"displacement_{axis}"] = field(image1.dims, moved[axis], *about)
@@ -250,7 +252,9 @@ def retrieve_wind(
         "flag": flags(found, image1.dims),
     }
     coords = centres(image1, windows, "template")
-    for axis, place in zip(image1.dims, np.meshgrid(*(coords[a][1] for a in "zy"), indexing="ij")):
+    for axis, place in zip(
+        image1.dims, np.meshgrid(*(coords[a][1] for a in "zy"), indexing="ij"), strict=True
+    ):
         vector = place + (0.0 if chosen.centred else 0.5) * moved[axis]
         about = f"{axis} of the vector at mid-time", "m"
         coords[f"{axis}_vector"] = field(image1.dims, vector, *about)
@@ -269,10 +273,10 @@ def wind_bound(
 ) -> xr.Dataset:
     """Least standard error of v and w (m/s) that any unbiased method has from each template alone.
 
-    The Cramer-Rao bound, see `bound.displacement_bound`; on the grid of `retrieve_wind`, which
-    says what the parameters are. Infinite without texture, NaN near non-finite pixels. A field that is fitted to the images
-    as a whole uses more than a template and may be better. Noise of 0 in some pixels of a map
-    counts as a thousandth of the median.
+    The Cramer-Rao bound, see `bound.displacement_bound`; on the grid of `retrieve_wind`, which says
+    what the parameters are. Infinite without texture, NaN near non-finite pixels. A field that is
+    fitted to the images as a whole uses more than a template and may be better. Noise of 0 in some
+    pixels of a map counts as a thousandth of the median.
 
     Returns
     -------
@@ -295,7 +299,7 @@ def wind_bound(
     root = covariance[:2, rows][:, :, columns].sqrt()
     root = torch.where(non_finite(pair, windows), torch.nan, root).numpy()
     found = {}
-    for name, values, step in zip("wv", root, spacing(image1)):
+    for name, values, step in zip("wv", root, spacing(image1), strict=True):
         about = f"Cramer-Rao bound of {name} from one template", "m s-1"
         found[f"{name}_bound"] = field(image1.dims, values * step / dt, *about)
     return xr.Dataset(found, centres(image1, windows, "template"))

@@ -128,7 +128,7 @@ class Windows:
         return row - self.lead, column - self.lead, rim
 
     def tiles(self, bytes_per_window: int) -> Iterator[Tile]:
-        """Cut the windows of an image into blocks of at most TILE_BYTES (but at least one window)."""
+        """The windows of an image in blocks of at most TILE_BYTES (but at least one window)."""
         rows, columns = self.count
         room = max(1, TILE_BYTES // bytes_per_window)
         width = min(columns, room)
@@ -203,7 +203,7 @@ def window_sums(
     fields = pad(fields, (0, max(0, (blocks - 1) * block * step + length - fields.shape[-1])))
     weights = fields.new_zeros(len(kernels), length, block)
     for i in range(block):
-        for weight, kernel in zip(weights, kernels):
+        for weight, kernel in zip(weights, kernels, strict=True):
             weight[i * step : i * step + taps, i] = kernel
     pieces = fields.unfold(-1, length, block * step)
     sums = pieces.reshape(1, -1, length) @ weights
@@ -268,7 +268,8 @@ def image_pair(image1: torch.Tensor, image2: torch.Tensor, dims: Sequence[int] =
     Raises
     ------
     InputError
-        Of other numbers of dimensions than `dims`, of different size or device, or not real numbers.
+        Of other numbers of dimensions than `dims`, of different size or device, or not real
+        numbers.
     """
     for name, image in (("image1", image1), ("image2", image2)):
         if not isinstance(image, torch.Tensor):
@@ -299,5 +300,5 @@ def working(image: torch.Tensor) -> torch.Tensor:
 
 
 def stored(image: torch.Tensor) -> torch.Tensor:
-    """An image as `working`, a volume in float32: what its mean is taken off loses nothing by it."""
+    """An image as `working`, a volume in float32, which suffices once its mean is subtracted."""
     return working(image) if image.ndim == 2 else image.float()

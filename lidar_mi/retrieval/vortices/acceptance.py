@@ -66,8 +66,8 @@ def checked_fit(
         sign = 1 if side == "port" else -1
         if not sign * circulation > _SIGNIFICANCE * spread[first]:
             reasons.append(
-                f"{side} circulation {circulation:.0f} +- {spread[first]:.0f} m2/s is not significant "
-                f"(below {_SIGNIFICANCE:g} standard errors)"
+                f"{side} circulation {circulation:.0f} +- {spread[first]:.0f} m2/s is not "
+                f"significant (below {_SIGNIFICANCE:g} standard errors)"
             )
         if not (y[0] <= at_y <= y[-1] and z[0] <= at_z <= z[-1]):
             reasons.append(f"{side} vortex at ({at_y:.1f}, {at_z:.1f}) m is outside")

@@ -21,7 +21,7 @@ def flow_error_of(found: Solution, shortest: float) -> FlowError:
 
 
 def parameter_covariance(found: Solution, error: FlowError, excess: float) -> np.ndarray:
-    """Covariance (10, 10): H^-1 M H^-1 with the noise's and the flow error's spread M of the force."""
+    """Covariance (10, 10): H^-1 M H^-1, M that of the force by noise and flow error."""
     misfit, weight = found.misfit, found.weight
     spread = _noise_spread(found, error) * excess
     jacobian, slope = misfit.jacobian, misfit.slope
@@ -42,7 +42,7 @@ def parameter_covariance(found: Solution, error: FlowError, excess: float) -> np
 
 
 def _noise_spread(found: Solution, error: FlowError) -> torch.Tensor:
-    """Covariance of the force that noise makes: by the stated noise or, if larger, by the residuals.
+    """Covariance of the force by noise: from the stated noise or, if larger, from the residuals.
 
     By the residuals, each stands for its own variance (White 1980, Econometrica 48, 817), whatever
     pixels are noisier than stated.

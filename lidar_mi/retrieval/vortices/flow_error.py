@@ -41,7 +41,7 @@ class FlowError:
     def covariance(self, distance: torch.Tensor) -> torch.Tensor:
         """At distances in steps of the grid."""
         total = torch.zeros_like(distance)
-        for variance, length in zip(self.variances, self.lengths):
+        for variance, length in zip(self.variances, self.lengths, strict=True):
             total = total + variance * torch.exp(-(distance**2) / (2 * length**2))
         return total
 
@@ -63,6 +63,7 @@ class Lags:
 
     @property
     def sizes(self) -> list[int]:
+        """Lengths of the padded Fourier transform along each axis."""
         return [scipy.fft.next_fast_len(2 * n, real=True) for n in self.shape]
 
     def distance(self) -> torch.Tensor:
@@ -74,11 +75,16 @@ class Lags:
         return torch.hypot(along[0][:, None], along[1][None, :])
 
     def transform(self, fields: torch.Tensor) -> torch.Tensor:
+        """Fourier transform of fields, padded so that lags do not wrap."""
         return torch.fft.rfft2(fields, s=self.sizes)
 
-    def autocorrelation(self, fields: Sequence[torch.Tensor], weights: Sequence[float]):
+    def autocorrelation(
+        self, fields: Sequence[torch.Tensor], weights: Sequence[float]
+    ) -> torch.Tensor:
         """Sum over the fields of weight * sum_x f(x) f(x + lag)."""
-        power = sum(w * self.transform(f).abs().square() for f, w in zip(fields, weights))
+        power = sum(
+            w * self.transform(f).abs().square() for f, w in zip(fields, weights, strict=True)
+        )
         return torch.fft.irfft2(power, s=self.sizes)
 
     def quadratic(self, fields: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
@@ -132,7 +138,7 @@ def flow_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) ->
         torch.stack(columns, 1).cpu().numpy(), (observed[used] / scale / size).cpu().numpy()
     )
     variances = amplitudes * size
-    kept = [(float(a), n) for a, n in zip(variances, lengths) if a > 0]
+    kept = [(float(a), n) for a, n in zip(variances, lengths, strict=True) if a > 0]
     return FlowError(tuple(a for a, _ in kept), tuple(n for _, n in kept))
 
 

@@ -71,7 +71,8 @@ class _Images:
         # the flow stands still in the frame that moves with the pair
         steady = torch.cat([theta[:8], theta[8:] - moving])
         middle, place = zip(
-            *(advected(steady, self.y, self.z, time, self.profile) for time in (-half, half))
+            *(advected(steady, self.y, self.z, time, self.profile) for time in (-half, half)),
+            strict=True,
         )
         shift = moving[:, None, None] * half
         place = [place[0] - shift, place[1] + shift]
@@ -83,7 +84,8 @@ class _Images:
         valid = self.spline.holds(rows, columns).all(0)
         if bool(self.bad.any()):
             nearest = [
-                p.round().long().clamp(0, n - 1) for p, n in zip((rows, columns), self.bad.shape)
+                p.round().long().clamp(0, n - 1)
+                for p, n in zip((rows, columns), self.bad.shape, strict=True)
             ]
             valid &= ~self.bad[nearest[0], nearest[1]].any(0)
         slope = torch.stack([slope_y / self.spacing[0], slope_z / self.spacing[1]], 1)
@@ -125,7 +127,8 @@ def fit_vortices(
     Parameters
     ----------
     image1, image2 : DataArray, dims (z, y)
-        On one grid, as `lidar_mi.retrieval.velocimetry.wind.retrieve_wind` takes them. NaN pixels are left out.
+        On one grid, as `lidar_mi.retrieval.velocimetry.wind.retrieve_wind` takes them. NaN pixels
+        are left out.
     dt : float
         s.
     noise : float or DataArray, optional
@@ -252,10 +255,10 @@ def fit_pixels(
 def _understated(noise: torch.Tensor, pair: torch.Tensor) -> float:
     """Factor by which the images vary more from pixel to pixel than a map states, at least 1.
 
-    Errors estimated from a few Monte Carlo samples miss the rare bright ones. With too
-    low a noise the filter takes what is left of it for texture and passes all of it. Texture down to
-    single pixels counts as noise here, which costs little: in images 150 m ahead noise comes out 1.5
-    times as large, and chi2 at 0.4, with the errors of the parameters unchanged.
+    Errors estimated from a few Monte Carlo samples miss the rare bright ones. With too low a noise
+    the filter takes what is left of it for texture and passes all of it. Texture down to single
+    pixels counts as noise here, which costs little: in images 150 m ahead noise comes out 1.5 times
+    as large, and chi2 at 0.4, with the errors of the parameters unchanged.
     """
     stated = float(noise[torch.isfinite(noise)].double().square().mean().sqrt())
     _, observed = band_limited(pair)
@@ -322,7 +325,8 @@ class _Builder:
         vertical, lateral = torch.meshgrid(*places, indexing="ij")
         variance = torch.full_like(lateral, 2 * noise**2)
         if isinstance(self.map, torch.Tensor):
-            # the filter spreads noise over a few pixels; of few samples one pixel's estimate is unreliable
+            # the filter spreads noise over a few pixels; of few samples one pixel's estimate is
+            # unreliable
             known = torch.nn.functional.avg_pool2d(
                 filled(self.map.double())[None].square(), 9, 1, 4, count_include_pad=False
             )[0]

@@ -26,7 +26,8 @@ PARAMETERS = (
 
 # Root of 1 + 2 a = exp(a): puts the peak of the Lamb-Oseen swirl at the core radius.
 _LAMB_OSEEN = 1.2564
-# Angle (rad) by which the fastest air may rotate in one Runge-Kutta step: errs by 3e-4 of its radius.
+# Angle (rad) by which the fastest air may rotate in one Runge-Kutta step: errs by 3e-4 of its
+# radius.
 _STEP_ANGLE = 0.5
 
 
@@ -127,7 +128,7 @@ def advected(
 
 
 def drift(theta: torch.Tensor, profile: Profile) -> torch.Tensor:
-    """Velocity (2,) of the pair, m s^-1: the mean wind and the velocity that the vortices induce on each other."""
+    """Velocity (2,) of the pair, m s^-1: mean wind plus mutual induction of the vortices."""
     centres = theta[[2, 6]], theta[[3, 7]]
     return wind(theta, *centres, profile).mean(1)
 
@@ -137,9 +138,9 @@ def path_sensitivity(
 ) -> torch.Tensor:
     """Derivatives (10, ...) of along . (end of the path) with respect to `PARAMETERS`.
 
-    A parameter's change du of the wind along the path is advected to its end by the flow. The integral over the
-    path is taken by its value in the middle, advected on by exp(L time/2) with the gradient L of the
-    wind there: off by (omega time)^2/24, 0.7 % for 0.4 rad.
+    A parameter's change du of the wind along the path is advected to its end by the flow. The
+    integral over the path is taken by its value in the middle, advected on by exp(L time/2) with
+    the gradient L of the wind there: off by (omega time)^2/24, 0.7 % for 0.4 rad.
     """
     v_y, v_z, w_y = gradient(theta, *middle, profile)
     h = time / 2

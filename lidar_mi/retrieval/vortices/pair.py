@@ -21,8 +21,8 @@ class VortexPairFit(Tabular):
     Attributes
     ----------
     parameters : ndarray, shape (10,)
-        In the order of `lidar_mi.retrieval.vortices.model.PARAMETERS`; NaN where there is no fit at all. Port is the
-        vortex that rotates from +y towards +z (circulation > 0).
+        In the order of `lidar_mi.retrieval.vortices.model.PARAMETERS`; NaN where there is no fit at
+        all. Port is the vortex that rotates from +y towards +z (circulation > 0).
     covariance : ndarray, shape (10, 10)
         Of the parameters: from the noise and from the flow's departure from the model.
     profile : {"lamb_oseen", "burnham_hallock"}
@@ -31,8 +31,8 @@ class VortexPairFit(Tabular):
         Mean square of the residuals over that of the noise; 1 where the model is all there is.
         NaN where no noise is known.
     correlation : float
-        Of image 1 and image 2, each advected to mid-time by the fit; of fits to vectors the fraction
-        of their variance that is explained.
+        Of image 1 and image 2, each advected to mid-time by the fit; of fits to vectors the
+        fraction of their variance that is explained.
     flow_error : float
         Rms of each component of the wind that the model misses, m s^-1, estimated from the
         residuals.
@@ -54,14 +54,17 @@ class VortexPairFit(Tabular):
 
     @property
     def success(self) -> bool:
+        """Whether the fit is accepted; else `reasons` says why not."""
         return not self.reasons
 
     @property
     def port(self) -> Vortex:
+        """The port vortex, of positive circulation."""
         return self._vortex(0)
 
     @property
     def starboard(self) -> Vortex:
+        """The starboard vortex, of negative circulation."""
         return self._vortex(4)
 
     def tables(self) -> list[Table]:
@@ -113,7 +116,7 @@ class VortexPairFit(Tabular):
         spread = np.sqrt(np.einsum("ij,jk,ik->i", slope, self.covariance, slope))
         return {
             name: Quantity(float(value), float(error), *MEANING[name])
-            for (name, value), error in zip(values.items(), spread)
+            for (name, value), error in zip(values.items(), spread, strict=True)
         }
 
     def after(self, seconds: float) -> "VortexPairFit":
@@ -218,7 +221,11 @@ MEANING = {
 _SIGNS = {"m2 s-1": "m²/s", "m s-1": "m/s", "m": "m", "s": "s"}
 
 
-def circulation_5_15(circulation, core_radius, profile: Profile = "lamb_oseen"):
+def circulation_5_15(
+    circulation: float | torch.Tensor,
+    core_radius: float | torch.Tensor,
+    profile: Profile = "lamb_oseen",
+) -> torch.Tensor:
     """Circulation of a vortex averaged over radii from 5 to 15 m, as lidars report it, m^2 s^-1."""
     circulation = torch.as_tensor(circulation, dtype=torch.float64)
     core_radius = torch.as_tensor(core_radius, dtype=torch.float64)

@@ -51,7 +51,7 @@ class Solution(NamedTuple):
 
 
 def weights(misfit: Misfit, flow_variance: float) -> torch.Tensor:
-    """1 / variance of noise and flow error together, less for outliers; 0 where there is no residual."""
+    """1 / variance of noise and flow error, less for outliers; 0 where there is no residual."""
     moved = flow_variance * misfit.slope.square().sum(0)
     size = misfit.residual.abs() / (misfit.scatter + moved).sqrt()
     return misfit.valid * (_HUBER / size.clamp(min=_HUBER)) / (misfit.variance + moved)

@@ -16,7 +16,7 @@ _RADII = (0.03, 0.08)
 
 
 class Observations(NamedTuple):
-    """Components of the wind observed at places: value = along . wind + noise, tensors of shape (n,).
+    """Observed components of the wind: value = along . wind + noise, tensors of shape (n,).
 
     Attributes
     ----------
@@ -47,7 +47,7 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
     step = (sides[0] * sides[1] / _PLACES) ** 0.5
     axes = [
         torch.linspace(float(a), float(b), max(2, round(side / step))).to(observed.y)
-        for a, b, side in zip(low, high, sides)
+        for a, b, side in zip(low, high, sides, strict=True)
     ]
     place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
     apart = torch.cdist(place, place)

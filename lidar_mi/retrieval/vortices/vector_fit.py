@@ -53,9 +53,9 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     Parameters
     ----------
     vectors : Dataset, dims (z, y)
-        As `lidar_mi.retrieval.velocimetry.wind.retrieve_wind` gives it: v, w, and where there are any
-        v_stderr, w_stderr, vw_correlation, flag, y_vector, z_vector. Vectors with a flag or without
-        a number are left out. Without standard errors all count alike, with the error that
+        As `lidar_mi.retrieval.velocimetry.wind.retrieve_wind` gives it: v, w, and where there are
+        any v_stderr, w_stderr, vw_correlation, flag, y_vector, z_vector. Vectors with a flag or
+        without a number are left out. Without standard errors all count alike, with the error that
         their residuals show.
     profile : {"lamb_oseen", "burnham_hallock"}
 

@@ -154,7 +154,7 @@ def test_rings_give_circulation_and_what_carries_the_vortex(model):
     radius = np.linspace(5, 15, 1001)
     share = circulation_inside(radius, 458.0, 3.0, model).mean()
     cores = [Core(o.y, o.z, o.core_radius, o.circulation) for o in pair]
-    for core, other, side in zip(cores, cores[::-1], (1, -1)):
+    for core, other, side in zip(cores, cores[::-1], (1, -1), strict=True):
         rings = ring_averages(flow, core, [other])
         assert rings.circulation == pytest.approx(side * share, rel=2e-3)
         assert rings.v == pytest.approx(3.0, abs=0.01)
@@ -172,6 +172,6 @@ def test_rings_that_hold_something_else_tell_nothing():
     path = files("lidar_mi.scenes").joinpath("wake_slab_40s.nc")
     wake = centre(resample(read_wake(path, 40.0), 0.5), None, None).isel(x=0)
     cores = find_cores(wake)
-    for core, said in zip(cores, (440.0, -438.4)):
+    for core, said in zip(cores, (440.0, -438.4), strict=True):
         others = [o for o in cores if o is not core]
         assert ring_averages(wake, core, others).circulation == pytest.approx(said, rel=5e-3)

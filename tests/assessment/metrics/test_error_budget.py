@@ -1,5 +1,6 @@
-"""What limits the wind. Detects a share that goes to the wrong cause, 5 % in a share, noise drawn anew
-instead of taken away, a chord or a window's mean off by 1 %, other vectors with a cause than without."""
+"""What limits the wind. Detects a share that goes to the wrong cause, 5 % in a share, noise drawn
+anew instead of taken away, a chord or a window's mean off by 1 %, other vectors with a cause than
+without."""
 
 import numpy as np
 import pytest
@@ -54,10 +55,10 @@ def pairs(count, seed=1):
 
 def test_each_cause_is_taken_away_and_all_else_stays():
     air, blur, photons, counts, shear = pairs(5)
-    blurred = [a + b for a, b in zip(air, blur)]
-    rendered = [a + b for a, b in zip(blurred, photons)]
-    seen = [a + b for a, b in zip(rendered, counts)]
-    carried = [a + b for a, b in zip(blurred, shear)]
+    blurred = [a + b for a, b in zip(air, blur, strict=True)]
+    rendered = [a + b for a, b in zip(blurred, photons, strict=True)]
+    seen = [a + b for a, b in zip(rendered, counts, strict=True)]
+    carried = [a + b for a, b in zip(blurred, shear, strict=True)]
     found = pictures_without(seen, blurred, air, rendered, carried)
     for k in (0, 1):
         expected = {
@@ -82,7 +83,7 @@ def test_picture_unit_finds_gain_and_offset_through_uneven_noise():
     rng = np.random.default_rng(2)
     (air,) = pairs(1)
     noise = [field(1e-9 * (1 + 50 * rng.random((20, 30)))) for _ in range(2)]
-    picture = [3e-6 * a + 2e-7 + rng.normal(0, n) for a, n in zip(air, noise)]
+    picture = [3e-6 * a + 2e-7 + rng.normal(0, n) for a, n in zip(air, noise, strict=True)]
     gain, offset = picture_unit(air, picture, noise)
     # weighted: the 5 % of pixels with noise below 3.5e-9 alone would give 2e-9 for the gain
     assert gain == pytest.approx(3e-6, abs=4e-9) and offset == pytest.approx(2e-7, abs=4e-9)
@@ -106,15 +107,16 @@ def test_chord_of_a_solid_rotation():
 
 
 def test_chords_agree_with_their_series_in_time():
-    """Second order in the time step, h = dt / 2: u + h^2 (j / 6 - (a . grad) u / 2) of the acceleration
-    a = (u . grad) u and j = (u . grad) a, by differences; the rest is of fourth order."""
+    """Second order in the time step, h = dt / 2: u + h^2 (j / 6 - (a . grad) u / 2) of the
+    acceleration a = (u . grad) u and j = (u . grad) a, by differences; the rest is of fourth
+    order."""
     pair = (Vortex(400.0, 3.0, -8.0, 0.5), Vortex(-400.0, 3.0, 8.0, 0.0))
     axis = np.arange(-100, 101) * 0.2
     y, z = np.meshgrid(axis, axis)
     truth = xr.Dataset(
         {
             n: xr.DataArray(x, {"z": axis, "y": axis}, ("z", "y"))
-            for n, x in zip("vw", velocity(pair, y, z))
+            for n, x in zip("vw", velocity(pair, y, z), strict=True)
         }
     )
     places = np.meshgrid(np.linspace(-12, 12, 25), np.linspace(-6, 6, 13))
@@ -141,8 +143,8 @@ def test_chords_agree_with_their_series_in_time():
 
 
 def test_window_means_of_a_curved_wind():
-    """A parabola over n pixels: the box adds h^2 (n^2 - 1) / 12 of half its curvature, a Gaussian its
-    variance."""
+    """A parabola over n pixels: the box adds h^2 (n^2 - 1) / 12 of half its curvature, a Gaussian
+    its variance."""
     truth = flow(lambda y, z: y**2, lambda y, z: 0.5 * z**2 + y * z)
     box = window_mean(truth, 8, "cc").interp(y=3.0, z=-2.0)
     assert float(box["v"]) == pytest.approx(9 + H**2 * 63 / 12, rel=0.01)
@@ -160,7 +162,10 @@ def test_displacements_in_a_core_are_off_by_the_time_step_alone():
     place = np.meshgrid(y, z)
     metres = {"z": z, "y": y}
     truth = xr.Dataset(
-        {n: xr.DataArray(x, metres, ("z", "y")) for n, x in zip("vw", velocity((vortex,), *place))}
+        {
+            n: xr.DataArray(x, metres, ("z", "y"))
+            for n, x in zip("vw", velocity((vortex,), *place), strict=True)
+        }
     )
     start = place[0] - vortex.y + 1j * (place[1] - vortex.z)
     r = np.abs(start)
@@ -337,8 +342,8 @@ def described(place="", **shares):
 def test_the_sentence_names_the_largest_causes_in_turn():
     metrics = described(beam_blur=0.2, detector_noise=0.7, window=0.01, method=-0.4)
     assert limit_sentence(metrics, "cc") == (
-        "The wind by cross-correlation is off by 0.35 m/s rms, limited by noise of the detector (70 % "
-        "of the mean square error), then width of the beam (20 %)."
+        "The wind by cross-correlation is off by 0.35 m/s rms, limited by noise of the detector "
+        "(70 % of the mean square error), then width of the beam (20 %)."
     )
     # beyond the cores where there are any; that noise of the simulation is not the lidar's is said
     both = described(beam_blur=0.9, detector_noise=0.1, monte_carlo=0.1)

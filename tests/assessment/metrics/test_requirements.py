@@ -190,7 +190,7 @@ def test_bad_measurements_are_named():
         with pytest.raises(InputError) as error:
             judge(TABLES["flight_control", "landing"], measured)
         assert str(error.value).startswith(message)
-    with pytest.raises(InputError, match="absent.yaml: No such file"):
+    with pytest.raises(InputError, match=r"absent.yaml: No such file"):
         read_requirements("absent.yaml")
 
 

@@ -1,5 +1,5 @@
-"""The report as a page. Detects names that become markup, a map whose numbers are not the wind's, and
-(in a browser, where there is one) a map that tells nothing when it is pointed at."""
+"""The report as a page. Detects names that become markup, a map whose numbers are not the wind's,
+and (in a browser, where there is one) a map that tells nothing when it is pointed at."""
 
 import json
 import re
@@ -100,7 +100,7 @@ def test_the_map_holds_the_wind():
 
 
 def test_the_map_takes_what_a_retrieval_leaves_out():
-    """No standard errors, no number at some places, vectors beside their nodes, too many of them."""
+    """No standard errors, no number at some places, vectors off their nodes, too many of them."""
     wind = some_wind(220, 9).drop_vars(["u", "u_true", "u_stderr", "v_stderr"])
     wind["v"][4, 30] = np.nan
     wind["w_stderr"][:] = np.nan

@@ -164,5 +164,5 @@ def test_refused(kind):
 def test_arguments():
     with pytest.raises(InputError, match="2 images are not allowed"):
         analyse_rings(np.zeros((2, 30, 30)))
-    with pytest.raises(InputError, match="centre: .900.0, 3.0. px"):
+    with pytest.raises(InputError, match=r"centre: .900.0, 3.0. px"):
         analyse_rings(split_rings((300, 400), (190.0, 160.0), 8000.0, (0.5,)), (900.0, 3.0))

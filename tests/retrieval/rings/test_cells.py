@@ -1,5 +1,5 @@
-"""Sums over sectors of annuli: unit tests against the same sums pixel by pixel. Detect a pixel in the
-wrong cell, a cell that forgets where its pixels lie, a sum that loses light."""
+"""Sums over sectors of annuli: unit tests against the same sums pixel by pixel. Detect a pixel in
+the wrong cell, a cell that forgets where its pixels lie, a sum that loses light."""
 
 import math
 
@@ -52,7 +52,7 @@ def test_cells_know_their_pixels_about_any_centre():
     y, x = np.mgrid[: shape[0], : shape[1]]
     index = cells.index.numpy()
     r2 = ((x - other[0]) ** 2 + (y - other[1]) ** 2).ravel()
-    dx, dy = (o - c for o, c in zip(other, centre))
+    dx, dy = (o - c for o, c in zip(other, centre, strict=True))
     mean = cells.r2 - 2 * (cells.x * dx + cells.y * dy) + dx**2 + dy**2
     by = torch.tensor([-2 * dx, -2 * dy, 1.0], dtype=torch.float64)
     spread = torch.einsum("i,cij,j->c", by, cells.spread, by)

@@ -26,7 +26,7 @@ def coarse(centre):
 @pytest.mark.parametrize("v_los", [-300.0, -130.0, 0.0, 51.0, 222.0, 300.0])
 @pytest.mark.parametrize("centre", [None, (300.0, 250.0), (485.7, 380.3)])
 def test_no_noise_no_error(v_los, centre):
-    """What order, cells and start do to the velocity: 0.003 m/s by pixels this large, no order lost."""
+    """Order, cells and start change the velocity by 0.003 m/s at most; no order is lost."""
     image = torch.as_tensor(reference.picture(v_los, centre=coarse(centre), **COARSE))
     fit = fit_rings(image, ring_model(**COARSE))
     assert abs(float(fit.v_los) - v_los) < 5e-3
@@ -118,7 +118,7 @@ def test_nuisances_do_no_harm():
     fit = fit_rings(torch.as_tensor(images), ring_model(**COARSE), PixelNoise(5))
     truth = (-35.0, 121.3, 95.1, None, 40.0, 250.0, 2 * half2 / radius**2)
     values = (fit.v_los, fit.x, fit.y, fit.level, fit.background, fit.temperature, fit.falloff)
-    for place, (true, value) in enumerate(zip(truth, values)):
+    for place, (true, value) in enumerate(zip(truth, values, strict=True)):
         if true is not None:
             pull = (value - true) / fit.std[:, place]
             assert abs(pull.mean()) < 4 / np.sqrt(32), place
@@ -150,7 +150,7 @@ def test_known_centre_stays():
 
 
 def test_emitted_picture_takes_the_instrument_off():
-    """Etalon and laser drift by 0.03 orders: 58 m/s in both pictures, nothing in their difference."""
+    """Etalon and laser drift by 0.03 orders: 58 m/s in both images, nothing in their difference."""
     order = reference.ORDER + 0.03
     air = ring_model(order_at_centre=order, **COARSE)
     laser = ring_model(
@@ -160,7 +160,7 @@ def test_emitted_picture_takes_the_instrument_off():
         torch.as_tensor(reference.picture(v, temperature=t, **COARSE))
         for v, t in ((33.0, reference.TEMPERATURE), (0.0, None))
     ]
-    received, emitted = (fit_rings(p, m) for p, m in zip(pictures, (air, laser)))
+    received, emitted = (fit_rings(p, m) for p, m in zip(pictures, (air, laser), strict=True))
     assert float(emitted.v_los) == pytest.approx(-0.03 * air.velocity_range, abs=0.05)
     v, std = difference(received, emitted)
     assert abs(float(v) - 33) < 0.05

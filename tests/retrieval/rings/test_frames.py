@@ -65,5 +65,5 @@ def test_inside_reaches_to_the_edges_of_the_pixels():
     for x, y in ((-0.5, -0.5), (29.5, 19.5), (7.0, 3.0)):
         inside(x, y, (20, 30))
     for x, y in ((-0.6, 3.0), (29.6, 3.0), (7.0, -0.6), (7.0, 19.6), (np.nan, 3.0)):
-        with pytest.raises(InputError, match="start: .* expected inside the image of 30 x 20 px"):
+        with pytest.raises(InputError, match=r"start: .* expected inside the image of 30 x 20 px"):
             inside(x, y, (20, 30), "start")

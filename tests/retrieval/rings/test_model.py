@@ -68,7 +68,7 @@ def test_derivatives_are_differences(kind):
     ).double()
     jacobian = mean_and_jacobian(model, cells, at)[1]
     for place, (name, step) in enumerate(
-        zip(PARAMETERS, (0.01, 1e-3, 1e-3, 1e-3, 1e-3, 1e-2, 1e-4))
+        zip(PARAMETERS, (0.01, 1e-3, 1e-3, 1e-3, 1e-3, 1e-2, 1e-4), strict=True)
     ):
         move = torch.zeros(7, dtype=torch.float64)
         move[place] = step

@@ -1,5 +1,5 @@
-"""Places of peaks: physics tests against the Cramer-Rao bound and closed forms. Detect a scatter 20 %
-above the bound, a bias of a quarter of it, and a place given where there is no peak."""
+"""Places of peaks: physics tests against the Cramer-Rao bound and closed forms. Detect a scatter 20
+% above the bound, a bias of a quarter of it, and a place given where there is no peak."""
 
 import numpy as np
 import pytest
@@ -25,8 +25,8 @@ def test_peaks_that_overlap():
 
 
 def test_scatter_is_that_of_the_bound():
-    """White noise s on samples d apart: var = 2 w d s^2 / (sqrt(pi) h^2) of the place, whatever else
-    is fitted with it, by symmetry. 300 draws (seed 1): standard deviation to 16 %, mean to a
+    """White noise s on samples d apart: var = 2 w d s^2 / (sqrt(pi) h^2) of the place, whatever
+    else is fitted with it, by symmetry. 300 draws (seed 1): standard deviation to 16 %, mean to a
     quarter of it, both 4 sigma."""
     step, noise, number = 0.5, 0.4, 300
     x = np.arange(0, 100, step)

@@ -70,7 +70,7 @@ def test_radial_cuts_and_their_filter():
     cuts = radial_cuts(2.0 * x + 3 * y, (20.0, 30.0), 8)
     assert cuts.shape[0] == 8
     r = np.arange(20)
-    for cut, angle in zip(cuts, np.arange(8) * np.pi / 4):
+    for cut, angle in zip(cuts, np.arange(8) * np.pi / 4, strict=True):
         np.testing.assert_allclose(
             cut[:20], 130 + r * (2 * np.cos(angle) + 3 * np.sin(angle)), atol=1e-9
         )
@@ -93,7 +93,7 @@ def test_wind_of_a_radius():
 
 @pytest.mark.parametrize("method", ["ca", "sg"])
 def test_gaussian_over_r2_has_no_bias(pictures, method):
-    """The ring is symmetric in r^2. Filtered cuts were smoothed over r: 1 m/s of the skew is left."""
+    """The ring is symmetric in r^2. Filtered cuts are smoothed over r: a skew of 1 m/s is left."""
     for kind, v in (("still", 0.0), ("wind", 50.0)):
         found = paper_velocity(
             pictures[kind], pictures["emitted"], method=method, coordinate="r2", centre=CENTRE
@@ -174,7 +174,7 @@ def test_bad_input(pictures):
         ring_radius(image, CENTRE, "ca", "r3")
     with pytest.raises(InputError, match="coordinate: 'r2' is not allowed with ml"):
         ring_radius(image, CENTRE, "ml", "r2")
-    with pytest.raises(InputError, match="centre: .* expected inside"):
+    with pytest.raises(InputError, match=r"centre: .* expected inside"):
         ring_radius(image, (-100.0, 3.0))
     with pytest.raises(InputError, match="centre: 'xx' is not one of ca, ml"):
         find_centre(image, "xx")

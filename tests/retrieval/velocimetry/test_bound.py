@@ -23,7 +23,7 @@ def wave(a, b, rows=60, columns=80):
 
 
 def test_two_waves_have_the_closed_form():
-    """Slopes (a, b) and (a, -b) of amplitude 0.1: mean squares 0.01 a^2 and 0.01 b^2, no product."""
+    """Slopes (a, b), (a, -b) of amplitude 0.1: mean squares 0.01 a^2 and 0.01 b^2, no product."""
     a, b, noise, n = 2 * np.pi / 8, 2 * np.pi / 12, 0.01, 24
     image = wave(a, b) + wave(a, -b)
     zz, yy, zy = displacement_bound(image, image, noise, n)

@@ -25,7 +25,7 @@ def wind_errors(pair, method, **options):
     wind = retrieve_wind(pair.first, pair.second, DT, method, noise=pair.noise or None, **options)
     z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
     errors = np.stack(
-        [wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z))]
+        [wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z), strict=True)]
     )
     stderr = np.stack([wind["v_stderr"].values, wind["w_stderr"].values])
     far = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) > 6
@@ -69,7 +69,7 @@ def shifted(dz, dy, pattern=None, rows=60, columns=70, seed=3):
 @pytest.mark.parametrize("shift", [(0.0, 0.5), (0.25, -1.3), (-3.4, 2.7)])
 def test_uniform_shift_is_found(shift):
     found = multipass(*shifted(*shift))
-    for d, true in zip((found.dz, found.dy), shift):
+    for d, true in zip((found.dz, found.dy), shift, strict=True):
         # windows at the rim lose what leaves the picture
         rim = 4 + math.ceil(max(map(abs, shift)))
         inner = d[rim:-rim, rim:-rim]
@@ -155,14 +155,14 @@ def test_large_scans_are_worked_off_in_bands(monkeypatch):
     ],
 )
 def test_bad_input_is_named(change, message):
-    pair = dict(zip(("image1", "image2"), shifted(0, 0)))
+    pair = dict(zip(("image1", "image2"), shifted(0, 0), strict=True))
     with pytest.raises(InputError, match=message):
         multipass(**pair | change)
 
 
 @pytest.mark.parametrize("method", ["cc", "multipass", "variational"])
 def test_particle_images(method):
-    """A PIV pair: Gaussian particles of 3.2 px (1/e^2), 0.05 a pixel, in a plane shear; exact positions."""
+    """Gaussian particles of 3.2 px (1/e^2), 0.05 a pixel, in a plane shear; exact positions."""
     rows, columns, density, radius = 90, 110, 0.05, 3.2 / 4
     random = np.random.default_rng(9)
     z0, y0 = random.uniform(-15, (rows + 15, columns + 15), (int(density * 120 * 140), 2)).T

@@ -28,12 +28,12 @@ def rms(values):
 
 
 def wind_errors(pair):
-    """Errors of v and w (2, vectors), m/s, their standard errors, which are far, all of the whole."""
+    """Errors of v and w (2, z, y), m/s, their standard errors, and which are far from the cores."""
     wind = retrieve_wind(pair.first, pair.second, DT, "variational", noise=pair.noise or None)
     assert (wind.flag == 0).mean() > 0.95
     z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
     errors = np.stack(
-        [wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z))]
+        [wind[n].values - true for n, true in zip("vw", velocity(pair.vortices, y, z), strict=True)]
     )
     stderr = np.stack([wind["v_stderr"].values, wind["w_stderr"].values])
     far = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) > 6
@@ -77,7 +77,7 @@ def test_standard_errors_cover_the_errors_and_beat_the_bound_of_a_window():
     pairs = [vortex_pair_images(0.03, seed) for seed in (1, 2)]
     found = [wind_errors(pair) for pair in pairs]
     check_coverage(found)
-    for pair, (errors, _, far) in zip(pairs, found):
+    for pair, (errors, _, far) in zip(pairs, found, strict=True):
         images = [torch.tensor(image.values) for image in (pair.first, pair.second)]
         bound = displacement_bound(*images, 0.03, 16)[1].mean().sqrt() * SPACING / DT
         assert rms(errors[0][far]) < 1.5 * bound
@@ -212,7 +212,7 @@ def test_short_waves_do_not_pull_displacements_to_whole_pixels(moved):
     phase = random.uniform(0, 2 * math.pi, 400)
 
     def pattern(z, y):
-        return sum(np.cos(a * z + b * y + c) for (a, b), c in zip(vector, phase)) / 14
+        return sum(np.cos(a * z + b * y + c) for (a, b), c in zip(vector, phase, strict=True)) / 14
 
     pair = [torch.tensor(pattern(z, y - moved * t)) for t in (-0.5, 0.5)]
     found = variational(*pair, noise=0.02)
@@ -241,7 +241,7 @@ def test_where_images_share_less_standard_errors_are_larger():
 
 
 def test_a_flow_that_diverges_everywhere_is_found():
-    """As of wind through the plane; the prior starts from ten times less divergence than vorticity."""
+    """As of wind through the plane; the prior starts from divergence 0.1 of vorticity."""
     z, y = grid(80, 110)
     pattern = waves(8, 3.0)
     random = np.random.default_rng(8)
@@ -280,7 +280,11 @@ def blurred_errors(seed, noise, sigma):
         true = velocity(pair.vortices, y, z)
         core = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) < 6
         errors.append(
-            [rms((wind[n].values - t)[m]) for m in (core, ~core) for n, t in zip("vw", true)]
+            [
+                rms((wind[n].values - t)[m])
+                for m in (core, ~core)
+                for n, t in zip("vw", true, strict=True)
+            ]
         )
     return np.reshape(errors, (2, 2, 2))
 

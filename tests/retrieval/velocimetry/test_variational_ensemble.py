@@ -60,7 +60,7 @@ def check(reduced, allowed=0.05):
 
 
 def test_coverage_on_the_shipped_wake():
-    reduced, errors = zip(*(reduced_errors(seed, 1.0) for seed in (1, 2)))
+    reduced, errors = zip(*(reduced_errors(seed, 1.0) for seed in (1, 2)), strict=True)
     # neighbours share their errors: the shares of one pair of pictures scatter by 2.5 points
     check(np.concatenate(reduced), 0.05 + 2 * 0.025 / np.sqrt(2))
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.1

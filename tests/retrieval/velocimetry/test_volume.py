@@ -27,7 +27,7 @@ def errors(found, true):
     """Errors in voxels, by component, where true(place) gives voxels in dt, and reduced ones."""
     places = np.stack(np.meshgrid(*(found[a].values / SPACING for a in "xzy"), indexing="ij"))
     off, reduced = {}, {}
-    for name, expected in zip(("u", "w", "v"), true(places)):
+    for name, expected in zip(("u", "w", "v"), true(places), strict=True):
         off[name] = (found[name].values * DT / SPACING - expected)[found["flag"].values == 0]
         reduced[name] = (
             off[name] / (found[f"{name}_stderr"].values * DT / SPACING)[found["flag"].values == 0]
@@ -198,7 +198,8 @@ def test_errors_reach_the_bound_of_a_known_shift():
 
     One rigid shift of both volumes, texture unknown: the differences of the volumes have twice the
     noise, so the information is that of sum |grad texture|^2 / (2 noise^2). A window of the
-    correlation sees the Gaussian's share of it, has gradients to find as well, and can do no better.
+    correlation sees the Gaussian's share of it, has gradients to find as well, and can do no
+    better.
     """
     shape, noise, step = (12, 12, 12), 0.01, 1e-2
     texture, places = random_waves(3, 120), nodes(shape)

@@ -50,7 +50,7 @@ def test_equals_the_definition(template, search, stride, dtype):
     first, second = (torch.as_tensor(1e-3 * (1 + rng.random((22, 25)))).to(dtype) for _ in "12")
     expected = direct(first.double().numpy(), second.double().numpy(), template, search, stride)
     found = weight_shift(first, second, template, search, stride)
-    for value, reference in zip((*found.d, found.score, found.flag), expected):
+    for value, reference in zip((*found.d, found.score, found.flag), expected, strict=True):
         np.testing.assert_allclose(value, reference, atol=1e-9)
 
 
@@ -59,7 +59,7 @@ def test_tiles_change_nothing(monkeypatch):
     first, second = (torch.as_tensor(1 + rng.random((40, 43))) for _ in "12")
     whole = weight_shift(first, second, stride=2)
     monkeypatch.setattr("lidar_mi.retrieval.velocimetry.windows.TILE_BYTES", 60_000)
-    for one, other in zip(weight_shift(first, second, stride=2), whole):
+    for one, other in zip(weight_shift(first, second, stride=2), whole, strict=True):
         torch.testing.assert_close(one, other, equal_nan=True)
 
 

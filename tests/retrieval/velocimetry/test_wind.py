@@ -50,7 +50,9 @@ def scores(pairs, method):
         y, z = dataset.y_vector.values, dataset.z_vector.values
         far = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) > 2 * CORE_RADIUS
         good = dataset.flag.values == 0
-        for found, true in zip((dataset.v.values, dataset.w.values), velocity(pair.vortices, y, z)):
+        for found, true in zip(
+            (dataset.v.values, dataset.w.values), velocity(pair.vortices, y, z), strict=True
+        ):
             error = found - true
             rows.append(
                 [

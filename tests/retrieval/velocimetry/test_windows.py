@@ -51,7 +51,7 @@ def test_window_sums_are_weighted_sums():
     for axis, step in ((1, 1), (1, 3), (2, 2), (2, 1)):
         found = window_sums(fields, kernels, step, axis)
         pieces = fields.unfold(axis, 7, step)
-        for sums, kernel in zip(found, kernels):
+        for sums, kernel in zip(found, kernels, strict=True):
             torch.testing.assert_close(sums, pieces @ kernel)
 
 

@@ -161,8 +161,9 @@ def test_missing_pixels_and_a_map_of_the_noise():
 
 
 def test_a_map_that_says_too_little():
-    """Half of the noise that there is: what the filter takes for texture would be noise, which draws
-    displacements to where splines damp it. Twice ten parameters within errors for the whole."""
+    """Half of the noise that there is: what the filter takes for texture would be noise, which
+    draws displacements to where splines damp it. Twice ten parameters within errors for the
+    whole."""
     reduced = []
     for seed in (1, 2):
         pair = vortex_pair_images(0.06, seed=seed, vortices=uneven(), **SMALL)
@@ -175,8 +176,8 @@ def test_a_map_that_says_too_little():
 
 
 def test_noise_that_lies_in_one_place():
-    """Around one core four times that of elsewhere, said to be even: residuals tell, and the errors of
-    that vortex are of the size that it is off by (3.5 times too small by what is said alone)."""
+    """Around one core four times that of elsewhere, said to be even: residuals tell, and the errors
+    of that vortex are of the size that it is off by (3.5 times too small by what is said alone)."""
     reduced = []
     for seed in (1, 2, 3):
         pair = vortex_pair_images(0.0, seed=seed, vortices=uneven(), **SMALL)
@@ -254,7 +255,7 @@ def simulated(texture_rms, noise):
 
 
 def test_simulated_wake_with_texture():
-    """Circulation to 5 % and places to 0.5 m; the file says 440 and 438 m^2/s, y = +-23.4 m, z = -0.5 m."""
+    """Circulation to 5 %, places to 0.5 m: 440 and 438 m^2/s, y = +-23.4 m, z = -0.5 m."""
     truth, found = simulated(0.1, 0.01)
     assert found.success
     values = {name: q.value for name, q in found.quantities.items()}
@@ -298,7 +299,7 @@ def stirred(seed, rms, length):
 
     def flow(y, z):
         v, w = velocity(uneven(), y, z)
-        for (a, b), phase in zip(vectors, phases):
+        for (a, b), phase in zip(vectors, phases, strict=True):
             slope = -scale * np.sin(a * y + b * z + phase)
             v, w = v - b * slope, w + a * slope
         return v, w

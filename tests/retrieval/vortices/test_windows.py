@@ -1,5 +1,5 @@
-"""The vortex fit as a method among others: detects a vector that differs from the fit's own wind, and
-a failed fit that leaves valid vectors."""
+"""The vortex fit as a method among others: detects a vector that differs from the fit's own wind,
+and a failed fit that leaves valid vectors."""
 
 import numpy as np
 import pytest
