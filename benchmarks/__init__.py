@@ -7,6 +7,8 @@ median over the turns, because machines are noisy and differ.
 estimators   the gated estimator against the analog one
 transient    the renderer against mitransient's volumetric integrator
 velocimetry  cross-correlation against OpenPIV
+methods      wind from exact images by all methods, and by public codes
+settings     wind after each setting of a method is halved and doubled
 rendered     wind from rendered pictures by all methods, and the share of every cause of error
 renderer     speed and memory of the renderer alone
 rings        wind from ring pictures, all rings at once, against a 2-D fit and scipy

@@ -16,6 +16,7 @@ COMPARISONS = (
     "transient",
     "velocimetry",
     "methods",
+    "settings",
     "rendered",
     "renderer",
     "fringes",

@@ -1,7 +1,6 @@
 """Images and volumes as band-limited functions of place: values and gradients anywhere."""
 
 from collections.abc import Sequence
-from itertools import product
 from typing import NamedTuple
 
 import scipy.fft
@@ -265,11 +264,9 @@ def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
 
 def _refined(spectrum: torch.Tensor, sizes: Sequence[int], finer: int) -> torch.Tensor:
     """Fields of odd sizes (axes but the first) from their spectra, on a grid that is finer."""
-    fine = [finer * size for size in sizes]
-    padded = spectrum.new_zeros(len(spectrum), *fine[:-1], fine[-1] // 2 + 1)
-    # waves of positive and of negative number stay at their ends of each axis but the last
-    halves = [(slice(n // 2 + 1), slice(n // 2 + 1 - n, None)) for n in sizes[:-1]]
-    column = slice(spectrum.shape[-1])
-    for corner in product(*halves):
-        padded[:, *corner, column] = spectrum[:, *corner]
-    return finer ** len(sizes) * torch.fft.irfftn(padded, s=fine, dim=tuple(range(1, padded.ndim)))
+    # axis by axis: what is not yet refined is small
+    for axis, n in enumerate(sizes[:-1], 1):
+        low, high = spectrum.split([n // 2 + 1, n // 2], axis)
+        shape = [*spectrum.shape[:axis], (finer - 1) * n, *spectrum.shape[axis + 1 :]]
+        spectrum = torch.fft.ifft(torch.cat([low, low.new_zeros(shape), high], axis), dim=axis)
+    return finer ** len(sizes) * torch.fft.irfft(spectrum, n=finer * sizes[-1])

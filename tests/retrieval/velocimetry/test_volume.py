@@ -20,6 +20,7 @@ from tests.support.volumes import (
     random_waves,
     shifted,
     volume,
+    vortex_pair,
 )
 
 
@@ -142,34 +143,6 @@ def test_solid_rotation_about_x(method):
     for name in "uvw":
         assert rms(off[name]) < 0.07, name
         assert abs(np.mean(off[name])) < 0.05, name
-
-
-def vortex_pair(shape, steps=8):
-    """Two Lamb-Oseen vortices along x with a wavy wind along them: velocity and way back."""
-    gamma, core, apart, height, width = 400.0 * DT / SPACING**2, 6.0, 34.0, *shape[1:]
-
-    def velocity(x):
-        total = np.zeros_like(x)
-        total[0] = 0.2 + 0.3 * np.sin(2 * np.pi * x[2] / 40) * np.cos(2 * np.pi * x[1] / 30)
-        for sign in (1, -1):
-            dy = x[2] - (width - 1) / 2 - sign * apart / 2
-            dz = x[1] - (height - 1) / 2
-            square = np.maximum(dy**2 + dz**2, 1e-9)
-            turn = sign * gamma / (2 * np.pi * square) * -np.expm1(-1.25643 * square / core**2)
-            total[1] += turn * dy
-            total[2] -= turn * dz
-        return total
-
-    def back(x, t):
-        h = -t / steps
-        for _ in range(steps):
-            k1 = velocity(x)
-            k2 = velocity(x + h / 2 * k1)
-            k3 = velocity(x + h / 2 * k2)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + velocity(x + h * k3))
-        return x
-
-    return velocity, back
 
 
 @pytest.mark.slow
