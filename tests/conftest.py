@@ -1,9 +1,8 @@
 # ruff: noqa: E402 - numpy and torch count their threads when they are imported
 """What every test may ask for: Mitsuba in a given variant; one thread for each of many processes.
 
-With pytest-xdist (`make test`) every process runs on one thread. The tests of a module go to one
-process, which builds the module's fixtures once; so do all tests that look at the run of the demo.
-Processes share Dr.Jit's kernel cache: it writes a kernel nameless and links it into place.
+With pytest-xdist (`make test`) every process runs on one thread, and all tests of a file in one
+process. Processes share Dr.Jit's kernel cache: it writes a kernel nameless and links it into place.
 """
 
 import gc
@@ -25,13 +24,6 @@ def pytest_configure():
         import drjit
 
         drjit.set_thread_count(1)
-
-
-def pytest_collection_modifyitems(items):
-    """Groups for ``--dist loadgroup``."""
-    for item in items:
-        group = "demo" if "demo" in item.fixturenames else item.path.as_posix()
-        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(scope="session")

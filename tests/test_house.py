@@ -1,7 +1,7 @@
 """The house: which room may import which, who may load Mitsuba, who opens files.
 
 Detects an arrow back up, a circle, a private name taken from another module, a file read or written
-outside io, a module that only forwards or has grown too long.
+outside io, a module that only forwards or has grown too long, a test that imports another.
 """
 
 import ast
@@ -227,6 +227,19 @@ def modules_of_imports_only() -> list[str]:
     return found
 
 
+def imports_between_tests() -> list[str]:
+    """What several tests use is in tests/support."""
+    found = []
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        place = str(path.relative_to(ROOT))
+        for one in imports(place, ast.parse(path.read_text())):
+            parts = one.split(".")
+            shared = parts[:2] == ["tests", "support"] and not parts[-1].startswith("test_")
+            if parts[0] in ("tests", "conftest") and not shared:
+                found.append(f"{place} imports {one}")
+    return found
+
+
 RULES = (
     wrong_arrows,
     circles,
@@ -236,6 +249,7 @@ RULES = (
     files_opened_elsewhere,
     long_files,
     modules_of_imports_only,
+    imports_between_tests,
 )
 
 

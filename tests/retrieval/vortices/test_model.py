@@ -16,8 +16,9 @@ from lidar_mi.retrieval.vortices.model import (
     sensitivity,
     wind,
 )
-from tests.retrieval.vortices.test_windows import DT
 from tests.support.vortex_pairs import uneven, vector
+
+DT = 0.1
 
 
 def grid(columns=41, rows=31, spacing=1.0):

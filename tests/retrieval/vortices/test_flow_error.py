@@ -1,0 +1,117 @@
+"""What a vortex model misses: physics tests against sums over all pairs of places and fields drawn
+from a known covariance. Detect a wrong factor in a correlation or a matrix, an error of a quarter in
+the variance of the missed flow, and noise of pixels taken for it."""
+
+import numpy as np
+import pytest
+import torch
+
+from lidar_mi.retrieval.vortices.flow_error import (
+    FlowError,
+    Lags,
+    flow_error,
+    mean_length,
+    spread_of,
+)
+
+ERROR = FlowError((0.3, 0.1), (2.0, 5.0))
+
+
+def distances(shape):
+    """Between all places of a grid, steps."""
+    places = np.stack(np.meshgrid(*map(np.arange, shape), indexing="ij"), -1).reshape(-1, 2)
+    return np.linalg.norm(places[:, None] - places, axis=-1)
+
+
+def dense(error, shape):
+    """Covariance matrix of one component over a grid."""
+    h = distances(shape)
+    return sum(
+        a * np.exp(-(h**2) / (2 * n**2))
+        for a, n in zip(error.variances, error.lengths, strict=True)
+    )
+
+
+def test_covariance_is_a_sum_of_gaussians():
+    at = torch.tensor([0.0, 2.0, 10.0], dtype=torch.float64)
+    expected = [
+        0.4,
+        0.3 * np.exp(-0.5) + 0.1 * np.exp(-0.08),
+        0.3 * np.exp(-12.5) + 0.1 * np.exp(-2),
+    ]
+    np.testing.assert_allclose(ERROR.covariance(at), expected, rtol=1e-12)
+    assert ERROR.variance == pytest.approx(0.4)
+    assert mean_length(ERROR) == pytest.approx((0.3 * 2 + 0.1 * 5) / 0.4)
+    assert mean_length(FlowError()) == 0 and FlowError().variance == 0
+
+
+@pytest.mark.parametrize("shape", [(7, 9), (8, 5)])
+def test_autocorrelation_is_the_sum_over_pairs(shape):
+    random = torch.Generator().manual_seed(2)
+    fields = torch.randn(2, *shape, generator=random, dtype=torch.float64)
+    lags = Lags(shape, fields)
+    found = lags.autocorrelation(fields, (1.0, 3.0))
+    distance = lags.distance()
+    for dz, dy in ((0, 0), (2, 1), (-1, 3), (shape[0] - 1, 0)):
+        expected = 0.0
+        for weight, field in zip((1.0, 3.0), fields.numpy(), strict=True):
+            for z in range(shape[0]):
+                for y in range(shape[1]):
+                    if 0 <= z + dz < shape[0] and 0 <= y + dy < shape[1]:
+                        expected += weight * field[z, y] * field[z + dz, y + dy]
+        assert float(found[dz, dy]) == pytest.approx(expected, rel=1e-10, abs=1e-10)
+        assert float(distance[dz, dy]) == pytest.approx(np.hypot(dz, dy))
+
+
+@pytest.mark.parametrize("shape", [(9, 11), (12, 8)])
+def test_spread_is_that_of_the_dense_matrix(shape):
+    """P C P^T, one component after the other; the Gaussians' spectrum loses 1e-6 to the padding."""
+    responses = torch.randn(
+        3, 2, *shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64
+    )
+    flat = responses.flatten(2).numpy()
+    matrix = dense(ERROR, shape)
+    expected = sum(flat[:, a] @ matrix @ flat[:, a].T for a in (0, 1))
+    size = np.abs(expected).max()
+    np.testing.assert_allclose(spread_of(responses, ERROR), expected, atol=2e-2 * size)
+    assert (spread_of(responses, FlowError()) == 0).all()
+
+
+def residuals(variance, length, noise, seed, shape=(40, 50)):
+    """Force and stiffness of residuals r = g . d + n with slopes and a displacement drawn at random."""
+    random = np.random.default_rng(seed)
+    axes = [np.arange(n) for n in shape]
+    # the covariance is a product over the axes, and so is its root
+    roots = [
+        np.linalg.cholesky(
+            np.exp(-((a[:, None] - a) ** 2) / (2 * length**2)) + 1e-9 * np.eye(len(a))
+        )
+        for a in axes
+    ]
+    d = [np.sqrt(variance) * roots[0] @ random.standard_normal(shape) @ roots[1].T for _ in "yz"]
+    g = random.standard_normal((2, *shape))
+    r = g[0] * d[0] + g[1] * d[1] + noise * random.standard_normal(shape)
+    weight = 1 / (noise**2 + variance * (g**2).sum(0))
+    force = weight * g * r
+    stiffness = weight * np.stack([g[0] ** 2, g[0] * g[1], g[1] ** 2])
+    return [torch.as_tensor(part) for part in (force, stiffness)]
+
+
+def test_variance_and_length_are_those_drawn():
+    """16 draws (seeds 0 to 15) of 0.04 m^2 over 6 steps: 2 x 2000 / (4 pi 36) = 9 independent
+    values a draw of noise 0.1, whose mean square scatters by sqrt(2 / 140) = 12 % in all."""
+    found = [flow_error(*residuals(0.04, 6.0, 0.1, seed), 1.0) for seed in range(16)]
+    assert np.mean([one.variance for one in found]) == pytest.approx(0.04, rel=0.36)
+    lengths = [mean_length(one) for one in found]
+    assert np.mean(lengths) == pytest.approx(6.0, rel=0.36)
+
+
+def test_noise_of_pixels_is_no_flow():
+    """White residuals of standard deviation 0.1 and slopes of 1: a flow of as much would be 0.01 m^2."""
+    found = [flow_error(*residuals(0.0, 6.0, 0.1, seed), 1.0).variance for seed in range(8)]
+    assert np.mean(found) < 2e-4
+
+
+def test_nothing_known_is_no_error():
+    nothing = torch.zeros(3, 20, 20, dtype=torch.float64)
+    assert flow_error(nothing[:2], nothing, 1.0) == FlowError()
