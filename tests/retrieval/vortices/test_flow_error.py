@@ -1,6 +1,8 @@
-"""What a vortex model misses: physics tests against sums over all pairs of places and fields drawn
-from a known covariance. Detect a wrong factor in a correlation or a matrix, an error of a quarter in
-the variance of the missed flow, and noise of pixels taken for it."""
+"""What a vortex model misses: sums over all pairs of places, fields drawn from known covariance.
+
+Physics tests. Detect a wrong factor in a correlation or a matrix, an error of a quarter in the
+variance of the missed flow, and noise of pixels taken for it.
+"""
 
 import numpy as np
 import pytest
@@ -78,7 +80,7 @@ def test_spread_is_that_of_the_dense_matrix(shape):
 
 
 def residuals(variance, length, noise, seed, shape=(40, 50)):
-    """Force and stiffness of residuals r = g . d + n with slopes and a displacement drawn at random."""
+    """Force and stiffness of residuals r = g . d + n, slopes and displacement drawn at random."""
     random = np.random.default_rng(seed)
     axes = [np.arange(n) for n in shape]
     # the covariance is a product over the axes, and so is its root
@@ -107,7 +109,7 @@ def test_variance_and_length_are_those_drawn():
 
 
 def test_noise_of_pixels_is_no_flow():
-    """White residuals of standard deviation 0.1 and slopes of 1: a flow of as much would be 0.01 m^2."""
+    """White residuals of standard deviation 0.1, slopes of 1: as a flow, this would be 0.01 m^2."""
     found = [flow_error(*residuals(0.0, 6.0, 0.1, seed), 1.0).variance for seed in range(8)]
     assert np.mean(found) < 2e-4
 

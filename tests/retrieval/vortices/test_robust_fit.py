@@ -1,5 +1,8 @@
-"""Robust least squares: unit tests against scipy's M-estimator and normal equations. Detect outliers
-that pull, weights that forget the flow's error, and a fit that stopped short taken for converged."""
+"""Robust least squares against scipy's M-estimator and normal equations.
+
+Unit tests. Detect outliers that pull, weights that forget the flow's error, and a fit that stopped
+short taken for converged.
+"""
 
 import numpy as np
 import pytest
@@ -90,7 +93,7 @@ def test_what_is_not_valid_has_no_weight():
 
 
 def test_weights_in_closed_form():
-    """1 / (variance + flow variance g^2), times 3 / size beyond 3 standard deviations of the scatter."""
+    """1 / (variance + flow variance g^2), times 3 / size beyond 3 standard deviations."""
     values = [torch.tensor([x], dtype=torch.float64) for x in (6.0, 1.0, 0.25, 0.16)]
     residual, slope, variance, scatter = values
     misfit = Misfit(

@@ -1,5 +1,8 @@
-"""Where fits of a vortex pair start: unit tests against least squares pair by pair. Detect a pair of
-the wrong sense, places off by more than the grid, and worse pairs ahead of better ones."""
+"""Where fits of a vortex pair start: least squares pair by pair.
+
+Unit tests. Detect a pair of the wrong sense, places off by more than the grid, worse pairs ahead
+of better ones.
+"""
 
 import numpy as np
 import pytest
