@@ -23,6 +23,7 @@ def pytest_configure():
     if IS_WORKER:
         import drjit
 
+        # mitsuba.Bitmap reads and writes EXR on a second thread: here it would wait for ever
         drjit.set_thread_count(1)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import mitsuba as mi
 import numpy as np
+import OpenEXR
 import pytest
 
 from lidar_mi.atmosphere.line import Line, backscatter_line
@@ -157,7 +158,7 @@ def test_picture_and_header_survive_the_file(tmp_path):
     assert np.array_equal(layers["Y"], picture["S0"])
     with pytest.raises(InputError, match="are not a picture of a fringe camera; expected S0, S1"):
         write_only = tmp_path / "other.exr"
-        mi.Bitmap(np.zeros((4, 4, 3), np.float32)).write(str(write_only))
+        OpenEXR.File({}, {"RGB": np.zeros((4, 4, 3), np.float32)}).write(str(write_only))
         read_fringes(write_only)
 
 
