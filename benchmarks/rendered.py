@@ -17,7 +17,7 @@ from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.error_budget import budgets
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.truth import Truth
-from lidar_mi.instrument.detection import noisy_scan
+from lidar_mi.instrument.detector_noise import noisy_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant

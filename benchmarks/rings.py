@@ -10,11 +10,12 @@ import torch
 from scipy.optimize import least_squares
 
 from lidar_mi.experiment.ring_instrument import air_rings, pixel_noise
+from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.etalon import Etalon
-from lidar_mi.instrument.fringe_camera import CCD, FringeCamera
+from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.retrieval.rings.cells import pixels
-from lidar_mi.retrieval.rings.fit import fit_rings
+from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
 from lidar_mi.retrieval.rings.model import RingModel, cramer_rao, expected, mean_and_jacobian
 
 from .measure import in_turns

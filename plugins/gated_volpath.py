@@ -58,8 +58,8 @@ import gc
 import drjit as dr
 import mitsuba as mi
 
+from .light_paths import Lidar
 from .parameters import choice, fail, whole
-from .paths import Lidar
 from .polarization import first_unpolarized_in_blend
 from .registration import register
 

@@ -37,7 +37,7 @@ def info(
     single-scattering albedo, lidar ratio, depolarisation ratio.
     """
     from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment.info import sections
+    from lidar_mi.experiment.describe import sections
     from lidar_mi.experiment.run_folder import failure, read_metrics, read_record
     from lidar_mi.experiment.study import RECORD
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from lidar_mi.assessment.metrics.requirements import look_ahead
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment.info import Section
+from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import Truth

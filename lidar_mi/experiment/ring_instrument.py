@@ -11,9 +11,10 @@ import numpy as np
 from lidar_mi.atmosphere.line import Line, backscatter_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.etalon import Etalon, harmonics
-from lidar_mi.instrument.fringe_camera import CCD, FringeCamera
+from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
 
 # Around the expected temperature: five nodes hold harmonics of air to 1e-4 of the ring contrast.

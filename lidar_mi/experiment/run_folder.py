@@ -15,7 +15,7 @@ from lidar_mi.experiment import log, reading
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.truth import find_file
-from lidar_mi.instrument.detection import without_noise
+from lidar_mi.instrument.detector_noise import without_noise
 from lidar_mi.io import exr
 from lidar_mi.io.json import read_json, write_json
 from lidar_mi.io.netcdf import write_netcdf

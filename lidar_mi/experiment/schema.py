@@ -1,4 +1,7 @@
-"""What an experiment file may say: every key, its unit, its default and its limits."""
+"""What an experiment file may say: every key, its unit, its default and its limits.
+
+The air's keys are in `schema_air`, the instruments' in `lidar_mi.instrument`.
+"""
 
 import math
 import re
@@ -7,12 +10,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field, PrivateAttr, field_validator, model_validator
 
-from lidar_mi.experiment.air import Scattering, Section, Wake
+from lidar_mi.experiment.schema_air import Scattering, Section, Wake
+from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors
 from lidar_mi.instrument.etalon import Etalon
-from lidar_mi.instrument.fringe_camera import CCD, FringeCamera
+from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings

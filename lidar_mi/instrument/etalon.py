@@ -7,6 +7,8 @@ light passes where m is an integer: the phase of reflection is tuned away with t
 As a series in the order the transmission is T(m) = A_0 + 2 sum A_n cos(2 pi n m). A line with the
 Fourier transform chi (`lidar_mi.atmosphere.line.Line`) replaces A_n by A_n chi(n / FSR), uneven
 plates into A_n D_n: all convolutions are products.
+
+The Mitsuba plugin `etalon` computes the same transmission ray by ray; tests compare the two.
 """
 
 import math

@@ -1,11 +1,10 @@
-"""The camera behind the etalon: where the rings fall, and the noise of the CCD they fall on.
+"""The camera behind the etalon: where the rings fall.
 
 Pixels are counted from 0, x to the right and y down, from the middle of the top left one; images
 have the shape (height, width).
 """
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,15 +14,14 @@ from pydantic import BaseModel, ConfigDict, Field
 from lidar_mi.atmosphere.line import Line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon, cosine_inside, fractional_order, harmonics, series
-from lidar_mi.units import Frequency, Length, Number, Time, quantity
+from lidar_mi.units import Length
 
-_CONFIG = ConfigDict(frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False)
 # Two Gauss-Legendre points average a pixel to fourth order.
 _NODES = {1: (0.0,), 2: (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))}
 
 
 class FringeCamera(BaseModel):
-    """Lens and CCD; lengths in m, text with units is read as such.
+    """Lens and the CCD's pixels; lengths in m, text with units is read as such.
 
     The paper gives 960 x 780 pixels; the other defaults are derived, as those of the
     `lidar_mi.instrument.etalon.Etalon`. Light at the angle theta to the axis falls
@@ -31,7 +29,9 @@ class FringeCamera(BaseModel):
     centre; what a lens loses by itself, cos(theta)^4, is 0.05 % in the corners and left out.
     """
 
-    model_config = _CONFIG
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
+    )
 
     focal_length: Length = Field(0.3, gt=0, description="of the lens")
     pixel: Length = Field(7.4e-6, gt=0, description="side of a pixel")
@@ -69,29 +69,6 @@ class FringeCamera(BaseModel):
     def illumination(self, radius_squared: ArrayLike) -> np.ndarray:
         """Light that reaches the CCD without an etalon, relative to the rings' centre."""
         return np.exp(-2 * np.asarray(radius_squared, float) / self.illumination_radius**2)
-
-
-class CCD(BaseModel):
-    """How a CCD counts; numbers of photoelectrons unless said otherwise.
-
-    ``quantum_efficiency`` is 1 by default because the paper's photon numbers count the photons
-    that the CCD detects. The other defaults are those of a scientific camera, not the paper's.
-    """
-
-    model_config = _CONFIG
-
-    quantum_efficiency: Number = Field(1.0, gt=0, le=1, description="photoelectrons per photon")
-    read_noise: Number = Field(5.0, ge=0, description="rms a pixel")
-    dark_current: Frequency = Field(
-        quantity("1 Hz"), ge=0, description="photoelectrons a pixel in the dark"
-    )
-    integration_time: Time = Field(
-        quantity("10 ms"), ge=0, description="from one read-out to the next; a laser of 100 Hz"
-    )
-    full_well: Number = Field(20e3, gt=0, description="most a pixel holds; no blooming")
-    gain: Number = Field(1.0, gt=0, description="photoelectrons a step of the digitiser")
-    bits: int | None = Field(16, ge=1, le=32, description="of the digitiser; null: no rounding")
-    bias: int = Field(100, ge=0, description="steps of the digitiser without a signal")
 
 
 def fringe_image(
@@ -180,60 +157,6 @@ def ring_radii(
     return camera.focal_length * np.sqrt(sine2 / (1 - sine2)) / camera.pixel
 
 
-def expose(
-    expected: torch.Tensor,
-    ccd: CCD,
-    seed: int,
-    images: int | Sequence[int] | None = None,
-    modes: float | torch.Tensor = math.inf,
-    background: float = 0.0,
-) -> torch.Tensor:
-    """Read the CCD: noisy images, in photoelectrons.
-
-    The mean of a pixel is drawn from a Gamma distribution of shape ``modes`` (speckle), the number
-    of photoelectrons from a Poisson one and clipped at the full well; Gaussian read noise is
-    added, the sum rounded to the digitiser's steps and clipped to its range, and bias and gain are
-    taken out again. What background and dark current add on average is left in. Pixels are
-    independent of each other: speckles are taken as smaller than a pixel.
-
-    Parameters
-    ----------
-    expected : tensor (height, width) or (N, height, width)
-        Mean photons of every pixel; noise is drawn on its device.
-    seed : int
-        Image k of a seed has its own stream of random numbers, whatever else is drawn.
-    images : int or sequence of int, optional
-        How many images, or the numbers k of the images; default: 1 or N.
-    modes : float or tensor
-        Degrees of freedom M of the speckle in a pixel, above 0; infinite: none.
-    background : float
-        Mean photons of incoherent light, a pixel.
-
-    Returns
-    -------
-    torch.Tensor
-        float32, (number of images, height, width).
-
-    Raises
-    ------
-    InputError
-    """
-    expected = torch.as_tensor(expected).double()
-    _check_image(expected, background)
-    modes = torch.as_tensor(modes, dtype=torch.float64, device=expected.device)
-    if not bool((modes > 0).all()):
-        raise InputError("modes: expected numbers above 0, or inf for no speckle")
-    numbers = _image_numbers(images, expected)
-    means = expected * ccd.quantum_efficiency
-    floor = background * ccd.quantum_efficiency + ccd.dark_current * ccd.integration_time
-    frames = expected.new_empty((len(numbers), *expected.shape[-2:]), dtype=torch.float32)
-    # one image at a time, so that its noise depends on its own number alone
-    for i, (frame, number) in enumerate(zip(frames, numbers, strict=True)):
-        mean = means if means.ndim == 2 else means[i]
-        frame[:] = _read(mean, floor, modes, ccd, _generator(seed, number, expected.device))
-    return frames
-
-
 def _passed(camera, etalon, line, speeds, subsamples):
     """Light behind the etalon (N, height, width), and the sum of what came."""
     if subsamples not in _NODES:
@@ -252,56 +175,6 @@ def _passed(camera, etalon, line, speeds, subsamples):
             order = fractional_order(etalon, line.wavelength, cosine, offset)
             image += series(amplitudes, torch.from_numpy(order)) * torch.from_numpy(falloff)
     return passed, light
-
-
-def _read(mean, floor, modes, ccd, generator):
-    """One image in photoelectrons."""
-    if not bool(torch.isinf(modes).all()):
-        shape = modes.expand(mean.shape)
-        # what torch.distributions.Gamma draws with, which takes no generator
-        drawn = torch._standard_gamma(torch.nan_to_num(shape, posinf=1.0), generator=generator)
-        mean = torch.where(torch.isinf(shape), mean, mean * drawn / shape)
-    electrons = torch.poisson(mean + floor, generator=generator).clamp(max=ccd.full_well)
-    if ccd.read_noise > 0:
-        noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
-        electrons = electrons + ccd.read_noise * noise
-    if ccd.bits is None:
-        return electrons
-    steps = torch.round(electrons / ccd.gain + ccd.bias).clamp(0, 2**ccd.bits - 1)
-    return (steps - ccd.bias) * ccd.gain
-
-
-def _generator(seed, number, device):
-    """Streams of all pairs of seed and number are hashed apart."""
-    for name, value in (("seed", seed), ("images", number)):
-        if not isinstance(value, int | np.integer) or value < 0:
-            raise InputError(f"{name}: {value!r} is not allowed; expected an integer, 0 or more")
-    state = np.random.SeedSequence([seed, number]).generate_state(1, np.uint64)[0]
-    # torch takes seeds as signed numbers
-    return torch.Generator(device).manual_seed(int(state) >> 1)
-
-
-def _image_numbers(images, expected):
-    count = expected.shape[0] if expected.ndim == 3 else None
-    if images is None:
-        images = count or 1
-    numbers = list(range(images)) if isinstance(images, int) else list(images)
-    if count is not None and len(numbers) != count:
-        raise InputError(
-            f"images: {len(numbers)} are not allowed; expected one for each of {count}"
-        )
-    return numbers
-
-
-def _check_image(expected, background):
-    if expected.ndim not in (2, 3):
-        raise InputError(
-            f"expected: {expected.ndim} dimensions are not allowed; expected (height, width) or "
-            "(N, height, width)"
-        )
-    if not bool((torch.isfinite(expected) & (expected >= 0)).all()):
-        raise InputError("expected: negative or not finite photons are not allowed")
-    _check("background", background, background >= 0, "0 photons a pixel or more")
 
 
 def _check(name, value, good, allowed):

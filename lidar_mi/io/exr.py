@@ -6,9 +6,10 @@ A scan's file shows what the pilot sees: top row = largest z, left column = larg
 backscatter of the first gate, so that any viewer shows something at once. Of a run,
 ``gate000.depolarization`` and ``gate000.multiple_scattering_fraction`` with their ``_stderr`` stand
 beside them, and with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``, ``Y_noisy`` and
-``Y_noise_std``. Everything else
-(beam positions, gates, instrument, units, seed, version) is in typed header attributes. A fringe
-camera's file has the layers ``S0`` ... ``S3``, ``S0_stderr`` and ``Y``, seen as the camera sees it.
+``Y_noise_std``. Everything else (beam positions, gates, instrument, units, seed, version) is in
+typed header attributes: those of the data set, which `lidar_mi.rendering.backscatter` and
+`lidar_mi.rendering.fringes` fill. A fringe camera's file has the layers ``S0`` ... ``S3``,
+``S0_stderr`` and ``Y``, seen as the camera sees it.
 """
 
 import re

@@ -58,7 +58,7 @@ def scatterer(
 
     Parameters
     ----------
-    scattering : lidar_mi.experiment.air.Scattering
+    scattering : lidar_mi.experiment.schema_air.Scattering
         Its own albedo stands over that of the scatterers.
     beside : path
         Folder in which tables are looked for.

@@ -21,7 +21,11 @@ class VolumeMethod(StrEnum):
 
 
 class RingMethod(StrEnum):
-    """From an image of rings to the velocity along the line of sight."""
+    """From an image of rings to the velocity along the line of sight.
+
+    ``annular`` and ``pixels`` are maximum-likelihood fits. The others find peaks, as the paper
+    does: ``ca`` centre of area, ``ml`` midpoint lines, ``sg`` Savitzky-Golay filter.
+    """
 
     ANNULAR = "annular"
     PIXELS = "pixels"

@@ -25,7 +25,7 @@ from pydantic import BaseModel
 from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
-from lidar_mi.experiment import air, reading, schema, truth
+from lidar_mi.experiment import reading, schema, schema_air, truth
 from lidar_mi.rendering.phase import scatterer
 
 ROOT = Path(__file__).parents[2]
@@ -41,7 +41,7 @@ PAGES = (
 )
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
-OPTIONAL = (air.VortexPair, air.Turbine, air.Part)
+OPTIONAL = (schema_air.VortexPair, schema_air.Turbine, schema_air.Part)
 # what makes a printed run small; nothing else of it changes
 SMALLER = ("wake.spacing=1 m", "render.samples_per_beam=2", "retrieval.stride=8")
 
@@ -165,7 +165,7 @@ def _value(name, model, *given):
     *parents, key = name.split(".")
     changes = {key: given[0]} if given else {}
     if model in OPTIONAL:
-        whole = {"phase": "rayleigh", "share": 1.0} if model is air.Part else {}
+        whole = {"phase": "rayleigh", "share": 1.0} if model is schema_air.Part else {}
         return getattr(model.model_validate(whole | changes), key)
     data = copy.deepcopy(BASE)
     if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors

@@ -15,6 +15,7 @@ from scipy import integrate
 
 from lidar_mi.atmosphere.line import Line, backscatter_line
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.doppler import (
     DopplerLidar,
     coherence_time,
@@ -23,7 +24,7 @@ from lidar_mi.instrument.doppler import (
     speckle_modes,
 )
 from lidar_mi.instrument.etalon import Etalon, harmonics
-from lidar_mi.instrument.fringe_camera import CCD, FringeCamera, expose, fringe_image
+from lidar_mi.instrument.fringe_camera import FringeCamera, fringe_image
 
 LIDAR = DopplerLidar()
 ETALON = Etalon()

@@ -15,15 +15,9 @@ from scipy import constants, stats
 
 from lidar_mi.atmosphere.line import backscatter_line, laser_line
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.etalon import Etalon
-from lidar_mi.instrument.fringe_camera import (
-    CCD,
-    FringeCamera,
-    doppler_shift,
-    expose,
-    fringe_image,
-    ring_radii,
-)
+from lidar_mi.instrument.fringe_camera import FringeCamera, doppler_shift, fringe_image, ring_radii
 
 WAVELENGTH = 354.7e-9
 AIR = backscatter_line(WAVELENGTH, 232.9, 33154.0, aerosol_share=0.1)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.info import sections
+from lidar_mi.experiment.describe import sections
 from lidar_mi.io.vortex_file import read_vortices, write_vortices
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 

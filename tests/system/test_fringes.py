@@ -25,7 +25,7 @@ from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.ring_images import summed
-from lidar_mi.instrument.fringe_camera import CCD, expose
+from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.io.exr import read_fringes
 from tests.support.experiments import leave_out_figures
 

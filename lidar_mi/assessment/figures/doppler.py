@@ -81,7 +81,8 @@ def _rings(doppler, exposure, photons):
         # every path carries the same energy
         hits = photons["S0"].values * photons["S0"].size * photons.attrs["samples_per_pixel"]
         shown.append((hits, "the laser's light, photon by photon through a lens", "photons"))
-    for axis, (image, title, label) in zip(axes, shown, strict=False):  # the last panel holds profiles
+    # the last panel holds profiles
+    for axis, (image, title, label) in zip(axes, shown, strict=False):
         # single noisy pixels must not darken all others
         mesh = axis.imshow(image, cmap="inferno", vmin=0, vmax=np.quantile(image, 0.998))
         axis.set(title=title, xlabel="x / px", ylabel="y / px")

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
-from scipy import stats
 
+from lidar_mi.assessment.figures.accuracy import draw_normal_density, draw_normalised_errors
 from lidar_mi.assessment.figures.plates import Drawn, save_all
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
@@ -155,22 +155,15 @@ def _uncertainty(found):
         )
         panel.set_xlim(float(y.max()), float(y.min()))
         figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="max")
-    axes = axes[-1]
-    edges = np.linspace(-5, 5, 51)
-    for name in COMPONENTS:
-        error = (found[name] - found[f"{name}_true"]) / found[f"{name}_stderr"]
-        values = error.transpose("z", "y").values[good]
-        axes.hist(
-            np.clip(values[np.isfinite(values)], -5, 5),
-            edges,
-            density=True,
-            histtype="step",
-            label=name,
-        )
-    middle = (edges[1:] + edges[:-1]) / 2
-    axes.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
-    axes.set(title="errors over standard errors", xlabel="reduced error", ylabel="density")
-    axes.legend()
+    errors = {
+        name: (found[name] - found[f"{name}_true"]) / found[f"{name}_stderr"] for name in COMPONENTS
+    }
+    draw_normalised_errors(
+        axes[-1], {name: e.transpose("z", "y").values[good] for name, e in errors.items()}
+    )
+    draw_normal_density(axes[-1])
+    axes[-1].set_title("errors over standard errors")
+    axes[-1].legend()
     return figure, (
         "Left, middle: standard errors of good vectors. Right: how errors against the truth, in "
         "units of their standard errors, are distributed; the last bins hold all beyond."

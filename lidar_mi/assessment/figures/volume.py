@@ -7,8 +7,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
-from scipy import stats
 
+from lidar_mi.assessment.figures.accuracy import draw_normal_density, draw_normalised_errors
 from lidar_mi.assessment.figures.plates import Drawn, by_factors, save_all
 from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES
 from lidar_mi.assessment.metrics.cores import Core
@@ -132,8 +132,6 @@ def _errors(found):
     axes = figure.subplots(2, 3)
     # an experiment may have one method alone
     colours = dict(zip(found["algorithm"].values, ("tab:orange", "tab:blue"), strict=False))
-    edges = np.linspace(-5, 5, 51)
-    middle = (edges[1:] + edges[:-1]) / 2
     for column, name in enumerate(_COMPONENTS):
         profile, density = axes[:, column]
         rms = np.sqrt((found[f"{name}_true"] ** 2).mean(("y", "z")))
@@ -148,21 +146,12 @@ def _errors(found):
                 profile.plot(
                     found["x"], level, style, color=colour, label=f"{METHOD_NAMES[method]}, {text}"
                 )
-            reduced = (error / stated).values
-            density.hist(
-                np.clip(reduced[np.isfinite(reduced)], -5, 5),
-                edges,
-                density=True,
-                histtype="step",
-                color=colour,
-                label=METHOD_NAMES[method],
-            )
+            normalised = (error / stated).values
+            draw_normalised_errors(density, {METHOD_NAMES[method]: normalised}, color=colour)
         profile.set(title=f"rms error of {name}", xlabel="x / m", ylabel=_SPEED)
         by_factors(profile)
-        density.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
-        density.set(
-            title=f"errors of {name} over standard errors", xlabel="reduced error", ylabel="density"
-        )
+        draw_normal_density(density)
+        density.set_title(f"errors of {name} over standard errors")
     # between the errors and the wind, of which v and w have much
     axes[0, 1].legend(fontsize="small", loc="center")
     axes[1, 0].legend(fontsize="small")

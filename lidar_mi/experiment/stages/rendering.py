@@ -10,8 +10,8 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import Flows, Truth, read_flows
-from lidar_mi.instrument.detection import noise_budget, noisy_scan
 from lidar_mi.instrument.detector import gate_duration
+from lidar_mi.instrument.detector_noise import noise_budget, noisy_scan
 from lidar_mi.instrument.products import with_products
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.instrument.speckle import speckle_modes

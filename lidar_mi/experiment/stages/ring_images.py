@@ -16,8 +16,9 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.ring_instrument import air_rings, pixel_noise
 from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.doppler import photons, solar_background, speckle_modes
-from lidar_mi.instrument.fringe_camera import CCD, expose, fringe_image, ring_radii
+from lidar_mi.instrument.fringe_camera import fringe_image, ring_radii
 from lidar_mi.rendering.fringes import render_fringes, scene_dict
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.rings.model import PixelNoise, RingModel

@@ -24,7 +24,7 @@ from lidar_mi.experiment.stages.ring_images import (
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.retrieval.methods import RingCentre, RingMethod
 from lidar_mi.retrieval.rings import peaks as ring_peaks
-from lidar_mi.retrieval.rings.fit import fit_rings
+from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
 from lidar_mi.retrieval.rings.model import cramer_rao
 
 FITS = (RingMethod.ANNULAR, RingMethod.PIXELS)

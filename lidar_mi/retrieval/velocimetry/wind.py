@@ -138,7 +138,7 @@ def retrieve_wind(
         Standard deviation, m, of the Gaussian by which the instrument blurs the air, as a beam of
         1/e^2 radius 2 `blur` does ("variational", which then sharpens; square pixels only).
     median_size, median_threshold, median_epsilon
-        Normalised median test, see `quality.median_outliers`. Neighbours are taken half a
+        Normalised median test, see `outliers.median_outliers`. Neighbours are taken half a
         template apart (or a stride, if that is more): closer ones share their pixels.
     settings : MultipassSettings or VariationalSettings, optional
         Of the method of that name, see `settings`. Left out: its defaults.

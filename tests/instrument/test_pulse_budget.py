@@ -9,8 +9,8 @@ import math
 import pytest
 
 from lidar_mi.errors import InputError
-from lidar_mi.instrument.budget import pulse_budget, pulses_for_error
 from lidar_mi.instrument.doppler import DopplerLidar, photons
+from lidar_mi.instrument.pulse_budget import pulse_budget, pulses_for_error
 
 
 def test_the_papers_doppler_lidar():

@@ -9,14 +9,14 @@ import xarray as xr
 from scipy import stats
 
 from lidar_mi.errors import InputError
-from lidar_mi.instrument.detection import (
+from lidar_mi.instrument.detector import Detector
+from lidar_mi.instrument.detector_noise import (
     detect,
     noise_budget,
     noise_terms,
     noise_variance,
     noisy_scan,
 )
-from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 
 LIDAR = BackscatterLidar()
