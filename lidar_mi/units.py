@@ -5,6 +5,7 @@ Each type here is a ``float`` for pydantic models that also reads text with a un
 except angles, which must say their unit (degrees and radians are too easily confused).
 """
 
+import math
 import re
 import tokenize
 from dataclasses import dataclass
@@ -12,7 +13,7 @@ from typing import Annotated, Any, cast
 
 import pint
 from pydantic import GetCoreSchemaHandler
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 UNITS: pint.UnitRegistry[float] = pint.UnitRegistry()
 # one number, then a unit: pint alone reads "0,1 m" as 1 m and "500 m 3" as 1500 m
@@ -79,6 +80,53 @@ class Unit:
                 lambda value: f"{value!r} {self.symbol}" if self.symbol else value, when_used="json"
             ),
         )
+
+
+@dataclass(frozen=True)
+class Within:
+    """Where a key's values lie, in its SI unit, and why nowhere else.
+
+    Both ends are allowed unless ``ends`` opens one, as in "[)". ``or_infinite`` also allows
+    infinity, where that is an idealisation of its own.
+    """
+
+    low: float
+    high: float
+    why: str
+    ends: str = "[]"
+    or_infinite: bool = False
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> CoreSchema:
+        """Refuses what lies outside, as a fault of the type ``out_of_range``."""
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def _checked(self, value: float) -> float:
+        if not self.holds(value):
+            raise PydanticCustomError(
+                "out_of_range",
+                "{value} is not allowed; expected {words}",
+                {"value": repr(value), "words": self.words()},
+            )
+        return value
+
+    def holds(self, value: float) -> bool:
+        """Whether a value is allowed."""
+        if self.or_infinite and value == math.inf:
+            return True
+        above = value > self.low if self.ends[0] == "(" else value >= self.low
+        return above and (value < self.high if self.ends[1] == ")" else value <= self.high)
+
+    def words(self, unit: str = "") -> str:
+        """What is allowed: "1e-06 to 10 m (from the mode of a fibre to the largest telescope)"."""
+        low, high = (
+            str(end) if isinstance(end, int) else f"{end:g}" for end in (self.low, self.high)
+        )
+        low = f"above {low}" if self.ends[0] == "(" else low
+        high = f"below {high}" if self.ends[1] == ")" else high
+        infinite = " or inf" if self.or_infinite else ""
+        return f"{low} to {high} {unit}".strip() + f"{infinite} ({self.why})"
 
 
 def quantity(text: str) -> float:

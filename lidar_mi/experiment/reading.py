@@ -12,7 +12,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema import BACKSCATTER, NAME, Experiment
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
-from lidar_mi.units import Unit
+from lidar_mi.units import Unit, Within, to_si
 
 
 def load_experiment(name: str | Path, *, variant: str | None = None, **changes: Any) -> Experiment:
@@ -198,7 +198,11 @@ def _first_fault(error: ValidationError) -> str:
     faults = error.errors()
     # a misspelt key also leaves one missing: what is there tells more
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-    where = [str(p) for p in fault["loc"] if p not in ("float", "literal['advect']")]
+    where, word = _key(fault["loc"]), ""
+    if len(where) < len(fault["loc"]) and fault["type"] == "literal_error":
+        # a word or a number: the number's fault tells more
+        word = fault["ctx"]["expected"] + " or "
+        fault = next(f for f in faults if f is not fault and _key(f["loc"]) == where)
     field = ".".join(where)
     message = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
@@ -211,11 +215,14 @@ def _first_fault(error: ValidationError) -> str:
     if fault["type"] == "value_error":
         return f"{field}: {message}" if field else message
     value = fault["input"]
-    unit = _unit_at(fault["loc"])
-    shown = f"{value:g} {unit}".strip() if isinstance(value, float) else repr(value)
-    if fault["type"] in _LIMITS:
-        limit, words = _LIMITS[fault["type"]]
-        expected = f"{words} {fault['ctx'][limit]:g} {unit}".strip()
+    unit, within = _metadata_at(fault["loc"], Unit), _metadata_at(fault["loc"], Within)
+    symbol = unit.symbol if unit else ""
+    shown = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
+    if fault["type"] in ("out_of_range", "finite_number", "int_parsing_size") and within:
+        if unit and not isinstance(value, float):
+            # as it was understood: a metre is no nanometre
+            shown = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
+        expected = word + within.words(symbol)
     elif fault["type"].startswith("model_"):
         expected = f"a section with keys out of {', '.join(_keys_at(fault['loc']))}"
     elif fault["type"] == "string_pattern_mismatch":
@@ -229,16 +236,14 @@ def _first_fault(error: ValidationError) -> str:
     return f"{field}: {shown} is not allowed; expected {expected}"
 
 
-_LIMITS = {
-    "greater_than": ("gt", "more than"),
-    "greater_than_equal": ("ge", "at least"),
-    "less_than": ("lt", "less than"),
-    "less_than_equal": ("le", "at most"),
-}
+def _key(location: tuple) -> list[str]:
+    """A fault's location without the kinds of value that pydantic tried there."""
+    kinds = ("literal[", "function-")
+    return [str(p) for p in location if p != "float" and not str(p).startswith(kinds)]
 
 
-def _unit_at(location: tuple) -> str:
-    """The SI unit of the key at a location, empty if it has none."""
+def _metadata_at(location: tuple, kind: type) -> Any:
+    """What the annotation of the key at a location holds of a kind; None if it has none."""
     model: Any = Experiment
     field: Any = None
     for part in location:
@@ -248,10 +253,10 @@ def _unit_at(location: tuple) -> str:
     pending = [field.annotation, *field.metadata] if field else []
     while pending:
         part = pending.pop()
-        if isinstance(part, Unit):
-            return part.symbol
+        if isinstance(part, kind):
+            return part
         pending += (*get_args(part), *getattr(part, "__metadata__", ()))
-    return ""
+    return None
 
 
 def _keys_at(location: tuple) -> list[str]:

@@ -22,30 +22,43 @@ from lidar_mi.instrument.scan import Scan
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings
 from lidar_mi.retrieval.methods import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table, Tabular
-from lidar_mi.units import Frequency, Length, Number, Speed, Time, to_si
+from lidar_mi.units import Frequency, Length, Number, Speed, Time, Within, to_si
+
+
+def _once(key: str, values: tuple) -> None:
+    twice = next((value for value in values if values.count(value) > 1), None)
+    if twice is not None:
+        raise ValueError(f"{key}: {twice!r} twice is not allowed; expected each once")
 
 
 class Platform(Section):
     """The aircraft that carries the lidar towards the wake."""
 
-    speed: Speed = Field(150.0, ge=0)
-    dt: Time = Field(0.1, gt=0)
+    speed: Annotated[Speed, Within(0, 12000, "from rest to escape velocity")] = 150.0
+    dt: Annotated[
+        Time, Within(1e-6, 10000, "from a repetition rate of 1 MHz to the life of a wake")
+    ] = 0.1
 
 
 class Retrieval(Section):
     """How winds are found in the image pair."""
 
     methods: tuple[ImageMethod, ...] = Field((ImageMethod.CC, ImageMethod.WS), min_length=1)
-    template: int = Field(8, ge=2)
-    search: int = Field(16, ge=4)
-    stride: int = Field(1, ge=1)
-    min_correlation: Number = Field(0.5, ge=-1, le=1)
-    min_texture: Number = Field(0.01, ge=0)
-    min_isotropy: Number = Field(0.2, ge=0, le=1)
-    blur: Literal["beam"] | Annotated[Length, Field(ge=0)] = Field(
+    template: Annotated[int, Within(2, 4096, "wider than any image")] = 8
+    search: Annotated[int, Within(4, 8192, "wider than any image")] = 16
+    stride: Annotated[int, Within(1, 8192, "wider than any image")] = 1
+    min_correlation: Annotated[Number, Within(-1, 1, "definition of a correlation")] = 0.5
+    min_texture: Annotated[Number, Within(0, 1000, "noise without signal has about 1")] = 0.01
+    min_isotropy: Annotated[Number, Within(0, 1, "definition of a ratio")] = 0.2
+    blur: Literal["beam"] | Annotated[Length, Within(0, 1000, "the widest beam")] = Field(
         0.0, description="standard deviation of what a beam averages over, undone by variational"
     )
     error_budget: bool = Field(False, description="find winds without each cause of error, too")
+
+    @model_validator(mode="after")
+    def _each_once(self):
+        _once("methods", self.methods)
+        return self
 
     @model_validator(mode="after")
     def _region_holds_template(self):
@@ -57,12 +70,6 @@ class Retrieval(Section):
         return self
 
 
-def _once(key: str, values: tuple) -> None:
-    twice = next((value for value in values if values.count(value) > 1), None)
-    if twice is not None:
-        raise ValueError(f"{key}: {twice!r} twice is not allowed; expected each once")
-
-
 class RingRetrieval(Section):
     """How the wind is read from pictures of rings, and how often, to know how well."""
 
@@ -71,12 +78,14 @@ class RingRetrieval(Section):
         min_length=1,
     )
     centre: tuple[RingCentre, ...] = Field((RingCentre.FREE, RingCentre.KNOWN), min_length=1)
-    averaged: tuple[Annotated[int, Field(ge=1, le=10_000)], ...] = Field(
+    averaged: tuple[Annotated[int, Within(1, 10000, "100 s of pulses at 100 Hz")], ...] = Field(
         (1, 5, 20), min_length=1, description="numbers of pictures averaged before they are read"
     )
-    images: int = Field(8, ge=1, le=100_000, description="averages of each kind and speed")
-    slow_images: int = Field(
-        3, ge=0, description="of these, read by methods other than annular, which are slow"
+    images: Annotated[int, Within(1, 100000, "the standard deviation is then known to 0.2 %")] = (
+        Field(8, description="averages of each kind and speed")
+    )
+    slow_images: Annotated[int, Within(0, 100000, "no more than images")] = Field(
+        3, description="of these, read by methods other than annular, which are slow"
     )
 
     @model_validator(mode="after")
@@ -91,10 +100,13 @@ class RingRetrieval(Section):
         return self
 
 
+_MODES = Within(0.1, 1e15, "from a pixel that sees part of a mode to white light", or_infinite=True)
+
+
 class Doppler(Section):
     """The fringe-imaging Doppler lidar and the winds along its line of sight."""
 
-    v_los: tuple[Speed, ...] = Field(
+    v_los: tuple[Annotated[Speed, Within(-12000, 12000, "escape velocity")], ...] = Field(
         (50.0, -300.0, -100.0, 0.0, 300.0),
         min_length=1,
         max_length=100,
@@ -104,12 +116,12 @@ class Doppler(Section):
     etalon: Etalon = Etalon()
     camera: FringeCamera = FringeCamera()
     ccd: CCD = CCD()
-    speckle_modes: Literal["derived"] | Annotated[float, Field(allow_inf_nan=True)] = Field(
+    speckle_modes: Literal["derived"] | Annotated[float, Field(allow_inf_nan=True), _MODES] = Field(
         "derived", description="degrees of freedom of the speckle in a pixel; inf: no speckle"
     )
     render: FringeSettings = FringeSettings()
-    photon_samples: int = Field(
-        16, ge=0, le=2**16, description="light paths a pixel, photon by photon through a real lens"
+    photon_samples: Annotated[int, Within(0, 65536, "the standard error is then 0.4 %")] = Field(
+        16, description="light paths a pixel, photon by photon through a real lens"
     )
     retrieval: RingRetrieval = RingRetrieval()
 
@@ -122,8 +134,8 @@ class Doppler(Section):
             number = to_si(value, "", "350")
         except ValueError:
             number = math.nan
-        if not number > 0:
-            raise ValueError(f"{value!r} is not allowed; expected derived or a number above 0")
+        if not _MODES.holds(number):
+            raise ValueError(f"{value!r} is not allowed; expected derived or {_MODES.words()}")
         return number
 
     @model_validator(mode="after")
@@ -138,17 +150,23 @@ class Sensor(Section):
     """Both lidars as one sensor: the Doppler lidar scans the slab of the backscatter lidar."""
 
     directions: DopplerScan = DopplerScan()
-    pulses: int = Field(20, ge=1, le=10_000, description="averaged in a direction of a slab")
-    slabs_per_second: Frequency = Field(10.0, gt=0, description="that are measured")
+    pulses: Annotated[int, Within(1, 10000, "100 s of pulses at 100 Hz")] = Field(
+        20, description="averaged in a direction of a slab"
+    )
+    slabs_per_second: Annotated[
+        Frequency, Within(1e-6, 1e6, "from one a week to one for every echo from 150 m")
+    ] = Field(10.0, description="that are measured")
     method: ImageMethod = Field(
         ImageMethod.VARIATIONAL, description="that the cross-flow wind is taken from"
     )
-    crossflow_std: Speed | None = Field(
-        None, gt=0, description="standard error of v and w; default: as the method says"
-    )
+    crossflow_std: (
+        Annotated[Speed, Within(1e-9, 1000, "from rounding errors to the fastest wind")] | None
+    ) = Field(None, description="standard error of v and w; default: as the method says")
     errors: PlatformErrors = PlatformErrors()
     requirements: str | None = Field(None, description="requirement table; default: the paper's")
-    exposure: Time = Field(10.0, gt=0, le=30_000, description="time of looking into the beams")
+    exposure: Annotated[
+        Time, Within(0, 30000, "exposure limits are defined up to 30 000 s", "(]")
+    ] = Field(10.0, description="time of looking into the beams")
 
 
 class Volume(Section):
@@ -157,10 +175,12 @@ class Volume(Section):
     methods: tuple[VolumeMethod, ...] = Field(
         (VolumeMethod.CORRELATION, VolumeMethod.VARIATIONAL), min_length=1
     )
-    template: int = Field(8, ge=4, description="voxels along each side of a window")
-    search: int = Field(16, ge=6)
-    stride: int = Field(4, ge=1)
-    min_correlation: Number = Field(0.5, ge=-1, le=1)
+    template: Annotated[int, Within(4, 1024, "wider than any volume")] = Field(
+        8, description="voxels along each side of a window"
+    )
+    search: Annotated[int, Within(6, 2048, "wider than any volume")] = 16
+    stride: Annotated[int, Within(1, 2048, "wider than any volume")] = 4
+    min_correlation: Annotated[Number, Within(-1, 1, "definition of a correlation")] = 0.5
 
     @model_validator(mode="after")
     def _each_once(self):
@@ -180,7 +200,7 @@ class Experiment(Tabular, Section):
     """One experiment, start to end: a wake for the backscatter lidar, a Doppler lidar, or both."""
 
     name: str = Field(pattern=f"^{NAME}$")
-    seed: int = Field(1, ge=0, lt=2**31)
+    seed: Annotated[int, Within(0, 2**31 - 1, "integers of an image header")] = 1
     wake: Wake | None = Field(None, description="seen by the backscatter lidar")
     doppler: Doppler | None = Field(None, description="the Doppler lidar; {} for the paper's")
     platform: Platform = Platform()

@@ -1,10 +1,20 @@
 """What an experiment file may say of the air: its flow, its extinction, how it scatters."""
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from lidar_mi.units import Circulation, Extinction, Length, Number, Speed, Time, quantity, to_si
+from lidar_mi.units import (
+    Circulation,
+    Extinction,
+    Length,
+    Number,
+    Speed,
+    Time,
+    Within,
+    quantity,
+    to_si,
+)
 
 
 class Section(BaseModel):
@@ -24,29 +34,62 @@ class VortexPair(Section):
     """An analytic vortex pair in place of a simulation."""
 
     model: Literal["lamb_oseen", "burnham_hallock"] = "lamb_oseen"
-    circulation: Circulation = Field(458.0, gt=0)
-    separation: Length = Field(47.1, gt=0)
-    core_radius: Length = Field(3.0, gt=0)
-    width: Length = Field(109.0, gt=0, description="extent of the domain in y")
-    height: Length = Field(69.0, gt=0, description="extent of the domain in z")
+    circulation: Annotated[
+        Circulation, Within(1e-6, 10000, "the largest aircraft have 1000 m^2/s")
+    ] = 458.0
+    separation: Annotated[
+        Length, Within(0.01, 1000, "from models in a tunnel to ten times the widest wing")
+    ] = 47.1
+    core_radius: Annotated[
+        Length, Within(0.001, 100, "from models in a tunnel to wider than any wake's core")
+    ] = 3.0
+    width: Annotated[
+        Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
+    ] = Field(109.0, description="extent of the domain in y")
+    height: Annotated[
+        Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
+    ] = Field(69.0, description="extent of the domain in z")
 
 
 class Turbine(Section):
     """The analytic wake of a wind turbine, seen downstream from its nacelle."""
 
-    diameter: Length = Field(50.0, gt=0, description="of the rotor")
-    thrust: Number = Field(0.75, gt=0, lt=1, description="thrust coefficient")
-    tip_speed_ratio: Number = Field(7.0, description="speed of the tips over that of the wind")
-    wind_speed: Speed = Field(8.0, gt=0, description="of the undisturbed wind, along x")
-    growth: Number = Field(0.035, gt=0, description="of the wake's width with the distance")
-    hub_core: Length = Field(3.0, gt=0, description="core radius of the swirl")
-    downstream: Length | None = Field(
-        None, gt=0, description="distance from the rotor; default: the middle of the gates"
+    diameter: Annotated[
+        Length, Within(0.1, 1000, "from models in a tunnel to four times the largest rotor")
+    ] = Field(50.0, description="of the rotor")
+    thrust: Annotated[
+        Number, Within(0, 1, "in momentum theory 0 leaves no wake, 1 no wind", "()")
+    ] = Field(0.75, description="thrust coefficient")
+    tip_speed_ratio: Annotated[Number, Within(-100, 100, "fast rotors have 15")] = Field(
+        7.0, description="speed of the tips over that of the wind"
     )
-    turbulence: Number = Field(0.06, ge=0, le=0.5, description="intensity of the undisturbed wind")
-    outer_scale: Length = Field(30.0, gt=0, description="of the turbulence")
-    width: Length = Field(109.0, gt=0, description="extent of the domain in y")
-    height: Length = Field(69.0, gt=0, description="extent of the domain in z")
+    wind_speed: Annotated[Speed, Within(0.01, 200, "from a calm to a tornado")] = Field(
+        8.0, description="of the undisturbed wind, along x"
+    )
+    growth: Annotated[Number, Within(0.0001, 1, "wakes are measured to have 0.02 to 0.08")] = Field(
+        0.035, description="of the wake's width with the distance"
+    )
+    hub_core: Annotated[
+        Length, Within(0.001, 100, "from models in a tunnel to the largest rotor")
+    ] = Field(3.0, description="core radius of the swirl")
+    downstream: (
+        Annotated[
+            Length, Within(0.01, 100000, "from models in a tunnel to farms beyond the horizon")
+        ]
+        | None
+    ) = Field(None, description="distance from the rotor; default: the middle of the gates")
+    turbulence: Annotated[Number, Within(0, 0.5, "turbulence is frozen only below")] = Field(
+        0.06, description="intensity of the undisturbed wind"
+    )
+    outer_scale: Annotated[
+        Length, Within(0.01, 10000, "from a wind tunnel to the depth of the troposphere")
+    ] = Field(30.0, description="of the turbulence")
+    width: Annotated[
+        Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
+    ] = Field(109.0, description="extent of the domain in y")
+    height: Annotated[
+        Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
+    ] = Field(69.0, description="extent of the domain in z")
 
 
 class ExtinctionMapping(Section):
@@ -55,21 +98,29 @@ class ExtinctionMapping(Section):
     source: Literal["tracer", "speed"] = "tracer"
     tracer: str | None = Field("tracer", description="exhaust tracer, or null for none")
     aerosol: str | None = Field("aerosol", description="background aerosol, or null for a flat one")
-    background: Extinction = Field(
-        quantity("0.1 / km"), ge=0, description="also of the environment"
+    background: Annotated[Extinction, Within(0, 10, "visibility is 0.3 m in the densest smoke")] = (
+        Field(quantity("0.1 / km"), description="also of the environment")
     )
-    maximum: Extinction = Field(quantity("1.8 / km"), gt=0)
-    molecules: Extinction = Field(
-        0.0, ge=0, description="on top of it, in slab and environment: by air, which has no texture"
+    maximum: Annotated[
+        Extinction, Within(1e-12, 10, "from the thermosphere to the densest smoke")
+    ] = quantity("1.8 / km")
+    molecules: Annotated[Extinction, Within(0, 0.1, "air at the ground has 0.03 / m at 100 nm")] = (
+        Field(
+            0.0, description="on top of it, in slab and environment: by air, which has no texture"
+        )
     )
-    stretch: Number = Field(2.0, ge=1, description="contrast of thin tracer; 1 = linear")
+    stretch: Annotated[Number, Within(1, 100, "1 is linear; 100 is a step")] = Field(
+        2.0, description="contrast of thin tracer; 1 = linear"
+    )
 
 
 class Texture(Section):
     """Sub-grid aerosol texture that a simulation's grid has lost; rms 0 switches it off."""
 
-    rms: Number = Field(0.1, ge=0, le=2)
-    outer_scale: Length = Field(10.0, gt=0)
+    rms: Annotated[Number, Within(0, 2, "a log-normal field of 2 consists of few peaks")] = 0.1
+    outer_scale: Annotated[
+        Length, Within(0.001, 10000, "from the smallest eddies to the depth of the troposphere")
+    ] = 10.0
 
 
 class Wake(Section):
@@ -78,16 +129,30 @@ class Wake(Section):
     file: str | None = Field(None, description="NetCDF file; beside the experiment or shipped")
     vortex_pair: VortexPair | None = None
     turbine: Turbine | None = None
-    time: Time | None = Field(None, description="needed when the file holds several")
-    second: Literal["advect"] | Time = Field("advect", description="t2: advected, or a time")
-    x: Length | None = Field(None, description="plane put in the middle of the gates")
+    time: Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")] | None = Field(
+        None, description="needed when the file holds several"
+    )
+    second: (
+        Literal["advect"] | Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")]
+    ) = Field("advect", description="t2: advected, or a time")
+    x: Annotated[Length, Within(-1e6, 1e6, "models of a region")] | None = Field(
+        None, description="plane put in the middle of the gates"
+    )
     depth: Literal["plane", "volume"] = Field(
         "plane", description="one plane extruded over the gates, or all planes of the file"
     )
-    centre: tuple[Length, Length] | None = Field(
+    centre: (
+        tuple[
+            Annotated[Length, Within(-1e6, 1e6, "models of a region")],
+            Annotated[Length, Within(-1e6, 1e6, "models of a region")],
+        ]
+        | None
+    ) = Field(
         None, description="(y, z) of the wake put on the beam axis; default: the domain's middle"
     )
-    spacing: Length = Field(0.5, gt=0)
+    spacing: Annotated[
+        Length, Within(0.001, 1000, "from the smallest eddies to models of a region")
+    ] = 0.5
     names: dict[str, str] = Field({}, description="our dimension or variable names: the file's")
     extinction: ExtinctionMapping = ExtinctionMapping()
     texture: Texture = Texture()
@@ -128,7 +193,9 @@ class _Scatterer(Section):
     band: Literal["cabannes", "rayleigh"] = Field(
         "cabannes", description="of molecules: the line a narrow filter lets through, or all"
     )
-    depolarization: Number = Field(0.0, ge=0, lt=0.5, description="of Rayleigh, natural light")
+    depolarization: Annotated[
+        Number, Within(0, 0.5, "anisotropy of molecules allows no more", "[)")
+    ] = Field(0.0, description="of Rayleigh, natural light")
     table: str | None = Field(None, description="scattering-matrix file, see the mueller plugin")
 
     @model_validator(mode="after")
@@ -144,7 +211,9 @@ class Part(_Scatterer):
     """One kind of scatterer in a mixture."""
 
     phase: Literal["rayleigh", "molecules", "aerosol", "table"]
-    share: Number = Field(gt=0, description="of the extinction, relative to the other parts")
+    share: Annotated[Number, Within(1e-9, 1e9, "only ratios count")] = Field(
+        description="of the extinction, relative to the other parts"
+    )
 
 
 class Scattering(_Scatterer):
@@ -153,10 +222,12 @@ class Scattering(_Scatterer):
     phase: Literal[
         "rayleigh", "molecules", "isotropic", "henyey_greenstein", "aerosol", "table", "mixture"
     ] = "rayleigh"
-    asymmetry: Number = Field(0.0, gt=-1, lt=1, description="of Henyey-Greenstein")
+    asymmetry: Annotated[
+        Number, Within(-0.999, 0.999, "at 0.999 the forward peak is 0.06 degrees wide")
+    ] = Field(0.0, description="of Henyey-Greenstein")
     parts: tuple[Part, ...] | None = Field(None, min_length=1, description="of a mixture")
-    albedo: Number | None = Field(
-        None, ge=0, le=1, description="scattered share of the extinction; default: the scatterers'"
+    albedo: Annotated[Number, Within(0, 1, "definition of an albedo")] | None = Field(
+        None, description="scattered share of the extinction; default: the scatterers'"
     )
 
     @model_validator(mode="after")

@@ -2,13 +2,14 @@
 
 import math
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from lidar_mi.errors import InputError
-from lidar_mi.units import Frequency, Number, Time, quantity
+from lidar_mi.units import Frequency, Number, Time, Within, quantity
 
 
 class CCD(BaseModel):
@@ -22,18 +23,30 @@ class CCD(BaseModel):
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
-    quantum_efficiency: Number = Field(1.0, gt=0, le=1, description="photoelectrons per photon")
-    read_noise: Number = Field(5.0, ge=0, description="rms a pixel")
-    dark_current: Frequency = Field(
-        quantity("1 Hz"), ge=0, description="photoelectrons a pixel in the dark"
+    quantum_efficiency: Annotated[
+        Number, Within(1e-9, 1, "one photoelectron per photon at most")
+    ] = Field(1.0, description="photoelectrons per photon")
+    read_noise: Annotated[Number, Within(0, 1e6, "capacity of the largest pixels")] = Field(
+        5.0, description="rms a pixel"
     )
-    integration_time: Time = Field(
-        quantity("10 ms"), ge=0, description="from one read-out to the next; a laser of 100 Hz"
+    dark_current: Annotated[Frequency, Within(0, 1e12, "one electron per picosecond")] = Field(
+        quantity("1 Hz"), description="photoelectrons a pixel in the dark"
     )
-    full_well: Number = Field(20e3, gt=0, description="most a pixel holds; no blooming")
-    gain: Number = Field(1.0, gt=0, description="photoelectrons a step of the digitiser")
-    bits: int | None = Field(16, ge=1, le=32, description="of the digitiser; null: no rounding")
-    bias: int = Field(100, ge=0, description="steps of the digitiser without a signal")
+    integration_time: Annotated[Time, Within(0, 100000, "one day")] = Field(
+        quantity("10 ms"), description="from one read-out to the next; a laser of 100 Hz"
+    )
+    full_well: Annotated[Number, Within(1, 1e12, "from a single photon to whole rows added")] = (
+        Field(20e3, description="most a pixel holds; no blooming")
+    )
+    gain: Annotated[
+        Number, Within(1e-6, 1e9, "from a fraction of an electron to the largest well")
+    ] = Field(1.0, description="photoelectrons a step of the digitiser")
+    bits: Annotated[int, Within(1, 32, "digitisers have 32 at most")] | None = Field(
+        16, description="of the digitiser; null: no rounding"
+    )
+    bias: Annotated[int, Within(0, 2**31 - 1, "what 32 bits hold")] = Field(
+        100, description="steps of the digitiser without a signal"
+    )
 
 
 def expose(

@@ -1,11 +1,13 @@
 """The detector: its description, and the mean photoelectrons of echo, sky and dark current."""
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy import constants
 
-from lidar_mi.units import Frequency, Length, Number, SpectralRadiance, quantity
+from lidar_mi.units import Frequency, Length, Number, SpectralRadiance, Within, quantity
 
 
 class Detector(BaseModel):
@@ -30,25 +32,35 @@ class Detector(BaseModel):
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
-    optics_efficiency: Number = Field(0.5, gt=0, le=1, description="telescope to detector")
-    quantum_efficiency: Number = Field(0.4, gt=0, le=1, description="photoelectrons per photon")
-    excess_noise_factor: Number = Field(1.25, ge=1, description="variance added by the gain")
-    dark_rate: Frequency = Field(
-        quantity("1 kHz"), ge=0, description="photoelectrons without light"
+    optics_efficiency: Annotated[
+        Number, Within(1e-9, 1, "from a blocking filter of 90 dB to all light")
+    ] = Field(0.5, description="telescope to detector")
+    quantum_efficiency: Annotated[
+        Number, Within(1e-9, 1, "one photoelectron per photon at most")
+    ] = Field(0.4, description="photoelectrons per photon")
+    excess_noise_factor: Annotated[
+        Number, Within(1, 1000, "avalanche photodiodes have 100 at most")
+    ] = Field(1.25, description="variance added by the gain")
+    dark_rate: Annotated[Frequency, Within(0, 1e12, "one electron per picosecond")] = Field(
+        quantity("1 kHz"), description="photoelectrons without light"
     )
-    readout_noise: Number = Field(0.0, ge=0, description="rms photoelectrons a gate, at the input")
-    sky_radiance: SpectralRadiance = Field(
-        quantity("0.3 W/m^2/sr/nm"), ge=0, description="solar background"
+    readout_noise: Annotated[Number, Within(0, 1e6, "capacity of the largest pixels")] = Field(
+        0.0, description="rms photoelectrons a gate, at the input"
     )
-    filter_bandwidth: Length = Field(
-        quantity("1 nm"), gt=0, description="equivalent width of the filter"
+    sky_radiance: Annotated[SpectralRadiance, Within(0, 1e14, "the disc of the sun has 3e13")] = (
+        Field(quantity("0.3 W/m^2/sr/nm"), description="solar background")
     )
+    filter_bandwidth: Annotated[
+        Length, Within(1e-16, 1e-5, "from 100 kHz at 532 nm to no filter")
+    ] = Field(quantity("1 nm"), description="equivalent width of the filter")
     speckle: bool = Field(True, description="whether the coherence of the laser causes speckle")
-    line_width: Frequency = Field(
-        quantity("30 GHz"), gt=0, description="of the echo, full width half maximum"
-    )
-    speckle_modes: Number | None = Field(
-        None, ge=1, description="number of modes; default: from line width, telescope and footprint"
+    line_width: Annotated[
+        Frequency, Within(1, 1e15, "from the narrowest lasers to white light")
+    ] = Field(quantity("30 GHz"), description="of the echo, full width half maximum")
+    speckle_modes: (
+        Annotated[Number, Within(1, 1e15, "from one mode to white light for a second")] | None
+    ) = Field(
+        None, description="number of modes; default: from line width, telescope and footprint"
     )
 
     @model_validator(mode="after")

@@ -1,7 +1,7 @@
 """The fringe-imaging Doppler lidar: its photons, its sunlight and its speckle."""
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from lidar_mi.units import (
     Number,
     SpectralRadiance,
     Time,
+    Within,
     quantity,
 )
 
@@ -47,37 +48,61 @@ class DopplerLidar(BaseModel):
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
-    wavelength: Length = Field(
-        354.7e-9, ge=100e-9, le=20e-6, description="vacuum wavelength of the laser"
+    wavelength: Annotated[
+        Length, Within(1e-7, 2e-5, "from the vacuum ultraviolet to the far infrared")
+    ] = Field(354.7e-9, description="vacuum wavelength of the laser")
+    pulse_energy: Annotated[
+        Energy, Within(1e-15, 10000, "from thousands of photons to the lasers of fusion")
+    ] = Field(0.07, description="energy of a pulse")
+    pulse_duration: Annotated[Time, Within(0, 0.001, "a millisecond is 150 km of air")] = Field(
+        10e-9, description="full width at half maximum of a pulse"
     )
-    pulse_energy: Energy = Field(0.07, gt=0, description="energy of a pulse")
-    pulse_duration: Time = Field(
-        10e-9, ge=0, le=1e-3, description="full width at half maximum of a pulse"
+    laser_width: Annotated[
+        Frequency, Within(1, 1e13, "from the narrowest lasers to 4 nm at 355 nm")
+    ] = Field(quantity("100 MHz"), description="full width half maximum")
+    beam_radius: Annotated[
+        Length, Within(1e-6, 10, "from the mode of a fibre to the largest telescope")
+    ] = Field(0.025, description="of the outgoing beam")
+    divergence_full: Annotated[Angle, Within(0, 0.5, "a collimated to a widely spread beam")] = (
+        Field(quantity("500 urad"), description="full angle")
     )
-    laser_width: Frequency = Field(quantity("100 MHz"), gt=0, description="full width half maximum")
-    beam_radius: Length = Field(0.025, gt=0, le=10, description="of the outgoing beam")
-    divergence_full: Angle = Field(quantity("500 urad"), ge=0, lt=0.5, description="full angle")
-    telescope_area: Area = Field(0.13, gt=0, description="of the receiving telescope")
-    fov_half: Angle = Field(
-        quantity("1 mrad"), gt=0, lt=0.5, description="field of view, half angle"
-    )
-    instrument_constant: Number = Field(0.15, gt=0, le=1, description="efficiency of the lidar")
+    telescope_area: Annotated[
+        Area, Within(1e-12, 1000, "from the core of a fibre to the largest telescope")
+    ] = Field(0.13, description="of the receiving telescope")
+    fov_half: Annotated[
+        Angle, Within(1e-7, 0.5, "from the diffraction of a telescope of 10 m to a camera's lens")
+    ] = Field(quantity("1 mrad"), description="field of view, half angle")
+    instrument_constant: Annotated[
+        Number, Within(1e-9, 1, "from a blocking filter of 90 dB to all light")
+    ] = Field(0.15, description="efficiency of the lidar")
     counted: Literal["detected", "before_etalon"] = Field(
         "detected", description="which photons the lidar equation counts"
     )
-    range: Length = Field(56.0, gt=0, description="middle of the range bin")
-    range_bin: Length = Field(10.0, gt=0, description="length of the range bin")
-    altitude: Length = Field(8500.0, description="of the air, for temperature and pressure")
-    backscatter: Backscatter = Field(3.104e-6, gt=0, description="backscatter coefficient")
-    extinction: Extinction = Field(2.70e-5, ge=0, description="extinction coefficient")
-    aerosol_share: Number = Field(0.0, ge=0, le=1, description="of the backscattered photons")
+    range: Annotated[
+        Length, Within(0.1, 100000, "from a wind tunnel to the top of the atmosphere")
+    ] = Field(56.0, description="middle of the range bin")
+    range_bin: Annotated[
+        Length, Within(0.001, 100000, "from a pulse of 7 ps to all of the atmosphere")
+    ] = Field(10.0, description="length of the range bin")
+    altitude: Annotated[Length, Within(-5004, 81020, "the standard atmosphere")] = Field(
+        8500.0, description="of the air, for temperature and pressure"
+    )
+    backscatter: Annotated[
+        Backscatter, Within(1e-15, 1, "from the thermosphere to the densest smoke")
+    ] = Field(3.104e-6, description="backscatter coefficient")
+    extinction: Annotated[Extinction, Within(0, 10, "visibility is 0.3 m in the densest smoke")] = (
+        Field(2.70e-5, description="extinction coefficient")
+    )
+    aerosol_share: Annotated[Number, Within(0, 1, "definition of a fraction")] = Field(
+        0.0, description="of the backscattered photons"
+    )
     line_shape: Literal["rayleigh", "rayleigh_brillouin"] = "rayleigh_brillouin"
-    sky_radiance: SpectralRadiance = Field(
-        quantity("0.18 W/m^2/sr/nm"), ge=0, description="background"
+    sky_radiance: Annotated[SpectralRadiance, Within(0, 1e14, "the disc of the sun has 3e13")] = (
+        Field(quantity("0.18 W/m^2/sr/nm"), description="background")
     )
-    filter_bandwidth: Length = Field(
-        quantity("1 nm"), gt=0, description="equivalent width of the filter"
-    )
+    filter_bandwidth: Annotated[
+        Length, Within(1e-16, 1e-5, "from 100 kHz at 355 nm to no filter")
+    ] = Field(quantity("1 nm"), description="equivalent width of the filter")
 
     @model_validator(mode="after")
     def _pulse_has_its_width(self):

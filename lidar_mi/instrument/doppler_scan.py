@@ -4,7 +4,7 @@ Line-of-sight velocities are positive toward the instrument, as in the paper's e
 """
 
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import xarray as xr
@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.scan import HalfAngle
-from lidar_mi.units import Angle, Speed, quantity
+from lidar_mi.units import Angle, Speed, Within, quantity
 
 # nodes of the quadrature over range bin, pulse and beam: exact for winds of degree 15, 5 and 5
 _BIN, _PULSE, _BEAM = 8, 3, 3
@@ -36,8 +36,12 @@ class DopplerScan(_Model):
     bins lie in the plane x = range; with ``spherical`` all are at the same distance.
     """
 
-    columns: int = Field(9, ge=1, le=1000, description="directions across")
-    rows: int = Field(7, ge=1, le=1000, description="directions up")
+    columns: Annotated[int, Within(1, 1000, "with the other, a million lines of sight")] = Field(
+        9, description="directions across"
+    )
+    rows: Annotated[int, Within(1, 1000, "with the other, a million lines of sight")] = Field(
+        7, description="directions up"
+    )
     azimuth_half: HalfAngle = Field(quantity("21.5 deg"), description="of the outermost directions")
     elevation_half: HalfAngle = Field(quantity("14 deg"), description="of the outermost directions")
     gates: Literal["planar", "spherical"] = "planar"
@@ -65,11 +69,21 @@ class PlatformErrors(_Model):
     velocity error of V e sin(t) at the angle t off the axis, V being the speed of the platform.
     """
 
-    roll: Angle = Field(0.0, gt=-1, lt=1, description="of the attitude")
-    pitch: Angle = Field(0.0, gt=-1, lt=1, description="of the attitude")
-    yaw: Angle = Field(0.0, gt=-1, lt=1, description="of the attitude")
-    jitter: Angle = Field(0.0, ge=0, lt=0.1, description="rms of every direction, on both axes")
-    speed: Speed = Field(0.0, description="of the speed along x")
+    roll: Annotated[Angle, Within(-1, 1, "larger errors are no errors of an attitude")] = Field(
+        0.0, description="of the attitude"
+    )
+    pitch: Annotated[Angle, Within(-1, 1, "larger errors are no errors of an attitude")] = Field(
+        0.0, description="of the attitude"
+    )
+    yaw: Annotated[Angle, Within(-1, 1, "larger errors are no errors of an attitude")] = Field(
+        0.0, description="of the attitude"
+    )
+    jitter: Annotated[Angle, Within(0, 0.1, "small angles only")] = Field(
+        0.0, description="rms of every direction, on both axes"
+    )
+    speed: Annotated[Speed, Within(-1000, 1000, "the fastest aircraft")] = Field(
+        0.0, description="of the speed along x"
+    )
 
 
 def pointed(directions: np.ndarray, errors: PlatformErrors, seed: int = 0) -> np.ndarray:

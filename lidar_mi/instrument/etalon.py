@@ -12,7 +12,7 @@ The Mitsuba plugin `etalon` computes the same transmission ray by ray; tests com
 """
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -23,7 +23,7 @@ from scipy.optimize import brentq
 
 from lidar_mi.atmosphere.line import Line
 from lidar_mi.errors import InputError
-from lidar_mi.units import Length, Number
+from lidar_mi.units import Length, Number, Within
 
 POLARIZATIONS = ("s", "p")
 # A mirror that transmits less is taken for opaque: even lossless, it would transmit no photon of a
@@ -64,28 +64,39 @@ class Etalon(BaseModel):
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
-    gap: Length = Field(13.7e-3, gt=0, description="distance of the mirrors")
-    order_fraction: Number | None = Field(
-        0.5,
-        ge=0,
-        lt=1,
-        description="fractional order at the centre, to which the gap is tuned; null: as it comes",
+    gap: Annotated[
+        Length, Within(1e-6, 1, "from a few wavelengths to the coherence length of the laser")
+    ] = Field(13.7e-3, description="distance of the mirrors")
+    order_fraction: Annotated[Number, Within(0, 1, "definition of a fraction", "[)")] | None = (
+        Field(
+            0.5,
+            description="fractional order at the centre, to which the gap is tuned; "
+            "null: as it comes",
+        )
     )
-    index: Number = Field(1.0, ge=1, le=4, description="refractive index in the gap")
-    reflectivity: Number = Field(0.70, gt=0, lt=1, description="of each mirror")
-    absorption: Number = Field(
-        0.0, ge=0, lt=1, description="fraction of the light absorbed by a mirror"
+    index: Annotated[Number, Within(1, 4, "from air to germanium")] = Field(
+        1.0, description="refractive index in the gap"
     )
-    surface_rms: Length = Field(
-        2e-9, ge=0, description="standard deviation of the gap by irregular plates"
+    reflectivity: Annotated[
+        Number, Within(1e-9, 0.999999, "from the best antireflection coating to the best mirror")
+    ] = Field(0.70, description="of each mirror")
+    absorption: Annotated[Number, Within(0, 1, "definition of a fraction", "[)")] = Field(
+        0.0, description="fraction of the light absorbed by a mirror"
     )
-    bow: Length = Field(0.0, ge=0, description="gap in the middle less gap at the rim")
+    surface_rms: Annotated[Length, Within(0, 1e-6, "a wavelength leaves no rings")] = Field(
+        2e-9, description="standard deviation of the gap by irregular plates"
+    )
+    bow: Annotated[Length, Within(0, 0.0001, "hundreds of wavelengths leave no rings")] = Field(
+        0.0, description="gap in the middle less gap at the rim"
+    )
     coatings: tuple[Layer, ...] | None = Field(
         None,
         min_length=1,
         description="(index, thickness) from plate to gap, instead of reflectivity and absorption",
     )
-    plate_index: Number = Field(1.476, ge=1, le=4, description="of the plates; fused silica")
+    plate_index: Annotated[Number, Within(1, 4, "from air to germanium")] = Field(
+        1.476, description="of the plates; fused silica"
+    )
 
     @model_validator(mode="after")
     def _mirrors_make_sense(self):
@@ -95,10 +106,11 @@ class Etalon(BaseModel):
                 f"{self.reflectivity:g}; expected less than {1 - self.reflectivity:g}"
             )
         for layer in self.coatings or ():
-            if not (layer.index >= 1 and layer.thickness > 0 and layer.extinction >= 0):
+            index, thickness, extinction = layer
+            if not (1 <= index <= 10 and 1e-10 <= thickness <= 1e-3 and 0 <= extinction <= 100):
                 raise ValueError(
-                    f"coatings: {tuple(layer)} is not allowed; expected index 1 or more, "
-                    "thickness above 0 and extinction 0 or more"
+                    f"coatings: {tuple(layer)} is not allowed; expected an index of 1 to 10, a "
+                    "thickness of 1e-10 to 0.001 m (an atom to a plate), an extinction of 0 to 100"
                 )
         return self
 

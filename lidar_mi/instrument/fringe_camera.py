@@ -5,6 +5,7 @@ have the shape (height, width).
 """
 
 import math
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -14,10 +15,13 @@ from pydantic import BaseModel, ConfigDict, Field
 from lidar_mi.atmosphere.line import Line
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon, cosine_inside, fractional_order, harmonics, series
-from lidar_mi.units import Length
+from lidar_mi.units import Length, Within
 
 # Two Gauss-Legendre points average a pixel to fourth order.
 _NODES = {1: (0.0,), 2: (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))}
+
+
+_Place = Annotated[float, Within(-1e6, 1e6, "rings far beyond the CCD are straight")]
 
 
 class FringeCamera(BaseModel):
@@ -33,16 +37,25 @@ class FringeCamera(BaseModel):
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
-    focal_length: Length = Field(0.3, gt=0, description="of the lens")
-    pixel: Length = Field(7.4e-6, gt=0, description="side of a pixel")
-    width: int = Field(960, ge=1, description="pixels of a row")
-    height: int = Field(780, ge=1, description="pixels of a column")
-    centre: tuple[float, float] | None = Field(
+    focal_length: Annotated[
+        Length, Within(0.001, 100, "from a telephone's camera to the longest telescope")
+    ] = Field(0.3, description="of the lens")
+    pixel: Annotated[
+        Length, Within(1e-7, 0.01, "from a fraction of a wavelength to a photodiode")
+    ] = Field(7.4e-6, description="side of a pixel")
+    width: Annotated[int, Within(1, 20000, "the largest sensors have 2e8 pixels")] = Field(
+        960, description="pixels of a row"
+    )
+    height: Annotated[int, Within(1, 20000, "the largest sensors have 2e8 pixels")] = Field(
+        780, description="pixels of a column"
+    )
+    centre: tuple[_Place, _Place] | None = Field(
         None, description="(x, y) of the rings in pixels; default: the middle of the image"
     )
-    illumination_radius: Length = Field(
+    illumination_radius: Annotated[
+        Length, Within(1e-6, 1000, "from a pixel to wider than any CCD", or_infinite=True)
+    ] = Field(
         math.inf,
-        gt=0,
         allow_inf_nan=True,
         description="1/e^2 radius of the light on the CCD; inf: even light",
     )

@@ -1,12 +1,13 @@
 """The backscatter lidar: what its laser sends and its telescope receives."""
 
 import math
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from lidar_mi.units import Angle, Energy, Length, Time, quantity
+from lidar_mi.units import Angle, Energy, Length, Time, Within, quantity
 
 
 class BackscatterLidar(BaseModel):
@@ -19,29 +20,34 @@ class BackscatterLidar(BaseModel):
         frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
     )
 
-    wavelength: Length = Field(
-        532e-9, ge=100e-9, le=20e-6, description="vacuum wavelength of the laser"
-    )
-    beam_radius: Length = Field(
-        0.1, gt=0, le=10, description="1/e^2 radius of the beam at the aperture"
-    )
-    beam_cut: Length = Field(
-        0.1, gt=0, allow_inf_nan=True, description="outer radius of the emitted beam; inf: uncut"
-    )
-    divergence_full: Angle = Field(
-        quantity("2 mrad"), ge=0, lt=0.5, description="1/e^2 divergence, full angle"
+    wavelength: Annotated[
+        Length, Within(1e-7, 2e-5, "from the vacuum ultraviolet to the far infrared")
+    ] = Field(532e-9, description="vacuum wavelength of the laser")
+    beam_radius: Annotated[
+        Length, Within(1e-6, 10, "from the mode of a fibre to the largest telescope")
+    ] = Field(0.1, description="1/e^2 radius of the beam at the aperture")
+    beam_cut: Annotated[
+        Length,
+        Within(1e-6, 1000, "from the mode of a fibre to wider than any beam", or_infinite=True),
+    ] = Field(0.1, allow_inf_nan=True, description="outer radius of the emitted beam; inf: uncut")
+    divergence_full: Annotated[Angle, Within(0, 0.5, "a collimated to a widely spread beam")] = (
+        Field(quantity("2 mrad"), description="1/e^2 divergence, full angle")
     )
     stokes: tuple[float, float, float, float] = Field(
         (1.0, 1.0, 0.0, 0.0), description="Stokes vector (I, Q, U, V) about the horizontal axis"
     )
-    pulse_energy: Energy = Field(1e-3, gt=0, description="energy of a pulse in one beam")
-    pulse_duration: Time = Field(
-        0.0, ge=0, le=1e-3, description="full width at half maximum of the pulse"
+    pulse_energy: Annotated[
+        Energy, Within(1e-15, 10000, "from thousands of photons to the lasers of fusion")
+    ] = Field(1e-3, description="energy of a pulse in one beam")
+    pulse_duration: Annotated[Time, Within(0, 0.001, "a millisecond is 150 km of air")] = Field(
+        0.0, description="full width at half maximum of the pulse"
     )
-    aperture_radius: Length = Field(0.5, gt=0, le=10, description="radius of the telescope")
-    fov_half: Angle = Field(
-        quantity("5 mrad"), gt=0, lt=0.5, description="field of view, half angle"
-    )
+    aperture_radius: Annotated[
+        Length, Within(1e-6, 10, "from the core of a fibre to the largest telescope")
+    ] = Field(0.5, description="radius of the telescope")
+    fov_half: Annotated[
+        Angle, Within(1e-7, 0.5, "from the diffraction of a telescope of 10 m to a camera's lens")
+    ] = Field(quantity("5 mrad"), description="field of view, half angle")
 
     @field_validator("stokes")
     @classmethod

@@ -1,6 +1,5 @@
 """Scan geometry: where the beams of a scan go and which ranges are recorded."""
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -9,12 +8,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from lidar_mi.units import Angle, Length, Speed, quantity
+from lidar_mi.units import Angle, Length, Speed, Within, quantity
 
 MOST_BEAMS = 10**7
 """An image of this many beams has about 1 GB, with a layer for each order and its errors."""
 
-HalfAngle = Annotated[Angle, Field(gt=0, lt=math.pi / 2)]
+HalfAngle = Annotated[
+    Angle, Within(1e-9, 1.5, "from a nanoradian to nearly across the scan's axis")
+]
 
 
 class Scan(BaseModel):
@@ -35,17 +36,23 @@ class Scan(BaseModel):
     )
 
     aim: Literal["grid", "angles"] = "grid"
-    range: Length = Field(
-        500.0, gt=0, le=100_000, description="distance of the first gate's start at t1"
-    )
-    thickness: Length = Field(2.5, gt=0, description="depth of all gates together")
+    range: Annotated[
+        Length, Within(0.1, 100000, "from a wind tunnel to the top of the atmosphere")
+    ] = Field(500.0, description="distance of the first gate's start at t1")
+    thickness: Annotated[
+        Length, Within(0.001, 100000, "from a pulse of 7 ps to all of the atmosphere")
+    ] = Field(2.5, description="depth of all gates together")
     gates: Literal["planar", "spherical"] = "planar"
-    gate_count: int = Field(1, ge=1, le=10_000)
-    follow: Speed = Field(
+    gate_count: Annotated[int, Within(1, 10000, "10 m each through all of the atmosphere")] = 1
+    follow: Annotated[Speed, Within(-1000, 1000, "the fastest jets")] = Field(
         0.0, description="wind along x with which the gates go along from scan to scan"
     )
-    columns: int = Field(219, ge=1, description="beams across, with aim: angles")
-    rows: int = Field(139, ge=1, description="beams up, with aim: angles")
+    columns: Annotated[int, Within(1, 10**7, "an image has at most 1e7 beams")] = Field(
+        219, description="beams across, with aim: angles"
+    )
+    rows: Annotated[int, Within(1, 10**7, "an image has at most 1e7 beams")] = Field(
+        139, description="beams up, with aim: angles"
+    )
     azimuth_half: tuple[HalfAngle, HalfAngle] = (quantity("6.2 deg"), quantity("6.4 deg"))
     elevation_half: tuple[HalfAngle, HalfAngle] = (quantity("3.9 deg"), quantity("4.1 deg"))
 

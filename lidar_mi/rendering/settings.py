@@ -1,10 +1,10 @@
 """How the light transport is run."""
 
-from typing import Literal, get_args
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lidar_mi.units import Length
+from lidar_mi.units import Length, Within
 
 Variant = Literal[
     "llvm_ad_mono_polarized",
@@ -27,10 +27,16 @@ class RenderSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     variant: Variant = "llvm_ad_mono_polarized"
-    samples_per_beam: int = Field(64, ge=2, lt=2**31)
-    max_order: int = Field(4, ge=1, le=64, description="scattering orders; 1 = single scattering")
+    samples_per_beam: Annotated[
+        int, Within(2, 2**31 - 1, "a standard error needs two; counted in 31 bits")
+    ] = 64
+    max_order: Annotated[int, Within(1, 64, "higher orders are below single precision")] = Field(
+        4, description="scattering orders; 1 = single scattering"
+    )
     estimator: Literal["gated", "analog"] = "gated"
-    samples_per_pass: int = Field(1 << 22, ge=1024, description="traced at once; limits the memory")
+    samples_per_pass: Annotated[
+        int, Within(1024, 2**31 - 1, "fewer waste the processor; counted in 31 bits")
+    ] = Field(1 << 22, description="traced at once; limits the memory")
 
 
 class FringeSettings(BaseModel):
@@ -39,7 +45,9 @@ class FringeSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     variant: Variant = "llvm_ad_mono_polarized"
-    samples_per_pixel: int = Field(16, ge=2, lt=2**20, description="light paths, on average")
+    samples_per_pixel: Annotated[
+        int, Within(2, 2**20 - 1, "a standard error needs two; it is then 0.1 %")
+    ] = Field(16, description="light paths, on average")
     estimator: Literal["camera", "forward", "analog"] = Field(
         "camera",
         description="from the pixels; plane waves forward; photons transmitted or rejected",
@@ -48,5 +56,9 @@ class FringeSettings(BaseModel):
         "folded", description="mean over the line in closed form; a frequency for every path"
     )
     lens: Literal["ideal", "singlet"] = "ideal"
-    stop_radius: Length = Field(5e-3, gt=0, description="of the light into the lens")
-    samples_per_pass: int = Field(1 << 22, ge=1024, description="traced at once; limits the memory")
+    stop_radius: Annotated[Length, Within(1e-6, 1, "from a pinhole to the largest lens")] = Field(
+        5e-3, description="of the light into the lens"
+    )
+    samples_per_pass: Annotated[
+        int, Within(1024, 2**31 - 1, "fewer waste the processor; counted in 31 bits")
+    ] = Field(1 << 22, description="traced at once; limits the memory")

@@ -226,7 +226,7 @@ def test_mirror_of_quarter_waves():
         ({"order_fraction": 1.0}, "order_fraction"),
         ({"coatings": ()}, "coatings"),
         ({"coatings": ((2.1, -1e-9),)}, r"coatings: \(2.1, -1e-09, 0.0\) is not allowed"),
-        ({"coatings": ((0.5, 1e-9),)}, "index 1 or more"),
+        ({"coatings": ((0.5, 1e-9),)}, "an index of 1 to 10"),
         ({"finesse": 30}, "finesse"),
     ],
 )

@@ -279,4 +279,5 @@ def test_bad_input_in_a_fresh_process(there):
     assert done.returncode == 2
     assert done.stdout == ""
     (line,) = done.stderr.splitlines()
-    assert line == "lidar-mi: tiny.yaml: scan.range: -5 m is not allowed; expected more than 0 m"
+    expected = "expected 0.1 to 100000 m (from a wind tunnel to the top of the atmosphere)"
+    assert line == f"lidar-mi: tiny.yaml: scan.range: -5 m is not allowed; {expected}"
