@@ -4,14 +4,32 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from html import escape
+from typing import Any
 
 from rich.console import Console
+from rich.text import Text
+
+from lidar_mi.errors import printable
 
 Notice = Callable[[str, float | None], None]
 """Called with what is running and how far it is (0 to 1, None: unknown)."""
 
 # seconds between two pictures of a bar in a notebook, each of which is a message to the browser
 _NOTEBOOK_INTERVAL = 0.2
+
+
+class Terminal(Console):
+    """A console for text that may hold names from files and folders.
+
+    Brackets and colons in it are no markup; what a terminal would obey shows as an escape.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Text of whatever is printed: lines, titles and cells of tables."""
+        return super().render_str(printable(text), **options)
 
 
 def progress(console: Console | None = None) -> AbstractContextManager[Notice]:
@@ -30,8 +48,7 @@ def progress(console: Console | None = None) -> AbstractContextManager[Notice]:
     context manager
         Gives the callable that is told what is running.
     """
-    # names in files and folders may hold brackets and colons: they are no markup
-    console = console or Console(stderr=True, markup=False, emoji=False)
+    console = console or Terminal(stderr=True)
     if console.is_jupyter:
         return _in_notebook()
     return _on_terminal(console) if console.is_terminal else _as_lines(console)
@@ -64,7 +81,7 @@ def _on_terminal(console: Console) -> Iterator[Notice]:
             nonlocal last
             # a full bar would stop clock and spinner, and what comes next goes on
             total, completed = (None, 0.0) if share is None else (1.0, min(share, 0.999))
-            bars.update(task, description=text, total=total, completed=completed)
+            bars.update(task, description=printable(text), total=total, completed=completed)
             if text != last and _is_warning(text):
                 console.print(text, highlight=False, soft_wrap=True)
             last = text
@@ -84,7 +101,7 @@ def _in_notebook() -> Iterator[Notice]:
         nonlocal shown, last
         now = time.monotonic()
         if text != last and _is_warning(text):
-            print(text)
+            print(printable(text))
         if text != last or now - shown > _NOTEBOOK_INTERVAL:
             value = "" if share is None else f' value="{share:.3f}"'
             clock = f"{int(now - start) // 60}:{int(now - start) % 60:02d}"

@@ -18,6 +18,12 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 UNITS: pint.UnitRegistry[float] = pint.UnitRegistry()
 # one number, then a unit: pint alone reads "0,1 m" as 1 m and "500 m 3" as 1500 m
 _TEXT = re.compile(r"""([-+]?(?:(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|inf|nan))\s*([^\n,;#"']*)""")
+# A unit's text as far as pint gets to see it: pint computes what it reads, 9**9**9 for ever.
+_LONGEST = 100
+_NAME = r"(?:[^\W\d_]|[%°])[\w⁻]*+"
+_NUMBER = r"(?:\d{1,20}(?:\.\d{0,20})?|\.\d{1,20})(?:[eE][-+]?\d{1,2})?(?![\w.])"
+_POWER = r"\s*(?:\*\*|\^)\s*(?:[-+]?\d{1,2}|\([-+]?\d{1,2}\))(?![\d.]|\s*+\^|\s*+\*\*)"
+_PARTS = re.compile(rf"(?:\s*+(?:(?:{_NAME}|{_NUMBER})(?:{_POWER})?|[*·/()](?!\*)))*\s*+")
 # what pint raises, and what reaches us through it from Python's tokenizer and arithmetic
 _BAD_UNIT = (
     pint.PintError,
@@ -44,10 +50,13 @@ def to_si(value: object, unit: str, example: str) -> float:
     if not isinstance(value, str):
         if unit == "rad" and value != 0:
             raise ValueError(f"{value!r} has no unit; expected an angle such as '{example}'")
-        return float(value)
+        try:
+            return float(value)
+        except OverflowError:
+            raise ValueError(f"{value!r} is not allowed; expected a smaller number") from None
     kind = f"a quantity in {unit}" if unit else "a number"
     wrong = ValueError(f"{value!r} is not allowed; expected {kind}, such as '{example}'")
-    match = _TEXT.fullmatch(value.strip())
+    match = _TEXT.fullmatch(value.strip()) if len(value) <= _LONGEST else None
     if not match:
         raise wrong
     number, text = float(match[1]), match[2]
@@ -56,10 +65,17 @@ def to_si(value: object, unit: str, example: str) -> float:
             raise ValueError(f"{value!r} has no unit; expected an angle such as '{example}'")
         return number
     try:
-        given = UNITS.parse_units("1" + text if text.startswith("/") else text)
+        given = UNITS.parse_units(_bounded("1" + text if text.startswith("/") else text))
         return float(UNITS.Quantity(number, given).to(unit or "dimensionless").magnitude)
     except _BAD_UNIT:
         raise wrong from None
+
+
+def _bounded(text: str) -> str:
+    """Text of a unit, if it is names and small numbers, with powers of two digits."""
+    if len(text) > _LONGEST or not _PARTS.fullmatch(text):
+        raise ValueError(f"{text!r} is not a unit")
+    return text
 
 
 @dataclass(frozen=True)
@@ -159,9 +175,11 @@ def parse_units(text: str) -> pint.Quantity[float]:
         If it is not a unit.
     """
     text = str(text).strip()
+    if len(text) > _LONGEST:
+        raise ValueError(f"{text!r} is not a unit")
     products = re.sub(r"(?<=[^\W_])\.(?=[^\W\d_])", "*", text)
     powers = re.sub(r"(?<![\w.])([^\W\d_]+)\^?(-?\d+)(?!\w)", r"\1**\2", products)
     try:
-        return 1.0 * UNITS.parse_expression(powers or "1") * UNITS.dimensionless
+        return 1.0 * UNITS.parse_expression(_bounded(powers or "1")) * UNITS.dimensionless
     except Exception as error:  # pint lets its tokenizer's own exceptions through
         raise ValueError(f"{text!r} is not a unit") from error

@@ -3,13 +3,12 @@
 from collections.abc import Sequence
 
 import rich.table
-from rich.console import Console
 
+from lidar_mi.progress import Terminal
 from lidar_mi.tables import Table
 
-# names in files and folders may hold brackets and colons: they are no markup
-output = Console(markup=False, emoji=False)
-errors = Console(stderr=True, markup=False, emoji=False)
+output = Terminal()
+errors = Terminal(stderr=True)
 
 
 def print_rows(title: str, rows: Sequence[Sequence[str]]) -> None:

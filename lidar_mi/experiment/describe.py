@@ -4,14 +4,16 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 from lidar_mi.atmosphere.aerosols import AEROSOLS
 from lidar_mi.atmosphere.molecules import BANDS, molecular_scattering, standard_atmosphere
 from lidar_mi.atmosphere.particle_scattering import Notice
 from lidar_mi.atmosphere.scattering import describe
 from lidar_mi.errors import InputError
-from lidar_mi.io.netcdf import open_netcdf
+from lidar_mi.io.netcdf import load_variable, open_netcdf
 from lidar_mi.io.scattering_table import aerosol_table, read_table
+from lidar_mi.io.size import fits
 from lidar_mi.io.vortex_file import read_vortices
 
 MOLECULES = "molecules"
@@ -143,8 +145,10 @@ def _netcdf(path: Path) -> Iterator[Section]:
         for name, variable in data.variables.items():
             shape = " x ".join(f"{d} {n}" for d, n in variable.sizes.items())
             span = ""
-            if variable.dtype.kind in "fiu" and variable.size:
-                span = f"{float(variable.min()):.4g} ... {float(variable.max()):.4g}"
+            # of what is larger, a part at a time would be wanted
+            if variable.dtype.kind in "fiu" and variable.size and fits(path, variable.nbytes):
+                values = load_variable(xr.DataArray(variable, name=name), path)
+                span = f"{float(values.min()):.4g} ... {float(values.max()):.4g}"
             rows.append((str(name), shape, span, str(variable.attrs.get("units", ""))))
         yield str(path), rows
         yield "attributes", [(key, _short(value)) for key, value in data.attrs.items()]

@@ -22,6 +22,8 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
+from lidar_mi.io.exr_header import declared_size
+from lidar_mi.io.size import check_size
 
 QUANTITIES = ("S0", "S1", "S2", "S3", "S0_stderr")
 _MEANING = {
@@ -31,7 +33,7 @@ _MEANING = {
     "S3": "Stokes V, over emitted pulse energy",
     "S0_stderr": "Monte Carlo standard error of S0",
 }
-_LAYER = re.compile(r"gate(\d+)\.(.+)$")
+_LAYER = re.compile(r"gate(\d{1,9})\.(.+)$")
 # header entries that describe the file, not the scan
 _STRUCTURE = {
     "channels",
@@ -89,8 +91,8 @@ def read_fringes(path: str | Path) -> xr.Dataset:
     header, layers = read_layers(path)
     if not {*QUANTITIES, "Y"} <= set(layers):
         raise InputError(
-            f"{path}: layers {', '.join(sorted(layers)) or 'none'} are not a picture of a fringe "
-            f"camera; expected {', '.join(QUANTITIES)} and Y"
+            f"{path}: its layers are not an image of a fringe camera; expected "
+            f"{', '.join(QUANTITIES)} and Y; it has {', '.join(sorted(layers)) or 'none'}"
         )
     return label_fringes({name: layers[name] for name in QUANTITIES}, header)
 
@@ -116,8 +118,15 @@ def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> Non
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     for key, value in attributes.items():
         header[key] = value.astype(np.float32) if isinstance(value, np.ndarray) else value
-    channels = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in channels.items()}
-    write_atomically(path, lambda part: OpenEXR.File(header, channels).write(str(part)))
+    with np.errstate(over="ignore"):
+        singles = {k: np.ascontiguousarray(v, dtype=np.float32) for k, v in channels.items()}
+    for name, single in singles.items():
+        if (np.isinf(single) & np.isfinite(channels[name])).any():
+            raise InputError(
+                f"{path}: layer {name} has values beyond {np.finfo(np.float32).max:.3g}, the "
+                "largest of an EXR file; expected smaller ones"
+            )
+    write_atomically(path, lambda part: OpenEXR.File(header, singles).write(str(part)))
 
 
 def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
@@ -132,12 +141,39 @@ def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an OpenEXR image")
     try:
+        size = declared_size(path)
+    except ValueError as error:
+        raise InputError(f"{path}: not a readable OpenEXR image ({error})") from None
+    check_size(path, size)
+    try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             header = {k: v for k, v in file.header().items() if k not in _STRUCTURE}
             layers = {k: np.array(c.pixels) for k, c in file.channels().items()}
-    except (RuntimeError, ValueError):  # no OpenEXR file; one that is cut off
+    except Exception:  # whatever the library meets in a damaged file
         raise InputError(f"{path}: not a readable OpenEXR image") from None
+    if len({pixels.shape for pixels in layers.values()}) != 1:
+        raise InputError(f"{path}: not a readable OpenEXR image (its layers differ in size)")
     return header, layers
+
+
+def axis_of(header: dict, name: str, size: int, path: str | Path) -> np.ndarray:
+    """A header's axis of an image, ascending, m.
+
+    Raises
+    ------
+    InputError
+        Not as many finite, ascending numbers as the image has pixels.
+    """
+    try:
+        values = np.asarray(header[name], float)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (size,) or not np.isfinite(values).all() or (np.diff(values) <= 0).any():
+        raise InputError(
+            f"{path}: header attribute {name} of {values.size} numbers is no axis of {size} "
+            "pixels; expected as many finite numbers, ascending"
+        )
+    return values
 
 
 def read_scan(path: str | Path) -> xr.Dataset:
@@ -172,19 +208,19 @@ def read_scan(path: str | Path) -> xr.Dataset:
     for name, pixels in layers.items():
         if match := _LAYER.match(name):
             gates.setdefault(int(match[1]), {})[match[2]] = pixels
-    complete = gates and all(set(QUANTITIES) <= set(layer) for layer in gates.values())
+    complete = gates and all(
+        set(QUANTITIES) <= set(layer) and set(layer) == set(gates[min(gates)])
+        for layer in gates.values()
+    )
     if not complete or "Y" not in layers or not {"y", "z"} <= set(header):
         raise InputError(
-            f"{path}: layers {', '.join(sorted(layers)) or 'none'} are not a lidar scan; expected "
-            "Y and gate000.S0 ... gate000.S3, gate000.S0_stderr, with header attributes y and z"
+            f"{path}: its layers are not a lidar scan; expected Y and gate000.S0 ... gate000.S3, "
+            "gate000.S0_stderr, the same of every gate, with header attributes y and z; it has "
+            f"{', '.join(sorted(layers)) or 'none'}"
         )
-    y, z = (np.asarray(header.pop(axis), float) for axis in ("y", "z"))
     rows, columns = layers["Y"].shape
-    if (len(z), len(y)) != (rows, columns):
-        raise InputError(
-            f"{path}: header axes of {len(y)} x {len(z)} values do not fit the image of "
-            f"{columns} x {rows} pixels"
-        )
+    y, z = (axis_of(header, *axis, path) for axis in (("y", columns), ("z", rows)))
+    header = {key: value for key, value in header.items() if key not in ("y", "z")}
     variables: dict[str, Any] = {
         quantity: (
             ("gate", "z", "y"),

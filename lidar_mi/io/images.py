@@ -1,5 +1,7 @@
 """Images of any common kind: pixels, axes, noise; and packed for a report."""
 
+import math
+import warnings
 from io import BytesIO
 from pathlib import Path
 
@@ -7,7 +9,8 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.exr import read_layers
+from lidar_mi.io.exr import axis_of, read_layers
+from lidar_mi.io.size import check_size
 
 FITS = (".fits", ".fit", ".fts")
 
@@ -86,8 +89,8 @@ def read_image(
     header = read_layers(path)[0] if _is_exr(path) else {}
     if spacing is not None:
         y, z = ((np.arange(n) - (n - 1) / 2) * spacing for n in (columns, rows))
-    elif {"y", "z"} <= set(header) and len(header["y"]) == columns and len(header["z"]) == rows:
-        y, z = np.asarray(header["y"], float), np.asarray(header["z"], float)
+    elif {"y", "z"} <= set(header):
+        y, z = axis_of(header, "y", columns, path), axis_of(header, "z", rows, path)
     else:
         raise InputError(
             f"{path}: no axes y and z for {columns} x {rows} pixels; expected them in the header "
@@ -195,10 +198,17 @@ def _fits(path):
         raise InputError(
             f"{path}: FITS files need the library astropy: pip install 'lidar-mi[fits]'"
         ) from None
+    with path.open("rb") as file:
+        if file.read(6) != b"SIMPLE":
+            raise InputError(f"{path}: no readable FITS file (it does not begin as one)")
     try:
         with fits.open(path, memmap=False) as parts:
+            shapes = [part.shape for part in parts if part.is_image]
+            check_size(path, max((8 * math.prod(shape) for shape in shapes), default=0))
             found = [part.data for part in parts if part.is_image and part.data is not None]
-    except (OSError, ValueError, TypeError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # whatever the library meets in a damaged file
         raise InputError(f"{path}: no readable FITS file ({_short(error)})") from None
     if not found or found[0].squeeze().ndim != 2:
         shape = " x ".join(map(str, found[0].shape)) if found else "none"
@@ -206,15 +216,26 @@ def _fits(path):
     return found[0].squeeze()
 
 
-def _image(path):
+def _opened(path):
+    """An image of one of the kinds that cameras write: others may run programs to be read."""
     from PIL import Image
 
+    with warnings.catch_warnings():
+        # its size is checked once it is known
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        return Image.open(path, formats=("PNG", "TIFF", "BMP", "JPEG", "WEBP"))
+
+
+def _image(path):
     try:
-        with Image.open(path) as file:
+        with _opened(path) as file:
+            check_size(path, 8 * file.width * file.height * len(file.getbands()))
             indirect = file.mode in ("P", "CMYK", "YCbCr", "HSV", "LAB")
             image = file.convert("RGB") if indirect else file
             bands, pixels = image.getbands(), np.asarray(image)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # whatever the library meets in a damaged file
         raise InputError(f"{path}: no readable image ({_short(error)})") from None
     if pixels.ndim == 2:
         return pixels

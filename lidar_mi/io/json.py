@@ -22,9 +22,10 @@ def read_json(path: str | Path, expected: str) -> Any:
     InputError
         A file that cannot be read or is not JSON.
     """
+    text = read_text(path, expected)
     try:
-        return json.loads(read_text(path, expected))
-    except json.JSONDecodeError:
+        return json.loads(text)
+    except (ValueError, RecursionError):  # a number of thousands of digits, thousands of lists
         raise InputError(f"{path}: not JSON; expected {expected}") from None
 
 

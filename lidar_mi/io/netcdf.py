@@ -1,5 +1,6 @@
 """NetCDF files."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -7,9 +8,7 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
-
-# what the format libraries raise on damaged files
-_FORMAT_ERRORS = (OSError, ValueError, TypeError, LookupError, RuntimeError, AttributeError)
+from lidar_mi.io.size import check_size
 
 
 def open_netcdf(path: str | Path) -> xr.Dataset:
@@ -18,9 +17,12 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     Raises
     ------
     InputError
-        A file that cannot be read, is no NetCDF, or is damaged.
+        A file that cannot be read, is no NetCDF, is damaged, or declares axes or chunks that are
+        out of proportion to it.
     """
     path = Path(path)
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise InputError(f"{path}: a device or a pipe; allowed: a NetCDF file")
     try:
         with path.open("rb") as file:
             magic = file.read(8)
@@ -34,18 +36,38 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
         engine = "scipy"
     else:
         raise InputError(f"{path}: is not NetCDF; allowed: NetCDF-4 (HDF5) or NetCDF-3 classic")
+    for what, size in _declared(path) if engine == "h5netcdf" else ():
+        check_size(path, size, what)
     try:
         return xr.open_dataset(path, engine=engine, decode_times=False)
-    except _FORMAT_ERRORS as error:
+    except Exception as error:  # whatever the libraries meet in a damaged file
         raise _damaged(path, error) from None
 
 
+def _declared(path):
+    """What opening reads at once, and the largest piece that any value takes to be read."""
+    import h5netcdf
+
+    found = []
+    try:
+        with h5netcdf.File(path, "r", phony_dims="access") as file:
+            for name, variable in file.variables.items():
+                is_axis = variable.dimensions == (name,)
+                for shape in (variable.shape if is_axis else None, variable.chunks):
+                    if shape is not None:
+                        found.append((name, math.prod(shape) * variable.dtype.itemsize))
+    except Exception as error:
+        raise _damaged(path, error) from None
+    return found
+
+
 def read_netcdf(path: str | Path) -> xr.Dataset:
-    """The whole of a NetCDF file, in memory; errors as in `open_netcdf`."""
+    """The whole of a NetCDF file, in memory; errors as in `open_netcdf` and `load_variable`."""
     with open_netcdf(path) as data:
+        check_size(path, data.nbytes)
         try:
             return data.load()
-        except _FORMAT_ERRORS as error:
+        except Exception as error:
             raise _damaged(path, error) from None
 
 
@@ -55,16 +77,17 @@ def load_variable(variable: xr.DataArray, path: str | Path) -> xr.DataArray:
     Raises
     ------
     InputError
-        The file is damaged where the values are.
+        The file is damaged where the values are, or there are more than it can hold.
     """
+    check_size(path, variable.nbytes, str(variable.name))
     try:
         return variable.load()
-    except _FORMAT_ERRORS as error:
+    except Exception as error:
         raise _damaged(path, error) from None
 
 
 def _damaged(path, error):
-    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    reason = next(iter(str(error).splitlines()), "") or type(error).__name__
     return InputError(f"{path}: is damaged ({reason}); allowed: a whole NetCDF file")
 
 

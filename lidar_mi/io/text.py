@@ -1,27 +1,43 @@
 """Text files."""
 
+import stat
 from pathlib import Path
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
 
+LONGEST = 64 << 20
+"""Bytes of a text file that is read."""
 
-def read_text(path: str | Path, expected: str) -> str:
-    """Text of a file.
+
+def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
+    """Text of a file, UTF-8.
 
     Parameters
     ----------
     path : str or Path
     expected : str
         What kind of file was asked for, for the message: "an experiment file".
+    longest : int
+        Bytes; nothing is read of a file that is longer, and nothing of devices and pipes, which
+        have no end.
 
     Raises
     ------
     InputError
-        A file that cannot be read or is not text.
+        A file that cannot be read, is too long or is not text.
     """
+    path = Path(path)
     try:
-        return Path(path).read_text()
+        found = path.stat()
+        if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):
+            raise InputError(f"{path}: a device or a pipe; expected {expected}")
+        if found.st_size > longest:
+            raise InputError(
+                f"{path}: {found.st_size} bytes are not allowed; expected {expected} of at most "
+                f"{longest} bytes"
+            )
+        return path.read_text(encoding="utf-8")
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; expected {expected}") from None
     except UnicodeDecodeError:
@@ -30,4 +46,4 @@ def read_text(path: str | Path, expected: str) -> str:
 
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file, whole or not at all."""
-    write_atomically(path, lambda part: part.write_text(text))
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

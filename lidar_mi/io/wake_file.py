@@ -40,6 +40,15 @@ def _scale_to(variable: xr.DataArray, target: str, name: str, path: Path) -> flo
         raise InputError(f"{path}: {name} has the unit {text!r}; {allowed}") from None
 
 
+def _numbers(variable: xr.DataArray, path: Path) -> np.ndarray:
+    """A variable's values as float64."""
+    if variable.dtype.kind not in "iuf":
+        raise InputError(
+            f"{path}: variable {variable.name!r} is of type {variable.dtype}; allowed: numbers"
+        )
+    return load_variable(variable, path).values.astype(float)
+
+
 def _file_names(names, path):
     """Our name -> the file's, for all dimensions and variables."""
     known = (*_DIMENSIONS, *_VARIABLES)
@@ -81,7 +90,7 @@ def _pick_time(data, name, time, path):
     plain = coordinate.copy()
     if "units" in plain.attrs:
         plain.attrs["units"] = str(plain.attrs["units"]).split(" since ")[0]
-    times = np.atleast_1d(coordinate.values.astype(float)) * _scale_to(plain, "s", name, path)
+    times = np.atleast_1d(_numbers(coordinate, path)) * _scale_to(plain, "s", name, path)
     listing = ", ".join(f"{t:.10g}" for t in times[:20]) + (" ..." if times.size > 20 else "")
     if time is None:
         if times.size > 1:
@@ -104,7 +113,7 @@ def _axis(data, name, ours, path):
             f"variable {name!r} in m"
         )
     variable = data[name]
-    values = variable.values.astype(float) * _scale_to(variable, "m", name, path)
+    values = _numbers(variable, path) * _scale_to(variable, "m", name, path)
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         raise InputError(
@@ -250,7 +259,8 @@ def _read(data, table, asked, time, x, path):
         theirs = table["x"]
         place = 0.0
         if theirs in data.variables and data[theirs].ndim == 0:
-            place = float(data[theirs]) * _scale_to(data[theirs], "m", theirs, path)
+            place = float(_numbers(data[theirs], path))
+            place *= _scale_to(data[theirs], "m", theirs, path)
         elif x is not None:
             raise InputError(
                 f"{path}: x = {x:g} m is asked for, but there is no {theirs!r}; it has the "
@@ -275,13 +285,8 @@ def _read(data, table, asked, time, x, path):
             unit = variable.attrs.get("units", "1")
         else:
             scale = _scale_to(variable, unit, f"variable {table[name]!r}", path)
-        variable = load_variable(variable, path)
-        if variable.dtype.kind not in "iuf":
-            raise InputError(
-                f"{path}: variable {table[name]!r} is of type {variable.dtype}; allowed: numbers"
-            )
         variable = variable.transpose(*(table[d] for d in "xyz" if table[d] in variable.dims))
-        values = variable.values.astype(float).reshape([axes[d].size for d in "xyz"]) * scale
+        values = _numbers(variable, path).reshape([axes[d].size for d in "xyz"]) * scale
         amount = name in asked and name in ("tracer", "aerosol")
         _check_values(values, axes, table[name], path, may_be_negative=not amount)
         wake[name] = ("x", "y", "z"), values, {"units": unit, "long_name": long_name}

@@ -1,30 +1,86 @@
-"""YAML, strictly: a key that stands twice in one section is an error."""
+"""YAML, strictly: plain data, of bounded size, and a key that stands twice is an error."""
 
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from lidar_mi.errors import InputError
+from lidar_mi.errors import InputError, one_line
 from lidar_mi.io.text import read_text
+
+LONGEST = 128 << 10
+"""Bytes of a YAML file."""
+LARGEST = 10_000
+"""Values in a file, those that aliases repeat included."""
+DEEPEST = 40
+"""Sections in sections."""
+
+_LARGEST_NUMBER = 10**300
+# what Python raises on the text of a number or a date that is none
+_NO_VALUE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # PyYAML has no types
-    """PyYAML would take the last of two equal keys without a word."""
+    """PyYAML as it is would expand aliases without end and take the last of two equal keys."""
+
+    def __init__(self, stream):
+        super().__init__(stream)
+        self._depth = self._count = 0
+        # values in a node, by its id; not there before the node is complete
+        self._sizes: dict[int, int] = {}
+
+    def compose_node(self, parent, index):
+        event = self.peek_event()
+        self._count += 1
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise _fault(f"more than {DEEPEST} sections in each other", event.start_mark)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        if not isinstance(event, yaml.AliasEvent):
+            self._sizes[id(node)] = 1 + sum(self._sizes[id(child)] for child in _children(node))
+        elif id(node) not in self._sizes:
+            raise _fault("an alias within what it stands for", event.start_mark)
+        if max(self._count, self._sizes[id(node)]) > LARGEST:
+            raise _fault(f"more than {LARGEST} values, aliases included", event.start_mark)
+        return node
+
+    def construct_object(self, node, deep=False):
+        try:
+            value = super().construct_object(node, deep)
+            # what is larger is no float, and cannot be shown
+            if not isinstance(value, int) or abs(value) < _LARGEST_NUMBER:
+                return value
+        except _NO_VALUE:
+            pass
+        kind = node.tag.rsplit(":", 1)[-1]
+        text = repr(node.value) if isinstance(node, yaml.ScalarNode) else "a section"
+        raise _fault(f"{one_line(text, 60)} is not of the type {kind}", node.start_mark)
 
     def construct_mapping(self, node, deep=False):
+        own = [key for key, _ in node.value if key.tag != "tag:yaml.org,2002:merge"]
+        data = super().construct_mapping(node, deep)
         seen = set()
-        for key in (key for key, _ in node.value if isinstance(key, yaml.ScalarNode)):
-            if key.value in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"key {key.value!r} is there twice", key.start_mark
-                )
-            seen.add(key.value)
-        return super().construct_mapping(node, deep)
+        for key in own:
+            name = self.construct_object(key, deep=True)
+            if name in seen:
+                raise _fault(f"key {one_line(repr(name), 60)} is there twice", key.start_mark)
+            seen.add(name)
+        return data
+
+
+def _children(node):
+    if isinstance(node, yaml.MappingNode):
+        return [part for pair in node.value for part in pair]
+    return node.value if isinstance(node, yaml.SequenceNode) else []
+
+
+def _fault(problem, mark):
+    return yaml.constructor.ConstructorError(None, None, problem, mark)
 
 
 def parse_yaml(text: str, origin: str) -> Any:
-    """Content of YAML text: dict, list, str, number, bool or None.
+    """Content of YAML text: dict, list, str, number, bool, date or None.
 
     Parameters
     ----------
@@ -35,20 +91,23 @@ def parse_yaml(text: str, origin: str) -> Any:
     Raises
     ------
     InputError
-        Not YAML, or a key that is there twice; with the line.
+        Not YAML, larger or deeper than allowed, a value that is not of its type, or a key that is
+        there twice; with the line.
     """
+    if len(text) > LONGEST:
+        raise InputError(f"{origin}: {len(text)} characters; expected at most {LONGEST}")
     try:
         return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f" line {mark.line + 1}" if mark else ""
-        reason = " ".join(str(getattr(error, "problem", None) or error).split())
+        reason = str(getattr(error, "problem", None) or error)
         raise InputError(f"{origin}:{line} not valid YAML ({reason})") from None
 
 
 def read_yaml(path: str | Path, expected: str) -> Any:
     """Content of a YAML file; ``expected`` and errors as in `read_text` and `parse_yaml`."""
-    return parse_yaml(read_text(path, expected), str(path))
+    return parse_yaml(read_text(path, expected, LONGEST), str(path))
 
 
 def to_yaml(data: Any) -> str:

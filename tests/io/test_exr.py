@@ -240,9 +240,41 @@ class TestErrors:
         axes = {"y": np.arange(5, dtype=np.float32), "z": np.arange(3, dtype=np.float32)}
         path = tmp_path / "other.exr"
         self.foreign(path, axes, names=names)
-        assert "header axes of 5 x 3 values do not fit the image of 4 x 3 pixels" in self.fault(
-            path
-        )
+        assert "header attribute y of 5 numbers is no axis of 4 pixels" in self.fault(path)
+
+    @pytest.mark.parametrize("y", ["port", 3.0, [0, 1, 1, 2], [0, 1, np.nan, 3], [3, 2, 1, 0]])
+    def test_axes_that_are_none(self, tmp_path, y):
+        names = {"Y"} | {f"gate000.{q}" for q in QUANTITIES}
+        y = np.array(y, np.float32) if isinstance(y, list) else y
+        path = tmp_path / "other.exr"
+        self.foreign(path, {"y": y, "z": np.arange(3, dtype=np.float32)}, names=names)
+        assert "is no axis of 4 pixels; expected as many finite numbers" in self.fault(path)
+
+    def test_gates_that_differ(self, tmp_path):
+        names = {"Y", "gate000.depolarization"}
+        names |= {f"gate00{gate}.{q}" for gate in (0, 1) for q in QUANTITIES}
+        axes = {"y": np.arange(4, dtype=np.float32), "z": np.arange(3, dtype=np.float32)}
+        path = tmp_path / "gates.exr"
+        self.foreign(path, axes, names=names)
+        assert "the same of every gate" in self.fault(path)
+
+    def test_more_pixels_than_a_file_can_hold(self, tmp_path):
+        path = tmp_path / "large.exr"
+        self.foreign(path, {}, names={"Y"})
+        content = path.read_bytes()
+        window = content.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4
+        large = np.array([0, 0, 29_999, 29_999], "<i4").tobytes()
+        path.write_bytes(content[:window] + large + content[window + 16 :])
+        assert "declares 3.6e+09 bytes in a file of" in self.fault(path)
+
+
+def test_what_float32_cannot_hold_is_not_written_as_infinity(tmp_path):
+    scan = make_scan()
+    scan["S0"] = scan["S0"].astype(float)
+    scan["S0"][0, 0, 0] = 1e300
+    with pytest.raises(InputError, match=r"gate000.S0 has values beyond 3.4e\+38"):
+        write_scan(tmp_path / "scan.exr", scan)
+    assert list(tmp_path.iterdir()) == []
 
 
 class TestFailedWrites:

@@ -1,12 +1,13 @@
 """NetCDF files: unit tests. Detect a value or a fill value changed on the way, a file half written,
 and any damaged file that does not give one clear line."""
 
+import h5py
 import numpy as np
 import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.netcdf import open_netcdf, read_netcdf, write_netcdf
+from lidar_mi.io.netcdf import load_variable, open_netcdf, read_netcdf, write_netcdf
 
 DATA = xr.Dataset({"v": ("y", [1.0, np.nan, 3.0])}, {"y": ("y", [0.0, 0.5, 1.0], {"units": "m"})})
 
@@ -38,6 +39,33 @@ def test_damaged_files_give_one_line(tmp_path, cut):
     with pytest.raises(InputError) as error:
         read_netcdf(path)
     assert str(error.value).startswith(f"{path}: ") and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "chunks"), [((30_000, 30_000), (10, 10)), ((10, 10), None), ((9_000, 9_000), None)]
+)
+def test_what_a_file_declares_is_bounded_by_what_it_is(tmp_path, shape, chunks):
+    """Values that were never written take no room in the file."""
+    path = tmp_path / "sparse.nc"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("v", shape, "f8", chunks=chunks)
+    with open_netcdf(path) as data:
+        if shape == (10, 10):
+            assert load_variable(data["v"], path).shape == shape
+            return
+        for read in (lambda: load_variable(data["v"], path), lambda: read_netcdf(path)):
+            with pytest.raises(InputError, match=r"declares .* expected at most 256 MiB"):
+                read()
+
+
+def test_an_axis_and_a_chunk_are_bounded_before_the_file_is_open(tmp_path):
+    with h5py.File(tmp_path / "axis.nc", "w") as file:
+        file.create_dataset("y", (10**10,), "f8", chunks=(1000,)).make_scale("y")
+    with h5py.File(tmp_path / "chunk.nc", "w") as file:
+        file.create_dataset("v", (10**10,), "f8", chunks=(5 * 10**7,))
+    for name, what in (("axis.nc", "y declares 8e"), ("chunk.nc", "v declares 4e")):
+        with pytest.raises(InputError, match=what):
+            open_netcdf(tmp_path / name)
 
 
 def test_missing_file_is_named(tmp_path):
