@@ -37,7 +37,7 @@ def info(
     single-scattering albedo, lidar ratio, depolarisation ratio.
     """
     from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment.describe import sections
+    from lidar_mi.experiment.describe import sections, value_at
     from lidar_mi.experiment.run_folder import failure, read_metrics, read_record
     from lidar_mi.experiment.study import RECORD
 
@@ -60,8 +60,8 @@ def info(
         elif metrics is None:
             output.print("unfinished: no metrics.json yet; run it again to go on")
         elif not (folder / RECORD).is_file():
-            doppler = read_record(folder)["experiment"].get("doppler")
-            averaged = doppler["retrieval"]["averaged"] if doppler else ()
+            asked = value_at(read_record(folder)["experiment"], "doppler.retrieval.averaged")
+            averaged = [n for n in asked if isinstance(n, int)] if isinstance(asked, list) else ()
             for table in summary(metrics, averaged):
                 print_table(table)
         if (folder / RECORD).is_file() and not reason:

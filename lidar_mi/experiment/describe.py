@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -231,11 +232,17 @@ def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
         "render.max_order",
         "retrieval.methods",
     ):
-        value = experiment
-        for part in key.split("."):
-            value = value.get(part) if isinstance(value, dict) else None
+        value = value_at(experiment, key)
         if value is not None:
-            yield key, ", ".join(value) if isinstance(value, list) else value
+            yield key, ", ".join(map(str, value)) if isinstance(value, list) else value
+
+
+def value_at(experiment: dict, key: str) -> Any:
+    """The value of a dotted key of a record's experiment; None: it has none."""
+    value: Any = experiment
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, dict) else None
+    return value
 
 
 def _short(value) -> str:

@@ -1,11 +1,14 @@
 """What a run says while it runs: to its log file and to the person in front of the screen."""
 
+import re
 import time
 from pathlib import Path
 
+from lidar_mi.errors import one_line, printable
 from lidar_mi.progress import Notice
 
 FAILED = "failed: "
+_TAIL = 1 << 16
 
 
 def silent(text: str, share: float | None) -> None:
@@ -30,8 +33,8 @@ class Log:
     def __call__(self, text: str) -> None:
         """Say a line, and write it into the file."""
         if self.path is not None:
-            with self.path.open("a") as file:
-                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {text}\n")
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {printable(text)}\n")
         self.notice(text, None)
 
     def remark(self, text: str) -> None:
@@ -41,7 +44,7 @@ class Log:
 
     def fail(self, error: Exception) -> None:
         """Say why the run ended, so that nobody takes it for one that was stopped and can go on."""
-        self(f"{FAILED}{' '.join(str(error).split()) or type(error).__name__}")
+        self(f"{FAILED}{one_line(error) or type(error).__name__}")
 
     def bar(self, text: str, share: float | None) -> None:
         """Show progress within a step; not written."""
@@ -50,6 +53,11 @@ class Log:
 
 def failure(path: Path) -> str | None:
     """What the run of a log file failed from; None: it did not, or was only stopped."""
-    lines = path.read_text().splitlines() if path.is_file() else []
-    _, _, text = lines[-1].split(" ", 2) if lines else ("", "", "")  # behind date and time
-    return text.removeprefix(FAILED) if text.startswith(FAILED) else None
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        # the end tells, and someone else may have written into it
+        file.seek(max(0, path.stat().st_size - _TAIL))
+        lines = file.read(_TAIL).decode(errors="backslashreplace").splitlines()
+    last = re.fullmatch(rf"\S+ \S+ {FAILED}(.*)", lines[-1]) if lines else None
+    return one_line(last[1]) if last else None

@@ -14,6 +14,16 @@ from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
 from lidar_mi.units import Unit, Within, to_si
 
+BESIDE_VARIANTS = (
+    "study.yaml",
+    "experiment.yaml",
+    "log.txt",
+    "metrics.json",
+    "report.html",
+    "figures",
+)
+"""What a study or a run has in its folder: no variant, whose folder is there too, is called so."""
+
 
 def load_experiment(name: str | Path, *, variant: str | None = None, **changes: Any) -> Experiment:
     """Read an experiment, and change some of its keys.
@@ -109,8 +119,12 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
         place = f"{path}: variants.{name}"
         if not re.fullmatch(NAME, str(name)):
             raise InputError(
-                f"{place}: not allowed; expected a name of letters, digits, _, . and -"
+                f"{place}: not allowed; expected a name of at most 100 letters, digits, _, . and -"
             )
+        if str(name) in found:
+            raise InputError(f"{place}: not allowed; another variant has this name")
+        if str(name).lower() in BESIDE_VARIANTS:
+            raise InputError(f"{place}: not allowed; a file beside the variants has this name")
         if not isinstance(changes, dict):
             raise InputError(f"{place}: {changes!r} is not allowed; expected keys to change")
         if "name" in changes:
@@ -226,7 +240,7 @@ def _first_fault(error: ValidationError) -> str:
     elif fault["type"].startswith("model_"):
         expected = f"a section with keys out of {', '.join(_keys_at(fault['loc']))}"
     elif fault["type"] == "string_pattern_mismatch":
-        expected = "letters, digits, _, . and -, a letter or digit first"
+        expected = "at most 100 letters, digits, _, . and -, a letter or digit first"
     elif fault["type"] in ("tuple_type", "list_type"):
         expected = "a list in brackets"
     elif fault["type"] == "too_short":

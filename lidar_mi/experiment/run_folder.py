@@ -203,7 +203,16 @@ def read_metrics(folder: str | Path) -> dict[str, float] | None:
         The folder's metrics.json was not written by a run.
     """
     path = Path(folder) / METRICS
-    return read_json(path, "metrics of a run") if path.is_file() else None
+    if not path.is_file():
+        return None
+    metrics = read_json(path, "metrics of a run")
+    if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
+        raise InputError(f"{path}: not written by a run; expected names with numbers")
+    return metrics
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**63)
 
 
 def failure(folder: str | Path) -> str | None:

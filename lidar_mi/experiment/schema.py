@@ -192,7 +192,7 @@ class Volume(Section):
 BACKSCATTER = ("platform", "lidar", "detector", "scan", "scattering", "render", "retrieval")
 
 
-NAME = "[A-Za-z0-9][A-Za-z0-9_.-]*"
+NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
 """What an experiment or a variant may be called: both name folders."""
 
 

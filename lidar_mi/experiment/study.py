@@ -4,6 +4,7 @@ Each variant is a run of its own in a folder of its own; beside these folders li
 report, its figure and all metrics, named VARIANT.METRIC.
 """
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from lidar_mi.experiment.reading import dump
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.run_folder import FIGURES, LOG, METRICS, REPORT, read_metrics, read_record
 from lidar_mi.experiment.run_folder import RECORD as RUN
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema import NAME, Experiment
 from lidar_mi.io.json import write_json
 from lidar_mi.io.text import write_text
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
@@ -104,6 +105,8 @@ def read_study(
     try:
         record = read_yaml(folder / RECORD, "a study's record")
         name, variants = str(record["name"]), [str(key) for key in record["variants"]]
+        if not all(re.fullmatch(NAME, key) for key in variants):
+            raise KeyError("variants")
     except (InputError, TypeError, KeyError):
         raise InputError(
             f"{folder / RECORD}: not written by a study; expected its folder"

@@ -280,8 +280,8 @@ FAULTS = [
     ("retrieval.blur=-1", "retrieval.blur: -1 m is not allowed; expected 'beam' or 0 to 1000 m"),
     ("retrieval.methods=[]", "retrieval.methods: [] is not allowed; expected 1 or more"),
     ("retrieval.methods=cc", "retrieval.methods: 'cc' is not allowed; expected a list in brackets"),
-    ("name=a/b", "name: 'a/b' is not allowed; expected letters, digits"),
-    ("name=..", "name: '..' is not allowed; expected letters, digits"),
+    ("name=a/b", "name: 'a/b' is not allowed; expected at most 100 letters, digits"),
+    ("name=..", "name: '..' is not allowed; expected at most 100 letters, digits"),
     # not the right kind
     ("wake=3", "wake: 3 is not allowed; expected a section with keys out of file, vortex_pair, "),
     ("lidar=", "lidar: None is not allowed; expected a section with keys out of wavelength, "),
