@@ -46,7 +46,7 @@ def progress(console: Console | None = None) -> AbstractContextManager[Notice]:
     Returns
     -------
     context manager
-        Gives the callable that is told what is running.
+        Gives the callable to which steps are reported.
     """
     console = console or Terminal(stderr=True)
     if console.is_jupyter:
@@ -58,7 +58,7 @@ def progress(console: Console | None = None) -> AbstractContextManager[Notice]:
 def _as_lines(console: Console) -> Iterator[Notice]:
     last = None
 
-    def notice(text: str, share: float | None) -> None:
+    def notice(text: str, fraction: float | None) -> None:
         nonlocal last
         if text != last:
             console.print(text, highlight=False, soft_wrap=True)
@@ -77,10 +77,10 @@ def _on_terminal(console: Console) -> Iterator[Notice]:
     with Progress(*columns, console=console, transient=True) as bars:
         task = bars.add_task("starting", total=None)
 
-        def notice(text: str, share: float | None) -> None:
+        def notice(text: str, fraction: float | None) -> None:
             nonlocal last
             # a full bar would stop clock and spinner, and what comes next goes on
-            total, completed = (None, 0.0) if share is None else (1.0, min(share, 0.999))
+            total, completed = (None, 0.0) if fraction is None else (1.0, min(fraction, 0.999))
             bars.update(task, description=printable(text), total=total, completed=completed)
             if text != last and _is_warning(text):
                 console.print(text, highlight=False, soft_wrap=True)
@@ -97,13 +97,13 @@ def _in_notebook() -> Iterator[Notice]:
     last = None
     bar = display(HTML(""), display_id=True)
 
-    def notice(text: str, share: float | None) -> None:
+    def notice(text: str, fraction: float | None) -> None:
         nonlocal shown, last
         now = time.monotonic()
         if text != last and _is_warning(text):
             print(printable(text))
         if text != last or now - shown > _NOTEBOOK_INTERVAL:
-            value = "" if share is None else f' value="{share:.3f}"'
+            value = "" if fraction is None else f' value="{fraction:.3f}"'
             clock = f"{int(now - start) // 60}:{int(now - start) % 60:02d}"
             bar.update(HTML(f"<progress{value}></progress> {clock} {escape(text)}"))
             shown = now

@@ -22,4 +22,4 @@ SOURCE_NAMES = {
 }
 """What winds are retrieved from, as figures and tables call it."""
 
-BACKSCATTER = "apparent backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$"
+BACKSCATTER = "attenuated backscatter / 10$^{-6}$ m$^{-1}$ sr$^{-1}$"

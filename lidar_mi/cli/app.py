@@ -1,4 +1,4 @@
-"""The command line, put together: one command a file beside this one."""
+"""The command line, put together: one command per file beside this one."""
 
 from typing import Annotated
 

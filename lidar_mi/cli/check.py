@@ -27,4 +27,4 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
         ]
     for title, rows in found:
         print_rows(title, rows)
-    output.print("nothing wrong found", highlight=False)
+    output.print("all checks passed", highlight=False)

@@ -12,7 +12,7 @@ from lidar_mi.errors import InputError, causes, is_interrupt, one_line
 BAD_INPUT = 2
 INTERRUPTED = 130
 
-_STOPPED = "stopped; a run goes on when started again"
+_STOPPED = "stopped; start it again to resume the run"
 
 # what typer finds wrong with arguments and options, whichever library it takes this from
 _USAGE_ERROR = typer.BadParameter.__mro__[1]

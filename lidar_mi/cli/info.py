@@ -58,7 +58,7 @@ def info(
         if reason := failure(folder):
             output.print(f"failed: {reason}", soft_wrap=True)
         elif metrics is None:
-            output.print("unfinished: no metrics.json yet; run it again to go on")
+            output.print("unfinished: no metrics.json yet; run it again to resume")
         elif not (folder / RECORD).is_file():
             asked = value_at(read_record(folder)["experiment"], "doppler.retrieval.averaged")
             averaged = [n for n in asked if isinstance(n, int)] if isinstance(asked, list) else ()

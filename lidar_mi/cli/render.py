@@ -17,7 +17,10 @@ def render(
     scene: Annotated[Path, typer.Argument(help="Mitsuba scene (XML).")],
     variant: Variant = None,
     samples: Annotated[
-        int, typer.Option("-s", "--spp", min=0, help="Photons a beam; 0 = as the scene says.")
+        int,
+        typer.Option(
+            "-s", "--spp", min=0, help="Monte Carlo samples per beam; 0 = as in the scene."
+        ),
     ] = 0,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="EXR file. Default: beside the scene.")
@@ -40,7 +43,7 @@ def render(
             samples,
             seed,
             _definitions(define or []),
-            lambda share: notice(f"rendering {scene.name}", share),
+            lambda fraction: notice(f"rendering {scene.name}", fraction),
         )
     output.print(f"image    {path}")
 

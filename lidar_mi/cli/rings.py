@@ -24,7 +24,7 @@ def rings(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="Picture (PNG). Default: IMAGE_rings.png.")
+        Path | None, typer.Option("-o", "--out", help="Image (PNG). Default: IMAGE_rings.png.")
     ] = None,
     layer: Annotated[
         str | None, typer.Option(help="Layer of an EXR file. Default: Y, or the only one.")
@@ -51,4 +51,4 @@ def rings(
     write_png(figure, path)
     for table in found.tables():
         print_table(table)
-    output.print(f"picture  {path}")
+    output.print(f"image    {path}")

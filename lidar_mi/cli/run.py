@@ -30,7 +30,7 @@ def run(
     """Run an experiment, start to end.
 
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
-    A run that was stopped goes on with the images it has.
+    A run that was stopped is resumed with the images it has.
     """
     from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment import reading, study

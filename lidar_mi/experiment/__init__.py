@@ -1,1 +1,1 @@
-"""The only room that sees all: what an experiment is, and running it."""
+"""The only room that imports all others: what an experiment is, and running it."""

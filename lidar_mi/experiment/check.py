@@ -1,4 +1,4 @@
-"""What an experiment will do, before it does it: checked as a run would, and told in numbers."""
+"""What an experiment will do, before it does it: checked as a run would, in numbers."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -27,7 +27,7 @@ def sections(
     beside : path
         Folder in which files named by the experiment are looked for first.
     notice : callable
-        Told what is running.
+        Called with what is running.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def _backscatter(asked: Experiment, truth: Truth, plan: ScanPlan) -> Iterator[Se
     rows.append(("extinction", _span(1e3 * air.values, "1/km")))
     rows.append(("texture, rms", f"{asked.wake.texture.rms:.0%}"))
     title = asked.wake.file or ("vortex_pair" if asked.wake.vortex_pair else "turbine")
-    yield f"{asked.name}: the air in the gates ({title}, about the scan's axis)", rows
+    yield f"{asked.name}: extinction in the gates ({title}, about the scan's axis)", rows
 
     scan, lidar, platform = asked.scan, asked.lidar, asked.platform
     pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
@@ -61,10 +61,10 @@ def _backscatter(asked: Experiment, truth: Truth, plan: ScanPlan) -> Iterator[Se
         ("gates", f"{scan.gate_count}, from {plan.gate_start:g} to {plan.gate_stop:g} m"),
         ("warning time", _warning(plan.gate_start, platform.speed)),
         (
-            "photons",
-            f"{asked.render.samples_per_beam} a beam, orders 1 to {asked.render.max_order}",
+            "samples per beam",
+            f"{asked.render.samples_per_beam}, orders 1 to {asked.render.max_order}",
         ),
-        ("time between the pictures", f"{platform.dt:g} s"),
+        ("time between the images", f"{platform.dt:g} s"),
     ]
     if not asked.volume:
         rows += _displacements(asked, wind, pixel)
@@ -103,9 +103,9 @@ def _sensor(asked: Experiment, tables: Mapping) -> Section:
     flat = "; all in one plane: no wind from both" if min(columns, rows) == 1 else ""
     return "both as one sensor", [
         ("lines of sight", f"{count}, {sensor.pulses} pulses each{flat}"),
-        ("pulses a second", f"{count * sensor.pulses * sensor.slabs_per_second:g}"),
+        ("pulses per second", f"{count * sensor.pulses * sensor.slabs_per_second:g}"),
         ("v and w from", sensor.method),
-        ("held against", ", ".join(" ".join(key) for key in tables) or "no requirements"),
+        ("compliance with", ", ".join(" ".join(key) for key in tables) or "no requirements"),
     ]
 
 

@@ -27,7 +27,7 @@ def sections(
     what: str,
     wavelength: float | None = None,
     altitude: float | None = None,
-    notice: Notice = lambda text, share: None,
+    notice: Notice = lambda text, fraction: None,
 ) -> Iterator[Section]:
     """Describe a file, a folder of a run or a study, a named aerosol or the molecules of air.
 
@@ -52,7 +52,7 @@ def sections(
     if altitude is not None and (not named or what != MOLECULES):
         raise InputError(f"--altitude: not allowed with {what}; expected {MOLECULES}")
     kinds = {
-        ".exr": _picture,
+        ".exr": _image,
         ".nc": _netcdf,
         ".nc4": _netcdf,
         ".cdf": _netcdf,
@@ -105,7 +105,7 @@ def _table_file(path: Path) -> Iterator[Section]:
 
 
 def _molecules(wavelength: float, altitude: float) -> Iterator[Section]:
-    """The whole band of Rayleigh scattering beside the line that a narrow receiver sees."""
+    """The whole band of Rayleigh scattering beside the line that a narrow receiver detects."""
     pressure, temperature = standard_atmosphere(altitude)
     bands = [molecular_scattering(wavelength, pressure, temperature, band) for band in BANDS]
     rows = [("", *(f"{band} {kind}" for band, kind in zip(BANDS, ("line", "band"), strict=True)))]
@@ -128,7 +128,7 @@ def _molecules(wavelength: float, altitude: float) -> Iterator[Section]:
     yield title, rows
 
 
-def _picture(path: Path) -> Iterator[Section]:
+def _image(path: Path) -> Iterator[Section]:
     from lidar_mi.io import exr
 
     header, layers = exr.read_layers(path)
@@ -183,7 +183,7 @@ def _study(folder: Path) -> Iterator[Section]:
         for label, unit, values in results(metrics)
     ]
     if found:
-        yield "what comes of it", [("", *metrics), *found]
+        yield "results", [("", *metrics), *found]
     yield _files(folder, beside=records)
 
 
@@ -211,7 +211,7 @@ def _files(folder: Path, beside: Iterable[str] = ()) -> Section:
 
 
 def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
-    """The keys of an experiment that tell one from another at a glance, as far as it has them."""
+    """The keys that distinguish experiments at a glance, as far as it has them."""
     for key in (
         "seed",
         "wake.file",

@@ -11,7 +11,7 @@ FAILED = "failed: "
 _TAIL = 1 << 16
 
 
-def silent(text: str, share: float | None) -> None:
+def silent(text: str, fraction: float | None) -> None:
     """The `Notice` of those who do not want to know."""
 
 
@@ -43,12 +43,12 @@ class Log:
         self(f"warning: {text}")
 
     def fail(self, error: Exception) -> None:
-        """Say why the run ended, so that nobody takes it for one that was stopped and can go on."""
+        """Say why the run ended, so that nobody takes it for one that can be resumed."""
         self(f"{FAILED}{one_line(error) or type(error).__name__}")
 
-    def bar(self, text: str, share: float | None) -> None:
+    def bar(self, text: str, fraction: float | None) -> None:
         """Show progress within a step; not written."""
-        self.notice(text, share)
+        self.notice(text, fraction)
 
 
 def failure(path: Path) -> str | None:

@@ -104,7 +104,7 @@ def measured(
 ) -> dict[str, float | None]:
     """What the sensor does, as `requirements.judge` takes it; errors beyond two core radii.
 
-    Points are lines of sight where velocities along them are asked for, else good vectors whose
+    Points are lines of sight where velocities along them are required, else valid vectors whose
     windows do not overlap.
     """
     retrieval, depth = experiment.retrieval, experiment.doppler.lidar.range_bin

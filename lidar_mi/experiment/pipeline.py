@@ -45,11 +45,11 @@ from lidar_mi.retrieval.methods import ImageMethod
 GIVEN = ("beside",)
 """What is there from the start: the folder in which files of an experiment are looked for first."""
 
-RINGS_READ = "doppler_retrieve"
+RING_RETRIEVAL = "doppler_retrieve"
 
 
 def has_wake(experiment: Experiment) -> bool:
-    """Whether a backscatter lidar looks at a wake."""
+    """Whether a backscatter lidar observes a wake."""
     return experiment.wake is not None
 
 
@@ -155,8 +155,8 @@ STAGES = (
         timing="doppler_render",
     ),
     Stage("lit_rings", _quiet(ring_images), ("ring_images",), has_rings),
-    Stage("v_los", line_of_sight_winds, ("rings", "lit_rings"), has_rings, timing=RINGS_READ),
-    Stage("ring_budget", ring_budget, ("rings", "lit_rings"), has_rings, timing=RINGS_READ),
+    Stage("v_los", line_of_sight_winds, ("rings", "lit_rings"), has_rings, timing=RING_RETRIEVAL),
+    Stage("ring_budget", ring_budget, ("rings", "lit_rings"), has_rings, timing=RING_RETRIEVAL),
     Stage("exposure", _quiet(exposure), ("rings", "lit_rings"), has_rings),
     # both as one sensor
     Stage("requirements", _quiet(requirement_tables), ("beside",), has_sensor, ahead=True),

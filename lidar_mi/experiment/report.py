@@ -32,7 +32,7 @@ Metrics = Mapping[str, float]
 def chapters(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> tuple[list[Chapter], dict[str, float]]:
-    """Draw all figures into a folder and say what the results tell.
+    """Draw all figures into a folder and put the chapters of the report together.
 
     Parameters
     ----------
@@ -51,10 +51,10 @@ def chapters(
     found: list[Chapter] = []
     seconds: dict[str, float] = defaultdict(float)
     log("drawing figures")
-    for result, step, tell in _CHAPTERS:
+    for result, step, chapter in _CHAPTERS:
         if result in results:
             start = time.perf_counter()
-            found.append(tell(experiment, results, metrics, folder, log))
+            found.append(chapter(experiment, results, metrics, folder, log))
             seconds[step] += time.perf_counter() - start
     return found, seconds
 

@@ -76,7 +76,7 @@ class Run(Tabular):
 
     @property
     def v_los(self) -> xr.Dataset | None:
-        """Line-of-sight velocities read from images of rings of the Doppler lidar."""
+        """Line-of-sight velocities retrieved from images of rings of the Doppler lidar."""
         return self.results.get("v_los")
 
     @property

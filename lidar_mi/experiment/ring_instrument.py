@@ -1,6 +1,6 @@
 """From the fringe-imaging instrument and the air to what ring analysis needs to know of them.
 
-The only place that sees both the instrument's room and the retrieval's.
+The only module that imports both the instrument's room and the retrieval's.
 """
 
 import math

@@ -1,7 +1,7 @@
 """One experiment, start to end: truth, sensor, images, estimate, verdict.
 
 A run may live in a folder. Images are kept there as soon as they are rendered; a run that was
-stopped goes on with those, and everything after them is computed again.
+stopped is resumed with those, and everything after them is computed again.
 """
 
 import time
@@ -45,8 +45,8 @@ def run(
     overwrite : bool
         Replace a run of a different experiment instead of refusing.
     notice : callable, optional
-        Told what is running, and how far it is (0 to 1, or None). Default: shown on the terminal
-        or in the notebook.
+        Called with what is running, and how far it is (0 to 1, or None). Default: shown on the
+        terminal or in the notebook.
 
     Returns
     -------
@@ -150,9 +150,9 @@ def _carry_out(stage: Stage, run: Run, kept: RunFolder | None = None) -> None:
 
 def _report(run: Run, kept: RunFolder) -> None:
     """Draw the figures; write them, the metrics and the report."""
-    told, seconds = chapters(run.experiment, run.results, run.metrics, kept.figures, run.log)
+    made, seconds = chapters(run.experiment, run.results, run.metrics, kept.figures, run.log)
     run.seconds |= seconds
     run.metrics |= {timing_key(step): round(value, 3) for step, value in seconds.items()}
     resolved, versions = dump(run.experiment), kept.record["versions"]
-    html = page(run.experiment, resolved, versions, run.metrics, told, run.warnings)
+    html = page(run.experiment, resolved, versions, run.metrics, made, run.warnings)
     kept.keep_verdict(run.metrics, html)

@@ -41,7 +41,7 @@ class Platform(Section):
 
 
 class Retrieval(Section):
-    """How winds are found in the image pair."""
+    """How winds are retrieved from the image pair."""
 
     methods: tuple[ImageMethod, ...] = Field((ImageMethod.CC, ImageMethod.WS), min_length=1)
     template: Annotated[int, Within(2, 4096, "wider than any image")] = 8
@@ -51,9 +51,9 @@ class Retrieval(Section):
     min_texture: Annotated[Number, Within(0, 1000, "noise without signal has about 1")] = 0.01
     min_isotropy: Annotated[Number, Within(0, 1, "definition of a ratio")] = 0.2
     blur: Literal["beam"] | Annotated[Length, Within(0, 1000, "the widest beam")] = Field(
-        0.0, description="standard deviation of what a beam averages over, undone by variational"
+        0.0, description="standard deviation of what a beam averages over, corrected by variational"
     )
-    error_budget: bool = Field(False, description="find winds without each cause of error, too")
+    error_budget: bool = Field(False, description="retrieve winds without each cause of error, too")
 
     @model_validator(mode="after")
     def _each_once(self):
@@ -71,7 +71,7 @@ class Retrieval(Section):
 
 
 class RingRetrieval(Section):
-    """How the wind is read from pictures of rings, and how often, to know how well."""
+    """How the wind is retrieved from images of rings, and from how many."""
 
     methods: tuple[RingMethod, ...] = Field(
         (RingMethod.ANNULAR, RingMethod.CA, RingMethod.CA_R2, RingMethod.ML, RingMethod.SG),
@@ -79,13 +79,13 @@ class RingRetrieval(Section):
     )
     centre: tuple[RingCentre, ...] = Field((RingCentre.FREE, RingCentre.KNOWN), min_length=1)
     averaged: tuple[Annotated[int, Within(1, 10000, "100 s of pulses at 100 Hz")], ...] = Field(
-        (1, 5, 20), min_length=1, description="numbers of pictures averaged before they are read"
+        (1, 5, 20), min_length=1, description="numbers of images averaged before the retrieval"
     )
     images: Annotated[int, Within(1, 100000, "the standard deviation is then known to 0.2 %")] = (
         Field(8, description="averages of each kind and speed")
     )
     slow_images: Annotated[int, Within(0, 100000, "no more than images")] = Field(
-        3, description="of these, read by methods other than annular, which are slow"
+        3, description="of these, for methods other than annular, which are slow"
     )
 
     @model_validator(mode="after")
@@ -121,7 +121,7 @@ class Doppler(Section):
     )
     render: FringeSettings = FringeSettings()
     photon_samples: Annotated[int, Within(0, 65536, "the standard error is then 0.4 %")] = Field(
-        16, description="light paths a pixel, photon by photon through a real lens"
+        16, description="light paths per pixel, each traced through a real lens"
     )
     retrieval: RingRetrieval = RingRetrieval()
 
@@ -201,11 +201,11 @@ class Experiment(Tabular, Section):
 
     name: str = Field(pattern=f"^{NAME}$")
     seed: Annotated[int, Within(0, 2**31 - 1, "integers of an image header")] = 1
-    wake: Wake | None = Field(None, description="seen by the backscatter lidar")
+    wake: Wake | None = Field(None, description="observed by the backscatter lidar")
     doppler: Doppler | None = Field(None, description="the Doppler lidar; {} for the paper's")
     platform: Platform = Platform()
     lidar: BackscatterLidar = BackscatterLidar()
-    detector: Detector | None = Field(None, description="adds a noisy picture and its winds")
+    detector: Detector | None = Field(None, description="adds a noisy image and its winds")
     scan: Scan = Scan()
     scattering: Scattering = Scattering()
     render: RenderSettings = RenderSettings()
@@ -248,7 +248,9 @@ class Experiment(Tabular, Section):
             )
         if self.sensor or self.retrieval != Retrieval():
             key = "sensor" if self.sensor else "retrieval"
-            raise ValueError(f"{key}: not allowed with volume, which finds the wind in its stead")
+            raise ValueError(
+                f"{key}: not allowed with volume, which retrieves the wind in its stead"
+            )
         if scan.gates != "planar":
             raise ValueError(
                 f"scan.gates: {scan.gates} is not allowed with volume; expected planar"
@@ -274,8 +276,8 @@ class Experiment(Tabular, Section):
             )
         if method in (ImageMethod.CC, ImageMethod.WS) and self.sensor.crossflow_std is None:
             raise ValueError(
-                f"sensor.crossflow_std: missing; expected a speed, as method {method} knows no "
-                "errors"
+                f"sensor.crossflow_std: missing; expected a speed, as method {method} gives no "
+                "standard errors"
             )
         return self
 
@@ -289,7 +291,7 @@ class Experiment(Tabular, Section):
         ):
             raise ValueError(
                 f"wake.extinction.molecules: not allowed with scattering.phase {phase}, which "
-                "knows no polarisation; expected 0"
+                "is unpolarised; expected 0"
             )
         return self
 

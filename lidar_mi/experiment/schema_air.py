@@ -52,7 +52,7 @@ class VortexPair(Section):
 
 
 class Turbine(Section):
-    """The analytic wake of a wind turbine, seen downstream from its nacelle."""
+    """The analytic wake of a wind turbine, as seen downstream from its nacelle."""
 
     diameter: Annotated[
         Length, Within(0.1, 1000, "from models in a tunnel to four times the largest rotor")
@@ -227,7 +227,7 @@ class Scattering(_Scatterer):
     ] = Field(0.0, description="of Henyey-Greenstein")
     parts: tuple[Part, ...] | None = Field(None, min_length=1, description="of a mixture")
     albedo: Annotated[Number, Within(0, 1, "definition of an albedo")] | None = Field(
-        None, description="scattered share of the extinction; default: the scatterers'"
+        None, description="scattered fraction of the extinction; default: the scatterers'"
     )
 
     @model_validator(mode="after")

@@ -1,4 +1,4 @@
-"""Several variants of one experiment, run one after the other and held against each other.
+"""Several variants of one experiment, run one after the other and compared.
 
 Each variant is a run of its own in a folder of its own; beside these folders lie the comparison's
 report, its figure and all metrics, named VARIANT.METRIC.
@@ -118,7 +118,7 @@ def read_study(
 
 
 def _of(variant: str, notice: Notice) -> Notice:
-    return lambda text, share: notice(f"{variant}: {text}", share)
+    return lambda text, fraction: notice(f"{variant}: {text}", fraction)
 
 
 def _shown(run: Run) -> tuple[xr.DataArray, xr.Dataset, list[tuple[float, float]]]:

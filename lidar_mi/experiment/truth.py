@@ -57,7 +57,7 @@ def make_truth(
     -------
     Truth
         ``wind`` (Dataset, m/s), ``extinction`` (at t1 and at t2, 1/m); ``image(k)`` is the
-        extinction over (z, y) as the lidar sees it.
+        extinction over (z, y) as the lidar images it.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def make_truth(
 
 
 def moves_along(experiment: Experiment) -> bool:
-    """Whether air moves along x between the pictures; a plane of air is the same all along it."""
+    """Whether air moves along x between the images; a plane of air is the same all along it."""
     return experiment.wake.turbine is not None or experiment.volume is not None
 
 
@@ -253,8 +253,8 @@ def _slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
                 f"whose planes fill {first:g} to {last:g} m; expected gates inside"
             )
         nodes = np.unique([*gates, *x[(x > gates[0]) & (x < gates[1])]])
-        hats = [np.interp(nodes, x, plane) for plane in np.eye(len(x))]
-        weights = integrate.trapezoid(hats, nodes) / (gates[1] - gates[0])
+        linear = [np.interp(nodes, x, plane) for plane in np.eye(len(x))]
+        weights = integrate.trapezoid(linear, nodes) / (gates[1] - gates[0])
     image = (field * xr.DataArray(weights, dims="x")).sum("x").transpose("z", "y")
     image.attrs = field.attrs
     for axis in ("y", "z"):
@@ -276,7 +276,7 @@ def find_file(name: str, beside: str | Path, field: str) -> Path:
 
 
 def blur_by_beam(image: xr.DataArray, lidar, distance: float, depth: float = 0.0) -> xr.DataArray:
-    """An image seen by beams of finite width, aimed at its nodes, at a distance.
+    """An image averaged over beams of finite width, aimed at its nodes, at a distance.
 
     Between nodes the air varies linearly, as the renderer's grid does. A beam is a Gaussian with
     the variance per axis of its truncated aperture plus its divergence, so a node k spacings away
@@ -301,7 +301,7 @@ def blur_by_beam(image: xr.DataArray, lidar, distance: float, depth: float = 0.0
 
 
 def _depths(lidar, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Places along a gate from its middle, m, and their shares of the light from within it."""
+    """Places along a gate from its middle, m, and their fractions of the light from within it."""
     if not depth > 0:
         return np.zeros(1), np.ones(1)
     nodes, weights = np.polynomial.legendre.leggauss(6)

@@ -27,10 +27,10 @@ class CCD(BaseModel):
         Number, Within(1e-9, 1, "one photoelectron per photon at most")
     ] = Field(1.0, description="photoelectrons per photon")
     read_noise: Annotated[Number, Within(0, 1e6, "capacity of the largest pixels")] = Field(
-        5.0, description="rms a pixel"
+        5.0, description="rms per pixel"
     )
     dark_current: Annotated[Frequency, Within(0, 1e12, "one electron per picosecond")] = Field(
-        quantity("1 Hz"), description="photoelectrons a pixel in the dark"
+        quantity("1 Hz"), description="photoelectrons per pixel in the dark"
     )
     integration_time: Annotated[Time, Within(0, 100000, "one day")] = Field(
         quantity("10 ms"), description="from one read-out to the next; a laser of 100 Hz"
@@ -40,7 +40,7 @@ class CCD(BaseModel):
     )
     gain: Annotated[
         Number, Within(1e-6, 1e9, "from a fraction of an electron to the largest well")
-    ] = Field(1.0, description="photoelectrons a step of the digitiser")
+    ] = Field(1.0, description="photoelectrons per step of the digitiser")
     bits: Annotated[int, Within(1, 32, "digitisers have 32 at most")] | None = Field(
         16, description="of the digitiser; null: no rounding"
     )

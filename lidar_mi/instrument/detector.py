@@ -45,7 +45,7 @@ class Detector(BaseModel):
         quantity("1 kHz"), description="photoelectrons without light"
     )
     readout_noise: Annotated[Number, Within(0, 1e6, "capacity of the largest pixels")] = Field(
-        0.0, description="rms photoelectrons a gate, at the input"
+        0.0, description="rms photoelectrons per gate, at the input"
     )
     sky_radiance: Annotated[SpectralRadiance, Within(0, 1e14, "the disc of the sun has 3e13")] = (
         Field(quantity("0.3 W/m^2/sr/nm"), description="solar background")

@@ -23,7 +23,7 @@ from lidar_mi.instrument.detector import (
 )
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.instrument.signal import apparent_backscatter
+from lidar_mi.instrument.signal import attenuated_backscatter
 from lidar_mi.instrument.speckle import speckle_modes
 
 
@@ -185,7 +185,7 @@ def noisy_scan(
     duration = np.broadcast_to(gate_duration(plan.gate_length()), s0.shape)
     counted = detect(s0, lidar, detector, duration, ranges, seed, _polarization(scan))
     scene = (plan, lidar.aperture_area, scan.attrs["environment_extinction"])
-    y, y_std = (apparent_backscatter(x, *scene)[0] for x in (counted.s0, counted.s0_std))
+    y, y_std = (attenuated_backscatter(x, *scene)[0] for x in (counted.s0, counted.s0_std))
     image, pixel = ("gate", "z", "y"), ("z", "y")
     noise = {
         "S0_noisy": (image, counted.s0, "S0 with the detector's noise", "1"),

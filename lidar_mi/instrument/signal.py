@@ -5,7 +5,7 @@ import numpy as np
 from lidar_mi.instrument.scan import ScanPlan
 
 
-def apparent_backscatter(
+def attenuated_backscatter(
     s0: np.ndarray, plan: ScanPlan, aperture_area: float, environment: float
 ) -> np.ndarray:
     """Range-corrected attenuated backscatter coefficient, m^-1 sr^-1: S0 r^2 / (A dr T^2).

@@ -1,9 +1,10 @@
-"""Pictures as OpenEXR files: one file a scan, one layer a gate and Stokes component.
+"""Images as OpenEXR files: one file per scan, one layer per gate and Stokes component.
 
 A scan's file shows what the pilot sees: top row = largest z, left column = largest y. Layers are
 ``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate (and
-``gate000.order1.S0``, ... where orders of scattering were told apart), and ``Y``, the apparent
-backscatter of the first gate, so that any viewer shows something at once. Of a run,
+``gate000.order1.S0``, ... where orders of scattering were separated), and ``Y``, the attenuated
+backscatter of the first gate, corrected for range, gate length and the environment's
+transmittance, so that any viewer shows something at once. Of a run,
 ``gate000.depolarization`` and ``gate000.multiple_scattering_fraction`` with their ``_stderr`` stand
 beside them, and with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``, ``Y_noisy`` and
 ``Y_noise_std``. Everything else (beam positions, gates, instrument, units, seed, version) is in
@@ -61,7 +62,7 @@ def write_scan(path: str | Path, scan: xr.Dataset) -> None:
     """
     path = Path(path)
     pilot = scan.transpose("gate", "z", "y").sortby(["z", "y"], ascending=False)
-    channels = {name: pilot[name].transpose("z", "y").values for name in _pictures(pilot)}
+    channels = {name: pilot[name].transpose("z", "y").values for name in _once_per_scan(pilot)}
     for gate in range(pilot.sizes["gate"]):
         for quantity in _quantities(pilot):
             channels[f"gate{gate:03d}.{quantity}"] = pilot[quantity].values[gate]
@@ -70,18 +71,18 @@ def write_scan(path: str | Path, scan: xr.Dataset) -> None:
     _write(path, axes | scan.attrs, channels)
 
 
-def write_fringes(path: str | Path, picture: xr.Dataset) -> None:
-    """Write the picture of a fringe camera: S0 ... S3, S0_stderr with dims (y, x), y downwards.
+def write_fringes(path: str | Path, image: xr.Dataset) -> None:
+    """Write the image of a fringe camera: S0 ... S3, S0_stderr with dims (y, x), y downwards.
 
     ``Y`` is S0 once more, so that any viewer shows the rings. Files, values and attributes as in
     `write_scan`.
     """
-    layers = {name: picture[name].transpose("y", "x").values for name in QUANTITIES}
-    _write(Path(path), picture.attrs, layers | {"Y": layers["S0"]})
+    layers = {name: image[name].transpose("y", "x").values for name in QUANTITIES}
+    _write(Path(path), image.attrs, layers | {"Y": layers["S0"]})
 
 
 def read_fringes(path: str | Path) -> xr.Dataset:
-    """Read a picture written by `write_fringes`; the round trip is exact in float32.
+    """Read an image written by `write_fringes`; the round trip is exact in float32.
 
     Raises
     ------
@@ -100,18 +101,18 @@ def read_fringes(path: str | Path) -> xr.Dataset:
 def label_fringes(layers: dict[str, np.ndarray], attributes: dict) -> xr.Dataset:
     """Layers (height, width) of a fringe camera with names, units and pixel numbers as axes."""
     rows, columns = layers["S0"].shape
-    picture = xr.Dataset(
+    image = xr.Dataset(
         {name: (("y", "x"), values) for name, values in layers.items()},
         coords={"y": np.arange(rows), "x": np.arange(columns)},
         attrs=attributes,
     )
     for name, text in _MEANING.items():
-        if name in picture:
+        if name in image:
             text = text.replace("emitted pulse energy", "the energy sent through the stop")
-            picture[name].attrs = {"long_name": text, "units": "1"}
-    picture["x"].attrs = {"long_name": "pixels to the right of the leftmost", "units": "1"}
-    picture["y"].attrs = {"long_name": "pixels down from the topmost", "units": "1"}
-    return picture
+            image[name].attrs = {"long_name": text, "units": "1"}
+    image["x"].attrs = {"long_name": "pixels to the right of the leftmost", "units": "1"}
+    image["y"].attrs = {"long_name": "pixels down from the topmost", "units": "1"}
+    return image
 
 
 def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> None:
@@ -241,7 +242,7 @@ def _quantities(scan: xr.Dataset) -> list[str]:
     return [str(name) for name, variable in scan.data_vars.items() if "gate" in variable.dims]
 
 
-def _pictures(scan: xr.Dataset) -> list[str]:
+def _once_per_scan(scan: xr.Dataset) -> list[str]:
     """What a scan holds once: Y, and Y_noisy with its standard deviation behind a detector."""
     return [
         str(name) for name, variable in scan.data_vars.items() if set(variable.dims) == {"z", "y"}
@@ -265,8 +266,8 @@ def label_scan(scan: xr.Dataset) -> xr.Dataset:
         "S0_S1_correlation": "correlation of the Monte Carlo errors of S0 and S1",
         "depolarization": "linear depolarisation ratio",
         "depolarization_stderr": "standard error of the linear depolarisation ratio",
-        "multiple_scattering_fraction": "share of light scattered more than once",
-        "multiple_scattering_fraction_stderr": "standard error of the share of light scattered "
+        "multiple_scattering_fraction": "fraction of light scattered more than once",
+        "multiple_scattering_fraction_stderr": "standard error of the fraction of light scattered "
         "more than once",
         "S0_noisy": "S0 with the detector's noise",
         "S0_noise_std": "standard deviation of the noise of S0_noisy",
@@ -278,11 +279,11 @@ def label_scan(scan: xr.Dataset) -> xr.Dataset:
             text = f"upper bound of the {text}"
         scan[name].attrs = {"long_name": text, "units": "1"}
     once = {
-        "Y": "apparent backscatter of the first gate",
-        "Y_noisy": "apparent backscatter with the detector's noise",
+        "Y": "attenuated backscatter of the first gate, corrected for range and environment",
+        "Y_noisy": "attenuated backscatter with the detector's noise",
         "Y_noise_std": "standard deviation of the noise of Y_noisy",
     }
-    for name in _pictures(scan):
+    for name in _once_per_scan(scan):
         scan[name].attrs = {"long_name": once.get(name, name), "units": "m-1 sr-1"}
     scan["y"].attrs = {"long_name": "distance to port", "units": "m", "axis": "Y"}
     scan["z"].attrs = {

@@ -12,7 +12,7 @@ from lidar_mi import __version__
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.instrument.signal import apparent_backscatter
+from lidar_mi.instrument.signal import attenuated_backscatter
 from lidar_mi.io.exr import label_scan, unpack
 from lidar_mi.rendering.phase import Molecules
 from lidar_mi.rendering.settings import RenderSettings
@@ -256,7 +256,7 @@ def _box(extinction: xr.DataArray) -> tuple[np.ndarray, np.ndarray]:
 def _as_dataset(image, names, plan, lidar, environment, settings, seed) -> xr.Dataset:
     """The rendered tensor (rows from the top, y falling) as a labelled dataset."""
     variables = unpack(image, names, plan.gate_count)
-    y = apparent_backscatter(variables["S0"][1], plan, lidar.aperture_area, environment)
+    y = attenuated_backscatter(variables["S0"][1], plan, lidar.aperture_area, environment)
     variables["Y"] = (("z", "y"), y[0].astype(np.float32))
     attributes = {
         "software": f"lidar-mi {__version__}",

@@ -49,8 +49,7 @@ class FringeSettings(BaseModel):
         int, Within(2, 2**20 - 1, "a standard error needs two; it is then 0.1 %")
     ] = Field(16, description="light paths, on average")
     estimator: Literal["camera", "forward", "analog"] = Field(
-        "camera",
-        description="from the pixels; plane waves forward; photons transmitted or rejected",
+        "camera", description="from the pixels; plane waves forward; paths transmitted or rejected"
     )
     line_shape: Literal["folded", "sampled"] = Field(
         "folded", description="mean over the line in closed form; a frequency for every path"

@@ -210,7 +210,7 @@ def test_noise_follows_obliquity():
     assert corner == pytest.approx(math.sqrt(1.25 * (2000 + sky)), rel=1e-4)
 
 
-def test_apparent_backscatter_of_the_noisy_image():
+def test_attenuated_backscatter_of_the_noisy_image():
     """The lidar equation by hand at one pixel: r = 501.25 m x slant, 2.5 m x slant."""
     found = noisy_scan(a_scan(), LIDAR, Detector(), 7)
     y, z = float(found["y"][12]), float(found["z"][40])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.instrument.signal import apparent_backscatter
+from lidar_mi.instrument.signal import attenuated_backscatter
 
 
 @pytest.mark.parametrize("kind", ["planar", "spherical"])
@@ -25,6 +25,6 @@ def test_environment_alone_gives_its_backscatter_coefficient(kind, count):
     edges = np.linspace(500, 502.5, count + 1)[:, None, None] * np.broadcast_to(slant, (5, 7))
     r = edges[:-1] + np.linspace(0, 1, 1001)[:, None, None, None] * np.diff(edges, axis=0)
     s0 = np.trapezoid(area * beta * np.exp(-2 * alpha * r) / r**2, r, axis=0)
-    found = apparent_backscatter(s0, plan, area, alpha)
+    found = attenuated_backscatter(s0, plan, area, alpha)
     assert found.shape == (count, 5, 7)
     assert found == pytest.approx(beta, rel=2e-5)

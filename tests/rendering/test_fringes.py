@@ -156,7 +156,7 @@ def test_picture_and_header_survive_the_file(tmp_path):
     assert back.attrs["order_fraction"] == pytest.approx(0.5, abs=1e-6)
     _, layers = read_layers(path)
     assert np.array_equal(layers["Y"], picture["S0"])
-    with pytest.raises(InputError, match="are not a picture of a fringe camera; expected S0, S1"):
+    with pytest.raises(InputError, match="are not an image of a fringe camera; expected S0, S1"):
         write_only = tmp_path / "other.exr"
         OpenEXR.File({}, {"RGB": np.zeros((4, 4, 3), np.float32)}).write(str(write_only))
         read_fringes(write_only)

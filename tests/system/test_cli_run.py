@@ -108,6 +108,6 @@ def test_ctrl_c_stops_cleanly_and_the_run_goes_on(there):
         process.send_signal(signal.SIGINT)
         _, err = process.communicate(timeout=60)
     assert process.returncode == 130, seen
-    assert err.splitlines()[-1] == "lidar-mi: stopped; a run goes on when started again"
+    assert err.splitlines()[-1] == "lidar-mi: stopped; start it again to resume the run"
     assert "Traceback" not in err
     assert sorted(p.name for p in (there / "run").iterdir()) == ["experiment.yaml", "log.txt"]

@@ -15,7 +15,7 @@ from lidar_mi.experiment.run import run
 from lidar_mi.experiment.run_folder import IMAGES
 from lidar_mi.experiment.stages.error_budget import budgets
 from lidar_mi.experiment.stages.rendering import scan_plans
-from lidar_mi.experiment.stages.winds import apparent_noise
+from lidar_mi.experiment.stages.winds import attenuated_backscatter_stderr
 from lidar_mi.experiment.truth import blur_by_beam, make_truth
 from lidar_mi.io import exr
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
@@ -95,7 +95,7 @@ def test_blur_is_undone_where_there_is_some(tmp_path):
     scans = noise_free_scans(experiment, truth)
     budget = budgets(experiment, truth, scans, cores=[], flagged=True)["variational"]
     settings = {"dt": 0.1, "method": "variational", "stride": 2}
-    level = apparent_noise(scans[0])
+    level = attenuated_backscatter_stderr(scans[0])
     # half of the beam's 1/e^2 radius where the slab's middle is
     width = float(experiment.lidar.radius_at(501.25)) / 2
     seen = retrieve_wind(*(scan["Y"] for scan in scans), noise=level, blur=width, **settings)

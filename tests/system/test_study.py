@@ -127,7 +127,7 @@ def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
         )
     )
     assert cells["scan.range"] == "150 m"
-    assert float(cells["hazard distance of a beam, naked eye"]) == pytest.approx(
+    assert float(cells["hazard distance of a beam, unaided"]) == pytest.approx(
         found["near"]["safety.hazard_distance"], rel=5e-3
     )
     assert imread(folder / "figures" / "fig00_comparison.png").std() > 0.05
@@ -135,8 +135,8 @@ def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
     rows = {name: values for name, *values in next(iter(told.values()))}
     assert f"{folder}: study two" in told and rows["variant"] == ["near", "far"]
     assert rows["scan.range"] == ["150 m", "500 m"]
-    results = {name: values for name, *values in told["what comes of it"]}
-    assert float(results["hazard distance of a beam, naked eye / m"][0]) == pytest.approx(
+    results = {name: values for name, *values in told["results"]}
+    assert float(results["hazard distance of a beam, unaided / m"][0]) == pytest.approx(
         found["near"]["safety.hazard_distance"], rel=5e-3
     )
     names = [name for name, _ in told["files"]]

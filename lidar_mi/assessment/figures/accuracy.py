@@ -71,7 +71,7 @@ def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     return figure, (
-        "Errors of valid vectors, in groups by what the pictures' noise allows any unbiased method "
+        "Errors of valid vectors, in groups by what the images' noise allows any unbiased method "
         "that uses one template alone. Below the line: methods that use more than a template. "
         "Far above it on the left: errors that are not the noise's, as of flow that a window or a "
         "smooth field cannot follow."
@@ -122,6 +122,6 @@ def error_by_texture(found: xr.Dataset, sweep: xr.Dataset) -> tuple[Figure, str]
     return figure, (
         "Winds can only be as good as the structure that moves with them. Left: the extinction "
         "pair with more and less sub-grid texture. Right: this run's vectors, grouped by whether "
-        "their windows have structure in both directions; along a mere edge nothing can be told "
-        "(aperture problem)."
+        "their windows have structure in both directions; along a mere edge the "
+        "displacement is undetermined (aperture problem)."
     )

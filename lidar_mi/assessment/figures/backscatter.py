@@ -1,4 +1,4 @@
-"""The figures of a run: an overview, the paper's figures 5 to 11, and what else a run tells.
+"""The figures of a run: an overview, the paper's figures 5 to 11, errors and products.
 
 All of them show the slab as the pilot sees it: port (+y) on the left, up (+z) at the top.
 """
@@ -57,17 +57,17 @@ def draw_all(
 
     Parameters
     ----------
-    truth : lidar_mi.experiment.truth.Truth scans : the two rendered scans found : winds with dims
-    (source, algorithm, z, y), from `lidar_mi.experiment.stages.winds.cross_flow_winds` sweep :
-    errors by texture, from `lidar_mi.experiment.stages.texture.texture_sweep`
+    truth : lidar_mi.experiment.truth.Truth
+    scans : two xr.Dataset
+        The rendered scans.
+    found : xr.Dataset, dims (source, algorithm, z, y)
+        Winds from `lidar_mi.experiment.stages.winds.cross_flow_winds`.
+    sweep : xr.Dataset
+        Errors by texture, from `lidar_mi.experiment.stages.texture.texture_sweep`.
     """
     scale = _scale(truth)
     plates = (
-        (
-            "fig00_overview",
-            "What the lidar sees, and the wind found in it",
-            overview(truth, scans, found, cores),
-        ),
+        ("fig00_overview", "Image and retrieved wind", overview(truth, scans, found, cores)),
         ("fig05_extinction", "Extinction", _extinction(truth)),
         (
             "fig06_wind_from_extinction",
@@ -83,7 +83,7 @@ def draw_all(
         (
             "fig09_backscatter_against_extinction",
             "Backscatter against extinction",
-            _picture_differences(truth, scans),
+            _image_differences(truth, scans),
         ),
         (
             "fig10_wind_from_backscatter",
@@ -108,7 +108,7 @@ def draw_all(
                     scans[0],
                     "depolarization",
                     "linear depolarisation ratio",
-                    "Linear depolarisation ratio of the first picture, cross- over co-polarised "
+                    "Linear depolarisation ratio of the first image, cross- over co-polarised "
                     "light.",
                 ),
             ),
@@ -121,8 +121,8 @@ def draw_all(
                 _product(
                     scans[0],
                     "multiple_scattering_fraction",
-                    "share of multiple scattering",
-                    "Share of the light of the first picture that was scattered more than once.",
+                    "fraction of multiple scattering",
+                    "Fraction of the light of the first image that was scattered more than once.",
                 ),
             ),
         )
@@ -143,15 +143,15 @@ def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale)
         "scale": scale.limit / (1.8 * step),
         "width": 0.0022,
     }
-    bad, good = known & (flag != 0), known & (flag == 0)
-    if bad.any():
-        axes.quiver(y[bad], z[bad], v[bad], w[bad], color="0.75", **style)
+    flagged, valid = known & (flag != 0), known & (flag == 0)
+    if flagged.any():
+        axes.quiver(y[flagged], z[flagged], v[flagged], w[flagged], color="0.75", **style)
     arrows = axes.quiver(
-        y[good],
-        z[good],
-        v[good],
-        w[good],
-        np.hypot(v, w)[good],
+        y[valid],
+        z[valid],
+        v[valid],
+        w[valid],
+        np.hypot(v, w)[valid],
         cmap="viridis",
         norm=Normalize(0, scale.limit),
         **style,
@@ -180,11 +180,11 @@ def overview(truth, scans, found: xr.Dataset, cores: list[Core]) -> tuple[Figure
     )
     source = Source.NOISY if detected else Source.BACKSCATTER
     wind = found.sel(source=source).isel(algorithm=0)
-    _arrows(axes[0, 1], wind, cores, "wind from two such pictures", scale)
-    noise = " with photon, sky, dark and speckle noise of one pulse a beam" if detected else ""
+    _arrows(axes[0, 1], wind, cores, "wind retrieved from two such images", scale)
+    noise = " with photon, sky, dark and speckle noise of one pulse per beam" if detected else ""
     return figure, (
-        f"Left: the first backscatter picture{noise}. Right: the cross-flow wind found from it and "
-        f"the second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are "
+        f"Left: the first backscatter image{noise}. Right: the cross-flow wind retrieved from "
+        f"it and the second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are "
         "flagged, red crosses mark the true cores."
     )
 
@@ -301,10 +301,10 @@ def _bright(fields) -> Normalize:
     return Normalize(low if low > 0.3 * high else 0, high)
 
 
-def _upper(field: xr.DataArray, share: float) -> float:
-    """The value that this share of a field's finite values does not exceed; 0 if there is none."""
+def _upper(field: xr.DataArray, fraction: float) -> float:
+    """The value that this fraction of the finite values does not exceed; 0 if there is none."""
     values = field.values[np.isfinite(field.values)]
-    return float(np.quantile(values, share)) if values.size else 0.0
+    return float(np.quantile(values, fraction)) if values.size else 0.0
 
 
 def _backscatter(scans):
@@ -327,7 +327,7 @@ def _backscatter(scans):
 
 
 def _product(scan, name, label, caption):
-    """What a scan tells of its first gate, and how well it knows it."""
+    """A product of a scan's first gate, and its standard error."""
     figure, axes = sheet(1, 2)
     first = scan.isel(gate=0)
     image_panel(
@@ -338,7 +338,7 @@ def _product(scan, name, label, caption):
     kind = "upper bound of the standard error" if bound else "standard error"
     image_panel(axes[0, 1], stderr, kind, label, "both", norm=_span(stderr), cmap="cividis")
     return figure, (
-        f"{caption} Right: {kind} of each pixel, from the simulation's photons. Colours span the "
+        f"{caption} Right: {kind} of each pixel, from the Monte Carlo samples. Colours span the "
         "middle 99 % of the pixels."
     )
 
@@ -351,7 +351,7 @@ def _span(field: xr.DataArray) -> Normalize:
     return Normalize((low + high) / 2 - half, (low + high) / 2 + half)
 
 
-def _picture_differences(truth, scans):
+def _image_differences(truth, scans):
     figure, axes = sheet(1, 2)
     differences = []
     for k, scan in enumerate(scans):

@@ -16,12 +16,12 @@ _SPEED = "m s$^{-1}$"
 def draw_comparison(
     folder: Path, rows: Mapping[str, tuple[xr.DataArray, xr.Dataset, Sequence]], log: Callable
 ) -> list[Drawn]:
-    """One row a variant: its first picture, the w found in the pair, and its error.
+    """One row per variant: its first image, the w retrieved from the pair, and its error.
 
     Parameters
     ----------
-    rows : mapping of variant to (picture, winds, cores)
-        Apparent backscatter (m^-1 sr^-1) and winds on (z, y), these with w_true and flag; places
+    rows : mapping of variant to (image, winds, cores)
+        Attenuated backscatter (m^-1 sr^-1) and winds on (z, y), these with w_true and flag; places
         (y, z) of the true cores, m.
     """
     figure = Figure(figsize=(19, 4.0 * len(rows)), layout="compressed")
@@ -37,20 +37,20 @@ def draw_comparison(
     ]
     # one variant without skill must not hide the errors of those that have some
     top = min(float(np.median(largest)) if largest else 0.0, limit) or limit
-    for row, (name, (picture, wind, cores)) in zip(axes, rows.items(), strict=True):
-        low, high = (float(1e6 * picture.quantile(share)) for share in (0.002, 0.998))
-        good, place = (
+    for row, (name, (image, wind, cores)) in zip(axes, rows.items(), strict=True):
+        low, high = (float(1e6 * image.quantile(q)) for q in (0.002, 0.998))
+        valid, place = (
             wind["flag"] == 0,
             {axis: slice(wind[axis][0], wind[axis][-1]) for axis in "yz"},
         )
         columns = (
             (
-                1e6 * picture.sel(place),
+                1e6 * image.sel(place),
                 {"cmap": "cividis", "vmin": low, "vmax": high},
-                f"{name}: picture",
+                f"{name}: image",
                 BACKSCATTER,
             ),
-            (wind["w"].where(good), speeds, f"{name}: w found", _SPEED),
+            (wind["w"].where(valid), speeds, f"{name}: w retrieved", _SPEED),
             (errors[name], speeds | {"vmin": -top, "vmax": top}, f"{name}: error of w", _SPEED),
         )
         for panel, (field, style, title, label) in zip(row, columns, strict=True):
@@ -66,7 +66,7 @@ def draw_comparison(
     for panel in axes[-1]:
         panel.set_xlabel("y / m (port is left)")
     caption = (
-        "Each variant's first picture, the vertical wind found by its first method (white: "
+        "Each variant's first image, the vertical wind retrieved by its first method (white: "
         "flagged vectors), and its error; winds are on one scale, errors on another, that of the "
         "middle variant. Crosses: true cores. Of several gates the first, of winds in three "
         "dimensions the layer nearest to it."

@@ -1,4 +1,4 @@
-"""The figures of a Doppler run: the paper's figures 3 and 4, errors by pictures averaged, bias."""
+"""The figures of a Doppler run: the paper's figures 3 and 4, errors by images averaged, bias."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -33,7 +33,7 @@ def draw_all(
     folder: Path,
     doppler,
     exposure,
-    photons: xr.Dataset | None,
+    samples: xr.Dataset | None,
     found: xr.Dataset,
     metrics: dict[str, float],
     log: Callable,
@@ -44,15 +44,15 @@ def draw_all(
     ----------
     doppler : lidar_mi.experiment.schema.Doppler
     exposure : lidar_mi.experiment.stages.ring_images.Exposure
-        Pictures of the laser and of the air at the first speed, without and with noise.
-    photons : xr.Dataset or None
-        Picture of the laser's light, photon by photon.
+        Images of the laser and of the air at the first speed, without and with noise.
+    samples : xr.Dataset or None
+        Image of the laser's light, traced path by path.
     found, metrics
         From `lidar_mi.experiment.stages.ring_velocities.velocities`,
         `lidar_mi.assessment.metrics.velocities`.
     """
     plates = [
-        ("fig03_fringes", "Rings on the CCD", _rings(doppler, exposure, photons)),
+        ("fig03_fringes", "Rings on the CCD", _rings(doppler, exposure, samples)),
         (
             "fig04_ring_cuts",
             "Noise in a cut through the rings, and without it",
@@ -71,16 +71,16 @@ def draw_all(
     return save_all(folder, plates, log)
 
 
-def _rings(doppler, exposure, photons):
+def _rings(doppler, exposure, samples):
     """The paper's figure 3, and the profiles of both."""
-    panels = 3 if photons is not None else 2
+    panels = 3 if samples is not None else 2
     figure = Figure(figsize=(5.6 * panels, 4.6), layout="constrained")
     axes = figure.subplots(1, panels)
     shown = [(exposure.noisy, f"one pulse, air at {doppler.v_los[0]:g} m/s", "photoelectrons")]
-    if photons is not None:
+    if samples is not None:
         # every path carries the same energy
-        hits = photons["S0"].values * photons["S0"].size * photons.attrs["samples_per_pixel"]
-        shown.append((hits, "the laser's light, photon by photon through a lens", "photons"))
+        hits = samples["S0"].values * samples["S0"].size * samples.attrs["samples_per_pixel"]
+        shown.append((hits, "the laser's light, traced path by path through a lens", "samples"))
     # the last panel holds profiles
     for axis, (image, title, label) in zip(axes, shown, strict=False):
         # single noisy pixels must not darken all others
@@ -96,21 +96,21 @@ def _rings(doppler, exposure, photons):
         near = weight > 30  # beyond, circles have a few pixels in the corners only
         axes[-1].plot(radius[near], mean[near], label=label, **style)
     axes[-1].set(
-        title="means over circles, without noise", xlabel="radius / px", ylabel="photons a pixel"
+        title="means over circles, without noise", xlabel="radius / px", ylabel="photons per pixel"
     )
     axes[-1].set_ylim(0, 1.25 * exposure.emitted.max())
     axes[-1].legend(loc="upper right")
     axes[-1].grid(alpha=0.3)
     right = (
         ""
-        if photons is None
+        if samples is None
         else (
             " Middle: the laser's own light, plane waves of random direction, frequency and place, "
-            "photon by photon through etalon and a real lens."
+            "traced path by path through etalon and a real lens."
         )
     )
     return figure, (
-        "As the paper's figure 3. Left: the CCD's picture of one pulse, broadened by the air's "
+        "As the paper's figure 3. Left: the CCD's image of one pulse, broadened by the air's "
         f"molecules.{right} Right: profiles; emitted and received light have equally many photons."
     )
 
@@ -140,11 +140,11 @@ def _cuts(doppler, exposure):
         axis.set(xlabel="radius / px", title=title)
         axis.legend(loc="upper right")
         axis.grid(alpha=0.3)
-    left.set_ylabel("photoelectrons a pixel")
+    left.set_ylabel("photoelectrons per pixel")
     # room above the cut for the legend
     left.set_ylim(top=1.3 * np.nanmax(single))
     return figure, (
-        "As the paper's figure 4: a cut through the picture of one pulse from the centre to the "
+        "As the paper's figure 4: a cut through the image of one pulse from the centre to the "
         "rim (red), and the same ring profile with less noise (blue). Left: 360 such cuts behind a "
         "Savitzky-Golay filter. Right: mean over circles."
     )
@@ -192,14 +192,14 @@ def _errors(doppler, metrics):
             axis.minorticks_off()
             axis.grid(alpha=0.3, which="both")
         column[0].set_title(CENTRES[centre])
-        column[1].set_xlabel("pictures averaged")
+        column[1].set_xlabel("images averaged")
         for axis in column:
             axis.legend(fontsize=8)
     axes[0, 0].set_ylabel("standard deviation / m s$^{-1}$")
     axes[1, 0].set_ylabel("size of the bias / m s$^{-1}$")
     return figure, (
         "Standard deviation (above) and bias (below) of the line-of-sight wind against the number "
-        "of pictures that are averaged, over all speeds, with standard errors; stars: what the "
+        "of images that are averaged, over all speeds, with standard errors; stars: what the "
         "paper states. Peaks are those of the innermost ring, the bound is that at the first speed."
     )
 
@@ -219,7 +219,7 @@ def _bias(doppler, exposure, found):
         fitted = peak(x, mean, crest, PIECE * power * crest)
         axis.axvline(crest, color="k", lw=0.8, label="true crest")
         axis.axvline(fitted, color=_BY_COORDINATE[coordinate], ls=":", label="Gaussian's crest")
-        axis.set(xlabel=f"{name} / {unit}", ylabel="photons a pixel", title=f"fit in {name}")
+        axis.set(xlabel=f"{name} / {unit}", ylabel="photons per pixel", title=f"fit in {name}")
         last.plot(
             found["piece"],
             found["peak_bias"].sel(coordinate=coordinate),
@@ -269,8 +269,8 @@ def _speeds(found):
         right.errorbar(true[order], mean - true[order], spread, **style)
     left.axline((0, 0), slope=1, color="k", lw=0.8)
     right.axhline(0, color="k", lw=0.8)
-    left.set(xlabel="true wind / m s$^{-1}$", ylabel="wind read / m s$^{-1}$")
-    right.set(xlabel="true wind / m s$^{-1}$", ylabel="wind read less true wind / m s$^{-1}$")
+    left.set(xlabel="true wind / m s$^{-1}$", ylabel="retrieved wind / m s$^{-1}$")
+    right.set(xlabel="true wind / m s$^{-1}$", ylabel="retrieved less true wind / m s$^{-1}$")
     right.set_yscale("symlog", linthresh=1.0)
     ticks = [sign * value for sign in (-1, 1) for value in (0.5, 1, 10, 100)]
     low, high = right.get_ylim()
@@ -279,10 +279,10 @@ def _speeds(found):
     )
     n, centre = int(case["averaged"]), CENTRES[str(case["centre"].values)]
     for axis in (left, right):
-        axis.set_title(f"{'single pictures' if n == 1 else f'averages of {n} pictures'}, {centre}")
+        axis.set_title(f"{'single images' if n == 1 else f'averages of {n} images'}, {centre}")
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
     return figure, (
-        "Left: wind read from the rings against the true one, mean and standard deviation of a "
-        "single reading. Right: the difference, on a scale that is logarithmic beyond 1 m/s."
+        "Left: wind retrieved from the rings against the true one, mean and standard deviation of "
+        "a single retrieval. Right: the difference, on a scale that is logarithmic beyond 1 m/s."
     )

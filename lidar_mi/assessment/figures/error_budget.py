@@ -1,4 +1,4 @@
-"""The figure of what limits the cross-flow wind."""
+"""The figure of the cross-flow wind's error budget."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,7 +20,7 @@ from lidar_mi.assessment.report.digits import whole_percent
 
 
 def draw_all(folder: Path, budgets: Budgets, log: Callable) -> list[Drawn]:
-    """Draw the shares of all causes as a PNG into ``folder``; nothing where none is known.
+    """Draw the fractions of all causes as a PNG into ``folder``; nothing where none is known.
 
     Parameters
     ----------
@@ -53,18 +53,18 @@ def _bars(budgets: Budgets):
             if f"{place}rmse_v" not in budget:
                 continue
             title.append(f"{where}: {component_rmse(budget, place):.2g} m/s")
-            shares = np.array([budget.get(f"{place}{cause}.share", np.nan) for cause in used])
+            fractions = np.array([budget.get(f"{place}{cause}.share", np.nan) for cause in used])
             at = rows + 0.2 - 0.4 * number
-            bars[where] = panel.barh(at, shares, 0.36, color=f"C{number}")
-            for y, share in zip(at, shares, strict=True):
-                if np.isfinite(share):
-                    end = min(max(share, 0), 1) + 0.015
-                    panel.text(end, y, whole_percent(share), va="center", fontsize=7)
+            bars[where] = panel.barh(at, fractions, 0.36, color=f"C{number}")
+            for y, fraction in zip(at, fractions, strict=True):
+                if np.isfinite(fraction):
+                    end = min(max(fraction, 0), 1) + 0.015
+                    panel.text(end, y, whole_percent(fraction), va="center", fontsize=7)
         for y, cause in zip(rows, used, strict=True):
             if cause not in causes_of(budget):
                 panel.text(0.015, y, "does not apply", va="center", color="0.5", fontsize=8)
         panel.set_title("\n".join([METHOD_NAMES[method], *title]), fontsize=10)
-        panel.set_xlabel("share of the mean square error")
+        panel.set_xlabel("fraction of the mean square error")
         panel.axvline(0, color="k", lw=0.8)
         panel.grid(alpha=0.3, axis="x")
         panel.set_axisbelow(True)
@@ -75,6 +75,6 @@ def _bars(budgets: Budgets):
     figure.legend(bars.values(), bars.keys(), loc="outside lower right", ncols=2, fontsize=9)
     return figure, (
         "By how much the mean square error of v and w falls without each cause of error in turn, "
-        "and the rms error with all of them (of a component). Shares need not add up to 100 %; "
+        "and the rms error with all of them (of a component). Fractions need not add up to 100 %; "
         "below 0 the wind is worse without the cause."
     )

@@ -1,4 +1,4 @@
-"""Pictures of ring analyses: what was found in an image."""
+"""Figures of ring analyses: the rings detected in an image."""
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,21 +9,21 @@ LINE_COLOURS = ("tab:red", "tab:cyan", "tab:orange")
 
 
 def draw_rings(image: np.ndarray, rings: Rings, title: str = "") -> Figure:
-    """An image with the rings found in it, its profile over r^2, and r^2 over the order."""
+    """An image with the rings detected in it, its profile over r^2, and r^2 over the order."""
     figure = Figure(figsize=(13, 7.5), layout="constrained")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1))
-    picture, profile, law = (
+    panel, profile, law = (
         figure.add_subplot(place) for place in (grid[:, 0], grid[0, 1], grid[1, 1])
     )
     height, width = image.shape
     low, high = np.percentile(image, (0.5, 99.8))
-    picture.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
+    panel.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
     angle = np.linspace(0, 2 * np.pi, 721)
     for radius, line in zip(rings.radius, rings.line, strict=True):
         x, y = rings.curve(radius, angle)
-        picture.plot(x, y, "--", color=LINE_COLOURS[line], lw=0.9)
-    picture.plot(*rings.centre, "+", color="yellow", ms=12)
-    picture.set(
+        panel.plot(x, y, "--", color=LINE_COLOURS[line], lw=0.9)
+    panel.plot(*rings.centre, "+", color="yellow", ms=12)
+    panel.set(
         xlim=(-0.5, width - 0.5),
         ylim=(height - 0.5, -0.5),
         xlabel="x / px",

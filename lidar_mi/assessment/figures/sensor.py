@@ -32,7 +32,7 @@ def draw_all(
     if found is not None:
         plates += [
             ("fig20_wind3d", "The wind from both lidars", _maps(found, lines, cores)),
-            ("fig21_uncertainty", "How certain it is", _uncertainty(found)),
+            ("fig21_uncertainty", "Standard errors of the wind", _uncertainty(found)),
         ]
     return save_all(folder, plates, log)
 
@@ -42,7 +42,7 @@ def _scan(lines, cores):
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
     place = (lines["range"] * lines["direction"]).transpose("line", "axis").values
     speed, true = lines["v_los"].values, lines["v_los_true"].values
-    reduced = (speed - true) / lines["v_los_std"].values
+    normalised = (speed - true) / lines["v_los_std"].values
     read = np.isfinite(speed)
     span = np.quantile(np.where(read, speed, true), (0.0, 1.0))
     for panel, values, title, label, style in (
@@ -55,9 +55,9 @@ def _scan(lines, cores):
         ),
         (
             panels[1],
-            reduced,
+            normalised,
             "its error over its standard error",
-            "reduced error",
+            "normalised error",
             {"cmap": "RdBu_r", "vmin": -4, "vmax": 4},
         ),
     ):
@@ -83,23 +83,23 @@ def _scan(lines, cores):
     panels[0].set_xlim(middle + half + 4, middle - half - 4)
     return figure, (
         "Middles of the range bins; what the aircraft flies is part of the velocity. Black "
-        "crosses: lines of sight whose rings could not be read. Red crosses: true cores."
+        "crosses: lines of sight whose rings gave no velocity. Red crosses: true cores."
     )
 
 
 def _maps(found, lines, cores):
     figure = Figure(figsize=(17, 10.5), layout="compressed")
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
-    good = found["flag"] == 0
+    valid = found["flag"] == 0
     y, z = found["y"], found["z"]
     place = (lines["range"] * lines["direction"]).transpose("line", "axis").values
     for row, name in zip(axes, COMPONENTS, strict=True):
-        true, value = found[f"{name}_true"], found[name].where(good)
+        true, value = found[f"{name}_true"], found[name].where(valid)
         error = value - true
         both = np.concatenate([true.values.ravel(), value.values.ravel()])
         columns = (
             (true, _colours(both), f"{name}, true"),
-            (value, _colours(both), f"{name}, found"),
+            (value, _colours(both), f"{name}, retrieved"),
             (error, _colours(error.values), f"{name}, error"),
         )
         for panel, (field, colours, title) in zip(row, columns, strict=True):
@@ -125,22 +125,22 @@ def _maps(found, lines, cores):
         panel.set_ylabel("z / m")
     return figure, (
         "Rows: u from the lines of sight (dots: their middles) with the cross-flow wind of the "
-        "images taken out, v and w from the images. Good vectors alone; crosses: true cores."
+        "images taken out, v and w from the images. Valid vectors alone; crosses: true cores."
     )
 
 
 def _uncertainty(found):
     figure = Figure(figsize=(17, 4.3), layout="compressed")
     axes = figure.subplots(1, 3, width_ratios=(1.25, 1.25, 1))
-    good = (found["flag"] == 0).transpose("z", "y").values
+    valid = (found["flag"] == 0).transpose("z", "y").values
     y, z = found["y"], found["z"]
     for panel, name in zip(axes[:2], ("u", "w"), strict=True):
         stderr = found[f"{name}_stderr"].transpose("z", "y").values
-        top = float(np.quantile(stderr[good], 0.99)) if good.any() else 1.0
+        top = float(np.quantile(stderr[valid], 0.99)) if valid.any() else 1.0
         mesh = panel.pcolormesh(
             y,
             z,
-            np.where(good, stderr, np.nan),
+            np.where(valid, stderr, np.nan),
             shading="nearest",
             rasterized=True,
             cmap="viridis",
@@ -159,13 +159,13 @@ def _uncertainty(found):
         name: (found[name] - found[f"{name}_true"]) / found[f"{name}_stderr"] for name in COMPONENTS
     }
     draw_normalised_errors(
-        axes[-1], {name: e.transpose("z", "y").values[good] for name, e in errors.items()}
+        axes[-1], {name: e.transpose("z", "y").values[valid] for name, e in errors.items()}
     )
     draw_normal_density(axes[-1])
     axes[-1].set_title("errors over standard errors")
     axes[-1].legend()
     return figure, (
-        "Left, middle: standard errors of good vectors. Right: how errors against the truth, in "
+        "Left, middle: standard errors of valid vectors. Right: how errors against the truth, in "
         "units of their standard errors, are distributed; the last bins hold all beyond."
     )
 

@@ -1,4 +1,4 @@
-"""The figures of a run with volumes: what the lidar sees, the wind, its errors."""
+"""The figures of a run with volumes: the observed volume, the wind, its errors."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -31,20 +31,20 @@ def draw_all(
     found : xr.Dataset
         From `lidar_mi.experiment.stages.volume.volume_winds`.
     volumes : sequence of xr.DataArray, dims (x, z, y)
-        Apparent backscatter at both times.
+        Attenuated backscatter at both times.
     """
     source = found["source"].values[-1]
     best = found.sel(source=source).isel(algorithm=-1)
     plates = (
-        ("fig30_volume", "What the lidar sees of the volume", _seen(volumes, cores)),
+        ("fig30_volume", "The observed volume", _volume_section(volumes, cores)),
         ("fig31_wind_in_three_dimensions", "The wind in three dimensions", _cuts(best, cores)),
         ("fig32_wind_along_x", "The wind along the flight path", _along_x(best, cores)),
-        ("fig33_volume_errors", "How good the winds are", _errors(found.sel(source=source))),
+        ("fig33_volume_errors", "Errors of the winds", _errors(found.sel(source=source))),
     )
     return save_all(folder, plates, log)
 
 
-def _seen(volumes, cores):
+def _volume_section(volumes, cores):
     figure = Figure(figsize=(16, 6.4), layout="compressed")
     axes = figure.subplots(2, 2, height_ratios=(3.2, 1))
     values = [1e6 * volume for volume in volumes]
@@ -76,7 +76,7 @@ def _cuts(wind, cores):
         panel.set_xlabel("")
     return figure, (
         f"A cut across the flight path at x = {float(cut['x']):.2f} m, by the last method of the "
-        "experiment. Good vectors alone; crosses: true cores. The errors have scales of their own."
+        "experiment. Valid vectors alone; crosses: true cores. The errors have scales of their own."
     )
 
 
@@ -100,7 +100,7 @@ def _row(panels, cut, name, across, up, stretch=1):
     limit, small = _limit(true), _limit(error)
     for panel, field, bound, title in (
         (panels[0], true, limit, f"{name}, true"),
-        (panels[1], value, limit, f"{name}, found"),
+        (panels[1], value, limit, f"{name}, retrieved"),
         (panels[2], error, small, f"{name}, error"),
     ):
         mesh = _map(panel, field, across, up, "RdBu_r", -bound, bound)
@@ -138,9 +138,9 @@ def _errors(found):
         profile.plot(found["x"], rms, "k:", label="the wind itself, rms")
         for method, colour in colours.items():
             wind = found.sel(algorithm=method)
-            good = wind["flag"] == 0
-            error = (wind[name] - wind[f"{name}_true"]).where(good)
-            stated = wind[f"{name}_stderr"].where(good)
+            valid = wind["flag"] == 0
+            error = (wind[name] - wind[f"{name}_true"]).where(valid)
+            stated = wind[f"{name}_stderr"].where(valid)
             for values, style, text in ((error, "-", "error"), (stated, "--", "as stated")):
                 level = np.sqrt((values**2).mean(("y", "z")))
                 profile.plot(
@@ -156,9 +156,9 @@ def _errors(found):
     axes[0, 1].legend(fontsize="small", loc="center")
     axes[1, 0].legend(fontsize="small")
     return figure, (
-        "Top: rms errors of good vectors against the truth, gate by gate, the standard errors that "
-        "the methods state, and how strong the wind itself is: an error above that line means no "
-        "skill. Bottom: errors over standard errors; the last bins hold all beyond."
+        "Top: rms errors of valid vectors against the truth, gate by gate, the standard errors "
+        "that the methods state, and the rms of the wind itself: an error above that line means "
+        "no skill. Bottom: errors over standard errors; the last bins hold all beyond."
     )
 
 

@@ -37,7 +37,7 @@ def draw_all(
 def _pair(image, vectors, truth, fits, cores):
     figure = Figure(figsize=(13.6, 12.4), layout="compressed")
     grid = figure.add_gridspec(3, 2)
-    seen, found, wrong, stated = (figure.add_subplot(grid[k // 2, k % 2]) for k in range(4))
+    first, fitted, wrong, stated = (figure.add_subplot(grid[k // 2, k % 2]) for k in range(4))
     cut = figure.add_subplot(grid[2, :])
     y, z = truth["y"].values, truth["z"].values
     best = next(iter(fits))
@@ -46,7 +46,7 @@ def _pair(image, vectors, truth, fits, cores):
 
     field = image.transpose("z", "y")
     top = float(np.nanquantile(field, 0.999))
-    seen.pcolormesh(
+    first.pcolormesh(
         field["y"],
         field["z"],
         field.values,
@@ -56,10 +56,10 @@ def _pair(image, vectors, truth, fits, cores):
         shading="nearest",
         rasterized=True,
     )
-    seen.set_title("first picture, fitted pairs")
+    first.set_title("first image, fitted pairs")
     limit = float(np.quantile(np.hypot(true["v"], true["w"]), 0.999)) or 1.0
-    _arrows(found, y, z, model, limit)
-    found.set_title(f"wind of the pair from the {ORIGIN_NAMES[best]}")
+    _arrows(fitted, y, z, model, limit)
+    fitted.set_title(f"wind of the pair from the {ORIGIN_NAMES[best]}")
     error = np.hypot(model["v"] - true["v"], model["w"] - true["w"]).values
     stderr = np.hypot(model["v_stderr"], model["w_stderr"]).values
     most = float(np.quantile(error, 0.995)) or 1.0
@@ -72,16 +72,16 @@ def _pair(image, vectors, truth, fits, cores):
         )
         figure.colorbar(mesh, ax=axes, label=_SPEED, pad=0.02, extend="max")
         axes.set_title(title)
-    for axes in (seen, found, wrong, stated):
-        _mark(axes, fits if axes is seen else {best: fits[best]}, cores)
+    for axes in (first, fitted, wrong, stated):
+        _mark(axes, fits if axes is first else {best: fits[best]}, cores)
         axes.set(aspect="equal", xlabel="y / m (port is left)", ylabel="z / m")
         axes.set_xlim(y.max(), y.min())
         axes.set_ylim(z.min(), z.max())
-    seen.legend(loc="lower center", ncols=3, fontsize=8)
+    first.legend(loc="lower center", ncols=3, fontsize=8)
     _along(cut, vectors, truth, fits, best)
     return figure, (
         "Circles: fitted cores with their radius of the largest swirl; crosses: true cores. Below: "
-        "vertical wind on the level of the pair, with the standard errors of the fit and of good "
+        "vertical wind on the level of the pair, with the standard errors of the fit and of valid "
         "vectors."
     )
 
@@ -140,11 +140,11 @@ def _along(axes, vectors, truth, fits, best):
     level = float(fits[best].quantities["centre_z"].value)
     if vectors is not None:
         row = vectors.sel(z=level, method="nearest")
-        good = (row["flag"] == 0).values
-        stderr = row["w_stderr"].values[good]
+        valid = (row["flag"] == 0).values
+        stderr = row["w_stderr"].values[valid]
         axes.errorbar(
-            row["y"].values[good],
-            row["w"].values[good],
+            row["y"].values[valid],
+            row["w"].values[valid],
             np.nan_to_num(stderr),
             fmt=".",
             ms=5,

@@ -14,9 +14,9 @@ class ScanSafety:
     permissible_exposure : float
         Of each pulse, J m^-2.
     hazard_distance, aided_hazard_distance : float
-        Of one beam, naked eye and with binoculars, m.
+        Of one beam, unaided and with binoculars, m.
     scan_hazard_distance : float
-        Of the whole scan, naked eye, m.
+        Of the whole scan, unaided, m.
     scan_power : float
         Average power of all beams, W.
     """

@@ -29,7 +29,7 @@ class LidarCost:
     permissible_exposure : float, optional
         J m^-2, of each pulse; None: its pulses have no duration, hence no limit.
     hazard_distance, aided_hazard_distance : float, optional
-        m, naked eye and with binoculars; None: none, or infinite.
+        m, unaided and with binoculars; None: none, or infinite.
     """
 
     pulses_per_second: float

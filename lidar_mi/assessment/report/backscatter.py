@@ -21,7 +21,7 @@ _ROWS = (
     ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
     ("all.rmse_v", "rms error of v, flagged vectors too", "m/s"),
     ("all.rmse_w", "rms error of w, flagged vectors too", "m/s"),
-    ("valid_fraction", "share of valid vectors", "%"),
+    ("valid_fraction", "fraction of valid vectors", "%"),
 )
 
 
@@ -32,7 +32,7 @@ def backscatter_chapter(
     drawn: Sequence[Drawn],
     vectors: dict | None = None,
 ) -> Chapter:
-    """What the backscatter lidar tells.
+    """Images and cross-flow winds of the backscatter lidar.
 
     Parameters
     ----------
@@ -42,9 +42,7 @@ def backscatter_chapter(
     vectors : dict, optional
         From `vector_map.map_data`.
     """
-    lead = [
-        "A backscatter lidar looks at a wake twice; cross-flow winds follow from the two images."
-    ]
+    lead = ["A backscatter lidar scans a wake twice; cross-flow winds follow from the two images."]
     if cores:
         places = ", ".join(
             f"a vortex at y = {core.y:.1f} m, z = {core.z:.1f} m (core radius {core.radius:.1f} m)"
@@ -52,13 +50,13 @@ def backscatter_chapter(
         )
         lead.append(f"The true flow holds {places}.")
     else:
-        lead.append("No vortex is found in the true flow.")
+        lead.append("No vortex core in the true flow.")
     numbers = Tables(
-        heading="How good the cross-flow winds are",
+        heading="Accuracy of the cross-flow winds",
         legend="Valid vectors against the truth at their place and time. Columns: what the winds "
-        "were retrieved from. Blurred is the extinction as wide beams see it, without noise: its "
-        "difference to the extinction is what the beam's width costs. The last column says how "
-        "strong the true wind is there: an error near it means no skill, as no wind at all would "
+        "were retrieved from. Blurred is the extinction averaged over the beam's width, without "
+        "noise: its difference to the extinction is what the beam's width costs. The last column "
+        "is the rms of the true wind there: an error near it means no skill, as zero wind would "
         "be no worse.",
         tables=list(_tables(experiment, metrics)),
     )
@@ -94,11 +92,11 @@ def _tables(experiment, metrics):
 
 
 def _noise(experiment, metrics) -> str:
-    """What the pictures' noise is made of, in one line."""
+    """The components of the images' noise, in one line."""
     line = (
-        "Noise of the first picture, relative to a pixel's light (medians): simulation "
+        "Noise of the first image, relative to a pixel's signal (medians): simulation "
         f"{percent(metrics['backscatter.mc_relative_error'])} "
-        f"({experiment.render.samples_per_beam} photons a beam)"
+        f"({experiment.render.samples_per_beam} samples per beam)"
     )
     if not experiment.detector:
         return f"{line}; no detector."

@@ -1,4 +1,4 @@
-"""Several variants of one experiment side by side: what differs, and what comes of it."""
+"""Several variants of one experiment side by side: settings that differ, and results."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
@@ -18,11 +18,11 @@ _ROWS = (
     ("backscatter.mc_relative_error", "Monte Carlo noise of a pixel over its signal, median", "%"),
     ("detector.signal", "photoelectrons of a pixel, median", ""),
     ("detector.noise.all", "noise of a pixel over its signal, median", "%"),
-    ("backscatter.multiple_scattering_fraction", "share of multiple scattering", "%"),
+    ("backscatter.multiple_scattering_fraction", "fraction of multiple scattering", "%"),
     ("{}.outside_cores.rmse_u", "rms error of u beyond two core radii", "m/s"),
     ("{}.outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
     ("{}.outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
-    ("{}.valid_fraction", "share of valid vectors", "%"),
+    ("{}.valid_fraction", "fraction of valid vectors", "%"),
     ("true_wind.outside_cores.rms_u", "the true u itself, rms", "m/s"),
     ("true_wind.outside_cores.rms_v", "the true v itself, rms", "m/s"),
     ("true_wind.outside_cores.rms_w", "the true w itself, rms", "m/s"),
@@ -35,16 +35,20 @@ _ROWS = (
     ("sensor.triples.rmse_w", "lines of sight alone: w", "m/s"),
     ("sensor.rmse_v_los", "rms error of a line-of-sight velocity", "m/s"),
     ("sensor.doppler.photons_per_direction", "Doppler lidar: photons of a direction", ""),
-    ("sensor.doppler.hazard_distance", "Doppler lidar: hazard distance, naked eye", "m"),
+    ("sensor.doppler.hazard_distance", "Doppler lidar: hazard distance, unaided", "m"),
     ("safety.permissible_exposure", "permissible exposure by a pulse", "J/m²"),
-    ("safety.hazard_distance", "hazard distance of a beam, naked eye", "m"),
-    ("safety.aided_hazard_distance", "hazard distance of a beam, binoculars", "m"),
-    ("safety.scan_hazard_distance", "hazard distance of the whole scan, naked eye", "m"),
+    ("safety.hazard_distance", "hazard distance of a beam, unaided", "m"),
+    ("safety.aided_hazard_distance", "hazard distance of a beam, with binoculars", "m"),
+    ("safety.scan_hazard_distance", "hazard distance of the whole scan, unaided", "m"),
     ("safety.scan_power", "average power of the scan", "W"),
 )
 
 # of the Doppler lidar's readings of single pulses: measure of `velocity_metrics`, name
-_READINGS = (("bias", "bias"), ("std", "standard deviation"), ("found_fraction", "share read"))
+_RETRIEVALS = (
+    ("bias", "bias"),
+    ("std", "standard deviation"),
+    ("found_fraction", "fraction retrieved"),
+)
 
 
 _METHODS = dict.fromkeys((*ImageMethod, *VolumeMethod))
@@ -60,7 +64,7 @@ def flat(settings: Mapping, prefix: str = "") -> dict[str, object]:
 
 
 def differences(settings: Mapping[str, Mapping[str, object]]) -> dict[str, list]:
-    """Keys that not all variants have alike, with each one's value (None: has no such key)."""
+    """Keys in which the variants differ, with each one's value (None: has no such key)."""
     keys = dict.fromkeys(key for one in settings.values() for key in one if key != "name")
     values = {key: [one.get(key) for one in settings.values()] for key in keys}
     return {key: row for key, row in values.items() if any(value != row[0] for value in row)}
@@ -95,17 +99,17 @@ def page(
         name=name,
         version=__version__,
         variants=list(settings),
-        pictures=[(one.title, one.caption, embedded(one.path)) for one in drawn],
+        images=[(one.title, one.caption, embedded(one.path)) for one in drawn],
         tables=[
-            ("What comes of it", legend, list(results(metrics))),
-            ("What differs", "In SI units; a dash: the variant has no such key.", changed),
+            ("Results", legend, list(results(metrics))),
+            ("Settings that differ", "In SI units; a dash: the variant has no such key.", changed),
         ],
         resolved=to_yaml(dict(settings)),
     )
 
 
 def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, str, list[str]]]:
-    """What comes of variants: (name, unit, one text a variant), where any of them has a number."""
+    """Results of variants: (name, unit, one text per variant), where any of them has a number."""
     for pattern, label, unit in _ROWS:
         if "{}" not in pattern:
             yield from _row(metrics, pattern, label, unit)
@@ -114,7 +118,7 @@ def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, s
             key = pattern.format(f"{source}.{method}")
             yield from _row(metrics, key, f"{_named(source, method)}: {label}", unit)
     for method, centre in product(RingMethod, RingCentre):
-        for measure, label in _READINGS:
+        for measure, label in _RETRIEVALS:
             unit = "%" if measure == "found_fraction" else "m/s"
             title = f"one pulse by {READERS[method]}, {CENTRES[centre]}: {label}"
             yield from _row(metrics, ring_key(method, centre, 1, measure), title, unit)
@@ -128,7 +132,7 @@ def _row(metrics: Mapping[str, Mapping[str, float]], key: str, label: str, unit:
 
 
 def _shown(values: Sequence[float | None], unit: str) -> list[str]:
-    style = {"m/s": fixed, "%": lambda share: three(100 * share)}.get(unit, three)
+    style = {"m/s": fixed, "%": lambda fraction: three(100 * fraction)}.get(unit, three)
     return ["-" if value is None else style(value) for value in values]
 
 

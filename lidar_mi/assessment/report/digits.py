@@ -24,9 +24,9 @@ def three(value: float) -> str:
     return f"{float(text):.10g}"
 
 
-def percent(share: float) -> str:
-    """A share as per cent, two digits at most below 10 %: 0.43 %, 72 %, 100 %."""
-    value = 100 * share
+def percent(fraction: float) -> str:
+    """A fraction as per cent, two digits at most below 10 %: 0.43 %, 72 %, 100 %."""
+    value = 100 * fraction
     text = (
         f"{round(value) + 0}"
         if abs(value) >= 9.95 or value == 0
@@ -35,9 +35,9 @@ def percent(share: float) -> str:
     return f"{text} %"
 
 
-def whole_percent(share: float) -> str:
+def whole_percent(fraction: float) -> str:
     """A fraction as whole per cent, without a sign before 0."""
-    return f"{round(100 * share) + 0} %"
+    return f"{round(100 * fraction) + 0} %"
 
 
 def with_error(value: float, stderr: float) -> str:
@@ -47,6 +47,6 @@ def with_error(value: float, stderr: float) -> str:
 
 
 def in_row(values: Sequence[float | None], unit: str) -> list[str]:
-    """Errors, or shares with the unit %, as `fixed`; a dash where there is none."""
+    """Errors, or fractions with the unit %, as `fixed`; a dash where there is none."""
     scale = 100 if unit == "%" else 1
     return ["-" if value is None else fixed(scale * value) for value in values]

@@ -10,7 +10,7 @@ from lidar_mi.assessment.report.page import Chapter, Tables
 
 
 def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn]) -> Chapter:
-    """What the Doppler lidar tells.
+    """Rings and line-of-sight winds of the Doppler lidar.
 
     Parameters
     ----------
@@ -23,7 +23,7 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
         "line of sight follows from the radii of the rings."
     )
     modes = metrics.get("doppler.speckle_modes")
-    speckle = f"speckle has {three(modes)} modes a pixel" if modes else "there is no speckle"
+    speckle = f"speckle has {three(modes)} modes per pixel" if modes else "there is no speckle"
     light = (
         f"A pulse gives {three(metrics['doppler.photons'])} photons from {doppler.lidar.range:g} m "
         f"and {three(metrics['doppler.background_photons'])} of sunlight; {speckle}, read-out "
@@ -32,16 +32,16 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
     rings = (
         f"The line is {metrics['doppler.line_width'] / 1e9:.2f} GHz wide, the etalon's free "
         f"spectral range {metrics['doppler.free_spectral_range'] / 1e9:.2f} GHz, its finesse "
-        f"{metrics['doppler.finesse']:.1f}: winds are told apart over "
-        f"{metrics['doppler.velocity_range']:.0f} m/s. Without noise, the rendered pictures give "
+        f"{metrics['doppler.finesse']:.1f}: the unambiguous velocity range is "
+        f"{metrics['doppler.velocity_range']:.0f} m/s. Without noise, the rendered images give "
         f"the true winds to {metrics['doppler.render.largest_error']:.2g} m/s."
     )
     numbers = Tables(
-        heading="How good the line-of-sight winds are",
-        legend="Winds that each method reads from noisy pictures, or from averages of several "
+        heading="Accuracy of the line-of-sight winds",
+        legend="Winds that each method retrieves from noisy images, or from averages of several "
         "(columns), over all speeds, with standard errors. "
         f"{_abbreviations(doppler.retrieval.methods)}The bound (Cramér-Rao) is the least standard "
-        "deviation without bias; its row says nothing of any method.",
+        "deviation without bias; its row belongs to no method.",
         tables=[
             _doppler_table(doppler.retrieval, centre, metrics)
             for centre in doppler.retrieval.centre
@@ -51,7 +51,7 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
 
 
 def _abbreviations(methods: Sequence[str]) -> str:
-    """What the names of those methods mean that read the peaks of the innermost ring."""
+    """The meaning of the names of those methods that use the peaks of the innermost ring."""
     names = {"ca": "CA: circular averaging", "ml": "ML: midpoint lines"}
     used = [text for key, text in names.items() if any(m.partition("_")[0] == key for m in methods)]
     if not set(methods) & set(PEAK_READERS):
@@ -72,5 +72,5 @@ def _doppler_table(settings, centre, metrics):
             rows.append((f"{READERS[method]}: {label}", "m/s", shown))
     bounds = [fixed(metrics[bound_key(centre, n)]) for n in settings.averaged]
     rows.append(("bound", "m/s", bounds))
-    heads = [f"{n} picture{'s' * (n > 1)}" for n in settings.averaged]
+    heads = [f"{n} image{'s' * (n > 1)}" for n in settings.averaged]
     return CENTRES[centre], heads, rows

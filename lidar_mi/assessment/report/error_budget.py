@@ -1,4 +1,4 @@
-"""The chapter of a report that says what limits the cross-flow wind."""
+"""The chapter of a report on the error budget of the cross-flow wind."""
 
 from collections.abc import Mapping, Sequence
 
@@ -23,13 +23,15 @@ def limit_sentence(budget: Mapping[str, float], method: str) -> str:
     name = METHOD_NAMES[method]
     causes = causes_of(budget)
     if not causes:
-        return f"What limits the wind by {name} cannot be told: no vector is valid."
+        return f"The error budget of the wind by {name} is undetermined: no vector is valid."
     place, where = "", ""
     if f"outside_cores.{causes[0]}.share" in budget:
         place, where = "outside_cores.", " beyond two core radii"
-    shares = {cause: budget[f"{place}{cause}.share"] for cause in causes}
-    ranked = sorted(causes, key=shares.get, reverse=True)
-    parts = [f"{CAUSES[c]} ({whole_percent(shares[c])}" for c in ranked if shares[c] >= _LEAST][:3]
+    fractions = {cause: budget[f"{place}{cause}.share"] for cause in causes}
+    ranked = sorted(causes, key=fractions.get, reverse=True)
+    parts = [
+        f"{CAUSES[c]} ({whole_percent(fractions[c])}" for c in ranked if fractions[c] >= _LEAST
+    ][:3]
     error = f"{component_rmse(budget, place):.2f} m/s"
     if not parts:
         return (
@@ -60,10 +62,10 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
     """
     numbers = Tables(
         heading="Errors without each cause in turn",
-        legend="Rms errors in m/s of v and w, and the share of the mean square error of both that "
-        "goes with the cause: over valid vectors, always the same, and over those beyond two core "
-        "radii. Noise is taken out as it fell, not drawn anew. The method itself: what it is off "
-        "by on pictures of the air as it is, without blur and noise.",
+        legend="Rms errors in m/s of v and w, and the fraction of the mean square error of both "
+        "that goes with the cause: over valid vectors, always the same, and over those beyond two "
+        "core radii. Noise is taken out as it fell, not drawn anew. The method itself: its error "
+        "on images of the air as it is, without blur and noise.",
         tables=[_table(budget, method) for method, budget in budgets.items()],
     )
     lead = [limit_sentence(budget, method) for method, budget in budgets.items()]
@@ -71,9 +73,9 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
     whole = [METHOD_NAMES[m] for m, causes in known.items() if causes and "window" not in causes]
     if whole:
         lead.append(
-            "There is no window, no shear within one and no straight path to take away for "
-            f"{' and '.join(whole)}, fitted to whole pictures along curved paths: how smooth the "
-            "flow is belongs to the method itself."
+            "No window, no shear within one and no straight path apply to "
+            f"{' and '.join(whole)}, fitted to whole images along curved paths: "
+            "smoothing is part of the method."
         )
     return Chapter("What limits the cross-flow wind", lead, drawn, numbers)
 
@@ -90,6 +92,8 @@ def _table(budget: Mapping[str, float], method: str):
     rows = [("with all causes", "", values(""))]
     rows += [(f"without: {CAUSES[c]}", "", values(f"{c}.")) for c in causes_of(budget)]
     heads = [
-        f"{quantity}{where}" for where in ("", ", beyond cores") for quantity in ("v", "w", "share")
+        f"{quantity}{where}"
+        for where in ("", ", beyond cores")
+        for quantity in ("v", "w", "fraction")
     ]
     return METHOD_NAMES[method], heads, rows

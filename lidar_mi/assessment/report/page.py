@@ -26,7 +26,7 @@ class Tables(NamedTuple):
 
 
 class Chapter(NamedTuple):
-    """What one instrument of a run tells.
+    """What the report says of one instrument.
 
     Attributes
     ----------
@@ -36,9 +36,9 @@ class Chapter(NamedTuple):
     drawn : sequence of Drawn
     numbers : Tables
     verdict : Tables, optional
-        Whether what is asked for is fulfilled; stands before all chapters' numbers.
+        Compliance with the requirements; stands before all chapters' numbers.
     vectors : dict, optional
-        `vector_map.map_data` with a ``title``, for a map to be looked at vector by vector.
+        `vector_map.map_data` with a ``title``, for an interactive map of the vectors.
     """
 
     title: str
@@ -57,7 +57,7 @@ def page(
     chapters: Sequence[Chapter],
     warnings: Sequence[str] = (),
 ) -> str:
-    """The report as HTML, pictures embedded, everything named by the user escaped.
+    """The report as HTML, images embedded, everything named by the user escaped.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def page(
     """
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]
-        pictures = dict(
+        images = dict(
             zip(drawn, pool.map(lambda figure: embedded(figure.path), drawn), strict=True)
         )
     return template("report.html").render(
@@ -85,8 +85,7 @@ def page(
         warnings=[text.rstrip(".") for text in warnings],
         script=Markup(files("lidar_mi.assessment.report").joinpath("vector_map.js").read_text()),
         chapters=[
-            chapter._asdict()
-            | {"pictures": [(d.title, d.caption, pictures[d]) for d in chapter.drawn]}
+            chapter._asdict() | {"images": [(d.title, d.caption, images[d]) for d in chapter.drawn]}
             for chapter in chapters
         ],
     )
@@ -102,7 +101,7 @@ def template(name: str) -> jinja2.Template:
 
 
 def embedded(path: Path) -> str:
-    """A picture as the text that a page holds it by: lossless WebP, two thirds of its PNG."""
+    """An image as a data URL: lossless WebP, two thirds of its PNG."""
     return f"data:image/webp;base64,{base64.b64encode(as_webp(path)).decode()}"
 
 
@@ -133,7 +132,7 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
             texture = f"texture of {percent(wake.texture.rms)} rms, {scale}"
         rows.append(("wake", f"{flow}; {texture}"))
         platform = experiment.platform
-        rows.append(("platform", f"{platform.speed:g} m/s, pictures {platform.dt:g} s apart"))
+        rows.append(("platform", f"{platform.speed:g} m/s, images {platform.dt:g} s apart"))
         beam = (
             f"{lidar.wavelength * 1e9:.5g} nm, {lidar.pulse_energy * 1e3:g} mJ, divergence "
             f"{lidar.divergence_full * 1e3:g} mrad, telescope of {2 * lidar.aperture_radius:g} m; "
@@ -144,7 +143,7 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
         air, render = experiment.scattering, experiment.render
         light = (
             f"scattering by {air.aerosol or air.table or air.phase.replace('_', ' ')}, orders up "
-            f"to {render.max_order}, {render.samples_per_beam} photons a beam, {render.variant}"
+            f"to {render.max_order}, {render.samples_per_beam} samples per beam, {render.variant}"
         )
         rows.append(("light", light))
         chosen = experiment.volume or experiment.retrieval

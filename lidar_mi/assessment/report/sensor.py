@@ -1,4 +1,4 @@
-"""The combined sensor's chapter of a report: its verdict, its numbers."""
+"""The combined sensor's chapter of a report: compliance, errors, resources."""
 
 from collections.abc import Mapping, Sequence
 
@@ -16,7 +16,7 @@ def sensor_chapter(
     drawn: Sequence[Drawn],
     vectors: dict | None = None,
 ) -> Chapter:
-    """What both lidars together tell, and whether that satisfies flight control.
+    """Winds of both lidars together, and their compliance with requirements.
 
     Parameters
     ----------
@@ -24,14 +24,14 @@ def sensor_chapter(
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     judged : sequence of (RequirementTable, list of Finding)
-        Empty: nothing is asked for.
+        Empty: no requirements.
     drawn : sequence of Drawn
     vectors : dict, optional
         From `vector_map.map_data`.
     """
     speed = experiment.platform.speed
     purpose = (
-        "Both lidars look at the same slab of air: the Doppler lidar's lines of sight and the "
+        "Both lidars observe the same slab of air: the Doppler lidar's lines of sight and the "
         "cross-flow wind of the backscatter lidar's images give the wind in three dimensions."
     )
     if speed:
@@ -40,7 +40,7 @@ def sensor_chapter(
     else:
         warning = "The platform stands still: there is no look-ahead time"
         warning += "." if judged else ", and requirements for flight control do not apply."
-    verdicts = {True: "fulfilled", False: "not fulfilled", None: "cannot be told"}
+    verdicts = {True: "fulfilled", False: "not fulfilled", None: "undetermined"}
     tables = [
         (
             f"{table.title}, {table.phase}: {verdicts[fulfilled(findings)]}",
@@ -65,21 +65,21 @@ def sensor_chapter(
         ],
         drawn=drawn,
         verdict=Tables(
-            "Whether it does what flight control asks for"
+            "Compliance with the requirements of flight control"
             if speed
-            else "Whether it does what is asked for",
-            "Errors of u, v, w are rms errors of good vectors beyond two core radii, those of "
+            else "Compliance with the requirements",
+            "Errors of u, v, w are rms errors of valid vectors beyond two core radii, those of "
             "v_LOS rms errors of lines of sight, in this run for all phases of flight. A margin "
-            "is the distance from the limit, as a share of it.",
+            "is the distance from the limit, as a fraction of it.",
             tables,
         )
         if judged
         else None,
         numbers=Tables(
-            "How good the wind from both lidars is",
+            "Accuracy of the wind from both lidars",
             f"{metrics['sensor.lines_read']} of {metrics['sensor.lines']} lines of sight were "
-            f"read; {metrics['sensor.vectors']} vectors, "
-            f"{percent(metrics['sensor.good_fraction'])}, are good. Errors over standard errors "
+            f"retrieved; {metrics['sensor.vectors']} vectors, "
+            f"{percent(metrics['sensor.good_fraction'])}, are valid. Errors over standard errors "
             "have a variance of 1 where they are as stated; then 68 % lie within one standard "
             "error and 95 % within 1.96.",
             [_numbers(metrics)],
@@ -91,8 +91,8 @@ def sensor_chapter(
 # A cause with less of u's mean square error is no limit.
 _LEAST = 0.05
 _CAUSES = {
-    "between_lines": "the air between the lines of sight",
-    "line_noise": "the noise of the rings",
+    "between_lines": "sampling error between the lines of sight",
+    "line_noise": "noise of the rings",
     "range_bin": "averaging along the range bin",
     "crossflow": "errors of v and w",
     "pointing": "errors of attitude and pointing",
@@ -100,14 +100,16 @@ _CAUSES = {
 
 
 def _limit_of_u(metrics) -> list[str]:
-    """What limits u, in a sentence; nothing where it is not known."""
+    """The error budget of u, in a sentence; empty where it is not known."""
     keys = {c: f"sensor.error_budget.{c}.share_u" for c in _CAUSES}
-    shares = {c: metrics[key] for c, key in keys.items() if key in metrics}
-    if not shares:
+    fractions = {c: metrics[key] for c, key in keys.items() if key in metrics}
+    if not fractions:
         return []
-    ranked = sorted(shares, key=shares.get, reverse=True)
-    parts = [f"{_CAUSES[c]} ({percent(min(shares[c], 1))}" for c in ranked if shares[c] >= _LEAST]
-    little = [_CAUSES[c] for c in ranked if shares[c] < _LEAST]
+    ranked = sorted(fractions, key=fractions.get, reverse=True)
+    parts = [
+        f"{_CAUSES[c]} ({percent(min(fractions[c], 1))}" for c in ranked if fractions[c] >= _LEAST
+    ]
+    little = [_CAUSES[c] for c in ranked if fractions[c] < _LEAST]
     rmse = metrics.get("sensor.outside_cores.rmse_u", metrics["sensor.rmse_u"])
     text = f"u is off by {rmse:.2g} m/s rms, limited by " + "), then ".join(
         [f"{parts[0]} of the mean square error", *parts[1:]]
@@ -116,12 +118,12 @@ def _limit_of_u(metrics) -> list[str]:
 
 
 def _not_stated(errors) -> list[str]:
-    """That errors of the platform are there, and not in what is stated."""
+    """That the platform has errors which standard errors do not include."""
     if errors == type(errors)():
         return []
     text = (
         "The platform's attitude, pointing or speed is not what it is taken for (sensor.errors). "
-        "Standard errors do not know of this: what turns all lines alike is on top of them."
+        "Standard errors do not include this: what turns all lines alike adds to them."
     )
     return [text]
 
@@ -131,12 +133,8 @@ def _costs(metrics) -> list[str]:
     text = (
         f"The Doppler lidar's directions take {_rate(metrics, 'doppler')}, and give "
         f"{three(metrics['sensor.doppler.photons_per_direction'])} photons each"
-        + (
-            f"; the error of v_LOS that is asked for takes {needed} of them a direction."
-            if needed
-            else "."
-        )
-        + f" The pictures take {_rate(metrics, 'backscatter')}."
+        + (f"; the required error of v_LOS takes {needed} pulses per direction." if needed else ".")
+        + f" The images take {_rate(metrics, 'backscatter')}."
     )
     safety = []
     for name, title in (("doppler", "Doppler"), ("backscatter", "backscatter")):
@@ -149,7 +147,7 @@ def _costs(metrics) -> list[str]:
             where = f"from {three(distance)} m on, with binoculars from {three(aided)} m"
         limit = three(metrics[f"sensor.{name}.permissible_exposure"])
         safety.append(
-            f"The {title} lidar's beam is safe for eyes {where}: {limit} J/m² of each pulse are "
+            f"The {title} lidar's beam is safe for eyes {where}: {limit} J/m² per pulse are "
             "permissible (IEC 60825-1:2014)."
         )
     return [text, *safety]
@@ -161,7 +159,7 @@ def _rate(metrics, name: str) -> str:
         metrics[f"sensor.{name}.{key}"] for key in ("pulses_per_second", "average_power", "beams")
     )
     at_once = f", {beams} directions at a time" if beams > 1 else ""
-    return f"{three(rate)} pulses a second{at_once}, {three(power)} W of light"
+    return f"{three(rate)} pulses per second{at_once}, {three(power)} W of light"
 
 
 def _numbers(metrics):
@@ -171,7 +169,7 @@ def _numbers(metrics):
         ("outside_cores.rmse_{}", "rms error beyond cores", "m/s"),
         ("outside_cores.rms_{}", "the true wind itself there, rms", "m/s"),
         ("bias_{}", "bias", "m/s"),
-        ("reduced_variance_{}", "variance of reduced errors", ""),
+        ("reduced_variance_{}", "variance of normalised errors", ""),
         ("coverage_68_{}", "within one standard error", "%"),
         ("coverage_95_{}", "within 1.96 standard errors", "%"),
         ("triples.rmse_{}", "rms error, lines of sight alone, in threes", "m/s"),

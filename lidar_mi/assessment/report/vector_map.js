@@ -6,37 +6,37 @@
   const speeds = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
   const errors = [[33, 102, 172], [103, 169, 207], [215, 215, 215], [239, 138, 98], [178, 24, 43]];
 
-  function colour(scale, share) {
-    const at = Math.min(Math.max(share, 0), 1) * (scale.length - 1), k = Math.min(Math.floor(at), scale.length - 2);
+  function colour(scale, fraction) {
+    const at = Math.min(Math.max(fraction, 0), 1) * (scale.length - 1), k = Math.min(Math.floor(at), scale.length - 2);
     return "rgb(" + scale[k].map((c, i) => Math.round(c + (at - k) * (scale[k + 1][i] - c))).join() + ")";
   }
 
-  function highest(values, share) {
+  function highest(values, quantile) {
     const known = values.filter(v => v !== null).map(Math.abs).sort((a, b) => a - b);
-    return known.length ? known[Math.floor(share * (known.length - 1))] || 1 : 1;
+    return known.length ? known[Math.floor(quantile * (known.length - 1))] || 1 : 1;
   }
 
   function start(box) {
     const data = JSON.parse(box.querySelector("script").textContent);
     const canvas = box.querySelector("canvas"), choice = box.querySelector("select");
     const flagged = box.querySelector("input"), key = box.querySelector(".key");
-    const told = box.querySelector("tbody"), where = box.querySelector(".where");
+    const rows = box.querySelector("tbody"), where = box.querySelector(".where");
     const part = Object.fromEntries(data.components.map(c => [c.name, c]));
     const { v, w } = part, many = data.y.length;
-    const difference = c => c.found.map((f, k) => f === null || c.true[k] === null ? null : f - c.true[k]);
-    const speed = v.found.map((f, k) => f === null || w.found[k] === null ? null : Math.hypot(f, w.found[k]));
-    const good = values => values.filter((_, k) => data.flag[k] === 0);
-    const fastest = highest([...good(speed), ...v.true.map((f, k) => f === null ? null : Math.hypot(f, w.true[k]))], 0.995);
+    const difference = c => c.retrieved.map((f, k) => f === null || c.true[k] === null ? null : f - c.true[k]);
+    const speed = v.retrieved.map((f, k) => f === null || w.retrieved[k] === null ? null : Math.hypot(f, w.retrieved[k]));
+    const valid = values => values.filter((_, k) => data.flag[k] === 0);
+    const fastest = highest([...valid(speed), ...v.true.map((f, k) => f === null ? null : Math.hypot(f, w.true[k]))], 0.995);
     const shown = [{ label: "speed of v and w", values: speed, scale: speeds, low: 0, high: fastest }];
     for (const c of data.components) {
-      const off = difference(c), top = highest(good(off), 0.98);
+      const off = difference(c), top = highest(valid(off), 0.98);
       shown.push({ label: "error of " + c.name, values: off, scale: errors, low: -top, high: top });
     }
     if (part.u) {
       // all one way: of its own range
-      const known = good(part.u.found).filter(u => u !== null), top = highest(known, 0.995);
+      const known = valid(part.u.retrieved).filter(u => u !== null), top = highest(known, 0.995);
       const least = Math.min(...known), most = Math.max(...known), oneWay = least > 0 || most < 0;
-      shown.push({ label: "u", values: part.u.found, scale: oneWay ? speeds : errors,
+      shown.push({ label: "u", values: part.u.retrieved, scale: oneWay ? speeds : errors,
         low: oneWay ? least : -top, high: oneWay ? most : top });
     }
     shown.forEach((s, k) => choice.add(new Option(s.label, k)));
@@ -75,11 +75,11 @@
       pen.scale(dense, dense);
       pen.lineWidth = Math.max(1, unit * data.step / 12);
       for (let k = 0; k < many; k++) {
-        if (v.found[k] === null || w.found[k] === null) continue;
+        if (v.retrieved[k] === null || w.retrieved[k] === null) continue;
         if (data.flag[k] !== 0 && !flagged.checked) continue;
-        const value = what.values[k], share = (value - what.low) / (what.high - what.low);
-        pen.strokeStyle = data.flag[k] !== 0 || value === null ? grey : colour(what.scale, share);
-        arrow(pen, data.y[k], data.z[k], v.found[k], w.found[k]);
+        const value = what.values[k], fraction = (value - what.low) / (what.high - what.low);
+        pen.strokeStyle = data.flag[k] !== 0 || value === null ? grey : colour(what.scale, fraction);
+        arrow(pen, data.y[k], data.z[k], v.retrieved[k], w.retrieved[k]);
       }
       pen.strokeStyle = "crimson";
       pen.lineWidth = 1.5;
@@ -103,15 +103,15 @@
       box.querySelector(".high").textContent = what.high.toFixed(1) + " m/s";
     }
 
-    function tell(k) {
+    function show(k) {
       if (k === chosen || k < 0) return;
       chosen = k;
       const number = value => value === null || value === undefined ? "\u2013" : value.toFixed(2).replace("-0.00", "0.00");
       const reasons = Object.entries(data.flags).filter(([mask]) => data.flag[k] & mask).map(([, text]) => text);
       where.textContent = "y = " + data.y[k].toFixed(1) + " m, z = " + data.z[k].toFixed(1) + " m: " +
-        (reasons.length ? "rejected, " + reasons.join(", ") : "good");
-      told.replaceChildren(...data.components.map(c => {
-        const row = document.createElement("tr"), f = c.found[k], t = c.true[k];
+        (reasons.length ? "rejected, " + reasons.join(", ") : "valid");
+      rows.replaceChildren(...data.components.map(c => {
+        const row = document.createElement("tr"), f = c.retrieved[k], t = c.true[k];
         const off = f === null || t === null ? null : f - t;
         for (const text of [c.name, number(f), number(t), number(off), number(c.stderr && c.stderr[k])]) {
           row.append(Object.assign(document.createElement("td"), { textContent: text }));
@@ -133,7 +133,7 @@
 
     function point(event) {
       const edge = canvas.getBoundingClientRect();
-      tell(nearest(left - (event.clientX - edge.left) / unit, top - (event.clientY - edge.top) / unit));
+      show(nearest(left - (event.clientX - edge.left) / unit, top - (event.clientY - edge.top) / unit));
     }
 
     canvas.addEventListener("pointermove", point);
@@ -142,7 +142,7 @@
       const step = { ArrowLeft: [1, 0], ArrowRight: [-1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[event.key];
       if (!step || chosen < 0) return;
       event.preventDefault();
-      tell(nearest(data.y[chosen] + step[0] * data.step, data.z[chosen] + step[1] * data.step));
+      show(nearest(data.y[chosen] + step[0] * data.step, data.z[chosen] + step[1] * data.step));
     });
     choice.addEventListener("change", draw);
     flagged.addEventListener("change", draw);
@@ -151,7 +151,7 @@
     box.hidden = false;
     draw();
     const [y, z] = data.cores.length ? data.cores[0] : [0, 0];
-    tell(nearest(y, z + 4));
+    show(nearest(y, z + 4));
   }
 
   document.querySelectorAll(".map").forEach(start);

@@ -52,7 +52,7 @@ def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core])
         "components": [
             {
                 "name": name,
-                "found": numbers(name),
+                "retrieved": numbers(name),
                 "true": numbers(f"{name}_true"),
                 "stderr": numbers(f"{name}_stderr") if f"{name}_stderr" in thin else None,
             }

@@ -11,7 +11,7 @@ from lidar_mi.assessment.report.page import Chapter, Tables
 
 
 def volume_chapter(experiment, metrics: Mapping[str, float], drawn: Sequence[Drawn]) -> Chapter:
-    """What the volumes tell.
+    """Volumes of the backscatter lidar and the winds retrieved from them.
 
     Parameters
     ----------
@@ -21,19 +21,19 @@ def volume_chapter(experiment, metrics: Mapping[str, float], drawn: Sequence[Dra
     """
     scan = experiment.scan
     purpose = (
-        f"A backscatter lidar looks twice at {scan.gate_count} slabs of "
-        f"{scan.thickness / scan.gate_count:g} m; the wind in all three directions follows from "
-        "the two volumes that they make."
+        f"A backscatter lidar scans {scan.gate_count} slabs of "
+        f"{scan.thickness / scan.gate_count:g} m twice; the wind in three dimensions follows from "
+        "the two volumes."
     )
     noise = (
-        "Noise of the simulation in a voxel, relative to its light (median): "
+        "Noise of the simulation in a voxel, relative to its signal (median): "
         f"{percent(metrics['backscatter.mc_relative_error'])} "
-        f"({experiment.render.samples_per_beam} photons a beam); "
+        f"({experiment.render.samples_per_beam} samples per beam); "
         f"{'with the noise of a detector' if experiment.detector else 'no detector'}."
     )
     numbers = Tables(
-        heading="How good the winds in three dimensions are",
-        legend="Good vectors against the truth at their place. The true wind's own rms stands "
+        heading="Accuracy of the winds in three dimensions",
+        legend="Valid vectors against the truth at their place. The true wind's own rms stands "
         "beside the errors: an error near it means no skill.",
         tables=list(_tables(experiment, metrics)),
     )
@@ -51,14 +51,14 @@ def _tables(experiment, metrics):
                 ("all.rmse_{}", "rms error, flagged vectors too", "m/s"),
                 ("bias_{}", "bias", "m/s"),
                 ("stderr_{}", "rms standard error, as stated", "m/s"),
-                ("reduced_variance_{}", "variance of reduced errors", ""),
+                ("reduced_variance_{}", "variance of normalised errors", ""),
                 ("coverage_68_{}", "within one standard error", "%"),
             ):
                 values = [metrics.get(wind_key(source, method, key.format(n))) for n in COMPONENTS]
                 rows.append((label, unit, in_row(values, unit)))
             own = [fixed(metrics[f"true_wind.rms_{name}"]) for name in COMPONENTS]
             rows.append(("the true wind itself, rms", "m/s", own))
-            share = metrics[wind_key(source, method, "valid_fraction")]
+            valid = metrics[wind_key(source, method, "valid_fraction")]
             name = METHOD_NAMES[method]
-            title = f"{SOURCE_NAMES[source]}, {name}: {percent(share)} of the vectors are good"
+            title = f"{SOURCE_NAMES[source]}, {name}: {percent(valid)} of the vectors are valid"
             yield title, list(COMPONENTS), rows

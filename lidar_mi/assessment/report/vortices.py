@@ -34,8 +34,8 @@ _ERRORS = (
     ("rmse_w", "rms error of w", "m/s"),
     ("outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
     ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
-    ("reduced_variance_v", "variance of reduced errors of v", ""),
-    ("reduced_variance_w", "variance of reduced errors of w", ""),
+    ("reduced_variance_v", "variance of normalised errors of v", ""),
+    ("reduced_variance_w", "variance of normalised errors of w", ""),
 )
 
 
@@ -45,19 +45,19 @@ def vortex_chapter(
     refused: Mapping[str, str],
     drawn: Sequence[Drawn],
 ) -> Chapter:
-    """What wake vortices are described by, beside the truth.
+    """Parameters of the fitted vortices, beside the truth.
 
     Parameters
     ----------
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     fits : mapping of str to VortexPairFit
-        The good ones, by `Origin`.
+        The accepted ones, by `Origin`.
     refused : mapping of str to str
         Why there is no other.
     """
     purpose = (
-        "Two vortices in a mean wind are fitted to the two pictures as a whole, and to the wind "
+        "Two vortices in a mean wind are fitted to the two images as a whole, and to the wind "
         "vectors. The fitted pair gives the wind anywhere, with its error (vortex.json)."
     )
     lead = [purpose]
@@ -78,11 +78,11 @@ def vortex_chapter(
     if fits:
         tables.append(("The pair's wind against the truth, all over the slab", heads[1:], errors))
     numbers = Tables(
-        heading="How well the vortices are known",
-        legend="Values with standard errors, at mid-time of the pictures; core radius and "
+        heading="Vortex parameters and standard errors",
+        legend="Values with standard errors, at mid-time of the images; core radius and "
         "circulation far from the core belong to the profile that was fitted (Lamb-Oseen), a true "
         "core radius is that of the largest swirl. True circulations and velocities are averages "
-        "over rings of 5 to 15 m; a dash: cannot be told.",
+        "over rings of 5 to 15 m; a dash: undetermined.",
         tables=tables,
     )
     return Chapter("The vortices", lead, drawn, numbers)
@@ -97,7 +97,7 @@ def _verdict(metrics, name) -> str | None:
     sides = [side for side in ("port", "starboard") if true[f"{side}_circulation_5_15"] is not None]
     if len(sides) < 2:
         return None
-    shares = [
+    deviations = [
         abs(found[f"{side}_circulation_5_15"] / true[f"{side}_circulation_5_15"] - 1)
         for side in sides
     ]
@@ -106,8 +106,9 @@ def _verdict(metrics, name) -> str | None:
         for side in sides
     ]
     return (
-        f"From the {ORIGIN_NAMES[name]}, circulation is off by {100 * shares[0]:.1f} % (port) and "
-        f"{100 * shares[1]:.1f} % (starboard), places by {places[0]:.2f} and {places[1]:.2f} m."
+        f"From the {ORIGIN_NAMES[name]}, circulation is off by {100 * deviations[0]:.1f} % (port) "
+        f"and {100 * deviations[1]:.1f} % (starboard), places by {places[0]:.2f} and "
+        f"{places[1]:.2f} m."
     )
 
 

@@ -1,4 +1,4 @@
-"""Lines of sight of the Doppler lidar through the slab, each read from images of rings."""
+"""Lines of sight of the Doppler lidar through the slab, each from images of rings."""
 
 from collections.abc import Mapping
 
@@ -49,12 +49,12 @@ def slab_wind(experiment: Experiment, truth: Truth) -> xr.Dataset:
 
 
 def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
-    """Say whether both lidars look at the same air, and the Doppler lidar can tell its winds.
+    """Say whether both lidars observe the same air, in the Doppler lidar's velocity range.
 
     Raises
     ------
     InputError
-        Lidars that do not look at the same slab, lines that leave the wake, speeds beyond the
+        Lidars that do not observe the same slab, lines that leave the wake, speeds beyond the
         unambiguous range.
     """
     lidar = experiment.doppler.lidar
@@ -85,17 +85,17 @@ def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
 def measure_lines(
     experiment: Experiment, truth: xr.Dataset, rings: Rings, *, log: Log
 ) -> xr.Dataset:
-    """Line-of-sight velocities as the Doppler lidar reads them from its rings.
+    """Line-of-sight velocities as the Doppler lidar retrieves them from its rings.
 
-    Pictures without noise are made at a few speeds and interpolated between them (their rings
-    move by far less than an order); each line's are drawn by the CCD and read by the annular fit,
-    which says how good it is.
+    Images without noise are made at a few speeds and interpolated between them (their rings
+    move by far less than an order); each line's are drawn by the CCD and evaluated by the annular
+    fit, which states its standard error.
 
     Returns
     -------
     xr.Dataset, dim (line)
-        From `scan_wind`, with ``v_los`` and ``v_los_std`` (m s^-1) as they were read; NaN where an
-        image cannot be read.
+        From `scan_wind`, with ``v_los`` and ``v_los_std`` (m s^-1) as retrieved; NaN where an image
+        gives none.
     """
     sensor, doppler = experiment.sensor, experiment.doppler
     lines = scan_wind(
@@ -120,9 +120,9 @@ def measure_lines(
     )
     noise = summed_noise(doppler.ccd, rings.modes, sensor.pulses)
     weights = torch.from_numpy(_lagrange(nodes, (true - middle) / half)).to(images.dtype)
-    read = np.empty((2, len(true)))
+    retrieved = np.empty((2, len(true)))
     for start in range(0, len(true), FRAMES):
-        log.bar(f"reading line of sight {start + 1} of {len(true)}", start / len(true))
+        log.bar(f"retrieving line of sight {start + 1} of {len(true)}", start / len(true))
         chunk = range(start, min(start + FRAMES, len(true)))
         frames = []
         for index in chunk:
@@ -134,10 +134,10 @@ def measure_lines(
                     doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
                 )
             )
-        read[:, start : chunk.stop] = fitted_speeds(
+        retrieved[:, start : chunk.stop] = fitted_speeds(
             torch.cat(frames), doppler, rings.model, noise, RingMethod.ANNULAR, RingCentre.FREE
         )
-    v_los, std = read
+    v_los, std = retrieved
     return lines.assign(
         v_los=("line", v_los, lines["v_los"].attrs),
         v_los_std=("line", std, lines["v_los_std"].attrs),

@@ -49,7 +49,7 @@ def scattering_air(experiment: Experiment, beside: str | Path, *, log: Log) -> S
         A scattering table that is missing or not one.
     """
     use_variant(experiment.render.variant)
-    log.bar("reading how the air scatters", None)
+    log.bar("reading scattering matrices", None)
     return scatterer(experiment.scattering, beside, experiment.lidar.wavelength, log.bar)
 
 

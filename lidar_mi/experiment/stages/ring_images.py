@@ -47,7 +47,7 @@ class RingImages:
 
 @dataclass(frozen=True)
 class Exposure:
-    """Images without noise, and one by the CCD: photoelectrons a pixel of one pulse.
+    """Images without noise, and one by the CCD: photoelectrons per pixel of one pulse.
 
     ``received`` and ``noisy`` are of air at the first speed.
     """
@@ -207,7 +207,7 @@ def _photon_by_photon(experiment: Experiment):
 
 
 def expected_image(image: xr.Dataset, total: float) -> torch.Tensor:
-    """Mean photons a pixel of an image of ``total`` photons."""
+    """Mean photons per pixel of an image of ``total`` photons."""
     light = torch.from_numpy(image["S0"].values.astype(float))
     return light * (total / light.sum())
 

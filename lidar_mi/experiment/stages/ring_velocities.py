@@ -45,7 +45,7 @@ FRAMES = 16  # noisy images in memory at a time
 def line_of_sight_winds(
     experiment: Experiment, rings: Rings, images: RingImages, *, log: Log
 ) -> xr.Dataset:
-    """What every method reads from noisy images, and from averages of several; see `velocities`."""
+    """Winds by every method from noisy images, and from averages of several; see `velocities`."""
     expected = [expected_image(image, rings.photons) for image in images.received]
     found = velocities(experiment.doppler, rings, images, expected, experiment.seed, log)
     found.attrs |= {
@@ -59,7 +59,7 @@ def line_of_sight_winds(
 def ring_budget(
     experiment: Experiment, rings: Rings, images: RingImages, *, log: Log
 ) -> RingBudget:
-    """Light, line and etalon of the lidar, and limits of what can be read from its images."""
+    """Light, line and etalon of the lidar, and limits of what can be retrieved from its images."""
     log("computing the Cramer-Rao bound")
     doppler = experiment.doppler
     expected = [expected_image(image, rings.photons) for image in images.received]
@@ -104,19 +104,19 @@ def _bound(doppler: Doppler, rings: Rings, centre: str) -> float:
 def velocities(
     doppler: Doppler,
     rings: Rings,
-    seen: RingImages,
+    rendered: RingImages,
     expected: Sequence[torch.Tensor],
     seed: int,
     log: Log,
 ) -> xr.Dataset:
-    """What every method reads from noisy images, and from averages of several.
+    """Winds by every method from noisy images, and from averages of several.
 
     Returns
     -------
     xr.Dataset
         ``tried`` (algorithm), the images of every case that were given to it; ``v`` and its
         standard deviation ``v_std`` as the fit says, m/s, dims (algorithm, centre, averaged, v_los,
-        image), NaN where nothing was read; and ``peak_bias`` (coordinate, piece) of the innermost
+        image), NaN where there is none; and ``peak_bias`` (coordinate, piece) of the innermost
         ring's peak without any noise, m/s, at the first speed.
     """
     settings, speeds = doppler.retrieval, doppler.v_los
@@ -128,8 +128,8 @@ def velocities(
         settings.images,
     )
     v, v_std = np.full((2, *shape), np.nan)
-    emitted = seen.emitted["S0"].values.astype(float)
-    reference = _emitted_velocity(doppler, seen.emitted, rings.photons)
+    emitted = rendered.emitted["S0"].values.astype(float)
+    reference = _emitted_velocity(doppler, rendered.emitted, rings.photons)
     radii = {centre: _peak_radii(emitted, doppler, centre) for centre in settings.centre}
     fits = [m for m in settings.methods if m in FITS]
     peaks = [m for m in settings.methods if m in PEAKS]
@@ -143,7 +143,7 @@ def velocities(
         noise = summed_noise(doppler.ccd, rings.modes, n)
         for k, speed in enumerate(speeds):
             for first in range(0, settings.images, FRAMES):
-                text = f"reading averages of {n} images at {speed:g} m/s"
+                text = f"retrieving winds from averages of {n} images at {speed:g} m/s"
                 log.bar(text, done / total)
                 images = range(first, min(first + FRAMES, settings.images))
                 numbers = [(j * len(speeds) + k) * settings.images + i for i in images]
@@ -172,16 +172,16 @@ def velocities(
     dims = ("algorithm", "centre", "averaged", "v_los", "image")
     return xr.Dataset(
         {
-            "v": (dims, v, {"units": "m s-1", "long_name": "line-of-sight wind that is read"}),
+            "v": (dims, v, {"units": "m s-1", "long_name": "retrieved line-of-sight wind"}),
             "v_std": (
                 dims,
                 v_std,
-                {"units": "m s-1", "long_name": "standard deviation that the fit expects"},
+                {"units": "m s-1", "long_name": "standard deviation stated by the fit"},
             ),
             "tried": ("algorithm", tried, {"units": "1", "long_name": "images of every case"}),
             "peak_bias": (
                 ("coordinate", "piece"),
-                _peak_bias(doppler, seen),
+                _peak_bias(doppler, rendered),
                 {
                     "units": "m s-1",
                     "long_name": "error of the innermost ring's peak by circular averaging, "
@@ -248,13 +248,13 @@ def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, f
     return radii
 
 
-def _peak_bias(doppler: Doppler, seen: RingImages) -> np.ndarray:
+def _peak_bias(doppler: Doppler, rendered: RingImages) -> np.ndarray:
     """Error of the first speed by the innermost ring's peak, (coordinates, PIECES), m/s.
 
     From images without noise, about the true centre; NaN where a piece holds no peak.
     """
     camera = doppler.camera
-    images = [p["S0"].values.astype(float) for p in (seen.received[0], seen.emitted)]
+    images = [p["S0"].values.astype(float) for p in (rendered.received[0], rendered.emitted)]
 
     def error(coordinate, piece):
         try:
@@ -286,4 +286,4 @@ def _warn_of_failures(found: xr.Dataset, log: Log) -> None:
         tried = int(one["tried"]) * one["v"][..., 0].size
         missing = tried - int(one["v"].count())
         if missing:
-            log.remark(f"{name}: reads no wind from {missing} of {tried} images")
+            log.remark(f"{name}: no wind from {missing} of {tried} images")

@@ -52,7 +52,7 @@ def combined_wind(
         log.remark(f"no wind from both lidars: {error}")
         return None
     if not (found["flag"] == 0).any():
-        log.remark(f"no vector from both lidars is good; {commonest_flag(found['flag'])}")
+        log.remark(f"no vector from both lidars is valid;  {commonest_flag(found['flag'])}")
     return found
 
 
@@ -79,7 +79,7 @@ def crossflow(experiment: Experiment, wind: xr.Dataset) -> xr.Dataset:
 
 
 def _oblique_view(experiment: Experiment) -> dict[str, float]:
-    """Settings of `combine` by which it knows that images show some of the motion along x."""
+    """Settings of `combine` by which it includes that images show some of the motion along x."""
     if not moves_along(experiment):
         return {}
     scan, platform = experiment.scan, experiment.platform
@@ -146,14 +146,14 @@ def mean_squares_without(
     (``sensor.errors``). What is left without all of them is the sampling error (`between_lines`).
     Without a cause the estimate also knows that it is gone, and the result is that of one draw: in
     `wake_sensor` the noise of lines scatters u, over draws, by 9 % of the mean square error; its
-    share is 23 % with the draw of seed 1, whose lines are off by 0.05 m/s in the mean (2.9 sigma;
-    seeds 2 to 4 0.00).
+    fraction is 23 % with the draw of seed 1, whose lines are off by 0.05 m/s in the mean (2.9
+    sigma; seeds 2 to 4 0.00).
 
     Returns
     -------
     dict
-        By cause; with all of them as "". Good vectors, beyond two core radii where there are cores.
-        Empty without any.
+        By cause; with all of them as "". Valid vectors, beyond two core radii where there are
+        cores. Empty without any.
     """
     at = {axis: crossflow[axis] for axis in ("z", "y")}
     true = {name: truth[name].interp(at).transpose("z", "y").values for name in COMPONENTS}

@@ -20,7 +20,7 @@ from lidar_mi.experiment.stages.rendering import environment_extinction
 from lidar_mi.experiment.truth import Flows
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.instrument.signal import apparent_backscatter
+from lidar_mi.instrument.signal import attenuated_backscatter
 from lidar_mi.retrieval.velocimetry.common_grid import resample
 from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
 from lidar_mi.retrieval.velocimetry.windows import Windows
@@ -36,7 +36,7 @@ class Volumes:
     Attributes
     ----------
     pairs : dict of str to list of two xr.DataArray, dims (x, z, y)
-        Apparent backscatter at both times, m^-1 sr^-1, by `Source`.
+        Attenuated backscatter at both times, m^-1 sr^-1, by `Source`.
     noise : dict of str to float
         Rms of its standard error, same unit.
     """
@@ -103,7 +103,7 @@ def scan_volume(
     environment: float,
     nodes: tuple[np.ndarray, ...],
 ) -> xr.DataArray:
-    """Apparent backscatter (m^-1 sr^-1) of all gates on one grid in the air, dims (x, z, y).
+    """Attenuated backscatter (m^-1 sr^-1) of all gates on one grid in the air, dims (x, z, y).
 
     Gate by gate by bicubic splines, from where the beams are to the nodes. A beam is as wide as
     its gate is thin or wider, so that little is lost; of the variance of white noise `PASSED` is
@@ -121,7 +121,7 @@ def scan_volume(
         x in the frame of the air, one a gate; inside the beams of every gate.
     """
     x, z, y = nodes
-    values = apparent_backscatter(
+    values = attenuated_backscatter(
         s0.transpose("gate", "z", "y").values, plan, lidar.aperture_area, environment
     )
     volume = np.empty((len(x), len(z), len(y)))
@@ -133,7 +133,10 @@ def scan_volume(
         )
         volume[gate] = resample(image, y, z).values
     coords = {name: (name, axis, {"units": "m"}) for name, axis in zip("xzy", nodes, strict=True)}
-    about = {"long_name": "apparent backscatter coefficient", "units": "m-1 sr-1"}
+    about = {
+        "long_name": "attenuated backscatter coefficient, corrected for range and environment",
+        "units": "m-1 sr-1",
+    }
     return xr.DataArray(volume, coords, ("x", "z", "y"), attrs=about)
 
 
@@ -148,7 +151,7 @@ def scan_volumes(
         return scan_volume(s0, plans[number], lidar, way, nodes)
 
     def level(error: xr.DataArray) -> float:
-        oblique = apparent_backscatter(
+        oblique = attenuated_backscatter(
             error.transpose("gate", "z", "y").values, plans[0], lidar.aperture_area, way
         )
         return float(np.sqrt(PASSED * (oblique**2).mean()))

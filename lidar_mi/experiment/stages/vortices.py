@@ -28,7 +28,7 @@ class VortexFits:
     Attributes
     ----------
     pairs : dict of str to VortexPairFit
-        Those that can be believed, by `Origin`.
+        The accepted ones, by `Origin`.
     refused : dict of str to str
         Why there is no other.
     """
@@ -82,5 +82,5 @@ def fit_pairs(
 
 def _from_vectors(vectors: xr.Dataset | None) -> VortexPairFit:
     if vectors is None:
-        raise InputError("vectors: none were found")
+        raise InputError("vectors: no valid vectors")
     return fit_vortices_to_wind(vectors)

@@ -41,13 +41,13 @@ def cross_flow_winds(
     """Winds by every method from every image pair, with the truth at their places.
 
     Sources are the extinction itself, the same without sub-grid texture, the extinction blurred by
-    the beam's width (what a noise-free lidar would see), the rendered backscatter and, with a
+    the beam's width (the image of a noise-free lidar), the rendered backscatter and, with a
     detector, the same with its noise.
 
     Returns
     -------
     xr.Dataset, dims (source, algorithm, z, y)
-        What `retrieve_wind` gives, ``score`` in place of what each method calls its own;
+        From `retrieve_wind`, with ``score`` for the score of every method;
         ``v_true``, ``w_true`` and, from `wind_bound`, ``v_bound``, ``w_bound`` (m s^-1).
     """
     log("retrieving winds")
@@ -115,7 +115,7 @@ def rendered_pairs(
 
     By source: the rendered backscatter, and with a detector the same with its noise.
     """
-    noise = apparent_noise(scans[0])
+    noise = attenuated_backscatter_stderr(scans[0])
     pairs = {Source.BACKSCATTER: ([scan["Y"] for scan in scans], noise)}
     if experiment.detector:
         noisy = np.hypot(noise, scans[0]["Y_noise_std"])
@@ -130,15 +130,15 @@ def rendered_pairs(
     return pairs
 
 
-def apparent_noise(scan: xr.Dataset) -> xr.DataArray:
-    """Standard error of the apparent backscatter Y, same unit."""
+def attenuated_backscatter_stderr(scan: xr.Dataset) -> xr.DataArray:
+    """Standard error of the attenuated backscatter Y, same unit."""
     first = scan.isel(gate=0)
     lit = first["S0"] > 0
     return (scan["Y"] * first["S0_stderr"] / first["S0"].where(lit)).fillna(0.0)
 
 
 def known_blur(experiment: Experiment, plan: ScanPlan) -> float:
-    """Standard deviation (m) of the blur that `retrieval.blur` tells methods of."""
+    """Standard deviation (m) of the blur that `retrieval.blur` states for the methods."""
     blur = experiment.retrieval.blur
     return float(experiment.lidar.radius_at(plan.centre)) / 2 if blur == "beam" else blur
 
@@ -155,7 +155,7 @@ def _warn_of_wide_beams(experiment, truth, plans, log) -> None:
     if width > template:
         log.remark(
             f"beams are {width:.3g} m wide at {plans[0].centre:g} m, wider than a template of "
-            f"{template:g} m: structure that winds could be found from is blurred"
+            f"{template:g} m: structure that the retrieval needs is blurred"
         )
 
 

@@ -92,8 +92,8 @@ def test_the_map_holds_the_wind():
     at = data["y"].index(3.0) + 6
     assert (data["y"][at], data["z"][at]) == (3.0, 2.0)
     u, _, w = data["components"]
-    assert (u["found"][at], u["true"][at], u["stderr"][at]) == (2.0, 1.5, 0.25)
-    assert w["found"][at] == 0.75
+    assert (u["retrieved"][at], u["true"][at], u["stderr"][at]) == (2.0, 1.5, 0.25)
+    assert w["retrieved"][at] == 0.75
     assert data["flag"][0] == 3 and data["flag"][8] == 2 and sum(map(bool, data["flag"])) == 2
     assert data["flags"] == {"1": "no crossflow", "2": "beyond lines"}
     assert data["cores"] == [[1.23, 2.0]] and data["step"] == 2.0
@@ -111,7 +111,7 @@ def test_the_map_takes_what_a_retrieval_leaves_out():
     assert len(data["y"]) == 55 * 2 and data["step"] == 8.0
     assert min(data["y"]) == -5 + 2 * 2.0 + 0.25
     text = json.dumps(data, allow_nan=False)
-    assert len(text) < 10_000 and None in v["found"] + w["stderr"]
+    assert len(text) < 10_000 and None in v["retrieved"] + w["stderr"]
 
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")

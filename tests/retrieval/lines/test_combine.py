@@ -2,7 +2,7 @@
 
 Detects an estimate or a covariance that differs from generalised least squares written out over all
 nodes (1e-7), information that does not add up (1e-7), errors that are not what the covariance says
-(reduced errors and coverage over many draws, 4 sigma), errors of the platform that have another
+(normalised errors and coverage over many draws, 4 sigma), errors of the platform that have another
 effect than the geometry says, a field without uncertainty where nothing was measured, and input
 that has no answer.
 """

@@ -187,7 +187,7 @@ def measured(winds, distance, random):
 
 @functools.cache
 def shares(name, distance, draws):
-    """Within 1 and 1.96 standard errors, and the variance of reduced errors: (draws, 3) of u."""
+    """Within 1 and 1.96 standard errors, and the variance of normalised errors: (draws, 3) of u."""
     rows = []
     for draw in range(draws):
         random = np.random.default_rng([draw, distance, zlib.crc32(name.encode())])

@@ -2,8 +2,8 @@
 
 Detects a wrong sign, a wind that is not exact where it is uniform (1e-9), covariances that differ
 from the closed form for a cone (1e-9) or from another solver (1e-9), errors that are not what the
-covariance says (variance of reduced errors and coverage within 4 sigma of 20 000 draws), an error
-of pointing with another effect than geometry gives it (exact), and input that has no answer.
+covariance says (variance of normalised errors and coverage within 4 sigma of 20 000 draws), an
+error of pointing with another effect than geometry gives it (exact), and input that has no answer.
 """
 
 import math
