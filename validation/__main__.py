@@ -9,7 +9,7 @@ from rich.console import Console
 
 from benchmarks.measure import fresh_process
 
-from . import GROUPS, report
+from . import GROUPS, OPEN, report
 from . import __doc__ as description
 from .eradiate import provenance
 from .group import run
@@ -36,9 +36,9 @@ def main(arguments: list[str] | None = None) -> int:
         "-o", "--out", type=Path, default=PAGE, help="page to write when all groups run"
     )
     options = parser.parse_args(arguments)
-    unknown = [name for name in options.groups if name not in GROUPS]
+    unknown = [name for name in options.groups if name not in (*GROUPS, *OPEN)]
     if unknown:
-        parser.error(f"NAME: {unknown[0]!r} is none of {', '.join(GROUPS)}")
+        parser.error(f"NAME: {unknown[0]!r} is none of {', '.join((*GROUPS, *OPEN))}")
 
     folder = options.out.parent / options.out.stem
     effort = Effort(16 if options.slow else 1, folder, options.eradiate)

@@ -1,0 +1,272 @@
+"""Winds from images that do not show the same air: errors against the standard errors stated."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+import lidar_mi as lm
+from lidar_mi.assessment.metrics.errors import truth_at_vectors
+from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from tests.support.flows import axes, data_array, origin, plane_waves, texture
+
+from .report import Check, Row
+
+TITLE = "Standard errors of winds"
+INTRODUCTION = (
+    "Winds are retrieved from image pairs of known wind. The second image shows the air of the "
+    "first one moved by the wind, and in most cases more: another state of the simulation, "
+    "texture that is replaced, an instrument that changes. Within 1 and 1.96 standard errors "
+    "should be 68 and 95 % of the errors of valid vectors, and the normalised errors should have "
+    "the variance 1. The uncertainty of each number is from its scatter over blocks of the image."
+)
+
+SCENES = Path(str(files("lidar_mi.scenes")))
+METHODS = ("variational", "vortex_fit")
+"""Methods that state standard errors."""
+TOLERANCE = {"coverage_68": 0.05, "coverage_95": 0.05}
+EXPECTED = {"coverage_68": 0.683, "coverage_95": 0.950}
+STRIDE = 4
+"""Vectors of one template share their pixels; every fourth one tells nearly as much as all."""
+BLOCK = 10
+"""Vectors along the side of a block: 20 m, several times what errors correlate over."""
+
+Pair = tuple[xr.DataArray, xr.DataArray, xr.Dataset, float | xr.DataArray | None]
+"""Both images, the true wind at mid-time, the noise that the retrieval is told."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How errors of valid vectors compare with their standard errors; each with its own error.
+
+    Attributes
+    ----------
+    case, method : str
+    rmse, stated : float
+        Rms error of v and w, and rms standard error, m/s.
+    wind : float
+        Rms of the true wind, m/s: an error as large is no skill.
+    coverage_68, coverage_95, variance : (float, float)
+        Value and standard error.
+    valid : float
+        Fraction of valid vectors.
+    """
+
+    case: str
+    method: str
+    rmse: float
+    stated: float
+    wind: float
+    coverage_68: tuple[float, float]
+    coverage_95: tuple[float, float]
+    variance: tuple[float, float]
+    valid: float
+
+
+def shipped_wake(second: str, rms: float, seed: int) -> Pair:
+    """The extinction of the shipped wake: advected, or its true state 0.1 s later."""
+    experiment = lm.load_experiment(
+        SCENES / "wake_backscatter.yaml",
+        seed=seed,
+        wake={"second": second, "texture": {"rms": rms}},
+    )
+    truth = lm.make_truth(experiment)
+    return truth.image(0), truth.image(1), truth.wind, None
+
+
+def _vortex_wind(columns: int, rows: int):
+    y, z = axes(columns, rows)
+    vortices = vortex_pair(400.0, separation=47.1, core_radius=3.0)
+    wind = partial(velocity, vortices)
+    return y, z, wind
+
+
+def replaced_texture(fraction: float, seed: int, noise: float = 0.01) -> Pair:
+    """Exactly advected texture; a fraction of the variance of image 2 is unrelated texture."""
+    y, z, wind = _vortex_wind(219, 139)
+    grid = np.meshgrid(y, z)
+    waves, other = (plane_waves(s, 3.0, 0.5) for s in (seed, seed + 1000))
+    first = texture(waves, *grid)
+    moved = texture(waves, *origin(wind, *grid, 0.1))
+    new = texture(other, *grid)
+    second = 1 + np.sqrt(1 - fraction) * (moved - 1) + np.sqrt(fraction) * (new - 1)
+    return _with_noise(first, second, y, z, wind, noise, seed, noise)
+
+
+def instrument(change: str, seed: int, noise: float = 0.01) -> Pair:
+    """Exactly advected texture behind an instrument of 5 % fault.
+
+    ``gain``: image 2 is brighter; ``gradient``: by an amount that grows from edge to edge;
+    ``pattern``: both images are multiplied by a pattern that does not move.
+    """
+    y, z, wind = _vortex_wind(219, 139)
+    grid = np.meshgrid(y, z)
+    waves = plane_waves(seed, 3.0, 0.5)
+    first, second = texture(waves, *grid), texture(waves, *origin(wind, *grid, 0.1))
+    if change == "gain":
+        second = 1.05 * second
+    elif change == "gradient":
+        second = second * (1 + 0.05 * grid[0] / y.max())
+    else:
+        fixed = texture(plane_waves(seed + 2000, 3.0, 0.5), *grid, contrast=0.05)
+        first, second = first * fixed, second * fixed
+    return _with_noise(first, second, y, z, wind, noise, seed, noise)
+
+
+def uneven_noise(told: bool, seed: int) -> Pair:
+    """Noise from 1 % to 10 % across the image; its map is told or not."""
+    y, z, wind = _vortex_wind(219, 139)
+    grid = np.meshgrid(y, z)
+    waves = plane_waves(seed, 3.0, 0.5)
+    first, second = texture(waves, *grid), texture(waves, *origin(wind, *grid, 0.1))
+    level = 0.01 * 10 ** ((grid[0] - y.min()) / np.ptp(y))
+    return _with_noise(
+        first, second, y, z, wind, level, seed, data_array(level, y, z) if told else None
+    )
+
+
+def _with_noise(first, second, y, z, wind, level, seed, told) -> Pair:
+    random = np.random.default_rng([seed, 1])
+    images = [image + level * random.standard_normal(image.shape) for image in (first, second)]
+    v, w = (data_array(a, y, z) for a in wind(*np.meshgrid(y, z)))
+    return *(data_array(image, y, z) for image in images), xr.Dataset({"v": v, "w": w}), told
+
+
+CASES: dict[str, Callable[[int], Pair]] = {
+    **{
+        f"advected, texture {100 * rms:.0f} %": partial(shipped_wake, "advect", rms)
+        for rms in (0.0, 0.02, 0.05, 0.1, 0.2)
+    },
+    **{
+        f"true second state, texture {100 * rms:.0f} %": partial(shipped_wake, "40.1 s", rms)
+        for rms in (0.0, 0.02, 0.05, 0.1, 0.2)
+    },
+    **{
+        f"{100 * fraction:.0f} % of the texture replaced": partial(replaced_texture, fraction)
+        for fraction in (0.0, 0.05, 0.1, 0.3)
+    },
+    "gain of 5 %": partial(instrument, "gain"),
+    "gradient of 5 %": partial(instrument, "gradient"),
+    "fixed pattern of 5 %": partial(instrument, "pattern"),
+    "noise of 1 to 10 %, map told": partial(uneven_noise, True),
+    "noise of 1 to 10 %, not told": partial(uneven_noise, False),
+}
+"""Image pairs by seed."""
+
+
+def measured(case: str, method: str, seeds) -> Coverage:
+    """One row of the table, over all seeds."""
+    errors, stated, valid, winds = [], [], [], []
+    for seed in seeds:
+        first, second, truth, noise = CASES[case](seed)
+        wind = retrieve_wind(first, second, 0.1, method, stride=STRIDE, noise=noise)
+        true = truth_at_vectors(wind, truth)
+        good = (wind["flag"] == 0).values
+        for name in "vw":
+            errors.append(np.where(good, (wind[name] - true[name]).values, np.nan))
+            stated.append(np.where(good, wind[f"{name}_stderr"].values, np.nan))
+            winds.append(true[name].values)
+        valid.append(good)
+    error, stderr = np.stack(errors), np.stack(stated)
+    score = error / stderr
+    return Coverage(
+        case,
+        method,
+        _rms(error),
+        _rms(stderr),
+        _rms(np.stack(winds)),
+        _mean_and_error(_indicator(score, 1.0)),
+        _mean_and_error(_indicator(score, 1.96)),
+        _mean_and_error(score**2),
+        float(np.mean(valid)),
+    )
+
+
+def table(repeats: int) -> Iterator[Coverage]:
+    """All cases by all methods, seeds 1 to ``repeats``."""
+    for case in CASES:
+        for method in METHODS:
+            yield measured(case, method, range(1, repeats + 1))
+
+
+def coverage(effort) -> Check:
+    """Rows for 68 and 95 %, and the whole table in words."""
+    repeats = 1 if effort.scale == 1 else 12
+    found = list(table(repeats))
+    rows = [
+        Row(
+            f"{one.case}, {one.method}: {name.removeprefix('coverage_')} %",
+            "normal distribution",
+            EXPECTED[name],
+            getattr(one, name)[0],
+            getattr(one, name)[1],
+            TOLERANCE[name],
+        )
+        for one in found
+        for name in EXPECTED
+        if one.valid > 0.01
+    ]
+    text = "\n".join(
+        [
+            f"Means over {repeats} seed(s); errors in m/s, of valid vectors.",
+            "",
+            "| images | method | error | stated | wind | 68 % | 95 % | variance | valid |",
+            "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+            *map(_line, found),
+        ]
+    )
+    return Check("Air that changes", text, tuple(rows))
+
+
+CHECKS = (coverage,)
+
+
+def _line(one: Coverage) -> str:
+    def percent(value):
+        return f"{100 * value[0]:.0f} ± {100 * value[1]:.0f}"
+
+    cells = [
+        one.case,
+        one.method,
+        *(f"{value:.3f}" for value in (one.rmse, one.stated)),
+        f"{one.wind:.1f}",
+        percent(one.coverage_68),
+        percent(one.coverage_95),
+        f"{one.variance[0]:.2f} ± {one.variance[1]:.2f}",
+        f"{100 * one.valid:.0f} %",
+    ]
+    return f"| {' | '.join(cells)} |"
+
+
+def _rms(values: np.ndarray) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean(known**2))) if known.size else np.nan
+
+
+def _indicator(score: np.ndarray, limit: float) -> np.ndarray:
+    return np.where(np.isfinite(score), np.abs(score) < limit, np.nan)
+
+
+def _mean_and_error(values: np.ndarray) -> tuple[float, float]:
+    """Mean, and its standard error from the scatter of the blocks' sums about it.
+
+    Both components of a block count as one: (images, z, y), images of v and w in turn.
+    """
+    rows, columns = (n // BLOCK * BLOCK for n in values.shape[1:])
+    parts = values[:, :rows, :columns]
+    parts = parts.reshape(-1, 2, rows // BLOCK, BLOCK, columns // BLOCK, BLOCK)
+    known = np.isfinite(parts)
+    number = known.sum((1, 3, 5)).ravel()
+    total = np.where(known, parts, 0.0).sum((1, 3, 5)).ravel()
+    if number.sum() == 0:
+        return np.nan, np.nan
+    mean = total.sum() / number.sum()
+    blocks = (number > 0).sum()
+    rest = total - mean * number
+    error = np.sqrt((rest**2).sum() * blocks / max(blocks - 1, 1)) / number.sum()
+    return float(np.nanmean(values)), float(error)
