@@ -1,0 +1,70 @@
+"""The table of coverage. Unit tier.
+
+Detects: a standard error of a fraction that takes neighbours for independent, a case that does not
+change what it says, and a table that leaves a case out.
+"""
+
+import numpy as np
+import pytest
+
+from validation import coverage
+
+
+def test_standard_error_of_independent_values():
+    values = np.random.default_rng(1).normal(size=(2, 60, 80))
+    mean, error = coverage._mean_and_error(values)
+    assert mean == pytest.approx(values.mean())
+    # of 48 blocks, known to a tenth
+    assert error == pytest.approx(1 / np.sqrt(values.size), rel=0.4)
+
+
+def test_standard_error_of_blocks_that_are_alike():
+    blocks = np.random.default_rng(2).normal(size=(1, 12, 16))
+    size = coverage.BLOCK
+    values = np.tile(np.kron(blocks, np.ones((1, size, size))), (2, 1, 1))
+    assert coverage._mean_and_error(values)[1] == pytest.approx(1 / np.sqrt(blocks.size), rel=0.3)
+
+
+def test_values_that_are_not_known_do_not_count():
+    values = np.full((2, 20, 20), np.nan)
+    assert np.isnan(coverage._mean_and_error(values)).all()
+    values[:, :10] = 3.0
+    assert coverage._mean_and_error(values) == (3.0, 0.0)
+
+
+@pytest.mark.parametrize("fraction", [0.05, 0.3])
+def test_replaced_fraction_is_what_images_do_not_share(fraction):
+    moved = coverage.replaced_texture(0.0, 1, noise=0.0)
+    changed = coverage.replaced_texture(fraction, 1, noise=0.0)
+    np.testing.assert_array_equal(changed[0], moved[0])
+    correlation = np.corrcoef(moved[1].values.ravel(), changed[1].values.ravel())[0, 1]
+    # a cell of the texture covers pi l^2 / 2 = 14 px: 2150 of them
+    error = 2 * correlation * (1 - correlation**2) / np.sqrt(2150)
+    assert 1 - correlation**2 == pytest.approx(fraction, abs=4 * error)
+
+
+def test_gain_gradient_and_pattern():
+    plain = coverage.replaced_texture(0.0, 1, noise=0.0)
+    gain = coverage.instrument("gain", 1, noise=0.0)
+    np.testing.assert_allclose(gain[1], 1.05 * plain[1], rtol=1e-12)
+    ratio = (coverage.instrument("gradient", 1, noise=0.0)[1] / plain[1]).isel(z=0).values
+    assert ratio[0] == pytest.approx(0.95) and ratio[-1] == pytest.approx(1.05)
+    pattern = coverage.instrument("pattern", 1, noise=0.0)
+    np.testing.assert_allclose(pattern[0] / plain[0], pattern[1] / plain[1], rtol=1e-9)
+    assert float((pattern[0] / plain[0]).std()) == pytest.approx(0.05, rel=0.1)
+
+
+def test_true_second_state_is_another_one():
+    advected = coverage.shipped_wake("advect", 0.1, 1)
+    true = coverage.shipped_wake("40.1 s", 0.1, 1)
+    # the winds of both states differ by what a wake does in 0.05 s
+    change = np.abs(advected[2]["w"] - true[2]["w"]).max()
+    assert 0 < change < 1.0
+    assert float(np.abs(advected[1] - true[1]).max()) > 0
+
+
+def test_a_row_of_the_table():
+    found = coverage.measured("gain of 5 %", "variational", [1])
+    assert 0.02 < found.rmse < 0.1 and 2 < found.wind < 4 and found.valid > 0.95
+    assert 0.4 < found.coverage_68[0] < found.coverage_95[0] <= 1
+    assert "gain of 5 %" in coverage._line(found)
