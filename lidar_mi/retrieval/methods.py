@@ -13,6 +13,15 @@ class ImageMethod(StrEnum):
     VORTEX_FIT = "vortex_fit"
 
 
+MOST_ACCURATE_FIRST = (
+    ImageMethod.VARIATIONAL,
+    ImageMethod.MULTIPASS,
+    ImageMethod.CC,
+    ImageMethod.WS,
+)
+"""Methods that give vectors of their own, by their errors on exactly advected images."""
+
+
 class VolumeMethod(StrEnum):
     """From two volumes to the wind in three dimensions (u, v, w)."""
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import vortex_key
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES
 from lidar_mi.assessment.report.digits import fixed, with_error
@@ -44,6 +45,7 @@ def vortex_chapter(
     fits: Mapping[str, VortexPairFit],
     refused: Mapping[str, str],
     drawn: Sequence[Drawn],
+    method: str | None = None,
 ) -> Chapter:
     """Parameters of the fitted vortices, beside the truth.
 
@@ -55,10 +57,13 @@ def vortex_chapter(
         The accepted ones, by `Origin`.
     refused : mapping of str to str
         Why there is no other.
+    method : str, optional
+        By which the wind vectors were retrieved.
     """
+    vectors = f" of the {METHOD_NAMES[method]}" if method else ""
     purpose = (
         "Two vortices in a mean wind are fitted to the two images as a whole, and to the wind "
-        "vectors. The fitted pair gives the wind anywhere, with its error (vortex.json)."
+        f"vectors{vectors}. The fitted pair gives the wind anywhere, with its error (vortex.json)."
     )
     lead = [purpose]
     lead += [sentence for name in fits if (sentence := _verdict(metrics, name))]

@@ -15,7 +15,7 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.winds import rendered_pairs
 from lidar_mi.retrieval.lines.combine import CombinedFlag
-from lidar_mi.retrieval.methods import ImageMethod
+from lidar_mi.retrieval.methods import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
@@ -46,12 +46,19 @@ def combined_vectors(experiment: Experiment, wind3d: xr.Dataset | None) -> xr.Da
 
 
 def image_vectors(experiment: Experiment, wind: xr.Dataset) -> xr.Dataset | None:
-    """Cross-flow wind of the first method that does not fit vortices itself, or None."""
-    local = [name for name in experiment.retrieval.methods if name != ImageMethod.VORTEX_FIT]
-    if not local:
+    """Cross-flow wind of the experiment's most accurate method, None where there is none."""
+    method = vectors_method(experiment)
+    if method is None:
         return None
-    found = wind.isel(source=-1).sel(algorithm=local[0])
+    found = wind.isel(source=-1).sel(algorithm=method)
     return found.set_coords(["y_vector", "z_vector"])
+
+
+def vectors_method(experiment: Experiment) -> str | None:
+    """Method whose vectors a vortex pair is fitted to; None where all methods fit vortices."""
+    if experiment.sensor:
+        return experiment.sensor.method
+    return next((m for m in MOST_ACCURATE_FIRST if m in experiment.retrieval.methods), None)
 
 
 def fit_pairs(
