@@ -79,7 +79,7 @@ def define():
             self.m_pixel = dr.opaque(mi.Float, self.pixel)
             self.m_centre = dr.opaque(mi.Point2f, self.centre)
             self.m_stop = dr.opaque(mi.Float, self.stop_radius)
-            self.m_pose = pose(props)
+            self.m_pose = pose(props, NAME)
             dr.make_opaque(self.m_pose)
             if self.lens is not None:
                 self.m_exit = dr.opaque(mi.Float, self._exit_radius())

@@ -42,6 +42,7 @@ import drjit as dr
 import mitsuba as mi
 
 from .parameters import choice, fail, whole
+from .physical import Physical
 from .polarization import horizontal_axis, rotate_stokes
 from .random_numbers import generator, pair
 from .registration import register
@@ -61,6 +62,7 @@ def define():
                 props, NAME, "estimator", "camera", ("camera", "forward", "analog")
             )
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 2)
+            self.physical = Physical(NAME)
             # called with (paths done, paths in all) after every pass, when set
             self.progress = None
 
@@ -78,6 +80,7 @@ def define():
             source = scene.environment()
             if not hasattr(source, "sample_direction_of_light"):
                 fail(NAME, "source", type(source).__name__, "an emitter of type 'plane_waves'")
+            self.physical.check(scene, sensor)
             _check_straight(scene)
             paths = int(spp) or sensor.sampler().sample_count()
             if self.estimator == "camera" and not 2 <= paths <= self.samples_per_pass:

@@ -47,6 +47,11 @@ the same number, at least two. Samples are independent; the random numbers of a 
 on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
 depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
 
+A scene is refused if a medium, Mitsuba's own included, has a negative, infinite or undefined
+extinction coefficient, an albedo or a weight of a blend outside 0 to 1, or if a shape or volume has
+a transform that is not finite. Values are checked before the first rendering and whenever they are
+replaced.
+
 .. code-block:: xml
 
     <integrator type="gated_volpath"> <integer name="max_order" value="4"/> </integrator>
@@ -60,6 +65,7 @@ import mitsuba as mi
 
 from .light_paths import Lidar
 from .parameters import choice, fail, whole
+from .physical import Physical
 from .polarization import first_unpolarized_in_blend
 from .registration import register
 
@@ -81,6 +87,7 @@ def define():
             self.orders = bool(props.get("orders", False))
             self.covariance = bool(props.get("covariance", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
+            self.physical = Physical(NAME)
             # called with (samples done, samples in all) after every pass, when set
             self.progress = None
 
@@ -175,6 +182,7 @@ def define():
                 sensor = scene.sensors()[sensor]
             if not hasattr(sensor, "beam_frame"):
                 fail(NAME, "sensor", type(sensor).__name__, "a sensor of type 'scanning_lidar'")
+            self.physical.check(scene, sensor)
             _check_gate_meets_medium(scene, sensor)
             _check_blends(scene, sensor)
             samples = int(spp) or sensor.sampler().sample_count()

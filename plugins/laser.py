@@ -61,7 +61,7 @@ def define():
             self.pulse_energy = positive(props, NAME, "pulse_energy", 1.0)
             self.pulse_duration = at_least(props, NAME, "pulse_duration", 0.0, 0.0)
             self.stokes = _stokes(props.get("stokes", "1, 1, 0, 0"))
-            self.m_pose = pose(props)
+            self.m_pose = pose(props, NAME)
             dr.make_opaque(self.m_pose)
             self.m_radius = dr.opaque(mi.Float, radius)
             # fraction of an uncut beam inside the aperture; radii are drawn from that fraction

@@ -12,20 +12,27 @@ def fail(plugin: str, field: str, value, allowed: str):
     raise ValueError(f"{plugin}.{field}: {value!r} is not allowed; expected {allowed}")
 
 
+# single precision holds numbers of this size, and their squares
+TINY, HUGE = 1e-18, 1e18
+
+
 def number(props, plugin: str, field: str, default: float) -> float:
-    """The float parameter ``field``."""
+    """The float parameter ``field``; infinite only where the default is."""
     value = props.get(field, default)
     try:
-        return float(value)
+        value = float(value)
     except (TypeError, ValueError):
         fail(plugin, field, value, "a number")
+    if not abs(value) <= HUGE and not value == default:
+        fail(plugin, field, value, f"a finite number, {HUGE:g} at most")
+    return value
 
 
 def positive(props, plugin: str, field: str, default: float) -> float:
     """The float parameter ``field``, greater than zero; infinite only where the default is."""
     value = number(props, plugin, field, default)
-    if not value > 0 or (math.isinf(value) and not math.isinf(default)):
-        fail(plugin, field, value, "a finite number above 0")
+    if not value >= TINY:
+        fail(plugin, field, value, f"a finite number above 0 ({TINY:g} at least)")
     return value
 
 
@@ -40,8 +47,8 @@ def at_least(props, plugin: str, field: str, default: float, least: float) -> fl
 def whole(props, plugin: str, field: str, default: int, least: int) -> int:
     """The integer parameter ``field``, no smaller than ``least``."""
     value = int(props.get(field, default))
-    if value < least:
-        fail(plugin, field, value, f"a whole number of at least {least}")
+    if not least <= value < 2**31:
+        fail(plugin, field, value, f"a whole number of at least {least}, below 2^31")
     return value
 
 
@@ -53,11 +60,23 @@ def choice(props, plugin: str, field: str, default: str, allowed: tuple[str, ...
     return value
 
 
-def pose(props, field: str = "to_world"):
+def pose(props, plugin: str, field: str = "to_world"):
     """The transform parameter ``field`` in the variant's precision; Mitsuba reads doubles."""
     if field not in props:
         return mi.Transform4f()
-    return mi.Transform4f(np.array(props[field].matrix, dtype=np.float32))
+    placed = mi.Transform4f(np.array(props[field].matrix, dtype=np.float32))
+    check_pose(placed, plugin, field)
+    return placed
+
+
+def check_pose(placed, plugin: str, field: str = "to_world") -> None:
+    """Refuse a pose that is no rotation and shift: instruments have their size by themselves."""
+    matrix = np.array(placed.matrix, float).reshape(4, 4)
+    turn = matrix[:3, :3]
+    rigid = np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3 and np.linalg.det(turn) > 0
+    # NaN compares as false
+    if not (rigid and np.isfinite(matrix).all() and (matrix[3] == [0, 0, 0, 1]).all()):
+        fail(plugin, field, matrix.round(4).tolist(), "a rotation and a translation")
 
 
 def table(plugin: str, field: str, source, columns: int) -> np.ndarray:

@@ -81,7 +81,7 @@ def define():
             self.m_flux = dr.opaque(mi.Float, math.pi * limit * (weights @ radiance) / 2)
             drawn = -math.expm1(-2 * limit / scale**2) * scale**2 / 2 if not self.even else limit
             self.m_drawn = dr.opaque(mi.Float, math.pi * drawn)
-            self.m_pose = pose(props)
+            self.m_pose = pose(props, NAME)
             dr.make_opaque(self.m_pose)
             self.m_flags = +mi.EmitterFlags.Infinite
 

@@ -44,7 +44,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .parameters import choice, fail, number, pose, positive, whole
+from .parameters import check_pose, choice, fail, number, pose, positive, whole
 from .parameters import table as read_table
 from .polarization import horizontal_axis
 from .registration import register
@@ -84,7 +84,7 @@ def define():
                     _angles(props, "azimuth", width), _angles(props, "elevation", height)
                 )
             self.m_directions = mi.Float(directions.ravel())
-            self.m_pose = pose(props)
+            self.m_pose = pose(props, NAME)
             dr.make_opaque(self.m_pose)
             self._check()
 
@@ -159,6 +159,9 @@ def define():
 
         def _check(self):
             start, stop = self.m_gate_start[0], self.m_gate_stop[0]
+            if not 0 < self.m_aperture[0] < np.inf:
+                fail(NAME, "aperture_radius", self.m_aperture[0], "a finite radius above 0 m")
+            check_pose(self.m_pose, NAME)
             if not 0 < start < np.inf:
                 fail(NAME, "gate_start", start, "a range above 0 m")
             if not start < stop < np.inf:

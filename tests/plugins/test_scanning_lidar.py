@@ -294,7 +294,7 @@ ERRORS = [
     ({"azimuth_max_deg": 90.0}, "scanning_lidar.azimuth_min_deg, azimuth_max_deg: (0.0, 90.0)"),
     ({"azimuth_min_deg": 5.0}, "scanning_lidar.azimuth_min_deg, azimuth_max_deg: (5.0, 1.0)"),
     ({"azimuth_max_deg": "wide"}, "scanning_lidar.azimuth_max_deg: 'wide' is not allowed"),
-    ({"elevation_max_deg": math.nan}, "scanning_lidar.elevation_min_deg, elevation_max_deg"),
+    ({"elevation_max_deg": math.nan}, "scanning_lidar.elevation_max_deg: nan is not allowed"),
     (
         {"directions": [[1.0, 0, 0]]},
         "scanning_lidar.directions: 'shape (1, 3)' is not allowed; expected (2, 3)",

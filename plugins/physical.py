@@ -1,0 +1,116 @@
+"""Refusing scenes that nature does not have: media, surfaces and poses, each with its reason.
+
+Media and volumes are mostly Mitsuba's own, which take any number: a negative extinction coefficient
+or an albedo of 2 render without a word. An integrator asks `Physical` before it traces. Arrays that
+have passed are remembered and not looked at again until they are replaced, so an optimisation pays
+for what it changes: the extremes of one array.
+"""
+
+import math
+import re
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from .parameters import fail
+
+# rounding to single precision may leave an albedo of 1 this much above it
+ROUNDING = 1e-5
+
+# of single precision
+LARGEST = float(np.finfo(np.float32).max)
+
+RULES = (
+    (re.compile(r"(sigma_t\..*\b(value|values|data)|scale)$"), 0.0, LARGEST, "finite, at least 0"),
+    (re.compile(r"albedo\..*\b(value|values|data)$"), 0.0, 1.0, "0 to 1"),
+    (re.compile(r"phase_function\..*weight\..*\b(value|values|data)$"), 0.0, 1.0, "0 to 1"),
+    (re.compile(r"phase_function\.(.*\.)?g$"), -0.99999, 0.99999, "above -1, below 1"),
+)
+"""Parameters of a medium, their least and largest value, and what a message says is allowed."""
+
+
+class Physical:
+    """Checks the media and surfaces of a scene for an integrator.
+
+    Parameters
+    ----------
+    plugin : str
+        Whose name messages begin with.
+    """
+
+    def __init__(self, plugin: str):
+        self.plugin = plugin
+        self.passed: dict = {}
+
+    def check(self, scene, sensor) -> None:
+        """Say what is unphysical.
+
+        Raises
+        ------
+        ValueError
+            A coefficient, albedo, weight or asymmetry out of its range or NaN; a shape or volume
+            whose place is not finite.
+        """
+        media = {}
+        if sensor.get_medium() is not None:
+            media[sensor.get_medium()] = sensor.get_medium().id()
+        for shape in scene.shapes():
+            self._place(shape.id(), shape.bbox())
+            for side in ("interior_medium", "exterior_medium"):
+                medium = getattr(shape, side)()
+                if medium is not None:
+                    media.setdefault(medium, f"{shape.id()}.{side}")
+        passed = {}
+        for medium, where in media.items():
+            parameters = mi.traverse(medium)
+            for name, (_, _, node, _) in parameters.properties.items():
+                if isinstance(node, mi.Volume):
+                    self._place(f"{where}.{name}", node.bbox())
+                value = parameters[name]
+                rule = next((rule for rule in RULES if rule[0].fullmatch(name)), None)
+                if rule is None or not _is_coefficient(node, value):
+                    continue
+                held = _flat(value)
+                if not _same(self.passed.get((medium, name), ()), held):
+                    self.check_values(f"{where}.{name}", held, *rule[1:])
+                passed[medium, name] = held
+        self.passed = passed
+
+    def _place(self, field, box):
+        if not (box.valid() and all(math.isfinite(end) for end in (*box.min, *box.max))):
+            fail(self.plugin, field, str(box), "a place that is finite, as its transform is")
+
+    def check_values(self, field, arrays, least, most, allowed):
+        """Say which of a parameter's values is out of its range."""
+        highest = most + ROUNDING if most == 1 else most
+        for array in arrays:
+            values = np.array(array)
+            # NaN makes both NaN, and compares as false
+            if not (values.min() >= least and values.max() <= highest):
+                wrong = values[~((values >= least) & (values <= highest))]
+                fail(self.plugin, field, float(wrong[0]), allowed)
+
+
+def _flat(value) -> list:
+    """Copies of a parameter's values: the parameter itself changes in place."""
+    if not dr.is_array_v(value):
+        return [value]
+    if dr.is_tensor_v(value):
+        value = value.array
+    parts = value if dr.depth_v(value) > 1 else [value]
+    return [mi.Float(dr.detach(part)) for part in parts]
+
+
+def _is_coefficient(node, value) -> bool:
+    """Whether a parameter is the quantity itself: spectral variants make polynomials of colours."""
+    if not mi.is_spectral:
+        return True
+    colours = node.class_name().startswith("SRGB")
+    return not colours and not (dr.is_tensor_v(value) and value.shape[-1] != 1)
+
+
+def _same(before, now) -> bool:
+    """Whether arrays are the very same ones as before, without a look at their values."""
+    identities = [[getattr(part, "index", part) for part in parts] for parts in (before, now)]
+    return identities[0] == identities[1]
