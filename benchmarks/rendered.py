@@ -1,4 +1,4 @@
-"""All methods on rendered pictures of the exactly known wind, and what their errors come from.
+"""All methods on rendered images of the exactly known wind, and what their errors come from.
 
 The case of the tables of winds, seen by the backscatter lidar: the texture is extinction, 1 / km on
 average, of spheroids (the experiments' aerosol), in a slab of 2.5 m at 500 m and, 0.1 s later, at
@@ -46,14 +46,14 @@ def compare(
     samples: int = 64,
     methods: Sequence[str] = tuple(METHODS),
 ) -> Comparison:
-    """Errors and shares averaged over as many textures as ``repeats``."""
-    title = f"Wind from rendered pictures of {columns} x {rows} beams, all methods"
+    """Errors and fractions averaged over as many textures as ``repeats``."""
+    title = f"Wind from rendered images of {columns} x {rows} beams, all methods"
     found = {}
     for seed in range(1, repeats + 1):
         pair = vortex_pair_images(0.0, seed, columns, rows)
         truth, experiment = seen_air(pair), sensor(pair, samples, methods)
         cores = [Core(o.y, o.z, o.core_radius, o.circulation) for o in pair.vortices]
-        scans = pictures(experiment, truth, seed)
+        scans = images(experiment, truth, seed)
         for energy in ENERGIES:
             lidar = experiment.lidar.model_copy(update={"pulse_energy": energy})
             noisy = [
@@ -85,7 +85,7 @@ def compare(
                     "m/s",
                     [mean["rmse_v"]],
                     [mean["outside_cores.rmse_v"]],
-                    note=shares(mean),
+                    note=fractions(mean),
                 )
             )
     return Comparison(
@@ -99,19 +99,19 @@ def compare(
                 "Remark: by how many per cent the mean square error of v falls without a cause, "
                 "everywhere / beyond 2 core radii: the detector's noise; the simulation's "
                 f"({samples} photons a beam); the beam's width; averaging over the window; shear "
-                "within it; curved paths in the time step; the method on perfect pictures. They "
+                "within it; curved paths in the time step; the method on perfect images. They "
                 "need not add up."
             ),
         ),
     )
 
 
-def shares(metrics: dict[str, float]) -> str:
+def fractions(metrics: dict[str, float]) -> str:
     """Per cent of the mean square error of v by cause, everywhere / beyond the cores."""
     parts = []
     for cause in CAUSES:
-        if f"{cause}.share_v" in metrics:
-            pair = [metrics[f"{place}{cause}.share_v"] for place in ("", "outside_cores.")]
+        if f"{cause}.fraction_v" in metrics:
+            pair = [metrics[f"{place}{cause}.fraction_v"] for place in ("", "outside_cores.")]
             parts.append(f"{SHORT[cause]} {' / '.join(f'{100 * x:.0f}' for x in pair)}")
     return ", ".join(parts)
 
@@ -149,7 +149,7 @@ def sensor(pair: Pair, samples: int, methods: Sequence[str]) -> Experiment:
     )
 
 
-def pictures(experiment: Experiment, truth: Truth, seed: int) -> list[xr.Dataset]:
+def images(experiment: Experiment, truth: Truth, seed: int) -> list[xr.Dataset]:
     """The two scans without a detector's noise."""
     use_variant(experiment.render.variant)
     plans = scan_plans(experiment, truth)

@@ -113,7 +113,7 @@ def measured(
     vectors = math.floor(overlap * metrics["sensor.vectors"])
     return {
         "range": experiment.scan.range + experiment.scan.thickness / 2,
-        "points_per_slab": metrics["sensor.lines_read"] if along else vectors,
+        "points_per_slab": metrics["sensor.lines_retrieved"] if along else vectors,
         "slabs_per_second": experiment.sensor.slabs_per_second,
         "slab_depth": depth if along else max(depth, experiment.scan.thickness),
         "error_v_los": metrics.get("sensor.rmse_v_los"),

@@ -10,6 +10,7 @@ from typing import Any
 import xarray as xr
 
 from lidar_mi import __version__
+from lidar_mi.assessment.metrics.names import current_name
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import log, reading
 from lidar_mi.experiment.schema import Experiment
@@ -195,7 +196,7 @@ def read_record(folder: str | Path) -> dict:
 
 
 def read_metrics(folder: str | Path) -> dict[str, float] | None:
-    """Metrics of the run or the study in a folder; None: it is not done.
+    """Metrics of the run or the study in a folder, by today's names; None: it is not done.
 
     Raises
     ------
@@ -208,7 +209,7 @@ def read_metrics(folder: str | Path) -> dict[str, float] | None:
     metrics = read_json(path, "metrics of a run")
     if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
         raise InputError(f"{path}: not written by a run; expected names with numbers")
-    return metrics
+    return {current_name(key): value for key, value in metrics.items()}
 
 
 def _is_number(value: object) -> bool:

@@ -19,7 +19,9 @@ _FRAME = (
     "parameters in SI units, log_radius the natural logarithm of the core radius in m; "
     "wind at mid-time of the two images"
 )
-_NUMBERS = ("chi2", "correlation", "flow_error", "flow_error_length")
+_NUMBERS = ("chi2", "correlation", "model_error", "model_error_length")
+# names in older files, by those of today
+_FORMER = {"model_error": "flow_error", "model_error_length": "flow_error_length"}
 
 
 def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about: str) -> None:
@@ -39,10 +41,10 @@ def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about:
     >>> import lidar_mi as lm
     >>> import numpy as np
     >>> vortices = [300.0, np.log(3.0), 15.0, 0.0, -300.0, np.log(3.0), -15.0, 0.0, 0.0, 0.0]
-    >>> chi2, correlation, flow_error, flow_error_length = 1.0, 1.0, 0.0, 0.0
+    >>> chi2, correlation, model_error, model_error_length = 1.0, 1.0, 0.0, 0.0
     >>> pair = lm.VortexPairFit(
     ...     np.array(vortices), np.eye(10), "lamb_oseen",
-    ...     chi2, correlation, flow_error, flow_error_length,
+    ...     chi2, correlation, model_error, model_error_length,
     ... )
     >>> lm.write_vortices("vortex.json", {"mine": pair})
     >>> lm.read_vortices("vortex.json")["mine"].port.circulation
@@ -104,10 +106,10 @@ def read_vortices(path: str | Path) -> dict[str, VortexPairFit]:
     >>> import lidar_mi as lm
     >>> import numpy as np
     >>> vortices = [300.0, np.log(3.0), 15.0, 0.0, -300.0, np.log(3.0), -15.0, 0.0, 0.0, 0.0]
-    >>> chi2, correlation, flow_error, flow_error_length = 1.0, 1.0, 0.0, 0.0
+    >>> chi2, correlation, model_error, model_error_length = 1.0, 1.0, 0.0, 0.0
     >>> pair = lm.VortexPairFit(
     ...     np.array(vortices), np.eye(10), "lamb_oseen",
-    ...     chi2, correlation, flow_error, flow_error_length,
+    ...     chi2, correlation, model_error, model_error_length,
     ... )
     >>> lm.write_vortices("vortex.json", {"mine": pair})
     >>> lm.read_vortices("vortex.json")["mine"].port.circulation
@@ -125,7 +127,10 @@ def _from_data(data: dict, where: str) -> VortexPairFit:
     try:
         parameters = np.array(data["parameters"], dtype=float)
         covariance = np.array(data["covariance"], dtype=float)
-        numbers = {n: math.nan if data[n] is None else float(data[n]) for n in _NUMBERS}
+        stored = {
+            name: data[_FORMER.get(name, name) if name not in data else name] for name in _NUMBERS
+        }
+        numbers = {n: math.nan if x is None else float(x) for n, x in stored.items()}
         profile, reasons = data["profile"], tuple(map(str, data["reasons"]))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(

@@ -50,7 +50,7 @@ def test_a_weak_pulse_is_what_limits(ran):
     _, folder, metrics = ran
     for method in ("multipass", "cc"):
         share = {
-            cause: metrics[f"error_budget.{method}.{cause}.share"]
+            cause: metrics[f"error_budget.{method}.{cause}.fraction"]
             for cause in ("detector_noise", "monte_carlo", "beam_blur", "window", "method")
         }
         assert max(share, key=share.get) == "detector_noise" and share["detector_noise"] > 0.5, (
@@ -60,7 +60,10 @@ def test_a_weak_pulse_is_what_limits(ran):
         count = metrics[f"backscatter_noisy.{method}.valid_fraction"]
         assert 0 < metrics[f"error_budget.{method}.vectors"] <= round(count * 33 * 17)
     written = json.loads((folder / "out/metrics.json").read_text())
-    assert written["error_budget.cc.time_step.share"] == metrics["error_budget.cc.time_step.share"]
+    assert (
+        written["error_budget.cc.time_step.fraction"]
+        == metrics["error_budget.cc.time_step.fraction"]
+    )
     assert (folder / "out/figures/fig23_error_budget.png").is_file()
     page = (folder / "out/report.html").read_text()
     assert "limited by noise of the detector" in page and "curved paths in the time step" in page
@@ -134,7 +137,7 @@ def test_wind_that_changes_through_the_slab_is_a_cause(tmp_path):
     budget = budgets(experiment, truth, noise_free_scans(experiment, truth), flagged=True)
     found = budget["multipass"]
     assert found["rmse_v"] > 0.3
-    assert found["slab.share_v"] > 0.9
-    assert abs(found["monte_carlo.share"]) < 0.05 and "detector_noise.share" not in found
+    assert found["slab.fraction_v"] > 0.9
+    assert abs(found["monte_carlo.fraction"]) < 0.05 and "detector_noise.fraction" not in found
     # the method on what it was given, a slab that does not move as one
-    assert found["method.share_v"] > 0.7
+    assert found["method.fraction_v"] > 0.7

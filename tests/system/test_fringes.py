@@ -225,7 +225,7 @@ def test_folder_holds_what_it_should(small):
 
 def test_metrics_are_the_stable_ones(small):
     measures = {
-        "found_fraction",
+        "retrieved_fraction",
         "bias",
         "bias_lowest",
         "bias_highest",

@@ -94,7 +94,7 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
         for source, method in product(SOURCES, ("cc", "ws"))
         for key in (
             "valid_fraction",
-            "found_fraction",
+            "retrieved_fraction",
             *(f"{part}{s}" for part in ("", "outside_cores.", "all.") for s in STATISTICS),
         )
     }

@@ -78,7 +78,7 @@ def test_the_whole_chain(whole):
     folder, metrics = whole
     lines = xr.open_dataset(folder / "lines_of_sight.nc", engine="h5netcdf")
     wind = xr.open_dataset(folder / "wind3d.nc", engine="h5netcdf")
-    assert lines.sizes["line"] == 15 == metrics["sensor.lines_read"]
+    assert lines.sizes["line"] == 15 == metrics["sensor.lines_retrieved"]
     assert wind.attrs["Conventions"] == "CF-1.11" and {"u", "v", "w", "u_true"} <= set(wind)
     # read from rings, with the errors that the fit states
     reduced = (lines.v_los - lines.v_los_true) / lines.v_los_std
@@ -86,8 +86,8 @@ def test_the_whole_chain(whole):
     assert float((reduced**2).mean()) < 1 + 4 * math.sqrt(2 / 15)
     # u of the combined sensor is what the lines are good for; triples are not
     assert metrics["sensor.rmse_u"] < 0.5 < metrics["sensor.triples.rmse_v"]
-    good = wind["flag"].values == 0
-    error = (wind["u"] - wind["u_true"]).values[good]
+    valid = wind["flag"].values == 0
+    error = (wind["u"] - wind["u_true"]).values[valid]
     assert metrics["sensor.rmse_u"] == pytest.approx(np.sqrt((error**2).mean()), rel=1e-3)
     # the verdict is that of the numbers
     margin = 1 - metrics["sensor.outside_cores.rmse_w"] / 2.5
@@ -104,7 +104,7 @@ def test_the_whole_chain(whole):
         "flight control, from wind vectors, landing",
         "at most 2.5 m/s",
         "safe for eyes from",
-        "0.002 J/m² of each pulse",
+        "0.002 J/m² per pulse",
         "up to nine by least squares",
         "asked for takes 1 of them a direction",
         "The pictures take 77000 pulses per second",
@@ -211,7 +211,7 @@ def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypat
     assert not (folder / "wind3d.nc").exists()
     assert set(read_vortices(folder / "vortex.json")) == {"images"}
     metrics = json.loads((folder / "metrics.json").read_text())
-    assert metrics["sensor.vectors"] == 0 and metrics["sensor.lines_read"] == 15
+    assert metrics["sensor.vectors"] == 0 and metrics["sensor.lines_retrieved"] == 15
     assert "sensor.triples.rmse_u" in metrics and "sensor.rmse_u" not in metrics
 
 
@@ -224,7 +224,7 @@ def test_lines_that_cannot_be_read_are_said_and_the_rest_is_shown(whole, tmp_pat
         lambda wind, lines: (wind, lines.assign(v_los=lines["v_los"] * np.nan)),
     )
     assert "Warning: no wind from both lidars: " in report
-    assert "0 of 15 lines of sight were read" in report
+    assert "0 of 15 lines of sight were retrieved" in report
     assert "From the images, circulation is off by" in report
     metrics = json.loads((folder / "metrics.json").read_text())
     assert "sensor.rmse_v_los" not in metrics
@@ -241,11 +241,14 @@ def test_two_lines_give_no_vector_and_that_is_said(whole, tmp_path, monkeypatch)
             lines.assign(v_los=lines["v_los"].where(np.arange(15) % 14 == 0)),
         ),
     )
-    assert "Warning: no vector from both lidars is good; 100 % have the flag beyond_lines" in report
+    assert (
+        "Warning: no vector from both lidars is valid; 100 % have the flag beyond_lines" in report
+    )
     assert "no wind from lines of sight alone: no three lines beside each other could" in report
     # the scan and the vectors that were rejected, but no figures of nothing
     assert (
-        "The scan of the Doppler lidar" in report and "2 of 15 lines of sight were read" in report
+        "The scan of the Doppler lidar" in report
+        and "2 of 15 lines of sight were retrieved" in report
     )
     assert "Standard errors of the wind" not in report and '"beyond lines"' in report
     with xr.open_dataset(folder / "wind3d.nc", engine="h5netcdf") as wind:
@@ -280,10 +283,10 @@ def test_errors_of_a_known_field():
         }
     )
     metrics = vector_metrics(found, [Core(y=0.0, z=0.0, radius=0.3, circulation=400.0)])
-    assert metrics["sensor.vectors"] == 9 and metrics["sensor.good_fraction"] == 0.9
+    assert metrics["sensor.vectors"] == 9 and metrics["sensor.valid_fraction"] == 0.9
     assert metrics["sensor.rmse_u"] == pytest.approx(0.5) == metrics["sensor.bias_u"]
     assert metrics["sensor.coverage_68_u"] == 1 and metrics["sensor.coverage_95_v"] == 0
-    assert metrics["sensor.reduced_variance_v"] == pytest.approx(4)
+    assert metrics["sensor.normalised_error_variance_v"] == pytest.approx(4)
     assert metrics["sensor.rmse_w"] == pytest.approx(1)
     assert (
         metrics["sensor.outside_cores.rmse_w"] == 0 and metrics["sensor.outside_cores.rms_u"] == 5
@@ -294,7 +297,7 @@ def test_errors_of_a_known_field():
     ("amplitude", "noise", "errors", "limit"),
     [
         (0.0, 0.5, {}, "line_noise"),
-        (1.0, 0.01, {}, "between_lines"),
+        (1.0, 0.01, {}, "sampling"),
         (0.0, 0.01, {"yaw": "20 mrad"}, "pointing"),
     ],
 )
@@ -323,15 +326,9 @@ def test_what_limits_u_is_found(amplitude, noise, errors, limit):
     crossflow.attrs = {"template": 4, "stride": 1}
     found = with_truth(experiment, truth, lines, crossflow)
     metrics = limit_metrics(mean_squares_without(experiment, truth, lines, crossflow, found, []))
-    causes = [
-        "line_noise",
-        "range_bin",
-        "crossflow",
-        "between_lines",
-        *(["pointing"] if errors else []),
-    ]
-    shares = {c: metrics[f"sensor.error_budget.{c}.share_u"] for c in causes}
-    other = "line_noise" if amplitude else "between_lines"
+    causes = ["line_noise", "range_bin", "crossflow", "sampling", *(["pointing"] if errors else [])]
+    shares = {c: metrics[f"sensor.error_budget.{c}.fraction_u"] for c in causes}
+    other = "line_noise" if amplitude else "sampling"
     assert shares[limit] > 0.9 and shares[other] < 0.1
     assert abs(shares["range_bin"]) < 0.1
     said = sensor_report._limit_of_u(metrics | {"sensor.rmse_u": 0.5})
@@ -366,11 +363,13 @@ def test_the_share_of_noise_is_between_what_draws_and_the_lines_say():
         metrics = limit_metrics(
             mean_squares_without(experiment, truth, lines, crossflow, found, [])
         )
-        good = found["flag"].values == 0
-        full = ((found["u"] - found["u_true"]).values[good] ** 2).mean()
+        valid = found["flag"].values == 0
+        full = ((found["u"] - found["u_true"]).values[valid] ** 2).mean()
         gained.append(full - metrics["sensor.error_budget.line_noise.rmse_u"] ** 2)
-        assert metrics["sensor.error_budget.line_noise.share_u"] == pytest.approx(gained[-1] / full)
-        winds.append(found["u"].values[good])
+        assert metrics["sensor.error_budget.line_noise.fraction_u"] == pytest.approx(
+            gained[-1] / full
+        )
+        winds.append(found["u"].values[valid])
     scatter = np.var(winds, axis=0, ddof=1).mean()
     assert scatter - 3 * np.std(gained) / math.sqrt(8) < np.mean(gained) < noise**2, (
         scatter,
@@ -380,7 +379,7 @@ def test_the_share_of_noise_is_between_what_draws_and_the_lines_say():
 
 def test_points_are_counted_as_each_table_means_them():
     """Lines of sight for velocities along them; windows that do not overlap for vectors."""
-    metrics = {"sensor.lines_read": 15, "sensor.vectors": 1000}
+    metrics = {"sensor.lines_retrieved": 15, "sensor.vectors": 1000}
     tables = read_requirements()
     for application, points in (("disturbance", 15), ("flight_control", 62)):
         found = measured(changed(), metrics, tables[application, "landing"])

@@ -320,7 +320,7 @@ def test_turbine_is_seen_by_both(tmp_path):
     verdict on what flight control asks for.
     """
     metrics = small_run("turbine", tmp_path / "run", [*SMALLER_SENSOR, "wake.turbine.turbulence=0"])
-    assert metrics["sensor.lines_read"] == 63
+    assert metrics["sensor.lines_retrieved"] == 63
     assert metrics["sensor.rmse_u"] < 0.5 < metrics["sensor.triples.rmse_u"]
     report = (tmp_path / "run" / "report.html").read_text()
     assert "The platform stands still: there is no look-ahead time" in report

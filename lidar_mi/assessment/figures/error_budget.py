@@ -41,7 +41,7 @@ def _bars(budgets: Budgets):
     panels = figure.subplots(1, len(budgets), sharey=True, squeeze=False)[0]
     rows = np.arange(len(used))[::-1]
     least = min(
-        budget.get(f"{place}{cause}.share", 0.0)
+        budget.get(f"{place}{cause}.fraction", 0.0)
         for budget in budgets.values()
         for place in PLACES
         for cause in used
@@ -53,7 +53,7 @@ def _bars(budgets: Budgets):
             if f"{place}rmse_v" not in budget:
                 continue
             title.append(f"{where}: {component_rmse(budget, place):.2g} m/s")
-            fractions = np.array([budget.get(f"{place}{cause}.share", np.nan) for cause in used])
+            fractions = np.array([budget.get(f"{place}{cause}.fraction", np.nan) for cause in used])
             at = rows + 0.2 - 0.4 * number
             bars[where] = panel.barh(at, fractions, 0.36, color=f"C{number}")
             for y, fraction in zip(at, fractions, strict=True):

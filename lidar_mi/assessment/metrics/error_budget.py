@@ -274,9 +274,9 @@ def error_budget(
 ) -> dict[str, float]:
     """Errors of a wind with all causes of error, and without each of them in turn.
 
-    The share of a cause is 1 - (rms error without it)^2 / (rms error with it)^2. Shares need not
-    add up to 1: causes act together, and one alone may even help (noise smooths what adapts to it),
-    which makes its share negative.
+    The fraction of a cause is 1 - (rms error without it)^2 / (rms error with it)^2. Fractions
+    need not add up to 1: causes act together, and one alone may even help (noise smooths what
+    adapts to it), which makes its fraction negative.
 
     Parameters
     ----------
@@ -298,9 +298,9 @@ def error_budget(
     -------
     dict
         Flat. `rmse_v`, `rmse_w` (m s^-1) with all causes; `CAUSE.rmse_v`, `.rmse_w` without it;
-        `CAUSE.share_v`, `.share_w`, and `.share` of both together; the same of vectors beyond two
-        core radii as `outside_cores....`; `vectors`, their number. Always the same vectors: those
-        of `found` that all cases found. Empty where there are none.
+        `CAUSE.fraction_v`, `.fraction_w`, and `.fraction` of both together; the same of vectors
+        beyond two core radii as `outside_cores....`; `vectors`, their number. Always the same
+        vectors: those of `found` that all cases retrieved. Empty where there are none.
     """
     method, template, dt = (found.attrs[name] for name in ("method", "template", "dt"))
     here = truth_at_vectors(found, truth)
@@ -320,9 +320,9 @@ def error_budget(
     if not flagged:
         chosen &= found["flag"].values == 0
     far = chosen & outside_cores(found["y_vector"].values, found["z_vector"].values, list(cores))
-    metrics = _shares(errors, chosen)
+    metrics = _fractions(errors, chosen)
     if cores:
-        metrics |= {f"outside_cores.{key}": x for key, x in _shares(errors, far).items()}
+        metrics |= {f"outside_cores.{key}": x for key, x in _fractions(errors, far).items()}
     return metrics
 
 
@@ -330,7 +330,7 @@ def _difference(wind, true) -> np.ndarray:
     return np.stack([np.asarray(wind[n], float) - np.asarray(true[n], float) for n in ("v", "w")])
 
 
-def _shares(errors: Mapping[str, np.ndarray], chosen: np.ndarray) -> dict[str, float]:
+def _fractions(errors: Mapping[str, np.ndarray], chosen: np.ndarray) -> dict[str, float]:
     if not chosen.any():
         return {}
     square = {cause: (e[:, chosen] ** 2).mean(1) for cause, e in errors.items()}
@@ -345,15 +345,15 @@ def _shares(errors: Mapping[str, np.ndarray], chosen: np.ndarray) -> dict[str, f
         if (full > 0).all():
             parts = 1 - rest / full
             metrics |= {
-                f"{cause}.share_{name}": float(x) for name, x in zip("vw", parts, strict=True)
+                f"{cause}.fraction_{name}": float(x) for name, x in zip("vw", parts, strict=True)
             }
-            metrics[f"{cause}.share"] = float(1 - rest.sum() / full.sum())
+            metrics[f"{cause}.fraction"] = float(1 - rest.sum() / full.sum())
     return metrics
 
 
 def causes_of(budget: Mapping[str, float]) -> list[str]:
     """Causes that a budget from `error_budget` knows of."""
-    return [cause for cause in CAUSES if f"{cause}.share" in budget]
+    return [cause for cause in CAUSES if f"{cause}.fraction" in budget]
 
 
 def component_rmse(budget: Mapping[str, float], place: str) -> float:

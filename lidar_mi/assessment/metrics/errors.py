@@ -68,9 +68,9 @@ def error_statistics(error, stderr=None, where=True) -> dict[str, float]:
     -------
     dict
         ``rmse`` and ``bias`` (unit of the error); with ``stderr`` also ``stderr`` (rms of those
-        stated), ``reduced_variance`` (mean square of error over standard error, 1 where errors are
-        as stated), ``coverage_68`` and ``coverage_95`` (fraction within 1 and 1.96 standard errors,
-        0.683 and 0.950 for Gaussian errors). Empty where no error counts.
+        stated), ``normalised_error_variance`` (mean square of error over standard error, 1
+        where errors are as stated), ``coverage_68`` and ``coverage_95`` (fraction within 1 and 1.96
+        standard errors, 0.683 and 0.950 for Gaussian errors). Empty where no error counts.
     """
     error = np.asarray(error)
     chosen = np.isfinite(error) & where
@@ -85,7 +85,7 @@ def error_statistics(error, stderr=None, where=True) -> dict[str, float]:
             normalised = values[known] / stated[known]
             found |= {
                 "stderr": np.sqrt(np.mean(stated[known] ** 2)),
-                "reduced_variance": np.mean(normalised**2),
+                "normalised_error_variance": np.mean(normalised**2),
                 "coverage_68": np.mean(np.abs(normalised) < 1),
                 "coverage_95": np.mean(np.abs(normalised) < 1.96),
             }
@@ -98,7 +98,7 @@ def wind_metrics(wind: xr.Dataset, truth: xr.Dataset, cores: list[Core]) -> dict
     ``rmse_*``, ``bias_*``, ``p50_*`` and ``p90_*`` (percentiles of the absolute error) of v, w,
     speed (m s^-1) and direction (rad, weighted by nothing) over valid vectors (flag 0);
     ``outside_cores.*`` the same beyond two core radii, ``all.*`` over every vector that has a
-    displacement, flagged or not; ``valid_fraction`` and ``found_fraction`` of all vectors.
+    displacement, flagged or not; ``valid_fraction`` and ``retrieved_fraction`` of all vectors.
     """
     error = deviations(wind, truth)
     known = np.isfinite(error["v"].values) & np.isfinite(error["w"].values)
@@ -106,7 +106,7 @@ def wind_metrics(wind: xr.Dataset, truth: xr.Dataset, cores: list[Core]) -> dict
     far = outside_cores(wind["y_vector"].values, wind["z_vector"].values, cores)
     metrics = {
         "valid_fraction": float(valid.mean()),
-        "found_fraction": float(known.mean()),
+        "retrieved_fraction": float(known.mean()),
         **_statistics(error, valid),
     }
     if cores:
@@ -134,7 +134,7 @@ def error_by_quality(
     """How the error depends on what a window holds: rms error of v and w in bins of a quality.
 
     All vectors with a displacement, flagged or not, in ``bins`` groups of equal number. Returns
-    ``rmse`` (m s^-1, both components together), ``valid`` (share of unflagged vectors) and the
+    ``rmse`` (m s^-1, both components together), ``valid`` (fraction of unflagged vectors) and the
     median of ``quality`` ("texture", relative slope per pixel, or "isotropy") of each group, dim
     ``group``.
     """
@@ -157,9 +157,9 @@ def error_by_quality(
 def commonest_flag(flag: xr.DataArray) -> str:
     """Which flag most vectors have, in words; ``flag`` has its CF attributes."""
     meanings, masks = flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"])
-    shares = {
+    fractions = {
         text: float(((flag.values & mask) != 0).mean())
         for text, mask in zip(meanings, masks, strict=True)
     }
-    worst = max(shares, key=shares.__getitem__)
-    return f"{round(100 * shares[worst])} % have the flag {worst}"
+    worst = max(fractions, key=fractions.__getitem__)
+    return f"{round(100 * fractions[worst])} % have the flag {worst}"

@@ -1,5 +1,6 @@
 """Names of metrics, made here alone: ``source.method.quantity`` and the like."""
 
+import re
 from enum import StrEnum
 
 
@@ -53,3 +54,22 @@ def vortex_key(origin: str, quantity: str) -> str:
 def timing_key(step: str) -> str:
     """Of the time that a step takes, s."""
     return f"timing.{step}_s"
+
+
+# Former names as patterns, and what stands there today: metrics.json of older runs has the former.
+_RENAMED = (
+    (r"\.reduced_variance_(u|v|w|v_los)$", r".normalised_error_variance_\1"),
+    (r"\.found_fraction$", ".retrieved_fraction"),
+    (r"\bsensor\.good_fraction$", "sensor.valid_fraction"),
+    (r"\bsensor\.lines_read$", "sensor.lines_retrieved"),
+    (r"\bsensor\.error_budget\.between_lines\.", "sensor.error_budget.sampling."),
+    (r"(\berror_budget\..+)\.share(_[uvw])?$", r"\1.fraction\2"),
+    (r"(\bvortex\..+)\.flow_error$", r"\1.model_error"),
+)
+
+
+def current_name(key: str) -> str:
+    """The name that a metric has today, of whichever one it had when it was written."""
+    for former, current in _RENAMED:
+        key = re.sub(former, current, key)
+    return key

@@ -1,4 +1,4 @@
-"""Whether a sensor does what flight control asks of it: requirement tables, judged row by row."""
+"""Compliance of a sensor with the requirements of flight control, row by row of their tables."""
 
 import difflib
 import math
@@ -27,17 +27,17 @@ QUANTITIES: Mapping[str, tuple[str, str]] = {
 }
 """Rows that a requirement table may have: name, what it is and its SI unit."""
 
-_LIMITS = {"min": "minimum", "max": "maximum", "max_of_range": "share"}
+_LIMITS = {"min": "minimum", "max": "maximum", "max_of_range": "fraction_of_range"}
 
 
 @dataclass(frozen=True)
 class Requirement:
-    """One row of a table, SI: from ``minimum`` to ``maximum``, and to ``share`` of the range."""
+    """One row of a table, SI: from ``minimum`` to ``maximum`` and a ``fraction_of_range``."""
 
     quantity: str
     minimum: float = 0.0
     maximum: float = math.inf
-    share: float = math.inf
+    fraction_of_range: float = math.inf
 
 
 @dataclass(frozen=True)
@@ -63,10 +63,10 @@ class Finding:
     measured : float
         NaN: not known.
     passed : bool or None
-        None: cannot be told, as something is not known.
+        None: undetermined, as something is not known.
     margin : float
-        Distance from the nearer limit as a share of it: 0.2 is 20 % better than required, -0.2 20 %
-        worse; NaN if it cannot be told.
+        Distance from the nearer limit as a fraction of it: 0.2 is 20 % better than required, -0.2
+        20 % worse; NaN where undetermined.
     """
 
     quantity: str
@@ -128,7 +128,7 @@ def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list
 
 
 def fulfilled(findings: list[Finding]) -> bool | None:
-    """Whether all rows pass; None if none fails but some cannot be told."""
+    """Whether all rows pass; None if none fails but some are undetermined."""
     results = {finding.passed for finding in findings}
     if False in results:
         return False
@@ -195,13 +195,15 @@ def _row(place: str, quantity: str, limits) -> Requirement:
     row = Requirement(quantity, **found)
     if row.minimum > row.maximum:
         raise InputError(f"{place}: min above max is not allowed")
-    if unit != "m" and math.isfinite(row.share):
+    if unit != "m" and math.isfinite(row.fraction_of_range):
         raise InputError(f"{place}.max_of_range: not allowed; only lengths compare with a range")
     return row
 
 
 def _judged(row: Requirement, measured: float, distance: float) -> Finding:
-    of_range = row.share * distance if math.isfinite(row.share) else math.inf
+    of_range = (
+        row.fraction_of_range * distance if math.isfinite(row.fraction_of_range) else math.inf
+    )
     # min() would lose a NaN
     maximum = of_range if math.isnan(of_range) else min(row.maximum, of_range)
     margins = []
@@ -217,7 +219,7 @@ def _judged(row: Requirement, measured: float, distance: float) -> Finding:
 
 def _required(finding: Finding, unit: str) -> str:
     if math.isnan(finding.maximum):
-        return "share of the range"
+        return "fraction of the range"
     low, high = _shown(finding.minimum, unit), _shown(finding.maximum, unit)
     if math.isinf(finding.maximum):
         return f"at least {low}"

@@ -42,9 +42,9 @@ class LidarCost:
 
 
 def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str, float]:
-    """Errors of good vectors (flag 0) of both lidars, as of `errors.error_statistics`.
+    """Errors of valid vectors (flag 0) of both lidars, as of `errors.error_statistics`.
 
-    ``sensor.rmse_*``, ``bias_*`` (m/s), ``reduced_variance_*``, ``coverage_68_*``,
+    ``sensor.rmse_*``, ``bias_*`` (m/s), ``normalised_error_variance_*``, ``coverage_68_*``,
     ``coverage_95_*``; ``outside_cores.rmse_*`` beyond two core radii, and ``outside_cores.rms_*``
     of the true wind there.
 
@@ -55,16 +55,16 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
         no wind.
     """
     if found is None:
-        return {"sensor.good_fraction": 0.0, "sensor.vectors": 0}
-    good = found["flag"].values == 0
+        return {"sensor.valid_fraction": 0.0, "sensor.vectors": 0}
+    valid = found["flag"].values == 0
     z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
-    far = good & outside_cores(y, z, list(cores))
-    metrics = {"sensor.good_fraction": float(good.mean()), "sensor.vectors": int(good.sum())}
+    far = valid & outside_cores(y, z, list(cores))
+    metrics = {"sensor.valid_fraction": float(valid.mean()), "sensor.vectors": int(valid.sum())}
     for name in COMPONENTS:
         true = found[f"{name}_true"].values
         error = found[name].values - true
-        here = error_statistics(error, found[f"{name}_stderr"].values, good)
-        for key in ("rmse", "bias", "reduced_variance", "coverage_68", "coverage_95"):
+        here = error_statistics(error, found[f"{name}_stderr"].values, valid)
+        for key in ("rmse", "bias", "normalised_error_variance", "coverage_68", "coverage_95"):
             if key in here:
                 metrics[f"sensor.{key}_{name}"] = here[key]
         beyond = far & np.isfinite(error)
@@ -87,10 +87,10 @@ def line_metrics(lines: xr.Dataset) -> dict[str, float]:
     error = (lines["v_los"] - lines["v_los_true"]).values
     metrics: dict[str, float] = {
         "sensor.lines": len(error),
-        "sensor.lines_read": int(np.isfinite(error).sum()),
+        "sensor.lines_retrieved": int(np.isfinite(error).sum()),
     }
     found = error_statistics(error, lines["v_los_std"].values)
-    for key in ("rmse", "bias", "reduced_variance"):
+    for key in ("rmse", "bias", "normalised_error_variance"):
         if key in found:
             metrics[f"sensor.{key}_v_los"] = found[key]
     return metrics
@@ -108,33 +108,33 @@ def doppler_alone_metrics(winds: Mapping[str, xr.Dataset], truth: xr.Dataset) ->
     """
     metrics = {}
     for key, found in winds.items():
-        good = found["flag"].values == 0
+        valid = found["flag"].values == 0
         for name in COMPONENTS:
             true = truth[name].interp(z=found["z"], y=found["y"])
-            errors = error_statistics((found[name] - true).values, where=good)
+            errors = error_statistics((found[name] - true).values, where=valid)
             if errors:
                 metrics[f"sensor.{key}.rmse_{name}"] = errors["rmse"]
     return metrics
 
 
 def limit_metrics(left: Mapping[str, float]) -> dict[str, float]:
-    """What limits u, ``sensor.error_budget.CAUSE.rmse_u`` (m/s) and ``.share_u``.
+    """What limits u, ``sensor.error_budget.CAUSE.rmse_u`` (m/s) and ``.fraction_u``.
 
     Parameters
     ----------
     left : mapping of str to float
         Mean square error of u (m^2 s^-2): with all causes as "", without each of them, and
-        "between_lines", what is left without all. Empty: not known.
+        "sampling", what is left without all. Empty: not known.
     """
     if not left:
         return {}
     metrics = {}
     for cause, square in left.items():
         if cause:
-            share = square / left[""]
+            left_over = square / left[""]
             key = f"sensor.error_budget.{cause}"
             metrics[f"{key}.rmse_u"] = math.sqrt(square)
-            metrics[f"{key}.share_u"] = share if cause == "between_lines" else 1 - share
+            metrics[f"{key}.fraction_u"] = left_over if cause == "sampling" else 1 - left_over
     return metrics
 
 

@@ -11,7 +11,7 @@ _DOPPLER = {
 }
 _VORTEX = {
     name: units.replace(" s-1", "/s").replace("m2", "m²") for name, (units, _) in MEANING.items()
-} | {"flow_error": "m/s"}
+} | {"model_error": "m/s"}
 
 
 def unit_of(key: str) -> str:

@@ -1,4 +1,4 @@
-"""How good line-of-sight winds are: spread and bias, with how well they are known."""
+"""Errors of line-of-sight winds: standard deviation and bias, with their standard errors."""
 
 import math
 
@@ -25,11 +25,11 @@ CENTRES = {RingCentre.FREE: "centre found", RingCentre.KNOWN: "centre known"}
 
 
 def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
-    """Error measures of every method, centre and number of averaged pictures.
+    """Error measures of every method, centre and number of averaged images.
 
     Keys ``doppler.METHOD.centre_CENTRE.averaged_N.`` and, all but the first in m/s,
 
-    found_fraction  share of the pictures from which a wind was read
+    retrieved_fraction  fraction of the images from which a wind was retrieved
     bias            mean over the speeds of each speed's mean error
     bias_stderr     standard error of the bias
     bias_lowest, bias_highest   mean error of the speed at which it is lowest, highest
@@ -37,13 +37,13 @@ def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
     std_stderr      its standard error, std / sqrt(2 degrees of freedom), for normal errors
     expected_std    root mean square of the standard deviations that the fits state
 
-    Measures that the pictures do not determine are left out.
+    Measures that the images do not determine are left out.
 
     Parameters
     ----------
     found : xr.Dataset
-        ``v`` and ``v_std`` with dims (algorithm, centre, averaged, v_los, image), NaN where nothing
-        was read, and ``tried`` (algorithm), the pictures of every case.
+        ``v`` and ``v_std`` with dims (algorithm, centre, averaged, v_los, image), NaN where there
+        is none, and ``tried`` (algorithm), the images of every case.
     """
     metrics = {}
     for algorithm in found["algorithm"].values:
@@ -67,20 +67,20 @@ def _spread(error: np.ndarray, tried: int) -> dict[str, float]:
     count = known.sum(1)
     measures = {}
     if tried:
-        measures["found_fraction"] = float(count.sum() / (tried * len(error)))
-    seen = count > 0
-    if not seen.any():
+        measures["retrieved_fraction"] = float(count.sum() / (tried * len(error)))
+    measured = count > 0
+    if not measured.any():
         return measures
-    means = np.nansum(error[seen], 1) / count[seen]
+    means = np.nansum(error[measured], 1) / count[measured]
     measures |= {
         "bias": float(means.mean()),
         "bias_lowest": float(means.min()),
         "bias_highest": float(means.max()),
     }
-    freedom = int((count[seen] - 1).sum())
+    freedom = int((count[measured] - 1).sum())
     if freedom:
-        std = math.sqrt(np.nansum((error[seen] - means[:, None]) ** 2) / freedom)
-        measures["bias_stderr"] = std * math.sqrt((1 / count[seen]).sum()) / seen.sum()
+        std = math.sqrt(np.nansum((error[measured] - means[:, None]) ** 2) / freedom)
+        measures["bias_stderr"] = std * math.sqrt((1 / count[measured]).sum()) / measured.sum()
         measures["std"] = std
         measures["std_stderr"] = std / math.sqrt(2 * freedom)
     return {name: float(value) for name, value in measures.items()}

@@ -16,9 +16,10 @@ COMPONENTS = ("u", "v", "w")
 def volume_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
     """Errors against the truth, ``source.method.quantity``, of valid vectors (flag 0).
 
-    ``rmse_u`` and so on, ``bias_u``, ``stderr_u``, ``reduced_variance_u``, ``coverage_68_u`` as of
-    `errors.error_statistics`; ``outside_cores.rmse_u`` beyond two core radii, ``all.rmse_u`` over
-    every vector, ``true_wind.rms_u`` of the wind itself at the same places.
+    ``rmse_u`` and so on, ``bias_u``, ``stderr_u``, ``normalised_error_variance_u``,
+    ``coverage_68_u`` as of `errors.error_statistics`; ``outside_cores.rmse_u`` beyond two core
+    radii, ``all.rmse_u`` over every vector, ``true_wind.rms_u`` of the wind itself at the same
+    places.
 
     Parameters
     ----------
@@ -45,7 +46,7 @@ def _errors(wind: xr.Dataset, far: np.ndarray) -> dict[str, float]:
         error, stderr = (wind[name] - wind[f"{name}_true"]).values, wind[f"{name}_stderr"].values
         here = error_statistics(error, stderr, valid)
         beyond, everywhere = error_statistics(error, where=valid & far), error_statistics(error)
-        for key in ("rmse", "bias", "stderr", "reduced_variance", "coverage_68"):
+        for key in ("rmse", "bias", "stderr", "normalised_error_variance", "coverage_68"):
             if key in here:
                 metrics[f"{key}_{name}"] = here[key]
         if beyond:

@@ -67,8 +67,8 @@ def vortex_metrics(
     """Quantities of the true and the fitted pairs, and the errors of the fitted wind.
 
     ``vortex.ORIGIN.QUANTITY`` and ``..._stderr``; over the whole slab ``rmse_v``, ``rmse_w`` (m/s)
-    and ``reduced_variance_*`` as of `errors.error_statistics`, ``outside_cores.rmse_*`` beyond two
-    core radii.
+    and ``normalised_error_variance_*`` as of `errors.error_statistics`, ``outside_cores.rmse_*``
+    beyond two core radii.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def vortex_metrics(
 
 
 def _quantities(fit: VortexPairFit) -> dict[str, float]:
-    numbers = {"correlation": fit.correlation, "flow_error": fit.flow_error}
+    numbers = {"correlation": fit.correlation, "model_error": fit.model_error}
     if np.isfinite(fit.chi2):
         numbers["chi2"] = fit.chi2
     for name, quantity in fit.quantities.items():
@@ -100,7 +100,7 @@ def _model_errors(fit: VortexPairFit, truth: xr.Dataset, cores: Sequence[Core]) 
     for name in ("v", "w"):
         error = model[name].values - truth[name].transpose("z", "y").values
         found = error_statistics(error, model[f"{name}_stderr"].values)
-        for key in ("rmse", "reduced_variance"):
+        for key in ("rmse", "normalised_error_variance"):
             if key in found:
                 metrics[f"{key}_{name}"] = found[key]
         if cores and far.any():

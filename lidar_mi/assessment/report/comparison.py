@@ -47,7 +47,7 @@ _ROWS = (
 _RETRIEVALS = (
     ("bias", "bias"),
     ("std", "standard deviation"),
-    ("found_fraction", "fraction retrieved"),
+    ("retrieved_fraction", "fraction retrieved"),
 )
 
 
@@ -119,7 +119,7 @@ def results(metrics: Mapping[str, Mapping[str, float]]) -> Iterator[tuple[str, s
             yield from _row(metrics, key, f"{_named(source, method)}: {label}", unit)
     for method, centre in product(RingMethod, RingCentre):
         for measure, label in _RETRIEVALS:
-            unit = "%" if measure == "found_fraction" else "m/s"
+            unit = "%" if measure == "retrieved_fraction" else "m/s"
             title = f"one pulse by {READERS[method]}, {CENTRES[centre]}: {label}"
             yield from _row(metrics, ring_key(method, centre, 1, measure), title, unit)
 

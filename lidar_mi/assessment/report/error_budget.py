@@ -25,9 +25,9 @@ def limit_sentence(budget: Mapping[str, float], method: str) -> str:
     if not causes:
         return f"The error budget of the wind by {name} is undetermined: no vector is valid."
     place, where = "", ""
-    if f"outside_cores.{causes[0]}.share" in budget:
+    if f"outside_cores.{causes[0]}.fraction" in budget:
         place, where = "outside_cores.", " beyond two core radii"
-    fractions = {cause: budget[f"{place}{cause}.share"] for cause in causes}
+    fractions = {cause: budget[f"{place}{cause}.fraction"] for cause in causes}
     ranked = sorted(causes, key=fractions.get, reverse=True)
     parts = [
         f"{CAUSES[c]} ({whole_percent(fractions[c])}" for c in ranked if fractions[c] >= _LEAST
@@ -84,7 +84,7 @@ def _table(budget: Mapping[str, float], method: str):
     def values(cause: str) -> list[str]:
         shown = []
         for place in PLACES:
-            for key, style in (("rmse_v", fixed), ("rmse_w", fixed), ("share", whole_percent)):
+            for key, style in (("rmse_v", fixed), ("rmse_w", fixed), ("fraction", whole_percent)):
                 value = budget.get(f"{place}{cause}{key}")
                 shown.append("-" if value is None else style(value))
         return shown

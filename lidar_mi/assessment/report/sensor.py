@@ -77,9 +77,9 @@ def sensor_chapter(
         else None,
         numbers=Tables(
             "Accuracy of the wind from both lidars",
-            f"{metrics['sensor.lines_read']} of {metrics['sensor.lines']} lines of sight were "
+            f"{metrics['sensor.lines_retrieved']} of {metrics['sensor.lines']} lines of sight were "
             f"retrieved; {metrics['sensor.vectors']} vectors, "
-            f"{percent(metrics['sensor.good_fraction'])}, are valid. Errors over standard errors "
+            f"{percent(metrics['sensor.valid_fraction'])}, are valid. Errors over standard errors "
             "have a variance of 1 where they are as stated; then 68 % lie within one standard "
             "error and 95 % within 1.96.",
             [_numbers(metrics)],
@@ -91,7 +91,7 @@ def sensor_chapter(
 # A cause with less of u's mean square error is no limit.
 _LEAST = 0.05
 _CAUSES = {
-    "between_lines": "sampling error between the lines of sight",
+    "sampling": "sampling error between the lines of sight",
     "line_noise": "noise of the rings",
     "range_bin": "averaging along the range bin",
     "crossflow": "errors of v and w",
@@ -101,7 +101,7 @@ _CAUSES = {
 
 def _limit_of_u(metrics) -> list[str]:
     """The error budget of u, in a sentence; empty where it is not known."""
-    keys = {c: f"sensor.error_budget.{c}.share_u" for c in _CAUSES}
+    keys = {c: f"sensor.error_budget.{c}.fraction_u" for c in _CAUSES}
     fractions = {c: metrics[key] for c, key in keys.items() if key in metrics}
     if not fractions:
         return []
@@ -169,7 +169,7 @@ def _numbers(metrics):
         ("outside_cores.rmse_{}", "rms error beyond cores", "m/s"),
         ("outside_cores.rms_{}", "the true wind itself there, rms", "m/s"),
         ("bias_{}", "bias", "m/s"),
-        ("reduced_variance_{}", "variance of normalised errors", ""),
+        ("normalised_error_variance_{}", "variance of normalised errors", ""),
         ("coverage_68_{}", "within one standard error", "%"),
         ("coverage_95_{}", "within 1.96 standard errors", "%"),
         ("triples.rmse_{}", "rms error, lines of sight alone, in threes", "m/s"),

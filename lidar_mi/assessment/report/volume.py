@@ -51,7 +51,7 @@ def _tables(experiment, metrics):
                 ("all.rmse_{}", "rms error, flagged vectors too", "m/s"),
                 ("bias_{}", "bias", "m/s"),
                 ("stderr_{}", "rms standard error, as stated", "m/s"),
-                ("reduced_variance_{}", "variance of normalised errors", ""),
+                ("normalised_error_variance_{}", "variance of normalised errors", ""),
                 ("coverage_68_{}", "within one standard error", "%"),
             ):
                 values = [metrics.get(wind_key(source, method, key.format(n))) for n in COMPONENTS]

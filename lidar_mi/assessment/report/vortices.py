@@ -35,8 +35,8 @@ _ERRORS = (
     ("rmse_w", "rms error of w", "m/s"),
     ("outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
     ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
-    ("reduced_variance_v", "variance of normalised errors of v", ""),
-    ("reduced_variance_w", "variance of normalised errors of w", ""),
+    ("normalised_error_variance_v", "variance of normalised errors of v", ""),
+    ("normalised_error_variance_w", "variance of normalised errors of w", ""),
 )
 
 

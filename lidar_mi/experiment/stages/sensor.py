@@ -143,7 +143,7 @@ def mean_squares_without(
 
     Causes: `line_noise` (what the rings' noise leaves), `range_bin` (averaging along it, here over
     `_SHORT`), `crossflow` (errors of v and w) and, where there are any, `pointing`
-    (``sensor.errors``). What is left without all of them is the sampling error (`between_lines`).
+    (``sensor.errors``). What is left without all of them is the sampling error (`sampling`).
     Without a cause the estimate also knows that it is gone, and the result is that of one draw: in
     `wake_sensor` the noise of lines scatters u, over draws, by 9 % of the mean square error; its
     fraction is 23 % with the draw of seed 1, whose lines are off by 0.05 m/s in the mean (2.9
@@ -200,4 +200,4 @@ def mean_squares_without(
     if experiment.sensor.errors != PlatformErrors():
         causes.append("pointing")
     left = {"": full} | {cause: square((cause,)) for cause in causes}
-    return left | {"between_lines": square(causes)}
+    return left | {"sampling": square(causes)}

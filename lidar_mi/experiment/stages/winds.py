@@ -81,7 +81,7 @@ def cross_flow_winds(
     found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
     found = found.assign_coords(source=list(pairs), algorithm=list(settings.methods))
     found["score"].attrs = {
-        "long_name": "cc: correlation at the peak; ws: misfit of weight and centre of mass",
+        "long_name": "; ".join(f"{name}: {METHODS[name].score[1]}" for name in settings.methods),
         "units": "1",
     }
     found.attrs["title"] = f"Cross-flow wind of the experiment {experiment.name}"

@@ -245,7 +245,7 @@ def error_variables(dims, covariance: np.ndarray) -> dict:
 def flag_attributes(flags: type[enum.IntFlag]) -> dict:
     """CF attributes of a variable that holds bits of ``flags``."""
     return {
-        "long_name": "reasons to reject the vector, 0 = good",
+        "long_name": "reasons to reject the vector, 0 = valid",
         "standard_name": "quality_flag",
         "flag_masks": np.array([bit.value for bit in flags], dtype=np.uint8),
         "flag_meanings": " ".join(str(bit.name).lower() for bit in flags),

@@ -107,7 +107,7 @@ def winds(
 def flags(found: Displacement, axes: Sequence[str]) -> Variable:
     """The flag with its CF attributes."""
     about = {
-        "long_name": "reasons to reject the vector, 0 = good",
+        "long_name": "reasons to reject the vector, 0 = valid",
         "standard_name": "quality_flag",
         "flag_masks": np.array([bit.value for bit in Flag], dtype=np.uint8),
         "flag_meanings": " ".join(bit.name.lower() for bit in Flag),

@@ -73,7 +73,7 @@ def retrieve_wind_volume(
     xr.Dataset, dims (x, z, y)
         At the windows' centres at mid-time: `u`, `v`, `w` and `u_stderr`, `v_stderr`, `w_stderr`
         (m s-1), `uv_correlation`, `uw_correlation`, `vw_correlation` of their errors,
-        `correlation`, `flag` (bits of `quality.Flag`, 0 = good; low texture means a standard error
+        `correlation`, `flag` (bits of `quality.Flag`, 0 = valid; low texture means a standard error
         beyond half a voxel in some direction). Rejected vectors keep their value, or NaN where
         there is none.
 

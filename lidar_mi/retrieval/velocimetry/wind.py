@@ -73,7 +73,7 @@ METHODS: Mapping[str, Method] = {
     ),
     "vortex_fit": Method(
         vortex_windows,
-        ("correlation", "correlation of the images, each carried to mid-time"),
+        ("correlation", "correlation of the images, each warped to mid-time"),
         ("noise", "axes", "dt"),
         centred=True,
         local=False,
@@ -150,12 +150,12 @@ def retrieve_wind(
         `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
         their correlation (NaN from methods that know none: "cc", "ws"), `displacement_y`,
         `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1), `isotropy`, `flag`
-        (bits of `quality.Flag`, 0 = good; also without texture counts a vector whose standard error
-        is beyond half a pixel in some direction). The auxiliary coordinates `y_vector`, `z_vector`
-        are where the vector belongs, at mid-time: the centre and, with "cc" and "ws", half the
-        displacement. "vortex_fit" adds the pair's numbers (`port_circulation` and so on, each with
-        `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or NaN if
-        there is none); nothing is replaced.
+        (bits of `quality.Flag`, 0 = valid; also without texture counts a vector whose standard
+        error is beyond half a pixel in some direction). The auxiliary coordinates `y_vector`,
+        `z_vector` are where the vector belongs, at mid-time: the centre and, with "cc" and "ws",
+        half the displacement. "vortex_fit" adds the pair's numbers (`port_circulation` and so on,
+        each with `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or
+        NaN if there is none); nothing is replaced.
 
     Raises
     ------

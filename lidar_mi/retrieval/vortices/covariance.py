@@ -3,12 +3,12 @@
 import numpy as np
 import torch
 
-from lidar_mi.retrieval.vortices.flow_error import FlowError, flow_error, spread_of
+from lidar_mi.retrieval.vortices.model_error import ModelError, model_error, spread_of
 from lidar_mi.retrieval.vortices.robust_fit import Solution
 
 
-def flow_error_of(found: Solution, shortest: float) -> FlowError:
-    """Departure of the flow from the model, from the residuals of a fit; see `flow_error`."""
+def model_error_of(found: Solution, shortest: float) -> ModelError:
+    """Departure of the flow from the model, from the residuals of a fit; see `model_error`."""
     misfit = found.misfit
     residual, slope, weight = misfit.residual, misfit.slope, found.weight
     if residual.ndim == 2:
@@ -17,10 +17,10 @@ def flow_error_of(found: Solution, shortest: float) -> FlowError:
     stiffness = torch.stack(
         [(weight * slope[a] * slope[b]).sum(0) for a, b in ((0, 0), (0, 1), (1, 1))]
     )
-    return flow_error(force, stiffness, shortest)
+    return model_error(force, stiffness, shortest)
 
 
-def parameter_covariance(found: Solution, error: FlowError, excess: float) -> np.ndarray:
+def parameter_covariance(found: Solution, error: ModelError, excess: float) -> np.ndarray:
     """Covariance (10, 10): H^-1 M H^-1, M that of the force by noise and flow error."""
     misfit, weight = found.misfit, found.weight
     spread = _noise_spread(found, error) * excess
@@ -41,7 +41,7 @@ def parameter_covariance(found: Solution, error: FlowError, excess: float) -> np
     return covariance.cpu().numpy()
 
 
-def _noise_spread(found: Solution, error: FlowError) -> torch.Tensor:
+def _noise_spread(found: Solution, error: ModelError) -> torch.Tensor:
     """Covariance of the force by noise: from the stated noise or, if larger, from the residuals.
 
     By the residuals, each stands for its own variance (White 1980, Econometrica 48, 817), whatever

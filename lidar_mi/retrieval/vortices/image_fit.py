@@ -24,9 +24,9 @@ from lidar_mi.retrieval.vortices.acceptance import (
     no_fit,
     step_limits,
 )
-from lidar_mi.retrieval.vortices.covariance import flow_error_of, parameter_covariance
-from lidar_mi.retrieval.vortices.flow_error import mean_length
+from lidar_mi.retrieval.vortices.covariance import model_error_of, parameter_covariance
 from lidar_mi.retrieval.vortices.model import Profile, advected, drift, path_sensitivity
+from lidar_mi.retrieval.vortices.model_error import mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.robust_fit import Misfit, fit
 from lidar_mi.retrieval.vortices.search import Observations, starting_points
@@ -228,9 +228,9 @@ def fit_pixels(
         level_images = make(blur, step)
         best = fit(level_images, best.parameters, limits, variance, 12, TOLERANCE)
     for _ in range(2):
-        error = flow_error_of(best, _NOISE_LAGS)
+        error = model_error_of(best, _NOISE_LAGS)
         best = fit(level_images, best.parameters, limits, error.variance, 10, TOLERANCE)
-    error = flow_error_of(best, _NOISE_LAGS)
+    error = model_error_of(best, _NOISE_LAGS)
     covariance = parameter_covariance(best, error, level_images.spline.excess)
     misfit, valid = best.misfit, best.misfit.valid
     # image 1 at its places, and image 2 at its own: the residual with image 1 put back

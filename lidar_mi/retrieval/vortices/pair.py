@@ -33,10 +33,10 @@ class VortexPairFit(Tabular):
     correlation : float
         Of image 1 and image 2, each advected to mid-time by the fit; of fits to vectors the
         fraction of their variance that is explained.
-    flow_error : float
+    model_error : float
         Rms of each component of the wind that the model misses, m s^-1, estimated from the
         residuals.
-    flow_error_length : float
+    model_error_length : float
         Over which it correlates, m.
     success : bool
     reasons : tuple of str
@@ -48,8 +48,8 @@ class VortexPairFit(Tabular):
     profile: Profile
     chi2: float
     correlation: float
-    flow_error: float
-    flow_error_length: float
+    model_error: float
+    model_error_length: float
     reasons: tuple[str, ...] = ()
 
     @property
@@ -183,7 +183,7 @@ class VortexPairFit(Tabular):
         ]
         covariance = torch.as_tensor(self.covariance)
         v, w = (torch.tensordot(covariance, part, 1) for part in slope)
-        own = self.flow_error**2
+        own = self.model_error**2
         spread = torch.stack(
             [(v * slope[0]).sum(0) + own, (w * slope[1]).sum(0) + own, (v * slope[1]).sum(0)]
         )

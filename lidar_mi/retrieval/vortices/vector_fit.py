@@ -15,9 +15,9 @@ from lidar_mi.retrieval.vortices.acceptance import (
     no_fit,
     step_limits,
 )
-from lidar_mi.retrieval.vortices.covariance import flow_error_of, parameter_covariance
-from lidar_mi.retrieval.vortices.flow_error import mean_length
+from lidar_mi.retrieval.vortices.covariance import model_error_of, parameter_covariance
 from lidar_mi.retrieval.vortices.model import Profile, sensitivity, wind
+from lidar_mi.retrieval.vortices.model_error import mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.robust_fit import Misfit, fit
 from lidar_mi.retrieval.vortices.search import Observations, starting_points
@@ -137,9 +137,9 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
                 *tensors[:2], torch.as_tensor(root) / spread, tensors[2], valid, profile
             )
     for _ in range(3):
-        error = flow_error_of(best, 1.0)
+        error = model_error_of(best, 1.0)
         best = fit(model, best.parameters, limits, error.variance, 12, TOLERANCE)
-    error = flow_error_of(best, 1.0)
+    error = model_error_of(best, 1.0)
     covariance = parameter_covariance(best, error, 1.0)
     chi2 = float(best.misfit.residual[:, valid].square().mean()) if known else np.nan
     left = (tensors[2] - wind(best.parameters, *tensors[:2], profile))[:, valid]

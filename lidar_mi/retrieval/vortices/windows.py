@@ -72,7 +72,7 @@ def vortex_windows(
             "profile": found.profile,
             "fit": "; ".join(found.reasons) or "good",
             "chi2": found.chi2,
-            "flow_error": found.flow_error,
-            "flow_error_length": found.flow_error_length,
+            "model_error": found.model_error,
+            "model_error_length": found.model_error_length,
         },
     )

@@ -117,8 +117,8 @@ def test_statistics_of_known_errors():
     assert metrics["rmse_w"] == metrics["bias_w"] == metrics["p50_w"] == metrics["p90_w"] == 0.5
     assert metrics["rmse_speed"] == pytest.approx(metrics["rmse_v"], rel=1e-6)
     assert metrics["bias_direction"] == pytest.approx(0.5e-6, rel=1e-3)
-    assert metrics["valid_fraction"] == metrics["found_fraction"] == 1
-    assert set(metrics) == {"valid_fraction", "found_fraction", *STATISTICS} | {
+    assert metrics["valid_fraction"] == metrics["retrieved_fraction"] == 1
+    assert set(metrics) == {"valid_fraction", "retrieved_fraction", *STATISTICS} | {
         f"all.{key}" for key in STATISTICS
     }
 
@@ -129,13 +129,13 @@ def test_flagged_vectors_count_only_where_all_are_asked_for():
     assert metrics["rmse_v"] == 1
     assert metrics["all.rmse_v"] == pytest.approx(np.sqrt(51 / 3))
     assert metrics["valid_fraction"] == 0.5
-    assert metrics["found_fraction"] == 0.75
+    assert metrics["retrieved_fraction"] == 0.75
 
 
 def test_a_vector_without_a_truth_is_not_known():
     metrics = wind_metrics(winds([1.0, 5.0], [0.0, 0.0]), winds([0.0, np.nan], [0.0, 0.0]), [])
     assert metrics["rmse_v"] == metrics["all.rmse_v"] == 1
-    assert metrics["found_fraction"] == 0.5
+    assert metrics["retrieved_fraction"] == 0.5
 
 
 def test_outside_two_core_radii():
@@ -151,10 +151,14 @@ def test_without_valid_vectors_keys_are_absent_not_nan():
     flagged = winds([1.0, 2.0], [0.0, 0.0], flag=[1, 1])
     still = winds([0.0, 0.0], [0.0, 0.0])
     metrics = wind_metrics(flagged, still, [Core(0.0, 0.0, 2.0, 100.0)])
-    assert set(metrics) == {"valid_fraction", "found_fraction", *(f"all.{k}" for k in STATISTICS)}
+    assert set(metrics) == {
+        "valid_fraction",
+        "retrieved_fraction",
+        *(f"all.{k}" for k in STATISTICS),
+    }
     nothing = winds([np.nan, np.nan], [np.nan, np.nan])
     metrics = wind_metrics(nothing, still, [])
-    assert metrics == {"valid_fraction": 0, "found_fraction": 0}
+    assert metrics == {"valid_fraction": 0, "retrieved_fraction": 0}
     json.dumps(metrics, allow_nan=False)
 
 
@@ -206,7 +210,7 @@ def test_statistics_of_gaussian_errors_are_the_closed_forms():
     stated = random.uniform(0.1, 2.0, n)
     found = error_statistics(stated * noise / 0.3, stated)
     assert found["stderr"] == pytest.approx(np.sqrt(np.mean(stated**2)))
-    assert found["reduced_variance"] == pytest.approx(1, abs=4 * np.sqrt(2 / n))
+    assert found["normalised_error_variance"] == pytest.approx(1, abs=4 * np.sqrt(2 / n))
     for key, share in (("coverage_68", 0.6827), ("coverage_95", 0.9500)):
         assert found[key] == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / n)), key
 
@@ -218,7 +222,7 @@ def test_statistics_of_a_few_known_errors():
     assert found["rmse"] == pytest.approx(np.sqrt(14 / 3))
     assert found["bias"] == pytest.approx(2 / 3)
     # the third has no error, the fourth no standard error
-    assert found["reduced_variance"] == pytest.approx((0.25 + 4) / 2)
+    assert found["normalised_error_variance"] == pytest.approx((0.25 + 4) / 2)
     assert found["stderr"] == pytest.approx(np.sqrt(2.5))
     assert found["coverage_68"] == 0.5 and found["coverage_95"] == 0.5
     assert error_statistics(error, stderr, np.zeros(5, bool)) == {}

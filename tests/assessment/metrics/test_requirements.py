@@ -46,14 +46,16 @@ def test_the_published_table():
         assert rows["range"].minimum == reach
         assert rows["points_per_slab"].minimum == 63
         assert rows["slabs_per_second"].minimum == 10
-        assert rows["slab_depth"].share * reach == pytest.approx(depth)
+        assert rows["slab_depth"].fraction_of_range * reach == pytest.approx(depth)
         assert rows["error_v_los"].maximum == 0.5
     for phase, reach, depth in (("landing", (30, 150), (3, 15)), ("cruise", (120, 600), (12, 60))):
         rows = limits("flight_control", phase)
         assert (rows["range"].minimum, rows["range"].maximum) == reach
         assert rows["points_per_slab"].minimum == 20
         assert rows["slabs_per_second"].minimum == 10
-        assert tuple(rows["slab_depth"].share * r for r in reach) == pytest.approx(depth)
+        assert tuple(rows["slab_depth"].fraction_of_range * r for r in reach) == pytest.approx(
+            depth
+        )
         assert [rows[f"error_{c}"].maximum for c in "uvw"] == [2.5] * 3
 
 
@@ -121,7 +123,9 @@ def test_what_is_not_known_does_not_pass():
 
 
 def test_a_share_of_the_range_and_a_limit_of_its_own():
-    table = RequirementTable("a", "a", "p", (Requirement("slab_depth", maximum=5.0, share=0.1),))
+    table = RequirementTable(
+        "a", "a", "p", (Requirement("slab_depth", maximum=5.0, fraction_of_range=0.1),)
+    )
     for reach, maximum in ((30.0, 3.0), (100.0, 5.0)):
         (found,) = judge(table, {"range": reach, "slab_depth": 4.0})
         assert found.maximum == maximum and found.passed is (4.0 <= maximum)

@@ -39,7 +39,7 @@ def test_measures_by_hand():
     std = np.sqrt(4 / 3)
     assert got == pytest.approx(
         {
-            "found_fraction": 5 / 6,
+            "retrieved_fraction": 5 / 6,
             "bias": -1.0,
             "bias_lowest": -4.0,
             "bias_highest": 2.0,
@@ -67,5 +67,5 @@ def test_standard_errors_are_those_of_repeated_experiments():
 def test_what_is_not_determined_is_left_out():
     one = measures([[1.0], [2.0]], 1)
     assert "std" not in one and "bias_stderr" not in one and one["bias"] == 1.5
-    assert measures([[np.nan, np.nan]], 2) == {"found_fraction": 0.0}
+    assert measures([[np.nan, np.nan]], 2) == {"retrieved_fraction": 0.0}
     assert measures([[np.nan, np.nan]], 0) == {}

@@ -73,7 +73,7 @@ def test_known_pair_at_three_percent_noise():
     mean = np.sqrt(bound[0, 0] + bound[4, 4] - 2 * bound[0, 4]) / 2
     assert mean == pytest.approx(1.4, rel=0.1)
     assert found.chi2 == pytest.approx(1.0, abs=0.06)
-    assert found.flow_error < 0.2
+    assert found.model_error < 0.2
     # nobody needs to say how noisy the images are
     alone = fit_vortices(pair.first, pair.second, DT)
     np.testing.assert_allclose(alone.parameters, found.parameters, atol=0.5 * stderr.max())
@@ -328,7 +328,7 @@ def test_a_disturbed_flow_is_admitted():
         reduced.append(off / np.sqrt(np.diag(found.covariance)))
         model = found.wind(images[0].y.values[None, :], images[0].z.values[:, None])
         winds.append((model["v"].values - true[0]) / model["v_stderr"].values)
-        stated.append(found.flow_error)
+        stated.append(found.model_error)
         noise = pair_bound(images[0], uneven(), 0.01)
         assert np.diag(found.covariance)[0] > 4 * noise[0, 0]
     assert np.mean(stated) == pytest.approx(0.5, rel=0.3)

@@ -19,7 +19,7 @@ _LENGTHS = (3.0, 6.0, 12.0, 24.0, 48.0)
 
 
 @dataclass(frozen=True)
-class FlowError:
+class ModelError:
     """Covariance of each component of what the model misses.
 
     Attributes
@@ -102,7 +102,7 @@ class Lags:
         return total
 
 
-def flow_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) -> FlowError:
+def model_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) -> ModelError:
     """The departure from a model that explains the correlation of the residuals of its fit.
 
     With the residual r, its slope g and its weight w, the force is q = w g r and the stiffness
@@ -128,21 +128,21 @@ def flow_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) ->
     used = (distance >= shortest) & (distance <= 2 * max(lengths))
     scale = unit[0, 0]
     if not float(scale) > 0 or not bool(used.any()):
-        return FlowError()
+        return ModelError()
     columns = [unit[used] / scale * torch.exp(-(distance[used] ** 2) / (2 * n**2)) for n in lengths]
     # normalised in both directions: least squares needs numbers near one
     size = float((observed[used] / scale).abs().max())
     if not size > 0:
-        return FlowError()
+        return ModelError()
     amplitudes, _ = nnls(
         torch.stack(columns, 1).cpu().numpy(), (observed[used] / scale / size).cpu().numpy()
     )
     variances = amplitudes * size
     kept = [(float(a), n) for a, n in zip(variances, lengths, strict=True) if a > 0]
-    return FlowError(tuple(a for a, _ in kept), tuple(n for _, n in kept))
+    return ModelError(tuple(a for a, _ in kept), tuple(n for _, n in kept))
 
 
-def spread_of(responses: torch.Tensor, error: FlowError) -> torch.Tensor:
+def spread_of(responses: torch.Tensor, error: ModelError) -> torch.Tensor:
     """Covariance (p, p) of sum_x P_p(x) . d(x), d the field of the flow's error, P (p, 2, z, y)."""
     lags = Lags(tuple(responses.shape[2:]), responses)
     if not error.variances:
@@ -150,6 +150,6 @@ def spread_of(responses: torch.Tensor, error: FlowError) -> torch.Tensor:
     return lags.quadratic(responses, error.covariance(lags.distance()))
 
 
-def mean_length(error: FlowError) -> float:
+def mean_length(error: ModelError) -> float:
     """Length over which the error correlates, steps of the grid, weighted by variance."""
     return float(np.average(error.lengths, weights=error.variances)) if error.variances else 0.0

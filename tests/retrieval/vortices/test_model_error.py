@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.retrieval.vortices.flow_error import (
-    FlowError,
+from lidar_mi.retrieval.vortices.model_error import (
     Lags,
-    flow_error,
+    ModelError,
     mean_length,
+    model_error,
     spread_of,
 )
 
-ERROR = FlowError((0.3, 0.1), (2.0, 5.0))
+ERROR = ModelError((0.3, 0.1), (2.0, 5.0))
 
 
 def distances(shape):
@@ -44,7 +44,7 @@ def test_covariance_is_a_sum_of_gaussians():
     np.testing.assert_allclose(ERROR.covariance(at), expected, rtol=1e-12)
     assert ERROR.variance == pytest.approx(0.4)
     assert mean_length(ERROR) == pytest.approx((0.3 * 2 + 0.1 * 5) / 0.4)
-    assert mean_length(FlowError()) == 0 and FlowError().variance == 0
+    assert mean_length(ModelError()) == 0 and ModelError().variance == 0
 
 
 @pytest.mark.parametrize("shape", [(7, 9), (8, 5)])
@@ -76,7 +76,7 @@ def test_spread_is_that_of_the_dense_matrix(shape):
     expected = sum(flat[:, a] @ matrix @ flat[:, a].T for a in (0, 1))
     size = np.abs(expected).max()
     np.testing.assert_allclose(spread_of(responses, ERROR), expected, atol=2e-2 * size)
-    assert (spread_of(responses, FlowError()) == 0).all()
+    assert (spread_of(responses, ModelError()) == 0).all()
 
 
 def residuals(variance, length, noise, seed, shape=(40, 50)):
@@ -102,7 +102,7 @@ def residuals(variance, length, noise, seed, shape=(40, 50)):
 def test_variance_and_length_are_those_drawn():
     """16 draws (seeds 0 to 15) of 0.04 m^2 over 6 steps: 2 x 2000 / (4 pi 36) = 9 independent
     values a draw of noise 0.1, whose mean square scatters by sqrt(2 / 140) = 12 % in all."""
-    found = [flow_error(*residuals(0.04, 6.0, 0.1, seed), 1.0) for seed in range(16)]
+    found = [model_error(*residuals(0.04, 6.0, 0.1, seed), 1.0) for seed in range(16)]
     assert np.mean([one.variance for one in found]) == pytest.approx(0.04, rel=0.36)
     lengths = [mean_length(one) for one in found]
     assert np.mean(lengths) == pytest.approx(6.0, rel=0.36)
@@ -110,10 +110,10 @@ def test_variance_and_length_are_those_drawn():
 
 def test_noise_of_pixels_is_no_flow():
     """White residuals of standard deviation 0.1, slopes of 1: as a flow, this would be 0.01 m^2."""
-    found = [flow_error(*residuals(0.0, 6.0, 0.1, seed), 1.0).variance for seed in range(8)]
+    found = [model_error(*residuals(0.0, 6.0, 0.1, seed), 1.0).variance for seed in range(8)]
     assert np.mean(found) < 2e-4
 
 
 def test_nothing_known_is_no_error():
     nothing = torch.zeros(3, 20, 20, dtype=torch.float64)
-    assert flow_error(nothing[:2], nothing, 1.0) == FlowError()
+    assert model_error(nothing[:2], nothing, 1.0) == ModelError()
