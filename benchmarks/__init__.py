@@ -8,6 +8,7 @@ estimators   the gated estimator against the analog one
 transient    the renderer against mitransient's volumetric integrator
 velocimetry  cross-correlation against OpenPIV
 methods      wind from exact images by all methods, and by public codes
+threads      winds on one thread and on several, on a quiet and on a busy machine
 settings     wind after each setting of a method is halved and doubled
 rendered     wind from rendered pictures by all methods, and the share of every cause of error
 renderer     speed and memory of the renderer alone

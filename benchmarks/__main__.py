@@ -17,6 +17,7 @@ COMPARISONS = (
     "velocimetry",
     "methods",
     "settings",
+    "threads",
     "rendered",
     "renderer",
     "fringes",

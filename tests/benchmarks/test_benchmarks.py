@@ -18,6 +18,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 from scipy.integrate import quad
 
@@ -37,10 +38,12 @@ from benchmarks import (
     renderer,
     report,
     settings,
+    threads,
     transient,
     velocimetry,
 )
 from lidar_mi.atmosphere.vortex import velocity
+from lidar_mi.retrieval import threads as thread_choice
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_MULTIPASS, VariationalSettings
 
 
@@ -364,6 +367,17 @@ def test_rendered_pictures_have_a_row_for_every_energy_and_method(monkeypatch):
         assert max(everywhere, key=everywhere.get) == "detector" and everywhere["detector"] > 50
         assert {"simulation", "beam", "window", "method"} < set(shares)
     assert "paths" in dark[0].note and "paths" not in dark[1].note
+
+
+def test_threads_are_compared_quiet_and_busy():
+    before = torch.get_num_threads(), thread_choice.SMALL
+    found = threads.compare(1, ((40, 32),))
+    assert [row.case for row in found.rows[::3]] == [
+        "40 x 32 px, quiet machine",
+        "40 x 32 px, busy machine",
+    ]
+    assert len(found.rows) == 6 and all(row.ours > 0 and row.ratio > 0 for row in found.rows)
+    assert (torch.get_num_threads(), thread_choice.SMALL) == before
 
 
 def test_settings_are_halved_and_doubled_in_turn():

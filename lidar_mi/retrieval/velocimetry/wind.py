@@ -9,6 +9,7 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.bound import displacement_bound
 from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
 from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
@@ -206,7 +207,8 @@ def retrieve_wind(
         "settings": settings,
     }
     options = {name: offered[name] for name in chosen.options}
-    found = chosen.find(pixels1, pixels2, template, search, stride, **options)
+    with threads_for(image1.size):
+        found = chosen.find(pixels1, pixels2, template, search, stride, **options)
     level = 0.0 if noise is None else noise
     texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
     apart = max(1, round(template / 2 / stride))

@@ -13,6 +13,7 @@ import xarray as xr
 from kornia.filters import gaussian_blur2d
 
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited
@@ -180,7 +181,8 @@ def fit_vortices(
     pixels = [on_device(image, device) for image in (image1, image2)]
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
-    return fit_pixels(*pixels, *axes, dt, noise, profile, frozen)
+    with threads_for(image1.size):
+        return fit_pixels(*pixels, *axes, dt, noise, profile, frozen)
 
 
 def fit_pixels(

@@ -1,0 +1,53 @@
+"""Threads of a retrieval. Detects a number that is not chosen, or not given back."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+import lidar_mi as lm
+from benchmarks.cases import vortex_pair_images
+from lidar_mi.retrieval.threads import SMALL, threads_for
+from lidar_mi.retrieval.velocimetry import wind
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_one_for_small_images_torch_s_own_for_large_ones():
+    with threads_for(SMALL):
+        assert torch.get_num_threads() == 1
+    assert torch.get_num_threads() == 2
+    with threads_for(SMALL + 1):
+        assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+def test_the_number_is_given_back_after_an_error():
+    with pytest.raises(ZeroDivisionError), threads_for(1):
+        1 / 0  # noqa: B018
+    assert torch.get_num_threads() == 2
+
+
+@pytest.mark.usefixtures("two_threads")
+@pytest.mark.parametrize("call", ["retrieve_wind", "fit_vortices"])
+def test_retrievals_of_images_work_on_one(call, monkeypatch):
+    pair = vortex_pair_images(0.0, 1, 40, 32)
+    seen = []
+
+    def watched(image1, *args, **options):
+        seen.append(torch.get_num_threads())
+        raise RuntimeError("seen")
+
+    method = replace(wind.METHODS["cc"], find=watched)
+    monkeypatch.setitem(wind.METHODS, "cc", method)
+    monkeypatch.setattr("lidar_mi.retrieval.vortices.image_fit.fit_pixels", watched)
+    with pytest.raises(RuntimeError, match="seen"):
+        getattr(lm, call)(pair.first, pair.second, dt=0.1)
+    assert seen == [1] and torch.get_num_threads() == 2
