@@ -13,6 +13,9 @@ from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, mismatch, nearest
 from lidar_mi.retrieval.velocimetry.windows import averaged, stored
 
+# Of an image's rms structure the splines miss more than this, however little noise there is.
+_INTERPOLATION = 1e-5
+
 
 class Images(NamedTuple):
     """What the flow has to explain.
@@ -99,6 +102,7 @@ def prepared(
         blur=blur,
         settings=settings.filter,
     )
+    level = max(level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
     time = time - time.mean()
     return Images(spline, known_at, time, level, weight, images, blur)
