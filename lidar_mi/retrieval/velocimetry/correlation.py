@@ -246,7 +246,7 @@ def _peak(coefficient: torch.Tensor, windows: Windows, min_correlation: float) -
         + Flag.NO_SUBPIXEL_FIT * (inside & ~(fitted[0] & fitted[1]))
         + Flag.NO_MATCH * ~matched
     )
-    return Displacement(torch.where(inside, d, torch.nan), best, flag.to(torch.uint8))
+    return Displacement(torch.where(inside, d, torch.nan), best, flag.to(torch.int16))
 
 
 def _gaussian_fit(

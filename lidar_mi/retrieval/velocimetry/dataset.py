@@ -109,10 +109,10 @@ def flags(found: Displacement, axes: Sequence[str]) -> Variable:
     about = {
         "long_name": "reasons to reject the vector, 0 = valid",
         "standard_name": "quality_flag",
-        "flag_masks": np.array([bit.value for bit in Flag], dtype=np.uint8),
+        "flag_masks": np.array([bit.value for bit in Flag], dtype=np.uint16),
         "flag_meanings": " ".join(bit.name.lower() for bit in Flag),
     }
-    return tuple(axes), found.flag.cpu().numpy(), about
+    return tuple(axes), found.flag.cpu().numpy().astype(np.uint16), about
 
 
 def dataset(

@@ -20,7 +20,7 @@ class Displacement(NamedTuple):
         indices; NaN where no displacement was found.
     score : torch.Tensor
         How well the windows match: correlation or mismatch, as the method says.
-    flag : torch.Tensor of uint8
+    flag : torch.Tensor of int16
         `quality.Flag` bits.
     covariance : torch.Tensor, shape (components, components, *windows.count), optional
         Of the components' errors, px^2, from methods that know it.
@@ -50,7 +50,7 @@ class Displacement(NamedTuple):
     @classmethod
     def empty(cls, windows: Windows, like: torch.Tensor) -> "Displacement":
         """Room for the result, to be filled tile by tile."""
-        flag = like.new_empty(windows.count, dtype=torch.uint8)
+        flag = like.new_empty(windows.count, dtype=torch.int16)
         return cls(
             like.new_empty(windows.dims, *windows.count), like.new_empty(windows.count), flag
         )

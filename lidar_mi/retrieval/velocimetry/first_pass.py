@@ -88,12 +88,17 @@ def first_pass(
     return grid.interpolated(d, known), replaced
 
 
-def _of_images(images, _, windows: Windows) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Windows twice as large over twice the range, where the image holds such search regions."""
+def coarse_windows(windows: Windows) -> Windows:
+    """Windows of images twice as large over twice the range, where the image holds them."""
     double = 2 if min(windows.shape) >= 2 * windows.search else 1
     template, search = double * windows.template, double * windows.search
-    coarse = Windows(windows.shape, template, search, max(1, template // 2))
-    found = cross_correlation(*images[:2], template, search, coarse.stride)
+    return Windows(windows.shape, template, search, max(1, template // 2))
+
+
+def _of_images(images, _, windows: Windows) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Windows twice as large over twice the range, where the image holds such search regions."""
+    coarse = coarse_windows(windows)
+    found = cross_correlation(*images[:2], coarse.template, coarse.search, coarse.stride)
     usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
     d = torch.where(usable, found.d, torch.nan)
     return d, [coarse.centres(axis).to(d.device) for axis in (0, 1)]
@@ -107,9 +112,25 @@ def _of_volumes(images, spline: Spline, windows: Windows):
     rim of the search.
     """
     finite = torch.stack([torch.isfinite(image) for image in images[:2]])
-    axes = [torch.arange(n).to(spline.coefficients) for n in windows.shape]
+    scores, centres = volume_scores(coarse_volumes(spline, finite), windows)
+    d = 2 * _peaks(scores, max(1, round(windows.reach / 2)))
+    return d, [at.to(d.device) for at in centres]
+
+
+def coarse_volumes(spline: Spline, finite: torch.Tensor) -> torch.Tensor:
+    """Two volumes averaged over 2 x 2 x 2 voxels, those not finite being 0."""
+    axes = [torch.arange(n).to(spline.coefficients) for n in spline.shape]
     whole = [place.expand(2, *place.shape) for place in torch.meshgrid(*axes, indexing="ij")]
-    values = avg_pool3d((spline.sample(*whole)[0] * finite)[:, None], 2)[:, 0]
+    return avg_pool3d((spline.sample(*whole)[0] * finite)[:, None], 2)[:, 0]
+
+
+def volume_scores(
+    values: torch.Tensor, windows: Windows
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Correlation (shifts, ...) of windows of averaged volumes, and their centres in voxels.
+
+    NaN where volume 1 has no contrast, -1 where too little is left to compare.
+    """
     shape = tuple(values.shape[1:])
     reach = max(1, round(windows.reach / 2))
     size = [min(windows.template, n) for n in shape]
@@ -132,9 +153,10 @@ def _of_volumes(images, spline: Spline, windows: Windows):
         score = (cross - mean1 * mean2) / contrast.clamp(min=1e-12).sqrt()
         scores.append(torch.where(inside > 0.5, score, -1.0))
     scores = torch.where(contrast1 > 1e-10, torch.stack(scores), torch.nan)
-    d = 2 * _peaks(scores, reach)
-    centres = [n - 0.5 + 2 * step * torch.arange(m) for n, m in zip(size, d.shape[1:], strict=True)]
-    return d, [at.to(d.device) for at in centres]
+    centres = [
+        n - 0.5 + 2 * step * torch.arange(m) for n, m in zip(size, scores.shape[1:], strict=True)
+    ]
+    return scores, centres
 
 
 def _peaks(scores: torch.Tensor, reach: int) -> torch.Tensor:

@@ -124,7 +124,7 @@ def multipass(
         + Flag.NO_SUBPIXEL_FIT * (matched & off)
         + Flag.LOW_CORRELATION * (matched & (fit.score < min_correlation))
         + Flag.REPLACED * replaced[at]
-    ).to(torch.uint8)
+    ).to(torch.int16)
     flag[bad] |= Flag.NON_FINITE_INPUT.value
     d = torch.where(bad | ~matched, torch.nan, d)
     return Displacement(d, fit.score, flag, fit.covariance + curved)

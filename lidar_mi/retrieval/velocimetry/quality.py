@@ -35,6 +35,8 @@ class Flag(enum.IntFlag):
     """No candidate could be compared (no contrast, no positive weight). No displacement."""
     REPLACED = 128
     """The previous pass found an outlier; this one began at its neighbours' median (multi-pass)."""
+    UNRELATED = 256
+    """The images around it are no more alike than unrelated textures (`relation`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:

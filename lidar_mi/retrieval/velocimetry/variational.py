@@ -154,7 +154,7 @@ def _flagged(
         Flag.NO_MATCH * ~matched
         + Flag.LOW_TEXTURE * ((worst_variance(covariance) > known) | ~matched)
         + Flag.LOW_CORRELATION * (matched & (score < (1 + min_correlation) / 2))
-    ).to(torch.uint8)
+    ).to(torch.int16)
     bad = non_finite(stack, windows)
     flag[bad] |= Flag.NON_FINITE_INPUT.value
     return Displacement(torch.where(matched, d, torch.nan), score.nan_to_num(0.0), flag, covariance)

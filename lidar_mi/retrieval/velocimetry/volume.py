@@ -12,6 +12,7 @@ from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.multipass import multipass
 from lidar_mi.retrieval.velocimetry.outliers import median_outliers
 from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, uncertain
+from lidar_mi.retrieval.velocimetry.relation import unrelated
 from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
 from lidar_mi.retrieval.velocimetry.variational import variational
 from lidar_mi.retrieval.velocimetry.windows import Windows, working
@@ -115,11 +116,12 @@ def retrieve_wind_volume(
     if method == "variational":
         options |= {"more": volumes[2:], "spacing": steps}
     found = METHODS[method](*volumes[:2], template, search, stride, **options)
-    flag = found.flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.uint8)
+    flag = found.flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
     if method == "correlation":
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, spacing=apart, continued=True)
-        flag = flag | (Flag.MEDIAN_OUTLIER * outlier).to(torch.uint8)
+        flag = flag | (Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
+    flag = flag | (Flag.UNRELATED * unrelated(volumes, windows, False, noise)).to(torch.int16)
     found = found._replace(flag=flag)
     variables = winds(found, AXES, steps, dt)
     long_name = "correlation of the volumes warped to mid-time"

@@ -104,4 +104,4 @@ def _best_match(
     d = torch.stack([shift_z, shift_y]) + torch.stack(rest)
     d = torch.where(matched & ~rim, d, torch.nan)
     flag = Flag.PEAK_ON_RIM * (matched & rim) + Flag.NO_MATCH * ~matched
-    return Displacement(d, best.sqrt(), flag.to(torch.uint8))
+    return Displacement(d, best.sqrt(), flag.to(torch.int16))

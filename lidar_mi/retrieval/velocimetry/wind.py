@@ -17,6 +17,7 @@ from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.multipass import multipass
 from lidar_mi.retrieval.velocimetry.outliers import median_outliers
 from lidar_mi.retrieval.velocimetry.quality import Flag, filled, low_texture, non_finite, uncertain
+from lidar_mi.retrieval.velocimetry.relation import unrelated
 from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
 from lidar_mi.retrieval.velocimetry.variational import variational
 from lidar_mi.retrieval.velocimetry.weight_shift import weight_shift
@@ -41,6 +42,9 @@ class Method:
     local : bool
         A vector knows its window only: without texture there, or contradicted by its neighbours,
         it is flagged. A field that is fitted as a whole says itself how certain it is where.
+    reach : int
+        Displacements it begins with, over those of its windows. 0: it says itself whether the
+        images are related.
     """
 
     find: Callable[..., Displacement]
@@ -48,6 +52,7 @@ class Method:
     options: tuple[str, ...] = ()
     centred: bool = False
     local: bool = True
+    reach: int = 1
 
 
 METHODS: Mapping[str, Method] = {
@@ -64,6 +69,7 @@ METHODS: Mapping[str, Method] = {
         ("correlation", "normalised cross-correlation of the deformed windows"),
         ("min_correlation", "noise", "settings"),
         centred=True,
+        reach=2,
     ),
     "variational": Method(
         variational,
@@ -71,6 +77,7 @@ METHODS: Mapping[str, Method] = {
         ("min_correlation", "noise", "more", "blur", "settings"),
         centred=True,
         local=False,
+        reach=2,
     ),
     "vortex_fit": Method(
         vortex_windows,
@@ -78,6 +85,7 @@ METHODS: Mapping[str, Method] = {
         ("noise", "axes", "dt"),
         centred=True,
         local=False,
+        reach=0,
     ),
 }
 """Methods by name."""
@@ -215,9 +223,12 @@ def retrieve_wind(
     outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
     flag = found.flag
     if found.covariance is not None:
-        flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.uint8)
+        flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
     if chosen.local:
-        flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.uint8)
+        flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
+    if chosen.reach:
+        apart = unrelated([pixels1, pixels2], windows, chosen.reach > 1, noise)
+        flag = flag | (Flag.UNRELATED * apart).to(torch.int16)
     attributes = {
         "method": method,
         "template": template,

@@ -56,7 +56,7 @@ def vortex_windows(
     v, w = tensor(values)
     variance_v, variance_w, both = tensor(covariance)
     vv, ww, wv = variance_v / pixel_y**2, variance_w / pixel_z**2, both / (pixel_y * pixel_z)
-    flag = torch.zeros(windows.count, dtype=torch.uint8, device=image1.device)
+    flag = torch.zeros(windows.count, dtype=torch.int16, device=image1.device)
     flag[non_finite([image1, image2], windows)] |= Flag.NON_FINITE_INPUT.value
     if not found.success:
         flag |= Flag.NO_MATCH.value

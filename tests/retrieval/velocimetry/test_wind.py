@@ -244,7 +244,7 @@ def test_data_set_is_cf_and_survives_a_file(tmp_path):
             xr.testing.assert_identical(back.load(), dataset)
             assert "_FillValue" not in back.y.encoding
             flag = back.flag
-            assert flag.dtype == flag.attrs["flag_masks"].dtype == np.uint8
+            assert flag.dtype == flag.attrs["flag_masks"].dtype == np.uint16
             assert len(flag.attrs["flag_masks"]) == len(flag.attrs["flag_meanings"].split())
 
 
