@@ -9,11 +9,7 @@ from torch.nn.functional import pad
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised, rms
 from lidar_mi.retrieval.velocimetry.correlation import correlate
-from lidar_mi.retrieval.velocimetry.first_pass import (
-    coarse_volumes,
-    coarse_windows,
-    volume_scores,
-)
+from lidar_mi.retrieval.velocimetry.first_pass import coarse_volumes, coarse_windows, volume_scores
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_FILTER, FilterSettings
 from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited
 from lidar_mi.retrieval.velocimetry.windows import (
@@ -88,7 +84,9 @@ def unrelated(
     thirds = [n // 3 for n in second.shape[-2:]]
     chance = torch.stack(
         [
-            search.score(first, turned.roll([n * third for n, third in zip(roll, thirds)], (-2, -1)))
+            search.score(
+                first, turned.roll([n * third for n, third in zip(roll, thirds)], (-2, -1))
+            )
             for roll in rolls
         ]
     )

@@ -20,12 +20,7 @@ from tests.support.flows import axes, data_array
 
 DT = 0.1
 # columns, rows, correlation length, template, search
-CASES = [
-    (57, 45, 2.0, 8, 16),
-    (83, 52, 4.5, 8, 18),
-    (131, 66, 2.5, 10, 20),
-    (72, 90, 8.0, 12, 24),
-]
+CASES = [(57, 45, 2.0, 8, 16), (83, 52, 4.5, 8, 18), (131, 66, 2.5, 10, 20), (72, 90, 8.0, 12, 24)]
 
 
 def images(seed, columns, rows, length, noise=0.0, number=2):
