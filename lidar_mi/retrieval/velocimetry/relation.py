@@ -20,7 +20,7 @@ from lidar_mi.retrieval.velocimetry.windows import (
     working,
 )
 
-FALSE_ALARM = 1e-4
+FALSE_ALARM = 1e-3
 """Probability that unrelated textures count as related at a vector."""
 # Windows along each axis whose correlations are averaged.
 _REGION = 5

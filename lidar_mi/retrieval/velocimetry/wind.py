@@ -228,6 +228,8 @@ def retrieve_wind(
         flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
     if chosen.reach:
         apart = unrelated([pixels1, pixels2], windows, chosen.reach > 1, noise)
+        # a field that is fitted as a whole is asked no more than whether images are related at all
+        apart = apart if chosen.local else apart.all().expand_as(apart)
         flag = flag | (Flag.UNRELATED * apart).to(torch.int16)
     attributes = {
         "method": method,
