@@ -81,15 +81,9 @@ def unrelated(
     observed = search.score(first, second)
     rolls = _ROLLS[: 8 if observed.numel() < _FEW_WINDOWS else 3]
     turned = second.flip(tuple(range(second.ndim)))
-    thirds = [n // 3 for n in second.shape[-2:]]
-    chance = torch.stack(
-        [
-            search.score(
-                first, turned.roll([n * third for n, third in zip(roll, thirds)], (-2, -1))
-            )
-            for roll in rolls
-        ]
-    )
+    rows, columns = (n // 3 for n in second.shape[-2:])
+    others = [turned.roll((i * rows, j * columns), (-2, -1)) for i, j in rolls]
+    chance = torch.stack([search.score(first, other) for other in others])
     excess = _excess(observed, chance, search.known)
     regions = max(1.0, observed.numel() / _REGION**windows.dims)
     least = float(stdtrit((len(rolls) - 1) * regions, 1 - false_alarm))

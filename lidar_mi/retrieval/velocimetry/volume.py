@@ -121,9 +121,9 @@ def retrieve_wind_volume(
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, spacing=apart, continued=True)
         flag = flag | (Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
-    apart = unrelated(volumes, windows, False, noise)
-    apart = apart if method == "correlation" else apart.all().expand_as(apart)
-    flag = flag | (Flag.UNRELATED * apart).to(torch.int16)
+    # shear lowers the correlation of windows as large as a volume is thick: only the whole is asked
+    if bool(unrelated(volumes, windows, False, noise).all()):
+        flag = flag | Flag.UNRELATED.value
     found = found._replace(flag=flag)
     variables = winds(found, AXES, steps, dt)
     long_name = "correlation of the volumes warped to mid-time"
