@@ -112,19 +112,19 @@ def complete(prepared: Run, folder: str | Path | None = None, *, overwrite: bool
         return _complete(prepared, None)
     prepared.folder = Path(folder)
     kept = RunFolder(folder, prepared.experiment, prepared.results["beside"])
-    kept.claim(overwrite)
-    log = prepared.log
-    log.path = kept.log
-    log(
-        f"lidar-mi {__version__}, experiment {prepared.experiment.name}, "
-        f"seed {prepared.experiment.seed}"
-    )
-    try:
-        return _complete(prepared, kept)
-    except Exception as error:
-        if not is_interrupt(error):
-            log.fail(error)
-        raise
+    with kept.claimed(overwrite):
+        log = prepared.log
+        log.path = kept.log
+        log(
+            f"lidar-mi {__version__}, experiment {prepared.experiment.name}, "
+            f"seed {prepared.experiment.seed}"
+        )
+        try:
+            return _complete(prepared, kept)
+        except Exception as error:
+            if not is_interrupt(error):
+                log.fail(error)
+            raise
 
 
 def _complete(run: Run, kept: RunFolder | None) -> Run:

@@ -1,8 +1,10 @@
 """The folder of a run: whose it is, which file belongs to which result, how far it came."""
 
 import hashlib
+import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,8 @@ from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.truth import find_file
 from lidar_mi.instrument.detector_noise import without_noise
 from lidar_mi.io import exr
-from lidar_mi.io.json import read_json, write_json
+from lidar_mi.io.folder import is_free, locked, make_folder
+from lidar_mi.io.json import read_json, to_json
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.io.text import write_text
 from lidar_mi.io.vortex_file import write_vortices
@@ -42,6 +45,8 @@ RESULTS = {
 
 # other versions of these may give other images
 _RENDERED_BY = ("lidar-mi", "mitsuba", "drjit")
+MADE_BY = "run_sha256"
+"""Attribute of every result: what made it, as of `RunFolder.made_by`."""
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "torch", "kornia", "OpenEXR", "xarray")
 
 
@@ -57,6 +62,14 @@ class RunFolder:
     experiment : Experiment
     beside : path
         Folder in which files named by the experiment are looked for first.
+
+    Attributes
+    ----------
+    record : dict
+        The experiment, checksums of its files, versions.
+    made_by : str
+        SHA-256 of what decides over the images in the record. Every result carries it; one that
+        carries another is none of this run.
     """
 
     def __init__(self, path: str | Path, experiment: Experiment, beside: str | Path):
@@ -73,54 +86,87 @@ class RunFolder:
                 **{name: version(name) for name in _LIBRARIES},
             },
         }
+        self.made_by = _made_by(self.record)
 
-    def claim(self, overwrite: bool) -> None:
-        """Make the folder this experiment's, keeping images of the very same one.
+    @contextmanager
+    def claimed(self, overwrite: bool) -> Iterator[None]:
+        """Make the folder this run's alone, keeping images of the very same experiment.
 
         Raises
         ------
         InputError
-            The folder holds images of another experiment or version, and ``overwrite`` is not set;
-            or it is no run folder.
+            Another run is at work in the folder; it holds images of another experiment or version,
+            and ``overwrite`` is not set; or it is no run folder.
         """
+        refuse_strangers(self.path, RECORD, "run folder")
+        make_folder(self.path)
+        with locked(self.path):
+            # who held the lock before may have made it another's
+            refuse_strangers(self.path, RECORD, "run folder")
+            self._begin(overwrite)
+            yield
+
+    def _begin(self, overwrite: bool) -> None:
+        """Write the record; of what an earlier run left, keep what is of this experiment."""
         folder, marker = self.path, self.path / RECORD
-        if marker.is_file():
-            other = _difference(read_record(folder), self.record)
-            if other:
-                images = [path for pattern in RENDERED for path in folder.glob(pattern)]
-                if images and not overwrite:
-                    raise InputError(
-                        f"{folder}: holds a run of {other}; expected an empty folder (-o DIR), or "
-                        "--overwrite to replace it"
-                    )
-                # nothing of the other experiment may be taken for a result of this one
-                old = [folder / name for name in (*RESULTS.values(), METRICS, REPORT, LOG)]
-                for path in (*images, *old, *self.figures.glob("*.png")):
-                    path.unlink(missing_ok=True)
-        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise InputError(f"{folder}: is no run folder; expected an empty or a new one (-o DIR)")
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
+        images = [path for pattern in RENDERED for path in folder.glob(pattern)]
+        results = [folder / name for name in (METRICS, REPORT, *RESULTS.values())]
+        results = [path for path in results if path.exists()]
+        other = _difference(read_record(folder), self.record) if marker.is_file() else None
+        foreign = [path for path in images if self._is_foreign(path)]
+        if other:
+            what, old = f"a run of {other}", [*results, *images]
+        else:
+            what, old = f"{foreign[0].name} of another experiment" if foreign else "", foreign
+        if old and not overwrite:
+            raise InputError(
+                f"{folder}: holds {what}; expected an empty folder (-o DIR), or --overwrite to "
+                "replace it"
+            )
+        # nothing of another experiment may be taken for a result of this one
+        drawn = [self.log, *self.figures.glob("*.png")] if other else []
+        for path in (*old, *drawn):
+            path.unlink(missing_ok=True)
         write_text(marker, to_yaml(self.record))
 
     def kept(self, part: str) -> xr.Dataset | None:
-        """A rendered image, without a detector's noise; None: it is not there."""
+        """A rendered image, without a detector's noise; None: it is not there.
+
+        Raises
+        ------
+        InputError
+            It was made by another experiment or version.
+        """
         path = self._image(part)
         if not path.is_file():
             return None
-        if part in rendering.IMAGES:
-            return without_noise(exr.read_scan(path))
-        return exr.read_fringes(path)
+        try:
+            image = exr.read_scan(path) if part in rendering.IMAGES else exr.read_fringes(path)
+        except InputError:  # damaged: it is rendered again
+            return None
+        if image.attrs.pop(MADE_BY, None) != self.made_by:
+            raise InputError(
+                f"{path}: was made by another experiment; expected the image of this one"
+            )
+        return without_noise(image) if part in rendering.IMAGES else image
 
     def keep_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
         """Write a rendered image; returns it as it is read."""
         write = exr.write_scan if part in rendering.IMAGES else exr.write_fringes
-        write(self._image(part), value)
+        write(self._image(part), self._signed(value))
         kept = self.kept(part)
         assert kept is not None
         return kept
+
+    def _signed(self, value: xr.Dataset) -> xr.Dataset:
+        return value.assign_attrs({MADE_BY: self.made_by})
+
+    def _is_foreign(self, image: Path) -> bool:
+        """Whether an image was made by something else, or cannot be read."""
+        try:
+            return exr.read_header(image).get(MADE_BY) != self.made_by
+        except InputError:
+            return True
 
     def keep(self, name: str, value: Any) -> None:
         """Write a result into its file, if it has one; None: there is no such result."""
@@ -133,14 +179,18 @@ class RunFolder:
             path.unlink(missing_ok=True)
         elif name == "vortices":
             about = {"experiment": self._experiment.name, "source": f"lidar-mi {__version__}"}
-            write_vortices(path, value.pairs, **about)
+            write_vortices(path, value.pairs, **about, **{MADE_BY: self.made_by})
         else:
-            write_netcdf(value, path)
+            write_netcdf(self._signed(value), path)
 
     def keep_verdict(self, metrics: Mapping[str, float], page: str) -> None:
-        """Write metrics and report: the run is done."""
-        write_json(self.path / METRICS, metrics)
+        """Write report and metrics: the run is done. The record says which metrics are its own."""
+        text = to_json(metrics)
+        (self.path / METRICS).unlink(missing_ok=True)
+        record = self.record | {"metrics": hashlib.sha256(text.encode()).hexdigest()}
+        write_text(self.path / RECORD, to_yaml(record))
         write_text(self.path / REPORT, page)
+        write_text(self.path / METRICS, text)
 
     def _image(self, part: str) -> Path:
         return self.path / f"{part}.exr"
@@ -149,7 +199,29 @@ class RunFolder:
         """Put noisy images beside those without noise, in the same files."""
         for part, scan in zip(rendering.IMAGES, scans, strict=True):
             if "Y_noisy" in scan and "Y_noisy" not in exr.read_scan(self._image(part)):
-                exr.write_scan(self._image(part), scan)
+                exr.write_scan(self._image(part), self._signed(scan))
+
+
+def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
+    """Leave a folder alone that holds something else than what a file in it stands for.
+
+    Raises
+    ------
+    InputError
+        The folder is not empty, and the marker is not in it.
+    """
+    if not (folder / marker).is_file() and not is_free(folder):
+        raise InputError(f"{folder}: is no {kind}; expected an empty or a new one (-o DIR)")
+
+
+def _made_by(record: dict) -> str:
+    """Hash of the parts of a record that decide over what is rendered."""
+    decisive = {
+        "experiment": record["experiment"],
+        "files": record["files"],
+        "versions": {name: record["versions"][name] for name in _RENDERED_BY},
+    }
+    return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
 
 
 def _difference(before: dict, now: dict) -> str | None:
@@ -170,7 +242,11 @@ def _checksums(experiment: Experiment, beside: str | Path) -> dict[str, str]:
     paths = table_files(experiment.scattering, beside)
     if experiment.wake.file:
         paths["wake.file"] = find_file(experiment.wake.file, beside, "wake.file")
-    return {field: hashlib.sha256(path.read_bytes()).hexdigest() for field, path in paths.items()}
+    return {field: _checksum(path) for field, path in paths.items()}
+
+
+def _checksum(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def read_record(folder: str | Path) -> dict:
@@ -201,14 +277,21 @@ def read_metrics(folder: str | Path) -> dict[str, float] | None:
     Raises
     ------
     InputError
-        The folder's metrics.json was not written by a run.
+        The folder's metrics.json was not written by its run.
     """
-    path = Path(folder) / METRICS
+    path, marker = Path(folder) / METRICS, Path(folder) / RECORD
     if not path.is_file():
         return None
     metrics = read_json(path, "metrics of a run")
     if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
         raise InputError(f"{path}: not written by a run; expected names with numbers")
+    if marker.is_file():  # which a study has not
+        checksum = read_record(folder).get("metrics", "")
+        if checksum is None:  # of an earlier run; this one is not done
+            return None
+        # older versions wrote no checksum
+        if checksum and checksum != _checksum(path):
+            raise InputError(f"{path}: was changed or copied here; expected the metrics of its run")
     return {current_name(key): value for key, value in metrics.items()}
 
 

@@ -17,9 +17,18 @@ from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.log import Log, Notice, silent
 from lidar_mi.experiment.reading import dump
 from lidar_mi.experiment.results import Run
-from lidar_mi.experiment.run_folder import FIGURES, LOG, METRICS, REPORT, read_metrics, read_record
+from lidar_mi.experiment.run_folder import (
+    FIGURES,
+    LOG,
+    METRICS,
+    REPORT,
+    read_metrics,
+    read_record,
+    refuse_strangers,
+)
 from lidar_mi.experiment.run_folder import RECORD as RUN
 from lidar_mi.experiment.schema import NAME, Experiment
+from lidar_mi.io.folder import locked, make_folder
 from lidar_mi.io.json import write_json
 from lidar_mi.io.text import write_text
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
@@ -52,33 +61,32 @@ def run(
         Bad input in any of the variants, or a folder that holds something else.
     """
     folder = Path(folder)
-    free = not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
-    if not free and not (folder / RECORD).is_file():
-        raise InputError(f"{folder}: is no study's folder; expected an empty or a new one (-o DIR)")
+    refuse_strangers(folder, RECORD, "study's folder")
     # what is wrong with the last one is said before the first one has taken its time
     ready = {
         key: experiment.prepare(one, beside, _of(key, notice)) for key, one in variants.items()
     }
     settings = {key: parse_yaml(dump(one), key) for key, one in variants.items()}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror})") from None
-    write_text(folder / RECORD, to_yaml({"name": name, "variants": list(variants)}))
-    metrics, rows = {}, {}
-    for key in variants:
-        done = experiment.complete(ready.pop(key), folder / key, overwrite=overwrite)
-        metrics[key] = done.metrics
-        # a variant without a wake has rings only, which the table compares
-        if done.wind is not None:
-            rows[key] = _shown(done)
-    log = Log(notice, folder / LOG)
-    log(f"comparing {', '.join(variants)}")
-    drawn = draw_comparison(folder / FIGURES, rows, log) if rows else []
-    merged = {f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()}
-    write_json(folder / METRICS, merged)
-    write_text(folder / REPORT, page(name, settings, metrics, drawn))
-    log("done")
+    make_folder(folder)
+    with locked(folder):
+        refuse_strangers(folder, RECORD, "study's folder")
+        write_text(folder / RECORD, to_yaml({"name": name, "variants": list(variants)}))
+        metrics, rows = {}, {}
+        for key in variants:
+            done = experiment.complete(ready.pop(key), folder / key, overwrite=overwrite)
+            metrics[key] = done.metrics
+            # a variant without a wake has rings only, which the table compares
+            if done.wind is not None:
+                rows[key] = _shown(done)
+        log = Log(notice, folder / LOG)
+        log(f"comparing {', '.join(variants)}")
+        drawn = draw_comparison(folder / FIGURES, rows, log) if rows else []
+        merged = {
+            f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()
+        }
+        write_json(folder / METRICS, merged)
+        write_text(folder / REPORT, page(name, settings, metrics, drawn))
+        log("done")
     return metrics
 
 

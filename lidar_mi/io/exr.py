@@ -130,6 +130,11 @@ def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> Non
     write_atomically(path, lambda part: OpenEXR.File(header, singles).write(str(part)))
 
 
+def read_header(path: str | Path) -> dict:
+    """Header attributes of any EXR file; errors as of `read_layers`."""
+    return _read(path, header_only=True)[0]
+
+
 def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
     """Header attributes and all layers of any EXR file, rows from the top.
 
@@ -138,6 +143,10 @@ def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
     InputError
         There is no such file, or it is no readable EXR.
     """
+    return _read(path)
+
+
+def _read(path: str | Path, *, header_only: bool = False) -> tuple[dict, dict[str, np.ndarray]]:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an OpenEXR image")
@@ -147,12 +156,13 @@ def read_layers(path: str | Path) -> tuple[dict, dict[str, np.ndarray]]:
         raise InputError(f"{path}: not a readable OpenEXR image ({error})") from None
     check_size(path, size)
     try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
+        with OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file:
             header = {k: v for k, v in file.header().items() if k not in _STRUCTURE}
-            layers = {k: np.array(c.pixels) for k, c in file.channels().items()}
+            channels = {} if header_only else file.channels()
+            layers = {k: np.array(c.pixels) for k, c in channels.items()}
     except Exception:  # whatever the library meets in a damaged file
         raise InputError(f"{path}: not a readable OpenEXR image") from None
-    if len({pixels.shape for pixels in layers.values()}) != 1:
+    if not header_only and len({pixels.shape for pixels in layers.values()}) != 1:
         raise InputError(f"{path}: not a readable OpenEXR image (its layers differ in size)")
     return header, layers
 

@@ -29,6 +29,11 @@ def read_json(path: str | Path, expected: str) -> Any:
         raise InputError(f"{path}: not JSON; expected {expected}") from None
 
 
+def to_json(data: Any) -> str:
+    """Plain data as JSON text; NaN and infinity are refused with a ValueError."""
+    return json.dumps(data, indent=1, allow_nan=False) + "\n"
+
+
 def write_json(path: str | Path, data: Any) -> None:
-    """Write a JSON file, whole or not at all; NaN and infinity are refused with a ValueError."""
-    write_text(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+    """Write a JSON file, whole or not at all; errors as of `to_json`."""
+    write_text(path, to_json(data))

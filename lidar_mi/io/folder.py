@@ -1,0 +1,83 @@
+"""Folders of results: made, told from those of others, held by one process at a time."""
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from lidar_mi.errors import InputError
+
+_LOCK = ".lock"
+
+
+def is_free(folder: str | Path) -> bool:
+    """Whether there is no such folder, or nothing in it but what a killed process left."""
+    folder = Path(folder)
+    if not folder.exists():
+        return True
+    return folder.is_dir() and all(path.name == _LOCK for path in folder.iterdir())
+
+
+def make_folder(folder: str | Path) -> None:
+    """Make a folder and those above it, where they are missing.
+
+    Raises
+    ------
+    InputError
+        It cannot be made.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot be made ({error.strerror}); expected a folder to write in"
+        ) from None
+
+
+@contextmanager
+def locked(folder: str | Path) -> Iterator[None]:
+    """Hold a folder while the context lasts.
+
+    The operating system holds the lock (``flock`` on a file in the folder) and releases it when the
+    process ends, however it ends. The file is removed at the end; one that a killed process left
+    means nothing.
+
+    Raises
+    ------
+    InputError
+        Another process, or another thread, holds the folder; or no file can be locked in it.
+    """
+    path = Path(folder) / _LOCK
+    try:
+        descriptor = _take(path)
+    except BlockingIOError:
+        raise InputError(
+            f"{folder}: is in use by another run; expected another folder (-o DIR), or to start "
+            "when that run has ended"
+        ) from None
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot be locked ({error.strerror}); expected a folder to write in"
+        ) from None
+    try:
+        yield
+    finally:
+        # while the lock is held: nobody else can hold a file of this name
+        with suppress(OSError):
+            path.unlink()
+        os.close(descriptor)
+
+
+def _take(path: Path) -> int:
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # its last holder may have removed the file between the two calls
+            if path.exists() and os.path.samestat(path.stat(), os.fstat(descriptor)):
+                return descriptor
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)

@@ -1,0 +1,134 @@
+"""Whose a run folder is: one process at a time, and nothing in it that something else made.
+
+Detects two runs that mix their images, a lock that outlives its process, and images or metrics of
+another experiment that are taken for this one's.
+"""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+from contextlib import contextmanager
+
+import pytest
+
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.run import run
+from lidar_mi.experiment.run_folder import MADE_BY, read_metrics
+from lidar_mi.io.exr import read_scan
+from lidar_mi.io.folder import locked
+from lidar_mi.io.netcdf import read_netcdf
+from tests.support.command_line import shell
+from tests.support.experiments import check, small
+
+
+@contextmanager
+def another_process(folder):
+    """Hold a folder in another process until the context ends or the process is killed."""
+    code = (
+        "import sys; from lidar_mi.io.folder import locked\n"
+        f"with locked({str(folder)!r}):\n    print('held', flush=True)\n    sys.stdin.read()"
+    )
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-c", code], **pipes) as process:
+        assert process.stdout.readline() == b"held\n"
+        yield process
+        process.stdin.close()
+
+
+def test_a_second_run_is_refused_while_the_first_works(tmp_path, quick):
+    """The second has another seed; it comes when the first renders, and changes nothing."""
+    folder, refused = tmp_path / "run", []
+
+    def notice(text, share):
+        if "rendering scan 2" in text and not refused:
+            for overwrite in (False, True):
+                with pytest.raises(InputError, match="in use by another run") as caught:
+                    run(check(small() | {"seed": 2}), folder, overwrite=overwrite)
+                refused.append(caught.value)
+
+    done = run(check(small()), folder, notice=notice)
+    assert len(refused) == 2
+    assert done.metrics == read_metrics(folder)
+    assert read_scan(folder / "image_t2.exr").attrs["seed"] == 1 + (1 << 16)
+    assert not list(folder.glob(".*"))
+
+
+def test_the_lock_dies_with_its_process(tmp_path):
+    with another_process(tmp_path) as process:
+        with pytest.raises(InputError, match="in use"), locked(tmp_path):
+            pytest.fail("held twice")
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        assert (tmp_path / ".lock").exists()  # what is left of it does not matter
+        with locked(tmp_path):
+            pass
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_study_is_refused_in_a_folder_at_work(there):
+    text = (there / "tiny.yaml").read_text() + "variants: {a: {seed: 1}, b: {seed: 2}}\n"
+    (there / "two.yaml").write_text(text)
+    (there / "out").mkdir()
+    with another_process(there / "out"):
+        found = shell("run", "two.yaml", "-o", "out")
+    assert found.returncode == 2 and "out: is in use by another run" in found.stderr
+    assert not list((there / "out").iterdir())
+
+
+def test_images_of_another_seed_are_not_used(tmp_path, quick):
+    folder, other = tmp_path / "run", tmp_path / "other"
+    run(check(small()), folder)
+    run(check(small() | {"seed": 2}), other)
+    shutil.copy(other / "image_t2.exr", folder)
+    with pytest.raises(InputError, match=r"image_t2.exr of another experiment; .*--overwrite"):
+        run(check(small()), folder)
+    assert read_scan(folder / "image_t2.exr").attrs["seed"] == 2 + (1 << 16)  # untouched
+    run(check(small()), folder, overwrite=True)
+    assert read_scan(folder / "image_t2.exr").attrs["seed"] == 1 + (1 << 16)
+
+
+def test_a_damaged_image_is_rendered_again(tmp_path, quick):
+    folder = tmp_path / "run"
+    run(check(small()), folder)
+    image = folder / "image_t1.exr"
+    before = read_scan(image)
+    image.write_bytes(image.read_bytes()[:-1000])
+    run(check(small()), folder)
+    assert (read_scan(image)["S0"] == before["S0"]).all()
+
+
+def test_every_result_says_what_made_it(tmp_path, quick):
+    asked = small() | {"retrieval": {"methods": ["cc", "vortex_fit"]}}
+    hashes = {}
+    for name, seed in (("one", 1), ("again", 1), ("other", 2)):
+        folder = tmp_path / name
+        run(check(asked | {"seed": seed}), folder)
+        hashes[name] = {
+            read_scan(folder / "image_t1.exr").attrs[MADE_BY],
+            read_netcdf(folder / "wind.nc").attrs[MADE_BY],
+            json.loads((folder / "vortex.json").read_text())[MADE_BY],
+        }
+    assert len(hashes["one"]) == 1
+    assert hashes["one"] == hashes["again"] != hashes["other"]
+
+
+def test_metrics_of_another_run_are_not_shown(tmp_path, quick, lidar_mi):
+    folder, other = tmp_path / "run", tmp_path / "other"
+    run(check(small()), folder)
+    run(check(small() | {"seed": 2}), other)
+    assert lidar_mi("info", folder)[0] == 0
+    shutil.copy(other / "metrics.json", folder)
+    code, _, err = lidar_mi("info", folder)
+    assert code == 2 and "metrics.json: was changed or copied here" in err
+
+
+def test_results_without_images_are_not_replaced_unasked(tmp_path, quick):
+    folder = tmp_path / "run"
+    run(check(small()), folder)
+    for image in folder.glob("*.exr"):
+        image.unlink()
+    with pytest.raises(InputError, match="holds a run of another experiment"):
+        run(check(small() | {"seed": 2}), folder)
+    assert (folder / "wind.nc").is_file()
