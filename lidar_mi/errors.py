@@ -45,6 +45,20 @@ def _escaped(character: str) -> str:
     return character.encode("unicode_escape").decode()
 
 
+class Stopped(BaseException):
+    """A signal asks the program to end.
+
+    Attributes
+    ----------
+    number : int
+        Of the signal.
+    """
+
+    def __init__(self, number: int):
+        super().__init__(number)
+        self.number = number
+
+
 def causes(error: BaseException | None) -> Iterator[BaseException]:
     """An exception, the one it came from, and so on."""
     while error is not None:
@@ -57,4 +71,11 @@ def is_interrupt(error: BaseException) -> bool:
 
     Libraries put exceptions of their own in the place of ``KeyboardInterrupt``.
     """
-    return any(isinstance(cause, KeyboardInterrupt) for cause in causes(error))
+    return any(isinstance(cause, KeyboardInterrupt | Stopped) for cause in causes(error))
+
+
+def notes(error: BaseException) -> list[str]:
+    """What was added to an exception and to those it came from, each note once."""
+    return list(
+        dict.fromkeys(note for cause in causes(error) for note in getattr(cause, "__notes__", ()))
+    )

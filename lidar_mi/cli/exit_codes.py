@@ -1,46 +1,77 @@
-"""From exceptions to one printable line on stderr and an exit code."""
+"""From exceptions and signals to one printable line on stderr and an exit code."""
 
+import os
+import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
 from typing import Any, NoReturn
 
 import typer
 
 from lidar_mi.cli.terminal import errors
-from lidar_mi.errors import InputError, causes, is_interrupt, one_line
+from lidar_mi.errors import InputError, Stopped, causes, is_interrupt, notes, one_line
 
 BAD_INPUT = 2
-INTERRUPTED = 130
+BY_SIGNAL = 128
+"""And the number of the signal."""
 
-_STOPPED = "stopped; start it again to resume the run"
+STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+TRACEBACK = "LIDAR_MI_TRACEBACK"
+"""Environment variable; set, it lets the traceback of any error through."""
 
 # what typer finds wrong with arguments and options, whichever library it takes this from
 _USAGE_ERROR = typer.BadParameter.__mro__[1]
 
 
 def exit_by(app: Callable[..., int | None]) -> None:
-    """Run a typer app; bad input ends it with one line and exit code 2, Ctrl-C with 130."""
+    """Run a typer app; what ends it before its end is said in one line.
+
+    Exit code 2: bad input, a disk or a file that fails, too little memory, equations that have no
+    solution. Exit code 128 + n: signal n (Ctrl-C, SIGTERM, SIGHUP).
+    """
     try:
-        code = app(standalone_mode=False)
-    except InputError as error:
-        _fail(str(error), BAD_INPUT)
+        with _raised_signals():
+            code = app(standalone_mode=False)
     except BaseException as error:
         if isinstance(error, _USAGE_ERROR):
             _fail_usage(error)
-        if is_interrupt(error):
-            _fail(_STOPPED, INTERRUPTED)
-        message = _plugin_message(error)
-        if message is None:
+        stop = _stop(error)
+        if stop is not None:
+            word = "stopped" if stop == signal.SIGINT else f"stopped by {signal.Signals(stop).name}"
+            _fail("; ".join([word, *notes(error)]), BY_SIGNAL + stop)
+        message = _message(error)
+        if message is None or (os.environ.get(TRACEBACK) and not isinstance(error, InputError)):
             raise
-        _fail(message, BAD_INPUT)
-    if code == INTERRUPTED:  # typer catches Ctrl-C
-        _fail(_STOPPED, INTERRUPTED)
+        _fail("; ".join([message, *notes(error)]), BAD_INPUT)
     sys.exit(code or 0)
+
+
+def _message(error: BaseException) -> str | None:
+    """What to say of an error; None: it is one of the program."""
+    if isinstance(error, InputError):
+        return str(error)
+    if isinstance(error, OSError):
+        names = [str(name) for name in (error.filename, error.filename2) if name is not None]
+        return ": ".join([*names, error.strerror or str(error)])
+    if isinstance(error, MemoryError):
+        return (
+            f"not enough memory ({one_line(error, 100) or 'in all'}); expected fewer beams, gates "
+            "or samples, or a larger machine"
+        )
+    # numpy, scipy and torch have each their own
+    if type(error).__name__.lstrip("_") == "LinAlgError":
+        reason = one_line(error, 100)
+        return f"equations without a solution ({reason}); expected data that determine it"
+    return _plugin_message(error)
 
 
 def _fail(message: str, code: int) -> NoReturn:
     line = one_line(message)
-    errors.print(f"lidar-mi: {line}", style="red", highlight=False, soft_wrap=True)
+    with suppress(OSError):  # the terminal may be gone
+        errors.print(f"lidar-mi: {line}", style="red", highlight=False, soft_wrap=True)
     sys.exit(code)
 
 
@@ -52,6 +83,30 @@ def _fail_usage(error: Any) -> NoReturn:
     name = error.ctx.command_path if error.ctx else "lidar-mi"
     hint = f"{' See' if message.endswith('?') else '; see'} {name} --help"
     _fail(f"{message[0].lower()}{message[1:]}{hint}", BAD_INPUT)
+
+
+@contextmanager
+def _raised_signals() -> Iterator[None]:
+    """Let signals that ask for the end raise `Stopped`, but those that are ignored (nohup)."""
+    before = {number: signal.getsignal(number) for number in STOPPING}
+    caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
+    try:
+        for number in caught:
+            signal.signal(number, _raise_stopped)
+        yield
+    finally:
+        for number in caught:
+            signal.signal(number, before[number])
+
+
+def _raise_stopped(number: int, frame: FrameType | None) -> None:
+    raise Stopped(number)
+
+
+def _stop(error: BaseException) -> int | None:
+    """The signal that stopped the program; None: none did."""
+    stops = [cause for cause in causes(error) if isinstance(cause, Stopped)]
+    return stops[0].number if stops else signal.SIGINT if is_interrupt(error) else None
 
 
 def _plugin_message(error: BaseException) -> str | None:

@@ -1,10 +1,14 @@
 """What a run says while it runs: to its log file and to the person in front of the screen."""
 
+import os
 import re
 import time
+import traceback
+from contextlib import suppress
 from pathlib import Path
 
-from lidar_mi.errors import one_line, printable
+from lidar_mi.errors import InputError, one_line, printable
+from lidar_mi.io.text import encoded
 from lidar_mi.progress import Notice
 
 FAILED = "failed: "
@@ -31,10 +35,14 @@ class Log:
         self.warnings: list[str] = []
 
     def __call__(self, text: str) -> None:
-        """Say a line, and write it into the file."""
-        if self.path is not None:
-            with self.path.open("a", encoding="utf-8") as file:
-                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {printable(text)}\n")
+        """Say a line, and write it into the file.
+
+        Raises
+        ------
+        InputError
+            It cannot be written.
+        """
+        self._write(text)
         self.notice(text, None)
 
     def remark(self, text: str) -> None:
@@ -43,12 +51,38 @@ class Log:
         self(f"warning: {text}")
 
     def fail(self, error: Exception) -> None:
-        """Say why the run ended, so that nobody takes it for one that can be resumed."""
-        self(f"{FAILED}{one_line(error) or type(error).__name__}")
+        """Say why the run ended, so that nobody takes it for one that can be resumed.
+
+        Of what is not bad input the traceback is written, too. A disk that takes nothing more has
+        failed already: that it takes no line about it is no other error.
+        """
+        text = f"{FAILED}{one_line(error) or type(error).__name__}"
+        with suppress(InputError):
+            if not isinstance(error, InputError):
+                self._write("".join(traceback.format_exception(error)).rstrip())
+            self._write(text)
+        self.notice(text, None)
 
     def bar(self, text: str, fraction: float | None) -> None:
         """Show progress within a step; not written."""
         self.notice(text, fraction)
+
+    def _write(self, text: str) -> None:
+        if self.path is None:
+            return
+        line = encoded(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {printable(text)}\n")
+        try:
+            with open(self.path, "ab", opener=_no_link) as file:
+                file.write(line)
+        except OSError as error:
+            raise InputError(
+                f"{self.path}: cannot be written ({error.strerror}); expected room for a log"
+            ) from error
+
+
+def _no_link(path: str, flags: int) -> int:
+    """A log that leads elsewhere would grow there."""
+    return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def failure(path: Path) -> str | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from lidar_mi import __version__
 from lidar_mi.assessment.metrics.names import timing_key
 from lidar_mi.assessment.report.page import page
-from lidar_mi.errors import is_interrupt
+from lidar_mi.errors import InputError, is_interrupt
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.measure import measure
 from lidar_mi.experiment.pipeline import stages_of
@@ -21,6 +21,8 @@ from lidar_mi.experiment.run_folder import RunFolder
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Stage, result_of
 from lidar_mi.progress import Notice, progress
+
+RESUMED = "start it again to resume the run"
 
 
 def run(
@@ -121,9 +123,13 @@ def complete(prepared: Run, folder: str | Path | None = None, *, overwrite: bool
         )
         try:
             return _complete(prepared, kept)
-        except Exception as error:
-            if not is_interrupt(error):
+        except BaseException as error:
+            if is_interrupt(error):
+                error.add_note(RESUMED)
+            elif isinstance(error, Exception):
                 log.fail(error)
+                if not isinstance(error, InputError):
+                    error.add_note(f"traceback in {log.path}")
             raise
 
 

@@ -20,10 +20,11 @@ from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.truth import find_file
 from lidar_mi.instrument.detector_noise import without_noise
 from lidar_mi.io import exr
+from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.folder import is_free, locked, make_folder
 from lidar_mi.io.json import read_json, to_json
 from lidar_mi.io.netcdf import write_netcdf
-from lidar_mi.io.text import write_text
+from lidar_mi.io.text import encoded, write_text
 from lidar_mi.io.vortex_file import write_vortices
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
 from lidar_mi.rendering.phase import table_files
@@ -124,10 +125,14 @@ class RunFolder:
                 "replace it"
             )
         # nothing of another experiment may be taken for a result of this one
-        drawn = [self.log, *self.figures.glob("*.png")] if other else []
-        for path in (*old, *drawn):
-            path.unlink(missing_ok=True)
-        write_text(marker, to_yaml(self.record))
+        drawn = [*self.figures.glob("*.png"), self.log] if other else []
+
+        def remove_old() -> None:
+            for path in (*old, *drawn):
+                path.unlink(missing_ok=True)
+
+        # if the disk is full, the earlier run stays as it is
+        write_atomically(marker, encoded(to_yaml(self.record)), first=remove_old)
 
     def kept(self, part: str) -> xr.Dataset | None:
         """A rendered image, without a detector's noise; None: it is not there.

@@ -1,25 +1,105 @@
-"""Files that are never half written."""
+"""Files that are never half written, and that last once they are there."""
 
+import errno
 import os
+import platform
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import count
 from pathlib import Path
 
+from lidar_mi.errors import InputError
 
-def write_atomically(path: str | Path, write: Callable[[Path], object]) -> None:
-    """Let ``write`` make a file under a temporary name beside the final one, then rename it.
+# of a process that was killed while it wrote, only such a file can be left
+TEMPORARY = ".lidar-mi.*.part"
 
-    An error leaves the file that was there before as it was.
+_numbers = count()
+
+
+def write_atomically(
+    path: str | Path, content: bytes | memoryview, first: Callable[[], object] | None = None
+) -> None:
+    """Write a file under a temporary name beside the final one, sync it to the disk, rename it.
+
+    Until the file is renamed, an error or a kill leaves what was there before as it was. When this
+    function returns, the file outlasts a loss of power. Temporary files of killed processes in the
+    same folder are removed.
 
     Parameters
     ----------
     path : str or Path
-    write : callable
-        Called with the temporary path, whose suffix is that of ``path``.
+    content : bytes
+        All of the file.
+    first : callable, optional
+        Called when the content is on the disk, before the file is renamed.
+
+    Raises
+    ------
+    InputError
+        The file cannot be written there, or something else than a file is in its place.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
-        write(temporary)
-        temporary.replace(path)
+        if not path.parent.is_dir():
+            raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: is no ordinary file; expected a file or a new name")
+        _remove_leftovers(path.parent)
+        temporary = path.with_name(f"{_own_prefix()}{os.getpid()}.{next(_numbers)}.part")
+        try:
+            _write_synced(temporary, content)
+            if first:
+                first()
+            os.replace(temporary, path)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink()
+            raise
+        sync_folder(path.parent)
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); expected a folder to write in, with "
+            "room left"
+        ) from error
+
+
+def sync_folder(folder: str | Path) -> None:
+    """Let names in a folder last: without it, a loss of power may undo that a file was renamed."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        # file systems that cannot sync a folder
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
     finally:
-        temporary.unlink(missing_ok=True)
+        os.close(descriptor)
+
+
+def _write_synced(path: Path, content: bytes | memoryview) -> None:
+    with path.open("xb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _own_prefix() -> str:
+    return f".lidar-mi.{platform.node()}."
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Remove temporary files of processes of this machine that are no more."""
+    for path in folder.glob(TEMPORARY):
+        process = path.name.removeprefix(_own_prefix()).split(".")[0]
+        if path.name.startswith(_own_prefix()) and process.isdigit() and not _lives(int(process)):
+            path.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):  # someone else's; no process has such a number
+        return True
+    return True

@@ -14,6 +14,7 @@ typed header attributes: those of the data set, which `lidar_mi.rendering.backsc
 """
 
 import re
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -56,9 +57,9 @@ _STRUCTURE = {
 def write_scan(path: str | Path, scan: xr.Dataset) -> None:
     """Write a scan: S0 ... S3, S0_stderr with dims (gate, z, y), and Y with dims (z, y).
 
-    The file is written under a temporary name and renamed, so that no broken file is left. Values
-    are float32. Attributes of the dataset become header attributes: float, int, text, and lists of
-    floats keep their type.
+    The file is written whole or not at all; errors as of `write_atomically`. Values are float32.
+    Attributes of the dataset become header attributes: float, int, text, and lists of floats keep
+    their type.
     """
     path = Path(path)
     pilot = scan.transpose("gate", "z", "y").sortby(["z", "y"], ascending=False)
@@ -127,7 +128,9 @@ def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> Non
                 f"{path}: layer {name} has values beyond {np.finfo(np.float32).max:.3g}, the "
                 "largest of an EXR file; expected smaller ones"
             )
-    write_atomically(path, lambda part: OpenEXR.File(header, singles).write(str(part)))
+    buffer = BytesIO()
+    OpenEXR.File(header, singles).write(buffer)
+    write_atomically(path, buffer.getvalue())
 
 
 def read_header(path: str | Path) -> dict:

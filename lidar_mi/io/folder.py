@@ -7,6 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lidar_mi.errors import InputError
+from lidar_mi.io.atomic import TEMPORARY, sync_folder
 
 _LOCK = ".lock"
 
@@ -16,7 +17,9 @@ def is_free(folder: str | Path) -> bool:
     folder = Path(folder)
     if not folder.exists():
         return True
-    return folder.is_dir() and all(path.name == _LOCK for path in folder.iterdir())
+    return folder.is_dir() and all(
+        path.name == _LOCK or path.match(TEMPORARY) for path in folder.iterdir()
+    )
 
 
 def make_folder(folder: str | Path) -> None:
@@ -27,8 +30,11 @@ def make_folder(folder: str | Path) -> None:
     InputError
         It cannot be made.
     """
+    folder = Path(folder)
     try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
+        if not folder.is_dir():
+            folder.mkdir(parents=True)
+            sync_folder(folder.parent)
     except OSError as error:
         raise InputError(
             f"{folder}: cannot be made ({error.strerror}); expected a folder to write in"

@@ -94,16 +94,15 @@ def _damaged(path, error):
 def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
     """Write a data set as compressed NetCDF-4, whole or not at all.
 
+    The file is composed in memory: HDF5 does not survive a disk that is full.
+
     Raises
     ------
     InputError
-        No folder to write into.
+        As of `write_atomically`.
     """
-    path = Path(path)
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
     packed: dict[Any, dict[str, Any]]
     packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
     # CF 2.5.1: no missing values in coordinate variables
     packed |= {name: {"_FillValue": None} for name in data.coords if name in data.dims}
-    write_atomically(path, lambda part: data.to_netcdf(part, engine="h5netcdf", encoding=packed))
+    write_atomically(path, data.to_netcdf(engine="h5netcdf", encoding=packed))

@@ -20,11 +20,15 @@ def write_png(figure: Figure, path: str | Path, *, cropped: bool = False) -> Non
         Without the room around the panels, but for 0.1 inch: panels of equal scales leave much.
     """
     room: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.1} if cropped else {}
-    write_atomically(path, lambda part: figure.savefig(part, dpi=110, format="png", **room))
+    write_atomically(path, _png(figure, dpi=110, **room))
 
 
 def png_bytes(figure: Figure) -> bytes:
     """A figure as a small PNG file in memory, 70 dots per inch, cropped."""
+    return _png(figure, dpi=70, bbox_inches="tight", pad_inches=0.1)
+
+
+def _png(figure: Figure, **options: Any) -> bytes:
     buffer = BytesIO()
-    figure.savefig(buffer, dpi=70, format="png", bbox_inches="tight", pad_inches=0.1)
+    figure.savefig(buffer, format="png", **options)
     return buffer.getvalue()

@@ -45,5 +45,10 @@ def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file, whole or not at all."""
-    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+    """Write a text file, whole or not at all; errors as of `write_atomically`."""
+    write_atomically(path, encoded(text))
+
+
+def encoded(text: str) -> bytes:
+    """Text as UTF-8; of names of files, bytes that are not UTF-8 are spelled out."""
+    return text.encode("utf-8", "backslashreplace")

@@ -3,7 +3,9 @@
 Detects: a flipped or transposed image, a layer under another's name, any bit of float32 lost.
 """
 
+import errno
 import math
+import os
 import re
 import shutil
 import subprocess
@@ -14,7 +16,6 @@ import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.io import exr
 from lidar_mi.io.exr import QUANTITIES, label_scan, read_layers, read_scan, write_scan
 
 ATTRIBUTES = {
@@ -289,14 +290,11 @@ class TestFailedWrites:
         write_scan(path, make_scan(seed=1))
         before = path.read_bytes()
 
-        class Half(OpenEXR.File):
-            def write(self, name):
-                with open(name, "wb") as file:
-                    file.write(b"v/1\x01")
-                raise OSError("no space left on device")
+        def fail(_):
+            raise OSError(errno.ENOSPC, "No space left on device")
 
-        monkeypatch.setattr(exr.OpenEXR, "File", Half)
-        with pytest.raises(OSError, match="no space left"):
+        monkeypatch.setattr(os, "fsync", fail)
+        with pytest.raises(InputError, match="No space left"):
             write_scan(path, make_scan(seed=2))
         assert path.read_bytes() == before
         assert list(tmp_path.iterdir()) == [path]

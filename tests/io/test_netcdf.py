@@ -1,6 +1,9 @@
 """NetCDF files: unit tests. Detect a value or a fill value changed on the way, a file half written,
 and any damaged file that does not give one clear line."""
 
+import subprocess
+import sys
+
 import h5py
 import numpy as np
 import pytest
@@ -73,18 +76,23 @@ def test_missing_file_is_named(tmp_path):
         open_netcdf(tmp_path / "no.nc")
 
 
-def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
-    data = xr.Dataset({"v": ("y", [1.0, 2.0])})
-    write_netcdf(data, tmp_path / "wind.nc")
-
-    def half(self, path, **_):
-        path.write_bytes(b"half a fi")
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(xr.Dataset, "to_netcdf", half)
-    with pytest.raises(KeyboardInterrupt):
-        write_netcdf(data * 2, tmp_path / "wind.nc")
-    monkeypatch.undo()
+def test_a_full_disk_leaves_the_old_file_and_the_process_alive(tmp_path):
+    """In a process of its own, which HDF5 would take down: no file may grow beyond 100 kB."""
+    path = tmp_path / "wind.nc"
+    write_netcdf(DATA, path)
+    code = f"""
+import resource, numpy as np, xarray as xr
+from lidar_mi.errors import InputError
+from lidar_mi.io.netcdf import write_netcdf
+resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))
+data = xr.Dataset({{"v": ("y", np.random.default_rng(1).random(100_000))}})
+try:
+    write_netcdf(data, {str(path)!r})
+except InputError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"{path}: cannot be written (File too large)")
     assert [p.name for p in tmp_path.iterdir()] == ["wind.nc"]
-    with xr.open_dataset(tmp_path / "wind.nc") as kept:
-        assert kept["v"].values.tolist() == [1.0, 2.0]
+    xr.testing.assert_identical(read_netcdf(path), DATA)

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 
+import pytest
 import xarray as xr
 
 from lidar_mi.io.exr import read_scan
@@ -80,7 +81,15 @@ def test_names_are_no_markup(there, lidar_mi):
     assert code == 2 and "[b]x: is no run folder" in err and "Traceback" not in err
 
 
-def test_ctrl_c_stops_cleanly_and_the_run_goes_on(there):
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (signal.SIGINT, "stopped"),
+        (signal.SIGTERM, "stopped by SIGTERM"),
+        (signal.SIGHUP, "stopped by SIGHUP"),
+    ],
+)
+def test_a_signal_stops_cleanly_and_the_run_goes_on(there, number, said):
     """In the middle of rendering, where Dr.Jit puts its own exception in the interrupt's place."""
     slow = [
         "run",
@@ -98,16 +107,16 @@ def test_ctrl_c_stops_cleanly_and_the_run_goes_on(there):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         # a shell's background job inherits ignored interrupts
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
     ) as process:
         seen = []
         for line in process.stderr:
             seen.append(line)
             if "rendering scan 1" in line:
                 break
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         _, err = process.communicate(timeout=60)
-    assert process.returncode == 130, seen
-    assert err.splitlines()[-1] == "lidar-mi: stopped; start it again to resume the run"
+    assert process.returncode == 128 + number, seen
+    assert err.splitlines()[-1] == f"lidar-mi: {said}; start it again to resume the run"
     assert "Traceback" not in err
     assert sorted(p.name for p in (there / "run").iterdir()) == ["experiment.yaml", "log.txt"]

@@ -9,6 +9,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from lidar_mi.io.folder import make_folder
 from lidar_mi.io.png import write_png
 
 
@@ -23,7 +24,7 @@ class Drawn:
 
 def save_all(folder: Path, plates, log: Callable) -> list[Drawn]:
     """Save plates, each (file name, title, (figure, caption)), as PNG."""
-    folder.mkdir(exist_ok=True)
+    make_folder(folder)
     drawn = []
     for index, (name, title, (figure, caption)) in enumerate(plates):
         log.bar(f"drawing {title.lower()}", index / len(plates))
