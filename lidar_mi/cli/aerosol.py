@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import quantity
+from lidar_mi.cli.options import Overwrite, quantity
 from lidar_mi.cli.terminal import output, print_rows
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
@@ -73,6 +73,7 @@ def aerosol(
             min=2, help="Sizes to average over. Default: 128 (spheroids), 10000 (spheres)."
         ),
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Make the scattering table of an aerosol: a named one, or one changed to taste.
 
@@ -85,6 +86,7 @@ def aerosol(
     from lidar_mi.atmosphere.particle_scattering import make_table
     from lidar_mi.atmosphere.scattering import describe
     from lidar_mi.io.scattering_table import write_table
+    from lidar_mi.io.target import check_target
 
     metres = quantity("--wavelength", wavelength, "m", "532 nm")
     particles = changed(
@@ -100,8 +102,7 @@ def aerosol(
         number_density=quantity("--number-density", number_density, "1/m^3", "2e8 / m^3"),
     )
     path = out or Path(f"aerosol_{particles.name}_{metres * 1e9:.0f}nm.txt")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
+    check_target(path, overwrite=overwrite)
     with progress() as notice:
         table = make_table(particles, metres, nodes, notice)
     write_table(table, path)

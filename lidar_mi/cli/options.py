@@ -24,6 +24,10 @@ Variant = Annotated[
     ),
 ]
 
+Overwrite = Annotated[
+    bool, typer.Option("--overwrite", help="Replace a file that is no result of lidar-mi.")
+]
+
 
 @overload
 def quantity(option: str, text: str, unit: str, example: str) -> float: ...

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Variant
+from lidar_mi.cli.options import Overwrite, Variant
 from lidar_mi.cli.terminal import output
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
@@ -30,11 +30,14 @@ def render(
         typer.Option("-D", "--define", metavar="KEY=VALUE", help="Fill in $KEY in the scene."),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
+    overwrite: Overwrite = False,
 ) -> None:
     """Render a Mitsuba scene with the project's plugins, like the `mitsuba` command."""
-    from lidar_mi.rendering.scene import render_file
+    from lidar_mi.io.target import check_target
+    from lidar_mi.rendering.scene import files_of, render_file
 
-    path = out or scene.with_suffix(".exr")
+    path, definitions = out or scene.with_suffix(".exr"), _definitions(define or [])
+    check_target(path, files_of(scene, definitions), overwrite=overwrite)
     with progress() as notice:
         render_file(
             scene,
@@ -42,7 +45,7 @@ def render(
             variant or "llvm_ad_mono_polarized",
             samples,
             seed,
-            _definitions(define or []),
+            definitions,
             lambda fraction: notice(f"rendering {scene.name}", fraction),
         )
     output.print(f"image    {path}")

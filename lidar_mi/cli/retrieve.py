@@ -5,6 +5,7 @@ from typing import Annotated, Any
 
 import typer
 
+from lidar_mi.cli.options import Overwrite
 from lidar_mi.cli.terminal import output, print_rows
 
 EXAMPLES = "Example: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc`"
@@ -46,14 +47,19 @@ def retrieve(
         ),
     ] = None,
     device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
+    overwrite: Overwrite = False,
 ) -> None:
     """Find the cross-flow wind (v, w) in any two images of the same air."""
+    from lidar_mi import __version__
     from lidar_mi.io.images import read_image, read_noise
     from lidar_mi.io.netcdf import write_netcdf
+    from lidar_mi.io.target import check_target
     from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
     from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
-    images = [read_image(path, layer, spacing) for path in (first, second, *(more or []))]
+    paths = (first, second, *(more or []))
+    check_target(out, paths, overwrite=overwrite)
+    images = [read_image(path, layer, spacing) for path in paths]
     pair = on_one_grid(*images[:2])
     level: Any = noise
     if noise is None:
@@ -72,7 +78,7 @@ def retrieve(
         noise=level,
         more=images[2:],
     )
-    write_netcdf(wind, out)
+    write_netcdf(wind.assign_attrs(software=f"lidar-mi {__version__}"), out)
     valid = float((wind["flag"] == 0).mean())
     if "fit" in wind.attrs:
         _print_vortices(wind)

@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from lidar_mi.cli.options import Overwrite
 from lidar_mi.cli.terminal import output, print_table
 from lidar_mi.errors import InputError
 
@@ -32,16 +33,17 @@ def rings(
     saturation: Annotated[
         float | None, typer.Option(help="Value from which on a pixel is full.")
     ] = None,
+    overwrite: Overwrite = False,
 ) -> None:
     """Measure the rings of an etalon in any image: centre, radii, orders, quality of the fit."""
     from lidar_mi.assessment.figures.rings import draw_rings
     from lidar_mi.io.images import read_pixels
     from lidar_mi.io.png import write_png
+    from lidar_mi.io.target import check_target
     from lidar_mi.retrieval.rings.analysis import analyse_rings
 
     path = out or Path(f"{image.stem}_rings.png")
-    if not path.parent.is_dir():
-        raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
+    check_target(path, [image], overwrite=overwrite)
     values = read_pixels(image, layer)
     try:
         found = analyse_rings(values, centre, saturation)

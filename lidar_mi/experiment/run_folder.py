@@ -77,10 +77,11 @@ class RunFolder:
         self.path = Path(path)
         self.figures = self.path / FIGURES
         self.log = self.path / LOG
-        self._experiment = experiment
+        self._experiment, self._beside = experiment, Path(beside)
+        self._inputs = _inputs(experiment, beside)
         self.record: dict[str, Any] = {
             "experiment": parse_yaml(reading.dump(experiment), experiment.name),
-            "files": _checksums(experiment, beside),
+            "files": {field: _checksum(path) for field, path in self._inputs.items()},
             "versions": {
                 "lidar-mi": __version__,
                 "python": platform.python_version(),
@@ -119,6 +120,7 @@ class RunFolder:
             what, old = f"a run of {other}", [*results, *images]
         else:
             what, old = f"{foreign[0].name} of another experiment" if foreign else "", foreign
+        self._refuse_inputs(changed=bool(other))
         if old and not overwrite:
             raise InputError(
                 f"{folder}: holds {what}; expected an empty folder (-o DIR), or --overwrite to "
@@ -133,6 +135,23 @@ class RunFolder:
 
         # if the disk is full, the earlier run stays as it is
         write_atomically(marker, encoded(to_yaml(self.record)), first=remove_old)
+
+    def _refuse_inputs(self, *, changed: bool) -> None:
+        """Leave files alone that this run reads."""
+        here = self.path.resolve()
+        written = {METRICS, REPORT, LOG, *RESULTS.values()}
+        for field, path in self._inputs.items():
+            rendered = any(path.match(pattern) for pattern in RENDERED)
+            if path.resolve().parent == here and (path.name in written or rendered):
+                raise InputError(
+                    f"{field}: {path} lies where this run writes; expected another folder (-o DIR)"
+                )
+        # the record of a run is an experiment file, too
+        if changed and self._beside.resolve() == here:
+            raise InputError(
+                f"{self.path}: holds the experiment that this one was made from; expected another "
+                "folder (-o DIR)"
+            )
 
     def kept(self, part: str) -> xr.Dataset | None:
         """A rendered image, without a detector's noise; None: it is not there.
@@ -240,14 +259,14 @@ def _difference(before: dict, now: dict) -> str | None:
     return None
 
 
-def _checksums(experiment: Experiment, beside: str | Path) -> dict[str, str]:
-    """SHA-256 of the files an experiment names: a changed file is another experiment."""
+def _inputs(experiment: Experiment, beside: str | Path) -> dict[str, Path]:
+    """The files an experiment names, by its keys: a changed file is another experiment."""
     if experiment.wake is None:
         return {}
     paths = table_files(experiment.scattering, beside)
     if experiment.wake.file:
         paths["wake.file"] = find_file(experiment.wake.file, beside, "wake.file")
-    return {field: _checksum(path) for field, path in paths.items()}
+    return paths
 
 
 def _checksum(path: Path) -> str:

@@ -6,6 +6,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
+from lidar_mi import __version__
 from lidar_mi.io.atomic import write_atomically
 
 
@@ -30,5 +31,6 @@ def png_bytes(figure: Figure) -> bytes:
 
 def _png(figure: Figure, **options: Any) -> bytes:
     buffer = BytesIO()
-    figure.savefig(buffer, format="png", **options)
+    software = {"Software": f"lidar-mi {__version__}"}
+    figure.savefig(buffer, format="png", metadata=software, **options)
     return buffer.getvalue()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lidar_mi import __version__
 from lidar_mi.atmosphere.aerosols import aerosol
 from lidar_mi.atmosphere.particle_scattering import Notice, make_table
 from lidar_mi.atmosphere.scattering import ScatteringTable
@@ -41,6 +42,7 @@ def write_table(table: ScatteringTable, path: str | Path) -> None:
         "lidar_ratio_sr": f"{table.lidar_ratio:.5g}",
         "linear_depolarization_ratio_180": f"{table.depolarization_ratio:.5g}",
         "asymmetry_parameter": f"{table.asymmetry:.5g}",
+        "software": f"lidar-mi {__version__}",
     }
     lines = ["# Scattering matrix, rows (a1,b1,0,0) (b1,a2,0,0) (0,0,a3,b2) (0,0,-b2,a4)"]
     lines += [f"# {key}: {value}" for key, value in (values | derived).items()]

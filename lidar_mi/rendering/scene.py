@@ -12,6 +12,7 @@ import xarray as xr
 from lidar_mi import __version__
 from lidar_mi.errors import InputError
 from lidar_mi.io.exr import label_scan, unpack, write_fringes, write_scan
+from lidar_mi.io.text import read_text
 from lidar_mi.rendering.fringes import render_image
 from lidar_mi.rendering.variant import use_variant
 
@@ -88,6 +89,30 @@ def render_file(
     }
     write_scan(out, scan)
     return scan
+
+
+def files_of(scene_path: str | Path, definitions: dict[str, str]) -> list[Path]:
+    """A scene file and the files that it names, as far as they exist.
+
+    Parameters
+    ----------
+    definitions : dict
+        Values for ``$name`` in the scene, which may be names of files.
+    """
+    scene_path = Path(scene_path)
+    if not scene_path.is_file():
+        return []
+    text = read_text(scene_path, "a Mitsuba scene (XML)")
+    values = {*re.findall(r"""value\s*=\s*["']([^"']+)""", text), *definitions.values()}
+    named = [folder / value for value in values for folder in (Path(), scene_path.parent)]
+    return [scene_path, *(path for path in named if _is_file(path))]
+
+
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except (OSError, ValueError):  # no value of a scene need be a possible name
+        return False
 
 
 def _as_dataset(image: np.ndarray, names: list[str], sensor) -> xr.Dataset:

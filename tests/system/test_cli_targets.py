@@ -1,0 +1,78 @@
+"""Commands that write a file: over their own results, not over anything else.
+
+Detects an input that is replaced by the result, a file of someone else that is lost, and a second
+run of the same command that is refused.
+"""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+
+@pytest.fixture
+def images(there):
+    """Two images of the same air, 1 m a pixel, 2 m apart."""
+    air = np.random.default_rng(1).integers(0, 255, (40, 48), dtype=np.uint8)
+    for name, shift in (("a.png", 0), ("b.png", 2)):
+        Image.fromarray(np.roll(air, shift, 1)).save(there / name)
+    return there
+
+
+RETRIEVE = ("retrieve", "a.png", "b.png", "--dt", "1", "--spacing", "1", "--stride", "4")
+
+
+def test_a_result_of_ours_is_replaced(images, lidar_mi):
+    assert lidar_mi(*RETRIEVE, "-o", "w.nc")[0] == 0
+    before = (images / "w.nc").stat().st_ino
+    assert lidar_mi(*RETRIEVE, "-o", "w.nc")[0] == 0
+    assert (images / "w.nc").stat().st_ino != before
+
+
+@pytest.mark.parametrize(
+    ("command", "target"),
+    [
+        (RETRIEVE, "a.png"),
+        (RETRIEVE, "./b.png"),
+        (("render", "slab.xml", "-s", "2"), "slab.xml"),
+        (("render", "slab.xml", "-s", "2", "-D", "table=notes.txt"), "notes.txt"),
+        (("rings", "a.png"), "a.png"),
+    ],
+)
+def test_an_input_is_never_replaced(images, lidar_mi, command, target):
+    (images / "notes.txt").write_text("mine")
+    before = (images / target).read_bytes()
+    code, _, err = lidar_mi(*command, "-o", target, "--overwrite")
+    assert code == 2 and f"{target.removeprefix('./')}: is an input; expected" in err
+    assert (images / target).read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    "command",
+    [RETRIEVE, ("render", "slab.xml", "-s", "2"), ("rings", "a.png"), ("aerosol", "soot")],
+)
+@pytest.mark.parametrize(
+    ("target", "says"),
+    [("notes.txt", "is no result of lidar-mi"), ("/dev/null", "is no ordinary file")],
+)
+def test_what_is_not_ours_is_kept(images, lidar_mi, command, target, says):
+    (images / "notes.txt").write_text("mine")
+    code, _, err = lidar_mi(*command, "-o", target)
+    assert code == 2 and f"{target}: {says}" in err
+    assert (images / "notes.txt").read_text() == "mine"
+
+
+def test_overwriting_is_asked_for(images, lidar_mi):
+    (images / "notes.txt").write_text("mine")
+    assert lidar_mi(*RETRIEVE, "-o", "notes.txt", "--overwrite")[0] == 0
+    assert (images / "notes.txt").read_bytes().startswith(b"\x89HDF")
+
+
+def test_a_run_never_replaces_what_it_reads(there, lidar_mi, quick):
+    """The record of a run is an experiment file, too."""
+    assert lidar_mi("run", "tiny.yaml", "-o", "run")[0] == 0
+    again = ("run", "run/experiment.yaml", "-o", "run")
+    assert lidar_mi(*again)[0] == 0
+    record = (there / "run" / "experiment.yaml").read_bytes()
+    code, _, err = lidar_mi(*again, "--set", "seed=2", "--overwrite")
+    assert code == 2 and "holds the experiment that this one was made from" in err
+    assert (there / "run" / "experiment.yaml").read_bytes() == record
