@@ -40,6 +40,7 @@ With ``forward`` the S0_stderr of a pixel without any path is 0.
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .parameters import choice, fail, whole
 from .physical import Physical
@@ -65,6 +66,8 @@ def define():
             self.physical = Physical(NAME)
             # called with (paths done, paths in all) after every pass, when set
             self.progress = None
+            # where passes are kept, when set; see gated_volpath
+            self.batches = None
 
         def aov_names(self):
             return []
@@ -100,9 +103,11 @@ def define():
 
         def _camera(self, scene, source, sensor, seed, paths, pixels):
             """Mean and standard error over the paths of each pixel, all of them in one pass."""
-            channels = [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
+            before, channels = self._kept(pixels)
             at_once = max(1, self.samples_per_pass // paths)
-            for first in range(0, pixels, at_once):
+            for index, first in enumerate(range(0, pixels, at_once)):
+                if index < before:
+                    continue
                 count = min(at_once, pixels - first)
                 lane = dr.arange(mi.UInt32, count * paths)
                 number = dr.opaque(mi.UInt32, paths)
@@ -131,16 +136,18 @@ def define():
                 place = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
                 for channel, mean in zip(channels, means, strict=True):
                     dr.scatter(channel, mean, place)
-                self._report(first + count, pixels, channels)
+                self._report(index + 1, first + count, pixels, channels)
             return channels
 
         def _forward(self, scene, source, sensor, seed, paths, pixels):
             """Light accumulated in the pixels where it arrives."""
             total = paths * pixels
-            sums = [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
+            before, sums = self._kept(pixels)
             context = mi.BSDFContext(mi.TransportMode.Importance)
             width = dr.opaque(mi.UInt32, sensor.film().size().x)
             for index, first in enumerate(range(0, total, self.samples_per_pass)):
+                if index < before:
+                    continue
                 count = min(self.samples_per_pass, total - first)
                 lane = dr.arange(mi.UInt32, count)
                 rng = generator(seed, dr.opaque(mi.UInt32, index), lane)
@@ -163,7 +170,7 @@ def define():
                 pixel = row * width + column
                 for channel, value in zip(sums, (*stokes, stokes[0] * stokes[0]), strict=True):
                     dr.scatter_reduce(dr.ReduceOp.Add, channel, value, pixel, arrives)
-                self._report(first + count, total, sums)
+                self._report(index + 1, first + count, total, sums)
             *stokes, squares = sums
             # energy per photon; the sampled flux is a little larger than the emitted one
             energy = drawn / source.flux() * dr.opaque(mi.Float, 1 / total)
@@ -171,10 +178,22 @@ def define():
             variance = dr.maximum(squares - mean, 0)
             return [*(s * energy for s in stokes), dr.sqrt(variance) * energy]
 
-        def _report(self, done, total, values):
+        def _kept(self, pixels):
+            """How many passes an earlier run kept, and what they have given."""
+            passes, arrays = self.batches.kept() if self.batches else (0, {})
+            if not passes:
+                return 0, [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
+            return passes, [mi.Float(row) for row in arrays["values"]]
+
+        def _report(self, passes, done, total, values):
             dr.eval(values)
-            if self.progress:
+            if self.progress or self.batches:
                 dr.sync_thread()
+            if self.batches and done < total:
+                self.batches.keep(
+                    passes, lambda: {"values": np.stack([value.numpy() for value in values])}
+                )
+            if self.progress:
                 self.progress(done, total)
 
         def to_string(self):

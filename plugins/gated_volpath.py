@@ -58,10 +58,12 @@ replaced.
 """
 
 import contextlib
+import functools
 import gc
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from .light_paths import Lidar
 from .parameters import choice, fail, whole
@@ -90,6 +92,9 @@ def define():
             self.physical = Physical(NAME)
             # called with (samples done, samples in all) after every pass, when set
             self.progress = None
+            # where passes are kept, when set: `kept()` gives how many, and arrays by name; `keep`
+            # is called with their number and a function that gives the arrays
+            self.batches = None
 
         def aov_names(self):
             return []
@@ -112,29 +117,31 @@ def define():
             sensor, seed, samples = self._prepare(scene, sensor, seed, spp)
             gates, beams = sensor.gate_count, sensor.beam_count
             quantities = len(self.quantities())
-            image = dr.zeros(mi.Float, beams * gates * quantities)
             trace = self._gated if self.estimator == "gated" else self._analog
-            done, total = 0, None
+            before, arrays = self.batches.kept() if self.batches else (0, {})
+            image = _float(arrays.get("image"), beams * gates * quantities)
+            done, total = 0, _moments(arrays)
             with dr.suspend_grad(), _nothing_freed():
-                for first, count, start, now, complete in self._passes(sensor, samples):
+                passes = enumerate(self._passes(sensor, samples), 1)
+                for number, (first, count, start, now, complete) in passes:
+                    done += count * now * self._unit(sensor)
+                    if number <= before:
+                        continue
                     part = trace(scene, sensor, seed, first, count, start, now)
                     total = part if total is None else _merge(total, part)
-                    done += count * now * self._unit(sensor)
-                    if self.progress:
-                        dr.eval(total[1:])
+                    if complete:
+                        cells = self._places(first * gates, count * gates)
+                        for value, place in zip(_results(*total), cells, strict=True):
+                            dr.scatter(image, value, place)
+                        dr.eval(image)
+                        total = None
+                    if self.progress or self.batches:
+                        dr.eval(image, total)
                         dr.sync_thread()
+                    if self.batches and done < beams * samples:
+                        self.batches.keep(number, functools.partial(_arrays, image, total))
+                    if self.progress:
                         self.progress(done, beams * samples)
-                    if not complete:
-                        continue
-                    number, means, spreads = total
-                    errors = _errors(_opaque(number), spreads)
-                    values = [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:]]
-                    for value, place in zip(
-                        values, self._places(first * gates, count * gates), strict=True
-                    ):
-                        dr.scatter(image, value, place)
-                    dr.eval(image)
-                    total = None
             width, height = sensor.film().size()
             return mi.TensorXf(image, (height, width, gates * quantities))
 
@@ -313,6 +320,38 @@ def _nothing_freed():
 def _opaque(number: float):
     """A number that changes from scan to scan without being compiled into a kernel."""
     return dr.opaque(mi.Float, number)
+
+
+def _float(values, size):
+    """An array of floats, zero where there are none yet."""
+    return dr.zeros(mi.Float, size) if values is None else mi.Float(values)
+
+
+def _arrays(image, total):
+    """Finished beams, and the moments of those that are not, for NumPy."""
+    arrays = {"image": image.numpy()}
+    if total is not None:
+        number, means, spreads = total
+        arrays |= {
+            "number": np.array(number),
+            "means": np.stack([mean.numpy() for mean in means]),
+            "spreads": np.stack([spread.numpy() for spread in spreads]),
+        }
+    return arrays
+
+
+def _moments(arrays):
+    """The moments that `_arrays` took apart."""
+    if "number" not in arrays:
+        return None
+    means, spreads = ([mi.Float(row) for row in arrays[name]] for name in ("means", "spreads"))
+    return int(arrays["number"]), means, spreads
+
+
+def _results(number, means, spreads):
+    """The image's quantities from the moments of all samples."""
+    errors = _errors(_opaque(number), spreads)
+    return [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:]]
 
 
 def _merge(first, second):

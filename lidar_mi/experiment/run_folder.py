@@ -20,6 +20,7 @@ from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.truth import find_file
 from lidar_mi.instrument.detector_noise import without_noise
 from lidar_mi.io import exr
+from lidar_mi.io.arrays import read_arrays, write_arrays
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.folder import is_free, locked, make_folder
 from lidar_mi.io.json import read_json, to_json
@@ -34,6 +35,8 @@ FIGURES = "figures"
 IMAGES = tuple(f"{name}.exr" for name in rendering.IMAGES)
 RENDERED = (*IMAGES, "fringes_*.exr")
 """Images that an earlier run of the same experiment leaves to the next one."""
+BATCHES = "_batches.npz"
+"""Behind the name of an image that is not finished: the samples that there are."""
 RESULTS = {
     "wind": "wind.nc",
     "wind_volume": "wind_volume.nc",
@@ -113,7 +116,7 @@ class RunFolder:
         folder, marker = self.path, self.path / RECORD
         images = [path for pattern in RENDERED for path in folder.glob(pattern)]
         results = [folder / name for name in (METRICS, REPORT, *RESULTS.values())]
-        results = [path for path in results if path.exists()]
+        results = [path for path in results if path.exists()] + [*folder.glob(f"*{BATCHES}")]
         other = _difference(read_record(folder), self.record) if marker.is_file() else None
         foreign = [path for path in images if self._is_foreign(path)]
         if other:
@@ -174,10 +177,26 @@ class RunFolder:
             )
         return without_noise(image) if part in rendering.IMAGES else image
 
+    def unfinished(self, part: str) -> dict[str, Any] | None:
+        """Samples of an image that an earlier run did not finish; None: there are none."""
+        path = self._batches(part)
+        if not path.is_file():
+            return None
+        try:
+            arrays = read_arrays(path)
+        except InputError:  # damaged: the image is rendered from the start
+            return None
+        return arrays if str(arrays.pop(MADE_BY, "")) == self.made_by else None
+
+    def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
+        """Keep samples of an image until the image itself is kept."""
+        write_arrays(self._batches(part), arrays | {MADE_BY: self.made_by})
+
     def keep_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
         """Write a rendered image; returns it as it is read."""
         write = exr.write_scan if part in rendering.IMAGES else exr.write_fringes
         write(self._image(part), self._signed(value))
+        self._batches(part).unlink(missing_ok=True)
         kept = self.kept(part)
         assert kept is not None
         return kept
@@ -218,6 +237,9 @@ class RunFolder:
 
     def _image(self, part: str) -> Path:
         return self.path / f"{part}.exr"
+
+    def _batches(self, part: str) -> Path:
+        return self.path / f"{part}{BATCHES}"
 
     def _keep_noise(self, scans: list[xr.Dataset]) -> None:
         """Put noisy images beside those without noise, in the same files."""

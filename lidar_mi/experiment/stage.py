@@ -35,8 +35,9 @@ class Stage:
         would otherwise fail after hours.
     parts : callable, optional
         ``parts(experiment)``, names of the parts of a result that takes long. Then ``compute`` also
-        takes ``missing=``, the names of those to be made, and yields (name, part) one by one: each
-        can be kept as soon as it is there. The result is a dictionary of all parts.
+        takes ``missing=``, the names of those to be made, and ``keeper=``, where unfinished ones
+        are kept, and yields (name, part) one by one: each can be kept as soon as it is there. The
+        result is a dictionary of all parts.
     timing : str, optional
         Step that the time it takes is counted for.
     """
@@ -56,6 +57,12 @@ class Keeper(Protocol):
 
     def kept(self, part: str) -> Any:
         """A part that is there from an earlier run; None: it is not."""
+
+    def unfinished(self, part: str) -> dict[str, Any] | None:
+        """What an earlier run kept of a part that it did not finish; None: nothing."""
+
+    def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
+        """Keep what there is of a part that takes long, until the part itself is kept."""
 
     def keep_part(self, part: str, value: Any) -> Any:
         """Keep a part; returns it as `kept` would."""
@@ -125,6 +132,7 @@ def result_of(
             "from an earlier run"
         )
     if missing:
-        for name, part in stage.compute(experiment, *needed, log=log, missing=missing):
+        made = stage.compute(experiment, *needed, log=log, missing=missing, keeper=keeper)
+        for name, part in made:
             there[name] = keeper.keep_part(name, part) if keeper else part
     return there

@@ -14,6 +14,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.signal import attenuated_backscatter
 from lidar_mi.io.exr import label_scan, unpack
+from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.phase import Molecules
 from lidar_mi.rendering.settings import RenderSettings
 
@@ -69,6 +70,7 @@ def render_scans(
     progress: Callable[[int, int, int], None] | None = None,
     scans: Sequence[int] | None = None,
     molecules: Molecules | None = None,
+    batches: Callable[[int], Batches] | None = None,
 ) -> Iterator[xr.Dataset]:
     """Render one scan after the other in one scene; only the first compiles anything.
 
@@ -91,6 +93,8 @@ def render_scans(
         Which of the scans to render; default: all.
     molecules : Molecules, optional
         A part of all ``extinctions`` and of ``environment`` that scatters in a way of its own.
+    batches : callable, optional
+        Gives what keeps the samples of a scan while it is rendered.
 
     Yields
     ------
@@ -120,12 +124,15 @@ def render_scans(
             _move(parameters, extinctions[index], plan, albedo, molecules)
         if progress:
             scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
+        kept = batches(index) if batches else None
+        scene.integrator().batches = kept
         start = time.perf_counter()
         seed_here = (seed + (index << 16)) % 2**31  # a header holds 32 bits with a sign
         image = np.array(mi.render(scene, seed=seed_here))
         names = scene.integrator().quantities()
         scan = _as_dataset(image, names, plan, lidar, environment, settings, seed_here)
-        scan.attrs["render_seconds"] = time.perf_counter() - start
+        earlier = kept.seconds if kept else 0.0
+        scan.attrs["render_seconds"] = earlier + time.perf_counter() - start
         yield scan
 
 

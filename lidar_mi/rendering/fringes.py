@@ -16,6 +16,7 @@ from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.instrument.lens import singlet
 from lidar_mi.io.exr import label_fringes
+from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.settings import FringeSettings
 
 # from the stop to the etalon, m: any distance that leaves room for a lens
@@ -33,6 +34,8 @@ def render_fringes(
     settings: FringeSettings,
     seed: int = 0,
     progress: Callable[[int, int, int], None] | None = None,
+    images: Sequence[int] | None = None,
+    batches: Callable[[int], Batches] | None = None,
 ) -> Iterator[xr.Dataset]:
     """Render one velocity after the other in one scene; only the first compiles anything.
 
@@ -48,6 +51,10 @@ def render_fringes(
         Image k uses seed + k * 2^16.
     progress : callable, optional
         Called with (image number, paths done, paths in all).
+    images : sequence of int, optional
+        Which of the velocities to render; default: all.
+    batches : callable, optional
+        Gives what keeps the paths of an image while it is rendered, by the image's number.
 
     Yields
     ------
@@ -66,17 +73,20 @@ def render_fringes(
         raise InputError(f"v_los: {wrong:g} m/s is not allowed; expected finite speeds")
     scene = mi.load_dict(scene_dict(etalon, camera, line, settings))
     parameters = mi.traverse(scene)
-    for index, speed in enumerate(speeds):
+    for index in range(len(speeds)) if images is None else images:
+        speed = speeds[index]
         parameters["line.v_los"] = float(speed)
         parameters.update()
         if progress:
             scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
+        kept = batches(index) if batches else None
+        scene.integrator().batches = kept
         start = time.perf_counter()
         image = render_image(scene, seed=(seed + (index << 16)) % 2**31)
         image.attrs |= {
             "v_los": float(speed),  # the scene's is rounded to float32
             "lens": settings.lens,
-            "render_seconds": time.perf_counter() - start,
+            "render_seconds": (kept.seconds if kept else 0.0) + time.perf_counter() - start,
         }
         yield image
 

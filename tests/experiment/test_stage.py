@@ -76,7 +76,7 @@ class Drawer:
 def test_parts_that_are_there_are_not_made_again():
     asked = []
 
-    def compute(experiment, *, log, missing):
+    def compute(experiment, *, log, missing, keeper):
         asked.append(list(missing))
         yield from ((name, f"new {name}") for name in missing)
 

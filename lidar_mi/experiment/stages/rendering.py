@@ -1,6 +1,6 @@
 """From the truth to the two images of the backscatter lidar: scan geometry, light, detector."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import xarray as xr
@@ -9,6 +9,7 @@ from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stage import Keeper
 from lidar_mi.experiment.truth import Flows, Truth, read_flows
 from lidar_mi.instrument.detector import gate_duration
 from lidar_mi.instrument.detector_noise import noise_budget, noisy_scan
@@ -16,6 +17,7 @@ from lidar_mi.instrument.products import with_products
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.instrument.speckle import speckle_modes
 from lidar_mi.rendering.backscatter import extrude, render_scans
+from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
 from lidar_mi.rendering.variant import use_variant
 
@@ -92,6 +94,7 @@ def render_images(
     *,
     log: Log,
     missing: Sequence[str] = IMAGES,
+    keeper: Keeper | None = None,
 ) -> Iterator[tuple[str, xr.Dataset]]:
     """Render the scans of both times without a detector's noise, one after the other.
 
@@ -121,12 +124,34 @@ def render_images(
         progress,
         wanted,
         molecules(mapping.molecules, experiment.lidar.wavelength, experiment.scattering.band),
+        batches_of(IMAGES, keeper, log),
     )
     platform = {"platform_speed": experiment.platform.speed, "dt": experiment.platform.dt}
     for index, scan in zip(wanted, rendered, strict=True):
         scan = with_products(scan)
         scan.attrs |= platform
         yield IMAGES[index], scan
+
+
+def batches_of(
+    names: Sequence[str], keeper: Keeper | None, log: Log
+) -> Callable[[int], Batches] | None:
+    """What keeps the samples of an image while it is rendered, by its place among the names."""
+    if keeper is None:
+        return None
+
+    def batches(index: int) -> Batches:
+        name = names[index]
+
+        def load() -> dict | None:
+            found = keeper.unfinished(name)
+            if found:
+                log(f"resuming {name}: {found['passes']} passes are kept from an earlier run")
+            return found
+
+        return Batches(load, lambda arrays: keeper.keep_unfinished(name, arrays))
+
+    return batches
 
 
 def detect_images(

@@ -16,6 +16,8 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.ring_instrument import air_rings, pixel_noise
 from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.experiment.stage import Keeper
+from lidar_mi.experiment.stages.rendering import batches_of
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.doppler import photons, solar_background, speckle_modes
 from lidar_mi.instrument.fringe_camera import fringe_image, ring_radii
@@ -127,7 +129,12 @@ def ring_image_names(experiment: Experiment) -> list[str]:
 
 
 def render_ring_images(
-    experiment: Experiment, rings: Rings, *, log: Log, missing: Sequence[str]
+    experiment: Experiment,
+    rings: Rings,
+    *,
+    log: Log,
+    missing: Sequence[str],
+    keeper: Keeper | None = None,
 ) -> Iterator[tuple[str, xr.Dataset]]:
     """Render the laser's own light, that of single photons, and that of air at every speed.
 
@@ -154,21 +161,21 @@ def render_ring_images(
             size = f"{doppler.camera.width} x {doppler.camera.height}"
             log(f"rendering {names[absent[0]]} ... {names[absent[-1]]}, {size} pixels")
             # the number of an image makes its seed: a resumed run renders the same ones
-            first, number = absent[0], before + absent[0]
             rendered = render_fringes(
                 doppler.etalon,
                 doppler.camera,
                 line,
-                speeds[first:],
+                speeds,
                 settings,
-                (experiment.seed + (number << 16)) % 2**31,
-                lambda k, done, paths, n=number: log.bar(
+                (experiment.seed + (before << 16)) % 2**31,
+                lambda k, done, paths, n=before: log.bar(
                     f"rendering rings {n + k + 1} of {total}", done / paths
                 ),
+                absent,
+                batches_of(names, keeper, log),
             )
-            for k, image in enumerate(rendered, first):
-                if k in absent:
-                    yield names[k], image
+            for k, image in zip(absent, rendered, strict=True):
+                yield names[k], image
         before += len(names)
 
 
