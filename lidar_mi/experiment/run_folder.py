@@ -175,6 +175,8 @@ class RunFolder:
             raise InputError(
                 f"{path}: was made by another experiment; expected the image of this one"
             )
+        # a kill may have left samples beside the image that they became
+        self._batches(part).unlink(missing_ok=True)
         return without_noise(image) if part in rendering.IMAGES else image
 
     def unfinished(self, part: str) -> dict[str, Any] | None:
@@ -196,7 +198,6 @@ class RunFolder:
         """Write a rendered image; returns it as it is read."""
         write = exr.write_scan if part in rendering.IMAGES else exr.write_fringes
         write(self._image(part), self._signed(value))
-        self._batches(part).unlink(missing_ok=True)
         kept = self.kept(part)
         assert kept is not None
         return kept

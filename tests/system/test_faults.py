@@ -1,0 +1,142 @@
+"""Every place of a run that touches the disk fails in turn, or is the last one before a kill.
+
+Detects a traceback where a line is due, a file half written, a temporary file or a lock that stays,
+results of two runs side by side, a folder that every rerun refuses, and a resumed run that ends
+with other bits than one that nothing happened to.
+"""
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidar_mi.io.exr import read_layers
+from lidar_mi.io.netcdf import read_netcdf
+
+ROOT = Path(__file__).parents[2]
+
+SEED, OTHER_SEED = 1, 2
+FULL, FORBIDDEN, KILL = "ENOSPC", "EACCES", "kill"
+FAULTS = {
+    "open": (FULL, FORBIDDEN, KILL),
+    "write": (FULL, KILL),
+    "fsync": (FULL, KILL),
+    "rename": (FULL, FORBIDDEN, KILL),
+    "remove": (FORBIDDEN, KILL),
+    "mkdir": (FULL, FORBIDDEN, KILL),
+}
+"""What happens at places of each kind."""
+SOME = {FULL: 15, FORBIDDEN: 15, KILL: 10}
+"""Of all places, every so-manyth."""
+
+
+def faults(work, starts=(None, OTHER_SEED), real=False, kinds=FAULTS, every=None):
+    """What came of runs with one fault each, in a new folder and over a run with another seed.
+
+    See `tests.support.faults`.
+    """
+    task = {"work": str(work), "seed": SEED, "starts": starts, "real": real, "faults": kinds}
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.support.faults"],
+        input=json.dumps(task | {"every": every or {}}),
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def content(state):
+    """What must be the same after every way to the end of a run: all but the log."""
+    return {name: text for name, text in state.items() if name != "log.txt"}
+
+
+def assert_holds(found, case):
+    where = case["place"], case["fault"], case["said"]
+    kind = case["place"].split()[1]
+    if case["fault"] == KILL:
+        assert case["code"] == -9, where
+    else:
+        lines = case["said"].splitlines()
+        assert (case["code"], len(lines)) in ((2, 1), (0, 0)), where
+        assert all(re.fullmatch(r"lidar-mi: [^\n]{1,290}", line) for line in lines), where
+        if kind != "remove":
+            hidden = [name for name in case["left"] if Path(name).name.startswith(".")]
+            assert hidden == [], where
+    assert_one_run(found, case["left"], where)
+    assert (case["again"], case["said_again"]) == (0, ""), where
+    assert content(case["end"]) == content(found["whole"]), where
+
+
+def assert_one_run(found, left, where):
+    """What lies in the folder is of the run that its record names: bit by bit, or not at all."""
+    results = {name: text for name, text in left.items() if not Path(name).name.startswith(".")}
+    results = {n: t for n, t in content(results).items() if not n.endswith("_batches.npz")}
+    records = [state.get("experiment.yaml") for state in (found["start"], found["whole"])]
+    record = results.pop("experiment.yaml", None)
+    if record is None:
+        assert results == {}, where
+        return
+    whose = found["start"] if record == records[0] else found["whole"]
+    assert results.items() <= content(whose).items(), where
+
+
+def test_some_faults_at_some_places(tmp_path):
+    """And that nothing is written past them: whatever lies there at the end came by a rename."""
+    fresh, over = faults(tmp_path, every=SOME)
+    for found in (fresh, over):
+        assert {kind for kind, _ in found["places"]} >= set(FAULTS) - {"mkdir"}
+        renames = sum(kind == "rename" for kind, _ in found["places"])
+        written = [name for name in found["whole"] if name != "log.txt"]
+        batches = 2 * 3  # of two images, three passes each
+        # the record is written twice: at the start, and when the metrics are known
+        assert (len(written), renames) == (7, 7 + 1 + batches), found["places"]
+        assert len(found["cases"]) > 10
+        for case in found["cases"]:
+            assert_holds(found, case)
+
+
+@pytest.mark.slow
+def test_every_fault_at_every_place(tmp_path):
+    for found in faults(tmp_path):
+        assert len(found["cases"]) > 150
+        for case in found["cases"]:
+            assert_holds(found, case)
+
+
+@pytest.mark.slow
+def test_real_runs_killed_at_every_rename(tmp_path):
+    """Rendered, retrieved and drawn, not replaced by something quick."""
+    (found,) = faults(tmp_path, [None], real=True, kinds={"rename": (KILL,)})
+    assert len(found["cases"]) > 20
+    expected = numbers(found["whole"], tmp_path)
+    for case in found["cases"]:
+        where = case["place"], case["said_again"]
+        assert (case["code"], case["again"]) == (-9, 0), where
+        assert case["end"].keys() == found["whole"].keys(), where
+        for name, values in numbers(case["end"], tmp_path).items():
+            np.testing.assert_array_equal(values, expected[name], err_msg=f"{where} {name}")
+
+
+def numbers(state, work):
+    """All that a run found, without what it took."""
+    found = {}
+    for name, content in state.items():
+        path = work / Path(name).name
+        path.write_bytes(bytes.fromhex(content))
+        if path.suffix == ".exr":
+            layers = read_layers(path)[1]
+            found |= {f"{name} {layer}": pixels for layer, pixels in layers.items()}
+        elif path.suffix == ".nc":
+            wind = read_netcdf(path)
+            found |= {f"{name} {key}": wind[key].values for key in wind.data_vars}
+        elif name == "metrics.json":
+            metrics = json.loads(path.read_text()).items()
+            found |= {key: value for key, value in metrics if not key.startswith("timing.")}
+    return found
