@@ -70,7 +70,7 @@ class RunFolder:
     Attributes
     ----------
     record : dict
-        The experiment, checksums of its files, versions.
+        The experiment, checksums of its files and of its metrics, versions.
     made_by : str
         SHA-256 of what decides over the images in the record. Every result carries it; one that
         carries another is none of this run.
@@ -90,6 +90,7 @@ class RunFolder:
                 "python": platform.python_version(),
                 **{name: version(name) for name in _LIBRARIES},
             },
+            "metrics": None,
         }
         self.made_by = _made_by(self.record)
 
