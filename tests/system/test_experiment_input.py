@@ -76,7 +76,7 @@ def test_air_without_vortices_is_told_of(tmp_path, quick):
     metrics = run(check(data), tmp_path / "run").metrics
     page = (tmp_path / "run" / "report.html").read_text()
     assert "Warning: no vortex pair from the images: " in page
-    assert "No pair from the images: " in page and "How well the vortices are known" in page
+    assert "No pair from the images: " in page and "Vortex parameters and standard errors" in page
     assert not [key for key in metrics if key.startswith("vortex.")]
     assert read_vortices(tmp_path / "run" / "vortex.json") == {}
     assert "vortex fit" in page

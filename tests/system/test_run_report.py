@@ -111,7 +111,7 @@ def test_report_needs_nothing_else(demo):
 def test_report_tells_the_numbers(demo):
     words = " ".join(Links((demo.folder / "report.html").read_text()).words)
     assert "wake_backscatter" in words and "seed: 1" in words
-    for text in ("wake_slab_40s.nc at 40 s", "532 nm, 1 mJ", "mitsuba 3.", "64 photons a beam"):
+    for text in ("wake_slab_40s.nc at 40 s", "532 nm, 1 mJ", "mitsuba 3.", "64 samples per beam"):
         assert text in words
     assert f"{demo.metrics['backscatter.cc.rmse_v']:.3f}" in words
     assert f"backscatter.cc.rmse_v: {demo.metrics['backscatter.cc.rmse_v']:.4g} m/s" in words
@@ -121,7 +121,7 @@ def test_report_tells_the_numbers(demo):
     )
     assert f"{demo.metrics['true_wind.rms_v']:.3g}" in words and "no skill" in words
     noise = (
-        f"simulation {percent(demo.metrics['backscatter.mc_relative_error'])} (64 photons a beam)"
+        f"simulation {percent(demo.metrics['backscatter.mc_relative_error'])} (64 samples per beam)"
     )
     assert noise in words and "no detector" in words
     assert "cross-correlation" in words and "weight shift" in words

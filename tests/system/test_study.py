@@ -91,7 +91,7 @@ def test_plain_files_have_none(file):
         ({}, "variants: {} is not allowed"),
         ([1], "variants: [1] is not allowed"),
         ({"near": 3}, "variants.near: 3 is not allowed; expected keys to change"),
-        ({"a/b": {}}, "variants.a/b: not allowed; expected a name of letters"),
+        ({"a/b": {}}, "variants.a/b: not allowed; expected a name of at most 100 letters"),
         ({"near": {"name": "x"}}, "variants.near.name: not allowed"),
         (
             {"near": {"scan": {"rnage": 1}}},
