@@ -178,7 +178,7 @@ def backscatter_line(
     temperature: float,
     pressure: float,
     laser_width: float = 100e6,
-    aerosol_share: float = 0.0,
+    aerosol_fraction: float = 0.0,
     shape: str = "rayleigh_brillouin",
 ) -> Line:
     """Line of the backscatter of air at rest, molecules and aerosol, with the laser's own width.
@@ -189,7 +189,7 @@ def backscatter_line(
         m, K, Pa; see `lidar_mi.atmosphere.molecules.standard_atmosphere`.
     laser_width : float
         Full width at half maximum of the emitted line, Hz.
-    aerosol_share : float
+    aerosol_fraction : float
         Fraction of the backscattered photons that comes from aerosol, 0 to 1; aerosol is too
         heavy to broaden the line.
     shape : {"rayleigh", "rayleigh_brillouin"}
@@ -201,14 +201,14 @@ def backscatter_line(
     """
     if shape not in SHAPES:
         raise InputError(f"shape: {shape!r} is not allowed; expected one of {', '.join(SHAPES)}")
-    _check("aerosol_share", aerosol_share, 0 <= aerosol_share <= 1, "0 to 1")
+    _check("aerosol_fraction", aerosol_fraction, 0 <= aerosol_fraction <= 1, "0 to 1")
     laser = laser_line(wavelength, laser_width)
     if shape == "rayleigh":
         air = rayleigh(wavelength, temperature)
     else:
         air = rayleigh_brillouin(wavelength, temperature, pressure)
     air = air.broadened(laser.sigmas[0])
-    weights = np.concatenate([[aerosol_share], (1 - aerosol_share) * air.weights])
+    weights = np.concatenate([[aerosol_fraction], (1 - aerosol_fraction) * air.weights])
     offsets, sigmas = np.append(laser.offsets, air.offsets), np.append(laser.sigmas, air.sigmas)
     present = weights > 0
     return Line(wavelength, weights[present], offsets[present], sigmas[present])

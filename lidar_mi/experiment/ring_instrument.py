@@ -75,7 +75,7 @@ def air_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> Ring
             kelvin,
             pressure,
             lidar.laser_width,
-            lidar.aerosol_share,
+            lidar.aerosol_fraction,
             lidar.line_shape,
         )
 

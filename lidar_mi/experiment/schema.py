@@ -8,7 +8,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, PrivateAttr, field_validator, model_validator
+from pydantic import AliasChoices, Field, PrivateAttr, field_validator, model_validator
 
 from lidar_mi.experiment.schema_air import Scattering, Section, Wake
 from lidar_mi.instrument.ccd import CCD
@@ -120,8 +120,10 @@ class Doppler(Section):
         "derived", description="degrees of freedom of the speckle in a pixel; inf: no speckle"
     )
     render: FringeSettings = FringeSettings()
-    photon_samples: Annotated[int, Within(0, 65536, "the standard error is then 0.4 %")] = Field(
-        16, description="light paths per pixel, each traced through a real lens"
+    path_samples: Annotated[int, Within(0, 65536, "the standard error is then 0.4 %")] = Field(
+        16,
+        description="light paths per pixel, each traced through a real lens",
+        validation_alias=AliasChoices("path_samples", "photon_samples"),  # its former name
     )
     retrieval: RingRetrieval = RingRetrieval()
 
@@ -141,8 +143,8 @@ class Doppler(Section):
     @model_validator(mode="after")
     def _speeds_make_sense(self):
         _once("v_los", self.v_los)
-        if self.photon_samples == 1:
-            raise ValueError("photon_samples: 1 is not allowed; expected 0 or 2 and more")
+        if self.path_samples == 1:
+            raise ValueError("path_samples: 1 is not allowed; expected 0 or 2 and more")
         return self
 
 

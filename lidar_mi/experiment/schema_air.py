@@ -2,7 +2,7 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from lidar_mi.units import (
     Circulation,
@@ -211,8 +211,9 @@ class Part(_Scatterer):
     """One kind of scatterer in a mixture."""
 
     phase: Literal["rayleigh", "molecules", "aerosol", "table"]
-    share: Annotated[Number, Within(1e-9, 1e9, "only ratios count")] = Field(
-        description="of the extinction, relative to the other parts"
+    fraction: Annotated[Number, Within(1e-9, 1e9, "only ratios count")] = Field(
+        description="of the extinction, relative to the other parts",
+        validation_alias=AliasChoices("fraction", "share"),  # its former name
     )
 
 

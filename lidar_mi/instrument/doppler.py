@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AliasChoices, BaseModel, ConfigDict, Field, model_validator
 
 from lidar_mi.atmosphere.line import Line
 from lidar_mi.errors import InputError
@@ -34,7 +34,7 @@ class DopplerLidar(BaseModel):
 
     The paper has ranges of 56 m and 76 m. Not from the paper are: the widths of the laser's line
     and of the filter, the field of view (which holds the beam from 34 m on), the sky's radiance,
-    the line's shape and ``aerosol_share``.
+    the line's shape and ``aerosol_fraction``.
 
     ``instrument_constant`` is taken to hold everything between telescope and photoelectron, so that
     the lidar equation counts detected photons. With ``counted: before_etalon`` it ends in front of
@@ -93,8 +93,10 @@ class DopplerLidar(BaseModel):
     extinction: Annotated[Extinction, Within(0, 10, "visibility is 0.3 m in the densest smoke")] = (
         Field(2.70e-5, description="extinction coefficient")
     )
-    aerosol_share: Annotated[Number, Within(0, 1, "definition of a fraction")] = Field(
-        0.0, description="of the backscattered photons"
+    aerosol_fraction: Annotated[Number, Within(0, 1, "definition of a fraction")] = Field(
+        0.0,
+        description="of the backscattered photons",
+        validation_alias=AliasChoices("aerosol_fraction", "aerosol_share"),  # its former name
     )
     line_shape: Literal["rayleigh", "rayleigh_brillouin"] = "rayleigh_brillouin"
     sky_radiance: Annotated[SpectralRadiance, Within(0, 1e14, "the disc of the sun has 3e13")] = (
@@ -194,5 +196,5 @@ def speckle_modes(lidar: DopplerLidar, camera: FringeCamera, etalon: Etalon, lin
     footprint = min(lidar.beam_width / 2, lidar.fov_half * lidar.range)
     radius = math.sqrt(lidar.telescope_area / math.pi)
     space = spatial_modes(radius, lidar.wavelength, footprint, lidar.range)
-    pixel_share = float(space) / (camera.width * camera.height)
-    return float(temporal_modes(width, lidar.gate_duration)) * max(1.0, pixel_share)
+    pixel_fraction = float(space) / (camera.width * camera.height)
+    return float(temporal_modes(width, lidar.gate_duration)) * max(1.0, pixel_fraction)

@@ -86,7 +86,7 @@ def scatterer(
         case "henyey_greenstein":
             phase = {"type": "hg", "g": scattering.asymmetry}
         case "mixture":
-            fractions = [part.share for part in scattering.parts]
+            fractions = [part.fraction for part in scattering.parts]
             tables = [
                 _table(part, beside, wavelength, f"scattering.parts.{index}", notice)
                 for index, part in enumerate(scattering.parts)

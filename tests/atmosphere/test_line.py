@@ -193,7 +193,10 @@ def test_samples_follow_the_density():
         ),
         (lambda: rayleigh_brillouin(WAVELENGTH, 233.0, math.nan), "pressure: nan"),
         (lambda: backscatter_line(WAVELENGTH, 233.0, 3e4, shape="voigt"), "shape: 'voigt'.*rayl"),
-        (lambda: backscatter_line(WAVELENGTH, 233.0, 3e4, aerosol_share=2), "aerosol_share: 2"),
+        (
+            lambda: backscatter_line(WAVELENGTH, 233.0, 3e4, aerosol_fraction=2),
+            "aerosol_fraction: 2",
+        ),
         (lambda: laser_line(WAVELENGTH, -1.0), "laser_width: -1"),
         (lambda: Line(WAVELENGTH, [0.5, 0.6], [0, 0], [1, 1]), "weights: 1.1 .*sum of 1"),
         (lambda: Line(WAVELENGTH, [1.5, -0.5], [0, 0], [1, 1]), r"weights: -0\.5"),

@@ -156,7 +156,7 @@ def _value(name, model, *given):
     *parents, key = name.split(".")
     changes = {key: given[0]} if given else {}
     if model in OPTIONAL:
-        whole = {"phase": "rayleigh", "share": 1.0} if model is schema_air.Part else {}
+        whole = {"phase": "rayleigh", "fraction": 1.0} if model is schema_air.Part else {}
         return getattr(model.model_validate(whole | changes), key)
     data = copy.deepcopy(BASE)
     if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors

@@ -1,6 +1,7 @@
 """What an experiment file may say. Detects a lost default, limit or message."""
 
 import math
+import re
 from importlib.resources import files
 from typing import get_args
 
@@ -154,29 +155,29 @@ FAULTS = [
     ("wake.extinction.sorce=x", "wake.extinction.sorce: unknown key; did you mean source?"),
     ("scan.zzz=1", "scan.zzz: unknown key (allowed: aim, range, "),
     (
-        "scattering={phase: mixture, parts: [{phase: molecules, shar: 1}]}",
-        "scattering.parts.0.shar: unknown key; did you mean share? (allowed: aerosol, band, ",
+        "scattering={phase: mixture, parts: [{phase: molecules, fractio: 1}]}",
+        "scattering.parts.0.fractio: unknown key; did you mean fraction? (allowed: aerosol, band, ",
     ),
     (
-        "scattering={phase: mixture, parts: [{phase: hg, share: 1}]}",
+        "scattering={phase: mixture, parts: [{phase: hg, fraction: 1}]}",
         "scattering.parts.0.phase: 'hg' is not allowed; expected 'rayleigh', 'molecules', "
         "'aerosol' or",
     ),
     (
-        "scattering={phase: mixture, parts: [{phase: aerosol, share: 1}]}",
+        "scattering={phase: mixture, parts: [{phase: aerosol, fraction: 1}]}",
         "scattering.parts.0: aerosol: None is not allowed with phase aerosol",
     ),
     (
         "scattering={phase: mixture, parts: [{phase: molecules}]}",
-        "scattering.parts.0.share: missing",
+        "scattering.parts.0.fraction: missing",
     ),
     (
-        "scattering={phase: mixture, parts: [{phase: molecules, share: 0}]}",
-        "scattering.parts.0.share: 0 is not allowed; expected 1e-09 to 1e+09",
+        "scattering={phase: mixture, parts: [{phase: molecules, fraction: 0}]}",
+        "scattering.parts.0.fraction: 0 is not allowed; expected 1e-09 to 1e+09",
     ),
     ("scattering={phase: mixture}", "scattering: parts: None is not allowed with phase mixture"),
     (
-        "scattering={parts: [{phase: molecules, share: 1}]}",
+        "scattering={parts: [{phase: molecules, fraction: 1}]}",
         "scattering: parts: 1 parts is not allowed with phase rayleigh",
     ),
     ("wake.vortex_pair.gamma=1", "wake.vortex_pair.gamma: unknown key (allowed: model, "),
@@ -352,7 +353,10 @@ def test_every_number_has_a_range_with_its_reason_and_extremes_are_refused(name,
         if key in ("v_los", "averaged"):
             innermost[key] = [value]
         if name.startswith("scattering.parts"):
-            data["scattering"] = {"phase": "mixture", "parts": [{"phase": "rayleigh", "share": 1}]}
+            data["scattering"] = {
+                "phase": "mixture",
+                "parts": [{"phase": "rayleigh", "fraction": 1}],
+            }
             data["scattering"]["parts"][0][key] = value
         if key == "stokes":
             innermost[key] = [1, value, 0, 0]
@@ -435,3 +439,23 @@ def test_a_wake_is_no_experiment(tmp_path):
 def test_a_scene_is_no_experiment(tmp_path):
     with pytest.raises(InputError, match=r"slab\.xml: .*expected lidar-mi render .*slab\.xml"):
         load(tmp_path / "slab.xml")
+
+
+def test_former_names_of_keys_are_accepted_and_not_written(tmp_path):
+    """Each as its key of today; both at once are refused."""
+    path = tmp_path / "old.yaml"
+    path.write_text(
+        "name: old\n"
+        "wake: {file: wake_slab_40s.nc, time: 40 s}\n"
+        "scattering: {phase: mixture, parts: [{phase: molecules, share: 3}]}\n"
+        "doppler: {photon_samples: 5, lidar: {aerosol_share: 0.25}}\n"
+    )
+    experiment = load(path)
+    assert experiment.scattering.parts[0].fraction == 3
+    assert experiment.doppler.path_samples == 5
+    assert experiment.doppler.lidar.aerosol_fraction == 0.25
+    written = dump(experiment)
+    assert "path_samples: 5" in written and "aerosol_fraction: 0.25" in written
+    assert not re.search("photon_samples|share", written)
+    with pytest.raises(InputError, match="photon_samples: unknown key"):
+        load(path, ["doppler.path_samples=5"])

@@ -196,7 +196,7 @@ def test_a_pulse_on_the_ccd():
         {"backscatter": "3 / m^2"},
         {"telescope_area": "0.13 m"},
         {"line_shape": "voigt"},
-        {"aerosol_share": 1.1},
+        {"aerosol_fraction": 1.1},
         {"divergence_full": 5e-4},
         {"laser_width": "43 MHz"},
     ],

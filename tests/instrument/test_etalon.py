@@ -30,7 +30,7 @@ from lidar_mi.instrument.etalon import (
 WAVELENGTH = 354.7e-9
 ETALON = Etalon()
 PERFECT = Etalon(surface_rms=0)
-AIR = backscatter_line(WAVELENGTH, 232.9, 33154.0, aerosol_share=0.2)
+AIR = backscatter_line(WAVELENGTH, 232.9, 33154.0, aerosol_fraction=0.2)
 HIGH, LOW = (2.1, WAVELENGTH / 4 / 2.1), (1.48, WAVELENGTH / 4 / 1.48)
 # not at all quarter waves, and one layer that absorbs
 ODD = ((2.1, 61e-9), (1.48, 40e-9), (2.3, 35e-9, 0.02), (1.48, 77e-9))

@@ -20,7 +20,7 @@ from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera, doppler_shift, fringe_image, ring_radii
 
 WAVELENGTH = 354.7e-9
-AIR = backscatter_line(WAVELENGTH, 232.9, 33154.0, aerosol_share=0.1)
+AIR = backscatter_line(WAVELENGTH, 232.9, 33154.0, aerosol_fraction=0.1)
 LASER = laser_line(WAVELENGTH, 100e6)
 ETALON = Etalon()
 SOLID = Etalon(index=1.476, gap="9.3 mm")

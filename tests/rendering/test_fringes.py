@@ -28,7 +28,7 @@ pytestmark = pytest.mark.usefixtures("variant")
 WAVELENGTH = 354.7e-9
 # the usual field on a tenth of the pixels
 CAMERA = {"width": 96, "height": 78, "pixel": 74e-6}
-LINE = backscatter_line(WAVELENGTH, 232.9, 33_154.0, aerosol_share=0.1)
+LINE = backscatter_line(WAVELENGTH, 232.9, 33_154.0, aerosol_fraction=0.1)
 SCENE = Path(str(files("lidar_mi.scenes"))) / "fringes.xml"
 
 

@@ -97,8 +97,8 @@ def test_molecules_are_those_of_the_wavelength():
 def test_a_mixture_is_weighted_by_scattering_coefficient(cosine):
     """Three parts of soot (albedo 0.22) and one of molecules: by hand from the parts alone."""
     parts = [
-        {"phase": "aerosol", "aerosol": "soot", "share": 3},
-        {"phase": "rayleigh", "depolarization": 0.1, "share": 1},
+        {"phase": "aerosol", "aerosol": "soot", "fraction": 3},
+        {"phase": "rayleigh", "depolarization": 0.1, "fraction": 1},
     ]
     mixture = scatterer(Scattering.model_validate({"phase": "mixture", "parts": parts}))
     soot = scatterer(Scattering(phase="aerosol", aerosol="soot"))
@@ -113,8 +113,8 @@ def test_a_mixture_is_weighted_by_scattering_coefficient(cosine):
 def test_tables_of_a_mixture_are_found(tmp_path):
     write_table(aerosol_table("dust", 532e-9), tmp_path / "dust.txt")
     parts = [
-        {"phase": "molecules", "share": 1},
-        {"phase": "table", "table": "dust.txt", "share": 1},
+        {"phase": "molecules", "fraction": 1},
+        {"phase": "table", "table": "dust.txt", "fraction": 1},
     ]
     mixture = Scattering.model_validate({"phase": "mixture", "parts": parts})
     found = {"scattering.parts.1.table": (tmp_path / "dust.txt").resolve()}

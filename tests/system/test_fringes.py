@@ -38,7 +38,7 @@ SMALL = {
     "doppler": {
         "v_los": list(SPEEDS),
         "camera": CAMERA,
-        "photon_samples": 2,
+        "path_samples": 2,
         "retrieval": {
             "methods": ["annular", "pixels", "ca", "ca_r2", "ml", "sg"],
             "averaged": [1, 9],
@@ -93,7 +93,7 @@ def quick(monkeypatch):
 
 
 QUICK = {
-    "photon_samples": 0,
+    "path_samples": 0,
     "v_los": [0],
     "render": {"samples_per_pixel": 2},
     "retrieval": {
@@ -360,7 +360,7 @@ def test_what_cannot_work_is_said_before_anything_is_written(tmp_path, changes, 
         ({}, "x: expected wake, doppler or both"),
         ({"doppler": {}, "scan": {"range": "400 m"}}, "x: scan: not allowed without wake"),
         ({"doppler": {"v_los": [1, 1]}}, "x: doppler: v_los: 1.0 twice is not allowed"),
-        ({"doppler": {"photon_samples": 1}}, "x: doppler: photon_samples: 1 is not allowed"),
+        ({"doppler": {"path_samples": 1}}, "x: doppler: path_samples: 1 is not allowed"),
         ({"doppler": {"speckle_modes": 0}}, "x: doppler.speckle_modes: 0 is not allowed"),
         (
             {"doppler": {"retrieval": {"images": 2}}},

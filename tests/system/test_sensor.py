@@ -43,7 +43,7 @@ SMALL = {
         "camera": {"pixel": "29.6 um", "width": 240, "height": 195},
         "ccd": {"full_well": 1e6},
         "retrieval": {"methods": ["annular"], "averaged": [1], "images": 2, "slow_images": 0},
-        "photon_samples": 0,
+        "path_samples": 0,
         "render": {"samples_per_pixel": 16},
     },
     "sensor": {
@@ -81,9 +81,9 @@ def test_the_whole_chain(whole):
     assert lines.sizes["line"] == 15 == metrics["sensor.lines_retrieved"]
     assert wind.attrs["Conventions"] == "CF-1.11" and {"u", "v", "w", "u_true"} <= set(wind)
     # read from rings, with the errors that the fit states
-    reduced = (lines.v_los - lines.v_los_true) / lines.v_los_std
-    assert abs(float(reduced.mean())) < 4 / math.sqrt(15)
-    assert float((reduced**2).mean()) < 1 + 4 * math.sqrt(2 / 15)
+    normalised = (lines.v_los - lines.v_los_true) / lines.v_los_std
+    assert abs(float(normalised.mean())) < 4 / math.sqrt(15)
+    assert float((normalised**2).mean()) < 1 + 4 * math.sqrt(2 / 15)
     # u of the combined sensor is what the lines are good for; triples are not
     assert metrics["sensor.rmse_u"] < 0.5 < metrics["sensor.triples.rmse_v"]
     valid = wind["flag"].values == 0
@@ -106,8 +106,8 @@ def test_the_whole_chain(whole):
         "safe for eyes from",
         "0.002 J/m² per pulse",
         "up to nine by least squares",
-        "asked for takes 1 of them a direction",
-        "The pictures take 77000 pulses per second",
+        "the required error of v_LOS takes 1 pulse per direction",
+        "The images take 77000 pulses per second",
         "2.1 s later",
         "u is off by",
         "The wind from both lidars",
@@ -115,9 +115,9 @@ def test_the_whole_chain(whole):
         assert text in report, text
     for name in ("fig19_lines_of_sight", "fig20_wind3d", "fig22_vortices"):
         assert (folder / "figures" / f"{name}.png").stat().st_size > 10_000
-    # pictures, then the verdict, then numbers
+    # images, then the verdict, then numbers
     order = [
-        "what is required:",
+        "<p>Compliance:",
         "<canvas",
         "data:image",
         'id="verdict-1"',
@@ -204,7 +204,7 @@ def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypat
         "The scan of the Doppler lidar",
         "at most 2.5 m/s",
         "not known",
-        "cannot be told",
+        "undetermined",
         "From the images, circulation is off by",
     ):
         assert text in report, text

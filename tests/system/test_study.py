@@ -198,7 +198,7 @@ def test_doppler_lidars_alone_are_compared(tmp_path, monkeypatch):
         "doppler": {
             "camera": {"pixel": "29.6 um", "width": 240, "height": 195},
             "v_los": [0.0],
-            "photon_samples": 0,
+            "path_samples": 0,
             "ccd": {"full_well": 1e8, "bits": None},
             "render": {"samples_per_pixel": 16},
             "retrieval": {"methods": ["annular"], "averaged": [1], "images": 3, "slow_images": 0},

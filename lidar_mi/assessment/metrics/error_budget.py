@@ -1,7 +1,7 @@
 """What limits the wind: how much better it would be without each cause of error in turn.
 
-Causes that act on the pictures are taken out of them and the wind is found again; those that lie in
-what a vector means are taken out of the truth it is compared with.
+Causes that act on the images are taken out of them and the wind is retrieved again; those that lie
+in what a vector means are taken out of the truth it is compared with.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ CAUSES = {
     "detector_noise": "noise of the detector",
     "monte_carlo": "noise of the simulation",
     "beam_blur": "width of the beam",
-    "slab": "what the slab's mean wind does not carry",
+    "slab": "motion other than the slab's mean wind",
     "window": "averaging over the window",
     "shear": "shear within the window",
     "time_step": "curved paths in the time step",
@@ -39,10 +39,10 @@ Pair = Sequence[xr.DataArray]
 _BOXES = (ImageMethod.CC, ImageMethod.WS)
 
 
-def picture_unit(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, float]:
-    """Gain and offset that make the air's extinction the rendered pictures.
+def image_scale(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, float]:
+    """Gain and offset that turn the air's extinction into the rendered images.
 
-    By least squares over both pictures, weighted by 1 / `noise`^2 (standard errors of the rendered
+    By least squares over both images, weighted by 1 / `noise`^2 (standard errors of the rendered
     ones). The offset is light that a pulse longer than the gate brings from the air around it.
     """
     x, y, s = (
@@ -55,44 +55,44 @@ def picture_unit(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, flo
     return float(gain / np.abs(x).max()), float(offset)
 
 
-def pictures_without(
-    seen: Pair,
+def images_without(
+    measured: Pair,
     blurred: Pair,
     sharp: Pair,
     rendered: Pair | None = None,
-    carried: Pair | None = None,
+    advected: Pair | None = None,
 ) -> dict[str, Pair]:
-    """Pictures without one cause of error each, all else as it fell.
+    """Images without one cause of error each, all else as it fell.
 
-    Noise is not drawn anew: that of the detector is what it added to the rendered picture, that of
-    the simulation what the rendered picture differs from the blurred air by. So two cases differ by
-    the cause alone and not by chance. The detector's noise stays what it was in the picture it was
+    Noise is not drawn anew: that of the detector is what it added to the rendered image, that of
+    the simulation what the rendered image differs from the blurred air by. So two cases differ by
+    the cause alone and not by chance. The detector's noise stays what it was in the image it was
     drawn for, though its photons follow the signal: where blur takes 20 % of it, noise is 10 % off.
     What the blur leaves out of the light transport (multiple scattering, extinction within the
     slab: 0.5 % of the signal in the paper's case, nearly even) goes with the simulation's noise.
 
     Parameters
     ----------
-    seen : two xr.DataArray, dims (z, y)
-        Pictures with all noise.
+    measured : two xr.DataArray, dims (z, y)
+        Images with all noise.
     blurred, sharp : pair
-        The air as beams of their width see it without noise, and as it is; in the unit of `seen`.
+        The air averaged over the beams' width without noise, and as it is; unit of `measured`.
     rendered : pair, optional
         Without the noise of a detector; left out: there is none.
-    carried : pair, optional
-        As `blurred`, of air that the slab's mean wind has carried as a whole.
+    advected : pair, optional
+        As `blurred`, of air that the slab's mean wind has advected as a whole.
 
     Returns
     -------
     dict
         Pairs by cause: `monte_carlo`, `beam_blur`, with `rendered` `detector_noise`, with
-        `carried` `slab`.
+        `advected` `slab`.
     """
     found: dict[str, Pair] = {} if rendered is None else {"detector_noise": rendered}
-    found["monte_carlo"] = _plus_difference(blurred, seen, rendered or seen)
-    found["beam_blur"] = _plus_difference(seen, sharp, blurred)
-    if carried is not None:
-        found["slab"] = _plus_difference(seen, carried, blurred)
+    found["monte_carlo"] = _plus_difference(blurred, measured, rendered or measured)
+    found["beam_blur"] = _plus_difference(measured, sharp, blurred)
+    if advected is not None:
+        found["slab"] = _plus_difference(measured, advected, blurred)
     return found
 
 
@@ -107,7 +107,7 @@ def _plus_difference(base: Pair, more: Pair, less: Pair) -> list[xr.DataArray]:
 def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.ndarray, np.ndarray]:
     """Mean wind over dt of the air whose way has its middle at given places.
 
-    Straight displacements between two pictures see the chord of a curved path. In a solid rotation
+    Straight displacements between two images are the chord of a curved path. In a solid rotation
     at the rate a it is the wind at the chord's middle times tan(a dt / 2) / (a dt / 2).
 
     Parameters
@@ -115,7 +115,7 @@ def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.n
     truth : xr.Dataset
         v, w (m s^-1) on (z, y); the flow stands still over dt. Beyond the field its edge holds.
     y, z : arrays
-        Middles between where the air is at either picture, m.
+        Middles between where the air is in either image, m.
     dt : float
         s.
     steps : int
@@ -170,7 +170,7 @@ def window_mean(truth: xr.Dataset, template: int, method: str) -> xr.Dataset | N
     Parameters
     ----------
     truth : xr.Dataset
-        v, w on (z, y), with the pictures' spacing.
+        v, w on (z, y), with the images' spacing.
     template : int
         Size of a window, px.
     method : str
@@ -197,30 +197,30 @@ def _box_mean(truth: xr.Dataset, template: int) -> xr.Dataset:
     return xr.Dataset({n: (("z", "y"), w.mean((2, 3))) for n, w in windows.items()}, axes)
 
 
-def moved_as_one(
+def moved_rigidly(
     found: xr.Dataset,
-    seen: Pair,
+    measured: Pair,
     blurred: Pair,
     truth: xr.Dataset,
     retrieve: Callable[[Pair, int], xr.Dataset],
 ) -> xr.Dataset | None:
-    """The wind found where the air of every window moves as one, by the window's mean wind.
+    """The wind retrieved where the air of every window moves rigidly, with the window's mean wind.
 
-    Shear deforms what a window holds, so that its two pictures do not match at any shift. Here
-    every window's search region is a picture of its own, all of them laid side by side: the second
-    shows the blurred air of the first, carried by the mean wind over the template, and what the
-    second picture seen has besides its own blurred air.
+    Shear deforms what a window holds, so that its two images do not match at any shift. Here
+    every window's search region is an image of its own, all of them laid side by side: the second
+    shows the blurred air of the first, advected by the mean wind over the template, and what the
+    second measured image has besides its own blurred air.
 
     Parameters
     ----------
     found : xr.Dataset
         From `retrieve_wind`; its attributes say method, template, search, stride and dt.
-    seen, blurred : pair
-        See `pictures_without`.
+    measured, blurred : pair
+        See `images_without`.
     truth : xr.Dataset
         v, w on (z, y).
     retrieve : callable
-        Finds the wind in a pair by found's method, with windows so many pixels apart.
+        Retrieves the wind from a pair by found's method, with windows so many pixels apart.
 
     Returns
     -------
@@ -231,23 +231,25 @@ def moved_as_one(
         return None
     template, search, stride, dt = (found.attrs[n] for n in ("template", "search", "stride", "dt"))
     mean = truth_at_vectors(found, _box_mean(truth, template))
-    regions = sliding_window_view(np.zeros(seen[0].shape), (search, search))[::stride, ::stride]
+    regions = sliding_window_view(np.zeros(measured[0].shape), (search, search))[::stride, ::stride]
     places = []
     for axis, (name, component) in enumerate((("z", "w"), ("y", "v"))):
-        spacing = float(seen[0][name][1] - seen[0][name][0])
+        spacing = float(measured[0][name][1] - measured[0][name][0])
         start = np.arange(regions.shape[axis]) * stride
         start = start[:, None] if axis == 0 else start[None, :]
         pixel = np.arange(search)[:, None] if axis == 0 else np.arange(search)[None, :]
         shift = np.nan_to_num(mean[component].values) * dt / spacing
         place = (start - shift)[:, :, None, None] + pixel
         places.append(np.broadcast_to(place, regions.shape))
-    carried = ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
+    advected = ndimage.map_coordinates(blurred[0].values, places, mode="nearest")
 
     def cut(image):
         return sliding_window_view(image, (search, search))[::stride, ::stride]
 
-    rest = cut(seen[1].values - blurred[1].values)
-    pair = [_side_by_side(blocks, seen[0]) for blocks in (cut(seen[0].values), carried + rest)]
+    rest = cut(measured[1].values - blurred[1].values)
+    pair = [
+        _side_by_side(blocks, measured[0]) for blocks in (cut(measured[0].values), advected + rest)
+    ]
     wind = retrieve(pair, search)
     return found.assign({name: (("z", "y"), wind[name].values) for name in ("v", "w")})
 
@@ -284,7 +286,7 @@ def error_budget(
         From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`; its attributes say method,
         template and dt.
     without : mapping of xr.Dataset
-        The same from `pictures_without`, by cause, and from `moved_as_one` as `shear`.
+        The same from `images_without`, by cause, and from `moved_rigidly` as `shear`.
     truth : xr.Dataset
         v, w on (z, y).
     cores : sequence of Core
@@ -352,7 +354,7 @@ def _fractions(errors: Mapping[str, np.ndarray], chosen: np.ndarray) -> dict[str
 
 
 def causes_of(budget: Mapping[str, float]) -> list[str]:
-    """Causes that a budget from `error_budget` knows of."""
+    """Causes that a budget from `error_budget` holds."""
     return [cause for cause in CAUSES if f"{cause}.fraction" in budget]
 
 

@@ -133,7 +133,12 @@ def _costs(metrics) -> list[str]:
     text = (
         f"The Doppler lidar's directions take {_rate(metrics, 'doppler')}, and give "
         f"{three(metrics['sensor.doppler.photons_per_direction'])} photons each"
-        + (f"; the required error of v_LOS takes {needed} pulses per direction." if needed else ".")
+        + (
+            f"; the required error of v_LOS takes {needed} pulse{'s' * (needed != 1)} per "
+            "direction."
+            if needed
+            else "."
+        )
         + f" The images take {_rate(metrics, 'backscatter')}."
     )
     safety = []

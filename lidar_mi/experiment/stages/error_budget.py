@@ -1,4 +1,4 @@
-"""What limits the cross-flow wind of an experiment: found again without each cause of error."""
+"""The error budget of an experiment's cross-flow wind: retrieved without each cause of error."""
 
 from collections.abc import Callable, Sequence
 
@@ -8,9 +8,9 @@ import xarray as xr
 from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.assessment.metrics.error_budget import (
     error_budget,
-    moved_as_one,
-    picture_unit,
-    pictures_without,
+    image_scale,
+    images_without,
+    moved_rigidly,
 )
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.atmosphere.advection import advect
@@ -35,7 +35,7 @@ def error_budgets(
     log: Log,
 ) -> dict[str, dict[str, float]]:
     """`budgets` from a run's winds, where these need not be retrieved again."""
-    log("finding what limits the wind")
+    log("retrieving winds without each cause of error")
     return budgets(experiment, truth, scans, log.bar, wind, cores)
 
 
@@ -43,7 +43,7 @@ def budgets(
     experiment: Experiment,
     truth: Truth,
     scans,
-    progress: Callable[[str, float], None] = lambda text, share: None,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
     known: xr.Dataset | None = None,
     cores: Sequence[Core] | None = None,
     flagged: bool = False,
@@ -54,39 +54,39 @@ def budgets(
     ----------
     scans : the two rendered scans
     progress : callable, optional
-        Told what is done, and its share.
+        Called with what is done, and its fraction.
     known : xr.Dataset, optional
-        Winds that need not be found again, from
+        Winds that need not be retrieved again, from
         `lidar_mi.experiment.stages.winds.cross_flow_winds`.
     cores, flagged : optional
         See `error_budget`; cores left out: those of the true wind.
     """
-    pictures, blurred = _pictures(experiment, truth, scans)
+    images, blurred = _images(experiment, truth, scans)
     cores = find_cores(truth.wind) if cores is None else cores
     methods = experiment.retrieval.methods
     settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
     blur = known_blur(experiment, scan_plans(experiment, truth)[0])
-    sources = {"seen": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
+    sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if experiment.detector:
-        sources |= {"seen": Source.NOISY, "detector_noise": Source.BACKSCATTER}
+        sources |= {"measured": Source.NOISY, "detector_noise": Source.BACKSCATTER}
     found = {}
     for index, method in enumerate(methods):
-        progress(f"finding what limits {method}", index / len(methods))
+        progress(f"retrieving without each cause of error, {method}", index / len(methods))
         winds = {}
-        for cause, (pair, noise) in pictures.items():
+        for cause, (pair, noise) in images.items():
             source = sources.get(cause)
             if known is not None and source:
                 kept = known.sel(source=source, algorithm=method)
                 winds[cause] = kept.assign_attrs(method=method, **settings)
             else:
-                undone = 0.0 if cause in _SHARP else blur
+                corrected = 0.0 if cause in _SHARP else blur
                 winds[cause] = retrieve_wind(
-                    *pair, method=method, noise=noise, blur=undone, **settings
+                    *pair, method=method, noise=noise, blur=corrected, **settings
                 )
-        seen, perfect = winds.pop("seen"), winds.pop("perfect")
-        stiff = moved_as_one(
-            seen,
-            pictures["seen"][0],
+        measured, perfect = winds.pop("measured"), winds.pop("perfect")
+        stiff = moved_rigidly(
+            measured,
+            images["measured"][0],
             blurred,
             truth.wind,
             lambda pair, stride, method=method: retrieve_wind(
@@ -94,22 +94,22 @@ def budgets(
             ),
         )
         winds |= {} if stiff is None else {"shear": stiff}
-        found[method] = error_budget(seen, winds, truth.wind, cores, perfect, flagged)
+        found[method] = error_budget(measured, winds, truth.wind, cores, perfect, flagged)
     return found
 
 
-def _pictures(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataArray]]:
-    """Pictures and their noise: as they are seen, without each cause, and of the air as it is.
+def _images(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataArray]]:
+    """Images and their noise: as measured, without each cause, and of the air as it is.
 
-    Beside them the air as beams see it.
+    Beside them the air averaged over the beams.
     """
     rendered = rendered_pairs(experiment, scans)
     pair, noise = rendered[Source.BACKSCATTER]
-    seen, level = rendered.get(Source.NOISY, (pair, noise))
+    measured, level = rendered.get(Source.NOISY, (pair, noise))
     gain = offset = None
 
-    def as_seen(images, blurred=True):
-        """Extinction as the lidar would see it without noise, on the pictures' grid."""
+    def as_measured(images, blurred=True):
+        """Extinction as the lidar would measure it without noise, on the images' grid."""
         depth = experiment.scan.thickness / experiment.scan.gate_count
         if blurred:
             images = [
@@ -122,19 +122,21 @@ def _pictures(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataA
 
     air = [truth.image(k) for k in (0, 1)]
     noises = [xr.zeros_like(image) + noise for image in pair]
-    gain, offset = picture_unit(as_seen(air), pair, noises)
-    carried = None
+    gain, offset = image_scale(as_measured(air), pair, noises)
+    advected = None
     if truth.extinction[0].sizes["x"] > 1 or experiment.wake.second != "advect":
         moved = advect(air[0], truth.wind["v"], truth.wind["w"], experiment.platform.dt)
-        carried = as_seen([air[0], moved])
-    sharp = as_seen(air, blurred=False)
-    blurred = as_seen(air)
-    without = pictures_without(seen, blurred, sharp, pair if experiment.detector else None, carried)
+        advected = as_measured([air[0], moved])
+    sharp = as_measured(air, blurred=False)
+    blurred = as_measured(air)
+    without = images_without(
+        measured, blurred, sharp, pair if experiment.detector else None, advected
+    )
     # without the simulation's noise the detector's is left, if there is one
     counts = np.sqrt(np.maximum(level**2 - noise**2, 0)) if experiment.detector else 0.0
     levels = {"detector_noise": noise, "monte_carlo": counts}
     return {
-        "seen": (seen, level),
+        "measured": (measured, level),
         "perfect": (sharp, 0.0),
         **{cause: (images, levels.get(cause, level)) for cause, images in without.items()},
     }, blurred

@@ -40,7 +40,7 @@ class Rings(NamedTuple):
 
 @dataclass(frozen=True)
 class RingImages:
-    """Rendered images: of the laser itself, of air at every speed, and photon by photon."""
+    """Rendered images: of the laser itself, of air at every speed, and of single light paths."""
 
     emitted: xr.Dataset
     received: list[xr.Dataset]
@@ -74,7 +74,7 @@ def ring_instrument(doppler: Doppler) -> Rings:
         temperature,
         pressure,
         lidar.laser_width,
-        lidar.aerosol_share,
+        lidar.aerosol_fraction,
         lidar.line_shape,
     )
     model = air_rings(lidar, etalon, camera)
@@ -118,13 +118,13 @@ def check_rings(experiment: Experiment, rings: Rings) -> None:
         Settings of etalon, camera and rendering that do not go together.
     """
     use_variant(experiment.doppler.render.variant)
-    for line, settings in ((rings.line, experiment.doppler.render), _photon_by_photon(experiment)):
+    for line, settings in ((rings.line, experiment.doppler.render), _path_by_path(experiment)):
         scene_dict(experiment.doppler.etalon, experiment.doppler.camera, line, settings)
 
 
 def ring_image_names(experiment: Experiment) -> list[str]:
     """Parts of the result of `render_ring_images`."""
-    photons_too = [PHOTONS] if experiment.doppler.photon_samples else []
+    photons_too = [PHOTONS] if experiment.doppler.path_samples else []
     return [EMITTED, *photons_too, *_received(experiment)]
 
 
@@ -136,7 +136,7 @@ def render_ring_images(
     missing: Sequence[str],
     keeper: Keeper | None = None,
 ) -> Iterator[tuple[str, xr.Dataset]]:
-    """Render the laser's own light, that of single photons, and that of air at every speed.
+    """Render the laser's own light, single paths of it, and that of air at every speed.
 
     Yields
     ------
@@ -150,8 +150,8 @@ def render_ring_images(
     laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
     # what to render: line, settings, speeds, names
     plan = [(laser, doppler.render, (0.0,), [EMITTED])]
-    if doppler.photon_samples:
-        plan.append((*_photon_by_photon(experiment), (0.0,), [PHOTONS]))
+    if doppler.path_samples:
+        plan.append((*_path_by_path(experiment), (0.0,), [PHOTONS]))
     plan.append((rings.line, doppler.render, doppler.v_los, _received(experiment)))
     total = sum(len(names) for *_, names in plan)
     before = 0
@@ -197,18 +197,18 @@ def _received(experiment: Experiment) -> list[str]:
     return [f"fringes_received_{k:02d}" for k in range(len(experiment.doppler.v_los))]
 
 
-def _photon_by_photon(experiment: Experiment):
-    """The laser's line, and how single photons of it are sent through a real lens."""
+def _path_by_path(experiment: Experiment):
+    """The laser's line, and how single paths of its light are traced through a real lens."""
     doppler = experiment.doppler
     laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
-    if not doppler.photon_samples:
+    if not doppler.path_samples:
         return laser, doppler.render
     return laser, doppler.render.model_copy(
         update={
             "estimator": "analog",
             "line_shape": "sampled",
             "lens": "singlet",
-            "samples_per_pixel": doppler.photon_samples,
+            "samples_per_pixel": doppler.path_samples,
         }
     )
 

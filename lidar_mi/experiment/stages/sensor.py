@@ -52,7 +52,7 @@ def combined_wind(
         log.remark(f"no wind from both lidars: {error}")
         return None
     if not (found["flag"] == 0).any():
-        log.remark(f"no vector from both lidars is valid;  {commonest_flag(found['flag'])}")
+        log.remark(f"no vector from both lidars is valid; {commonest_flag(found['flag'])}")
     return found
 
 

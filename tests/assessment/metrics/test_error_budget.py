@@ -13,9 +13,9 @@ from lidar_mi.assessment.metrics.error_budget import (
     CAUSES,
     chord_wind,
     error_budget,
-    moved_as_one,
-    picture_unit,
-    pictures_without,
+    image_scale,
+    images_without,
+    moved_rigidly,
     window_mean,
 )
 from lidar_mi.assessment.report.error_budget import budget_chapter, limit_sentence
@@ -45,7 +45,7 @@ def winds(v, w, method="variational", flag=None, template=8):
     return found.assign_attrs(method=method, template=template, dt=DT)
 
 
-# --- pictures
+# --- images
 
 
 def pairs(count, seed=1):
@@ -59,7 +59,7 @@ def test_each_cause_is_taken_away_and_all_else_stays():
     rendered = [a + b for a, b in zip(blurred, photons, strict=True)]
     seen = [a + b for a, b in zip(rendered, counts, strict=True)]
     carried = [a + b for a, b in zip(blurred, shear, strict=True)]
-    found = pictures_without(seen, blurred, air, rendered, carried)
+    found = images_without(seen, blurred, air, rendered, carried)
     for k in (0, 1):
         expected = {
             "detector_noise": air[k] + blur[k] + photons[k],
@@ -74,21 +74,21 @@ def test_each_cause_is_taken_away_and_all_else_stays():
 
 def test_without_detector_and_depth_there_are_two_causes():
     air, blurred, seen = pairs(3)
-    found = pictures_without(seen, blurred, air)
+    found = images_without(seen, blurred, air)
     assert set(found) == {"monte_carlo", "beam_blur"}
     np.testing.assert_allclose(found["monte_carlo"][1], blurred[1], rtol=1e-12)
 
 
-def test_picture_unit_finds_gain_and_offset_through_uneven_noise():
+def test_image_scale_finds_gain_and_offset_through_uneven_noise():
     rng = np.random.default_rng(2)
     (air,) = pairs(1)
     noise = [field(1e-9 * (1 + 50 * rng.random((20, 30)))) for _ in range(2)]
-    picture = [3e-6 * a + 2e-7 + rng.normal(0, n) for a, n in zip(air, noise, strict=True)]
-    gain, offset = picture_unit(air, picture, noise)
+    image = [3e-6 * a + 2e-7 + rng.normal(0, n) for a, n in zip(air, noise, strict=True)]
+    gain, offset = image_scale(air, image, noise)
     # weighted: the 5 % of pixels with noise below 3.5e-9 alone would give 2e-9 for the gain
     assert gain == pytest.approx(3e-6, abs=4e-9) and offset == pytest.approx(2e-7, abs=4e-9)
     even = [field(np.full((20, 30), 2.0))] * 2
-    assert picture_unit(even, [3 * e for e in even], noise) == pytest.approx((3.0, 0.0))
+    assert image_scale(even, [3 * e for e in even], noise) == pytest.approx((3.0, 0.0))
 
 
 # --- what a vector means
@@ -262,18 +262,18 @@ def test_noise_alone_has_all_of_it(method):
     sharp = carried(lambda y, z: (y - H, z + H))
     rng = np.random.default_rng(11)
     seen = [i + 0.1 * rng.standard_normal(i.shape) for i in sharp]
-    pictures = pictures_without(seen, sharp, sharp, sharp)
+    images = images_without(seen, sharp, sharp, sharp)
     truth = flow(lambda y, z: H / DT + 0 * y, lambda y, z: -H / DT + 0 * y)
     settings = {"dt": DT, "method": method, "stride": 2}
     found = retrieve_wind(*seen, noise=0.1, **settings)
     without = {
         cause: retrieve_wind(*pair, noise=0.0 if cause == "detector_noise" else 0.1, **settings)
-        for cause, pair in pictures.items()
+        for cause, pair in images.items()
     }
     budget = error_budget(found, without, truth, [])
     assert budget["rmse_v"] > 0.05
     assert budget["detector_noise.fraction"] > 0.9
-    # neither simulation's noise nor blur is in these pictures
+    # neither simulation's noise nor blur is in these images
     assert budget["monte_carlo.fraction"] == pytest.approx(0, abs=1e-6)
     assert budget["beam_blur.fraction"] == pytest.approx(0, abs=1e-6)
 
@@ -311,7 +311,7 @@ def test_shear_within_the_window(shear):
     truth = flow(lambda y, z: 5 + shear * z, lambda y, z: 0 * y, 57, 41)
     settings = {"dt": DT, "method": "cc", "search": 24}
     found = retrieve_wind(*seen, **settings)
-    stiff = moved_as_one(
+    stiff = moved_rigidly(
         found,
         seen,
         sharp,
@@ -323,10 +323,10 @@ def test_shear_within_the_window(shear):
         assert budget["rmse_v"] > 2 and budget["shear.fraction"] > 0.6
         assert budget["shear.rmse_v"] < 0.9
     else:
-        # the same pictures but for the interpolation between pixels
+        # the same images but for the interpolation between pixels
         assert budget["shear.fraction"] == pytest.approx(0, abs=0.1)
         assert np.nanmedian(abs(stiff["v"] - found["v"])) < 0.02
-    assert moved_as_one(found.assign_attrs(method="multipass"), seen, sharp, truth, None) is None
+    assert moved_rigidly(found.assign_attrs(method="multipass"), seen, sharp, truth, None) is None
 
 
 # --- the report
@@ -359,7 +359,7 @@ def test_nothing_to_name_is_said():
 
 
 def test_what_a_method_has_not_is_said():
-    """A fit of whole pictures has no window, and so no row for what happens within one."""
+    """A fit of whole images has no window, and so no row for what happens within one."""
     with_window = described(beam_blur=0.2, window=0.1)
     budgets = {"cc": with_window, "variational": described(beam_blur=0.2)}
     *_, last = budget_chapter(budgets, []).lead
