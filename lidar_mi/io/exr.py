@@ -228,8 +228,8 @@ def read_scan(path: str | Path) -> xr.Dataset:
     )
     if not complete or "Y" not in layers or not {"y", "z"} <= set(header):
         raise InputError(
-            f"{path}: its layers are not a lidar scan; expected Y and gate000.S0 ... gate000.S3, "
-            "gate000.S0_stderr, the same of every gate, with header attributes y and z; it has "
+            f"{path}: its layers are not a lidar scan; expected Y and, the same of every gate, "
+            "gate000.S0 ... gate000.S3, gate000.S0_stderr, header attributes y and z; it has "
             f"{', '.join(sorted(layers)) or 'none'}"
         )
     rows, columns = layers["Y"].shape
