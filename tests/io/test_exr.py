@@ -222,7 +222,10 @@ class TestErrors:
         path = tmp_path / "rgb.exr"
         self.foreign(path)
         text = self.fault(path)
-        assert "are not a lidar scan; expected Y and gate000.S0" in text and "B, G, R" in text
+        assert (
+            "are not a lidar scan; expected Y and, the same of every gate, gate000.S0" in text
+            and "B, G, R" in text
+        )
         # it is readable all the same
         _, layers = read_layers(path)
         assert set(layers) == set("RGB") and (layers["R"] == 1).all()
