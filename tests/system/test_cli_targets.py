@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from tests.support.command_line import files_in
+
 
 @pytest.fixture
 def images(there):
@@ -76,3 +78,19 @@ def test_a_run_never_replaces_what_it_reads(there, lidar_mi, quick):
     code, _, err = lidar_mi(*again, "--set", "seed=2", "--overwrite")
     assert code == 2 and "holds the experiment that this one was made from" in err
     assert (there / "run" / "experiment.yaml").read_bytes() == record
+
+
+@pytest.mark.parametrize(
+    ("target", "says"),
+    [("x" * 300, "File name too long"), ("notes.txt/w.nc", "notes.txt is no folder")],
+)
+@pytest.mark.parametrize("command", [RETRIEVE, ("run", "tiny.yaml")])
+def test_places_that_cannot_be(images, lidar_mi, command, target, says):
+    """One line, said before the work, and nothing left."""
+    (images / "notes.txt").write_text("mine")
+    before = files_in(images)
+    code, _, err = lidar_mi(*command, "-o", target)
+    assert code == 2 and "Traceback" not in err
+    if command[0] == "retrieve":
+        assert says in err.splitlines()[-1]
+    assert files_in(images) == before

@@ -18,7 +18,6 @@ from lidar_mi.experiment.run_folder import MADE_BY, read_metrics
 from lidar_mi.io.exr import read_scan
 from lidar_mi.io.folder import locked
 from lidar_mi.io.netcdf import read_netcdf
-from tests.support.command_line import shell
 from tests.support.experiments import check, small
 
 
@@ -66,13 +65,13 @@ def test_the_lock_dies_with_its_process(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_study_is_refused_in_a_folder_at_work(there):
+def test_a_study_is_refused_in_a_folder_at_work(there, lidar_mi):
     text = (there / "tiny.yaml").read_text() + "variants: {a: {seed: 1}, b: {seed: 2}}\n"
     (there / "two.yaml").write_text(text)
     (there / "out").mkdir()
-    with another_process(there / "out"):
-        found = shell("run", "two.yaml", "-o", "out")
-    assert found.returncode == 2 and "out: is in use by another run" in found.stderr
+    with locked(there / "out"):
+        code, _, err = lidar_mi("run", "two.yaml", "-o", "out")
+    assert code == 2 and "out: is in use by another run" in err
     assert not list((there / "out").iterdir())
 
 
