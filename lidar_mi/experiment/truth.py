@@ -78,7 +78,7 @@ def make_truth(
     smooth1 = _extinction(first, mapping, first, second)
     if second is None:
         flow = first
-        smooth2 = _carried(smooth1, flow, experiment)
+        smooth2 = _advected(smooth1, flow, experiment)
     else:
         flow = (first + second) / 2
         smooth2 = _extinction(second, mapping, first, second)
@@ -98,10 +98,10 @@ def make_truth(
         factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
         if second is None:
             rough1 = smooth1 * factor
-            rough2 = _carried(rough1, flow, experiment)
+            rough2 = _advected(rough1, flow, experiment)
         else:
             rough1 = smooth1 * factor
-            rough2 = smooth2 * _carried(factor, flow, experiment)
+            rough2 = smooth2 * _advected(factor, flow, experiment)
     else:
         rough1, rough2 = smooth1, smooth2
     # winds are retrieved from the first gate
@@ -122,7 +122,7 @@ def moves_along(experiment: Experiment) -> bool:
     return experiment.wake.turbine is not None or experiment.volume is not None
 
 
-def _carried(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> xr.DataArray:
+def _advected(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> xr.DataArray:
     """A field after dt, in the frame that goes along with the gates."""
     v, w, dt = flow["v"], flow["w"], experiment.platform.dt
     if float(field.min()) == float(field.max()):

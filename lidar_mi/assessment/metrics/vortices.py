@@ -31,14 +31,14 @@ def true_pair(wind: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
     out. Circulation far from the core is that of a model, not of a flow.
     """
     true: dict[str, float] = {}
-    carried = []
+    advecting = []
     for core in cores:
         side = "port" if core.circulation > 0 else "starboard"
         true |= {f"{side}_core_radius": core.radius, f"{side}_y": core.y, f"{side}_z": core.z}
         rings = ring_averages(wind, core, [other for other in cores if other is not core])
         if rings is not None:
             true[f"{side}_circulation_5_15"] = rings.circulation
-            carried.append((rings.v, rings.w))
+            advecting.append((rings.v, rings.w))
     if len(cores) == 2:
         port, starboard = cores
         true |= {
@@ -46,8 +46,8 @@ def true_pair(wind: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
             "centre_y": (port.y + starboard.y) / 2,
             "centre_z": (port.z + starboard.z) / 2,
         }
-    if len(carried) == 2:
-        true["drift_v"], true["drift_w"] = (float(mean) for mean in np.mean(carried, axis=0))
+    if len(advecting) == 2:
+        true["drift_v"], true["drift_w"] = (float(mean) for mean in np.mean(advecting, axis=0))
     return true
 
 

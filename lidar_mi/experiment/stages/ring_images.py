@@ -124,8 +124,8 @@ def check_rings(experiment: Experiment, rings: Rings) -> None:
 
 def ring_image_names(experiment: Experiment) -> list[str]:
     """Parts of the result of `render_ring_images`."""
-    photons_too = [PHOTONS] if experiment.doppler.path_samples else []
-    return [EMITTED, *photons_too, *_received(experiment)]
+    single_paths = [PHOTONS] if experiment.doppler.path_samples else []
+    return [EMITTED, *single_paths, *_received(experiment)]
 
 
 def render_ring_images(

@@ -82,8 +82,8 @@ def best_filter(
     elif noise is None:
         # the lowest shells are low by chance as well: the mean of all that may be as low
         floor = (density * below).min()
-        share = uncertainty**-2 * (density <= floor * below)
-        floor = (share * density).sum() / share.sum()
+        fraction = uncertainty**-2 * (density <= floor * below)
+        floor = (fraction * density).sum() / fraction.sum()
     else:
         floor = torch.as_tensor(noise**2, dtype=images.dtype, device=images.device)
     # shells of noise alone must not pass because their mean happens to be a little higher
@@ -182,8 +182,8 @@ def shell_means(
     last = most + int((number[most:] >= min(_SHELL_WAVES, float(number[most]))).sum()) - 1
     density[last + 1 :] = density[last]
     # independent waves: an image has as many as pixels, tapering leaves two fifths of them
-    share = 0.4 ** (len(shape) / 2) * len(images) * math.prod(shape) / math.prod(sizes)
-    return density, (share * number.clamp(min=1)).rsqrt()
+    fraction = 0.4 ** (len(shape) / 2) * len(images) * math.prod(shape) / math.prod(sizes)
+    return density, (fraction * number.clamp(min=1)).rsqrt()
 
 
 def faded(

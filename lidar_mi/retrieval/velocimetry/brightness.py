@@ -27,14 +27,14 @@ def of_one_brightness(
     attenuated unlike, lose their linear trend along x as well.
     """
     dims = tuple(range(1, value.ndim))
-    share = weight / weight.sum().clamp(min=1e-30)
-    value = value - (share * value).sum(dims, keepdim=True)
+    fraction = weight / weight.sum().clamp(min=1e-30)
+    value = value - (fraction * value).sum(dims, keepdim=True)
     if len(dims) > 2:
         x = torch.arange(len(weight)).to(value)[:, None, None]
-        x = x - (share * x).sum()
-        trend = share * x / (share * x * x).sum().clamp(min=1e-30)
+        x = x - (fraction * x).sum()
+        trend = fraction * x / (fraction * x * x).sum().clamp(min=1e-30)
         value = value - x * (trend * value).sum(dims, keepdim=True)
-    contrast = (share * value.square()).sum(dims, keepdim=True).sqrt()
+    contrast = (fraction * value.square()).sum(dims, keepdim=True).sqrt()
     # images come with nearly one contrast: what asks for more has none
     gain = (contrast[:1] / contrast).nan_to_num(1.0).clamp(0.5, 2.0)
     return gain * value, gain

@@ -47,7 +47,7 @@ def cross_correlation(
     neighbours (Willert & Gharib 1991, Exp. Fluids 10, 181-193). On smooth images with few
     correlation lengths in a window the peak is no Gaussian: expect 0.1 px rms without any noise
     where an 8 px template sees texture of 3 px correlation length. A displacement beyond
-    (search - template) // 2 - 1/2 px cannot be seen; its peak lies on the rim and is flagged.
+    (search - template) // 2 - 1/2 px is out of reach; its peak lies on the rim and is flagged.
 
     Parameters
     ----------

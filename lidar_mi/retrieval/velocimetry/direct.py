@@ -19,7 +19,7 @@ _ROUNDING = 1e-14
 class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, and the factor of the second derivative there.
 
-    `stiff` is the prior's share of the second derivative, a band.
+    `stiff` is the prior's part of the second derivative, a band.
     """
 
     coefficients: torch.Tensor

@@ -115,7 +115,7 @@ def multipass(
     bent = curvature(fit.gradient, max(1, round(template / 2 / stride))) / stride
     curved = (sigma**2 / 2 * bent).square()
     curved = torch.diag_embed(curved.movedim(0, -1)).movedim((-2, -1), (0, 1))
-    matched = (fit.score > 0) & (fit.share > 0.5)
+    matched = (fit.score > 0) & (fit.fraction_valid > 0.5)
     at = torch.meshgrid(*places, indexing="ij")
     off = (d - flow[:, *at]).norm(dim=0) > max(settings.jump, sigma)
     bad = non_finite([image1, image2], windows)
@@ -190,15 +190,15 @@ class _Fit(NamedTuple):
     """Affine displacement of windows, in px.
 
     `displacement` (n, ...), `gradient` (n, n, ...) by component and axis, weighted correlation
-    `score` (0 where there is no texture), `covariance` (n, n, ...) of the displacement, `share` of
-    the window's weight where both images are valid.
+    `score` (0 where there is no texture), `covariance` (n, n, ...) of the displacement,
+    `fraction_valid` of the window's weight where both images are valid.
     """
 
     displacement: torch.Tensor
     gradient: torch.Tensor
     score: torch.Tensor
     covariance: torch.Tensor
-    share: torch.Tensor
+    fraction_valid: torch.Tensor
 
 
 def _fit(
@@ -321,7 +321,7 @@ def _solved(
     dims = plain.ndim - 1
     terms = _terms(dims)
     misfit, *means, square1, square2, cross, number = plain
-    share = number / whole
+    fraction_valid = number / whole
     number = number.clamp(min=1e-12)
     covary = cross - means[0] * means[1] / number
     contrast = [s - mean**2 / number for s, mean in zip((square1, square2), means, strict=True)]
@@ -350,5 +350,5 @@ def _solved(
         solution[:, 1:] / sigma,
         torch.where(textured, covary / scale, 0.0),
         covariance.movedim((-2, -1), (0, 1)),
-        share,
+        fraction_valid,
     )

@@ -177,11 +177,11 @@ class Prior(NamedTuple):
         self, informed: torch.Tensor, energy: torch.Tensor, settings: VariationalSettings
     ) -> Divergence:
         before, all_of_it = self.divergence, self._divergent()
-        share = all_of_it / before.strength
+        fraction = all_of_it / before.strength
         largest = settings.largest_change_divergence
         everywhere, beside = (
             float(bounded(*((part * all_of_it * f).mean() for f in (informed, energy)), most))
-            for part, most in ((share, largest), (1 - share, settings.largest_change))
+            for part, most in ((fraction, largest), (1 - fraction, settings.largest_change))
         )
         trend = math.log(before.strength), math.log(everywhere)
         # images of weak texture that show no divergence do not say that there is none

@@ -100,28 +100,28 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     vertical, lateral = np.meshgrid(z, y, indexing="ij")
     value = np.stack([field("v"), field("w")])
     place = np.stack([field("y_vector", lateral), field("z_vector", vertical)])
-    good = np.isfinite(value).all(0) & np.isfinite(place).all(0)
-    good &= field("flag", np.zeros(good.shape)) == 0
-    stderr = [field(name, np.full(good.shape, np.nan)) for name in ("v_stderr", "w_stderr")]
+    usable = np.isfinite(value).all(0) & np.isfinite(place).all(0)
+    usable &= field("flag", np.zeros(usable.shape)) == 0
+    stderr = [field(name, np.full(usable.shape, np.nan)) for name in ("v_stderr", "w_stderr")]
     stderr = np.stack(stderr)
-    known = bool(np.isfinite(stderr[:, good]).any())
+    known = bool(np.isfinite(stderr[:, usable]).any())
     if known:
-        good &= (np.isfinite(stderr) & (stderr > 0)).all(0)
-    if int(good.sum()) < 20:
-        raise InputError(f"vectors: {int(good.sum())} are good; expected at least 20")
-    stderr = np.where(good, stderr if known else 1.0, 1.0)
-    shared = np.nan_to_num(field("vw_correlation", np.zeros(good.shape))) * good
+        usable &= (np.isfinite(stderr) & (stderr > 0)).all(0)
+    if int(usable.sum()) < 20:
+        raise InputError(f"vectors: {int(usable.sum())} are valid; expected at least 20")
+    stderr = np.where(usable, stderr if known else 1.0, 1.0)
+    shared = np.nan_to_num(field("vw_correlation", np.zeros(usable.shape))) * usable
     shared = shared.clip(-0.999, 0.999) if known else 0 * shared
-    root = np.zeros((2, 2, *good.shape))
+    root = np.zeros((2, 2, *usable.shape))
     root[0, 0] = 1 / stderr[0]
     root[1, 0] = -shared / np.sqrt(1 - shared**2) / stderr[0]
     root[1, 1] = 1 / np.sqrt(1 - shared**2) / stderr[1]
 
-    tensors = [torch.as_tensor(np.where(good, a, 0.0)) for a in (*place, value)]
-    valid = torch.as_tensor(good)
+    tensors = [torch.as_tensor(np.where(usable, a, 0.0)) for a in (*place, value)]
+    valid = torch.as_tensor(usable)
     model = _Vectors(*tensors[:2], torch.as_tensor(root), tensors[2], valid, profile)
     limits = step_limits(y, z)
-    flow_variance = float(np.square(value[:, good]).mean()) / 4
+    flow_variance = float(np.square(value[:, usable]).mean()) / 4
     best = None
     for start in starting_points(_components(model, flow_variance), STARTS, profile):
         found = fit(model, start, limits, flow_variance, 30, TOLERANCE)

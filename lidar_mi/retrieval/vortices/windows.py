@@ -70,7 +70,7 @@ def vortex_windows(
         found.quantities,
         {
             "profile": found.profile,
-            "fit": "; ".join(found.reasons) or "good",
+            "fit": "; ".join(found.reasons) or "accepted",
             "chi2": found.chi2,
             "model_error": found.model_error,
             "model_error_length": found.model_error_length,

@@ -100,5 +100,5 @@ def test_flags_outliers_and_unknown_errors():
         assert (off < 6 * np.sqrt(np.diag(found.covariance))).all()
         assert (off[[0, 4]] < 8).all()
     assert np.isnan(unknown.chi2)
-    with pytest.raises(InputError, match="vectors: 0 are good"):
+    with pytest.raises(InputError, match="vectors: 0 are valid"):
         fit_vortices_to_wind(data.assign(flag=data.flag + 1))

@@ -20,7 +20,7 @@ def test_vectors_and_numbers_in_one_data_set(tmp_path):
     pair = vortex_pair_images(0.02, seed=11, vortices=uneven(), **SMALL)
     found = retrieve_wind(pair.first, pair.second, DT, "vortex_fit", stride=2, noise=0.02)
     fit = fit_vortices(pair.first, pair.second, DT, noise=0.02)
-    assert (found.flag == 0).all() and found.attrs["fit"] == "good"
+    assert (found.flag == 0).all() and found.attrs["fit"] == "accepted"
     assert found.attrs["profile"] == "lamb_oseen"
     for name, quantity in fit.quantities.items():
         assert float(found[name]) == pytest.approx(quantity.value)
@@ -42,4 +42,4 @@ def test_a_failed_fit_leaves_no_good_vector():
     pair = vortex_pair_images(0.0, columns=60, rows=50)
     images = [pair.first.copy(data=1 + random.standard_normal(pair.first.shape)) for _ in range(2)]
     found = retrieve_wind(*images, DT, "vortex_fit", noise=1.0)
-    assert (found.flag & Flag.NO_MATCH.value > 0).all() and found.attrs["fit"] != "good"
+    assert (found.flag & Flag.NO_MATCH.value > 0).all() and found.attrs["fit"] != "accepted"
