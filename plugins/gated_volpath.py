@@ -119,6 +119,8 @@ def define():
             quantities = len(self.quantities())
             trace = self._gated if self.estimator == "gated" else self._analog
             before, arrays = self.batches.kept() if self.batches else (0, {})
+            if arrays and int(arrays.get("samples_per_pass", -1)) != self.samples_per_pass:
+                before, arrays = 0, {}  # passes of another size, for another machine's memory
             image = _float(arrays.get("image"), beams * gates * quantities)
             done, total = 0, _moments(arrays)
             with dr.suspend_grad(), _nothing_freed():
@@ -139,11 +141,14 @@ def define():
                         dr.eval(image, total)
                         dr.sync_thread()
                     if self.batches and done < beams * samples:
-                        self.batches.keep(number, functools.partial(_arrays, image, total))
+                        self.batches.keep(number, functools.partial(self._kept, image, total))
                     if self.progress:
                         self.progress(done, beams * samples)
             width, height = sensor.film().size()
             return mi.TensorXf(image, (height, width, gates * quantities))
+
+        def _kept(self, image, total):
+            return _arrays(image, total) | {"samples_per_pass": np.array(self.samples_per_pass)}
 
         def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
             """Gradients of the scene from those of the image (of S0 to S3; S0_stderr has none)."""
@@ -192,6 +197,15 @@ def define():
             self.physical.check(scene, sensor)
             _check_gate_meets_medium(scene, sensor)
             _check_blends(scene, sensor)
+            values = sensor.beam_count * sensor.gate_count * len(self.quantities())
+            if values >= 2**32:
+                most = (2**32 - 1) // (sensor.beam_count * len(self.quantities()))
+                fail(
+                    NAME,
+                    "gate_count",
+                    sensor.gate_count,
+                    f"at most {most} with {sensor.beam_count} beams: images are counted in 32 bits",
+                )
             samples = int(spp) or sensor.sampler().sample_count()
             if self.estimator == "gated":
                 samples = sensor.gate_count * max(2, -(-samples // sensor.gate_count))

@@ -9,29 +9,31 @@ from scipy.interpolate import CubicSpline
 
 from lidar_mi.errors import InputError
 
-_MOST_NODES = 10**8
+MOST_NODES = 10**8
 
 # how far the extent may be from a whole number of cells, in cells: axes of files are even to this
 _UNEVEN = 1e-3
 
 
-def check_nodes(spacing: float, counts: Mapping[str, int]) -> None:
+def check_nodes(spacing: float, counts: Mapping[str, int], most: int = MOST_NODES) -> None:
     """Whether as many nodes along each axis fit into memory, several fields of them.
 
     Raises
     ------
     InputError
-        More than 1e8 nodes, 0.8 GB a field.
+        More than ``most`` nodes. 1e8 take 0.8 GB a field.
     """
-    if math.prod(counts.values()) > _MOST_NODES:
+    if math.prod(counts.values()) > most:
         counted = " x ".join(f"{count} ({name})" for name, count in counts.items())
         raise InputError(
             f"wake.spacing: {spacing:g} m is not allowed, it makes {counted} nodes; expected at "
-            f"most {_MOST_NODES:g} nodes"
+            f"most {most:g} nodes, which memory holds with all that is made of them"
         )
 
 
-def resample(wake: xr.Dataset, spacing: float, axes: str = "yz") -> xr.Dataset:
+def resample(
+    wake: xr.Dataset, spacing: float, axes: str = "yz", most: int = MOST_NODES
+) -> xr.Dataset:
     """Finer nodes by cubic splines, in y and z unless other axes are named.
 
     Splines (not-a-knot) along one axis after the other, through the nodes; exact for cubic
@@ -46,6 +48,8 @@ def resample(wake: xr.Dataset, spacing: float, axes: str = "yz") -> xr.Dataset:
     spacing : float
         m; it must divide the extent along each of the axes.
     axes : "yz" or "xyz"
+    most : int
+        Nodes.
 
     Returns
     -------
@@ -74,7 +78,7 @@ def resample(wake: xr.Dataset, spacing: float, axes: str = "yz") -> xr.Dataset:
                 f"{extent:g} m; allowed: {extent:g} m over a whole number"
             )
         ends[name] = (places[0], places[-1], cells + 1)
-    check_nodes(spacing, {d: ends[d][2] if d in ends else wake.sizes[d] for d in "xyz"})
+    check_nodes(spacing, {d: ends[d][2] if d in ends else wake.sizes[d] for d in "xyz"}, most)
     nodes = {name: np.linspace(*end) for name, end in ends.items()}
 
     fine = wake.drop_vars([*wake.data_vars, *axes]).assign_coords(

@@ -8,11 +8,13 @@ import numpy as np
 from lidar_mi.assessment.metrics.requirements import look_ahead
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.describe import Section
+from lidar_mi.experiment.forecast import forecast
 from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import Truth
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.rendering.memory import ceiling
 from lidar_mi.retrieval.methods import ImageMethod
 
 
@@ -65,10 +67,28 @@ def _backscatter(asked: Experiment, truth: Truth, plan: ScanPlan) -> Iterator[Se
             f"{asked.render.samples_per_beam}, orders 1 to {asked.render.max_order}",
         ),
         ("time between the images", f"{platform.dt:g} s"),
+        *_forecast(asked, plan),
     ]
     if not asked.volume:
         rows += _displacements(asked, wind, pixel)
     yield "backscatter lidar", rows
+
+
+def _forecast(asked: Experiment, plan: ScanPlan) -> list[tuple[str, str]]:
+    """Memory and time, to a factor of two."""
+    expected, allowed = forecast(asked, plan), ceiling(asked.render.memory)
+    return [
+        ("memory", f"about {expected.memory / 1e9:.2g} GB, at most {allowed / 1e9:.3g} GB"),
+        ("time on one core", f"about {duration(expected.seconds)}, figures not counted"),
+    ]
+
+
+def duration(seconds: float) -> str:
+    """A time as people say it: 40 s, 3 min, 5 h, 12 days."""
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{max(seconds, 1):.0f} s"
 
 
 def _displacements(asked: Experiment, wind, pixel: float) -> list[tuple[str, str]]:

@@ -16,6 +16,7 @@ from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
 from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
 from lidar_mi.atmosphere.wake import centre, check_nodes, resample
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.forecast import most_nodes
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.io.wake_file import read_wake
 
@@ -134,11 +135,11 @@ def _advected(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> 
 
 def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
     """The flow at t1 and, if it is a state of its own, at t2, centred and refined."""
-    wake = experiment.wake
+    wake, most = experiment.wake, most_nodes(experiment)
     gate_middle = experiment.scan.range + experiment.scan.thickness / 2
     if wake.vortex_pair:
         pair = wake.vortex_pair
-        axes = _axes(wake, "vortex_pair")
+        axes = _axes(wake, "vortex_pair", most)
         vortices = vortex_pair(
             pair.circulation, pair.separation, pair.core_radius, model=pair.model
         )
@@ -172,7 +173,8 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
             )
         y, z = wake.centre or (None, None)
         axes = "xyz" if experiment.volume else "yz"
-        flow = centre(resample(flow, wake.spacing, axes), y, z).drop_vars("time", errors="ignore")
+        fine = resample(flow, wake.spacing, axes, most)
+        flow = centre(fine, y, z).drop_vars("time", errors="ignore")
         middle = wake.x if wake.x is not None else float(flow["x"].mean())
         flows.append(flow.assign_coords(x=flow["x"] - middle + gate_middle))
     return flows[0], flows[1]
@@ -193,11 +195,16 @@ def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
     half = math.ceil((scan.thickness / 2 + margin) / wake.spacing)
     x = gate_middle + wake.spacing * np.arange(-half, half + 1)
     return turbine_flow(
-        mean, x, *_axes(wake, "turbine"), turbine.turbulence, turbine.outer_scale, experiment.seed
+        mean,
+        x,
+        *_axes(wake, "turbine", most_nodes(experiment)),
+        turbine.turbulence,
+        turbine.outer_scale,
+        experiment.seed,
     )
 
 
-def _axes(wake, key: str) -> list[np.ndarray]:
+def _axes(wake, key: str, most: int) -> list[np.ndarray]:
     """y and z of an analytic wake, about the scan's axis."""
     ends = {}
     for axis, name in (("y", "width"), ("z", "height")):
@@ -209,7 +216,7 @@ def _axes(wake, key: str) -> list[np.ndarray]:
                 f"wake.spacing = {wake.spacing:g} m"
             )
         ends[axis] = (-extent / 2, extent / 2, cells + 1)
-    check_nodes(wake.spacing, {axis: count for axis, (*_, count) in ends.items()})
+    check_nodes(wake.spacing, {axis: count for axis, (*_, count) in ends.items()}, most)
     return [np.linspace(*end) for end in ends.values()]
 
 

@@ -8,6 +8,8 @@ from numpy.typing import ArrayLike
 
 from lidar_mi.errors import InputError
 
+# whose products are computed together
+_GATES = 16
 _ORDER = re.compile(r"order\d+\.S0")
 
 
@@ -219,8 +221,14 @@ def with_products(scan: xr.Dataset) -> xr.Dataset:
     if "order2.S0" in scan:
         images.append(multiple_scattering_image)
     for image in images:
-        for name, variable in image(scan).data_vars.items():
-            scan = scan.assign({name: variable.astype(np.float32)})
+        # a few gates at a time: in double precision all of them are several times the scan
+        parts = [
+            image(scan.isel(gate=slice(first, first + _GATES))).astype(np.float32)
+            for first in range(0, scan.sizes["gate"], _GATES)
+        ]
+        whole = xr.concat(parts, "gate") if len(parts) > 1 else parts[0]
+        for name, variable in whole.data_vars.items():
+            scan = scan.assign({name: variable})
             if "stderr_is_bound" in variable.attrs:
                 scan.attrs[f"{name}_is_bound"] = variable.attrs["stderr_is_bound"]
     return scan

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 import xarray as xr
@@ -15,6 +16,7 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.signal import attenuated_backscatter
 from lidar_mi.io.exr import label_scan, unpack
 from lidar_mi.rendering.batches import Batches
+from lidar_mi.rendering.memory import samples_at_once
 from lidar_mi.rendering.phase import Molecules
 from lidar_mi.rendering.settings import RenderSettings
 
@@ -129,6 +131,7 @@ def render_scans(
         start = time.perf_counter()
         seed_here = (seed + (index << 16)) % 2**31  # a header holds 32 bits with a sign
         image = np.array(mi.render(scene, seed=seed_here))
+        dr.flush_malloc_cache()  # what was traced with is as large as the image
         names = scene.integrator().quantities()
         scan = _as_dataset(image, names, plan, lidar, environment, settings, seed_here)
         earlier = kept.seconds if kept else 0.0
@@ -168,7 +171,7 @@ def scene_dict(
             "orders": settings.max_order > 1,
             "covariance": mi.is_polarized,
             "estimator": settings.estimator,
-            "samples_per_pass": settings.samples_per_pass,
+            "samples_per_pass": samples_at_once(settings.samples_per_pass, settings.memory),
         },
         "environment": {"type": "homogeneous", "sigma_t": environment, **around},
         "sensor": {

@@ -13,7 +13,9 @@ from lidar_mi import __version__
 from lidar_mi.errors import InputError
 from lidar_mi.io.exr import label_scan, unpack, write_fringes, write_scan
 from lidar_mi.io.text import read_text
+from lidar_mi.io.xml import check_scene_file
 from lidar_mi.rendering.fringes import render_image
+from lidar_mi.rendering.memory import PROGRAM, check_memory, image_bytes, samples_at_once
 from lidar_mi.rendering.variant import use_variant
 
 
@@ -50,6 +52,7 @@ def render_file(
         raise InputError(f"{scene_path}: no such file; expected a Mitsuba scene (XML)")
     if not out.parent.is_dir():
         raise InputError(f"{out}: {out.parent} is no folder; expected one that exists")
+    check_scene_file(scene_path)
     use_variant(variant)
     try:
         scene = mi.load_file(str(scene_path), **(definitions or {}))
@@ -74,6 +77,10 @@ def render_file(
         image.attrs["scene"] = scene_path.name
         write_fringes(out, image)
         return image
+    integrator.samples_per_pass = samples_at_once(integrator.samples_per_pass, None)
+    needed = image_bytes(sensor.beam_count, sensor.gate_count, len(integrator.quantities()))
+    what = f"{scene_path}: {sensor.beam_count} beams x {sensor.gate_count} gates"
+    check_memory(PROGRAM + needed, None, what, "fewer beams, gates or orders")
     tensor = np.array(mi.render(scene, spp=samples, seed=seed))
     scan = _as_dataset(tensor, integrator.quantities(), sensor)
     scan.attrs |= {

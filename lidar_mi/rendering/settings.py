@@ -4,7 +4,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from lidar_mi.units import Length, Within
+from lidar_mi.units import Length, Memory, Within
 
 Variant = Literal[
     "llvm_ad_mono_polarized",
@@ -19,6 +19,9 @@ Variant = Literal[
     "cuda_ad_spectral",
 ]
 VARIANTS: tuple[str, ...] = get_args(Variant)
+
+
+_CEILING = Within(1e8, 1e15, "from a small scene to the largest machine")
 
 
 class RenderSettings(BaseModel):
@@ -36,7 +39,10 @@ class RenderSettings(BaseModel):
     estimator: Literal["gated", "analog"] = "gated"
     samples_per_pass: Annotated[
         int, Within(1024, 2**31 - 1, "fewer waste the processor; counted in 31 bits")
-    ] = Field(1 << 22, description="traced at once; limits the memory")
+    ] = Field(1 << 22, description="traced at once, fewer if memory does not hold them")
+    memory: Annotated[Memory, _CEILING] | None = Field(
+        None, description="that a run may take; default: half of the machine's"
+    )
 
 
 class FringeSettings(BaseModel):
@@ -60,4 +66,7 @@ class FringeSettings(BaseModel):
     )
     samples_per_pass: Annotated[
         int, Within(1024, 2**31 - 1, "fewer waste the processor; counted in 31 bits")
-    ] = Field(1 << 22, description="traced at once; limits the memory")
+    ] = Field(1 << 22, description="traced at once, fewer if memory does not hold them")
+    memory: Annotated[Memory, _CEILING] | None = Field(
+        None, description="that a run may take; default: half of the machine's"
+    )

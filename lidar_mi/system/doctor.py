@@ -19,6 +19,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 
 from lidar_mi.system import llvm
+from lidar_mi.system.memory import GIB, available_memory, machine_memory
 from lidar_mi.tables import Table, Tabular
 
 LLVM_VARIANTS = (
@@ -30,7 +31,6 @@ LLVM_VARIANTS = (
 CUDA_VARIANT = "cuda_ad_mono_polarized"
 DEFAULT_VARIANT = "llvm_ad_mono_polarized"
 
-GIB = 2**30
 MEMORY_NEEDED = 2 * GIB  # a full scan with all its kernels stays below
 DISK_NEEDED = 1 * GIB
 
@@ -303,26 +303,11 @@ def _check_cores() -> Check:
 
 
 def _check_memory() -> Check:
-    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    free = min([total, *_memory_bounds()])
+    total, free = machine_memory(), available_memory()
     ok = free >= MEMORY_NEEDED
     detail = f"{free / GIB:.1f} GiB free of {total / GIB:.1f} GiB (needs {MEMORY_NEEDED // GIB})"
     remedy = "" if ok else "ps aux --sort=-rss | head   (shows what to end)"
     return Check("memory", ok, detail, remedy)
-
-
-def _memory_bounds() -> list[int]:
-    """What the kernel calls available and what a container is limited to, where they say so."""
-    bounds = []
-    meminfo = Path("/proc/meminfo")
-    if meminfo.is_file():
-        lines = meminfo.read_text().splitlines()
-        bounds = [int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable")]
-    for file in ("memory.max", "memory/memory.limit_in_bytes"):
-        limit = Path("/sys/fs/cgroup", file)
-        if limit.is_file() and (text := limit.read_text().strip()).isdigit():
-            bounds.append(int(text))
-    return bounds
 
 
 def _check_disk() -> Check:

@@ -109,6 +109,7 @@ def _unit(field):
             (units.SpectralRadiance, "W/m³/sr"),
             (units.Backscatter, "1/m/sr"),
             (units.Area, "m²"),
+            (units.Memory, "byte"),
             (units.Number, None),
         )
     }

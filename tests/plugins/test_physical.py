@@ -204,3 +204,11 @@ def test_numbers_that_single_precision_loses_are_refused(plugin, changes):
     film = {"film": film} if plugin == "ccd" else {}
     line = refusal(mi.load_dict, {"type": plugin, **changes, **film})
     assert line.startswith(f"{plugin}.{field}: ") and "; expected " in line
+
+
+def test_images_beyond_32_bits_are_refused(world):
+    """2^32 values and more wrapped around, or ended the process."""
+    film = {"type": "hdrfilm", "width": 300, "height": 300, "rfilter": {"type": "box"}}
+    loaded = scene(world, gate_count=10_000, film=film, azimuth_max_deg=1.0, elevation_max_deg=1.0)
+    line = refusal(mi.render, loaded)
+    assert "gated_volpath.gate_count: 10000 is not allowed; expected at most 9544 with" in line

@@ -7,6 +7,7 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.forecast import check_brightness, check_size
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Keeper
@@ -72,6 +73,7 @@ def check_light(
         Air that does not scatter, a detector that does not go with the pulse, beams wider than a
         medium can be made for.
     """
+    check_size(experiment, plans[0])
     _media(experiment, truth, plans)
     if experiment.detector:
         for plan in plans:
@@ -84,6 +86,8 @@ def check_light(
         )
     if not air.albedo > 0:
         raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
+    for plan in plans:
+        check_brightness(experiment, truth.extinction, plan, air.albedo)
 
 
 def render_images(

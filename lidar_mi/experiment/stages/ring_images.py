@@ -22,6 +22,7 @@ from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.doppler import photons, solar_background, speckle_modes
 from lidar_mi.instrument.fringe_camera import fringe_image, ring_radii
 from lidar_mi.rendering.fringes import render_fringes, scene_dict
+from lidar_mi.rendering.memory import PER_PIXEL, PER_SAMPLE, PROGRAM, check_memory
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
 
@@ -67,6 +68,16 @@ def ring_instrument(doppler: Doppler) -> Rings:
     InputError
         Winds beyond the unambiguous range, fewer than two rings on the CCD, pixels that overflow.
     """
+    render, pixels = doppler.render, doppler.camera.width * doppler.camera.height
+    at_once = min(render.samples_per_pass, pixels * render.samples_per_pixel)
+    check_memory(
+        PROGRAM + PER_PIXEL * pixels + PER_SAMPLE * at_once,
+        render.memory,
+        f"doppler.camera: {doppler.camera.width} x {doppler.camera.height} pixels and "
+        f"{at_once:.3g} samples at once",
+        "fewer pixels or samples_per_pass",
+        "doppler.render.memory",
+    )
     lidar, etalon, camera, ccd = doppler.lidar, doppler.etalon, doppler.camera, doppler.ccd
     pressure, temperature = standard_atmosphere(lidar.altitude)
     line = backscatter_line(

@@ -1,0 +1,179 @@
+"""What a run will take, before it does: memory, time, and whether its images will have light."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.atmosphere.wake import MOST_NODES
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.rendering.memory import (
+    PER_SAMPLE,
+    PROGRAM,
+    ceiling,
+    check_memory,
+    image_bytes,
+    samples_at_once,
+)
+
+PER_NODE = 160
+"""Bytes of a node of the wake: twenty fields in double precision."""
+PER_VECTOR = 400
+"""Bytes of a vector, for every method and source: 25 variables, and once more where they meet."""
+PER_VOXEL = 200
+"""Bytes of a voxel of a volume whose wind is retrieved."""
+SAMPLES_PER_SECOND = 8e6
+"""Times scattering orders, on one core (wake_backscatter on a core of 2024)."""
+VECTORS_PER_SECOND = 15e3
+"""On one core, by correlation of windows of 8 in 16 pixels; other methods are within a factor 3."""
+SINGLE = 1e-17
+"""S0 whose squared error is the smallest number of single precision."""
+CONTRIBUTIONS = 5
+"""Samples of a pixel that must bring light, on average: 0.7 % of all pixels then have none."""
+
+
+class Forecast(NamedTuple):
+    """What a run takes: memory in bytes, time of rendering and retrieval on one core in s."""
+
+    memory: float
+    seconds: float
+
+
+def forecast(experiment: Experiment, plan: ScanPlan) -> Forecast:
+    """Memory and time of the backscatter lidar's part of a run, to a factor of two."""
+    render, beams = experiment.render, plan.y.size * plan.z.size
+    samples = beams * max(render.samples_per_beam, 2 * plan.gate_count)
+    at_once = samples_at_once(render.samples_per_pass, render.memory)
+    memory = (
+        PROGRAM
+        + _per_beam(experiment, plan.gate_count) * beams
+        + PER_SAMPLE * min(samples, at_once)
+    )
+    vectors = _vectors_per_beam(experiment) * beams
+    seconds = 2 * samples * render.max_order / SAMPLES_PER_SECOND + vectors / VECTORS_PER_SECOND
+    return Forecast(memory, seconds)
+
+
+def _per_beam(experiment: Experiment, gates: int) -> float:
+    """Bytes that grow with the number of beams: the wake's nodes, images, vectors."""
+    orders = experiment.render.max_order
+    # Stokes vector, errors, correlation; both products with their errors; the detector's
+    quantities = 11 + (orders if orders > 1 else 0) + 2 * bool(experiment.detector)
+    voxels = gates if experiment.volume else 0
+    return (
+        PER_NODE
+        + image_bytes(1, gates, quantities)
+        + PER_VOXEL * voxels
+        + PER_VECTOR * _vectors_per_beam(experiment)
+    )
+
+
+def _vectors_per_beam(experiment: Experiment) -> float:
+    """Vectors of all methods and sources over the number of beams."""
+    if experiment.volume:
+        gates, volume = experiment.scan.gate_count, experiment.volume
+        return gates / volume.stride**3 * len(volume.methods)
+    sources = 5 if experiment.detector else 4
+    return len(experiment.retrieval.methods) * sources / experiment.retrieval.stride**2
+
+
+def check_size(experiment: Experiment, plan: ScanPlan) -> None:
+    """Refuse a run that would take more memory than it may.
+
+    Raises
+    ------
+    InputError
+        With what it would take.
+    """
+    check_memory(
+        forecast(experiment, plan).memory,
+        experiment.render.memory,
+        f"scan: {plan.y.size} x {plan.z.size} beams x {plan.gate_count} gates",
+        "a larger wake.spacing, retrieval.stride or fewer gates",
+    )
+
+
+def most_nodes(experiment: Experiment) -> int:
+    """Nodes of the wake that a run can have in memory; every one has a beam with ``aim: grid``."""
+    beams = experiment.scan.aim == "grid" and experiment.wake.depth == "plane"
+    # of the gates `check_size` says what they take
+    each = _per_beam(experiment, 1) if beams else PER_NODE
+    left = ceiling(experiment.render.memory) - PROGRAM
+    return max(1, min(MOST_NODES, int(left / each)))
+
+
+def check_brightness(
+    experiment: Experiment, extinction: Sequence[xr.DataArray], plan: ScanPlan, albedo: float
+) -> None:
+    """Refuse images whose pixels would mostly be dark, by the lidar equation of the median pixel.
+
+    Raises
+    ------
+    InputError
+        Too few samples bring light: free flights that end elsewhere, or a field of view that holds
+        hardly any of the beam; or light so weak that single precision loses its error.
+    """
+    lidar, render, mapping = experiment.lidar, experiment.render, experiment.wake.extinction
+    inside = float(np.median([np.median(field.values) for field in extinction]))
+    if not inside > 0:
+        raise InputError(
+            "wake.extinction.background: 0 is not allowed with a wake that fills less than half "
+            "of the image; expected more, so that pixels have light and errors"
+        )
+    length, distance = float(np.median(plan.gate_length())), float(np.median(plan.ranges()[0]))
+    around = mapping.background + mapping.molecules
+    arriving = math.exp(-min(around * plan.gate_start, 300))
+    seen = overlap(lidar, distance)
+    light = lidar.aperture_area / distance**2 * albedo * inside * length / (4 * math.pi)
+    if light * arriving**2 < SINGLE:
+        raise InputError(
+            f"wake.extinction: {around:g} 1/m on the way to {inside:g} 1/m of albedo {albedo:g} at "
+            f"{distance:g} m is not allowed; expected that at least {SINGLE:g} of the light comes "
+            f"back, not {light * arriving**2:.1g}"
+        )
+    if render.estimator == "analog":
+        # of all samples of a beam those count that collide in the gate
+        key, value, fraction = "render.estimator", "analog", seen * inside * length * arriving
+    else:
+        key, value, fraction = "lidar.fov_half", f"{lidar.fov_half:g} rad", seen / plan.gate_count
+    bring = fraction * render.samples_per_beam
+    if bring < CONTRIBUTIONS and (seen < 0.9 or render.estimator == "analog"):
+        raise InputError(
+            f"{key}: {value} is not allowed with {render.samples_per_beam} samples per beam, of "
+            f"which {bring:.2g} would bring light to a pixel; expected "
+            f"render.samples_per_beam of {math.ceil(CONTRIBUTIONS / fraction):.3g} or more"
+        )
+
+
+def overlap(lidar: BackscatterLidar, distance: float) -> float:
+    """Fraction of the light from a distance (m) that arrives within the field of view.
+
+    Mean over the beam's Gaussian cross-section and the telescope's disc, which are concentric: a
+    place at r from the axis is seen from points of the disc within ``fov_half`` times the distance.
+    """
+    seen = math.tan(lidar.fov_half) * distance
+    sigma = float(lidar.radius_at(distance)) / 2
+    # of a Gaussian in the plane, the share beyond r is exp(-r^2 / 2 sigma^2): its quantiles
+    share = (np.arange(1000) + 0.5) / 1000
+    gap = sigma * np.sqrt(-2 * np.log(share))
+    area = math.pi * lidar.aperture_radius**2
+    return float(_lens(gap, seen, lidar.aperture_radius).mean() / area)
+
+
+def _lens(gap: np.ndarray, first: float, second: float) -> np.ndarray:
+    """Area that two circles of given radii have in common, their centres being ``gap`` apart."""
+    small, large = min(first, second), max(first, second)
+    apart = np.clip(gap, large - small + 1e-12 * large, large + small)
+    # angles at both centres to where the circles meet
+    at_small = (apart**2 + small**2 - large**2) / (2 * apart * small)
+    at_large = (apart**2 + large**2 - small**2) / (2 * apart * large)
+    at_small, at_large = (np.arccos(np.clip(c, -1, 1)) for c in (at_small, at_large))
+    area = small**2 * (at_small - np.sin(2 * at_small) / 2)
+    area = area + large**2 * (at_large - np.sin(2 * at_large) / 2)
+    area = np.where(gap <= large - small, math.pi * small**2, area)
+    return np.where(gap >= large + small, 0.0, area)

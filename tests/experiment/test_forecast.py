@@ -1,0 +1,139 @@
+"""Forecasts of memory and light against numbers that did not come from them.
+
+Detects: a run that takes more than it may and starts, one that fits and is refused, images that are
+dark or undetermined after hours, an overlap of beam and field of view wrong by 1 %.
+"""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.check import duration, sections
+from lidar_mi.experiment.forecast import check_brightness, check_size, forecast, overlap
+from lidar_mi.experiment.truth import read_flows
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import plan_scans
+from lidar_mi.rendering.memory import PER_SAMPLE, samples_at_once
+from lidar_mi.system.memory import available_memory, machine_memory
+from tests.support.experiments import check, small
+
+
+def planned(**changes):
+    """An experiment, and its first scan over an image of 219 x 139 nodes, 0.5 m apart."""
+    experiment = check(small() | changes)
+    y, z = np.arange(-109, 110) / 2, np.arange(-69, 70) / 2
+    return experiment, plan_scans(experiment.scan, y, z, (0.0,))[0]
+
+
+def air(extinction):
+    return [xr.DataArray(np.full((1, 5, 5), extinction), dims=("x", "y", "z"))] * 2
+
+
+@pytest.mark.parametrize(
+    ("fov_half", "distance", "divergence"),
+    [(5e-3, 500, 2e-3), (1e-3, 500, 2e-3), (3e-4, 500, 2e-3), (1e-3, 300, 1e-2), (1e-2, 75, 0)],
+)
+def test_overlap_by_throwing_darts(fov_half, distance, divergence):
+    """Places in the beam and points of the telescope, drawn independently: 4 sigma."""
+    lidar = BackscatterLidar(fov_half=f"{fov_half} rad", divergence_full=f"{divergence} rad")
+    rng, number = np.random.default_rng(5), 200_000
+    place = rng.standard_normal((number, 2)) * float(lidar.radius_at(distance)) / 2
+    angle, radius = 2 * np.pi * rng.random(number), 0.5 * np.sqrt(rng.random(number))
+    point = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
+    seen = np.hypot(*(place - point).T) < np.tan(fov_half) * distance
+    error = np.sqrt(max(seen.mean() * (1 - seen.mean()), 1e-6) / number)
+    assert overlap(lidar, distance) == pytest.approx(seen.mean(), abs=4 * error + 1e-3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "extinction", "says"),
+    [
+        ({"render": {"estimator": "analog"}}, 1e-3, "render.estimator: analog is not allowed with"),
+        ({"lidar": {"fov_half": "0.01 mrad"}}, 1e-3, "lidar.fov_half: 1e-05 rad is not allowed"),
+        ({"lidar": {"fov_half": "1e-4 mrad"}}, 1e-3, "lidar.fov_half: 1e-07 rad is not allowed"),
+        (
+            {"wake": small(extinction={"background": 1, "maximum": 2})["wake"]},
+            1.0,
+            "albedo 1 at 502",
+        ),
+        ({}, 0.0, "wake.extinction.background: 0 is not allowed with a wake that fills less"),
+    ],
+)
+def test_images_that_would_be_dark_are_refused(changes, extinction, says):
+    experiment, plan = planned(**changes)
+    with pytest.raises(InputError, match=says) as error:
+        check_brightness(experiment, air(extinction), plan, 1.0)
+    assert "; expected " in str(error.value) and len(str(error.value)) < 300
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"render": {"samples_per_beam": 2}},
+        {"lidar": {"fov_half": "1 mrad"}, "render": {"samples_per_beam": 64}},
+        {"render": {"estimator": "analog", "samples_per_beam": 100_000}},
+        {"scan": {"range": "5 km"}},
+    ],
+)
+def test_images_with_light_are_not(changes):
+    experiment, plan = planned(**changes)
+    check_brightness(experiment, air(1e-3), plan, 1.0)
+
+
+def test_check_refuses_what_the_retrieval_would_fail_on(tmp_path):
+    with pytest.raises(InputError, match=r"render\.estimator: analog"):
+        list(sections(check(small() | {"render": {"estimator": "analog"}}), tmp_path))
+
+
+def test_memory_against_what_runs_took():
+    """Resident memory at most, measured: 0.7 GB for wake_backscatter; 1.02 GB for 110 x 70 beams,
+    200 gates, 400 samples, two orders and vectors at every fourth pixel."""
+    whole = {"retrieval": {"methods": ["cc", "ws"]}, "render": {"samples_per_beam": 64}}
+    found = forecast(*planned(**whole))
+    assert 0.7e9 / 1.5 < found.memory < 0.7e9 * 1.5
+    experiment, _ = planned(
+        scan={"gate_count": 200},
+        render={"samples_per_beam": 400, "max_order": 2},
+        retrieval={"methods": ["cc"], "stride": 4},
+    )
+    plan = plan_scans(experiment.scan, np.arange(110.0), np.arange(70.0), (0.0,))[0]
+    assert 1.02e9 / 1.5 < forecast(experiment, plan).memory < 1.02e9 * 1.5
+
+
+@pytest.mark.parametrize(("gates", "fits"), [(1, True), (100, True), (2000, False), (10000, False)])
+def test_a_run_that_memory_does_not_hold_is_refused_with_what_it_would_take(gates, fits):
+    experiment, plan = planned(
+        scan={"gate_count": gates}, render={"memory": "8 GB", "max_order": 4}
+    )
+    if fits:
+        return check_size(experiment, plan)
+    with pytest.raises(
+        InputError, match=rf"219 x 139 beams x {gates} gates .* would take [\d.]+e?"
+    ):
+        check_size(experiment, plan)
+
+
+def test_a_spacing_that_memory_does_not_hold_is_refused_before_the_air_is_made():
+    data = small(spacing="0.01 m")
+    data["render"]["memory"] = "1 GB"
+    with pytest.raises(InputError, match=r"wake\.spacing: 0\.01 m is not allowed, it makes"):
+        read_flows(check(data))
+
+
+def test_samples_of_a_pass_stay_below_the_ceiling():
+    assert samples_at_once(1 << 22, 8e9) == 1 << 22
+    assert samples_at_once(2_000_000_000, 8e9) * PER_SAMPLE <= 8e9 / 4
+    assert samples_at_once(1 << 22, 1e8) >= 1024
+
+
+def test_the_machine_has_memory():
+    assert 1e8 < available_memory() <= machine_memory() < 1e15
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.1, "1 s"), (100, "100 s"), (600, "10 min"), (9e3, "2 h"), (1e6, "12")]
+)
+def test_durations(seconds, text):
+    assert duration(seconds).startswith(text)
