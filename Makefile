@@ -2,7 +2,7 @@
 # ARGS goes to the command behind a target: make test ARGS="tests/system/test_llvm.py -x"
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all bench validate docs lint clean
+.PHONY: help setup demo test test-all fuzz bench validate docs lint clean
 
 PYTHON_ENV := .venv/bin/python
 EXPERIMENT := wake_sensor
@@ -25,6 +25,11 @@ test: setup ## run the tests, without those marked slow
 
 test-all: setup ## run all tests
 	$(PYTHON_ENV) -m pytest $(IN_PARALLEL) -m "slow or not slow" $(ARGS)
+
+MINUTES := 20
+
+fuzz: setup ## try hostile input: make fuzz MINUTES=20; what breaks something goes to tests/corpus
+	$(PYTHON_ENV) -m tests.fuzz --minutes $(MINUTES) $(ARGS)
 
 bench: setup ## compare with other programs, side by side
 	@$(PYTHON_ENV) -c "from importlib.util import find_spec as f; exit(not (all(map(f, ('mitransient', 'openpiv', 'cv2', 'skimage')))))" \

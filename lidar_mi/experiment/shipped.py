@@ -30,8 +30,11 @@ def experiment_file(name: str | Path) -> Path:
         Neither a file nor a shipped experiment.
     """
     path = Path(name)
-    if path.is_file():
-        return path
+    try:
+        if path.is_file():
+            return path
+    except OSError as error:  # a name that is too long
+        raise InputError(f"{name}: {error.strerror}; expected an experiment file") from None
     shipped = _folder() / (path.name if path.suffix == ".yaml" else f"{path.name}.yaml")
     if path.parent == Path() and shipped.is_file():
         return shipped

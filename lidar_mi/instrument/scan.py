@@ -1,5 +1,6 @@
 """Scan geometry: where the beams of a scan go and which ranges are recorded."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from lidar_mi.errors import InputError
 from lidar_mi.units import Angle, Length, Speed, Within, quantity
 
 MOST_BEAMS = 10**7
@@ -141,14 +143,16 @@ def plan_scans(
 
     Raises
     ------
-    ValueError
-        The telescope would reach the slab.
+    InputError
+        The telescope would reach the slab, or a distance is not finite.
     """
     plans = []
     for index, position in enumerate(travelled):
         start = scan.range - position
+        if not math.isfinite(start):
+            raise InputError(f"travelled: {position} m is not allowed; expected finite distances")
         if start <= 0:
-            raise ValueError(
+            raise InputError(
                 f"scan.range: {scan.range:g} m is not allowed; expected more than the "
                 f"{position:g} m flown until the last scan"
             )

@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import h5py
 import xarray as xr
 
 from lidar_mi.errors import InputError
@@ -46,16 +47,16 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
 
 def _declared(path):
     """What opening reads at once, and the largest piece that any value takes to be read."""
-    import h5netcdf
-
     found = []
     try:
-        with h5netcdf.File(path, "r", phony_dims="access") as file:
-            for name, variable in file.variables.items():
-                is_axis = variable.dimensions == (name,)
-                for shape in (variable.shape if is_axis else None, variable.chunks):
-                    if shape is not None:
-                        found.append((name, math.prod(shape) * variable.dtype.itemsize))
+        with h5py.File(path, "r") as file:
+            file.attrs.get("_nc3_strict")  # h5netcdf could not even be closed without
+            for name, variable in file.items():
+                if isinstance(variable, h5py.Dataset):
+                    axis = variable.shape if variable.ndim == 1 else None
+                    for shape in (axis, variable.chunks):
+                        if shape is not None:
+                            found.append((name, math.prod(shape) * variable.dtype.itemsize))
     except Exception as error:
         raise _damaged(path, error) from None
     return found

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from lidar_mi.errors import InputError
 from lidar_mi.instrument.scan import Scan, ScanPlan, plan_scans
 
 Y = np.arange(-54.5, 54.6, 0.5)
@@ -88,6 +89,12 @@ def test_spherical_gates_have_equal_ranges(count):
 def test_a_telescope_that_reaches_the_slab_is_refused():
     with pytest.raises(ValueError, match=r"scan\.range: 500 m is not allowed; expected more than"):
         plan_scans(Scan(), Y, Z, (0.0, 500.0))
+
+
+@pytest.mark.parametrize("distance", [math.nan, math.inf, -math.inf])
+def test_distances_that_are_none_are_refused(distance):
+    with pytest.raises(InputError, match=r"travelled: .* expected finite distances"):
+        plan_scans(Scan(), Y, Z, (0.0, distance))
 
 
 def test_defaults_are_the_papers():

@@ -1,7 +1,7 @@
 """Calls in processes that may die, hang or eat memory: each in a fork with limits of its own.
 
 A server imports the package once; every call runs in a fork of it, which takes milliseconds. The
-server never starts a thread and never renders, so that what it forks is whole.
+server starts no thread and renders nothing, so that what it forks is whole.
 """
 
 import os
@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,8 +49,6 @@ class Outcome:
     out, err : str
         What it wrote; invalid UTF-8 shows as escapes.
     seconds : float
-    memory : int
-        Bytes that the call took beyond what the server holds.
     value : object
         What a function returned, or the exception that it raised.
     """
@@ -59,7 +58,6 @@ class Outcome:
     out: str
     err: str
     seconds: float
-    memory: int
     value: Any = None
 
 
@@ -118,6 +116,9 @@ def serve() -> None:
     """Answer calls from standard input until it ends."""
     for name in PRELOADED:
         __import__(name)
+    with suppress(ImportError):  # no LLVM here
+        # loaded, its threads come with the first image: in a fork of their own
+        mitsuba_with_plugins("llvm_ad_mono_polarized")
     if threading.active_count() > 1:
         raise RuntimeError("a thread is there already")
     answers = os.fdopen(os.dup(1), "wb")
@@ -131,20 +132,26 @@ def serve() -> None:
         answers.flush()
 
 
+def mitsuba_with_plugins(variant: str) -> None:
+    """Load Mitsuba as every command would."""
+    import mitsuba
+
+    mitsuba.set_variant(variant)
+
+
 def _fork(function, arguments, folder, seconds, memory) -> Outcome:
     with (
         tempfile.TemporaryFile() as out,
         tempfile.TemporaryFile() as err,
         tempfile.TemporaryFile() as result,
     ):
-        before = _resident()
         start = time.perf_counter()
         child = os.fork()
         if child == 0:
             _run(function, arguments, folder, memory, out, err, result)
         timed_out = False
         while True:
-            pid, status, usage = os.wait4(child, os.WNOHANG)
+            pid, status = os.waitpid(child, os.WNOHANG)
             if pid:
                 break
             if time.perf_counter() - start > seconds:
@@ -160,8 +167,7 @@ def _fork(function, arguments, folder, seconds, memory) -> Outcome:
         content = result.read()
         value = pickle.loads(content) if content else None
         code = os.waitstatus_to_exitcode(status)
-        peak = usage.ru_maxrss * 1024 - before
-        return Outcome(code, timed_out, *texts, taken, max(peak, 0), value)
+        return Outcome(code, timed_out, *texts, taken, value)
 
 
 def _run(function, arguments, folder, memory, out, err, result) -> None:
@@ -198,7 +204,3 @@ def _run(function, arguments, folder, memory, out, err, result) -> None:
 
 def _address_space() -> int:
     return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-
-
-def _resident() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()

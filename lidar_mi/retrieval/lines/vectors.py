@@ -33,7 +33,8 @@ def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
     Raises
     ------
     InputError
-        A variable is missing, has another shape, or a direction is no unit vector.
+        A variable is missing, has another shape, a direction is no unit vector, or a range is not
+        above 0.
     """
     for name in _NAMES:
         if name not in scan:
@@ -52,6 +53,8 @@ def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
     length = np.linalg.norm(scan["direction"].transpose("line", "axis").values, axis=1)
     if not (np.abs(length - 1) < 1e-6).all():
         raise InputError("scan.direction: not of length 1; expected unit vectors")
+    if not (scan["range"].values > 0).all() or not np.isfinite(scan["range"].values).all():
+        raise InputError("scan.range: not > 0 m everywhere; every line needs its finite range")
     if not (scan["v_los_std"].values[np.isfinite(scan["v_los"].values)] > 0).all():
         raise InputError("scan.v_los_std: not > 0 m/s everywhere; every line needs its error")
     return scan["direction"].dot(scan["platform_velocity"], dim="axis") - scan["v_los"]

@@ -28,6 +28,11 @@ TRUE = np.array([3.0, -4.0, 5.0])
 DRAWS = 20_000
 
 
+def ranged(distance):
+    scan = scanned()
+    return scan.assign(range=scan["range"] * 0 + distance)
+
+
 def scanned(std=0.5, seed=1, speed=150.0, errors=None, noisy=True, **scan):
     y, z = np.linspace(-60, 60, 5), np.linspace(-45, 45, 5)
     wind = xr.Dataset(
@@ -247,6 +252,9 @@ def test_neighbours_in_a_row_are_flagged():
         (lambda: wind_from_neighbours(scanned(), 64), "count: 64"),
         (lambda: wind_from_triples(scanned().drop_vars("range")), "scan.range: missing"),
         (lambda: wind_from_triples(scanned(std=0.0)), "scan.v_los_std: not > 0"),
+        (lambda: wind_from_triples(ranged(-76.0)), "scan.range: not > 0 m"),
+        (lambda: wind_from_triples(ranged(np.nan)), "scan.range: not > 0 m"),
+        (lambda: wind_from_neighbours(ranged(np.inf), 5), "scan.range: not > 0 m"),
         (
             lambda: wind_from_triples(scanned().assign_coords(direction=2 * scanned().direction)),
             "scan.direction: not of length 1",

@@ -1,0 +1,148 @@
+"""Hypothesis strategies for calls from Python, from the signatures of the public functions."""
+
+import inspect
+import typing
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from hypothesis import strategies as st
+
+import lidar_mi as lm
+from tests.support.cases import Case
+from tests.support.hostile_experiments import BASE, as_yaml
+from tests.support.hostile_files import exr_file, picture
+
+SLOW = ("run", "fit_vortices", "doctor", "register_plugins")
+"""Public functions that take ten seconds, or look at the machine and take no input."""
+
+WRONG = ("None", "'a'", "3", "-1", "nan", "[]", "{}", "object()", "b'a'", "True", "'\\x1b[31m'")
+
+IMAGES = (
+    "pattern(1)",
+    "pattern(2)",
+    "pattern(1, fill=nan)",
+    "pattern(1, fill=inf)",
+    "pattern(1, fill=0)",
+    "pattern(1, rows=1)",
+    "pattern(1, rows=3)",
+    "pattern(1, rows=0)",
+    "pattern(1, spacing=nan)",
+    "pattern(1, spacing=-1.0)",
+    "pattern(1, spacing=0.0)",
+    "pattern(1, spacing=1e300)",
+    "pattern(1, dims=('a', 'b'))",
+    "pattern(1, dims=('y', 'z'))",
+    "pattern(1) * 0",
+    "pattern(1) * 1e300",
+    "pattern(1) * 1e-300",
+    "pattern(1) - 5",
+    "pattern(1).values",
+    "pattern(1).drop_vars('y')",
+    "pattern(1).astype(int)",
+    "pattern(1).astype(complex)",
+    "pattern(1).astype(str)",
+    "pattern(1).astype(object)",
+    "pattern(1).to_dataset(name='a')",
+    "pattern(1).expand_dims('t')",
+    "xr.DataArray(3.0)",
+    "volume(1)",
+    "volume(1) * nan",
+)
+
+# valid first
+BY_TYPE: dict[typing.Any, tuple[str, ...]] = {
+    xr.DataArray: IMAGES,
+    float: ("0.1", "1", "0.0", "-1.0", "nan", "inf", "-inf", "1e-320", "1e308", "10**400", "'1 s'"),
+    int: ("8", "1", "2", "0", "-1", "3", "10", "31", "10**9", "10**400", "2.5", "nan"),
+    str: ("'a'", "'cc'", "'cpu'", "'cuda:9'", "'variational'", "'multipass'", "'ws'", "'Y'", "''"),
+    bool: ("True", "False", "2"),
+    Path: ("'a.exr'", "'a.png'", "'none'", "'.'", "'/dev/zero'", "''", "'a' * 5000", "'a\\0'"),
+    xr.Dataset: ("xr.Dataset()", "xr.Dataset({'v': pattern(1), 'w': pattern(2)})"),
+    lm.Experiment: ("lm.load_experiment('a.yaml')",),
+    tuple: ("(15.0, 12.0)", "(nan, 1.0)", "(1.0,)", "(inf, inf)", "(1e30, -1e30)"),
+}
+
+VALID = {"method": "'cc'", "device": "'cpu'", "template": "4", "search": "8", "stride": "4"}
+NAMED = {
+    "image1": "pattern(1)",
+    "image2": "pattern(1).roll(y=1)",
+    "volume1": "volume(1)",
+    "volume2": "volume(2)",
+    "image": "pattern(1).values",
+    "path": "'a.exr'",
+    "name": "'a.yaml'",
+    "fits": "{}",
+}
+
+
+def pattern(
+    seed: int,
+    rows: int = 24,
+    columns: int = 30,
+    dims: tuple[str, str] = ("z", "y"),
+    spacing: float = 0.5,
+    fill: float | None = None,
+) -> xr.DataArray:
+    """An image of noise, a corner of which may be filled with something else."""
+    values = np.random.default_rng(seed).random((rows, columns))
+    if fill is not None:
+        values[: rows // 2, :5] = fill
+    axes = {
+        name: (name, spacing * np.arange(n), {"units": "m"})
+        for name, n in zip(dims, (rows, columns), strict=True)
+    }
+    return xr.DataArray(values, axes, dims)
+
+
+def volume(seed: int) -> xr.DataArray:
+    """A volume of noise."""
+    values = np.random.default_rng(seed).random((10, 24, 24))
+    axes = {
+        n: (n, np.arange(k) * 1.0, {"units": "m"}) for n, k in zip("xzy", (10, 24, 24), strict=True)
+    }
+    return xr.DataArray(values, axes, ("x", "z", "y"))
+
+
+def functions() -> dict[str, Callable]:
+    """Public functions by name."""
+    found = {name: getattr(lm, name) for name in lm.__all__}
+    return {
+        name: one for name, one in found.items() if inspect.isfunction(one) and name not in SLOW
+    }
+
+
+def candidates(annotation: typing.Any) -> tuple[str, ...]:
+    """Expressions for what a parameter is annotated with, right ones first."""
+    origin = typing.get_origin(annotation)
+    if annotation in BY_TYPE:
+        return BY_TYPE[annotation]
+    if origin is typing.Literal:
+        return tuple(map(repr, typing.get_args(annotation)))
+    if origin is tuple:
+        return BY_TYPE[tuple]
+    return tuple(text for part in typing.get_args(annotation) for text in candidates(part))
+
+
+@st.composite
+def calls(draw: st.DrawFn) -> Case:
+    """A public function with one or two arguments that are unusual or wrong."""
+    name = draw(st.sampled_from(sorted(functions())))
+    function = functions()[name]
+    hints = typing.get_type_hints(function)
+    parameters = inspect.signature(function).parameters
+    given = {}
+    for key, one in parameters.items():
+        if one.kind in (one.VAR_KEYWORD, one.VAR_POSITIONAL):
+            continue
+        if key in NAMED or one.default is one.empty or key in VALID:
+            right = NAMED.get(key) or VALID.get(key)
+            given[key] = right or (candidates(hints.get(key)) or WRONG)[0]
+    if parameters:
+        for key in draw(st.sets(st.sampled_from(sorted(parameters)), min_size=1, max_size=2)):
+            given[key] = draw(st.sampled_from((*candidates(hints.get(key)), *WRONG)))
+    text = ", ".join(f"{key}={value}" for key, value in given.items())
+    files = {"a.exr": exr_file(), "a.png": picture(".png", "L"), "a.yaml": as_yaml(BASE)}
+    named = {file: content for file, content in files.items() if file in text}
+    return Case("call", ("python", f"lm.{name}({text})"), named)
