@@ -22,5 +22,5 @@ KINDS: dict[str, Callable[[], SearchStrategy]] = {
     "call": calls.calls,
     "run": accepted.run_cases,
 }
-RENDERED = ("run",)
+RENDERED = ("call", "run")
 """Kinds that take seconds a case."""
