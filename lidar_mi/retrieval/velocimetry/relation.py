@@ -26,8 +26,9 @@ FALSE_ALARM = 1e-3
 _REGION = 5
 # Few windows need more surrogates to know how far their mean scatters.
 _FEW_WINDOWS = 100
-# In thirds of the last two axes.
-_ROLLS = ((1, 1), (2, 2), (1, 2), (2, 1), (0, 1), (1, 0), (0, 2), (2, 0))
+# Parts of the last two axes by which surrogates are rolled, of many windows and of few.
+_THIRDS = tuple((i / 3, j / 3) for i, j in ((1, 1), (2, 2), (1, 2)))
+_FIFTHS = tuple((i / 5, j / 5) for i in range(5) for j in range(5) if i or j)
 # Of the images' rms: where they hold less, rounding and ringing must not be alike.
 _FLOOR = 1e-3
 # Student's t where no window is finite.
@@ -46,8 +47,8 @@ def unrelated(
     Any two textures correlate somewhere in a search region: the highest of many correlations of
     windows with few independent pixels is often beyond 0.8. How high it gets depends on the
     autocorrelations of both images and on the range, so it is measured: with surrogates of image
-    2, turned by 180 degrees and rolled by thirds of its sides, which have its autocorrelation and
-    nothing else in common with image 1. Fisher's z of the highest correlations, averaged over
+    2, turned by 180 degrees and rolled by thirds of its sides (of few windows by fifths), which
+    have its autocorrelation and nothing else in common with image 1. Fisher's z of the highest correlations, averaged over
     5 windows along each axis, must exceed the mean of the surrogates by what Student's t allows
     at the rate of false alarms (their scatter is that of all regions together).
 
@@ -79,10 +80,10 @@ def unrelated(
     search = (_of_images if windows.dims == 2 else _of_volumes)(spline, finite, windows, wide)
     first, second = search.values
     observed = search.score(first, second)
-    rolls = _ROLLS[: 8 if observed.numel() < _FEW_WINDOWS else 3]
+    rolls = _FIFTHS if observed.numel() < _FEW_WINDOWS else _THIRDS
     turned = second.flip(tuple(range(second.ndim)))
-    rows, columns = (n // 3 for n in second.shape[-2:])
-    others = [turned.roll((i * rows, j * columns), (-2, -1)) for i, j in rolls]
+    rows, columns = second.shape[-2:]
+    others = [turned.roll((int(i * rows), int(j * columns)), (-2, -1)) for i, j in rolls]
     chance = torch.stack([search.score(first, other) for other in others])
     excess = _excess(observed, chance, search.known)
     regions = max(1.0, observed.numel() / _REGION**windows.dims)
