@@ -48,9 +48,10 @@ def unrelated(
     windows with few independent pixels is often beyond 0.8. How high it gets depends on the
     autocorrelations of both images and on the range, so it is measured: with surrogates of image
     2, turned by 180 degrees and rolled by thirds of its sides (of few windows by fifths), which
-    have its autocorrelation and nothing else in common with image 1. Fisher's z of the highest correlations, averaged over
-    5 windows along each axis, must exceed the mean of the surrogates by what Student's t allows
-    at the rate of false alarms (their scatter is that of all regions together).
+    have its autocorrelation and nothing else in common with image 1. Fisher's z of the highest
+    correlations, averaged over 5 windows along each axis, must exceed the mean of the surrogates
+    by what Student's t allows at the rate of false alarms (their scatter is that of all regions
+    together).
 
     The windows are twice as large as the template where the images hold them, half of themselves
     apart, and the images are band-limited. Assumed is texture that is alike all over the image and
