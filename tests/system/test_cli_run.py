@@ -82,7 +82,11 @@ def test_names_are_no_markup(there, lidar_mi):
 
 
 @pytest.mark.parametrize(
-    ("number", "said"), [(signal.SIGINT, "stopped"), (signal.SIGTERM, "stopped by SIGTERM")]
+    ("number", "said"),
+    [
+        (signal.SIGINT, "stopped"),
+        pytest.param(signal.SIGTERM, "stopped by SIGTERM", marks=pytest.mark.slow),
+    ],
 )
 def test_a_signal_stops_cleanly_and_the_run_goes_on(there, number, said):
     """In the middle of rendering, where Dr.Jit puts its own exception in the interrupt's place."""

@@ -165,6 +165,7 @@ VOLUME = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_volumes_are_compared(file, tmp_path, monkeypatch):
     """Their wind is another file with a layer more: drawn is the one nearest to the picture."""

@@ -129,7 +129,7 @@ def test_bad_descriptions_are_named(sections, message):
     ("sections", "start"),
     [
         ({"scan": {"range": "480 m", "thickness": "40 m"}}, "scan.thickness: gates from 480"),
-        ({"volume": {"search": 8}}, "search: 8 voxels"),
+        pytest.param({"volume": {"search": 8}}, "search: 8 voxels", marks=pytest.mark.slow),
     ],
 )
 def test_what_does_not_go_together_is_said_ahead(sections, start):
