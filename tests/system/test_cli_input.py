@@ -210,7 +210,11 @@ def bad(*arguments, says):
         bad("info", "tiny.yaml", says=["tiny.yaml", "expected lidar-mi check tiny.yaml"]),
         bad("info", "slab.xml", says=["slab.xml", "expected .exr, .nc, .txt", "run folder"]),
         bad(
-            "check", "tiny.yaml", "--set", "wake.spacing=2 mm", says=["wake.spacing", "nodes, which memory"]
+            "check",
+            "tiny.yaml",
+            "--set",
+            "wake.spacing=2 mm",
+            says=["wake.spacing", "nodes, which memory"],
         ),
         bad("check", "wake_senor", says=["wake_senor: no such file", "did you mean wake_sensor?"]),
         bad("check", "wake.yaml", says=["text.nc", "not NetCDF"]),
