@@ -18,7 +18,7 @@ demo: setup ## run the main experiment; another: make demo EXPERIMENT=turbine
 	.venv/bin/lidar-mi run scenes/$(EXPERIMENT).yaml -o outputs/$(EXPERIMENT) $(ARGS)
 
 # One process for each core, eight at most (1.5 GiB each). In this process: make test ARGS=-n0
-IN_PARALLEL := -n auto --maxprocesses 8 --dist loadgroup
+IN_PARALLEL := -n auto --maxprocesses 8 --dist loadfile
 
 test: setup ## run the tests, without those marked slow
 	$(PYTHON_ENV) -m pytest $(IN_PARALLEL) -m "not slow" $(ARGS)

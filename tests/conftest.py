@@ -1,9 +1,8 @@
 # ruff: noqa: E402 - numpy and torch count their threads when they are imported
 """What every test may ask for: Mitsuba in a given variant; one thread for each of many processes.
 
-With pytest-xdist (`make test`) every process runs on one thread. All tests of a file run in one
-process, and so do all that look at the run of the demo. Processes share Dr.Jit's kernel cache: it
-writes a kernel nameless and links it into place.
+With pytest-xdist (`make test`) every process runs on one thread, and all tests of a file in one
+process. Processes share Dr.Jit's kernel cache: it writes a kernel nameless and links it into place.
 """
 
 import gc
@@ -26,12 +25,6 @@ def pytest_configure():
 
         # mitsuba.Bitmap reads and writes EXR on a second thread: here it would wait for ever
         drjit.set_thread_count(1)
-
-
-def pytest_itemcollected(item):
-    """Groups for ``--dist loadgroup``, which reads them before tests can be reordered."""
-    group = "demo" if "demo" in getattr(item, "fixturenames", ()) else item.path.as_posix()
-    item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(scope="session")
