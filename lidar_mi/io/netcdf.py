@@ -40,7 +40,9 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
     for what, size in _declared(path) if engine == "h5netcdf" else ():
         check_size(path, size, what)
     try:
-        return xr.open_dataset(path, engine=engine, decode_times=False)
+        # axes without a name, of HDF5 that is no NetCDF, are named without a warning
+        unnamed: dict[str, Any] = {"phony_dims": "access"} if engine == "h5netcdf" else {}
+        return xr.open_dataset(path, engine=engine, decode_times=False, **unnamed)
     except Exception as error:  # whatever the libraries meet in a damaged file
         raise _damaged(path, error) from None
 

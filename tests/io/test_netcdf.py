@@ -65,7 +65,7 @@ def test_an_axis_and_a_chunk_are_bounded_before_the_file_is_open(tmp_path):
     with h5py.File(tmp_path / "axis.nc", "w") as file:
         file.create_dataset("y", (10**10,), "f8", chunks=(1000,)).make_scale("y")
     with h5py.File(tmp_path / "chunk.nc", "w") as file:
-        file.create_dataset("v", (10**10,), "f8", chunks=(5 * 10**7,))
+        file.create_dataset("v", (10, 10**9), "f8", chunks=(1, 5 * 10**7))
     for name, what in (("axis.nc", "y declares 8e"), ("chunk.nc", "v declares 4e")):
         with pytest.raises(InputError, match=what):
             open_netcdf(tmp_path / name)
