@@ -16,6 +16,12 @@ from lidar_mi.units import (
     to_si,
 )
 
+_Extent = Annotated[
+    Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
+]
+_Place = Annotated[Length, Within(-1e6, 1e6, "models of a region")]
+_Moment = Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")]
+
 
 class Section(BaseModel):
     """A part of an experiment file: frozen, every key known, no NaN or infinity."""
@@ -43,12 +49,8 @@ class VortexPair(Section):
     core_radius: Annotated[
         Length, Within(0.001, 100, "from models in a tunnel to wider than any wake's core")
     ] = 3.0
-    width: Annotated[
-        Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
-    ] = Field(109.0, description="extent of the domain in y")
-    height: Annotated[
-        Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
-    ] = Field(69.0, description="extent of the domain in z")
+    width: _Extent = Field(109.0, description="extent of the domain in y")
+    height: _Extent = Field(69.0, description="extent of the domain in z")
 
 
 class Turbine(Section):
@@ -84,12 +86,8 @@ class Turbine(Section):
     outer_scale: Annotated[
         Length, Within(0.01, 10000, "from a wind tunnel to the depth of the troposphere")
     ] = Field(30.0, description="of the turbulence")
-    width: Annotated[
-        Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
-    ] = Field(109.0, description="extent of the domain in y")
-    height: Annotated[
-        Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
-    ] = Field(69.0, description="extent of the domain in z")
+    width: _Extent = Field(109.0, description="extent of the domain in y")
+    height: _Extent = Field(69.0, description="extent of the domain in z")
 
 
 class ExtinctionMapping(Section):
@@ -129,25 +127,13 @@ class Wake(Section):
     file: str | None = Field(None, description="NetCDF file; beside the experiment or shipped")
     vortex_pair: VortexPair | None = None
     turbine: Turbine | None = None
-    time: Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")] | None = Field(
-        None, description="needed when the file holds several"
-    )
-    second: (
-        Literal["advect"] | Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")]
-    ) = Field("advect", description="t2: advected, or a time")
-    x: Annotated[Length, Within(-1e6, 1e6, "models of a region")] | None = Field(
-        None, description="plane put in the middle of the gates"
-    )
+    time: _Moment | None = Field(None, description="needed when the file holds several")
+    second: Literal["advect"] | _Moment = Field("advect", description="t2: advected, or a time")
+    x: _Place | None = Field(None, description="plane put in the middle of the gates")
     depth: Literal["plane", "volume"] = Field(
         "plane", description="one plane extruded over the gates, or all planes of the file"
     )
-    centre: (
-        tuple[
-            Annotated[Length, Within(-1e6, 1e6, "models of a region")],
-            Annotated[Length, Within(-1e6, 1e6, "models of a region")],
-        ]
-        | None
-    ) = Field(
+    centre: tuple[_Place, _Place] | None = Field(
         None, description="(y, z) of the wake put on the beam axis; default: the domain's middle"
     )
     spacing: Annotated[
