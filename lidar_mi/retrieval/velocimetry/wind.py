@@ -217,20 +217,20 @@ def retrieve_wind(
     options = {name: offered[name] for name in chosen.options}
     with threads_for(image1.size):
         found = chosen.find(pixels1, pixels2, template, search, stride, **options)
-    level = 0.0 if noise is None else noise
-    texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
-    apart = max(1, round(template / 2 / stride))
-    outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
-    flag = found.flag
-    if found.covariance is not None:
-        flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
-    if chosen.local:
-        flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
-    if chosen.reach:
-        apart = unrelated([pixels1, pixels2], windows, chosen.reach > 1, noise)
-        # a field that is fitted as a whole is asked no more than whether images are related at all
-        apart = apart if chosen.local else apart.all().expand_as(apart)
-        flag = flag | (Flag.UNRELATED * apart).to(torch.int16)
+        level = 0.0 if noise is None else noise
+        texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
+        apart = max(1, round(template / 2 / stride))
+        outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
+        flag = found.flag
+        if found.covariance is not None:
+            flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+        if chosen.local:
+            flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
+        if chosen.reach:
+            apart = unrelated([pixels1, pixels2], windows, chosen.reach > 1, noise)
+            # a field fitted as a whole is only asked whether images are related at all
+            apart = apart if chosen.local else apart.all().expand_as(apart)
+            flag = flag | (Flag.UNRELATED * apart).to(torch.int16)
     attributes = {
         "method": method,
         "template": template,
