@@ -1,4 +1,4 @@
-"""What every retrieval asks of its images: one uniform grid in metres, real numbers."""
+"""Checks of a retrieval's images: one uniform grid in metres, real numbers."""
 
 from collections.abc import Sequence
 
@@ -44,7 +44,7 @@ def on_device(image: xr.DataArray, device: str | torch.device) -> torch.Tensor:
 
 
 def positive(name: str, value: float) -> float:
-    """A time in s that is one."""
+    """A time in s, checked to be finite and > 0."""
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -19,7 +19,7 @@ MOST_ACCURATE_FIRST = (
     ImageMethod.CC,
     ImageMethod.WS,
 )
-"""Methods that give vectors of their own, by their errors on exactly advected images."""
+"""Methods that retrieve vectors, by their errors on exactly advected images."""
 
 
 class VolumeMethod(StrEnum):
@@ -45,7 +45,7 @@ class RingMethod(StrEnum):
 
 
 class RingCentre(StrEnum):
-    """Whether a ring method retrieves the centre of the rings or is given it."""
+    """Whether the centre of the rings is fitted or given."""
 
     FREE = "free"
     KNOWN = "known"

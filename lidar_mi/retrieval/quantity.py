@@ -1,11 +1,11 @@
-"""A number that was measured."""
+"""A scalar result of a retrieval."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number with its standard error and what it is."""
+    """A number with its standard error, unit and name."""
 
     value: float
     stderr: float

@@ -1,7 +1,7 @@
-"""How many threads work on an image: one, unless it is large.
+"""Number of threads for an image: one, unless it is large.
 
-A step of a retrieval takes some 0.1 ms on an image of the paper's size. Threads then wait for each
-other longer than they work, and on a machine that has other work to do they wait for their turn.
+A step of a retrieval takes some 0.1 ms on an image of the paper's size. The synchronisation of
+threads then takes longer than their work, the more so on a machine with other load.
 """
 
 from collections.abc import Iterator

@@ -31,7 +31,7 @@ from lidar_mi.retrieval.lines.grid_lines import (
 from lidar_mi.retrieval.lines.u_statistics import correlation, probable_statistics, relative_std
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, error_variables, flag_attributes
 
-# Standard deviation of the mean of u before anything is measured, m/s.
+# Prior standard deviation of the mean of u, m/s.
 _MEAN_STD = 100.0
 
 
@@ -67,8 +67,8 @@ def combine(
     scan : xr.Dataset, dim line
         Line-of-sight velocities of the same air, as for
         `lidar_mi.retrieval.lines.vectors.wind_from_triples`, with `range_bin`. A line of sight
-        averages the wind over its bin, along its oblique way through the (y, z) plane; the wind is
-        taken to be the same along x. Lines that leave the grid, or have no velocity, are not used.
+        averages the wind over its bin, along its oblique path through the (y, z) plane; the wind is
+        taken to be uniform along x. Lines that leave the grid, or have no velocity, are not used.
     crossflow_std : float, optional
         Standard error of v and w, m/s, in place of the data set's own (methods that give none).
     window : float, optional
@@ -84,12 +84,12 @@ def combine(
         u's standard deviation is proportional to this power of the local shear of v and w, with
         the rms ``u_std`` over the lines; 0: uniform. Default: averaged over 0, 0.5 and 1 likewise.
     u_exponent : float, optional
-        a of u's correlation, exp(-(|dy|^a + |dz|^a) / length^a), above 0 and up to 2: 1 is rough,
-        as turbulence is, 2 smooth. Default: averaged over 1 and 2 likewise.
+        a of u's correlation, exp(-(|dy|^a + |dz|^a) / length^a), above 0 and up to 2: 1 is rough
+        like turbulence, 2 smooth. Default: averaged over 1 and 2 likewise.
     distance : float, optional
         Of the images' plane x = const from the telescope, m: air that moves along x by dx relative
         to the gates shifts by -y / distance dx, -z / distance dx in the images, since beams are
-        oblique. Default: no such shift, as of air that is the same along x.
+        oblique. Default: no such shift, as for air that is uniform along x.
     gate_speed : float
         Of the images' gates over the ground along x, m/s; matters with ``distance``.
 
@@ -98,7 +98,7 @@ def combine(
     xr.Dataset, dims (z, y)
         `u`, `v`, `w` (m s-1), their standard errors and correlations, `flag` (bits of
         `CombinedFlag`). Where the images gave no vector, v and w are NaN, and lines have less
-        weight: there v and w are taken to be the mean of the others, with twice their standard
+        weight: there v and w are assumed to be the mean of the others, with twice their standard
         deviation. Attributes: `lines_used`, `misfit` (of the lines, 1 where errors are as stated),
         and `u_std`, `u_length`, `u_power` and `u_exponent` of largest evidence.
 
@@ -109,26 +109,26 @@ def combine(
 
     Notes
     -----
-    With x the wind at all nodes, x_b and P what is known without the lines (v, w of the images with
-    their errors; u by its statistics, of unknown mean) and b = H x + e what the lines measured, e
-    of variance R,
+    With x the wind at all nodes, the background x_b of covariance P (v, w of the images with their
+    errors; u by its statistics, of unknown mean) and the lines' velocities b = H x + e, e of
+    variance R,
 
         x = x_b + P H^T S^-1 (b - H x_b),   S = H P H^T + R,   P_x = P - P H^T S^-1 H P .
 
     A line through nodes of valid v and w determines u there, and v and w a little better. The
-    standard errors are as valid as those of v, w and v_LOS (an error of the attitude or of the
-    pointing that ``v_los_std`` does not include is not in them). Those of u assume that it varies
-    uniformly, or more where v and w do; between lines they rest on the statistics that the lines
-    determine. Over an ensemble of flows 71 % of the errors of u lie within one standard error and
-    94 % within 1.96 (tests/retrieval/lines/test_combine_ensemble.py); where u is half the noise of
-    a line, 60 and 84 %, where it is smooth over the lines' spacing, or near zero but for a few
+    standard errors are as valid as those of v, w and v_LOS; they do not include errors of attitude
+    or pointing beyond ``v_los_std``. Those of u assume that its variance is uniform, or larger
+    where the shear of v and w is; between lines they depend on the statistics estimated from the
+    lines. Over an ensemble of flows 71 % of the errors of u lie within one standard error and
+    94 % within 1.96 (tests/retrieval/lines/test_combine_ensemble.py). Where u is half the noise of
+    a line it is 60 and 84 %; where u is smooth over the lines' spacing, or near zero but for a few
     jets, 80 to 90 and 97 %.
     """
     field = checked_crossflow(crossflow, crossflow_std)
     z, y = (crossflow[axis].values.astype(float) for axis in ("z", "y"))
     lines, hull = lines_on_grid(scan, z, y)
     slope = apparent_slopes(z, y, distance)
-    # v and w for u = gate_speed; `forward` accounts for the rest of u
+    # v and w for u = gate_speed; `forward` accounts for the remaining u
     field = field._replace(value=field.value - gate_speed * slope)
     lines = with_slopes(lines, slope)
     if window is None:
@@ -147,8 +147,8 @@ def combine(
 
     spacing = line_spacing(lines, z, y)
     relative_stds = relative_std(field, lines, z, y, spacing, u_power)
-    asked = u_std, u_length, u_exponent
-    found, best = probable_statistics(fixed, residual, lines, z, y, spacing, relative_stds, asked)
+    given = u_std, u_length, u_exponent
+    found, best = probable_statistics(fixed, residual, lines, z, y, spacing, relative_stds, given)
     valid = field.valid
     wind = np.zeros((*valid.shape, 3))
     covariance = np.zeros((*valid.shape, 3, 3))

@@ -8,8 +8,8 @@ import xarray as xr
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_image
 
-# Standard deviation of v and w about their mean where the images gave no vector, in standard
-# deviations of the valid ones: vectors are rejected where the wind varies most.
+# Standard deviation of v and w where the images gave no vector, over that of the valid ones:
+# vectors are rejected where the wind varies most.
 _PRIOR_WITHOUT_IMAGE = 2.0
 
 
@@ -39,7 +39,7 @@ def apparent_slopes(z: np.ndarray, y: np.ndarray, distance: float | None) -> np.
 
 
 def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
-    """v and w of a data set with the covariance of their errors; ``std`` (m/s) in place of its own.
+    """v and w of a data set with the covariance of their errors, or with errors of ``std`` (m/s).
 
     Raises
     ------

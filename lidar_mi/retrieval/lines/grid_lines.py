@@ -53,7 +53,7 @@ def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridL
     corners = {}
     for name, axis in (("z", z), ("y", y)):
         step = (place[name] - axis[0]) / (axis[-1] - axis[0]) * (len(axis) - 1)
-        # a place on the last node may be off by rounding
+        # a place on the last node may lie outside by rounding
         used &= ((step > -1e-9) & (step < len(axis) - 1 + 1e-9)).all(1)
         low = np.clip(np.floor(step), 0, len(axis) - 2).astype(int)
         corners[name] = low, step - low

@@ -14,13 +14,13 @@ from lidar_mi.retrieval.lines.grid_lines import covariance_of_lines
 _STDS = np.geomspace(0.05, 10, 16)
 _LENGTHS = 8
 
-# Powers of the cross-flow's shear that u's standard deviation may go with.
+# Powers of the cross-flow's shear that u's standard deviation may be proportional to.
 _POWERS = (0.0, 0.5, 1.0)
 
 # Exponents of u's correlation: rough as turbulence, and smooth.
 _EXPONENTS = (1.0, 2.0)
 
-# Number of statistics drawn, each as often as it is probable.
+# Number of statistics drawn, in proportion to their probability.
 _DRAWN = 16
 
 
@@ -61,10 +61,10 @@ def relative_std(field, lines, z, y, spacing, power) -> dict[float, np.ndarray]:
     # over the lines' spacing: finer variations of u are not observed
     width = [spacing / np.diff(nodes).mean() for nodes in (z, y)]
     square, known = (ndimage.gaussian_filter(a, width, mode="constant") for a in (square, known))
-    even = np.ones_like(square)
+    uniform = np.ones_like(square)
     known_here = known > 1e-3
     if not (square[known_here] > 0).any():
-        return {0.0: even} if power is None else {power: even}
+        return {0.0: uniform} if power is None else {power: uniform}
     shear = np.sqrt(square / np.where(known_here, known, 1))
     shear = np.where(known_here, shear, shear[known_here].mean())
     shear = np.maximum(shear, 1e-3 * shear.max())
@@ -78,16 +78,16 @@ def relative_std(field, lines, z, y, spacing, power) -> dict[float, np.ndarray]:
 
 
 def probable_statistics(
-    fixed, residual, lines, z, y, spacing, relative_stds, asked
+    fixed, residual, lines, z, y, spacing, relative_stds, given
 ) -> tuple[list[Statistics], Statistics]:
     """Statistics of u drawn by their probability, and those of largest evidence.
 
-    The prior is uniform in the standard deviation, which favours no small ones where lines are too
-    noisy to determine it (Gelman 2006, Bayesian Analysis 1, 515-533), and uniform in the logarithm
-    of the length. The evidence is the likelihood of the lines' velocities. Statistics are drawn at
-    even steps of the cumulative probability, so that each draw has the same weight.
+    The prior is uniform in the standard deviation, which does not favour small ones where lines are
+    too noisy to determine it (Gelman 2006, Bayesian Analysis 1, 515-533), and uniform in the
+    logarithm of the length. The evidence is the likelihood of the lines' velocities. Statistics
+    are drawn at equal steps of the cumulative probability, so that each has the same weight.
     """
-    std, length, exponent = asked
+    std, length, exponent = given
     for name, value, unit in (("u_std", std, "m/s"), ("u_length", length, "m")):
         if value is not None and not value > 0:
             raise InputError(f"{name}: {value} {unit} is not allowed; expected more than 0 {unit}")

@@ -11,7 +11,7 @@ from lidar_mi.errors import InputError
 COMPONENTS = ("u", "v", "w")
 _NAMES = ("v_los", "v_los_std", "direction", "range", "platform_velocity")
 # Singular values of directions, smallest over largest, below which they lie in one plane: rounding
-# leaves 1e-16 there, lines a second of arc apart 5e-6.
+# gives 1e-16, lines a second of arc apart 5e-6.
 _COPLANAR = 1e-8
 
 
@@ -19,7 +19,7 @@ class LineFlag(enum.IntFlag):
     """Why a vector is rejected, one bit per reason; 0: valid."""
 
     COPLANAR = 1
-    """The lines lie in one plane: they do not say how the wind blows across it. No vector."""
+    """The lines lie in one plane: the wind across it is undetermined. No vector."""
     NO_VELOCITY = 2
     """A line has no velocity. No vector."""
 
@@ -80,19 +80,19 @@ def solve_lines(
     covariance : (n, 3, 3) array, (m/s)^2
         (sum d d^T / s^2)^-1; infinite (and the wind NaN) where the lines lie in one plane.
     chi_square : (n,) array
-        Squared misfit; of k - 3 degrees of freedom if the wind is the same along all lines.
+        Squared misfit; of k - 3 degrees of freedom if the wind is uniform over the lines.
 
     Notes
     -----
-    k lines evenly around a cone of half angle a about x, each of error s, give u to
-    s / (sqrt(k) cos a) and v, w to s sqrt(2 / k) / sin a: at small angles v and w are worse than u
-    by sqrt(2) / a.
+    k lines evenly around a cone of half angle a about x, each of error s, give u with an error of
+    s / (sqrt(k) cos a) and v, w with s sqrt(2 / k) / sin a: at small angles v and w are worse than
+    u by sqrt(2) / a.
     """
     matrix = directions / std[..., None]
     left, values, right = np.linalg.svd(matrix, full_matrices=False)
     # of the directions themselves: errors may differ by orders of magnitude
-    bare = np.linalg.svd(directions, compute_uv=False)
-    flat = bare[:, -1] <= _COPLANAR * bare[:, 0]
+    unweighted = np.linalg.svd(directions, compute_uv=False)
+    flat = unweighted[:, -1] <= _COPLANAR * unweighted[:, 0]
     inverse = 1 / np.where(flat[:, None], np.nan, values)
     root = right.swapaxes(-1, -2) * inverse[:, None]
     data = along / std
@@ -108,13 +108,13 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
 
     Neighbours are those of a Delaunay triangulation of the directions (of their tangents, so that
     triangles are those in a plane x = const); the centre is the mean of the middles of the three
-    range bins (paper, fig. 1). The wind is taken to be the same along all three lines.
+    range bins (paper, fig. 1). The wind is assumed uniform over the three lines.
 
     Parameters
     ----------
     scan : xr.Dataset, dim line
         `v_los`, `v_los_std`, `range`, `direction` (line, axis), `platform_velocity` (axis), as
-        `lidar_mi.instrument.doppler_scan.scan_wind` gives them.
+        from `lidar_mi.instrument.doppler_scan.scan_wind`.
 
     Returns
     -------
@@ -125,7 +125,7 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
     Raises
     ------
     InputError
-        Fewer than three lines, all of them in one plane, a scan without what is needed.
+        Fewer than three lines, all of them in one plane, a variable missing.
     """
     along = wind_along_lines(scan)
     tangents = _tangents(scan)
@@ -136,7 +136,7 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
             f"scan.direction: all {len(tangents)} lines lie in one plane; expected three lines "
             "that do not"
         ) from None
-    # Qhull's order is its own: triangles by their lines, as the scan counts them
+    # Qhull's order is arbitrary: sort triangles by the numbers of their lines
     corners = np.sort(corners, axis=1)
     return _vectors(scan, along, corners[np.lexsort(corners.T[::-1])], "triples")
 
@@ -144,16 +144,16 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
 def wind_from_neighbours(scan: xr.Dataset, count: int = 9) -> xr.Dataset:
     """A wind vector for every line of sight, from it and its nearest neighbours by least squares.
 
-    More lines, wider apart, constrain v and w better, if the wind is the same along all of
-    them: `misfit` (squared misfit over its degrees of freedom) is 1 then, and more where it is not;
-    the standard errors know only of the lines' noise.
+    More lines, wider apart, constrain v and w better if the wind is uniform over all of them:
+    `misfit` (squared misfit over its degrees of freedom) is 1 then, and more where it is not. The
+    standard errors contain the lines' noise only.
 
     Parameters
     ----------
     scan : xr.Dataset
-        As for `wind_from_triples`, which also says what is returned.
+        As for `wind_from_triples`; the result is the same, too.
     count : int
-        Lines a vector, itself included: 3 or more.
+        Lines per vector, itself included: 3 or more.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def _vectors(scan, along, lines, method) -> xr.Dataset:
     directions = scan["direction"].transpose("line", "axis").values[lines]
     values, std = along.values[lines], scan["v_los_std"].values[lines]
     missing = ~np.isfinite(values).all(1)
-    # any number will do: what comes of it is taken out below
+    # any number will do: the results are replaced by NaN below
     wind, covariance, chi_square = solve_lines(
         directions, np.where(missing[:, None], 0.0, values), np.where(missing[:, None], 1.0, std)
     )
@@ -193,7 +193,7 @@ def _vectors(scan, along, lines, method) -> xr.Dataset:
     freedom = lines.shape[1] - 3
     misfit = {}
     if freedom:
-        text = {"units": "1", "long_name": "squared misfit a degree of freedom"}
+        text = {"units": "1", "long_name": "squared misfit per degree of freedom"}
         misfit["misfit"] = "vector", np.where(missing | flat, np.nan, chi_square / freedom), text
     centre = (scan["range"].values[lines][..., None] * directions).mean(1)
     return xr.Dataset(

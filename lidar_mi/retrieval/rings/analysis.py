@@ -1,9 +1,9 @@
-"""Rings in any image: centre, radii, orders, and their deviation from the law of an etalon.
+"""Rings in any image: centre, radii, orders, and their deviation from equal steps of r^2.
 
-Nothing needs to be known of the instrument. Rings are found in the average over circles, measured
-in sectors, and one centre is fitted to all of them; then r^2 must rise by one step from order to
+The instrument need not be known. Rings are detected in the average over circles, measured in
+sectors, and one centre is fitted to all of them; then r^2 must increase by one step from order to
 order, r_p^2 = (p + e) spacing with p = 0, 1, ... from the centre outwards and e the fractional
-order at the centre, for each line that the light has (a split line has two or three).
+order at the centre, for each line of the light (a split line has two or three).
 """
 
 import itertools
@@ -22,11 +22,11 @@ from lidar_mi.tables import Table, Tabular, with_error
 STEPS = 1200  # annuli out to the farthest corner
 SECTORS = 48
 SIGNIFICANT = 8.0  # standard deviations of the smoothed average, the least height of a ring
-PROMINENT = 0.1  # and of the tallest ring's height
+PROMINENT = 0.1  # of the tallest ring's height, likewise
 LEAST = 3  # sectors in which a ring must be detected
 ALL_AROUND = 0.5  # of the sectors, in which a ring must be detected to determine its shape
-LINES = 3  # most that a line may be split into
-LAW = 0.02  # of an order: farther off equal steps, rms, is no etalon's pattern
+LINES = 3  # largest number of components of a line
+LAW = 0.02  # orders, largest rms deviation from equal steps of an etalon's pattern
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,7 +42,7 @@ class Rings(Tabular):
     radius, radius_std : array (rings,)
         From the centre outwards.
     order : array (rings,) of int
-        How many orders of interference each ring lies below the centre's, whole part.
+        Orders of interference of each ring below the centre's, integer part.
     line : array (rings,) of int
         Which of the split line's components, 0 the innermost.
     spacing, spacing_std : float
@@ -85,7 +85,7 @@ class Rings(Tabular):
 
     @property
     def splitting(self) -> np.ndarray:
-        """r^2 from the first to the other components in every order that shows both, px^2.
+        """r^2 from the first to the other components in every order that has both, px^2.
 
         Shape (orders, lines - 1); NaN where an order lacks one.
         """
@@ -124,9 +124,7 @@ class Rings(Tabular):
                         (f"{value:.6g} px^2, {value / self.spacing:.4f} orders"),
                     )
                 )
-        steps = (
-            "no ring left over to test" if math.isnan(self.misfit) else f"{self.misfit:.2g} orders"
-        )
+        steps = "too few rings to test" if math.isnan(self.misfit) else f"{self.misfit:.2g} orders"
         whole += [
             ("rms deviation from equal steps", steps),
             ("rms deviation of crests from the rings", f"{self.roundness:.2g} px"),
@@ -152,11 +150,11 @@ def analyse_rings(
     Parameters
     ----------
     image : array or tensor, shape (height, width)
-        Any scale; a sloping background does no harm.
+        Any scale; the background may have a slope.
     centre : (float, float), optional
         (x, y) of the rings where it is known, px; fitted if not given.
     saturation : float, optional
-        Value from which on a pixel is full.
+        Value from which a pixel is saturated.
 
     Returns
     -------
@@ -165,8 +163,8 @@ def analyse_rings(
     Raises
     ------
     InputError
-        An image that is not finite, saturated, shows fewer than two rings, has its centre
-        outside, or whose rings do not follow one another by equal steps of r^2.
+        An image that is not finite or saturated, has fewer than two rings or its centre outside, or
+        rings that are not equally spaced in r^2.
 
     Examples
     --------
@@ -239,7 +237,7 @@ class _Sectors:
         count = np.bincount(label.ravel(), minlength=size).reshape(STEPS, SECTORS)
         total = np.bincount(label.ravel(), image.ravel(), size).reshape(STEPS, SECTORS)
         self.angle = (np.arange(SECTORS) + 0.5) * (2 * np.pi / SECTORS)
-        # a sector cut by the rim would average another part of the image
+        # a sector cut by the edge would average another part of the image
         r = np.sqrt((np.arange(STEPS) + 1) * self.step)[:, None, None]
         around = (np.arange(SECTORS)[:, None] + np.linspace(0, 1, 5)) * (2 * np.pi / SECTORS)
         x, y = centre[0] + r * np.cos(around), centre[1] + r * np.sin(around)
@@ -257,7 +255,7 @@ def _crests(sectors: _Sectors) -> tuple[np.ndarray, np.ndarray]:
     """r^2 of every ring, (rings, SECTORS), NaN where it is not detected; the sectors' angles."""
     mean = sectors.mean
     smooth = savgol_filter(mean, 15, 2)
-    # smoothing by 15 steps leaves 0.4 of white noise
+    # smoothing over 15 steps reduces white noise to 0.4
     noise = 0.4 * 1.4826 * np.median(np.abs(mean - smooth - np.median(mean - smooth)))
     height = max(SIGNIFICANT * noise, PROMINENT * np.ptp(smooth))
     if not np.ptp(smooth) > SIGNIFICANT * noise:
@@ -296,9 +294,9 @@ def _circles(crests: np.ndarray, angle: np.ndarray, free: bool):
     """One centre for all rings, and how far they are from circles about it.
 
     Least squares of r = a + shift . u + a ellipticity . u2 + a^2 tilt . u with u = (cos, sin) of
-    the angle and u2 of twice the angle: what a tilted camera makes of circles to first order in
-    the tilt (each ring's own shift goes with its area), and pixels or lenses that are not as wide
-    as high. Where fewer than two rings are detected all around, only the shift is fitted.
+    the angle and u2 of twice the angle. These are the distortions of circles by a tilted camera,
+    to first order in the tilt (each ring's shift is proportional to its area), and by anamorphic
+    pixels or lenses. Where fewer than two rings are detected all around, only the shift is fitted.
     """
     rings = len(crests)
     radius = np.sqrt(np.nanmedian(crests, 1))

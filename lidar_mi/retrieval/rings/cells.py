@@ -1,11 +1,11 @@
-"""Images of rings in few numbers: sums over sectors of annuli of equal width in r^2.
+"""Binned images of rings: means over sectors of annuli of equal width in r^2.
 
-An etalon's order falls linearly with r^2 (to 1e-4 on a camera), so annuli of equal steps in r^2
-are equal steps in order: every ring gets as many as every other. Sectors keep the direction, from
-which the centre follows. A cell remembers where its pixels lie, to second moments, about the
-centre it was made with; about any other centre its mean r^2 is then exact, and the spread of r^2
-in it exact too but for third moments. An image is so binned once, however often a fit moves the
-centre, as long as it moves by a few pixels.
+An etalon's order decreases linearly with r^2 (to 1e-4 on a camera), so annuli of equal steps in r^2
+are equal steps in order: every ring has the same number of them. Sectors keep the direction, from
+which the centre follows. A cell stores first and second moments of its pixels' positions about the
+centre it was made with. About any other centre its mean r^2 is then exact, and the spread of r^2
+exact up to third moments. So an image is binned only once, although a fit moves the centre, as long
+as it moves by a few pixels.
 """
 
 import math
@@ -26,7 +26,7 @@ class Cells(NamedTuple):
     count : torch.Tensor
         Pixels in the cell.
     centre : (float, float)
-        Where x, y and r2 are counted from: (x, y) from the top left pixel's centre.
+        Origin of x, y and r2: (x, y) from the top left pixel's centre.
     x, y, r2 : torch.Tensor
         Means over the cell's pixels.
     spread : torch.Tensor, shape (cells, 3, 3), or None
@@ -77,7 +77,7 @@ def annular_sectors(
     centre : (float, float)
         (x, y), pixels; may lie outside.
     step : float
-        px^2. A fit loses (2 pi n step / order)^2 / 12 of the information of the n-th harmonic of
+        px^2. Binning loses (2 pi n step / order)^2 / 12 of the information of the n-th harmonic of
         the ring profile, with `order` the step of r^2 from ring to ring.
     sectors : int
         Per turn; 1 for whole annuli.

@@ -1,4 +1,4 @@
-"""Where the rings' centre is: from gradients, by circular averaging, by midpoint lines.
+"""The rings' centre: from gradients, by circular averaging, by midpoint lines.
 
 Coordinates are pixels, x to the right and y down, from the top left pixel's centre.
 """
@@ -14,12 +14,11 @@ from lidar_mi.retrieval.rings.peak_fit import peak
 def gradient_centre(image) -> tuple[float, float]:
     """Point that the lines along all gradients pass closest by, to about a pixel.
 
-    The gradient of rings points to or from their centre wherever a pixel lies, so that every
-    edge votes and no ring needs to be found or closed: least squares of the distances between the
-    point and the lines, weighted by the squared gradient (Parthasarathy 2012, Nature Methods 9,
-    724), here of the smoothed image. Noise of white pixels draws the point toward the
-    image's middle, by its fraction of the squared gradient: below 0.1 % for the paper's 1.3e7
-    photons.
+    The gradient of rings points to or from their centre at every pixel, so that no ring needs to be
+    detected or complete: least squares of the distances between the point and the lines, weighted
+    by the squared gradient (Parthasarathy 2012, Nature Methods 9, 724), here of the smoothed
+    image. White noise biases the point toward the image's middle by its fraction of the squared
+    gradient: below 0.1 % for the paper's 1.3e7 photons.
 
     Parameters
     ----------
@@ -41,7 +40,7 @@ def gradient_centre(image) -> tuple[float, float]:
     rows, columns = (size // block for size in image.shape)
     coarse = image[: rows * block, : columns * block].reshape(rows, block, columns, block)
     coarse = gaussian_filter(coarse.mean((1, 3)).cpu().numpy().astype(float), 2.0)
-    # the filter invents what lies beyond the rim
+    # the filter extrapolates beyond the edge
     rim = 5
     slope_y, slope_x = (part[rim:-rim, rim:-rim] for part in np.gradient(coarse))
     y, x = np.mgrid[rim : rows - rim, rim : columns - rim].astype(float)
@@ -64,7 +63,7 @@ def circular_average(image: np.ndarray, centre: tuple[float, float]) -> tuple:
     Returns
     -------
     radius, mean, weight : arrays
-        px; the value's unit; pixels that took part. Radii of weight 0 are left out.
+        px; the value's unit; sum of the pixels' weights. Radii of weight 0 are left out.
     """
     height, width = image.shape
     x, y = np.arange(width) - centre[0], np.arange(height) - centre[1]
@@ -81,22 +80,22 @@ def circular_average(image: np.ndarray, centre: tuple[float, float]) -> tuple:
 
 
 def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[float, float]:
-    """Centre about which the circular average has the most contrast: the paper's CA.
+    """Centre about which the circular average has the largest contrast: the paper's CA.
 
-    The contrast, the variance of the averages over all pixels, falls with the square of the
-    distance to the centre: averages about another point smear the rings. Its top is found by
-    Newton's method, on differences over 1 px.
+    The contrast, the variance of the averages over all pixels, decreases with the square of the
+    distance to the centre, as averages about another point blur the rings. Its maximum is found
+    by Newton's method, from differences over 1 px.
 
     Parameters
     ----------
     image : array, shape (height, width)
     start : (float, float)
-        Within about a third of a ring's width.
+        Within about 1/3 of a ring's width.
 
     Raises
     ------
     InputError
-        A contrast without a top: no rings about one centre.
+        A contrast without a maximum: no rings about one centre.
     """
     # variances do not depend on an offset; sums of squares lose least without one
     image = np.asarray(image, float) - np.mean(image)
@@ -113,11 +112,11 @@ def circular_centre(image: np.ndarray, start: tuple[float, float]) -> tuple[floa
         slope = np.array([right - left, below - above]) / 2
         mixed = corner - right - below + middle
         curve = np.array([[right + left - 2 * middle, mixed], [mixed, below + above - 2 * middle]])
-        # where the contrast is not yet a hill's top, uphill
-        hill = np.linalg.eigvalsh(curve)[1] < 0
-        step = -np.linalg.solve(curve, slope) if hill else 2 * np.sign(slope)
+        # uphill where the contrast is not concave
+        concave = np.linalg.eigvalsh(curve)[1] < 0
+        step = -np.linalg.solve(curve, slope) if concave else 2 * np.sign(slope)
         x, y = np.array([x, y]) + step.clip(-2, 2)
-        if hill and np.hypot(*step) < 0.01:
+        if concave and np.hypot(*step) < 0.01:
             return float(x), float(y)
     raise InputError("image: averages over circles have no best centre; expected rings")
 
@@ -132,7 +131,7 @@ def midpoint_points(
     """Crests of one ring along lines across it, left and right and above and below.
 
     Lines are bands of rows (columns) within half a radius of the centre; along each, a Gaussian
-    fitted within ``half_width`` of where the ring of ``radius`` should be gives the crest.
+    fitted within ``half_width`` of the ring of ``radius`` gives the crest.
 
     Returns
     -------
@@ -142,7 +141,7 @@ def midpoint_points(
     """
     found = np.full((2, 2, bands, 2), np.nan)
     for direction in range(2):
-        # lines along x of the image, or along y of it: the same on the transposed image
+        # lines along x of the image; along y the same on the transposed image
         lines = image if direction == 0 else image.T
         along, across = centre if direction == 0 else centre[::-1]
         edges = across + np.linspace(-radius / 2, radius / 2, bands + 1)

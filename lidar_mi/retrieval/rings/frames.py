@@ -1,14 +1,14 @@
-"""Which images may be analysed: finite ones that are not saturated."""
+"""Checks of images before their analysis: finite and not saturated."""
 
 import numpy as np
 import torch
 
 from lidar_mi.errors import InputError
 
-# A value that so large a fraction of the pixels has, several times as many as have the next lower
-# one, is the end of the scale. Of a smooth crest, rounded to integers, the top value has at most
-# 2.4 times as many pixels as the one below it, for the area above a level grows with the root of
-# the depth.
+# The highest value is the end of the scale if it has more than this fraction of the pixels, and
+# this factor more than the next lower value. Of a smooth crest, rounded to integers, the top value
+# has at most 2.4 times as many pixels as the one below it, as the area above a level grows with the
+# square root of the depth.
 PLATEAU = 1e-3
 EXCESS = 4.0
 

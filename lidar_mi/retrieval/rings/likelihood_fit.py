@@ -36,13 +36,13 @@ from lidar_mi.retrieval.rings.model import (
 
 METHODS = ("annular", "pixels")
 
-# Annuli per order of interference, for each harmonic that matters: pi^2 / 3 / 16^2 = 1.3 % of the
-# information of the highest is lost, which is hardly any.
+# Annuli per order of interference, for each significant harmonic: pi^2 / 3 / 16^2 = 1.3 % of the
+# information of the highest is lost.
 STEPS_PER_HARMONIC = 16
 SECTORS = 16
-REACH = 0.025  # of the first ring's size, how far off a centre may lie from the sectors' own
+REACH = 0.025  # of the first ring's size, largest distance of a centre from the sectors' own
 ITERATIONS = 40
-CLOSE = 1e-3  # standard deviations, the last step of a fit that has converged
+CLOSE = 1e-3  # standard deviations, largest last step of a fit that has converged
 CHUNK_BYTES = 256e6
 SIGNIFICANT = 5.0  # standard deviations, the least amplitude of rings
 
@@ -111,15 +111,15 @@ def fit_rings(
         (x, y) of the rings, pixels: where the fit starts, and where it stays if x and y are not
         free. Found from the images' gradients if not given.
     free : names out of `lidar_mi.retrieval.rings.model.PARAMETERS`, optional
-        What is fitted; everything the model has if not given. The others stay at the model's
+        Fitted parameters; all that the model has if not given. The others stay at the model's
         values, the background at 0.
     saturation : float, optional
-        Electrons from which on a pixel is full. Images that end in a plateau are refused even
+        Electrons from which a pixel is saturated. Images that end in a plateau are refused even
         if it is not given.
     max_chi_square : float
-        An image that fits worse is refused: whatever it shows, the model is not it. Infinite
-        lets all through. The default detects a wrong line or noise, not a small error: chi_square
-        scatters by (2 / cells)^(1/2) = 1 to 2 %.
+        Images that fit worse are refused; infinite accepts all. The default detects a wrong line
+        or noise, not a small error: the standard deviation of chi_square is
+        (2 / cells)^(1/2) = 1 to 2 %.
 
     Returns
     -------
@@ -129,7 +129,7 @@ def fit_rings(
     ------
     InputError
         Sizes, method or names that are not allowed; an image that is not finite or saturated,
-        shows fewer than two rings, has its centre outside or does not fit the model.
+        has fewer than two rings or its centre outside, or does not fit the model.
     """
     if method not in METHODS:
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
@@ -174,7 +174,7 @@ def _steps(model: RingModel) -> int:
 
 
 class _Task(NamedTuple):
-    """Whatever is the same for all images of a call."""
+    """The settings common to all images of a call."""
 
     model: RingModel
     noise: PixelNoise
@@ -186,8 +186,8 @@ class _Task(NamedTuple):
 def _fit(images, task: _Task, number: int, method: str) -> RingFit:
     """`fit_rings` for some of the images, from the ``number``-th on.
 
-    They share their cells, about the centre of their mean. Where one of them shows no rings about
-    that, or its centre lies farther off than sectors allow, it gets cells of its own.
+    They have common cells, about the centre of their mean. An image without rings about that
+    centre, or with its own centre too far from it, gets cells of its own.
     """
     centre = task.centre or gradient_centre(images.mean(0, dtype=torch.float32))
     try:
@@ -273,7 +273,7 @@ def _start(model, cells, means, noise, number) -> torch.Tensor:
     weight = cells.count
     inverse = torch.linalg.pinv((waves * weight) @ waves.T, hermitian=True)
     found = (means * weight) @ waves.T @ inverse
-    # the noise as the image's mean has it
+    # the noise at the image's mean
     spread = noise.variance(found[:, :1].clamp(min=0), found[:, :1].clamp(min=0))
     size = found[:, 1:].norm(dim=1)
     error = (spread[:, 0] * inverse.diagonal()[1:].mean()).sqrt()
@@ -302,7 +302,7 @@ def _scoring(model, cells, means, parameters, noise, indices, number):
     if PARAMETERS.index("background") in fixed:
         parameters[:, 3] += parameters[:, 4]
         parameters[:, 4] = 0
-    # a step longer than the rings are wide leaves the range that the first order describes
+    # a step longer than the rings are wide leaves the linear range
     limit = torch.full_like(parameters[0], math.inf)
     limit[0], limit[1:3] = model.velocity_range / 16, 0.04 * math.sqrt(model.order_spacing)
     limit[5], limit[6] = 20.0, 0.3
@@ -335,8 +335,7 @@ def _scoring(model, cells, means, parameters, noise, indices, number):
         converged = (step.abs() <= CLOSE * std).all(1)
     bad = number + int((~converged).nonzero()[0])
     raise InputError(
-        f"images[{bad}]: the fit does not converge; expected two rings or more as the model has "
-        "them"
+        f"images[{bad}]: the fit does not converge; expected two rings or more as in the model"
     )
 
 

@@ -29,7 +29,7 @@ PARAMETERS = ("v_los", "x", "y", "level", "background", "temperature", "falloff"
 electrons per pixel, K, and the exponent of the illumination's fall-off from centre to corner."""
 
 PIXEL_R2 = 1 / 6  # px^2, mean squared distance of a pixel's points from its centre
-NEGLIGIBLE = 1e-7  # harmonics below this part of A_0 change no velocity by 1e-4 m/s
+NEGLIGIBLE = 1e-7  # harmonics below this fraction of A_0 change velocities by less than 1e-4 m/s
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class RingModel:
         K, ascending, a few nodes: harmonics between them follow the polynomial through all. One
         node, or none given: the temperature is not a parameter.
     falloff : float
-        The illumination's, see the module.
+        Of the illumination, see the module.
 
     Raises
     ------
@@ -126,7 +126,7 @@ class RingModel:
 
     @property
     def middle_temperature(self) -> float:
-        """The temperature, K, in the middle of those that the model knows."""
+        """The middle one of the model's temperatures, K."""
         return float(self.temperatures[len(self.temperatures) // 2])
 
     def at_temperature(self, temperature: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -152,8 +152,8 @@ class PixelNoise:
     Parameters
     ----------
     read_noise : float
-        Standard deviation of what does not depend on the light: read-out, and 1 / sqrt(12) of a
-        step of the digitisation added in squares.
+        Standard deviation of the noise that does not depend on the light: root sum of squares of
+        the read-out's and of 1 / sqrt(12) of a digitisation step.
     speckle_modes : float
         M of the Gamma distribution that the laser light of a pixel follows; infinite without.
 
@@ -179,9 +179,9 @@ class PixelNoise:
         A Poisson number whose mean is Gamma distributed is negative binomial: mean +
         signal^2 / M. Its likelihood, like Poisson's own, has the score (count - mean) / variance
         d mean, so that weighting by the variance of the fitted mean *is* maximum likelihood.
-        With read noise the exact density is a convolution; what the same score then leaves
-        unused of its information is below 1 % for a mean of 20 electrons or more and 4 % at
-        worst (5 electrons rms, M = 10 or more).
+        With read noise the exact density is a convolution; the same score then loses less than
+        1 % of the information for a mean of 20 electrons or more and 4 % at worst (5 electrons
+        rms, M = 10 or more).
         """
         return mean + signal**2 / self.speckle_modes + self.read_noise**2
 
@@ -227,7 +227,7 @@ def mean_and_jacobian(
     -------
     mean : torch.Tensor, shape (images, cells)
     jacobian : torch.Tensor, shape (images, 7, cells)
-        By each parameter. That a cell's spread of r^2 changes with the centre is left out of it.
+        By each parameter. The change of a cell's spread of r^2 with the centre is neglected.
     """
     v, dx, dy, level, background, temperature, falloff = parameters.T[..., None]
     r2 = squared_radius(cells, dx, dy)
@@ -236,7 +236,7 @@ def mean_and_jacobian(
         by = torch.cat([-2 * dx, -2 * dy, torch.ones_like(dx)], -1)  # of r2 by (x, y, r2)
         variance = variance + torch.einsum("bi,cij,bj->bc", by, cells.spread, by)
     light = illumination(model, r2, falloff)
-    # more light at the inner end of a cell: its rings count there
+    # more light at the inner end of a cell
     cosine, fraction = orders(model, r2 - falloff / _corner(model) * variance, v)
     turn = torch.polar(torch.ones_like(fraction), 2 * torch.pi * fraction)
     per_velocity = cosine / model.velocity_range
@@ -278,7 +278,7 @@ def parameter_vector(
     background: float = 0.0,
     temperature: float | None = None,
 ) -> torch.Tensor:
-    """Parameters (1, 7) of an image about the cells' centre that holds so many signal electrons.
+    """Parameters (1, 7) of an image about the cells' centre with this number of signal electrons.
 
     Raises
     ------
@@ -296,7 +296,7 @@ def parameter_vector(
         first, last = model.temperatures[[0, -1]]
         if not first <= temperature <= last:
             raise InputError(
-                f"temperature: {temperature!r} K is not allowed; the model holds from "
+                f"temperature: {temperature!r} K is not allowed; the model is valid from "
                 f"{first:g} to {last:g} K"
             )
     vector = torch.tensor(
@@ -386,7 +386,7 @@ def cramer_rao(
     """Smallest standard deviation that an unbiased estimate from one image can have.
 
     The inverse of the Fisher matrix F = sum over pixels of J J^T / variance, J the derivatives
-    of the mean by all free parameters: none of them is taken as known. Exact for Poisson noise
+    of the mean by all free parameters, none of which is known. Exact for Poisson noise
     and Poisson with speckle; with read noise up to 2 % above the exact bound, see
     `PixelNoise.variance`.
 
@@ -397,9 +397,9 @@ def cramer_rao(
     noise : PixelNoise
         Poisson alone if not given.
     v_los, background, centre, temperature
-        Where the bound is wanted; see `expected`. The centre may lie outside the image.
+        Parameters of the image; see `expected`. The centre may lie outside the image.
     free : names out of `PARAMETERS`, optional
-        What is not known; everything the model has if not given.
+        The unknown parameters; all that the model has if not given.
 
     Returns
     -------

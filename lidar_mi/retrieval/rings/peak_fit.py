@@ -1,4 +1,4 @@
-"""Where peaks are: Gaussians on a level or a slope, fitted by Levenberg-Marquardt."""
+"""Positions of peaks: Gaussians on a level or a slope, fitted by Levenberg-Marquardt."""
 
 import warnings
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ def peaks(
     x, values : arrays (N,)
         NaN values are left out.
     starts : sequence of float
-        About where the peaks are, ascending.
+        Approximate positions of the peaks, ascending.
     reach : float
         The fit goes from the first less ``reach`` to the last plus ``reach``.
     slope : bool
-        Whether what the peaks stand on may slope.
+        Whether the background of the peaks may have a slope.
 
     Returns
     -------

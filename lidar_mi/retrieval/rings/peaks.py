@@ -1,15 +1,15 @@
 """The paper's retrieval of the wind: radius of the innermost ring, emitted and received.
 
 Profiles come from circular averaging (CA), from crests along midpoint lines (ML) or, as the
-baseline, from 360 radial cuts behind a Savitzky-Golay filter; a Gaussian fitted by
+baseline, from 360 radial cuts after a Savitzky-Golay filter; a Gaussian fitted by
 Levenberg-Marquardt gives the peak, its radius the wavelength. The paper names these steps and
-leaves their detail to Hirschberger & Ehret 2011 (Appl. Phys. B 103, 207-222); what is not said
-there is chosen here and documented.
+leaves their detail to Hirschberger & Ehret 2011 (Appl. Phys. B 103, 207-222); details missing
+there are chosen here and documented.
 
 A line that is broadened symmetrically in frequency is symmetric in order, hence in r^2, not in r:
 in r its outer flank is steeper. A Gaussian fitted in r turns the skew into a shift, by -10 to
--40 m/s for air at 233 K, as wide as the fitted piece is; fitted in r^2 the same chain is free of
-it. Both are here, ``coordinate`` says which.
+-40 m/s for air at 233 K, depending on the width of the fitted piece. Fitted in r^2 the same chain
+has no such shift. ``coordinate`` selects one of them.
 """
 
 import numpy as np
@@ -31,13 +31,13 @@ from lidar_mi.retrieval.rings.peak_fit import peak
 METHODS = ("ca", "ml", "sg")
 COORDINATES = ("r", "r2")
 
-PIECE = 0.35  # of the ring's radius to both sides is fitted: about half way to the minimum
+PIECE = 0.35  # of the ring's radius, fitted to both sides: about half way to the minimum
 
 
 def radial_cuts(image: np.ndarray, centre: tuple[float, float], cuts: int = 360) -> np.ndarray:
     """Values along rays from the centre, (cuts, radii), 1 px apart, linear between pixels.
 
-    As far as the farthest corner; NaN outside the image.
+    Out to the farthest corner; NaN outside the image.
     """
     height, width = image.shape
     far = np.hypot(*(max(c, size - 1 - c) for c, size in zip(centre, (width, height), strict=True)))
@@ -78,7 +78,7 @@ def find_centre(
 def innermost(image: np.ndarray, centre: tuple[float, float]) -> float:
     """Radius of the innermost ring, px, to a few pixels: first crest of the smoothed average."""
     r, mean, weight = circular_average(image, centre)
-    # the first pixels from the centre average next to nothing
+    # circles next to the centre average too few pixels
     mean, r = mean[weight > 30], r[weight > 30]
     smooth = savgol_filter(mean, max(5, len(mean) // 20 * 2 + 1), 2)
     crest = 1 + np.flatnonzero((smooth[1:-1] > smooth[:-2]) & (smooth[1:-1] >= smooth[2:]))
@@ -105,19 +105,19 @@ def ring_radius(
         (x, y), px.
     method : {"ca", "ml", "sg"}
         Circular average; mean distance of crests along midpoint lines; mean of radial cuts
-        behind a Savitzky-Golay filter.
+        after a Savitzky-Golay filter.
     coordinate : {"r", "r2"}
-        What the Gaussian is fitted over; ``ml`` fits along lines across the ring, in r only.
+        Coordinate of the Gaussian; ``ml`` fits along lines across the ring, in r only.
     radius : float, optional
-        About where the ring is, px; found if not given.
+        Approximate radius of the ring, px; detected if not given.
     piece : float
-        Half width of the fitted piece of the profile, in radii; for r2, of the piece between the
-        same ends as nearly as it is symmetric in r^2.
+        Half width of the fitted piece of the profile, in radii; for r2, of nearly the same piece,
+        symmetric in r^2.
 
     Raises
     ------
     InputError
-        No ring, or a method that is none.
+        No ring, or an unknown method.
     """
     if method not in METHODS:
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")

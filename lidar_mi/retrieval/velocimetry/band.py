@@ -1,4 +1,4 @@
-"""Quadratic forms of a plane flow's coefficients: the band they fill, and its inverse.
+"""Quadratic forms of a plane flow's coefficients as band matrices, and their inverse.
 
 The coefficients (component, knot along z, knot along y) couple only where the knots are at most
 three apart. With the knots along y in threes the matrix of a form is block tridiagonal.

@@ -11,14 +11,14 @@ import torch
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 
-# Shells of the power spectrum with fewer waves say too little about their mean.
+# Shells of the power spectrum with fewer waves have too uncertain a mean.
 _SHELL_WAVES = 200
-# Shells in a cycle per pixel, at the least.
+# Least number of shells per cycle per pixel.
 _SHELLS = 16
 
 
 class Filter(NamedTuple):
-    """A filter by shells of wavenumber, and what it makes of texture and noise.
+    """A filter by shells of wavenumber, and its effect on texture and noise.
 
     Attributes
     ----------
@@ -28,10 +28,10 @@ class Filter(NamedTuple):
     passed : float
         Fraction of the variance of white noise that the filter lets pass.
     excess : float
-        Variance of a displacement over what the slopes would allow, were they free of noise.
+        Variance of a displacement over that from noise-free slopes.
     efficiency : float
-        Fraction of the information in the slopes that is left: 1 but where blur is undone, which
-        makes the noise of short waves stronger.
+        Fraction of the information in the slopes that is left: 1 unless blur is corrected, which
+        amplifies the noise of short waves.
     """
 
     gain: torch.Tensor
@@ -54,7 +54,7 @@ def best_filter(
 
     With texture of spectral density S and white noise N the filter is sqrt(S / (S + N / 2)): of
     all filters applied to both images of a pair before their differences are squared, the one
-    with the least variance of the displacement (a wave k tells k^2 S of it, against a variance of
+    with the least variance of the displacement (a wave k informs it by k^2 S at a variance of
     4 S N + 2 N^2, so its weight S / (2 S + N) is the square of this filter but for a factor).
 
     Parameters
@@ -80,7 +80,7 @@ def best_filter(
         floor = torch.where(mismatch.isfinite(), mismatch, density)
         floor = floor.clamp(min=max(1e-9 * float(density.max()), 1e-30))
     elif noise is None:
-        # the lowest shells are low by chance as well: the mean of all that may be as low
+        # the lowest shells are low partly by chance: the mean of all shells consistent with them
         floor = (density * below).min()
         fraction = uncertainty**-2 * (density <= floor * below)
         floor = (fraction * density).sum() / fraction.sum()
@@ -101,7 +101,7 @@ def best_filter(
     passed = float(passed[..., :1].sum() + 2 * passed[..., 1:].sum()) / math.prod(sizes)
     white = level / floor if mismatch is not None else torch.ones_like(response)
     gain = (response * white).sqrt()
-    # the slopes' power with noise and filter, what of it is informed by texture, and its variance
+    # power of the filtered slopes with noise, the part of it from texture, and its variance
     both = texture + floor / 2
     steep = radius**2 * gain[shell] ** 2
     power, informed, spread = (
@@ -191,8 +191,8 @@ def faded(
 ) -> torch.Tensor:
     """Images or volumes of mean 0, mirrored at their edges, fading to 0 over the margin.
 
-    A Fourier transform goes on from the last pixel to the first. Were one side brighter than the
-    other, a filter that stops short waves would ring from that step into the image.
+    A Fourier transform is periodic. Were one side brighter than the other, a low-pass filter would
+    ring from that step into the image.
 
     Parameters
     ----------
@@ -201,7 +201,7 @@ def faded(
         Of the result along all axes but the first; `margin` pixels of it come before the image.
     margin : int
     antisymmetric : bool
-        Mirrored about the edge's value as well, so that the slope goes on.
+        Mirrored about the edge's value as well, which keeps the slope.
     """
     for axis, size in enumerate(sizes, 1):
         n = images.shape[axis]

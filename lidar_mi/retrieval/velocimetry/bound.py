@@ -1,4 +1,4 @@
-"""The Cramer-Rao bound: how well an image pair can tell a displacement at all."""
+"""The Cramer-Rao bound: smallest possible standard error of a displacement from an image pair."""
 
 import torch
 
@@ -20,7 +20,7 @@ def displacement_bound(
     For one displacement of all pixels of a window and white Gaussian noise of standard deviation s
     in both images the Fisher information is sum(g g^T) / (2 s^2), g being the texture's slope, and
     its inverse the bound (Kay 1993, Fundamentals of Statistical Signal Processing, ch. 3). The
-    slopes' products are means over both band-limited images, less what noise adds to them.
+    slopes' products are means over both band-limited images, less the contribution of noise.
     A method can be better than the bound of a window only by using more than the window, as
     smooth flows do, and is worse where the flow is not uniform in it.
 

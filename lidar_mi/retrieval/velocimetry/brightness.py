@@ -1,4 +1,4 @@
-"""One brightness for images of the same air: over the whole, and over what is valid in all."""
+"""Equal brightness of images of the same air: over the whole, and over what is valid in all."""
 
 from collections.abc import Sequence
 
@@ -20,11 +20,11 @@ def normalised(images: Sequence[torch.Tensor]) -> torch.Tensor:
 def of_one_brightness(
     value: torch.Tensor, weight: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Warped images (images, ...) with one mean and contrast, and what each was multiplied by.
+    """Warped images (images, ...) with one mean and contrast, and the factor of each.
 
-    Of air that is valid in all images, weighted as its noise deserves: bright air that enters an
-    image changes its mean by little, but by more than the noise of dark air. Volumes, which may be
-    attenuated unlike, lose their linear trend along x as well.
+    From air that is valid in all images, weighted by inverse variance: bright air that enters an
+    image changes its mean by little, but by more than the noise of dark air. Volumes, whose
+    attenuation may differ, lose their linear trend along x as well.
     """
     dims = tuple(range(1, value.ndim))
     fraction = weight / weight.sum().clamp(min=1e-30)
@@ -35,13 +35,13 @@ def of_one_brightness(
         trend = fraction * x / (fraction * x * x).sum().clamp(min=1e-30)
         value = value - x * (trend * value).sum(dims, keepdim=True)
     contrast = (fraction * value.square()).sum(dims, keepdim=True).sqrt()
-    # images come with nearly one contrast: what asks for more has none
+    # images come with nearly one contrast: a larger factor means that there is none
     gain = (contrast[:1] / contrast).nan_to_num(1.0).clamp(0.5, 2.0)
     return gain * value, gain
 
 
 def rms(noise: float | torch.Tensor) -> float:
-    """One standard deviation for an image, from its own or those of its pixels (NaN left out)."""
+    """Rms standard deviation of an image's noise, of a number or a map (NaN left out)."""
     if not isinstance(noise, torch.Tensor):
         return noise
     finite = working(noise[torch.isfinite(noise)])

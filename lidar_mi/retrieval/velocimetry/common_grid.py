@@ -79,7 +79,7 @@ def resample_pair(
     nodes = {}
     for name in ("z", "y"):
         axes = [_axis(image, name)[1] for image in (image1, image2)]
-        # a hair of tolerance: an edge that is a multiple but for rounding is still a node
+        # an edge that is a multiple but for rounding is still a node
         low = np.ceil(max(axis[0] for axis in axes) / spacing - 1e-6)
         high = np.floor(min(axis[-1] for axis in axes) / spacing + 1e-6)
         if high <= low:
@@ -169,6 +169,6 @@ def _axis(image: xr.DataArray, name: str) -> tuple[str, np.ndarray]:
 
 
 def _within(nodes: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """Nodes on the axis, a rounding error at its ends forgiven."""
+    """Nodes on the axis, with a tolerance for rounding at its ends."""
     slack = 1e-6 * (axis[-1] - axis[0]) / (len(axis) - 1)
     return (nodes >= axis[0] - slack) & (nodes <= axis[-1] + slack)

@@ -6,7 +6,7 @@ template and of each candidate, shift by shift,
     c(s) = sum (f - <f>) (g_s - <g_s>) / sqrt(sum (f - <f>)^2  sum (g_s - <g_s>)^2),
 
 with f the template of image 1 and g_s the equally large piece of image 2 at shift s. One
-normalisation for a whole search region, as some tools have it, draws the peak toward the
+normalisation for a whole search region, as in some tools, biases the peak toward the
 brighter side of a smooth image.
 """
 
@@ -46,8 +46,8 @@ def cross_correlation(
     The integer peak is refined in both directions by a Gaussian through the peak and its two
     neighbours (Willert & Gharib 1991, Exp. Fluids 10, 181-193). On smooth images with few
     correlation lengths in a window the peak is no Gaussian: expect 0.1 px rms without any noise
-    where an 8 px template sees texture of 3 px correlation length. A displacement beyond
-    (search - template) // 2 - 1/2 px is out of reach; its peak lies on the rim and is flagged.
+    for an 8 px template on texture of 3 px correlation length. A displacement beyond
+    (search - template) // 2 - 1/2 px is out of range; its peak lies on the rim and is flagged.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def correlate(
     algorithm : {"auto", "dense", "fft"}
         "dense" multiplies the whole images at each shift and sums over boxes: its cost does not
         depend on the template and hardly on the stride. "fft" transforms each window: its cost
-        goes with the number of windows and hardly depends on the number of shifts. Both give the
+        scales with the number of windows and hardly depends on the number of shifts. Both give the
         same numbers; "auto" takes the cheaper one.
 
     Returns
@@ -114,8 +114,7 @@ def correlate(
     torch.Tensor, shape (shifts, shifts, rows, columns)
         Between -1 and 1; [p, q, i, j] belongs to the shift (p - lead, q - lead) px in (z, y) of
         window (i, j). Zero where template or candidate has no contrast beyond the rounding of
-        the images' own numbers. All of it is held in memory: `cross_correlation` is the one that
-        works by tiles.
+        the images' own numbers. All of it is held in memory; `cross_correlation` works by tiles.
 
     Raises
     ------
@@ -136,7 +135,7 @@ def _choose(algorithm: str, windows: Windows) -> str:
     if algorithm != "auto":
         return algorithm
     # Passes over the data, weighted by measured times: box sums stream through memory, an FFT of
-    # a window costs about ten times as much a value.
+    # a window costs about ten times as much per value.
     rows, columns = windows.count
     pixels = (rows - 1) * windows.stride + windows.template
     pixels *= (columns - 1) * windows.stride + windows.template
@@ -184,7 +183,7 @@ def _correlate(
 
 
 def _inverse_deviation(square: torch.Tensor, mean: torch.Tensor, floor: float) -> torch.Tensor:
-    """1 / standard deviation from <x^2> and <x>; 0 where there is none beyond rounding."""
+    """1 / standard deviation from <x^2> and <x>; 0 where it is within rounding."""
     variance = square - mean**2
     limit = floor + 16 * torch.finfo(square.dtype).eps * square
     return torch.where(variance > limit, variance, torch.inf).rsqrt()
@@ -197,7 +196,7 @@ def _covariance_dense(
     mean2: torch.Tensor,
     windows: Windows,
 ) -> torch.Tensor:
-    """<f g_s> - <f> <g_s> from box means of the product at each shift, one row of shifts a time."""
+    """<f g_s> - <f> <g_s> from box means of the product at each shift, row by row of shifts."""
     n, stride = windows.template, windows.stride
     height, width = (size - windows.search + n for size in windows.shape)
     fixed = image1[windows.lead :, windows.lead :][:height, :width] / n**2

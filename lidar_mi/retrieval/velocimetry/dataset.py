@@ -57,7 +57,7 @@ def winds(
 ) -> dict[str, Variable]:
     """Every component with its standard error and the correlations of their errors (m/s, 1).
 
-    Standard errors and correlations are NaN where there is no displacement or the method knows
+    Standard errors and correlations are NaN where there is no displacement or the method gives
     none.
 
     Parameters
@@ -122,7 +122,7 @@ def dataset(
     attributes: Mapping[str, object],
     found: Displacement,
 ) -> xr.Dataset:
-    """All of it, with the numbers that describe the whole."""
+    """The data set, with the scalar quantities of the result."""
     attrs = {"Conventions": "CF-1.11", "title": title, **attributes, "dt_units": "s"}
     result = xr.Dataset(variables, coords, attrs)
     for name, quantity in found.quantities.items():

@@ -12,7 +12,7 @@ from lidar_mi.retrieval.velocimetry.likelihood import Linear
 from lidar_mi.retrieval.velocimetry.prior import Prior
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 
-# What a factorisation may lose of the largest entries: fifty times the rounding of one.
+# Relative rounding error of a factorisation: fifty times that of one entry.
 _ROUNDING = 1e-14
 
 
@@ -29,12 +29,12 @@ class Posterior(NamedTuple):
     stiff: torch.Tensor
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Of each kind of motion: variance that the images took from it, and its square."""
+        """By kind of motion: the variance removed by the images, and its square in the flow."""
         before = self.band.covariance(self.band.factor(self.stiff))
-        open_ = before - self.band.covariance(self.root)
+        removed = before - self.band.covariance(self.root)
         informed = [
             sum(
-                one * other * self.band.spread(open_[a, b], self.prior.mesh, first, second)
+                one * other * self.band.spread(removed[a, b], self.prior.mesh, first, second)
                 for a, first, one in terms
                 for b, second, other in terms
             )
@@ -61,7 +61,7 @@ def solved(
     settings: VariationalSettings,
     turn: int,
 ) -> Posterior:
-    """One Gauss-Newton step; the number of the turn makes no difference here."""
+    """One Gauss-Newton step; `turn` is for `iterative` only."""
     band = Band(*mesh.axes)
     data = band.form(linear.weight * linear.slope[:, None] * linear.slope, mesh)
     stiff = _prior_form(band, prior, settings.ridge)
@@ -72,7 +72,7 @@ def solved(
 
 
 def _prior_form(band: Band, prior: Prior, ridge: float) -> torch.Tensor:
-    """The prior's quadratic form; rigid motion and what else it leaves free is just not inf."""
+    """The prior's quadratic form; the ridge keeps the variance of rigid motion finite."""
     form = prior.local.new_zeros(2, 2, 7, band.z.knots, 4, band.y.knots)
     for terms, strength in zip(_kinds(prior), prior.strength, strict=True):
         for a, first, one in terms:
@@ -85,10 +85,10 @@ def _prior_form(band: Band, prior: Prior, ridge: float) -> torch.Tensor:
 
 
 def _damped(stiff: torch.Tensor) -> torch.Tensor:
-    """A quadratic form that rounding leaves positive: it only shortens the steps.
+    """A quadratic form that stays positive in spite of rounding; this only shortens the steps.
 
-    Images of a flow without any vorticity, and without noise, make the prior stronger than the
-    ridge by more than numbers have digits.
+    Noise-free images of a flow without any vorticity make the prior stronger than the ridge by
+    more than the floating-point precision.
     """
     stiff = stiff.clone()
     least = _ROUNDING * float(stiff.amax())

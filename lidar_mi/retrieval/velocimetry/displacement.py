@@ -19,15 +19,15 @@ class Displacement(NamedTuple):
         Pixels along the axes, (z, y) of images and (x, z, y) of volumes, positive toward higher
         indices; NaN where no displacement was found.
     score : torch.Tensor
-        How well the windows match: correlation or mismatch, as the method says.
+        How well the windows match: correlation or mismatch, depending on the method.
     flag : torch.Tensor of int16
         `quality.Flag` bits.
     covariance : torch.Tensor, shape (components, components, *windows.count), optional
-        Of the components' errors, px^2, from methods that know it.
+        Of the components' errors, px^2, from methods that give it.
     quantities : mapping, optional
-        Numbers with standard errors that describe the whole, by name (`quantity.Quantity`).
+        Scalar quantities with standard errors, by name (`quantity.Quantity`).
     attributes : mapping, optional
-        What else a method says about its result.
+        Further attributes of a method's result.
     """
 
     d: torch.Tensor
@@ -49,13 +49,13 @@ class Displacement(NamedTuple):
 
     @classmethod
     def empty(cls, windows: Windows, like: torch.Tensor) -> "Displacement":
-        """Room for the result, to be filled tile by tile."""
+        """An uninitialised result, to be filled tile by tile."""
         flag = like.new_empty(windows.count, dtype=torch.int16)
         return cls(
             like.new_empty(windows.dims, *windows.count), like.new_empty(windows.count), flag
         )
 
     def fill(self, part: "Displacement", vectors: tuple[slice, ...]) -> None:
-        """Put the displacements, scores and flags of some windows in their place."""
+        """Put the displacements, scores and flags of some windows of a tile."""
         self.d[:, *vectors] = part.d
         self.score[vectors], self.flag[vectors] = part.score, part.flag

@@ -15,7 +15,7 @@ from lidar_mi.retrieval.velocimetry.windows import Windows, separable
 
 
 class Grid(NamedTuple):
-    """Places one pixel apart that the windows' centres are among: pixels, or half way between.
+    """Places one pixel apart that contain the windows' centres: pixels, or half way between.
 
     Attributes
     ----------
@@ -68,14 +68,14 @@ def first_pass(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Displacement (components, *grid.shape) by large windows, and where it was replaced.
 
-    Windows that the correlation flags or their neighbours contradict take the neighbours' median.
+    Windows with a flag, and outliers of the median test, take the median of their neighbours.
 
     Parameters
     ----------
     images : list of torch.Tensor
-        The first two of them count.
+        The first two of them are used.
     spline : Spline, optional
-        Through the images, band-limited: what volumes are correlated by.
+        Through the images, band-limited: volumes are correlated from it.
     windows : Windows
         Of the last pass.
     grid : Grid
@@ -89,14 +89,14 @@ def first_pass(
 
 
 def coarse_windows(windows: Windows) -> Windows:
-    """Windows of images twice as large over twice the range, where the image holds them."""
+    """Windows of images twice as large over twice the range, where they fit into the image."""
     double = 2 if min(windows.shape) >= 2 * windows.search else 1
     template, search = double * windows.template, double * windows.search
     return Windows(windows.shape, template, search, max(1, template // 2))
 
 
 def _of_images(images, _, windows: Windows) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Windows twice as large over twice the range, where the image holds such search regions."""
+    """Windows twice as large over twice the range, where such search regions fit into the image."""
     coarse = coarse_windows(windows)
     found = cross_correlation(*images[:2], coarse.template, coarse.search, coarse.stride)
     usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
@@ -105,7 +105,7 @@ def _of_images(images, _, windows: Windows) -> tuple[torch.Tensor, list[torch.Te
 
 
 def _of_volumes(images, spline: Spline, windows: Windows):
-    """Windows about twice as large, as far as the volume holds them, over the same range.
+    """Windows about twice as large, as far as they fit into the volume, over the same range.
 
     Normalised cross-correlation of volumes averaged over 2 x 2 x 2 voxels at all whole shifts, and
     the top of a quadratic through the peak and its 26 neighbours. NaN where the peak lies on the

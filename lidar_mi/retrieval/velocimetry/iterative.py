@@ -1,6 +1,6 @@
-"""The flow in a volume, solved by conjugate gradients; what stays open is measured by draws.
+"""The flow in a volume, solved by conjugate gradients; posterior covariance from random draws.
 
-The matrix is never written down. Solutions for random right-hand sides whose covariance is the
+The matrix is never stored. Solutions for random right-hand sides whose covariance is the
 second derivative are flows drawn from the posterior (Papandreou & Yuille 2010, NIPS 23).
 """
 
@@ -18,7 +18,7 @@ from lidar_mi.retrieval.velocimetry.windows import linear_weights, separable
 
 
 class Posterior(NamedTuple):
-    """A flow after a Gauss-Newton step, and what its posterior is drawn from.
+    """A flow after a Gauss-Newton step, with the terms of its posterior.
 
     Attributes
     ----------
@@ -41,22 +41,22 @@ class Posterior(NamedTuple):
     turn: int
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Of each kind of motion: variance that the images took from it, and its square."""
+        """By kind of motion: the variance removed by the images, and its square in the flow."""
         solver = self.settings.solver
         before, after = (
             self.rough.by_kind(self.rough.rates(flows).square()).mean(0)
             for flows in self._drawn(solver.draws, before=True)
         )
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
-        # added to both, for what is drawn has noise of its own
+        # added to both, as the draws have sampling noise
         more = solver.damping * before
         return (before - after).clamp(min=0) + more, energy + more
 
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before.
 
-        A mean over flows drawn and over the width of the prior, good to some 10 %. Before the
-        images it is taken to be infinite: the prior leaves rigid motion free.
+        A mean over flows drawn and over the width of the prior, accurate to some 10 %. Before the
+        images it is infinite: the prior leaves rigid motion free.
         """
         (flows,) = self._drawn(self.settings.solver.final_draws, before=False)
         flows = self.rough.mesh.field(flows).to(self.prior.local)
@@ -67,7 +67,7 @@ class Posterior(NamedTuple):
     def _drawn(self, number: int, before: bool) -> list[torch.Tensor]:
         """Flows (number, components, knots) drawn from the prior, if wanted, and the posterior.
 
-        Both from the same random numbers: where the volumes inform nothing they are alike.
+        Both from the same random numbers: they are equal where the volumes inform nothing.
         """
         prior, ridge = self.rough, self.settings.ridge
         like = self.coefficients.to(prior.local)
@@ -107,12 +107,12 @@ def solved(
     settings: VariationalSettings,
     turn: int,
 ) -> Posterior:
-    """One Gauss-Newton step; the number of the turn seeds the flows drawn from the posterior."""
+    """One Gauss-Newton step; the number `turn` seeds the flows drawn from the posterior."""
     ridge, solver = settings.ridge, settings.solver
     lumps = [
         linear_weights(m.to(p), p).T for m, p in zip(prior.mesh.places, mesh.places, strict=True)
     ]
-    # on the knots in the precision of the prior, which may be strong; on the voxels in theirs
+    # knots have the precision of the prior, which may be strong; voxels have their own
     coefficients, voxels = coefficients.to(prior.local), linear.slope.dtype
     dims = mesh.dims
     bend = coefficients.new_empty(dims, dims, *prior.mesh.shape)
@@ -159,7 +159,7 @@ def _root(bend: torch.Tensor) -> torch.Tensor:
 def _preconditioner(
     bend: torch.Tensor, prior: Prior, ridge: float
 ) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Each knot's own block (components, components), inverted."""
+    """The inverse of each knot's diagonal block (components, components)."""
     mesh = prior.mesh
     dims = mesh.dims
     bases = [[mesh.basis(axis, order).square().T for axis in range(dims)] for order in (0, 1)]
@@ -191,19 +191,19 @@ def conjugate_gradients(
         return (a * b).flatten(1).sum(1).reshape(-1, *[1] * (a.ndim - 1))
 
     solution = torch.zeros_like(right)
-    rest = right
-    ahead = preconditioned(rest)
+    residual = right
+    ahead = preconditioned(residual)
     direction = ahead
-    energy = inner(rest, ahead)
+    energy = inner(residual, ahead)
     goal = tolerance**2 * energy
     for _ in range(steps):
         forward = applied(direction)
         # a system that is solved already takes no more steps
         length = energy / inner(direction, forward).clamp(min=1e-30)
         solution = solution + length * direction
-        rest = rest - length * forward
-        ahead = preconditioned(rest)
-        before, energy = energy, inner(rest, ahead)
+        residual = residual - length * forward
+        ahead = preconditioned(residual)
+        before, energy = energy, inner(residual, ahead)
         if bool((energy <= goal).all()):
             break
         direction = ahead + energy / before.clamp(min=1e-30) * direction

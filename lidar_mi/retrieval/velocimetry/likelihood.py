@@ -1,4 +1,4 @@
-"""What images or volumes say on a flow: warped to mid-time, of one brightness, noise weighed."""
+"""Likelihood of a flow, linearised: images or volumes warped to mid-time, equal in brightness."""
 
 import math
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, mismatch, nearest
 from lidar_mi.retrieval.velocimetry.windows import averaged, stored
 
-# Of an image's rms structure the splines miss more than this, however little noise there is.
+# Interpolation error of the splines over an image's rms structure: the least noise assumed.
 _INTERPOLATION = 1e-5
 
 
 class Images(NamedTuple):
-    """What the flow has to explain.
+    """The images that the flow is fitted to, and their noise.
 
     Attributes
     ----------
@@ -36,8 +36,8 @@ class Images(NamedTuple):
         The images, of one brightness.
     blur : float
         Standard deviation of the Gaussian that blurred the images, px.
-    weighed : bool
-        Whether noise holds the misfit at each place already.
+    noise_updated : bool
+        Whether noise and weight contain the local misfit already.
     """
 
     spline: Spline
@@ -47,24 +47,24 @@ class Images(NamedTuple):
     weight: torch.Tensor
     stack: torch.Tensor
     blur: float
-    weighed: bool = False
+    noise_updated: bool = False
 
 
 class Linear(NamedTuple):
-    """The images about a flow: what they say on its change.
+    """The log-likelihood linearised about a flow.
 
     Attributes
     ----------
     slope : torch.Tensor, shape (components, ...)
         Of the mean of the warped images.
     gradient : torch.Tensor, shape (components, ...)
-        Of the log-likelihood by the flow at each pixel.
+        Of the log-likelihood with respect to the flow at each pixel.
     weight : torch.Tensor
-        Of the slopes' products in the second derivative.
+        Of the products of slopes in the second derivative.
     variance : float
         Of the noise.
     warped : torch.Tensor, shape (images, ...)
-        The images at mid-time, of one brightness.
+        The images at mid-time, equal in brightness.
     valid : torch.Tensor of bool
         Where all of them are.
     """
@@ -83,7 +83,7 @@ def prepared(
     blur: float,
     settings: VariationalSettings,
 ) -> Images:
-    """The images, normalised and band-limited, with what is known of their noise."""
+    """The images, normalised and band-limited, with the noise as given or estimated."""
     known_at = usable(stack)
     weight = torch.ones_like(stored(stack[0]))
     if isinstance(noise, torch.Tensor) and noise.ndim:
@@ -108,20 +108,20 @@ def prepared(
     return Images(spline, known_at, time, level, weight, images, blur)
 
 
-def weighed(images: Images, linear: Linear, width: float, coloured: bool) -> Images:
-    """The images with noise as large, at each place and wave, as what they do not share.
+def with_local_noise(images: Images, linear: Linear, width: float, coloured: bool) -> Images:
+    """The images with the noise estimated from their misfit at each place and wavenumber.
 
-    Where no flow of the splines explains the images there is more than their noise: structure
-    that moved through the plane or that is lost between pixels, motion on too small scales. What
-    is known of the noise is the least.
+    Warped images differ by more than their noise where structure moves through the plane, is
+    undersampled, or moves on scales smaller than the splines'. The known noise is the lower
+    limit.
     """
-    rest = (linear.warped - linear.warped.mean(0)) * linear.valid
-    free = (len(rest) - 1) * max(images.spline.passed, 1e-6)
+    residual = (linear.warped - linear.warped.mean(0)) * linear.valid
+    free = (len(residual) - 1) * max(images.spline.passed, 1e-6)
     # what counts is the misfit where slopes are steep, and there it is largest (White 1980,
     # Econometrica 48, 817-838)
     steep = linear.slope.square().sum(0)
     steep = steep + 1e-3 * steep.mean() + 1e-30
-    local = averaged(rest.square().sum(0) * images.weight * steep / free, linear.valid, width)
+    local = averaged(residual.square().sum(0) * images.weight * steep / free, linear.valid, width)
     local = local / averaged(steep, linear.valid, width)
     mean = float(local[linear.valid].mean()) if linear.valid.any() else 0.0
     level = max(images.noise**2, mean, 1e-30)
@@ -129,28 +129,28 @@ def weighed(images: Images, linear: Linear, width: float, coloured: bool) -> Ima
     weight = images.weight * (level / local.clamp(min=least))
     density = None
     if coloured:
-        density = mismatch(images.spline, rest * weight.sqrt()).clamp(min=least)
+        density = mismatch(images.spline, residual * weight.sqrt()).clamp(min=least)
     spline, noise = band_limited(
         images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
     )
-    return images._replace(spline=spline, noise=noise, weight=weight, weighed=True)
+    return images._replace(spline=spline, noise=noise, weight=weight, noise_updated=True)
 
 
 def linearised(
     images: Images, mesh: Mesh, coefficients: torch.Tensor, settings: VariationalSettings
 ) -> Linear:
-    """The images about a flow; `mesh` is that of the pixels."""
+    """The log-likelihood about a flow; `mesh` is that of the pixels."""
     places = path(mesh, coefficients, images.time, settings.path_order)
     value, *slopes = images.spline.sample(*places)
     valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
     value, gain = of_one_brightness(value, images.weight * valid)
     slope = torch.stack([(gain * part).mean(0) for part in slopes])
-    rest = (value - value.mean(0)) * images.weight.sqrt()
+    residual = (value - value.mean(0)) * images.weight.sqrt()
     passed = max(images.spline.passed, 1e-6)
-    misfit = rest.square().sum(0)
+    misfit = residual.square().sum(0)
     # what no flow explains counts as noise: images are never taken to be better than they fit
     variance = max(images.noise**2, 1e-30)
-    if not images.weighed:
+    if not images.noise_updated:
         variance = max(variance, misfit_variance(misfit[valid], len(value)) / passed)
     off = (misfit / ((len(value) - 1) * passed * variance)).sqrt()
     weight = images.weight * (settings.robust / off.clamp(min=settings.robust)) * valid
@@ -162,10 +162,10 @@ def linearised(
 
 
 def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int) -> torch.Tensor:
-    """Where air that is at the pixels at mid-time is at other times, (components, images, ...), px.
+    """Position at other times of the air at the pixels at mid-time, (components, images, ...), px.
 
-    Lie series x + sum t^k / k! (u . grad)^(k - 1) u for a wind that stands still: with six terms,
-    where air turns by an angle a in t, the place is off by a^7 / 5040 of the radius.
+    Lie series x + sum t^k / k! (u . grad)^(k - 1) u for a steady wind: with six terms, where air
+    rotates by an angle a in t, the position error is a^7 / 5040 of the radius.
     """
     flow = mesh.field(coefficients)
     time = time.reshape(-1, *[1] * mesh.dims)

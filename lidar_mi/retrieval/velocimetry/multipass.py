@@ -1,8 +1,8 @@
 """Multi-pass correlation: coarse to fine, both images or volumes deformed half way (multipass).
 
 The first pass correlates windows twice as large. Every later pass deforms both images by half of
-what is known so far, in opposite directions, and fits an affine displacement to what is left in
-each window, weighted by a Gaussian. Between passes vectors that their neighbours contradict are
+the displacement so far, in opposite directions, and fits an affine displacement to the remaining
+difference in each window, weighted by a Gaussian. Between passes outliers of the median test are
 replaced.
 """
 
@@ -39,12 +39,12 @@ def multipass(
     """Displacement of every window by correlation of images deformed to fit, coarse to fine.
 
     Window deformation after Scarano (2002, Meas. Sci. Technol. 13, R1-R19; in volumes Elsinga et
-    al. 2006, Exp. Fluids 41, 933-947), symmetric in time. Where images are deformed well already,
+    al. 2006, Exp. Fluids 41, 933-947), symmetric in time. Where images are nearly aligned already,
     the shift of highest correlation is the least squares solution of the linearised difference of
     the images, which the later passes solve at once for displacement and displacement gradient
-    (affine), both of the whole motion and not of the rest: so noise in the predictor does not add
-    up from pass to pass. Images are band-limited before (see `band_limit.best_filter`) and may
-    differ in brightness by a factor and an offset.
+    (affine), both of the whole motion and not of the remainder: so noise in the predictor does not
+    accumulate from pass to pass. Images are band-limited before (see `band_limit.best_filter`).
+    Their brightness may differ by a factor and an offset.
 
     A Gaussian window with a standard deviation sigma of a third of the template weights the
     pixels; displacement that curves over it is underestimated by sigma^2 / 2 times its Laplacian.
@@ -54,9 +54,9 @@ def multipass(
     image1, image2 : torch.Tensor, shape (z, y), or (x, z, y) of volumes
         On one device, where the result stays too.
     template, search, stride : int
-        Pixels, see `windows.Windows`. The first pass sees displacements up to search - template -
-        1/2 px, where an image holds search regions of twice the size, else (and in volumes) half of
-        that.
+        Pixels, see `windows.Windows`. The first pass covers displacements up to search - template -
+        1/2 px where an image is large enough for search regions of twice the size, else (and in
+        volumes) half of that.
     min_correlation : float
         Vectors whose deformed windows correlate less are flagged; -1 to 1.
     noise : float or torch.Tensor, optional
@@ -70,8 +70,8 @@ def multipass(
     Displacement
         At the windows' centres at mid-time; times 1 / dt the wind there, the paths' curvature
         taken into account. `score` is the weighted correlation of the deformed windows. The
-        covariance holds the images' noise, or what the fit leaves where that is more, and the
-        displacement's curvature over the window.
+        covariance is from the images' noise, or the fit's residual where that is more, and from
+        the displacement's curvature over the window.
 
     Raises
     ------
@@ -172,11 +172,11 @@ def curvature(gradient: torch.Tensor, reach: int) -> torch.Tensor:
 
 
 class Pair(NamedTuple):
-    """Two images and what is known of them.
+    """Two images with their noise and the prior.
 
-    `spline` through both, which pixels are `usable` (images, ...), `variance` of the noise of a
-    displacement times the sum of squared slopes, standard deviation of a displacement `gradient`
-    a priori, whether their brightness is `rebalanced` in every pass.
+    `spline` through both, which pixels are `usable` (images, ...), `variance` of a displacement
+    times the sum of squared slopes, standard deviation of a displacement `gradient` a priori,
+    whether their brightness is `rebalanced` in every pass.
     """
 
     spline: Spline
@@ -207,8 +207,8 @@ def _fit(
     """The affine displacement about each place that makes the images agree there, as `_Fit`.
 
     With the images read at x -+ flow / 2, their difference r and the slope g of their mean, the
-    sum over a Gaussian window of (r - g flow + g (a + A x))^2 is least. The gradient's standard
-    deviation a priori decides where the texture does not.
+    sum over a Gaussian window of (r - g flow + g (a + A x))^2 is minimised. The gradient's standard
+    deviation a priori regularises it where there is little texture.
     """
     dims = len(places)
     reach = math.ceil(3 * sigma)
@@ -216,12 +216,12 @@ def _fit(
     gaussian = torch.exp(-(x**2) / 2)
     kernels = [[w * x**power for power in range(3)] for w in (gaussian, gaussian**2)]
     steps = [int(at[1] - at[0]) if len(at) > 1 else 1 for at in places]
-    # products of slopes, then those with the shift, then what is summed as it is
+    # products of slopes, then those with the shift, then the fields summed without moments
     squares = dims * (dims + 1) // 2
     whole = float(gaussian.sum()) ** dims
     # a band repeats its neighbours' margins: thin volumes are best done at once
-    room = geometry.TILE_BYTES * (1 if dims == 2 else 8)
-    rows = max(1, room // (8 * 100 * steps[0] * math.prod(grid.shape[1:])))
+    most_bytes = geometry.TILE_BYTES * (1 if dims == 2 else 8)
+    rows = max(1, most_bytes // (8 * 100 * steps[0] * math.prod(grid.shape[1:])))
     bands = []
     for part in places[0].split(rows):
         top, stop = int(part[0]) - reach, int(part[-1]) + reach + 1
@@ -237,13 +237,13 @@ def _fit(
             _moments(fields[:number], kernel, steps, rims, order)
             for number, kernel, order in ((squares + dims, kernels[0], 2), (squares, kernels[1], 2))
         ]
-        plain = _moments(fields[squares + dims :], kernels[0], steps, rims, 0)[(0,) * dims]
-        bands.append(_solved(*summed, plain, sigma, pair, whole))
+        unweighted = _moments(fields[squares + dims :], kernels[0], steps, rims, 0)[(0,) * dims]
+        bands.append(_solved(*summed, unweighted, sigma, pair, whole))
     return _Fit(*(torch.cat(parts, dim=-dims) for parts in zip(*bands, strict=True)))
 
 
 def _products(pair: Pair, flow: torch.Tensor, places: Sequence[torch.Tensor]) -> torch.Tensor:
-    """What is summed over windows: products of slopes, of slopes and shift, of the images.
+    """The fields summed over windows: products of slopes, of slopes and shift, of the images.
 
     Zero where one of the images is not valid.
     """
@@ -308,19 +308,19 @@ def _normal(moments: dict[tuple[int, ...], torch.Tensor], dims: int) -> torch.Te
 def _solved(
     once: dict[tuple[int, ...], torch.Tensor],
     twice: dict[tuple[int, ...], torch.Tensor],
-    plain: torch.Tensor,
+    unweighted: torch.Tensor,
     sigma: float,
     pair: Pair,
     whole: float,
 ) -> tuple[torch.Tensor, ...]:
-    """What `_Fit` holds, from the sums over the windows.
+    """The fields of `_Fit`, from the sums over the windows.
 
-    The covariance is that of a weighted fit to white noise: of the pair's variance, or what the
-    fit leaves of the difference of the images where that is more.
+    The covariance is that of a weighted fit to white noise: of the pair's variance, or of the
+    residual difference of the images where that is more.
     """
-    dims = plain.ndim - 1
+    dims = unweighted.ndim - 1
     terms = _terms(dims)
-    misfit, *means, square1, square2, cross, number = plain
+    misfit, *means, square1, square2, cross, number = unweighted
     fraction_valid = number / whole
     number = number.clamp(min=1e-12)
     covary = cross - means[0] * means[1] / number

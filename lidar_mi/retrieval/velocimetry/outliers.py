@@ -1,4 +1,4 @@
-"""Normalised median test: vectors that contradict their neighbours, and what takes their place."""
+"""Normalised median test: outliers among their neighbours, and their replacement."""
 
 import math
 from itertools import product
@@ -30,16 +30,16 @@ def median_outliers(
     size : int
         Neighbourhood of `size` vectors along each axis, 3 or 5.
     spacing : int
-        Vectors from one neighbour to the next. Vectors whose windows nearly coincide share their
-        errors and cannot judge each other: the test expects windows to overlap by half or less.
+        Vectors from one neighbour to the next. Vectors whose windows nearly coincide have common
+        errors, which the test does not detect: it expects windows to overlap by half or less.
     threshold : float
         2 in the paper.
     epsilon : float
         Expected noise of a displacement, px.
     continued : bool
-        Beyond the rim the field goes on as it changes there (point reflection). Else the
-        neighbours that exist judge, which reject a rim in a shear of more than 0.2 px a neighbour:
-        most of them lie on one side.
+        Beyond the rim the field is continued by point reflection. Else only the neighbours inside
+        are used; most of them lie on one side, which rejects the rim in a shear of more than 0.2
+        px per neighbour.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def validated(
 
     Outliers are those of the normalised median test. Gaps take the median of their neighbours,
     from the rim of a gap inwards; without any vector at all the displacement is zero. Returns
-    them and what was replaced.
+    them and where they were replaced.
     """
     wrong = d.isnan().any(0) | median_outliers(d, 3, spacing, threshold, epsilon, continued)
     d = torch.where(wrong, torch.nan, d)

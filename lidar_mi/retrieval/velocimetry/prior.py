@@ -1,8 +1,8 @@
-"""What is known of air before the images: vorticity is concentrated, divergence small.
+"""The prior of a flow: vorticity is concentrated, divergence small.
 
-Vorticity and divergence are white noise whose variances, kind by kind and place by place, are
-those of largest evidence (MacKay 1992, Neural Comput. 4, 415-447): the retrieved flow's energy is
-then what the prior expects less what the images leave open.
+Vorticity and divergence are white noise. Their variances, for each kind and place, are those of
+largest evidence (MacKay 1992, Neural Comput. 4, 415-447): the retrieved flow's energy then equals
+the prior variance less the posterior variance.
 """
 
 import math
@@ -38,16 +38,16 @@ In a volume vorticity along x and across x are two kinds: the vortices of a wake
 
 
 class Divergence(NamedTuple):
-    """Divergence in a plane: its variance has a part that is the same everywhere.
+    """Divergence in a plane: its variance has a uniform part.
 
     Attributes
     ----------
     strength : float
-        Where there is no vorticity, as of wind through the plane.
+        Where there is no vorticity, as from wind through the plane.
     ratio : float
-        Strength over the vorticity's of further divergence, as where splines cannot follow a core.
+        Strength over the vorticity's of further divergence, as where splines do not resolve a core.
     trend : (float, float), optional
-        ln of the strength a round before, and of the ratio found for it.
+        ln of the strength one round before, and of the ratio estimated for it.
     """
 
     strength: float
@@ -63,7 +63,7 @@ class Prior(NamedTuple):
     local : torch.Tensor, shape (kinds, *mesh.shape)
         Strength of the kinds whose strength varies from place to place.
     mesh : Mesh
-        Half as far apart as the knots.
+        At half the spacing of the knots.
     width : float
         Over which the strength may vary, px.
     spacing : tuple of float
@@ -140,12 +140,12 @@ class Prior(NamedTuple):
     def updated(
         self, informed: torch.Tensor, energy: torch.Tensor, settings: VariationalSettings
     ) -> "Prior":
-        """The prior nearer to the one of largest evidence (MacKay's fixed point).
+        """The prior after a step toward largest evidence (MacKay's fixed point).
 
         Parameters
         ----------
         informed, energy : torch.Tensor, shape (kinds, *mesh.shape)
-            Variance that the images take from each kind of motion, and its square in the flow.
+            Variance of each kind of motion removed by the images, and its square in the flow.
         settings : VariationalSettings
         """
         count = len(self.local)
@@ -157,7 +157,7 @@ class Prior(NamedTuple):
         return self._replace(local=self.local * change, divergence=divergence)
 
     def to(self, like: torch.Tensor) -> "Prior":
-        """The same in another precision."""
+        """The same in the precision of a tensor."""
         mesh = Mesh(self.mesh.axes, [place.to(like) for place in self.mesh.places])
         return self._replace(local=self.local.to(like), mesh=mesh)
 
@@ -184,14 +184,14 @@ class Prior(NamedTuple):
             for part, most in ((fraction, largest), (1 - fraction, settings.largest_change))
         )
         trend = math.log(before.strength), math.log(everywhere)
-        # images of weak texture that show no divergence do not say that there is none
+        # images of weak texture without measurable divergence are no evidence that there is none
         most = settings.largest_ratio / float((1 / self.local[0]).mean())
         change = math.exp(_secant(trend, before.trend, math.log(largest)))
         return Divergence(min(before.strength * change, most), before.ratio * beside, trend)
 
 
 def _secant(now: tuple[float, float], before: tuple[float, float] | None, limit: float) -> float:
-    """Change of ln strength that takes ln of its ratio to 0, by the secant of two rounds.
+    """Change of ln strength that brings ln of its ratio to 0, by the secant of two rounds.
 
     Where the images inform little, the fixed point alone would take hundreds of rounds.
     """
@@ -214,7 +214,7 @@ def first_prior(
     spacing: Sequence[float],
     settings: VariationalSettings,
 ) -> Prior:
-    """A prior as strong everywhere as a flow's vorticity says."""
+    """A uniform prior of the strength that matches a flow's vorticity."""
     mesh = halves(axes, coefficients)
     dims = mesh.dims
     one = torch.ones(len(KINDS[dims]), *mesh.shape).to(coefficients)
@@ -231,7 +231,7 @@ def first_prior(
 
 
 def refined(prior: Prior, axes: Sequence[Axis]) -> Prior:
-    """A prior found on coarser knots, for finer ones."""
+    """A prior estimated on coarser knots, interpolated to finer ones."""
     mesh = halves(axes, prior.local)
     local = interpolated(prior.local.log(), prior.mesh.places, mesh.places).exp()
     trendless = prior.divergence and prior.divergence._replace(trend=None)

@@ -14,7 +14,7 @@ from lidar_mi.retrieval.velocimetry.windows import Windows, working
 
 
 class Flag(enum.IntFlag):
-    """Why a vector is rejected, one bit a reason; 0 is a good vector.
+    """Why a vector is rejected, one bit per reason; 0 is a valid vector.
 
     Names and values become the CF attributes `flag_meanings` and `flag_masks`.
     """
@@ -28,7 +28,7 @@ class Flag(enum.IntFlag):
     MEDIAN_OUTLIER = 8
     """Fails the normalised median test against its neighbours."""
     NO_SUBPIXEL_FIT = 16
-    """A neighbour of the peak is not positive: the displacement is the integer one there."""
+    """A neighbour of the peak is not positive: the displacement is an integer."""
     NON_FINITE_INPUT = 32
     """NaN or infinity in the search region of one of the images. No displacement."""
     NO_MATCH = 64
@@ -36,7 +36,7 @@ class Flag(enum.IntFlag):
     REPLACED = 128
     """The previous pass found an outlier; this one began at its neighbours' median (multi-pass)."""
     UNRELATED = 256
-    """The images around it are no more alike than unrelated textures (`relation`)."""
+    """The images around it correlate no better than unrelated textures (`relation`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:
@@ -51,7 +51,7 @@ _SOBEL_NOISE = 3 / 16
 
 
 class Texture(NamedTuple):
-    """What the templates hold to be recognised by, tensors of shape `windows.count`.
+    """Texture of the templates, tensors of shape `windows.count`.
 
     Attributes
     ----------
@@ -76,12 +76,12 @@ def texture(image: torch.Tensor, windows: Windows) -> Texture:
     squared slope in the direction in which the image changes least. Two things follow:
 
     - With white noise of standard deviation s in both images, the variance of the displacement
-      in that direction is at least 2 s^2 / (n^2 lambda) (Cramer-Rao). So sqrt(lambda) counts
-      against the noise, and is given as contrast relative to the local mean, per pixel.
-    - Where the air in a window is also deformed, the strong direction spoils the weak one even
-      without noise; the error then follows the ratio of the eigenvalues, not their size. (CC 8
+      in that direction is at least 2 s^2 / (n^2 lambda) (Cramer-Rao). So sqrt(lambda) is compared
+      with the noise; it is given as contrast relative to the local mean, per pixel.
+    - Where the air in a window is also deformed, the strong direction causes errors in the weak
+      one even without noise; they scale with the ratio of the eigenvalues, not their size. (CC 8
       in 16 on a simulated wake with 5 % of texture, no noise, rms of the vector's error: 0.9 m/s
-      where the isotropy is above 0.5, 4 m/s below 0.13.) So the ratio of the slopes counts too.
+      where the isotropy is above 0.5, 4 m/s below 0.13.) So the ratio of the slopes is given too.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def low_texture(
     min_isotropy: float = 0.0,
     noise: float | torch.Tensor = 0.0,
 ) -> tuple[Texture, torch.Tensor]:
-    """Texture of every template, and where it is too low to say anything.
+    """Texture of every template, and where it is too low for a displacement.
 
     Too low is: slope not above `min_texture`; isotropy below `min_isotropy`; or a squared slope
     below twice what the noise alone would give (3/16 of its variance after the Sobel filter),
@@ -206,7 +206,7 @@ def usable(images: Sequence[torch.Tensor]) -> torch.Tensor:
 def filled(image: torch.Tensor) -> torch.Tensor:
     """The image with its mean in place of non-finite pixels, so that sums stay finite.
 
-    Windows that hold such a pixel are flagged by `non_finite`; the others never see it.
+    Windows that hold such a pixel are flagged by `non_finite`; the others do not depend on it.
     """
     finite = torch.isfinite(image)
     if bool(finite.all()):

@@ -1,4 +1,4 @@
-"""Whether two images show the same air at all: their correlation against that of unrelated ones."""
+"""Whether two images show the same air: their correlation against that of unrelated ones."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -24,12 +24,12 @@ FALSE_ALARM = 1e-3
 """Probability that unrelated textures count as related at a vector."""
 # Windows along each axis whose correlations are averaged.
 _REGION = 5
-# Few windows need more surrogates to know how far their mean scatters.
+# Few windows need more surrogates for the scatter of their mean.
 _FEW_WINDOWS = 100
-# Parts of the last two axes by which surrogates are rolled, of many windows and of few.
+# Fractions of the last two axes by which surrogates are rolled, of many windows and of few.
 _THIRDS = tuple((i / 3, j / 3) for i, j in ((1, 1), (2, 2), (1, 2)))
 _FIFTHS = tuple((i / 5, j / 5) for i in range(5) for j in range(5) if i or j)
-# Of the images' rms: where they hold less, rounding and ringing must not be alike.
+# Noise added, over the images' rms, so that rounding and ringing do not correlate.
 _FLOOR = 1e-3
 # Student's t where no window is finite.
 _CERTAIN = 1e6
@@ -42,27 +42,26 @@ def unrelated(
     noise: float | torch.Tensor | None = None,
     false_alarm: float = FALSE_ALARM,
 ) -> torch.Tensor:
-    """Windows about which two images are no more alike than unrelated textures.
+    """Windows about which two images correlate no better than unrelated textures.
 
     Any two textures correlate somewhere in a search region: the highest of many correlations of
-    windows with few independent pixels is often beyond 0.8. How high it gets depends on the
-    autocorrelations of both images and on the range, so it is measured: with surrogates of image
-    2, turned by 180 degrees and rolled by thirds of its sides (of few windows by fifths), which
-    have its autocorrelation and nothing else in common with image 1. Fisher's z of the highest
+    windows with few independent pixels is often beyond 0.8. Its level depends on the
+    autocorrelations of both images and on the range, so it is estimated with surrogates of image
+    2: rotated by 180 degrees and rolled by thirds of its sides (of few windows by fifths), they
+    keep its autocorrelation and are otherwise independent of image 1. Fisher's z of the highest
     correlations, averaged over 5 windows along each axis, must exceed the mean of the surrogates
-    by what Student's t allows at the rate of false alarms (their scatter is that of all regions
-    together).
+    by Student's t at the rate of false alarms (their scatter is pooled over all regions).
 
-    The windows are twice as large as the template where the images hold them, half of themselves
-    apart, and the images are band-limited. Assumed is texture that is alike all over the image and
-    not periodic. Images of one pattern repeated, or the same turned by 180 degrees and rolled by a
-    third, look unrelated. What is unrelated over less than half a region (24 px with windows of 8
+    The windows are twice as large as the template where they fit into the images, half a window
+    apart, and the images are band-limited. Assumed is texture that is homogeneous and not
+    periodic. Images of one repeated pattern, or the same rotated by 180 degrees and rolled by 1/3,
+    count as unrelated. Windows unrelated over less than half a region (24 px with windows of 8
     px) may count as related.
 
     Parameters
     ----------
     images : sequence of torch.Tensor, shape (z, y), or (x, z, y) of volumes
-        The first two of them count.
+        The first two of them are used.
     windows : Windows
     wide : bool
         Whether the displacement may be twice that of the windows, as in `coarse_windows`.
@@ -82,9 +81,9 @@ def unrelated(
     first, second = search.values
     observed = search.score(first, second)
     rolls = _FIFTHS if observed.numel() < _FEW_WINDOWS else _THIRDS
-    turned = second.flip(tuple(range(second.ndim)))
+    rotated = second.flip(tuple(range(second.ndim)))
     rows, columns = second.shape[-2:]
-    others = [turned.roll((int(i * rows), int(j * columns)), (-2, -1)) for i, j in rolls]
+    others = [rotated.roll((int(i * rows), int(j * columns)), (-2, -1)) for i, j in rolls]
     chance = torch.stack([search.score(first, other) for other in others])
     excess = _excess(observed, chance, search.known)
     regions = max(1.0, observed.numel() / _REGION**windows.dims)
@@ -111,12 +110,12 @@ def _excess(observed: torch.Tensor, chance: torch.Tensor, known: torch.Tensor) -
     mean, degrees = chance.mean(0), len(chance) - 1
     scatter = (chance - mean).square().sum(0)[number > 0].mean() / degrees
     excess = (observed - mean) / (scatter * (1 + 1 / len(chance))).sqrt().clamp(min=1e-9)
-    # without a finite window nothing is known either way
+    # without a finite window nothing is flagged
     return torch.where(number > 0, excess, _CERTAIN)
 
 
 class _Search(NamedTuple):
-    """What correlates two band-limited images, `values`, whose windows' `centres` are in pixels.
+    """The correlation of two band-limited images, `values`, with the windows' `centres` in pixels.
 
     `score` gives the highest correlation of every window; `known` says which are finite.
     """
@@ -157,7 +156,7 @@ def _of_volumes(spline: Spline, finite: torch.Tensor, windows: Windows, _: bool)
 
 
 def _floored(values: torch.Tensor) -> torch.Tensor:
-    """Images with a little noise of their own."""
+    """Images with independent noise added, see `_FLOOR`."""
     draw = torch.Generator().manual_seed(0)
     noise = torch.randn(values.shape, generator=draw, dtype=values.dtype).to(values.device)
     return values + _FLOOR * values.square().mean().sqrt() * noise

@@ -10,18 +10,18 @@ class FilterSettings:
     Attributes
     ----------
     margin : int
-        Pixels by which images are continued, fading, beyond each edge. The interpolating spline
-        forgets an edge by a factor 0.27 a pixel.
+        Pixels by which images are continued, fading, beyond each edge. The influence of an edge on
+        the interpolating spline decays by a factor 0.27 per pixel.
     nodes : int
-        Spline nodes in a pixel along each axis. On half-pixel nodes the shortest wave loses 2.8 %
-        of its amplitude, on whole ones all of it half way between (peak locking).
+        Spline nodes per pixel along each axis. On half-pixel nodes the shortest wave loses 2.8 %
+        of its amplitude, on whole-pixel nodes all of it half way between (peak locking).
     smoothing : int
         Shells of wavenumber that each value of the power spectrum averages over; odd.
     threshold : float
         Standard errors by which a shell must exceed the noise to count as texture.
     antisymmetric : bool
-        Continuation beyond the edges by the mirror image about the edge's value, whose slope goes
-        on, in place of the mirror image itself, whose kink rings into thin volumes.
+        Continuation beyond the edges by point reflection at the edge, which keeps the slope, in
+        place of mirroring, whose kink rings into thin volumes.
     sharpening : float
         Largest amplification of a wave that a known blur attenuated.
     """
@@ -35,7 +35,7 @@ class FilterSettings:
 
 
 VOLUME_FILTER = FilterSettings(margin=12, smoothing=1, antisymmetric=True)
-"""Of volumes: a shell holds enough waves by itself, and memory goes with the margin cubed."""
+"""Of volumes: one shell holds enough waves, and memory scales with the cube of the margin."""
 
 
 @dataclass(frozen=True)
@@ -45,23 +45,23 @@ class MultipassSettings:
     Attributes
     ----------
     widths : tuple of float
-        Standard deviations of the Gaussian windows, pass by pass, over the last one.
+        Standard deviations of the Gaussian windows of the passes, over the last one.
     sigma : float
         That of the last pass over the template.
     spacing : float
-        Windows of all passes but the last are so many standard deviations apart.
+        Spacing of the windows in all passes but the last, in their standard deviations.
     gradient : float
-        Standard deviation a priori of the displacement gradient, px per px: 1 would make air
-        change places within a window.
+        Standard deviation a priori of the displacement gradient, px per px: a gradient of -1
+        would move the air of a window to one point.
     jump : float
-        Vectors further from the pass before are flagged; px, or sigma if that is more.
+        Vectors that differ by more from the pass before are flagged; px, or sigma if that is more.
     median_threshold, median_epsilon : float
-        Median test between passes, no unit and px (2 and 0.1: Westerweel & Scarano 2005).
+        Median test between passes, dimensionless and px (2 and 0.1: Westerweel & Scarano 2005).
     continued : bool
         Whether the median test continues the field beyond the rim, see `outliers`.
     rebalanced : bool
-        Whether brightness is found anew in every pass, from what is valid in both images. What
-        enters and leaves a volume changes the mean of its gates by a tenth of the texture.
+        Whether brightness is fitted again in every pass, from what is valid in both images. Air
+        that enters and leaves a volume changes the mean of its gates by 10 % of the texture.
     filter : FilterSettings
     """
 
@@ -80,7 +80,7 @@ class MultipassSettings:
 VOLUME_MULTIPASS = MultipassSettings(
     spacing=1.0, continued=True, rebalanced=True, filter=VOLUME_FILTER
 )
-"""Of volumes: an eighth of the windows between passes."""
+"""Of volumes: 1/8 as many windows between passes."""
 
 
 @dataclass(frozen=True)
@@ -90,14 +90,14 @@ class IterativeSettings:
     Attributes
     ----------
     tolerance, loose : float
-        Residual over the first one at which a solution ends: of a flow, of a drawn one.
+        Residual over the first one at which iteration ends: for the flow, for a drawn one.
     steps : int
         Largest number of steps.
     draws, final_draws : int
-        Flows drawn in each round, and for the standard errors.
+        Flows drawn per round, and for the standard errors.
     damping : float
-        Fraction of the prior's expected energy added to both sides of the fixed point, for what is
-        drawn has noise: 0 is MacKay's step.
+        Fraction of the prior's expected energy added to both sides of the fixed point against the
+        sampling noise of the draws: 0 is MacKay's step.
     seed : int
         Of the draws.
     """
@@ -118,39 +118,39 @@ class VariationalSettings:
     Attributes
     ----------
     knots : tuple of float
-        Spacing of the knots over the template, level by level.
+        Spacing of the knots over the template on each level.
     rounds : tuple of int
         Rounds of flow and evidence on each level.
-    weighed : int
+    noise_round : int
         Round of the last level before which noise is estimated from the misfit.
     robust : float
-        Residuals beyond so many standard deviations enter linearly (Huber 1964, Ann. Math. Stat.
+        Standard deviations beyond which residuals enter linearly (Huber 1964, Ann. Math. Stat.
         35, 73-101).
     path_order : int
         Terms of the path's series in time.
     coloured : bool
-        Whether the misfit is weighed by wavenumber as well as by place. In a thin volume few
-        shells hold the texture, and none tells its misfit from what the faces do.
+        Whether the misfit is resolved by wavenumber as well as by place. In a thin volume few
+        shells hold the texture, and in none can its misfit be separated from edge effects.
     misfit_width : float
         Standard deviation over the template of the Gaussian that averages the misfit.
     noise_width : float
-        The same of a known noise map, px.
+        The same for a known noise map, px.
     ridge : float
-        Precision of each coefficient beside the prior's, px^-2: nothing for displacements of
-        some px.
+        Precision of each coefficient in addition to the prior's, px^-2: negligible for
+        displacements of some px.
     ratio : float
-        Strength of the divergence over the vorticity's at the start: a tenth of its standard
-        deviation.
+        Initial strength of the divergence over the vorticity's; 100 is a standard deviation of
+        10 % of the vorticity's.
     least_vorticity : float
-        Standard deviation of the vorticity (px per px) at the start, at the least: a coarse flow
-        may look rigid.
+        Lower limit of the initial standard deviation of the vorticity, px per px: a coarse flow
+        may be rigid.
     largest_ratio : float
-        Most of it, images only: 0.3 % of the standard deviation. Images of weak texture that show
-        no divergence do not prove that there is none.
+        Upper limit of the ratio, images only; 1e5 is 0.3 % of the standard deviation. Images of
+        weak texture without measurable divergence do not prove that there is none.
     prior_width : float
         Standard deviation over the template within which the prior's strength varies little.
     largest_change, largest_change_divergence : float
-        Factor by which a strength may change in a round.
+        Factor by which a strength may change per round.
     filter : FilterSettings
     solver : IterativeSettings
         Of volumes; images are solved directly.
@@ -158,7 +158,7 @@ class VariationalSettings:
 
     knots: tuple[float, ...] = (1.25, 0.5)
     rounds: tuple[int, ...] = (6, 4)
-    weighed: int = 2
+    noise_round: int = 2
     robust: float = 3.0
     path_order: int = 6
     coloured: bool = True
@@ -178,7 +178,7 @@ class VariationalSettings:
 VOLUME_VARIATIONAL = VariationalSettings(
     knots=(0.625,),
     rounds=(5,),
-    weighed=3,
+    noise_round=3,
     coloured=False,
     least_vorticity=0.03,
     filter=VOLUME_FILTER,

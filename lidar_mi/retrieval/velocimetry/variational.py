@@ -1,9 +1,8 @@
 """Variational retrieval: the smooth flow that warps the images into one another, with its errors.
 
 The flow is a field of cubic B-splines, of images or of volumes. Its coefficients are the most
-probable ones given the images and a prior that knows of air that vorticity is concentrated and
-divergence small; how strongly the prior counts, and where, is itself found from the images
-(evidence).
+probable ones given the images and a prior of concentrated vorticity and small divergence. The
+prior's strength, which varies over the image, is itself estimated from the images (evidence).
 """
 
 from collections.abc import Sequence
@@ -14,7 +13,7 @@ from lidar_mi.retrieval.velocimetry import direct, iterative
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
-from lidar_mi.retrieval.velocimetry.likelihood import Linear, linearised, prepared, weighed
+from lidar_mi.retrieval.velocimetry.likelihood import Linear, linearised, prepared, with_local_noise
 from lidar_mi.retrieval.velocimetry.prior import first_prior, refined
 from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, non_finite, worst_variance
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
@@ -37,7 +36,7 @@ def variational(
 ) -> Displacement:
     """Displacement of every window's centre in the most probable flow between the images.
 
-    Least is, over the flow u (displacement in dt) as B-splines,
+    Minimised over the flow u (displacement in dt) as B-splines is
 
         sum_k sum_x (I_k(x + path(u, t_k)) - mean_k)^2 / (2 s^2)
             + 1/2 integral L(x) vorticity^2 + divergence^2 / (1 / D + 1 / (q L(x))),
@@ -56,22 +55,22 @@ def variational(
     ----------
     image1, image2 : torch.Tensor, shape (z, y), or (x, z, y) of volumes
         On one device, where the result stays too. Brightness may differ by a factor and an offset,
-        which are found anew for every flow, from the air that is valid in all images.
+        which are fitted again for every flow, from the air that is valid in all images.
     template, search, stride : int
-        Pixels, see `windows.Windows`: where vectors are wanted, and the range of the first
+        Pixels, see `windows.Windows`: the positions of the vectors, and the range of the first
         correlation (see `multipass`); the template also sets the scale of the knots.
     more : sequence of torch.Tensor
         Further images, each dt after the one before. Mid-time is then that of the whole burst.
     min_correlation : float
         Vectors are flagged where the images warped to mid-time correlate over a template by less
-        than half way from this to 1: a flow that bends makes unrelated textures alike to 0.7.
+        than half way from this to 1: a flow fitted to unrelated textures correlates them to 0.7.
     noise : float or torch.Tensor, optional
         Standard deviation of the images' white noise, of each pixel or of all; left out: from the
-        images' spectra. Where images warped by the flow differ by more, that is taken.
+        images' spectra. Where images warped by the flow differ by more, their misfit is used.
     blur : float
         Standard deviation, px, of a Gaussian that the instrument blurred the images by. They are
-        then sharpened before they are warped, as far as noise allows: shear turns what blur has
-        done in cores, which is an error of a quarter there for a blur of 1 px.
+        then sharpened before they are warped, as far as noise allows: shear in cores rotates the
+        blur with the texture, which is an error of 25 % there for a blur of 1 px.
     spacing : sequence of float, optional
         Of the pixels along each axis, in any unit: vorticity and divergence are those in space.
         Left out: square pixels.
@@ -82,11 +81,11 @@ def variational(
     -------
     Displacement
         Wind times dt at the windows' centres at mid-time. `score` is the smallest correlation of an
-        image with the mean of the others, `covariance` that of the posterior: what the noise, and
-        what else the images do not share, leaves open and the prior does not know. What splines
-        cannot follow shows in neither: 0.02 px in vortex cores without noise. Where pixels are too
-        coarse displacements are off by a fraction of a pixel that neighbours share: up to 0.04 px
-        on particles of 2 px (1/e^2), 0.01 px of 2.5 px, nothing on larger ones.
+        image with the mean of the others, `covariance` that of the posterior, from noise, misfit
+        and prior. Neither contains what the splines cannot resolve: 0.02 px in vortex cores
+        without noise. On undersampled images displacements have an error that is correlated among
+        neighbours: up to 0.04 px on particles of 2 px (1/e^2), 0.01 px of 2.5 px, none on larger
+        ones.
 
     Raises
     ------
@@ -118,13 +117,13 @@ def variational(
             prior = refined(prior, axes)
         for turn in range(rounds):
             linear = linearised(images, mesh, coefficients, settings)
-            if level == last and turn == settings.weighed:
+            if level == last and turn == settings.noise_round:
                 width = settings.misfit_width * template
-                images = weighed(images, linear, width, settings.coloured)
+                images = with_local_noise(images, linear, width, settings.coloured)
                 linear = linearised(images, mesh, coefficients, settings)
             posterior = solve(linear, mesh, coefficients, prior, settings, turn)
             coefficients = posterior.coefficients.to(like)
-            # the first flow on coarse knots is nothing to learn from
+            # the first flow on coarse knots is too far off to estimate the prior from
             if turn or level:
                 prior = prior.updated(*posterior.evidence(), settings)
         flow = mesh.field(coefficients)
@@ -147,7 +146,7 @@ def _flagged(
     min_correlation: float,
 ) -> Displacement:
     """The result, with flags where images inform too little or do not agree."""
-    # what is left of the prior's variance: in the mean of all directions, and in the worst
+    # remaining fraction of the prior's variance: in the mean of all directions, and in the worst
     known = before.diagonal().mean(-1) / 2
     matched = (covariance.diagonal().mean(-1) < known) & score.isfinite()
     flag = (

@@ -121,7 +121,7 @@ def retrieve_wind_volume(
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, spacing=apart, continued=True)
         flag = flag | (Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
-    # shear lowers the correlation of windows as large as a volume is thick: only the whole is asked
+    # shear lowers the correlation of windows as large as a volume is thick: all windows together
     if bool(unrelated(volumes, windows, False, noise).all()):
         flag = flag | Flag.UNRELATED.value
     found = found._replace(flag=flag)
@@ -144,10 +144,10 @@ def retrieve_wind_volume(
 def without_attenuation(
     volumes: Sequence[torch.Tensor], noise: float | torch.Tensor | None = None
 ) -> tuple[list[torch.Tensor], torch.Tensor | None]:
-    """Volumes over their own brightness c exp(a x) less 1, and the noise of the first alike.
+    """Volumes over their own brightness c exp(a x) less 1, and the noise of the first likewise.
 
-    The brightness is fitted to the means of the gates: so attenuation on the way through the
-    volume is no motion. Non-finite voxels stay so.
+    The brightness is fitted to the means of the gates, so that attenuation through the volume
+    causes no displacement. Non-finite voxels stay so.
 
     Parameters
     ----------

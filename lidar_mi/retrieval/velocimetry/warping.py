@@ -33,7 +33,7 @@ class Spline(NamedTuple):
     shape : tuple of int
         Of the images, (z, y), or (x, z, y) of volumes.
     passed, excess, gain, efficiency
-        Of the filter before the spline, see `band_limit.Filter`.
+        As in `band_limit.Filter`.
     settings : FilterSettings
     """
 
@@ -186,14 +186,15 @@ def band_limited(
         Standard deviation of the images' white noise. Left out: from the lowest shell of the
         power spectrum.
     mismatch : torch.Tensor, shape (shells,), optional
-        Spectral density N of what the images do not share, see `mismatch`. The filter is then
-        sqrt(noise^2 / N) of what it would be in white noise (Hannan & Thomson 1973, Biometrika
-        60, 117-130), so that what it passes of the mismatch is as if it had been white.
+        Spectral density N of the differences of warped images, see `mismatch`. The filter is then
+        sqrt(noise^2 / N) of that for white noise (Hannan & Thomson 1973, Biometrika 60,
+        117-130), so that the mismatch is whitened.
     weight : torch.Tensor, shape of an image, optional
         Of the pixels, for the texture's spectrum.
     blur : float, optional
-        Standard deviation, px, of a Gaussian that blurred the images. It is undone by a Wiener
-        filter, S / (S + N / 2) / B with the Gaussian's transform B and S as it is in the images.
+        Standard deviation, px, of a Gaussian that blurred the images. It is corrected by a Wiener
+        filter, S / (S + N / 2) / B with the Gaussian's transform B and the spectral density S of
+        the blurred images.
     settings : FilterSettings, optional
         Left out: those of images.
 
@@ -239,12 +240,12 @@ def band_limited(
 
 
 def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
-    """Spectral density, by shells, of what warped images do not share, before their filter.
+    """Spectral density, by shells, of the differences of warped images, before their filter.
 
     Parameters
     ----------
     spline : Spline
-        That the images were read from.
+        That the warped images were sampled from.
     rest : torch.Tensor, shape (images, ...)
         Each warped image less the mean of all; zero where not all are valid.
 
@@ -264,7 +265,7 @@ def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
 
 def _refined(spectrum: torch.Tensor, sizes: Sequence[int], finer: int) -> torch.Tensor:
     """Fields of odd sizes (axes but the first) from their spectra, on a grid that is finer."""
-    # axis by axis: what is not yet refined is small
+    # axis by axis: the axes not yet refined are small
     for axis, n in enumerate(sizes[:-1], 1):
         low, high = spectrum.split([n // 2 + 1, n // 2], axis)
         shape = [*spectrum.shape[:axis], (finer - 1) * n, *spectrum.shape[axis + 1 :]]

@@ -19,15 +19,16 @@ def weight_shift(
         J(s) = ((M_s - M) / S_M)^2 + |C_s - C|^2 / S_C^2,
 
     S_M and S_C being the standard deviations of the candidates' weight and centre (vector) over
-    the search region: so weight and centre count alike, whatever the image's unit and contrast.
-    The displacement is s + C_s - C: the rest that the centres of mass still differ by.
+    the search region: so weight and centre have equal influence, whatever the image's unit and
+    contrast. The displacement is s + C_s - C, which includes the remaining difference of the
+    centres of mass.
 
-    The method sees three numbers of a template's n^2, so candidates are easily confused: on
-    texture of 3 px correlation length carried by two vortices (2.7 m/s rms) its error is
-    3.3 m/s where cross-correlation has 0.9; a match by centre alone has 5.7. It does well where
-    a template holds one compact blob on little background. Unlike correlation it depends on the
-    offset of the images (a background adds mass at rest, which pulls the centres to the middle)
-    and on their relative brightness.
+    The method uses three numbers of a template's n^2, so candidates are easily confused: on
+    texture of 3 px correlation length advected by two vortices (2.7 m/s rms) its error is
+    3.3 m/s where cross-correlation has 0.9; a match by centre alone has 5.7. It performs well
+    where a template holds one compact blob on little background. Unlike correlation it depends on
+    the offset of the images (a background adds mass at rest, which shifts the centres to the
+    middle) and on their relative brightness.
 
     Parameters
     ----------
@@ -49,7 +50,7 @@ def weight_shift(
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)
     bad = non_finite([image1, image2], windows)
-    # Spreads below the rounding of the images' own numbers are none.
+    # Spreads below the rounding of the images' own numbers count as none.
     rounding = 4 * max(
         (torch.finfo(i.dtype).eps for i in (image1, image2) if i.is_floating_point()), default=0.0
     )

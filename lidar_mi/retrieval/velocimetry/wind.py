@@ -40,11 +40,11 @@ class Method:
     centred : bool
         Vectors belong to the windows' centres, not half their displacement further on.
     local : bool
-        A vector knows its window only: without texture there, or contradicted by its neighbours,
-        it is flagged. A field that is fitted as a whole says itself how certain it is where.
+        A vector depends on its window only, and is flagged without texture there or as an outlier
+        among its neighbours. A field fitted as a whole has standard errors of its own.
     reach : int
-        Displacements it begins with, over those of its windows. 0: it says itself whether the
-        images are related.
+        Range of its first displacements over that of its windows. 0: the method checks by itself
+        whether the images are related.
     """
 
     find: Callable[..., Displacement]
@@ -126,7 +126,7 @@ def retrieve_wind(
         fitted to the images as a whole, see `METHODS`.
     template, search, stride : int
         Pixels: template n >= 2, search region >= n + 2, step from window to window >= 1. Winds
-        beyond ((search - template) // 2 - 1/2) spacing / dt cannot be seen (17.5 m/s for 8 in 16
+        beyond ((search - template) // 2 - 1/2) spacing / dt are out of range (17.5 m/s for 8 in 16
         at 0.5 m and 0.1 s).
     device : str or torch.device
         Where to compute.
@@ -138,11 +138,11 @@ def retrieve_wind(
         strongest direction. See `quality.texture`.
     noise : float or xr.DataArray, optional
         Standard deviation of image 1's noise, in its unit; a template with less structure than
-        noise is flagged as without texture. Left out, no noise is assumed for that, and methods
+        noise is flagged as without texture. Left out, that flag assumes no noise, and methods
         that weight by it ("multipass", "variational", "vortex_fit") estimate it from the images.
     more : sequence of xr.DataArray
-        Further images on the same grid, each dt after the one before ("variational"): a burst,
-        whose mid-time is the winds'.
+        Further images on the same grid, each dt after the one before ("variational"): a burst.
+        The winds are those at its mid-time.
     blur : float
         Standard deviation, m, of the Gaussian by which the instrument blurs the air, as a beam of
         1/e^2 radius 2 `blur` does ("variational", which then sharpens; square pixels only).
@@ -157,12 +157,12 @@ def retrieve_wind(
     xr.Dataset, dims (z, y)
         At the template centres (an even template's lies between pixels): `v`, `w` (m s-1),
         `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
-        their correlation (NaN from methods that know none: "cc", "ws"), `displacement_y`,
+        their correlation (NaN from methods that give none: "cc", "ws"), `displacement_y`,
         `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1), `isotropy`, `flag`
-        (bits of `quality.Flag`, 0 = valid; also without texture counts a vector whose standard
-        error is beyond half a pixel in some direction). The auxiliary coordinates `y_vector`,
-        `z_vector` are where the vector belongs, at mid-time: the centre and, with "cc" and "ws",
-        half the displacement. "vortex_fit" adds the pair's numbers (`port_circulation` and so on,
+        (bits of `quality.Flag`, 0 = valid; low texture also means a standard error beyond half a
+        pixel in some direction). The auxiliary coordinates `y_vector`, `z_vector` are the
+        position of the vector at mid-time: the centre and, with "cc" and "ws", half the
+        displacement. "vortex_fit" adds the pair's numbers (`port_circulation` and so on,
         each with `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or
         NaN if there is none); nothing is replaced.
 
@@ -228,7 +228,7 @@ def retrieve_wind(
             flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
         if chosen.reach:
             apart = unrelated([pixels1, pixels2], windows, chosen.reach > 1, noise)
-            # a field fitted as a whole is only asked whether images are related at all
+            # a field fitted as a whole is flagged only if the images are unrelated everywhere
             apart = apart if chosen.local else apart.all().expand_as(apart)
             flag = flag | (Flag.UNRELATED * apart).to(torch.int16)
     attributes = {
@@ -288,10 +288,10 @@ def wind_bound(
 ) -> xr.Dataset:
     """Least standard error of v and w (m/s) that any unbiased method has from each template alone.
 
-    The Cramer-Rao bound, see `bound.displacement_bound`; on the grid of `retrieve_wind`, which says
-    what the parameters are. Infinite without texture, NaN near non-finite pixels. A field that is
-    fitted to the images as a whole uses more than a template and may be better. Noise of 0 in some
-    pixels of a map counts as a thousandth of the median.
+    The Cramer-Rao bound, see `bound.displacement_bound`. Grid and parameters are those of
+    `retrieve_wind`. Infinite without texture, NaN near non-finite pixels. A field that is fitted
+    to the images as a whole uses more than a template and may be better. Noise below 0.001 of the
+    median of a map is raised to that.
 
     Returns
     -------

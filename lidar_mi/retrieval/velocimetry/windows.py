@@ -1,4 +1,4 @@
-"""Where the windows lie: templates in image 1, search regions in image 2, sums over both."""
+"""Positions of the windows: templates in image 1, search regions in image 2, sums over both."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -11,14 +11,14 @@ from torch.nn.functional import pad
 from lidar_mi.errors import InputError
 
 # Working memory of one tile of windows. Small enough to stay near the cache, large enough that
-# the cost of a call does not matter.
+# the cost of a call is negligible.
 TILE_BYTES = 1 << 27
 # Windows summed at once: more waste products with zeros, fewer are too small to be fast.
 _BLOCK = 48
 
 
 class Tile(NamedTuple):
-    """A block of windows and the pixels it needs; as an image of its own it has just these."""
+    """A block of windows and the pixels it needs."""
 
     vectors: tuple[slice, slice]
     pixels: tuple[slice, slice]
@@ -33,8 +33,8 @@ class Windows:
     -lead ... search - template - lead with lead = (search - template) // 2: where
     search - template is odd, there is one more shift on the positive side.
 
-    In an image the search regions lie wholly inside. Volumes are thin: there the templates do, and
-    what the stride leaves over is halved between both faces.
+    In an image the search regions lie wholly inside. In a volume, which is thin, the templates do,
+    and the margin that the stride leaves is divided equally between both faces.
 
     Attributes
     ----------
@@ -80,7 +80,7 @@ class Windows:
 
     @property
     def inner(self) -> int:
-        """Side of what lies wholly inside: search region of an image, template of a volume."""
+        """Side of the window that lies wholly inside: search region, of a volume the template."""
         return self.search if self.dims == 2 else self.template
 
     @property
@@ -90,7 +90,7 @@ class Windows:
 
     @property
     def reach(self) -> float:
-        """Largest displacement looked for in each direction, px."""
+        """Largest displacement searched in each direction, px."""
         return (self.search - self.template) / 2
 
     @property
@@ -130,9 +130,9 @@ class Windows:
     def tiles(self, bytes_per_window: int) -> Iterator[Tile]:
         """The windows of an image in blocks of at most TILE_BYTES (but at least one window)."""
         rows, columns = self.count
-        room = max(1, TILE_BYTES // bytes_per_window)
-        width = min(columns, room)
-        height = max(1, room // width)
+        most = max(1, TILE_BYTES // bytes_per_window)
+        width = min(columns, most)
+        height = max(1, most // width)
         for top in range(0, rows, height):
             for left in range(0, columns, width):
                 vectors = (
@@ -165,7 +165,7 @@ class Windows:
 def box_sum(values: torch.Tensor, size: int, axis: int) -> torch.Tensor:
     """Sum of `size` neighbours along `axis`, at every position where they all exist.
 
-    Built by doubling (pairs, fours, eights, ...): log2(size) additions a value, and unlike a
+    Built by doubling (pairs, fours, eights, ...): log2(size) additions per value, and unlike a
     running sum its rounding error does not grow along the image and a NaN stays in its windows.
     """
     length = values.shape[axis] - size + 1
@@ -187,8 +187,8 @@ def window_sums(
 ) -> torch.Tensor:
     """Sums along an axis of fields (n, ...), weighted by each of several kernels.
 
-    One sum begins every `step` values, as long as the kernel is covered. Multiplies blocks of
-    values with all kernels at once, which takes a tenth of the time of a convolution.
+    Sums start every `step` values, where the kernel lies wholly inside. Blocks of values are
+    multiplied with all kernels at once, which takes 10 % of the time of a convolution.
 
     Returns
     -------
@@ -212,7 +212,7 @@ def window_sums(
 
 
 def averaged(field: torch.Tensor, known: torch.Tensor, width: float) -> torch.Tensor:
-    """Mean of a field over Gaussians, of what is known; of all of it where nothing is near."""
+    """Gaussian mean of a field where it is known; the mean of all of it where nothing is near."""
     reach = math.ceil(3 * width)
     place = torch.arange(-reach, reach + 1, dtype=field.dtype, device=field.device) / width
     gaussian = torch.exp(-place.square() / 2)
@@ -290,11 +290,11 @@ def image_pair(image1: torch.Tensor, image2: torch.Tensor, dims: Sequence[int] =
 
 
 def working(image: torch.Tensor) -> torch.Tensor:
-    """The image in the precision all sums are made in: float64 (float32 where there is none).
+    """The image in the precision of all sums: float64 (float32 where there is none).
 
-    Variances come out as differences of sums, which float32 spoils where the contrast of a
-    window is below 1e-3 of the distance between its mean and the image's. float64 adds about a
-    third to the time of a full scan.
+    Variances are differences of sums, for which float32 is too coarse where the contrast of a
+    window is below 1e-3 of the difference between its mean and the image's. float64 takes about
+    30 % more time for a full scan.
     """
     return image.to(torch.float32 if image.device.type == "mps" else torch.float64)
 

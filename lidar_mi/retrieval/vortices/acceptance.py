@@ -11,18 +11,18 @@ from lidar_mi.retrieval.vortices.model import PROFILES, Profile
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.robust_fit import Solution
 
-# How many starting points are followed.
+# Number of starting points that are fitted.
 STARTS = 3
-# A fit has converged when its steps get smaller than so many standard errors, squared.
+# A fit has converged when its squared step, in standard errors, is smaller.
 TOLERANCE = 0.03
 
-# A fit is refused below these: circulation over its standard error, correlation of the images.
+# Least circulation over its standard error and least correlation of the images of a valid fit.
 _SIGNIFICANCE = 5.0
 _MATCH = 0.5
 
 
 def step_limits(y: np.ndarray, z: np.ndarray) -> Callable[[torch.Tensor, torch.Tensor], bool]:
-    """Steps that stay near and keep core radii between a cell and the region."""
+    """Limits of a step: its size, and core radii between half a cell and half the region."""
     sides = float(y[-1] - y[0]), float(z[-1] - z[0])
     cell = max(sides[0] / (len(y) - 1), sides[1] / (len(z) - 1))
     smallest, largest = np.log(cell / 2), np.log(min(sides) / 2)
@@ -51,7 +51,7 @@ def no_fit(profile: Profile, reason: str) -> VortexPairFit:
 def checked_fit(
     found: Solution, covariance, profile, chi2, match, error, length, z, y
 ) -> VortexPairFit:
-    """The fit, with the reasons for which it is not to be trusted."""
+    """The fit, with the reasons for which it is not accepted."""
     theta = found.parameters[:10].cpu().numpy()
     reasons = []
     if not found.converged and far_from_minimum(found, covariance):

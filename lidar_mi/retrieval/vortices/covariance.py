@@ -1,4 +1,4 @@
-"""Covariance of fitted parameters: noise, the flow's departure from the model, steps not taken."""
+"""Covariance of fitted parameters: from noise, model error and incomplete convergence."""
 
 import numpy as np
 import torch
@@ -61,7 +61,7 @@ def _noise_spread(found: Solution, error: ModelError) -> torch.Tensor:
 
 
 def _remaining_step(found: Solution) -> torch.Tensor:
-    """The step (10,) that a fit would still take, where noise in the interpolation stopped it."""
+    """The remaining step (10,) of a fit that interpolation noise has stopped."""
     misfit, weight = found.misfit, found.weight
     force = -misfit.jacobian.flatten(1) @ (weight * misfit.residual).flatten()
     scale = found.normal.diagonal().sqrt()
@@ -70,18 +70,18 @@ def _remaining_step(found: Solution) -> torch.Tensor:
 
 
 def far_from_minimum(found: Solution, covariance: np.ndarray) -> bool:
-    """Whether the step left is more than a standard error of any parameter, itself apart."""
+    """Whether the remaining step is more than the other standard error of any parameter."""
     left = _remaining_step(found).cpu().numpy() ** 2
     return not (left < np.diagonal(covariance) - left).all()
 
 
 def _attenuation(found: Solution) -> torch.Tensor:
-    """How far the circulations may be biased towards zero, as an error of all parameters (10,).
+    """Possible bias of the circulations towards zero, as an error of all parameters (10,).
 
-    Structure that has been wound up for long lies along the flow: the images change little, and
-    what remains unexplained may as well be the model's error. Regressing the other way round
-    (errors in the model, not in the change) would make both circulations larger by the unexplained
-    fraction of the change: this is the error stated.
+    Structure that has been wound up for long is aligned with the flow: the images change little,
+    and the residual may as well be model error. The inverse regression (errors in the model, not
+    in the change) would make both circulations larger by the unexplained fraction of the change:
+    this is the error stated.
     """
     misfit, theta = found.misfit, found.parameters
     explained = theta[0] * misfit.jacobian[0] + theta[4] * misfit.jacobian[4]

@@ -1,7 +1,7 @@
-"""A pair of wake vortices from two images: the model that explains both images best.
+"""A pair of wake vortices from two images: the model that fits both images best.
 
-No vector is needed on the way: the whole image informs the ten parameters at once, so this works
-where the texture is too weak for any local method, and as well as the noise allows elsewhere.
+No wind vectors are needed in between: the whole image informs the ten parameters at once. So this
+works where the texture is too weak for any local method, and elsewhere as well as the noise allows.
 """
 
 from dataclasses import dataclass
@@ -34,22 +34,22 @@ from lidar_mi.retrieval.vortices.search import Observations, starting_points
 
 # Coarse to fine: standard deviation of the blur and step between the pixels used, px.
 _LEVELS = ((3.0, 4), (1.5, 2), (0.0, 1))
-# A cubic spline misses about so much of an image's rms structure.
+# Interpolation error of a cubic spline over an image's rms structure.
 _INTERPOLATION = 1e-4
-# What the flow may be off at first (px); later it is estimated.
-_FIRST_FLOW_ERROR = 0.1
+# Model error assumed at first (px); later it is estimated.
+_FIRST_MODEL_ERROR = 0.1
 # Lags (px) over which the noise of band-limited images correlates.
 _NOISE_LAGS = 4.0
 
 
 @dataclass(frozen=True)
 class _Images:
-    """Two images as the fit reads them; call with parameters for the misfit.
+    """The two images of a fit; call with parameters for the misfit.
 
     Parameters are those of the pair and two more, gain and offset of image 2 over image 1. The
-    images are compared whole, and their difference is filtered: a filter before would take
-    another part from texture that the vortices have sheared, which makes cores 1 % too wide. The
-    derivatives are those of the filtered images.
+    unfiltered images are compared, and their difference is filtered: filtering them before would
+    remove another part of texture that the vortices have sheared, which makes cores 1 % too wide.
+    The derivatives are those of the filtered images.
     """
 
     spline: Spline
@@ -69,7 +69,7 @@ class _Images:
         theta, gain, offset = parameters[:10], parameters[10], parameters[11]
         half = self.dt / 2
         moving = torch.zeros_like(theta[:2]) if self.frozen else drift(theta, self.profile)
-        # the flow stands still in the frame that moves with the pair
+        # the flow is steady in the frame that moves with the pair
         steady = torch.cat([theta[:8], theta[8:] - moving])
         middle, place = zip(
             *(advected(steady, self.y, self.z, time, self.profile) for time in (-half, half)),
@@ -121,9 +121,9 @@ def fit_vortices(
 
     Every pixel is followed half a dt back and half a dt on along its curved path; there the images
     must agree, but for a gain and an offset. The squares of their difference are minimised, each
-    weighted by the noise and by what the flow's departure from the model makes of the image's
-    slope; the departure is estimated from the residuals of the same fit. The start is the best
-    of all pairs of places (see `lidar_mi.retrieval.vortices.search`), no guess is needed.
+    weighted by the inverse variance of the noise and of the model error times the image's slope;
+    the model error is estimated from the residuals of the same fit. The start is the best of all
+    pairs of places (see `lidar_mi.retrieval.vortices.search`), no guess is needed.
 
     Parameters
     ----------
@@ -133,12 +133,12 @@ def fit_vortices(
     dt : float
         s.
     noise : float or DataArray, optional
-        Standard deviation of each image's white noise, in image 1's unit; of pixels where it is an
-        image. Left out: from the images' spectra.
+        Standard deviation of each image's white noise, in image 1's unit, of all pixels or of
+        each. Left out: from the images' spectra.
     profile : {"lamb_oseen", "burnham_hallock"}
     frozen : bool
-        The vortices stay where they are during dt. Default: they drift with the mean wind and each
-        other's.
+        The vortices do not move during dt. Default: they drift with the mean wind and their mutual
+        induction.
     device : str or torch.device
 
     Returns
@@ -225,7 +225,7 @@ def fit_pixels(
             best = found
     if best is None:
         return no_fit(profile, "no vortex signature")
-    variance = (_FIRST_FLOW_ERROR * spacing) ** 2
+    variance = (_FIRST_MODEL_ERROR * spacing) ** 2
     for blur, step in _LEVELS[1:]:
         level_images = make(blur, step)
         best = fit(level_images, best.parameters, limits, variance, 12, TOLERANCE)
@@ -235,7 +235,7 @@ def fit_pixels(
     error = model_error_of(best, _NOISE_LAGS)
     covariance = parameter_covariance(best, error, level_images.spline.excess)
     misfit, valid = best.misfit, best.misfit.valid
-    # image 1 at its places, and image 2 at its own: the residual with image 1 put back
+    # image 1 at its places, and image 2 at its own: the residual with image 1 added
     first = -misfit.jacobian[10]
     second = misfit.residual + best.parameters[10] * first
     match = float(torch.corrcoef(torch.stack([first[valid], second[valid]]))[0, 1])
@@ -258,9 +258,9 @@ def _understated(noise: torch.Tensor, pair: torch.Tensor) -> float:
     """Factor by which the images vary more from pixel to pixel than a map states, at least 1.
 
     Errors estimated from a few Monte Carlo samples miss the rare bright ones. With too low a noise
-    the filter takes what is left of it for texture and passes all of it. Texture down to single
-    pixels counts as noise here, which costs little: in images 150 m ahead noise comes out 1.5 times
-    as large, and chi2 at 0.4, with the errors of the parameters unchanged.
+    the filter mistakes the excess for texture and passes all of it. Texture down to single pixels
+    counts as noise here, with little effect: in images 150 m ahead the noise is overestimated by
+    1.5 and chi2 is 0.4, with the errors of the parameters unchanged.
     """
     stated = float(noise[torch.isfinite(noise)].double().square().mean().sqrt())
     _, observed = band_limited(pair)
@@ -268,10 +268,10 @@ def _understated(noise: torch.Tensor, pair: torch.Tensor) -> float:
 
 
 def _typical(noise: float | torch.Tensor | None, contrast: torch.Tensor) -> float | None:
-    """One standard deviation for the filter: where pixels differ, the rms where the structure is.
+    """One standard deviation for the filter: of a noise map the rms weighted by image contrast.
 
-    That of most pixels will not do: where bright air is the noisiest the filter would stop too
-    little of it, and circulations come out up to 10 % too large.
+    That of most pixels is not enough: where bright air is noisiest the filter would pass too
+    much noise, and circulations would be up to 10 % too large.
     """
     if not isinstance(noise, torch.Tensor):
         return noise
@@ -282,7 +282,7 @@ def _typical(noise: float | torch.Tensor | None, contrast: torch.Tensor) -> floa
 
 @dataclass(frozen=True)
 class _Builder:
-    """Images of the levels, from coarse to fine."""
+    """Builds the images of the levels, from coarse to fine."""
 
     pair: torch.Tensor
     bad: torch.Tensor
@@ -327,8 +327,8 @@ class _Builder:
         vertical, lateral = torch.meshgrid(*places, indexing="ij")
         variance = torch.full_like(lateral, 2 * noise**2)
         if isinstance(self.map, torch.Tensor):
-            # the filter spreads noise over a few pixels; of few samples one pixel's estimate is
-            # unreliable
+            # the filter spreads noise over a few pixels, and with few samples one pixel's estimate
+            # is unreliable
             known = torch.nn.functional.avg_pool2d(
                 filled(self.map.double())[None].square(), 9, 1, 4, count_include_pad=False
             )[0]
@@ -359,7 +359,7 @@ def _differences(images: _Images) -> Observations:
     slope = torch.stack([slope_y.mean(0) / images.spacing[0], slope_z.mean(0) / images.spacing[1]])
     clean = ~images.bad[rows.round().long(), columns.round().long()]
     strength = slope.square().sum(0)
-    # all pixels may be off by a pixel's displacement
+    # model error of one pixel everywhere
     weight = 1 / (images.scatter + strength * images.spacing[0] * images.spacing[1])
     parts = (images.y, images.z, *slope, value[1] - value[0], weight)
     y, z, slope_y, slope_z, change, weight = (part[clean] for part in parts)

@@ -26,8 +26,8 @@ PARAMETERS = (
 
 # Root of 1 + 2 a = exp(a): puts the peak of the Lamb-Oseen swirl at the core radius.
 _LAMB_OSEEN = 1.2564
-# Angle (rad) by which the fastest air may rotate in one Runge-Kutta step: errs by 3e-4 of its
-# radius.
+# Angle (rad) by which the fastest air may rotate in one Runge-Kutta step: an error of 3e-4 of
+# its radius.
 _STEP_ANGLE = 0.5
 
 
@@ -105,10 +105,10 @@ def sensitivity(
 def advected(
     theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, time: float, profile: Profile
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where air at places (...) is after half of a time and after all of it, (2, ...) each, in m.
+    """Positions of air after half of a time and after all of it, (2, ...) each, in m.
 
-    Runge-Kutta of fourth order in a flow that stands still; `time` in s, negative: where it was
-    before. The middle, which only derivatives are taken at, is Hermite's cubic.
+    Runge-Kutta of fourth order in a steady flow; `time` in s, negative: backward. The middle,
+    which is used for derivatives only, is by Hermite's cubic.
     """
     centre = {"lamb_oseen": _LAMB_OSEEN, "burnham_hallock": 1.0}[profile] / (2 * torch.pi)
     fastest = max(
@@ -139,8 +139,8 @@ def path_sensitivity(
     """Derivatives (10, ...) of along . (end of the path) with respect to `PARAMETERS`.
 
     A parameter's change du of the wind along the path is advected to its end by the flow. The
-    integral over the path is taken by its value in the middle, advected on by exp(L time/2) with
-    the gradient L of the wind there: off by (omega time)^2/24, 0.7 % for 0.4 rad.
+    integral over the path is by the midpoint rule, advected on by exp(L time/2) with the gradient L
+    of the wind there: a relative error of (omega time)^2/24, 0.7 % for 0.4 rad.
     """
     v_y, v_z, w_y = gradient(theta, *middle, profile)
     h = time / 2

@@ -1,7 +1,7 @@
 """Departure of a flow from its model, and the error of the parameters that it causes.
 
-A real flow is not two vortices. What is left of it moves the air by a smooth random field, taken to
-be isotropic: each component has the covariance sum_j a_j exp(-h^2 / (2 L_j^2)) at the distance h.
+A real flow is not two vortices. The departure moves the air by a smooth random field, taken to be
+isotropic: each component has the covariance sum_j a_j exp(-h^2 / (2 L_j^2)) at the distance h.
 In the residuals of a fit it is a displacement correlated between neighbours, in the parameters an
 error that does not average out over pixels.
 """
@@ -20,7 +20,7 @@ _LENGTHS = (3.0, 6.0, 12.0, 24.0, 48.0)
 
 @dataclass(frozen=True)
 class ModelError:
-    """Covariance of each component of what the model misses.
+    """Covariance of each component of the flow's departure from the model.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ def model_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) -
     Parameters
     ----------
     force : torch.Tensor, shape (2, z, y)
-        q; zero where nothing is known.
+        q; zero where there is no residual.
     stiffness : torch.Tensor, shape (3, z, y)
         A: yy, yz, zz.
     shortest : float

@@ -26,21 +26,21 @@ class VortexPairFit(Tabular):
     covariance : ndarray, shape (10, 10)
         Of the parameters: from the noise and from the flow's departure from the model.
     profile : {"lamb_oseen", "burnham_hallock"}
-        To which circulation and core radius belong: the same data give different radii.
+        Of the swirl, which circulation and core radius refer to: the same data give different
+        radii for each.
     chi2 : float
-        Mean square of the residuals over that of the noise; 1 where the model is all there is.
-        NaN where no noise is known.
+        Mean square of the residuals over that of the noise; 1 without model error. NaN where the
+        noise is not known.
     correlation : float
         Of image 1 and image 2, each advected to mid-time by the fit; of fits to vectors the
         fraction of their variance that is explained.
     model_error : float
-        Rms of each component of the wind that the model misses, m s^-1, estimated from the
-        residuals.
+        Rms departure of each wind component from the model, m s^-1, estimated from the residuals.
     model_error_length : float
-        Over which it correlates, m.
+        Its correlation length, m.
     success : bool
     reasons : tuple of str
-        Why not.
+        Why the fit is not accepted; empty if it is.
     """
 
     parameters: np.ndarray
@@ -54,7 +54,7 @@ class VortexPairFit(Tabular):
 
     @property
     def success(self) -> bool:
-        """Whether the fit is accepted; else `reasons` says why not."""
+        """Whether the fit is accepted; if not, see `reasons`."""
         return not self.reasons
 
     @property
@@ -68,7 +68,7 @@ class VortexPairFit(Tabular):
         return self._vortex(4)
 
     def tables(self) -> list[Table]:
-        """Both vortices and the pair, with standard errors; first of all whether it is a fit."""
+        """Both vortices and the pair, with standard errors, after whether the fit is accepted."""
         found = self.quantities
 
         def shown(name):
@@ -87,7 +87,7 @@ class VortexPairFit(Tabular):
 
     @property
     def mean_wind(self) -> tuple[float, float]:
-        """v and w of the air the pair is in, m s^-1."""
+        """v and w of the ambient air, m s^-1."""
         return float(self.parameters[8]), float(self.parameters[9])
 
     def _vortex(self, first: int) -> Vortex:
@@ -104,7 +104,7 @@ class VortexPairFit(Tabular):
         mean over radii from 5 to 15 m), core_radius (of the largest swirl), y, z of port and
         starboard; separation b_0, centre_y, centre_z, descent_speed w_0 = Gamma/(2 pi b_0) with
         the mean circulation, time_scale t_0 = b_0/w_0; mean_v, mean_w; drift_v and drift_w, the
-        velocity of the pair, which the mean wind and its own make together.
+        velocity of the pair from mean wind and mutual induction.
         """
         theta = torch.as_tensor(self.parameters)
 
@@ -120,9 +120,9 @@ class VortexPairFit(Tabular):
         }
 
     def after(self, seconds: float) -> "VortexPairFit":
-        """The pair as it drifts on, with the errors that grow on the way.
+        """The pair after some time of drift, with its growing errors.
 
-        The vortices keep their circulation, core radius and distance: good for a fraction of the
+        The vortices keep their circulation, core radius and distance: valid for a fraction of the
         time in which the pair descends by its separation.
         """
 
@@ -135,7 +135,7 @@ class VortexPairFit(Tabular):
         return replace(self, parameters=moved(theta).numpy(), covariance=covariance)
 
     def wind(self, y, z) -> xr.Dataset:
-        """The wind of the fit anywhere, at mid-time; `after` gives that of a later one.
+        """The wind of the fit anywhere, at mid-time; see `after` for later times.
 
         Parameters
         ----------
@@ -146,8 +146,8 @@ class VortexPairFit(Tabular):
         Returns
         -------
         Dataset
-            `v`, `w`, `v_stderr`, `w_stderr` (m s^-1) and `vw_correlation`, dims (row, column) or as
-            the arrays have. The errors hold those of the parameters and the flow's error.
+            `v`, `w`, `v_stderr`, `w_stderr` (m s^-1) and `vw_correlation`, dims (row, column) or
+            those of the arrays. The errors contain those of the parameters and the model error.
         """
         y, z = np.broadcast_arrays(np.asarray(y, dtype=float), np.asarray(z, dtype=float))
         values, covariance = self.wind_and_covariance(y, z)
@@ -183,16 +183,15 @@ class VortexPairFit(Tabular):
         ]
         covariance = torch.as_tensor(self.covariance)
         v, w = (torch.tensordot(covariance, part, 1) for part in slope)
-        own = self.model_error**2
+        model = self.model_error**2
         spread = torch.stack(
-            [(v * slope[0]).sum(0) + own, (w * slope[1]).sum(0) + own, (v * slope[1]).sum(0)]
+            [(v * slope[0]).sum(0) + model, (w * slope[1]).sum(0) + model, (v * slope[1]).sum(0)]
         )
         return wind(theta, *places, self.profile).numpy(), spread.numpy()
 
 
-# What a drift along y and along z adds to the parameters.
+# Derivatives of the parameters by a shift of the pair along y and along z.
 _CENTRES = torch.zeros(2, 10)
-
 _CENTRES[0, [2, 6]] = _CENTRES[1, [3, 7]] = 1.0
 
 MEANING = {
@@ -226,7 +225,7 @@ def circulation_5_15(
     core_radius: float | torch.Tensor,
     profile: Profile = "lamb_oseen",
 ) -> torch.Tensor:
-    """Circulation of a vortex averaged over radii from 5 to 15 m, as lidars report it, m^2 s^-1."""
+    """Circulation of a vortex averaged over radii from 5 to 15 m, as usual for lidars, m^2 s^-1."""
     circulation = torch.as_tensor(circulation, dtype=torch.float64)
     core_radius = torch.as_tensor(core_radius, dtype=torch.float64)
     radius = torch.linspace(5, 15, 101, dtype=torch.float64)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import torch
 
-# Residuals beyond so many standard deviations have the influence of those at it (Huber, 1964):
-# costs normal noise 0.1 % of its information.
+# Residuals beyond so many standard deviations have the influence of those at it (Huber, 1964),
+# which loses 0.1 % of the information with normal noise.
 _HUBER = 3.0
 _LARGEST_DAMPING = 1e4
 # Squared standard errors from the minimum that a fit may stop at.
@@ -22,13 +22,13 @@ class Misfit(NamedTuple):
     jacobian : torch.Tensor, shape (p, ..., z, y)
         Derivatives of the residual with respect to the parameters.
     slope : torch.Tensor, shape (2, ..., z, y)
-        Change of the residual per metre (per m/s) that the model's flow is off along y, z.
+        Change of the residual per metre (per m/s) of the model flow's error along y, z.
     valid : torch.Tensor of bool
         Which residuals exist.
     variance : torch.Tensor
-        Of the noise, as it acts on the parameters.
+        Of the noise, for its effect on the parameters.
     scatter : torch.Tensor
-        Of the noise, as it shows in a residual (less than `variance` after a filter).
+        Of the noise in a residual (less than `variance` after a filter).
     """
 
     residual: torch.Tensor
@@ -51,7 +51,7 @@ class Solution(NamedTuple):
 
 
 def weights(misfit: Misfit, flow_variance: float) -> torch.Tensor:
-    """1 / variance of noise and flow error, less for outliers; 0 where there is no residual."""
+    """1 / variance of noise and model error, less for outliers; 0 where there is no residual."""
     moved = flow_variance * misfit.slope.square().sum(0)
     size = misfit.residual.abs() / (misfit.scatter + moved).sqrt()
     return misfit.valid * (_HUBER / size.clamp(min=_HUBER)) / (misfit.variance + moved)
@@ -72,11 +72,11 @@ def fit(
     evaluate : callable
         Parameters (p,) -> Misfit.
     parameters : torch.Tensor, shape (p,)
-        Where to start.
+        Starting point.
     allowed : callable
         (parameters, step) -> whether such a step may be tried.
     flow_variance : float
-        Of the model flow's error in each component; adds to the noise through `slope`.
+        Of the model error in each component; adds to the noise through `slope`.
     iterations : int
         At most.
     tolerance : float

@@ -1,4 +1,4 @@
-"""Where to start a fit of two vortices: every pair of places on a grid is tried.
+"""Starting points for a fit of two vortices: every pair of places on a grid is tried.
 
 For given places and core radius the wind is linear in the circulations and the mean wind, so each
 pair's best circulations and misfit follow in closed form from sums over the observations.
@@ -23,7 +23,7 @@ class Observations(NamedTuple):
     y, z : torch.Tensor
         m.
     along : torch.Tensor, shape (2, n)
-        The component observed, times whatever makes it the value's unit.
+        The component observed, times the conversion to the value's unit.
     value : torch.Tensor
     weight : torch.Tensor
         1 / variance, up to a factor.
@@ -37,7 +37,7 @@ class Observations(NamedTuple):
 
 
 def starting_points(observed: Observations, count: int, profile: Profile) -> torch.Tensor:
-    """Parameters (up to `count`, 10) of pairs that explain most of the observations, best first.
+    """Parameters (up to `count`, 10) of pairs with the least misfit, best first.
 
     Vortices rotate in opposite directions and are at least three core radii apart. Of each
     neighbourhood only the best pair is taken.
@@ -52,10 +52,10 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
     place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
     apart = torch.cdist(place, place)
     root = observed.weight.sqrt()
-    plain = torch.linalg.qr((observed.along * root).T)[0]
+    uniform = torch.linalg.qr((observed.along * root).T)[0]
 
     def without_mean_wind(values):
-        return values - plain @ (plain.T @ values)
+        return values - uniform @ (uniform.T @ values)
 
     value = without_mean_wind(observed.value * root)
     found = []
@@ -83,7 +83,7 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
 
 
 def _swirls(observed: Observations, root, place, radius: float, profile: Profile) -> torch.Tensor:
-    """Weighted observations that vortices of unit circulation at each place make, (n, places)."""
+    """Weighted observations of vortices of unit circulation at each place, (n, places)."""
     dy, dz = (observed[axis][:, None] - place[:, axis] for axis in (0, 1))
     value, _ = angular_velocity((dy**2 + dz**2) / radius**2, profile)
     across = observed.along[1][:, None] * dy - observed.along[0][:, None] * dz
@@ -91,7 +91,7 @@ def _swirls(observed: Observations, root, place, radius: float, profile: Profile
 
 
 def _explained(normal, wanted):
-    """Misfit that every pair of columns explains, and the amplitudes of both."""
+    """Reduction of the misfit by every pair of columns, and the amplitudes of both."""
     power = normal.diagonal()
     determinant = power[:, None] * power - normal**2
     determinant = torch.where(determinant > 1e-6 * power[:, None] * power, determinant, torch.inf)
@@ -111,7 +111,7 @@ def _peaks(gain, apart, count: int, distance: float):
 
 
 def _with_mean_wind(theta, observed: Observations, root, profile: Profile) -> torch.Tensor:
-    """The parameters with the mean wind that fits the rest best."""
+    """The parameters with the mean wind that fits the residual best."""
     left = observed.value - (observed.along * wind(theta, observed.y, observed.z, profile)).sum(0)
     mean = torch.linalg.lstsq((observed.along * root).T, (left * root)[:, None]).solution[:, 0]
     return torch.cat([theta[:8], mean])

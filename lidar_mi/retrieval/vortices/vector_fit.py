@@ -48,22 +48,22 @@ class _Vectors:
 
 
 def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -> VortexPairFit:
-    """Two vortices and a mean wind that explain retrieved vectors.
+    """Two vortices and a mean wind fitted to retrieved vectors.
 
     Parameters
     ----------
     vectors : Dataset, dims (z, y)
-        As `lidar_mi.retrieval.velocimetry.wind.retrieve_wind` gives it: v, w, and where there are
-        any v_stderr, w_stderr, vw_correlation, flag, y_vector, z_vector. Vectors with a flag or
-        without a number are left out. Without standard errors all count alike, with the error that
-        their residuals show.
+        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`: v, w, and if present v_stderr,
+        w_stderr, vw_correlation, flag, y_vector, z_vector. Vectors that are flagged or NaN are left
+        out. Without standard errors all have the same weight, with the error estimated from their
+        residuals.
     profile : {"lamb_oseen", "burnham_hallock"}
 
     Returns
     -------
     VortexPairFit
-        Errors correlated between neighbouring vectors show in the residuals and count as the
-        flow's.
+        Errors correlated between neighbouring vectors appear in the residuals and count as model
+        error.
 
     Raises
     ------
@@ -110,12 +110,12 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     if int(usable.sum()) < 20:
         raise InputError(f"vectors: {int(usable.sum())} are valid; expected at least 20")
     stderr = np.where(usable, stderr if known else 1.0, 1.0)
-    shared = np.nan_to_num(field("vw_correlation", np.zeros(usable.shape))) * usable
-    shared = shared.clip(-0.999, 0.999) if known else 0 * shared
+    rho = np.nan_to_num(field("vw_correlation", np.zeros(usable.shape))) * usable
+    rho = rho.clip(-0.999, 0.999) if known else 0 * rho
     root = np.zeros((2, 2, *usable.shape))
     root[0, 0] = 1 / stderr[0]
-    root[1, 0] = -shared / np.sqrt(1 - shared**2) / stderr[0]
-    root[1, 1] = 1 / np.sqrt(1 - shared**2) / stderr[1]
+    root[1, 0] = -rho / np.sqrt(1 - rho**2) / stderr[0]
+    root[1, 1] = 1 / np.sqrt(1 - rho**2) / stderr[1]
 
     tensors = [torch.as_tensor(np.where(usable, a, 0.0)) for a in (*place, value)]
     valid = torch.as_tensor(usable)

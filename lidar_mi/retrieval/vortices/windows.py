@@ -26,7 +26,7 @@ def vortex_windows(
     ----------
     image1, image2 : torch.Tensor, shape (z, y)
     template, search, stride : int
-        Pixels; they say where vectors are wanted and nothing else.
+        Pixels; only the positions of the vectors depend on them.
     axes : (array, array)
         z and y of the pixels, m.
     dt : float
@@ -37,8 +37,8 @@ def vortex_windows(
     Returns
     -------
     Displacement
-        With the pair's `quantities`. Without a fit that can be believed every vector has the flag
-        NO_MATCH, and no number where there is none.
+        With the pair's `quantities`. If the fit is not accepted every vector has the flag NO_MATCH;
+        without any fit they are NaN.
     """
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)
