@@ -37,6 +37,10 @@ class Flag(enum.IntFlag):
     """The previous pass found an outlier; this one began at its neighbours' median (multi-pass)."""
     UNRELATED = 256
     """The images around it correlate no better than unrelated textures (`relation`)."""
+    SATURATED = 512
+    """The template holds an area saturated in all images, or is saturated by a quarter (`rest`)."""
+    AT_REST = 1024
+    """The template holds structure that stays while the air around it moves (`rest`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:

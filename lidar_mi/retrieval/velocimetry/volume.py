@@ -13,6 +13,7 @@ from lidar_mi.retrieval.velocimetry.multipass import multipass
 from lidar_mi.retrieval.velocimetry.outliers import median_outliers
 from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, uncertain
 from lidar_mi.retrieval.velocimetry.relation import unrelated
+from lidar_mi.retrieval.velocimetry.rest import all_at_rest
 from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
 from lidar_mi.retrieval.velocimetry.variational import variational
 from lidar_mi.retrieval.velocimetry.windows import Windows, working
@@ -110,13 +111,15 @@ def retrieve_wind_volume(
     volumes = [on_device(volume, device) for volume in stack]
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
-    volumes, noise = without_attenuation(volumes, noise)
+    resting, whole = all_at_rest(volumes, windows), volumes
+    volumes, noise = without_attenuation(resting.left_out(volumes), noise)
     steps = spacing(stack[0])
     options = {"min_correlation": min_correlation, "noise": noise, "settings": settings}
     if method == "variational":
         options |= {"more": volumes[2:], "spacing": steps}
     found = METHODS[method](*volumes[:2], template, search, stride, **options)
-    flag = found.flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+    flag = resting.flags(whole, windows, found.flag)
+    flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
     if method == "correlation":
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, spacing=apart, continued=True)

@@ -18,6 +18,7 @@ from lidar_mi.retrieval.velocimetry.multipass import multipass
 from lidar_mi.retrieval.velocimetry.outliers import median_outliers
 from lidar_mi.retrieval.velocimetry.quality import Flag, filled, low_texture, non_finite, uncertain
 from lidar_mi.retrieval.velocimetry.relation import unrelated
+from lidar_mi.retrieval.velocimetry.rest import all_at_rest
 from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
 from lidar_mi.retrieval.velocimetry.variational import variational
 from lidar_mi.retrieval.velocimetry.weight_shift import weight_shift
@@ -214,14 +215,20 @@ def retrieve_wind(
         "blur": blurred,
         "settings": settings,
     }
-    options = {name: offered[name] for name in chosen.options}
     with threads_for(image1.size):
-        found = chosen.find(pixels1, pixels2, template, search, stride, **options)
+        resting = all_at_rest([pixels1, pixels2, *rest], windows)
+        pair = [pixels1, pixels2]
+        if chosen.centred:
+            # these leave out pixels; a correlation of windows would lose all that see one
+            pair = resting.left_out(pair)
+            offered["more"] = resting.left_out(rest)
+        options = {name: offered[name] for name in chosen.options}
+        found = chosen.find(*pair, template, search, stride, **options)
         level = 0.0 if noise is None else noise
         texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
-        flag = found.flag
+        flag = resting.flags([pixels1, pixels2, *rest], windows, found.flag)
         if found.covariance is not None:
             flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
         if chosen.local:

@@ -1,0 +1,144 @@
+"""Saturation and structure at rest: detects vectors called valid on them, and any lost without.
+
+Wind, textures, seeds and places are none of those that the thresholds were tried on.
+"""
+
+import numpy as np
+import pytest
+import torch
+
+from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.retrieval.velocimetry.quality import Flag
+from lidar_mi.retrieval.velocimetry.rest import all_at_rest, saturated
+from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.velocimetry.windows import Windows
+from tests.support.flows import axes, data_array, origin, plane_waves, texture
+from tests.support.volumes import shifted
+
+DT = 0.1
+COLUMNS, ROWS = 104, 84
+
+
+def pair(seed, length=3.5, noise=0.03, mean=(-9.0, 5.0), circulation=200.0):
+    """Images (arrays) of two vortices in a crosswind, and v at the pixels."""
+    y, z = axes(COLUMNS, ROWS)
+    grid = np.meshgrid(y, z)
+    vortices = vortex_pair(circulation, 40.0, 3.0)
+
+    def wind(y, z):
+        return [part + more for part, more in zip(velocity(vortices, y, z), mean, strict=True)]
+
+    waves, random = plane_waves(seed, length, 0.5), np.random.default_rng(seed)
+    return [
+        texture(waves, *place) + noise * random.standard_normal((ROWS, COLUMNS))
+        for place in (grid, origin(wind, *grid, DT))
+    ], wind(*grid)[0]
+
+
+def found_at_rest(images):
+    return all_at_rest([torch.as_tensor(i) for i in images], Windows((ROWS, COLUMNS), 8, 16, 1))
+
+
+def retrieved(images, method):
+    y, z = axes(COLUMNS, ROWS)
+    return retrieve_wind(*(data_array(i, y, z) for i in images), DT, method, stride=2)
+
+
+@pytest.mark.parametrize(("length", "noise"), [(1.8, 0.0), (2.6, 0.05), (5.0, 0.02)])
+def test_nothing_is_at_rest_in_moving_air(length, noise):
+    for seed, mean in ((61, (-9.0, 5.0)), (62, (3.0, -12.0)), (63, (0.0, 0.0))):
+        images, _ = pair(seed, length, noise, mean, 350.0)
+        found = found_at_rest(images)
+        assert not bool(found.structure.any()) and not bool(found.saturated.any())
+
+
+@pytest.mark.parametrize("method", ["cc", "variational"])
+def test_a_saturated_block_makes_no_confident_wrong_winds(method):
+    """10 times the mean in both images: it was 67 % valid, off by 99 times the stated errors."""
+    images, v = pair(64)
+    for image in images:
+        image[30:52, 22:47] = 10.0
+    wind = retrieved(images, method)
+    y, z = axes(COLUMNS, ROWS)
+    held = wind.flag.sel(y=slice(y[22], y[46]), z=slice(z[30], z[51]))
+    assert ((held & Flag.SATURATED.value) > 0).all()
+    good = (wind.flag == 0).values
+    assert 0.7 < good.mean() < 0.95
+    off = (wind.v - data_array(v, y, z).interp(y=wind.y, z=wind.z)).values[good]
+    if method == "variational":
+        # an error of standard errors that are a quarter too small
+        assert np.sqrt(np.mean((off / wind.v_stderr.values[good]) ** 2)) < 1.5
+        assert np.sqrt(np.mean(off**2)) < 0.3
+
+
+def test_moving_texture_that_is_clipped_is_flagged_only_where_little_else_is_left():
+    images, _ = pair(65)
+    whole = retrieved(images, "cc")
+    clipped = [np.minimum(image, 1.25) for image in images]
+    wind = retrieved(clipped, "cc")
+    flagged = ((wind.flag & Flag.SATURATED.value) > 0).values
+    piled = np.stack([i == 1.25 for i in clipped]).mean((1, 2))
+    assert 0.01 < flagged.mean() < 3 * piled.mean()
+    others = (wind.flag.values == 0) & ~flagged
+    assert others[~flagged].mean() > (whole.flag.values == 0)[~flagged].mean() - 0.02
+
+
+def test_what_counts_as_saturated():
+    random = np.random.default_rng(66)
+    plain = torch.as_tensor(random.normal(1.0, 0.2, (80, 90)))
+    counts = torch.as_tensor(random.poisson(0.7, (80, 90)).astype(float))
+    eight_bits = (100 * plain).round().clamp(max=255)
+    for image in (plain, counts, eight_bits, torch.ones(80, 90), plain.float()):
+        assert not bool(saturated(image).any())
+    top = plain.clamp(max=1.3)
+    assert torch.equal(saturated(top), plain >= 1.3)
+    high = eight_bits.clamp(max=130)
+    assert torch.equal(saturated(high), eight_bits >= 130)
+
+
+@pytest.mark.parametrize(("kind", "least"), [("dead", 0.8), ("bright", 0.8), ("dirt", 0.25)])
+def test_structure_at_rest_is_found(kind, least):
+    """Of its pixels at least so many; and hardly a pixel elsewhere."""
+    images, _ = pair(67)
+    z, y = np.mgrid[:ROWS, :COLUMNS]
+    place = np.zeros((ROWS, COLUMNS), bool)
+    random = np.random.default_rng(68)
+    if kind in ("dead", "bright"):
+        place[random.integers(12, ROWS - 12, 12), random.integers(12, COLUMNS - 12, 12)] = True
+    if kind == "dirt":
+        place = (np.abs(z - 50) < 4) & (np.abs(y - 30) < 4)
+    for image in images:
+        image[place] *= {"dead": 0.0, "bright": 4.0, "dirt": 0.25}[kind]
+    found = found_at_rest(images).structure.numpy()
+    assert found[place].mean() > least
+    near = torch.nn.functional.max_pool2d(torch.as_tensor(place)[None].double(), 9, 1, 4)[0] > 0
+    assert found[~near.numpy()].mean() < 1e-3
+    wind = retrieved(images, "variational")
+    assert bool(((wind.flag & Flag.AT_REST.value) > 0).any())
+    assert not bool(((wind.flag & Flag.NON_FINITE_INPUT.value) > 0).any())
+    assert float((wind.flag == 0).mean()) > 0.6
+
+
+def test_saturated_voxels():
+    first, second = shifted((16, 24, 28), (0.2, 0.4, -0.6), 0.01, seed=69)
+    for volume in (first, second):
+        volume.values[3:12, 6:14, 4:12] = 9.0
+    wind = retrieve_wind_volume(first, second, DT, method="correlation", stride=4)
+    flagged = (wind.flag & Flag.SATURATED.value) > 0
+    assert bool(flagged.any()) and not bool(flagged.all())
+    assert not bool(((wind.flag & Flag.NON_FINITE_INPUT.value) > 0).any())
+
+
+@pytest.mark.parametrize("roll", [(0, 0), (2, 0), (-1, 3)])
+def test_identical_and_rolled_images_without_noise(roll):
+    """Their factorisation failed. Errors: a seam where the image's ends meet is no texture."""
+    y, z = axes(64, 48)
+    first = texture(plane_waves(3, 3.0, 0.5), *np.meshgrid(y, z))
+    second = np.roll(first, roll, (0, 1))
+    for method, limit in (("ws", 1e-6), ("multipass", 0.01), ("variational", 0.01)):
+        wind = retrieve_wind(data_array(first, y, z), data_array(second, y, z), DT, method)
+        good = (wind.flag == 0).values
+        off = np.hypot(wind.displacement_z / 0.5 - roll[0], wind.displacement_y / 0.5 - roll[1])
+        assert good.mean() > 0.95
+        assert float(np.median(off.values[good])) < limit
