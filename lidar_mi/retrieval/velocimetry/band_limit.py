@@ -49,6 +49,7 @@ def best_filter(
     mismatch: torch.Tensor | None = None,
     weight: torch.Tensor | None = None,
     blur: float = 0.0,
+    known: torch.Tensor | None = None,
 ) -> Filter:
     """The filter of least variance of a displacement between images.
 
@@ -64,7 +65,7 @@ def best_filter(
     sizes : sequence of int
         Odd lengths of the Fourier transforms.
     settings : FilterSettings
-    noise, mismatch, weight, blur
+    noise, mismatch, weight, blur, known
         See `warping.band_limited`.
     """
     shape = images.shape[1:]
@@ -72,7 +73,7 @@ def best_filter(
     radius = _radius(frequency)
     shell = shells(frequency, shape)
     density, uncertainty = shell_means(
-        images if weight is None else images * weight, shell, sizes, settings.smoothing
+        images if weight is None else images * weight, shell, sizes, settings.smoothing, known
     )
     below = 1 + settings.threshold * uncertainty
     if mismatch is not None:
@@ -152,9 +153,15 @@ def _radius(frequency: Sequence[torch.Tensor]) -> torch.Tensor:
 
 
 def shell_means(
-    images: torch.Tensor, shell: torch.Tensor, sizes: Sequence[int], smoothing: int
+    images: torch.Tensor,
+    shell: torch.Tensor,
+    sizes: Sequence[int],
+    smoothing: int,
+    known: torch.Tensor | None = None,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Power spectrum by shells of wavenumber, mean over the images; white noise gives its variance.
+
+    So it does where only some pixels are `known`, (images, ...), and the others are the mean.
 
     Each shell's value is a mean over `smoothing` neighbours. Returns these means and their
     relative standard errors.
@@ -168,7 +175,10 @@ def shell_means(
     mean = (images * window).sum(dims, keepdim=True) / window.sum()
     power = torch.fft.rfftn((images - mean) * window, s=list(sizes), dim=dims)
     power = power.abs().square().mean(0)
-    power = power / window.square().sum()
+    covered = window.square()
+    if known is not None and not bool(known.all()):
+        covered = (covered * known).sum() / len(images)
+    power = power / covered.sum().clamp(min=1e-30)
     number = torch.bincount(shell.flatten())
     total = torch.bincount(shell.flatten(), weights=power.flatten())
     kernel = torch.ones(1, 1, smoothing, dtype=images.dtype, device=images.device)

@@ -9,12 +9,17 @@ from lidar_mi.retrieval.velocimetry.windows import stored, working
 
 
 def normalised(images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Images of one texture but unlike brightness: all with mean 0 and the first one's contrast."""
+    """Images of one texture but unlike brightness: all with mean 0 and the first one's contrast.
+
+    Non-finite pixels are NaN.
+    """
+    finite = torch.stack([torch.isfinite(image) for image in images])
     images = [stored(filled(image)) for image in images]
     images = torch.stack([image - image.mean() for image in images])
     dims = tuple(range(1, images.ndim))
     contrast = images.square().mean(dims, keepdim=True).sqrt()
-    return images * torch.where(contrast > 0, contrast[:1] / contrast, 1.0)
+    images = images * torch.where(contrast > 0, contrast[:1] / contrast, 1.0)
+    return torch.where(finite, images, torch.nan)
 
 
 def of_one_brightness(

@@ -3,19 +3,24 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from scipy import ndimage
-from torch.nn.functional import avg_pool2d, grid_sample, max_pool2d, pad
+from torch.nn.functional import grid_sample, max_pool2d, pad
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
+from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import coarse_windows
 from lidar_mi.retrieval.velocimetry.quality import Flag, non_finite
-from lidar_mi.retrieval.velocimetry.windows import Windows, linear_weights, separable, working
+from lidar_mi.retrieval.velocimetry.saturation import saturated, saturated_areas
+from lidar_mi.retrieval.velocimetry.windows import (
+    Windows,
+    averaged,
+    box_sum,
+    linear_weights,
+    separable,
+    working,
+)
 
-# Pixels at the largest value for each at the values below it, at which values pile up.
-_PILED = 10
 # Fraction of a template at the largest value that leaves too little to see.
 _SATURATED = 0.25
 # Coarse vectors along each axis whose median is the motion around a place.
@@ -26,31 +31,24 @@ _SLOWEST = 1.0
 _SIZES = (1, 3, 5, 9)
 # Standard deviations of the image, of spots of one size, that a spot must exceed.
 _OUTSTANDING = 5.0
-
-
-def saturated(image: torch.Tensor) -> torch.Tensor:
-    """Pixels at the largest value of an image or volume, if values pile up there.
-
-    The tail of a distribution falls: more than 10 times as many pixels at the last value as at each
-    of the 10 before it, and at least 10, are no tail. An image that is half at its largest value
-    is not saturated but empty.
-    """
-    finite = image[torch.isfinite(image)]
-    if not finite.numel():
-        return torch.zeros_like(image, dtype=torch.bool)
-    values, number = torch.unique(finite, return_counts=True)
-    before = number[-11:-1]
-    piled = len(values) > 10 and int(number[-1]) > _PILED * max(1, int(before.max()))
-    few = 2 * int(number[-1]) < finite.numel()
-    return (image == values[-1]) & (piled and few)
+# Px; spots give way to the mean over Gaussians of this width before the motion is looked for.
+_FILLED = 3.0
 
 
 class AtRest(NamedTuple):
     """What two or more images have in common that does not move, bool in the images' shape.
 
-    `saturated` are areas of at least half a template, `structure` is that of `at_rest`.
+    Attributes
+    ----------
+    piled : torch.Tensor
+        Saturated pixels, of each image.
+    saturated : torch.Tensor
+        Areas of them of at least half a template, see `saturation.saturated_areas`.
+    structure : torch.Tensor
+        That of `at_rest`.
     """
 
+    piled: torch.Tensor
     saturated: torch.Tensor
     structure: torch.Tensor
 
@@ -59,34 +57,62 @@ class AtRest(NamedTuple):
         return [_left_out(image, self.saturated | self.structure) for image in images]
 
     def flags(
-        self, images: Sequence[torch.Tensor], windows: Windows, flag: torch.Tensor
+        self, found: Displacement, images: Sequence[torch.Tensor], windows: Windows, left_out: bool
     ) -> torch.Tensor:
-        """The flags of vectors from images that were `left_out`, with the reason by its name.
+        """The flags of vectors, with the reasons by their names.
 
-        Non-finite input is only what the images themselves hold.
+        Parameters
+        ----------
+        found : Displacement
+        images : sequence of torch.Tensor
+            As they are.
+        windows : Windows
+        left_out : bool
+            The vectors are from what was `left_out` of the images. Flags of non-finite input stay
+            where the images themselves hold it. Otherwise the place in image 2 counts as well, and
+            of saturated areas all of the search region.
         """
+        flag = found.flag
         bad = non_finite(images, windows)
-        lost = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
-        flag = flag & ~(Flag.NON_FINITE_INPUT * lost).to(flag.dtype)
-        piled = torch.stack([windows.of_templates(working(saturated(i))) for i in images]).amax(0)
-        lost &= (flag & Flag.NO_MATCH.value) > 0
-        for bit, pixels, more in (
-            (Flag.SATURATED, self.saturated, piled > _SATURATED),
-            (Flag.AT_REST, self.structure, torch.zeros_like(lost)),
+        hidden = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
+        flag = flag & ~(Flag.NON_FINITE_INPUT * hidden).to(flag.dtype)
+        wide = ~torch.isfinite(found.d).all(0) & ~bad
+        piled = windows.of_templates(working(self.piled)).amax(0) > _SATURATED
+        # an area of another brightness spoils a correlation from afar
+        for bit, pixels, here, reach in (
+            (Flag.SATURATED, self.saturated, piled, wide if left_out else ~bad),
+            (Flag.AT_REST, self.structure, torch.zeros_like(bad), wide),
         ):
-            holds = windows.of_templates(working(pixels)) > 0
-            holds |= more | (lost & (windows.of_regions(working(pixels)) > 0))
-            flag = flag | (bit * holds).to(flag.dtype)
+            here = here | (windows.of_templates(working(pixels)) > 0)
+            here |= reach & (windows.of_regions(working(pixels)) > 0)
+            if not left_out:
+                here |= _matched(pixels, windows, found.d)
+            flag = flag | (bit * here).to(flag.dtype)
         return flag
+
+
+def _matched(pixels: torch.Tensor, windows: Windows, d: torch.Tensor) -> torch.Tensor:
+    """Whether there are such pixels where a template, moved by d px, lies in image 2."""
+    n = windows.template
+    boxes = box_sum(box_sum(working(pixels), n, -1), n, -2) > 0
+    starts = [torch.tensor(windows.starts(axis), device=d.device) for axis in (0, 1)]
+    row, column = (
+        (start + part.nan_to_num(0.0).round().long()).clamp(0, size - 1)
+        for start, part, size in zip(
+            torch.meshgrid(*starts, indexing="ij"), d, boxes.shape, strict=True
+        )
+    )
+    return boxes[row, column]
 
 
 def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
     """Saturated areas of images or volumes, and structure at rest of images."""
-    areas = saturated_at_rest(images, windows.template)
+    piled = torch.stack([saturated(image) for image in images])
+    areas = saturated_areas(piled, windows)
     if windows.dims > 2:
-        return AtRest(areas, torch.zeros_like(areas))
+        return AtRest(piled, areas, torch.zeros_like(areas))
     first, second = (_left_out(image, areas) for image in images[:2])
-    return AtRest(areas, at_rest(first, second, windows) & ~areas)
+    return AtRest(piled, areas, at_rest(first, second, windows) & ~areas)
 
 
 def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
@@ -96,29 +122,15 @@ def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     return torch.where(pixels, torch.nan, image)
 
 
-def saturated_at_rest(images: Sequence[torch.Tensor], template: int) -> torch.Tensor:
-    """Areas of at least half a template that are saturated in all images.
-
-    Texture that is cut off at its brightest spots moves with the air: it is no such area.
-    """
-    both = torch.stack([saturated(image) for image in images]).all(0)
-    if not bool(both.any()):
-        return both
-    label, number = ndimage.label(both.cpu().numpy())
-    size = np.bincount(label.ravel(), minlength=number + 1)
-    size[0] = 0
-    return torch.as_tensor(size[label] >= template**both.ndim / 2, device=both.device)
-
-
 def at_rest(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:
     """Pixels with structure that stays where it is while the air around it moves.
 
-    The motion d around a place is the median of 5 x 5 coarse vectors. Structure is at rest where
-    the images agree better at rest than along d, forward from image 1 and back from image 2.
     Spots of 1, 3, 5 and 9 px count (mean over a square less that over one three times as large):
-    beyond 5 robust standard deviations in both images, alike there to 0.3 of their height, and
-    unlike by 0.7 of it along d both ways. Gaussian texture has one such pixel in two millions in
-    one image alone.
+    beyond 5 robust standard deviations in both images, and alike there to 0.3 of their height. The
+    motion d around them is the median of 5 x 5 coarse vectors of the images without these spots.
+    Spots are at rest where the images differ by 0.7 of the height along d, forward from image 1
+    and back from image 2. Gaussian texture has one pixel beyond 5 standard deviations in two
+    millions, in one image alone.
 
     Not found: structure where the air moves by less than a pixel, where it fills most of 5 coarse
     windows, edges, or a pattern so weak or so dense that no place stands out. Bright air that
@@ -133,32 +145,52 @@ def at_rest(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> tor
     -------
     torch.Tensor of bool, shape (z, y)
     """
-    d = _around(image1, image2, windows)
-    moving = d.norm(dim=0) >= _SLOWEST
-    if not bool(moving.any()):
-        return moving
-    first, second = normalised([image1, image2])
-    found = torch.zeros_like(moving)
-    for size in _SIZES:
-        found |= _spots(first, second, d, size)
-    found &= moving
-    return max_pool2d(found[None].double(), 3, 1, 1)[0] > 0
+    first, second = normalised([image1, image2]).nan_to_num(0.0)
+    means = {size: _means(first, second, size) for size in {*_SIZES, *(3 * n for n in _SIZES)}}
+    spots = [_spots(means[size] - means[3 * size]) for size in _SIZES]
+    candidates = torch.stack([_grown(s.alike, z) for s, z in zip(spots, _SIZES, strict=True)])
+    candidates = candidates.any(0)
+    if not bool(candidates.any()):
+        return candidates
+    d = _around(*(_filled(image, candidates) for image in (image1, image2)), windows)
+    found = torch.zeros_like(candidates)
+    for spot, size in zip(spots, _SIZES, strict=True):
+        found |= _grown(spot.alike & spot.apart(d), size)
+    return _grown(found & (d.norm(dim=0) >= _SLOWEST), 3)
 
 
-def _spots(first: torch.Tensor, second: torch.Tensor, d: torch.Tensor, size: int) -> torch.Tensor:
-    """Pixels of spots that both images have, and that did not come along d nor go on."""
-    one, two = (_mean(image, size) - _mean(image, 3 * size) for image in (first, second))
+class _Spots(NamedTuple):
+    """Two images of spots of one size, and where both have alike ones that stand out."""
+
+    one: torch.Tensor
+    two: torch.Tensor
+    alike: torch.Tensor
+
+    def apart(self, d: torch.Tensor) -> torch.Tensor:
+        """Where spots neither came along d nor go on."""
+        off = (self.two - _moved(self.one, -d)).abs(), (self.one - _moved(self.two, d)).abs()
+        return torch.minimum(*off) > 0.7 * torch.minimum(self.one.abs(), self.two.abs())
+
+
+def _spots(pair: torch.Tensor) -> _Spots:
+    one, two = pair
     least = torch.minimum(one.abs(), two.abs())
     outstanding = _OUTSTANDING * 1.4826 * torch.maximum(one.abs().median(), two.abs().median())
-    apart = torch.minimum((two - _moved(one, -d)).abs(), (one - _moved(two, d)).abs())
-    alike = (two - one).abs() < 0.3 * least
-    spots = (least > outstanding) & alike & (apart > 0.7 * least)
-    return max_pool2d(spots[None].double(), size, 1, size // 2)[0] > 0
+    return _Spots(one, two, (least > outstanding) & ((two - one).abs() < 0.3 * least))
 
 
-def _mean(image: torch.Tensor, size: int) -> torch.Tensor:
-    rim = (size // 2,) * 4
-    return avg_pool2d(pad(image[None], rim, "replicate"), size, 1)[0]
+def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:
+    return max_pool2d(pixels[None].double(), size, 1, size // 2)[0] > 0
+
+
+def _means(first: torch.Tensor, second: torch.Tensor, size: int) -> torch.Tensor:
+    images = pad(torch.stack([first, second]), (size // 2,) * 4, "replicate")
+    return box_sum(box_sum(images, size, -1), size, -2) / size**2
+
+
+def _filled(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    image = working(image)
+    return torch.where(pixels, averaged(image, torch.isfinite(image) & ~pixels, _FILLED), image)
 
 
 def _around(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:

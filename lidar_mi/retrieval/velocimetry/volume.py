@@ -118,7 +118,7 @@ def retrieve_wind_volume(
     if method == "variational":
         options |= {"more": volumes[2:], "spacing": steps}
     found = METHODS[method](*volumes[:2], template, search, stride, **options)
-    flag = resting.flags(whole, windows, found.flag)
+    flag = resting.flags(found, whole, windows, True)
     flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
     if method == "correlation":
         apart = max(1, round(template / 2 / stride))

@@ -181,7 +181,7 @@ def band_limited(
     Parameters
     ----------
     images : torch.Tensor, shape (images, ...)
-        Non-finite pixels take the image's mean.
+        Non-finite pixels take the image's mean, and do not count in the power spectrum.
     noise : float, optional
         Standard deviation of the images' white noise. Left out: from the lowest shell of the
         power spectrum.
@@ -211,11 +211,12 @@ def band_limited(
     """
     checked_noise(noise)
     settings = settings or FilterSettings()
+    known = torch.stack([torch.isfinite(image) for image in images])
     images = torch.stack([stored(filled(image)) for image in images])
     shape, margin, finer = tuple(images.shape[1:]), settings.margin, settings.nodes
     sizes = [odd_fast_len(n + 2 * margin) for n in shape]
     dims = tuple(range(1, images.ndim))
-    chosen = best_filter(images, sizes, settings, noise, mismatch, weight, blur)
+    chosen = best_filter(images, sizes, settings, noise, mismatch, weight, blur, known)
 
     frequency = frequencies(sizes, images)
     gain = chosen.gain[shells(frequency, shape)]

@@ -228,7 +228,7 @@ def retrieve_wind(
         texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
-        flag = resting.flags([pixels1, pixels2, *rest], windows, found.flag)
+        flag = resting.flags(found, [pixels1, pixels2, *rest], windows, chosen.centred)
         if found.covariance is not None:
             flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
         if chosen.local:

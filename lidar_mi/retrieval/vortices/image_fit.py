@@ -200,7 +200,7 @@ def fit_pixels(
     if float(finite.double().mean()) < 0.5:
         return no_fit(profile, f"{float(finite.double().mean()):.0%} of the pixels are finite")
     # in units of image 1's own structure, so that no constant depends on the images' unit
-    pair = normalised([image1.double(), image2.double()])
+    pair = normalised([image1.double(), image2.double()]).nan_to_num(0.0)
     contrast = pair[0][finite].std()
     scale = filled(image1.double()).abs().max()
     if not bool(contrast > 1e-9 * scale) or not bool(pair[1][finite].std() > 0):

@@ -45,7 +45,22 @@ def retrieved(images, method):
     return retrieve_wind(*(data_array(i, y, z) for i in images), DT, method, stride=2)
 
 
-@pytest.mark.parametrize(("length", "noise"), [(1.8, 0.0), (2.6, 0.05), (5.0, 0.02)])
+def errors(wind, v):
+    """Of v, at the places of the vectors."""
+    return (
+        wind.v.values
+        - data_array(v, *axes(COLUMNS, ROWS)).interp(y=wind.y_vector, z=wind.z_vector).values
+    )
+
+
+def ratio(wind, off, good):
+    """Rms of the errors in stated standard errors."""
+    return np.sqrt(np.mean((off / wind.v_stderr.values)[good] ** 2))
+
+
+@pytest.mark.parametrize(
+    ("length", "noise"), [(1.8, 0.0), pytest.param(2.6, 0.05, marks=pytest.mark.slow), (5.0, 0.02)]
+)
 def test_nothing_is_at_rest_in_moving_air(length, noise):
     for seed, mean in ((61, (-9.0, 5.0)), (62, (3.0, -12.0)), (63, (0.0, 0.0))):
         images, _ = pair(seed, length, noise, mean, 350.0)
@@ -53,35 +68,62 @@ def test_nothing_is_at_rest_in_moving_air(length, noise):
         assert not bool(found.structure.any()) and not bool(found.saturated.any())
 
 
-@pytest.mark.parametrize("method", ["cc", "variational"])
-def test_a_saturated_block_makes_no_confident_wrong_winds(method):
-    """10 times the mean in both images: it was 67 % valid, off by 99 times the stated errors."""
+@pytest.mark.parametrize(
+    "method",
+    [pytest.param(m, marks=pytest.mark.slow) for m in ("cc", "ws", "multipass")] + ["variational"],
+)
+def test_a_saturated_block_is_flagged_and_harms_nothing_else(method):
+    """10 times the mean in both images: variational was 67 % valid, off by 99 stated errors."""
     images, v = pair(64)
-    for image in images:
-        image[30:52, 22:47] = 10.0
-    wind = retrieved(images, method)
+    clean = retrieved(images, method)
     y, z = axes(COLUMNS, ROWS)
-    held = wind.flag.sel(y=slice(y[22], y[46]), z=slice(z[30], z[51]))
-    assert ((held & Flag.SATURATED.value) > 0).all()
+    spoiled = [image.copy() for image in images]
+    for image in spoiled:
+        image[30:52, 22:47] = 10.0
+    wind = retrieved(spoiled, method)
+    flagged = (wind.flag & Flag.SATURATED.value) > 0
+    assert flagged.sel(y=slice(y[22], y[46]), z=slice(z[30], z[51])).all()
+    assert flagged.mean() < 0.25
+    good, whole = ((w.flag == 0).values for w in (wind, clean))
+    assert np.isfinite(wind.v.values[good]).all()
+    elsewhere = ~flagged.values
+    assert good[elsewhere].mean() > whole[elsewhere].mean() - 0.01
+    both = good & whole
+    off, least = errors(wind, v), errors(clean, v)
+    assert np.sqrt(np.mean(off[both] ** 2)) < 1.15 * np.sqrt(np.mean(least[both] ** 2))
+    if np.isfinite(wind.v_stderr.values[both]).all():
+        assert ratio(wind, off, both) < 1.15 * max(1.0, ratio(clean, least, both))
+
+
+@pytest.mark.slow
+def test_an_area_that_saturates_in_one_image_alone():
+    images, v = pair(64)
+    images[1][30:52, 22:47] = 10.0
+    wind = retrieved(images, "variational")
     good = (wind.flag == 0).values
-    assert 0.7 < good.mean() < 0.95
-    off = (wind.v - data_array(v, y, z).interp(y=wind.y, z=wind.z)).values[good]
-    if method == "variational":
-        # an error of standard errors that are a quarter too small
-        assert np.sqrt(np.mean((off / wind.v_stderr.values[good]) ** 2)) < 1.5
-        assert np.sqrt(np.mean(off**2)) < 0.3
+    assert 0.75 < good.mean() < 0.9
+    assert ratio(wind, errors(wind, v), good) < 1.5
 
 
-def test_moving_texture_that_is_clipped_is_flagged_only_where_little_else_is_left():
-    images, _ = pair(65)
-    whole = retrieved(images, "cc")
-    clipped = [np.minimum(image, 1.25) for image in images]
-    wind = retrieved(clipped, "cc")
+@pytest.mark.parametrize(
+    "method",
+    [pytest.param(m, marks=pytest.mark.slow) for m in ("cc", "ws", "variational")] + ["multipass"],
+)
+def test_images_clipped_at_the_brightest_2_percent(method):
+    """Texture that is cut off moves with the air: few vectors are lost, and all are honest."""
+    images, v = pair(65)
+    clean = retrieved(images, method)
+    level = np.quantile(images[0], 0.98)
+    wind = retrieved([np.minimum(image, level) for image in images], method)
     flagged = ((wind.flag & Flag.SATURATED.value) > 0).values
-    piled = np.stack([i == 1.25 for i in clipped]).mean((1, 2))
-    assert 0.01 < flagged.mean() < 3 * piled.mean()
-    others = (wind.flag.values == 0) & ~flagged
-    assert others[~flagged].mean() > (whole.flag.values == 0)[~flagged].mean() - 0.02
+    assert 0 < flagged.mean() < 0.05
+    good, whole = ((w.flag == 0).values for w in (wind, clean))
+    assert good[~flagged].mean() > whole[~flagged].mean() - 0.02
+    both = good & whole
+    off, least = errors(wind, v), errors(clean, v)
+    assert np.sqrt(np.mean(off[both] ** 2)) < 1.1 * np.sqrt(np.mean(least[both] ** 2))
+    if np.isfinite(wind.v_stderr.values[both]).all():
+        assert ratio(wind, off, both) < 1.1 * max(1.0, ratio(clean, least, both))
 
 
 def test_what_counts_as_saturated():
@@ -89,7 +131,8 @@ def test_what_counts_as_saturated():
     plain = torch.as_tensor(random.normal(1.0, 0.2, (80, 90)))
     counts = torch.as_tensor(random.poisson(0.7, (80, 90)).astype(float))
     eight_bits = (100 * plain).round().clamp(max=255)
-    for image in (plain, counts, eight_bits, torch.ones(80, 90), plain.float()):
+    two_levels = (plain > 1.2).double()
+    for image in (plain, counts, eight_bits, two_levels, torch.ones(80, 90), plain.float()):
         assert not bool(saturated(image).any())
     top = plain.clamp(max=1.3)
     assert torch.equal(saturated(top), plain >= 1.3)
@@ -97,7 +140,37 @@ def test_what_counts_as_saturated():
     assert torch.equal(saturated(high), eight_bits >= 130)
 
 
-@pytest.mark.parametrize(("kind", "least"), [("dead", 0.8), ("bright", 0.8), ("dirt", 0.25)])
+def test_rate_of_false_alarms_of_saturation():
+    """Of images whose largest values are the rarest, none beyond the rate (4 sigma).
+
+    The rate is reached where the number at each value is the same.
+    """
+    number, rate = 200, 0.05
+    most = number * rate + 4 * np.sqrt(number * rate * (1 - rate))
+    for draw in (
+        lambda random: random.normal(100, 4, 2000).round(),
+        lambda random: random.poisson(3.0, 2000),
+        lambda random: random.exponential(5.0, 2000).round(),
+        lambda random: random.integers(0, 40, 2000),
+    ):
+        seen = 0
+        for seed in range(number):
+            image = torch.as_tensor(draw(np.random.default_rng([67, seed])).astype(float))
+            seen += bool(saturated(image, rate).any())
+        assert seen <= most
+
+
+@pytest.mark.parametrize(("fraction", "least"), [(0.005, 0.8), (0.01, 1.0), (0.1, 1.0)])
+def test_saturation_is_found_by_how_much_of_8_bits_is_clipped(fraction, least):
+    seen = []
+    for seed in range(40):
+        image = np.random.default_rng([68, seed]).normal(100, 20, (80, 90))
+        clipped = np.minimum(image, np.quantile(image, 1 - fraction)).round()
+        seen.append(bool(saturated(torch.as_tensor(clipped)).any()))
+    assert np.mean(seen) >= least
+
+
+@pytest.mark.parametrize(("kind", "least"), [("dead", 0.9), ("bright", 0.9), ("dirt", 0.25)])
 def test_structure_at_rest_is_found(kind, least):
     """Of its pixels at least so many; and hardly a pixel elsewhere."""
     images, _ = pair(67)
@@ -114,10 +187,16 @@ def test_structure_at_rest_is_found(kind, least):
     assert found[place].mean() > least
     near = torch.nn.functional.max_pool2d(torch.as_tensor(place)[None].double(), 9, 1, 4)[0] > 0
     assert found[~near.numpy()].mean() < 1e-3
-    wind = retrieved(images, "variational")
+    wind = retrieved(images, "cc" if kind == "bright" else "multipass")
     assert bool(((wind.flag & Flag.AT_REST.value) > 0).any())
     assert not bool(((wind.flag & Flag.NON_FINITE_INPUT.value) > 0).any())
-    assert float((wind.flag == 0).mean()) > 0.6
+    good = (wind.flag == 0).values
+    assert good.mean() > 0.4
+    clean, v = pair(67)
+    clean = retrieved(clean, wind.method)
+    both = good & (clean.flag == 0).values
+    off, least = (np.sqrt(np.mean(errors(w, v)[both] ** 2)) for w in (wind, clean))
+    assert off < 1.15 * least
 
 
 def test_saturated_voxels():
@@ -130,7 +209,9 @@ def test_saturated_voxels():
     assert not bool(((wind.flag & Flag.NON_FINITE_INPUT.value) > 0).any())
 
 
-@pytest.mark.parametrize("roll", [(0, 0), (2, 0), (-1, 3)])
+@pytest.mark.parametrize(
+    "roll", [pytest.param(r, marks=pytest.mark.slow) for r in ((0, 0), (2, 0))] + [(-1, 3)]
+)
 def test_identical_and_rolled_images_without_noise(roll):
     """Their factorisation failed. Errors: a seam where the image's ends meet is no texture."""
     y, z = axes(64, 48)
