@@ -38,7 +38,7 @@ def one_line(message: object, longest: int = LONGEST) -> str:
         return text
     # the beginning says where, the end what is allowed
     tail = longest // 3
-    return f"{text[: longest - tail - 5]} ... {text[-tail:]}"
+    return f"{text[: longest - tail - 5].rstrip()} ... {text[-tail:].lstrip()}"
 
 
 def _escaped(character: str) -> str:

@@ -13,10 +13,15 @@ if IS_WORKER:  # before anything imports numpy or torch
     for library in ("OMP", "OPENBLAS", "MKL", "NUMBA"):
         os.environ[f"{library}_NUM_THREADS"] = "1"
 
+import hypothesis
 import pytest
 
 # the package chooses Dr.Jit's LLVM, so it comes before anything that imports drjit
 import lidar_mi  # noqa: F401
+
+# the same cases in every run; `python -m tests.fuzz` draws new ones
+hypothesis.settings.register_profile("reproducible", derandomize=True, database=None, deadline=None)
+hypothesis.settings.load_profile("reproducible")
 
 
 def pytest_configure():

@@ -23,6 +23,11 @@ def test_a_long_message_keeps_its_ends():
     assert message.endswith("99 is not allowed; expected at most 3")
 
 
+def test_a_shortened_message_is_not_shortened_again():
+    message = one_line("0 " * 5000)
+    assert "  " not in message and one_line(message) == message
+
+
 @pytest.mark.parametrize("text", ["\x1b[31mred", "\x9b31m", "\u202eright to left", "\udc80"])
 def test_what_a_terminal_obeys_is_escaped(text, capsys):
     assert printable(text).isascii() and "\\" in printable(text)

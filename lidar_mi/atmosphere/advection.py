@@ -45,8 +45,11 @@ def _departures(velocity, dt, steps):
     samplers = [_sampler(component) for component in velocity]
     h = dt / steps
     place = np.indices(velocity[0].shape, dtype=float)
-    for _ in range(steps):
-        half = place - 0.5 * h * np.stack([sample(place) for sample in samplers])
+    there = np.stack(velocity)  # of the nodes themselves nothing is to be interpolated
+    for step in range(steps):
+        if step:
+            there = np.stack([sample(place) for sample in samplers])
+        half = place - 0.5 * h * there
         place = place - h * np.stack([sample(half) for sample in samplers])
     return place
 

@@ -352,6 +352,7 @@ def test_error_of_the_true_wind_is_zero_at_its_place():
     assert off == pytest.approx((0.5, 0.5))
 
 
+@pytest.mark.slow
 def test_rendered_pictures_have_a_row_for_every_energy_and_method(monkeypatch):
     monkeypatch.setattr(rendered, "ENERGIES", (1e-4, 1e-2))
     found = rendered.compare(1, 60, 50, 16, ("cc", "multipass"))
@@ -369,6 +370,7 @@ def test_rendered_pictures_have_a_row_for_every_energy_and_method(monkeypatch):
     assert "paths" in dark[0].note and "paths" not in dark[1].note
 
 
+@pytest.mark.slow
 def test_threads_are_compared_quiet_and_busy():
     before = torch.get_num_threads(), thread_choice.SMALL
     found = threads.compare(1, ((40, 32),))

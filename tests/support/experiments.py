@@ -2,6 +2,7 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
+from io import BytesIO
 
 import numpy as np
 import OpenEXR
@@ -81,6 +82,21 @@ def leave_out_figures(patch):
     """Take the backscatter lidar's figures and its texture sweep out of all runs."""
     patch.setattr("lidar_mi.assessment.figures.backscatter.draw_all", lambda *_: [])
     patch.setattr("lidar_mi.experiment.stages.texture.LEVELS", ())
+
+
+@contextmanager
+def sketched_figures():
+    """Figures at 40 dots per inch and without layout, in a fifth of the time."""
+
+    def sketch(figure, **_):
+        buffer = BytesIO()
+        figure.set_layout_engine("none")
+        figure.savefig(buffer, format="png", dpi=40)
+        return buffer.getvalue()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lidar_mi.io.png._png", sketch)
+        yield
 
 
 def replace_stages(patch, **computes):

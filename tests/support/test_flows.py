@@ -23,11 +23,11 @@ def test_air_turns_around_a_single_vortex():
 
 @pytest.mark.parametrize("spacing", [1.0, 0.5])
 def test_texture_has_the_contrast_and_the_correlation_it_is_given(spacing):
-    """exp(-(r / length)^2) over 10 seeds of 120 x 90 px: some 900 independent cells of a texture of
-    3 px each, a tenth of which the random wave vectors cost; 4 standard errors are 0.04."""
+    """exp(-(r / length)^2) over 5 seeds of 120 x 90 px: some 900 independent cells of a texture of
+    3 px each, a tenth of which the random wave vectors cost; 4 standard errors are 0.06."""
     grid = np.meshgrid(*axes(120, 90, spacing))
     products = []
-    for seed in range(10):
+    for seed in range(5):
         waves = plane_waves(seed, 3.0, spacing)
         here = texture(waves, *grid) - 1
         moved = [
@@ -36,5 +36,5 @@ def test_texture_has_the_contrast_and_the_correlation_it_is_given(spacing):
         ]
         products.append([np.mean(here * other) for other in moved])
     variance, along_y, along_z = np.mean(products, axis=0) / 0.2**2
-    assert variance == pytest.approx(1, abs=0.04)
-    assert (along_y, along_z) == pytest.approx((np.exp(-1), np.exp(-1)), abs=0.04)
+    assert variance == pytest.approx(1, abs=0.06)
+    assert (along_y, along_z) == pytest.approx((np.exp(-1), np.exp(-1)), abs=0.06)

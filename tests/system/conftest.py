@@ -1,32 +1,47 @@
 """One run of the demo for every test that looks at its results, quick runs, the command line."""
 
 import gc
+import os
+import pickle
 import sys
 from importlib.resources import files
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from filelock import FileLock
 
 from lidar_mi.cli import app as cli
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
 from tests.support.command_line import TINY
-from tests.support.experiments import without_figures
+from tests.support.experiments import sketched_figures, without_figures
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 
 
 @pytest.fixture(scope="session")
 def demo(tmp_path_factory):
-    """What ``lidar-mi run wake_backscatter`` leaves: folder, metrics, and what it told."""
-    folder = tmp_path_factory.mktemp("demo") / "run"
+    """What ``lidar-mi run wake_backscatter`` leaves: folder, metrics, and what it told.
+
+    One run for all processes of pytest-xdist.
+    """
+    here = tmp_path_factory.getbasetemp()
+    shared = (here.parent if "PYTEST_XDIST_WORKER" in os.environ else here) / "demo"
     loaded = config.load(SCENES / "wake_backscatter.yaml")
-    told = []
-    done = experiment.run(
-        loaded, folder, beside=SCENES, notice=lambda text, share: told.append((text, share))
-    )
-    return SimpleNamespace(folder=folder, experiment=loaded, metrics=done.metrics, told=told)
+    left = shared / "left.pickle"
+    with FileLock(f"{shared}.lock"):
+        if not left.is_file():
+            told = []
+            done = experiment.run(
+                loaded,
+                shared / "run",
+                beside=SCENES,
+                notice=lambda text, share: told.append((text, share)),
+            )
+            left.write_bytes(pickle.dumps((done.metrics, told)))
+    metrics, told = pickle.loads(left.read_bytes())
+    return SimpleNamespace(folder=shared / "run", experiment=loaded, metrics=metrics, told=told)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -35,6 +50,13 @@ def free_scenes():
     yield
     gc.collect()
     gc.collect()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def sketches():
+    """The demo apart, figures are drawn to be there."""
+    with sketched_figures():
+        yield
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from importlib.metadata import entry_points, version
 import pytest
 
 from lidar_mi.cli import app as cli
+from lidar_mi.system.doctor import Check, Checkup
 from tests.support.command_line import TINY, shell, words_of
 
 
@@ -57,7 +58,14 @@ def test_a_missing_argument_is_a_usage_error(lidar_mi):
     assert code == 2 and "--dt" in err and "Traceback" not in err
 
 
-def test_doctor_ends_as_its_findings_say(lidar_mi):
-    code, out, _ = lidar_mi("doctor")
-    assert "LLVM" in out and "mitsuba" in out.lower()
-    assert code == int("FAILED" in out)
+@pytest.mark.parametrize(
+    ("ok", "code", "end"), [(True, 0, "all checks passed"), (False, 1, "1 of 2")]
+)
+def test_doctor_ends_as_its_findings_say(lidar_mi, monkeypatch, ok, code, end):
+    found = Checkup(
+        (Check("LLVM library", ok, "what it is", "what to do"), Check("torch", True, "2"))
+    )
+    monkeypatch.setattr("lidar_mi.system.doctor.doctor", lambda: found)
+    ended, out, _ = lidar_mi("doctor")
+    assert ended == code and end in out.splitlines()[-1]
+    assert ("FAILED" in out) != ok and ("to repair" in out) != ok

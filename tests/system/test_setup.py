@@ -306,6 +306,7 @@ def test_doctor_sees_a_dependency_that_is_too_old_or_absent():
 OLD = next((path for path, version in llvm.find_llvm() if version in (15, 16)), None)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(OLD is None, reason="no LLVM 15 or 16 here, with which Dr.Jit aborts")
 def test_doctor_explains_an_llvm_that_aborts(monkeypatch, capsys):
     monkeypatch.setenv(llvm.VARIABLE, str(OLD))

@@ -276,7 +276,14 @@ def test_shipped_experiments_are_documented():
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize(("name", "one"), list(shipped()))
+@pytest.mark.parametrize(
+    ("name", "one"),
+    [
+        # carrying the volume on takes 12 s
+        pytest.param(name, one, marks=[pytest.mark.slow] * (name == "wake_3d"), id=name)
+        for name, one in shipped()
+    ],
+)
 def test_shipped_experiments_fit_together(name, one):
     """Everything that a run checks before it writes: files, tables, lines within the wake."""
     experiment.prepare(one, SCENES)
@@ -313,6 +320,7 @@ def small_run(name, folder, more=()):
         return experiment.run(config.load(path, sets), folder, beside=SCENES).metrics
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_turbine_is_seen_by_both(tmp_path):
     """The mean wake's deficit of 4 m/s from lines of sight 11 m apart, to 0.5 m/s rms.

@@ -52,6 +52,7 @@ def test_holds_every_file(wheel):
     assert packed == expected
 
 
+@pytest.mark.slow
 def test_works_elsewhere(wheel, tmp_path):
     """A shipped experiment and its wake are found beside the installed package."""
     program = (

@@ -13,6 +13,9 @@ from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.warping import Spline
 from lidar_mi.retrieval.velocimetry.windows import Windows, separable
 
+# Voxels of shifted volumes that are correlated at once: more do not fit into a core's cache.
+_AT_ONCE = 2**17
+
 
 class Grid(NamedTuple):
     """Places one pixel apart that contain the windows' centres: pixels, or half way between.
@@ -137,14 +140,17 @@ def volume_scores(
     step = max(1, windows.template // 2)
 
     def sums(field):
-        return avg_pool3d(field[None], size, step)[0]
+        return avg_pool3d(field[:, None], size, step)[:, 0]
 
     first, second = values
     fields = pad(torch.stack([second, second**2, torch.ones_like(first)]), (reach,) * 6)
-    contrast1 = sums(first**2) - sums(first) ** 2
+    for axis, n in enumerate(shape, start=1):
+        fields = fields.unfold(axis, n, 1)  # a view: (3, *shifts, *shape)
+    contrast1 = (sums((first**2)[None]) - sums(first[None]) ** 2)[0]
+    shifts = torch.cartesian_prod(*[torch.arange(2 * reach + 1)] * 3)
     scores = []
-    for shift in product(range(2 * reach + 1), repeat=3):
-        moved = fields[(slice(None), *(slice(s, s + n) for s, n in zip(shift, shape, strict=True)))]
+    for some in shifts.split(max(1, _AT_ONCE // first.numel())):
+        moved = fields[:, *some.T]
         inside = sums(moved[2])
         # of image 1 the part that is compared
         parts = [moved[0], moved[1], first * moved[0], first * moved[2], first**2 * moved[2]]
@@ -152,7 +158,7 @@ def volume_scores(
         contrast = (square1 - mean1**2) * (square2 - mean2**2)
         score = (cross - mean1 * mean2) / contrast.clamp(min=1e-12).sqrt()
         scores.append(torch.where(inside > 0.5, score, -1.0))
-    scores = torch.where(contrast1 > 1e-10, torch.stack(scores), torch.nan)
+    scores = torch.where(contrast1 > 1e-10, torch.cat(scores), torch.nan)
     centres = [
         n - 0.5 + 2 * step * torch.arange(m) for n, m in zip(size, scores.shape[1:], strict=True)
     ]

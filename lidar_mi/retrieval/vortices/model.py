@@ -29,6 +29,8 @@ _LAMB_OSEEN = 1.2564
 # Angle (rad) by which the fastest air may rotate in one Runge-Kutta step: an error of 3e-4 of
 # its radius.
 _STEP_ANGLE = 0.5
+# Steps for all air together; beyond, only air near a core takes as many as the core does.
+_FEW_STEPS = 4
 
 
 def angular_velocity(s: torch.Tensor, profile: Profile) -> tuple[torch.Tensor, torch.Tensor]:
@@ -108,23 +110,49 @@ def advected(
     """Positions of air after half of a time and after all of it, (2, ...) each, in m.
 
     Runge-Kutta of fourth order in a steady flow; `time` in s, negative: backward. The middle,
-    which is used for derivatives only, is by Hermite's cubic.
+    which is used for derivatives only, is by Hermite's cubic. Where the core takes many steps, air
+    that turns less than half as fast as four steps allow takes four.
     """
     centre = {"lamb_oseen": _LAMB_OSEEN, "burnham_hallock": 1.0}[profile] / (2 * torch.pi)
     fastest = max(
         float(centre * theta[first].abs() * (-2 * theta[first + 1]).exp()) for first in (0, 4)
     )
     steps = int(min(64, 1 + fastest * abs(time) // _STEP_ANGLE))
+    start = torch.stack([y, z])
+    began = wind(theta, y, z, profile)
+    if steps <= _FEW_STEPS:
+        place, ended = _followed(theta, start, began, time, steps, profile)
+    else:
+        near = _turning(theta, y, z, profile) * abs(time) > _FEW_STEPS / 2 * _STEP_ANGLE
+        place, ended = torch.empty_like(start), torch.empty_like(start)
+        for some, number in ((near, steps), (~near, _FEW_STEPS)):
+            place[:, some], ended[:, some] = _followed(
+                theta, start[:, some], began[:, some], time, number, profile
+            )
+    return (start + place) / 2 + time / 8 * (began - ended), place
+
+
+def _followed(theta, place, k1, time: float, steps: int, profile: Profile):
+    """Where air at places (2, n) with the wind k1 comes in so many steps, and the wind there."""
     h = time / steps
-    place = start = torch.stack([y, z])
-    k1 = began = wind(theta, y, z, profile)
     for _ in range(steps):
         k2 = wind(theta, *(place + h / 2 * k1), profile)
         k3 = wind(theta, *(place + h / 2 * k2), profile)
         k4 = wind(theta, *(place + h * k3), profile)
         place = place + h / 6 * (k1 + 2 * (k2 + k3) + k4)
         k1 = wind(theta, *place, profile)
-    return (start + place) / 2 + time / 8 * (began - k1), place
+    return place, k1
+
+
+def _turning(theta, y, z, profile: Profile) -> torch.Tensor:
+    """Sum of the angular velocities about both vortices, s^-1, without their signs."""
+    total = torch.zeros_like(y)
+    for first in (0, 4):
+        radius2 = (2 * theta[first + 1]).exp()
+        square = (y - theta[first + 2]) ** 2 + (z - theta[first + 3]) ** 2
+        value, _ = angular_velocity(square / radius2, profile)
+        total = total + theta[first].abs() / (2 * torch.pi * radius2) * value
+    return total
 
 
 def drift(theta: torch.Tensor, profile: Profile) -> torch.Tensor:

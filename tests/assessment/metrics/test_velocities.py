@@ -52,16 +52,16 @@ def test_measures_by_hand():
 
 
 def test_standard_errors_are_those_of_repeated_experiments():
-    """2000 sets of 3 speeds x 4 normal errors: bias and std scatter as stated, to 5 %."""
+    """500 sets of 3 speeds x 4 normal errors: bias and std scatter as stated."""
     rng = np.random.default_rng(1)
-    errors = 0.7 * rng.standard_normal((2000, 3, 4)) + np.array([3, -1, 0])[:, None]
+    errors = 0.7 * rng.standard_normal((500, 3, 4)) + np.array([3, -1, 0])[:, None]
     sets = [measures(error, 4) for error in errors]
     column = {name: np.array([s[name] for s in sets]) for name in sets[0]}
-    assert np.mean(column["bias"]) == pytest.approx(2 / 3, abs=4 * 0.7 / np.sqrt(12 * 2000))
+    assert np.mean(column["bias"]) == pytest.approx(2 / 3, abs=4 * 0.7 / np.sqrt(12 * 500))
     assert np.sqrt(np.mean(column["std"] ** 2)) == pytest.approx(0.7, rel=0.05)
-    # 2000 sets know a standard deviation to 1.6 %
-    assert np.std(column["bias"]) == pytest.approx(np.mean(column["bias_stderr"]), rel=0.07)
-    assert np.std(column["std"]) == pytest.approx(np.mean(column["std_stderr"]), rel=0.1)
+    # 500 sets know a standard deviation to 3.2 %
+    assert np.std(column["bias"]) == pytest.approx(np.mean(column["bias_stderr"]), rel=0.13)
+    assert np.std(column["std"]) == pytest.approx(np.mean(column["std_stderr"]), rel=0.13)
 
 
 def test_what_is_not_determined_is_left_out():

@@ -166,6 +166,7 @@ def test_vortices_along_x(noise, limit):
     assert both[1] < 0.7 * both[0]
 
 
+@pytest.mark.slow
 def test_errors_reach_the_bound_of_a_known_shift():
     """A tiny case against the Fisher information, by differences of the texture itself.
 

@@ -35,7 +35,7 @@ def test_quantities_in_closed_form():
 
 
 def test_errors_of_quantities_and_wind_against_drawn_parameters():
-    """First order against 1500 draws from the covariance: their spread scatters by 2 %."""
+    """First order against 1500 draws from the covariance: their spread scatters by 2 %, of 80 by 8 %."""
     random = np.random.default_rng(3)
     root = (
         random.standard_normal((10, 10)) * np.array([3, 0.01, 0.1, 0.1] * 2 + [0.05] * 2)[:, None]
@@ -44,7 +44,7 @@ def test_errors_of_quantities_and_wind_against_drawn_parameters():
     fit = some_fit(covariance)
     drawn = random.multivariate_normal(fit.parameters, covariance, 1500)
     y, z = np.array([10.0, 14.0, -3.0]), np.array([0.0, 3.0, 5.0])
-    fits = [VortexPairFit(p, covariance, "lamb_oseen", 1.0, 1.0, 0.0, 0.0) for p in drawn[:200]]
+    fits = [VortexPairFit(p, covariance, "lamb_oseen", 1.0, 1.0, 0.0, 0.0) for p in drawn[:80]]
     winds = np.array(
         [
             wind(torch.as_tensor(p), torch.as_tensor(y), torch.as_tensor(z), "lamb_oseen").numpy()
@@ -56,9 +56,10 @@ def test_errors_of_quantities_and_wind_against_drawn_parameters():
     np.testing.assert_allclose(stated["w_stderr"], winds[:, 1].std(0), rtol=0.08)
     together = [np.corrcoef(winds[:, 0, k], winds[:, 1, k])[0, 1] for k in range(3)]
     np.testing.assert_allclose(stated["vw_correlation"], together, atol=0.08)
+    quantities = [one.quantities for one in fits]
     for name in ("separation", "descent_speed", "port_core_radius", "starboard_circulation_5_15"):
-        values = [one.quantities[name].value for one in fits]
-        assert fit.quantities[name].stderr == pytest.approx(np.std(values), rel=0.2), name
+        values = [one[name].value for one in quantities]
+        assert fit.quantities[name].stderr == pytest.approx(np.std(values), rel=0.32), name
 
 
 def test_the_pair_drifts_on_and_its_errors_grow():
