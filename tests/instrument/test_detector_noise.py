@@ -18,31 +18,13 @@ from lidar_mi.instrument.detector_noise import (
     noisy_scan,
 )
 from lidar_mi.instrument.lidar import BackscatterLidar
+from tests.support.detectors import IDEAL, ideal, s0_of
 
 LIDAR = BackscatterLidar()
-
-# nothing but the Poisson noise of the signal, every photon counted
-IDEAL = Detector(
-    optics_efficiency=1,
-    quantum_efficiency=1,
-    excess_noise_factor=1,
-    dark_rate=0,
-    sky_radiance=0,
-    speckle=False,
-)
 
 GATE = 5 / 299_792_458  # 2.5 m
 
 DRAWS = 100_000
-
-
-def ideal(**changes):
-    return IDEAL.model_copy(update=changes)
-
-
-def s0_of(photons):
-    """Received over emitted energy of that many photons with the paper's lidar (1 mJ, 532 nm)."""
-    return photons * 3.73393e-19 / 1e-3
 
 
 def read(photons, detector, seed=1, count=DRAWS, lidar=LIDAR):

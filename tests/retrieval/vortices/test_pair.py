@@ -35,7 +35,7 @@ def test_quantities_in_closed_form():
 
 
 def test_errors_of_quantities_and_wind_against_drawn_parameters():
-    """First order against 1500 draws from the covariance: their spread scatters by 2 %, of 80 by 8 %."""
+    """First order against 1500 draws from the covariance: these scatter by 2 %, 80 by 8 %."""
     random = np.random.default_rng(3)
     root = (
         random.standard_normal((10, 10)) * np.array([3, 0.01, 0.1, 0.1] * 2 + [0.05] * 2)[:, None]
