@@ -192,7 +192,7 @@ def test_both_directions_give_the_analytic_rings(estimator, shape, lens, statist
     [
         ("camera", "folded", None, 16, 0.02),
         pytest.param("camera", "folded", LENS, 64, 0.05, marks=pytest.mark.slow),
-        ("forward", "sampled", LENS, 32, None),
+        pytest.param("forward", "sampled", LENS, 32, None, marks=pytest.mark.slow),
     ],
 )
 def test_velocity_of_a_picture_without_noise(estimator, shape, lens, paths, allowed):

@@ -69,7 +69,9 @@ def backward(scene, parameters, seed, spp):
     return np.array(dr.grad(parameters[KEY]))[..., 0].astype(float)
 
 
-@pytest.mark.parametrize("samples_per_pass", [1 << 22, 60_000])
+@pytest.mark.parametrize(
+    "samples_per_pass", [pytest.param(1 << 22, marks=pytest.mark.slow), 60_000]
+)
 def test_backward_agrees_with_differences(slab, samples_per_pass):
     scene, parameters = slab
     scene.integrator().samples_per_pass = samples_per_pass

@@ -96,7 +96,7 @@ def test_a_signal_stops_cleanly_and_the_run_goes_on(there, number, said):
         "-o",
         "run",
         "--set",
-        "render.samples_per_beam=50000",
+        "render.samples_per_beam=30000",
         "--set",
         "render.samples_per_pass=20000",
     ]

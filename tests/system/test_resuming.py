@@ -83,6 +83,7 @@ def test_another_experiment_is_kept_out(tmp_path, quick):
     assert yaml.safe_load((folder / "experiment.yaml").read_text())["experiment"]["seed"] == 2
 
 
+@pytest.mark.slow
 def test_pictures_of_another_version_are_kept_out(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
@@ -140,7 +141,13 @@ def test_a_file_in_the_folders_place_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "step", ["reading the wake", "rendering scan 1", "rendering scan 2", "retrieving winds"]
+    "step",
+    [
+        pytest.param("reading the wake", marks=pytest.mark.slow),
+        pytest.param("rendering scan 1", marks=pytest.mark.slow),
+        "rendering scan 2",
+        "retrieving winds",
+    ],
 )
 def test_stopped_anywhere_it_goes_on(tmp_path, quick, step):
     """An interrupt at any step leaves whole files only, and the next start ends as if nothing had
@@ -177,6 +184,7 @@ def test_stopped_anywhere_it_goes_on(tmp_path, quick, step):
     )
 
 
+@pytest.mark.slow
 def test_the_seed_decides(tmp_path, quick):
     runs = {}
     for name, seed in (("one", 1), ("again", 1), ("other", 2)):

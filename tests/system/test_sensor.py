@@ -189,6 +189,7 @@ def again(whole, tmp_path, monkeypatch, spoil):
     return (tmp_path / "run" / "report.html").read_text(), tmp_path / "run"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
     report, folder = again(
@@ -298,7 +299,7 @@ def test_errors_of_a_known_field():
     [
         (0.0, 0.5, {}, "line_noise"),
         (1.0, 0.01, {}, "sampling"),
-        (0.0, 0.01, {"yaw": "20 mrad"}, "pointing"),
+        pytest.param(0.0, 0.01, {"yaw": "20 mrad"}, "pointing", marks=pytest.mark.slow),
     ],
 )
 def test_what_limits_u_is_found(amplitude, noise, errors, limit):

@@ -32,7 +32,7 @@ def test_values_that_are_not_known_do_not_count():
     assert coverage._mean_and_error(values) == (3.0, 0.0)
 
 
-@pytest.mark.parametrize("fraction", [0.05, 0.3])
+@pytest.mark.parametrize("fraction", [pytest.param(0.05, marks=pytest.mark.slow), 0.3])
 def test_replaced_fraction_is_what_images_do_not_share(fraction):
     moved = coverage.replaced_texture(0.0, 1, noise=0.0)
     changed = coverage.replaced_texture(fraction, 1, noise=0.0)

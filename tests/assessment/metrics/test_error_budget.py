@@ -300,7 +300,7 @@ def test_share_of_noise_is_what_noise_drawn_anew_scatters_winds_by(method):
     assert share == pytest.approx(scatter / error.mean(), abs=0.08)
 
 
-@pytest.mark.parametrize("shear", [0.0, 4.0])
+@pytest.mark.parametrize("shear", [pytest.param(0.0, marks=pytest.mark.slow), 4.0])
 def test_shear_within_the_window(shear):
     """A simple shear (closed form) of 4 / s deforms a window of 8 px by 1.6 px on either side. With
     windows that move as one, correlation errs as in an even wind, by 0.13 px or

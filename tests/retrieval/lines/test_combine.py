@@ -326,7 +326,7 @@ def uneven_scene(random, follows):
     return wind, crossflow(wind.v, wind.w, 0.01, 0.0, y, z), scan
 
 
-@pytest.mark.parametrize("follows", [True, False])
+@pytest.mark.parametrize("follows", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_u_may_vary_where_the_cross_flow_does(follows):
     """Stated variances of u over those of its errors, half by half: 1.
 

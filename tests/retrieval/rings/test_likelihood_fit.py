@@ -36,6 +36,7 @@ def test_no_noise_no_error(v_los, centre):
     assert float(fit.chi_square) < 1e-3 and fit.rings >= 9
 
 
+@pytest.mark.slow
 def test_full_size_both_ways():
     image = torch.as_tensor(reference.picture(-77.0, centre=(470.2, 402.9)))
     for method in ("annular", "pixels"):
@@ -61,7 +62,13 @@ def bound_of(case, v_los=20.0, **size):
     return cramer_rao(ring_model(**size), photons, noise, v_los=v_los, centre=centre)["v_los"]
 
 
-@pytest.mark.parametrize("case", TABLE)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=[pytest.mark.slow] * (case not in ("speckle", "off centre")))
+        for case in TABLE
+    ],
+)
 def test_reaches_the_bound(case):
     """64 pictures: std known to 9 %, mean to an eighth of it; both within 4 sigma."""
     number = 64

@@ -38,7 +38,12 @@ def rms(values):
 
 @pytest.mark.parametrize(
     ("noise", "everywhere", "beyond"),
-    [(0.0, 0.35, 0.12), (0.01, 0.38, 0.17), (0.03, 0.50, 0.32), (0.06, 0.77, 0.66)],
+    [
+        (0.0, 0.35, 0.12),
+        pytest.param(0.01, 0.38, 0.17, marks=pytest.mark.slow),
+        (0.03, 0.50, 0.32),
+        pytest.param(0.06, 0.77, 0.66, marks=pytest.mark.slow),
+    ],
 )
 def test_errors_are_below_the_best_window_deformation(noise, everywhere, beyond):
     """Known errors (m/s) of OpenPIV's window deformation with its best settings on this case."""

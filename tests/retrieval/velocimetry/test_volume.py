@@ -44,7 +44,13 @@ SHIFT = np.array([0.37, -1.21, 1.74])
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("moved", [0.0, 0.25, 0.5, 0.75, 1.0, 1.35, 1.5, 1.75, 2.0])
+@pytest.mark.parametrize(
+    "moved",
+    [
+        *(0.0, 0.5, 1.35, 2.0),
+        *(pytest.param(m, marks=pytest.mark.slow) for m in (0.25, 0.75, 1.0, 1.5, 1.75)),
+    ],
+)
 def test_displacements_are_not_drawn_to_whole_voxels(axis, moved):
     """Mean over a volume of two correlation lengths a template; noise is stated and not there."""
     shift = np.roll([moved, 0.3, -0.6], axis)
@@ -56,7 +62,9 @@ def test_displacements_are_not_drawn_to_whole_voxels(axis, moved):
         assert abs(np.mean(off[name])) < 0.01, (name, np.mean(off[name]))
 
 
-@pytest.mark.parametrize("moved", [0.5, 1.0, 1.75])
+@pytest.mark.parametrize(
+    "moved", [0.5, *(pytest.param(m, marks=pytest.mark.slow) for m in (1, 1.75))]
+)
 def test_smooth_flows_are_not_drawn_to_whole_voxels(moved):
     shift = np.array([0.3, moved, -0.7 * moved])
     pair = shifted((16, 24, 28), shift, 0.0, seed=3, length=2.0)
