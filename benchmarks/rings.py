@@ -14,9 +14,10 @@ from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera
+from lidar_mi.retrieval.rings.bound import cramer_rao
 from lidar_mi.retrieval.rings.cells import pixels
 from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
-from lidar_mi.retrieval.rings.model import RingModel, cramer_rao, expected, mean_and_jacobian
+from lidar_mi.retrieval.rings.model import RingModel, expected, mean_and_jacobian
 
 from .measure import in_turns
 from .report import Comparison, row

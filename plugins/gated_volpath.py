@@ -71,6 +71,7 @@ from .physical import Physical
 from .polarization import first_unpolarized_in_blend
 from .registration import register
 
+# how samples scatter and where they fly next is in `light_paths`, of both estimators
 NAME, KIND = "gated_volpath", "integrator"
 
 STOKES = ("S0", "S1", "S2", "S3")

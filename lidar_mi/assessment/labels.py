@@ -1,7 +1,7 @@
 """What figures, tables and reports call methods, sources and quantities."""
 
 from lidar_mi.assessment.metrics.names import Source
-from lidar_mi.retrieval.methods import ImageMethod, VolumeMethod
+from lidar_mi.retrieval.method_names import ImageMethod, VolumeMethod
 
 METHOD_NAMES = {
     ImageMethod.CC: "cross-correlation",

@@ -15,7 +15,7 @@ from lidar_mi.experiment.truth import Truth
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.memory import ceiling
-from lidar_mi.retrieval.methods import ImageMethod
+from lidar_mi.retrieval.method_names import ImageMethod
 
 
 def sections(

@@ -40,7 +40,7 @@ from lidar_mi.experiment.stages.volume import check_volume, scan_volumes, volume
 from lidar_mi.experiment.stages.vortices import combined_vectors, fit_pairs, image_vectors
 from lidar_mi.experiment.stages.winds import check_windows, cross_flow_winds
 from lidar_mi.experiment.truth import make_truth
-from lidar_mi.retrieval.methods import ImageMethod
+from lidar_mi.retrieval.method_names import ImageMethod
 
 GIVEN = ("beside",)
 """What is there from the start: the folder in which files of an experiment are looked for first."""

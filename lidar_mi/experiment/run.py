@@ -1,7 +1,9 @@
 """One experiment, start to end: truth, sensor, images, estimate, verdict.
 
 A run may live in a folder. Images are kept there as soon as they are rendered; a run that was
-stopped is resumed with those, and everything after them is computed again.
+stopped is resumed with those, and everything after them is computed again. What is kept and
+whether it is used again is decided in `run_folder`, batches of an image's samples in
+`rendering.batches`.
 """
 
 import time

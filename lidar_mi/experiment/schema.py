@@ -20,7 +20,7 @@ from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings
-from lidar_mi.retrieval.methods import ImageMethod, RingCentre, RingMethod, VolumeMethod
+from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table, Tabular
 from lidar_mi.units import Frequency, Length, Number, Speed, Time, Within, to_si
 

@@ -13,6 +13,7 @@ import xarray as xr
 from numpy.typing import ArrayLike
 
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector import (
     Detector,
     background_photoelectrons,
@@ -23,7 +24,6 @@ from lidar_mi.instrument.detector import (
 )
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.instrument.signal import attenuated_backscatter
 from lidar_mi.instrument.speckle import speckle_modes
 
 

@@ -11,9 +11,9 @@ import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.instrument.signal import attenuated_backscatter
 from lidar_mi.io.exr import label_scan, unpack
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.memory import samples_at_once

@@ -2,7 +2,7 @@
 
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.names import Source
-from lidar_mi.retrieval.methods import ImageMethod, VolumeMethod
+from lidar_mi.retrieval.method_names import ImageMethod, VolumeMethod
 
 
 def test_every_method_and_source_has_a_name():

@@ -7,7 +7,7 @@ import xarray as xr
 import lidar_mi as lm
 from lidar_mi.assessment.report.vortices import vortex_chapter
 from lidar_mi.experiment.stages.vortices import image_vectors, vectors_method
-from lidar_mi.retrieval.methods import MOST_ACCURATE_FIRST, ImageMethod
+from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST, ImageMethod
 
 
 def winds(methods):

@@ -8,7 +8,7 @@ import torch
 import lidar_mi as lm
 from benchmarks.cases import vortex_pair_images
 from lidar_mi.retrieval.threads import SMALL, threads_for
-from lidar_mi.retrieval.velocimetry import wind
+from lidar_mi.retrieval.velocimetry import methods
 
 
 @pytest.fixture
@@ -45,8 +45,8 @@ def test_retrievals_of_images_work_on_one(call, monkeypatch):
         seen.append(torch.get_num_threads())
         raise RuntimeError("seen")
 
-    method = replace(wind.METHODS["cc"], find=watched)
-    monkeypatch.setitem(wind.METHODS, "cc", method)
+    method = replace(methods.METHODS["cc"], find=watched)
+    monkeypatch.setitem(methods.METHODS, "cc", method)
     monkeypatch.setattr("lidar_mi.retrieval.vortices.image_fit.fit_pixels", watched)
     with pytest.raises(RuntimeError, match="seen"):
         getattr(lm, call)(pair.first, pair.second, dt=0.1)

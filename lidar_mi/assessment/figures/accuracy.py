@@ -12,7 +12,7 @@ from lidar_mi.assessment.figures.plates import by_factors
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.errors import error_by_quality
 from lidar_mi.assessment.metrics.names import RENDERED, Source
-from lidar_mi.retrieval.methods import ImageMethod
+from lidar_mi.retrieval.method_names import ImageMethod
 
 
 def draw_normalised_errors(axes: Axes, errors: Mapping[str, np.ndarray], **style: str) -> None:

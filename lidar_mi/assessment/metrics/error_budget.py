@@ -13,7 +13,7 @@ from scipy import ndimage
 
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
-from lidar_mi.retrieval.methods import ImageMethod
+from lidar_mi.retrieval.method_names import ImageMethod
 
 CAUSES = {
     "detector_noise": "noise of the detector",

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.names import ring_key
-from lidar_mi.retrieval.methods import RingCentre, RingMethod
+from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 
 READERS = {
     RingMethod.ANNULAR: "all rings, full model",

@@ -11,7 +11,7 @@ from lidar_mi.assessment.metrics.velocities import CENTRES, READERS
 from lidar_mi.assessment.report.digits import fixed, three
 from lidar_mi.assessment.report.page import embedded, template
 from lidar_mi.io.yaml import to_yaml
-from lidar_mi.retrieval.methods import ImageMethod, RingCentre, RingMethod, VolumeMethod
+from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 
 # rows of the comparison: key, name, unit; {} stands for a method's winds
 _ROWS = (

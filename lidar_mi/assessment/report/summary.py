@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 
 from lidar_mi.assessment.metrics.names import Source, bound_key, ring_key, wind_key
-from lidar_mi.retrieval.methods import ImageMethod, RingCentre, RingMethod, VolumeMethod
+from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table
 
 _METHODS = tuple(dict.fromkeys((*ImageMethod, *VolumeMethod)))

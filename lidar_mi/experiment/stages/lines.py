@@ -17,7 +17,7 @@ from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_at
 from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
-from lidar_mi.retrieval.methods import RingCentre, RingMethod
+from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 
 # Speeds at which images without noise are made; those between are interpolated (Chebyshev).
 _NODES = 7

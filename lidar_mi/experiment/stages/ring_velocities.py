@@ -22,10 +22,10 @@ from lidar_mi.experiment.stages.ring_images import (
     summed_noise,
 )
 from lidar_mi.instrument.etalon import finesse
-from lidar_mi.retrieval.methods import RingCentre, RingMethod
+from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 from lidar_mi.retrieval.rings import peaks as ring_peaks
+from lidar_mi.retrieval.rings.bound import cramer_rao
 from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
-from lidar_mi.retrieval.rings.model import cramer_rao
 
 FITS = (RingMethod.ANNULAR, RingMethod.PIXELS)
 # way to the radius and coordinate of the fit, as `ring_peaks.ring_radius` takes them

@@ -15,7 +15,7 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.winds import rendered_pairs
 from lidar_mi.retrieval.lines.combine import CombinedFlag
-from lidar_mi.retrieval.methods import MOST_ACCURATE_FIRST
+from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind

@@ -14,7 +14,8 @@ from lidar_mi.experiment.schema import Experiment, Retrieval
 from lidar_mi.experiment.truth import Truth, blur_by_beam
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
-from lidar_mi.retrieval.velocimetry.wind import METHODS, retrieve_wind, wind_bound
+from lidar_mi.retrieval.velocimetry.methods import METHODS
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind, wind_bound
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import torch
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.bound import fisher_matrix, free_indices, standard_deviations
 from lidar_mi.retrieval.rings.cells import annular_sectors, pixels
 from lidar_mi.retrieval.rings.centre import gradient_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
@@ -25,13 +26,10 @@ from lidar_mi.retrieval.rings.model import (
     PARAMETERS,
     PixelNoise,
     RingModel,
-    fisher_matrix,
-    free_indices,
     illumination,
     mean_and_jacobian,
     orders,
     squared_radius,
-    standard_deviations,
 )
 
 METHODS = ("annular", "pixels")

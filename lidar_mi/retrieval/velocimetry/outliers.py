@@ -9,13 +9,18 @@ from torch.nn.functional import pad
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.velocimetry import windows as geometry
 
+MEDIAN_THRESHOLD = 2.0
+"""Of the normalised residual (Westerweel & Scarano 2005)."""
+MEDIAN_EPSILON = 0.1
+"""Expected noise of a displacement, px (Westerweel & Scarano 2005)."""
+
 
 def median_outliers(
     d: torch.Tensor,
     size: int = 3,
     spacing: int = 1,
-    threshold: float = 2.0,
-    epsilon: float = 0.1,
+    threshold: float = MEDIAN_THRESHOLD,
+    epsilon: float = MEDIAN_EPSILON,
     continued: bool = False,
 ) -> torch.Tensor:
     """Normalised median test of Westerweel & Scarano (2005, Exp. Fluids 39, 1096-1100).
@@ -79,8 +84,8 @@ def median_outliers(
 def validated(
     d: torch.Tensor,
     spacing: int,
-    threshold: float = 2.0,
-    epsilon: float = 0.1,
+    threshold: float = MEDIAN_THRESHOLD,
+    epsilon: float = MEDIAN_EPSILON,
     continued: bool = False,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Displacements (components, ...) with outliers and gaps filled from their neighbours.

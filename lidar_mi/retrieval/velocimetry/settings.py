@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+from lidar_mi.retrieval.velocimetry.outliers import MEDIAN_EPSILON, MEDIAN_THRESHOLD
+
 
 @dataclass(frozen=True)
 class FilterSettings:
@@ -70,8 +72,8 @@ class MultipassSettings:
     spacing: float = 0.5
     gradient: float = 1.0
     jump: float = 2.0
-    median_threshold: float = 2.0
-    median_epsilon: float = 0.1
+    median_threshold: float = MEDIAN_THRESHOLD
+    median_epsilon: float = MEDIAN_EPSILON
     continued: bool = False
     rebalanced: bool = False
     filter: FilterSettings = FilterSettings()

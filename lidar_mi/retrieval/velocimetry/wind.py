@@ -1,7 +1,6 @@
 """From two images to the wind: one call, CF data set out."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -11,85 +10,18 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.bound import displacement_bound
-from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
 from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
-from lidar_mi.retrieval.velocimetry.displacement import Displacement
-from lidar_mi.retrieval.velocimetry.multipass import multipass
-from lidar_mi.retrieval.velocimetry.outliers import median_outliers
+from lidar_mi.retrieval.velocimetry.methods import METHODS
+from lidar_mi.retrieval.velocimetry.outliers import (
+    MEDIAN_EPSILON,
+    MEDIAN_THRESHOLD,
+    median_outliers,
+)
 from lidar_mi.retrieval.velocimetry.quality import Flag, filled, low_texture, non_finite, uncertain
 from lidar_mi.retrieval.velocimetry.relation import unrelated
 from lidar_mi.retrieval.velocimetry.rest import all_at_rest
 from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
-from lidar_mi.retrieval.velocimetry.variational import variational
-from lidar_mi.retrieval.velocimetry.weight_shift import weight_shift
 from lidar_mi.retrieval.velocimetry.windows import Windows
-from lidar_mi.retrieval.vortices.windows import vortex_windows
-
-
-@dataclass(frozen=True)
-class Method:
-    """A way to find displacements.
-
-    Attributes
-    ----------
-    find : callable
-        (image1, image2, template, search, stride, **options) -> Displacement, in pixels.
-    score : (str, str)
-        What its `Displacement.score` is: name in the data set, meaning.
-    options : tuple of str
-        Keywords of `retrieve_wind` it takes, `min_correlation` and `noise` among them.
-    centred : bool
-        Vectors belong to the windows' centres, not half their displacement further on.
-    local : bool
-        A vector depends on its window only, and is flagged without texture there or as an outlier
-        among its neighbours. A field fitted as a whole has standard errors of its own.
-    reach : int
-        Range of its first displacements over that of its windows. 0: the method checks by itself
-        whether the images are related.
-    """
-
-    find: Callable[..., Displacement]
-    score: tuple[str, str]
-    options: tuple[str, ...] = ()
-    centred: bool = False
-    local: bool = True
-    reach: int = 1
-
-
-METHODS: Mapping[str, Method] = {
-    "cc": Method(
-        cross_correlation,
-        ("correlation", "normalised cross-correlation at the peak"),
-        ("min_correlation",),
-    ),
-    "ws": Method(
-        weight_shift, ("mismatch", "misfit of weight and centre of mass over their spread")
-    ),
-    "multipass": Method(
-        multipass,
-        ("correlation", "normalised cross-correlation of the deformed windows"),
-        ("min_correlation", "noise", "settings"),
-        centred=True,
-        reach=2,
-    ),
-    "variational": Method(
-        variational,
-        ("correlation", "normalised cross-correlation of the images warped to mid-time"),
-        ("min_correlation", "noise", "more", "blur", "settings"),
-        centred=True,
-        local=False,
-        reach=2,
-    ),
-    "vortex_fit": Method(
-        vortex_windows,
-        ("correlation", "correlation of the images, each warped to mid-time"),
-        ("noise", "axes", "dt"),
-        centred=True,
-        local=False,
-        reach=0,
-    ),
-}
-"""Methods by name."""
 
 
 def retrieve_wind(
@@ -109,8 +41,8 @@ def retrieve_wind(
     more: Sequence[xr.DataArray] = (),
     blur: float = 0.0,
     median_size: int = 3,
-    median_threshold: float = 2.0,
-    median_epsilon: float = 0.1,
+    median_threshold: float = MEDIAN_THRESHOLD,
+    median_epsilon: float = MEDIAN_EPSILON,
     settings: MultipassSettings | VariationalSettings | None = None,
 ) -> xr.Dataset:
     """Wind in the image plane from two images of the same air, dt apart.
@@ -124,7 +56,7 @@ def retrieve_wind(
         Time from image 1 to image 2, s.
     method : {"cc", "ws", "multipass", "variational", "vortex_fit"}
         Cross-correlation, weight shift, multi-pass correlation, a smooth flow or a vortex pair
-        fitted to the images as a whole, see `METHODS`.
+        fitted to the images as a whole, see `methods.METHODS`.
     template, search, stride : int
         Pixels: template n >= 2, search region >= n + 2, step from window to window >= 1. Winds
         beyond ((search - template) // 2 - 1/2) spacing / dt are out of range (17.5 m/s for 8 in 16

@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.bound import cramer_rao
 from lidar_mi.retrieval.rings.likelihood_fit import difference, fit_rings
-from lidar_mi.retrieval.rings.model import PixelNoise, cramer_rao
+from lidar_mi.retrieval.rings.model import PixelNoise
 from tests.support import ring_reference as reference
 from tests.support.ring_models import TABLE, ring_model
 

@@ -10,14 +10,9 @@ import pytest
 import torch
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.bound import cramer_rao
 from lidar_mi.retrieval.rings.cells import annular_sectors, pixels
-from lidar_mi.retrieval.rings.model import (
-    PARAMETERS,
-    PixelNoise,
-    cramer_rao,
-    expected,
-    mean_and_jacobian,
-)
+from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, expected, mean_and_jacobian
 from tests.support import ring_reference as reference
 from tests.support.ring_models import TABLE, TEMPERATURES, ring_model
 

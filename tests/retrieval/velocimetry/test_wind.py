@@ -14,8 +14,9 @@ from scipy.optimize import least_squares
 from benchmarks.cases import CORE_RADIUS, DT, vortex_pair_images
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.velocimetry.methods import METHODS
 from lidar_mi.retrieval.velocimetry.quality import Flag
-from lidar_mi.retrieval.velocimetry.wind import METHODS, retrieve_wind, wind_bound
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind, wind_bound
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
 

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.instrument.signal import attenuated_backscatter
 
 
 @pytest.mark.parametrize("kind", ["planar", "spherical"])
