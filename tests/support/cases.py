@@ -2,12 +2,14 @@
 
 The promise: a command ends with exit code 0 or 2, in bounded time and memory; bad input gives one
 printable line of at most 300 characters; nothing is left behind; nothing that a terminal would
-obey is printed. A call from Python returns, or raises an InputError of one such line; a TypeError
-for an argument of another type than its signature says.
+obey is printed. A call from Python returns, or raises an InputError of one such line; for an
+argument of another type than its signature says also a TypeError that names it.
 """
 
+import ast
 import base64
 import json
+import re
 import tempfile
 import zlib
 from collections.abc import Mapping
@@ -80,20 +82,32 @@ def evaluate(expression: str) -> str | None:
 
     import lidar_mi as lm
     from tests.support.accepted import runs
-    from tests.support.hostile_calls import pattern, volume
+    from tests.support.hostile_calls import pattern, vectors, volume
 
     warnings.simplefilter("ignore")
     names = {"lm": lm, "np": np, "xr": xr, "runs": runs}
-    names |= {"pattern": pattern, "volume": volume, "nan": np.nan, "inf": np.inf}
+    names |= {
+        "pattern": pattern,
+        "volume": volume,
+        "vectors": vectors,
+        "nan": np.nan,
+        "inf": np.inf,
+    }
     try:
         eval(expression, names)
     except lm.InputError as error:
         return None if str(error) else "an empty message"
-    except TypeError:  # something of another type than the signature says
-        return None
+    except TypeError as error:
+        return None if _names_argument(error, expression) else _where(error)
     except Exception as error:
         return _where(error)
     return None
+
+
+def _names_argument(error: TypeError, expression: str) -> bool:
+    """Whether an error says which argument of a call it is about."""
+    call = ast.parse(expression).body[0].value
+    return any(re.search(rf"\b{one.arg}\b", str(error)) for one in call.keywords)
 
 
 def _where(error: BaseException) -> str:

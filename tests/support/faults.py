@@ -234,11 +234,11 @@ def scenario(work, start, task):
     assert run_once(whole, seed, real) == (0, "")
     places = json.loads(Path(f"{whole}.places").read_text())
     cases = []
-    for number, (kind, path) in enumerate(places):
-        for fault in task["faults"].get(kind, ()):
-            if number % task["every"].get(fault, 1) == 0:
-                case = tried(work / "run", begin, seed, real, number, fault)
-                cases.append({"place": f"{number} {kind} {path}", "fault": fault, **case})
+    for fault, kinds in task["faults"].items():
+        possible = [number for number, (kind, _) in enumerate(places) if kind in kinds]
+        for number in possible[:: task["every"].get(fault, 1)]:
+            case = tried(work / "run", begin, seed, real, number, fault)
+            cases.append({"place": f"{number} {' '.join(places[number])}", "fault": fault, **case})
     found = {"places": places, "start": state(begin) if begin else {}, "whole": state(whole)}
     return found | {"cases": cases}
 

@@ -10,12 +10,13 @@ import xarray as xr
 from hypothesis import strategies as st
 
 import lidar_mi as lm
+from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 from tests.support.cases import Case
 from tests.support.hostile_experiments import BASE, as_yaml
 from tests.support.hostile_files import exr_file, picture
 
-SLOW = ("run", "fit_vortices", "doctor", "register_plugins")
-"""Public functions that take ten seconds, or look at the machine and take no input."""
+NOT_CALLED = ("run", "doctor", "register_plugins")
+"""Public functions that are tried as `accepted.runs`, or that take no input."""
 
 WRONG = ("None", "'a'", "3", "-1", "nan", "[]", "{}", "object()", "b'a'", "True", "'\\x1b[31m'")
 
@@ -59,7 +60,26 @@ BY_TYPE: dict[typing.Any, tuple[str, ...]] = {
     str: ("'a'", "'cc'", "'cpu'", "'cuda:9'", "'variational'", "'multipass'", "'ws'", "'Y'", "''"),
     bool: ("True", "False", "2"),
     Path: ("'a.exr'", "'a.png'", "'none'", "'.'", "'/dev/zero'", "''", "'a' * 5000", "'a\\0'"),
-    xr.Dataset: ("xr.Dataset()", "xr.Dataset({'v': pattern(1), 'w': pattern(2)})"),
+    xr.Dataset: (
+        "vectors()",
+        "xr.Dataset()",
+        "vectors().isel(y=slice(2))",
+        "vectors().isel(y=0)",
+        "vectors().drop_vars('y')",
+        "vectors().expand_dims('t')",
+        "vectors() * nan",
+        "vectors() * 0",
+        "vectors() * inf",
+        "vectors() * 1e200",
+        "vectors().assign(v_stderr=0)",
+        "vectors().assign(v_stderr=1, w_stderr=1, vw_correlation=2)",
+        "vectors().assign(flag='a')",
+        "vectors().assign(v=pattern(1))",
+        "vectors().assign_coords(y=nan)",
+        "vectors().rename(v='a')",
+        "vectors().astype(str)",
+        "vectors().astype(complex)",
+    ),
     lm.Experiment: ("lm.load_experiment('a.yaml')",),
     tuple: ("(15.0, 12.0)", "(nan, 1.0)", "(1.0,)", "(inf, inf)", "(1e30, -1e30)"),
 }
@@ -105,11 +125,22 @@ def volume(seed: int) -> xr.DataArray:
     return xr.DataArray(values, axes, ("x", "z", "y"))
 
 
+def vectors() -> xr.Dataset:
+    """The wind of a vortex pair, 1 m/s of noise, without errors."""
+    y, z = np.arange(-20.0, 21.0, 2.0), np.arange(-14.0, 15.0, 2.0)
+    wind = velocity(vortex_pair(200.0, separation=16.0, core_radius=2.0), y, z[:, None])
+    noise = np.random.default_rng(1).normal(size=(2, z.size, y.size))
+    data = {name: (("z", "y"), part) for name, part in zip("vw", wind + noise, strict=True)}
+    return xr.Dataset(data, {"z": z, "y": y})
+
+
 def functions() -> dict[str, Callable]:
     """Public functions by name."""
     found = {name: getattr(lm, name) for name in lm.__all__}
     return {
-        name: one for name, one in found.items() if inspect.isfunction(one) and name not in SLOW
+        name: one
+        for name, one in found.items()
+        if inspect.isfunction(one) and name not in NOT_CALLED
     }
 
 

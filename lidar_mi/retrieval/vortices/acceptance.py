@@ -7,7 +7,7 @@ import torch
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices.covariance import far_from_minimum
-from lidar_mi.retrieval.vortices.model import PROFILES, Profile
+from lidar_mi.retrieval.vortices.model import PROFILES, Profile, core_turns
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.robust_fit import Solution
 
@@ -21,20 +21,28 @@ _SIGNIFICANCE = 5.0
 _MATCH = 0.5
 
 
-def step_limits(y: np.ndarray, z: np.ndarray) -> Callable[[torch.Tensor, torch.Tensor], bool]:
-    """Limits of a step: its size, and core radii between half a cell and half the region."""
+def step_limits(
+    y: np.ndarray, z: np.ndarray, profile: Profile, dt: float = 0.0
+) -> Callable[[torch.Tensor, torch.Tensor], bool]:
+    """Limits of a step: its size, and core radii between half a cell and half the region.
+
+    Between two images, ``dt`` apart, no core turns more than once: images do not tell a turn more
+    from one less, and air that is followed round and round takes minutes.
+    """
     sides = float(y[-1] - y[0]), float(z[-1] - z[0])
     cell = max(sides[0] / (len(y) - 1), sides[1] / (len(z) - 1))
     smallest, largest = np.log(cell / 2), np.log(min(sides) / 2)
 
     def allowed(parameters: torch.Tensor, step: torch.Tensor) -> bool:
-        radii = (parameters + step)[[1, 5]]
+        reached = parameters + step
+        radii = reached[[1, 5]]
         near = step[[2, 3, 6, 7]].abs().max() <= 0.15 * min(sides)
         return bool(
             near
             and step[[1, 5]].abs().max() <= 1
             and radii.min() >= smallest
             and radii.max() <= largest
+            and core_turns(reached, dt, profile) <= 1
         )
 
     return allowed

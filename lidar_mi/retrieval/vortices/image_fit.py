@@ -134,7 +134,7 @@ def fit_vortices(
         s.
     noise : float or DataArray, optional
         Standard deviation of each image's white noise, in image 1's unit, of all pixels or of
-        each. Left out: from the images' spectra.
+        each. Left out, or 0 in each: from the images' spectra.
     profile : {"lamb_oseen", "burnham_hallock"}
     frozen : bool
         The vortices do not move during dt. Default: they drift with the mean wind and their mutual
@@ -206,6 +206,8 @@ def fit_pixels(
     if not bool(contrast > 1e-9 * scale) or not bool(pair[1][finite].std() > 0):
         return no_fit(profile, "an image is constant")
     pair = pair / contrast
+    if isinstance(noise, torch.Tensor) and not bool((noise > 0).any()):
+        noise = None  # no pixel's noise is known: a fit that took it for 0 would follow it for long
     if isinstance(noise, torch.Tensor):
         noise = noise.double() * _understated(noise / contrast, pair)
     level = _typical(noise, pair[0].square())
@@ -214,7 +216,7 @@ def fit_pixels(
     bad = torch.nn.functional.max_pool2d((~finite)[None].double(), 5, 1, 2)[0] > 0
     make = _Builder(pair, bad, z, y, dt, level, noise, float(contrast), profile, frozen)
     spacing = (make.spacing[0] * make.spacing[1]) ** 0.5
-    limits = step_limits(y, z)
+    limits = step_limits(y, z, profile, dt)
 
     best = None
     level_images = make(*_LEVELS[0])

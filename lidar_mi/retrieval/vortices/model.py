@@ -155,6 +155,15 @@ def _turning(theta, y, z, profile: Profile) -> torch.Tensor:
     return total
 
 
+def core_turns(theta: torch.Tensor, time: float, profile: Profile) -> float:
+    """Turns of the air at the core radius in a time in s, of the vortex that rotates faster."""
+    value, _ = angular_velocity(torch.ones_like(theta[:1]), profile)
+    fastest = max(float(theta[first].abs() * (-2 * theta[first + 1]).exp()) for first in (0, 4)) / (
+        2 * torch.pi
+    )
+    return float(value) * fastest * time / (2 * torch.pi)
+
+
 def drift(theta: torch.Tensor, profile: Profile) -> torch.Tensor:
     """Velocity (2,) of the pair, m s^-1: mean wind plus mutual induction of the vortices."""
     centres = theta[[2, 6]], theta[[3, 7]]

@@ -120,7 +120,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     tensors = [torch.as_tensor(np.where(usable, a, 0.0)) for a in (*place, value)]
     valid = torch.as_tensor(usable)
     model = _Vectors(*tensors[:2], torch.as_tensor(root), tensors[2], valid, profile)
-    limits = step_limits(y, z)
+    limits = step_limits(y, z, profile)
     flow_variance = float(np.square(value[:, usable]).mean()) / 4
     best = None
     for start in starting_points(_components(model, flow_variance), STARTS, profile):

@@ -18,8 +18,9 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.truth import make_truth
 from lidar_mi.retrieval.velocimetry.warping import band_limited
+from lidar_mi.retrieval.vortices import model
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
-from lidar_mi.retrieval.vortices.model import PROFILES, advected, path_sensitivity
+from lidar_mi.retrieval.vortices.model import PROFILES, advected, path_sensitivity, wind
 from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
 from tests.support.vortex_pairs import uneven, vector
@@ -246,6 +247,28 @@ def test_bad_input_is_named():
         with pytest.raises(InputError) as error:
             call()
         assert str(error.value).startswith(start) and "\n" not in str(error.value)
+
+
+def test_noise_alone_keeps_no_fit_busy(monkeypatch):
+    """Nothing in such images ends a search, and cores may spin up.
+
+    Followed round and round, the air took 50 000 steps, and minutes in images of the usual size.
+    """
+    steps = []
+    monkeypatch.setattr(model, "wind", lambda *given: steps.append(1) or wind(*given))
+    random = np.random.default_rng(1)
+    y, z = np.arange(30) * 0.5, np.arange(24) * 0.5
+    images = [data_array(random.random((24, 30)), y, z) for _ in range(2)]
+    found = fit_vortices(*images, DT, noise=0.0)
+    assert not found.success and len(steps) < 8000
+
+
+def test_a_map_without_noise_says_nothing():
+    """As files have it whose pixels have no standard error."""
+    pair = vortex_pair_images(0.05, seed=6, vortices=uneven(), columns=40, rows=30)
+    alone = fit_vortices(pair.first, pair.second, DT)
+    stated = fit_vortices(pair.first, pair.second, DT, noise=0 * pair.first)
+    np.testing.assert_array_equal(stated.parameters, alone.parameters)
 
 
 def simulated(texture_rms, noise):
