@@ -1,11 +1,11 @@
-"""Recover the air of a slab from its lidar picture by gradient descent.
+"""Recover the extinction of a slab from its lidar image by gradient descent.
 
-Wide beams blur the picture of a wake. The renderer is differentiable with respect to the extinction
-of every cell, so one can ask which air would have given the picture that was seen, and descend:
+Wide beams blur the image of a wake. The renderer is differentiable with respect to the extinction
+of every cell, so the extinction can be fitted to the observed image by gradient descent:
 
     python examples/recover_slab.py        # half a minute; writes recover_slab.png
 
-The picture's noise is blurred air's enemy: descent must stop before it fits that as well.
+The descent must stop before it fits the noise of the image.
 """
 
 import argparse
@@ -38,34 +38,34 @@ def port_vortex(width: float, height: float) -> xr.DataArray:
     return middle.assign_coords(y=middle["y"] - 24)
 
 
-def recover(truth: xr.DataArray, steps: int, photons: int, learning_rate: float = 0.03):
-    """First guess and recovered extinction from the picture of ``truth``, and the misfits.
+def recover(truth: xr.DataArray, steps: int, samples: int, learning_rate: float = 0.03):
+    """First guess and recovered extinction from the image of ``truth``, and the misfits.
 
-    The first guess is what the lidar equation makes of the picture: the blurred air.
+    The first guess is the solution of the lidar equation for the image: the blurred extinction.
     """
     (plan,) = plan_scans(Scan(), truth["y"].values, truth["z"].values, [0.0])
     phase = {"type": "rayleigh_polarized"}
-    settings = RenderSettings(samples_per_beam=photons, max_order=1)
+    settings = RenderSettings(samples_per_beam=samples, max_order=1)
     air = extrude(truth, plan, LIDAR)
     scene = mi.load_dict(scene_dict(air, plan, LIDAR, ENVIRONMENT, phase, 1.0, settings))
     parameters = mi.traverse(scene)
 
-    picture = np.array(mi.render(scene, spp=64 * photons, seed=1))[..., 0]
+    image = np.array(mi.render(scene, spp=64 * samples, seed=1))[..., 0]
     flat = xr.ones_like(truth) * 1e-3
     parameters[KEY] = _voxels(extrude(flat, plan, LIDAR))
     parameters.update()
-    reference = np.array(mi.render(scene, spp=64 * photons, seed=2))[..., 0]
-    guess = truth.copy(data=(1e-3 * picture / reference)[::-1, ::-1])
+    reference = np.array(mi.render(scene, spp=64 * samples, seed=2))[..., 0]
+    guess = truth.copy(data=(1e-3 * image / reference)[::-1, ::-1])
 
     # the logarithm keeps extinction positive
     optimizer = mi.ad.Adam(lr=learning_rate)
     optimizer["log"] = dr.log(_voxels(extrude(guess, plan, LIDAR)))
-    measured, misfits = mi.TensorXf(picture), []
+    measured, misfits = mi.TensorXf(image), []
     for step in range(steps):
         parameters[KEY] = dr.exp(optimizer["log"])
         parameters.update()
-        seen = mi.render(scene, parameters, spp=photons, seed=10 + step)[..., 0]
-        misfit = dr.mean(dr.square(seen / measured - 1))
+        rendered = mi.render(scene, parameters, spp=samples, seed=10 + step)[..., 0]
+        misfit = dr.mean(dr.square(rendered / measured - 1))
         dr.backward(misfit)
         optimizer.step()
         misfits.append(float(misfit.array[0]))
@@ -75,7 +75,7 @@ def recover(truth: xr.DataArray, steps: int, photons: int, learning_rate: float 
 
 
 def error(found: xr.DataArray, truth: xr.DataArray) -> float:
-    """Relative rms error, two nodes from the edge on."""
+    """Relative rms error, without two nodes at the edges."""
     inner = (slice(2, -2), slice(2, -2))
     return float(np.sqrt(np.mean((found.values / truth.values - 1)[inner] ** 2)))
 
@@ -86,8 +86,8 @@ def draw(truth, guess, found, path) -> None:
         figure.subplots(1, 3),
         (truth, guess, found),
         (
-            "true air",
-            f"as seen: error {error(guess, truth):.1%}",
+            "truth",
+            f"first guess: error {error(guess, truth):.1%}",
             f"recovered: error {error(found, truth):.1%}",
         ),
         strict=True,
@@ -114,12 +114,14 @@ def _voxels(extinction: xr.DataArray):
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--photons", type=int, default=64, help="a beam and step")
+    parser.add_argument(
+        "--samples", "--photons", type=int, default=64, help="Monte Carlo samples per beam and step"
+    )
     parser.add_argument("--out", default="recover_slab.png")
     options = parser.parse_args()
     use_variant("llvm_ad_mono")
     truth = port_vortex(32, 24)
-    guess, found, misfits = recover(truth, options.steps, options.photons)
+    guess, found, misfits = recover(truth, options.steps, options.samples)
     draw(truth, guess, found, options.out)
     print(
         f"lidar-mi {lidar_mi.__version__}: misfit {misfits[0]:.2e} -> {misfits[-1]:.2e}, error "

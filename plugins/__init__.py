@@ -1,8 +1,8 @@
-"""Mitsuba plugins: how light moves, and how a lidar sends and receives it.
+"""Mitsuba plugins: light transport, and emission and reception by a lidar.
 
-One plugin a file. A Mitsuba class belongs to one variant, so every plugin module holds a function
-``define()`` that builds its class for the variant in force, and says under which ``NAME`` and
-``KIND`` Mitsuba knows it; the module's docstring is the plugin's reference page.
+One plugin per file. A Mitsuba class belongs to one variant, so every plugin module has a function
+``define()`` that builds its class for the variant in force. ``NAME`` and ``KIND`` are those of its
+registration; the module's docstring is the plugin's reference page.
 
 Importing this package registers all plugins, see `registration`.
 """

@@ -96,10 +96,10 @@ def define():
             return dr.pi * self.m_stop * self.m_stop
 
         def receive(self, point, direction):
-            """Where light through ``point`` of the stop along ``direction`` (world) arrives.
+            """Position on the CCD of light through ``point`` of the stop along ``direction``.
 
-            Returns its place in px right and down from the centre of the top left pixel, and
-            whether that is on the CCD.
+            Both in world coordinates. The position is in px right and down from the centre of the
+            top left pixel; also returns whether it is on the CCD.
             """
             inverse = self.m_pose.inverse()
             point, direction = inverse @ point, inverse @ direction
@@ -123,7 +123,7 @@ def define():
         def sample_towards_scene(self, place, sample):
             """A ray from ``place`` (px, as above) through the lens: stop point, direction, weight.
 
-            The weight is that of a pixel's étendue; the mean over ``sample`` counts.
+            The mean of the weight over ``sample`` is a pixel's étendue.
             """
             at = (place - self.m_centre) * self.m_pixel
             disc = mi.warp.square_to_uniform_disk(sample)
@@ -136,12 +136,12 @@ def define():
                 return self.m_pose @ point, self.m_pose @ direction, weight
             distance = float(self.lens[-1, 2])
             behind = disc * self.m_exit  # a point in the last surface's tangent plane
-            way = dr.normalize(mi.Vector3f(behind.x - at.x, behind.y - at.y, distance))
+            inward = dr.normalize(mi.Vector3f(behind.x - at.x, behind.y - at.y, distance))
             (right, down), out, passes = _through(
-                _reversed(self.lens), (at.x, at.y), (way.x, way.y, way.z), dr
+                _reversed(self.lens), (at.x, at.y), (inward.x, inward.y, inward.z), dr
             )
             passes &= dr.square(right) + dr.square(down) <= dr.square(self.m_stop)
-            weight = area * dr.pi * dr.square(self.m_exit) * dr.square(dr.square(way.z))
+            weight = area * dr.pi * dr.square(self.m_exit) * dr.square(dr.square(inward.z))
             weight = dr.select(passes, weight / distance**2, 0)
             point, direction = mi.Point3f(0, right, down), mi.Vector3f(out[2], out[0], out[1])
             return self.m_pose @ point, self.m_pose @ direction, weight
@@ -210,7 +210,7 @@ def read_lens(source) -> np.ndarray:
 
 
 def _reversed(lens: np.ndarray) -> np.ndarray:
-    """The lens as light from the CCD meets it: the CCD first, the stop's plane at the end."""
+    """The lens in reverse order: the CCD first, the stop's plane at the end."""
     back = np.zeros_like(lens)
     back[0, 2], back[0, 3] = lens[-1, 2], 1
     back[1:, :2] = lens[:0:-1, :2] * (-1, 1)
@@ -219,14 +219,14 @@ def _reversed(lens: np.ndarray) -> np.ndarray:
     return back
 
 
-def _through(lens, place, way, xp):
+def _through(lens, place, direction, xp):
     """Follow light through a lens: from the plane of its first row to that at its end.
 
-    ``place`` (2 arrays) and ``way`` (3 arrays, a unit vector) are (right, down) and (right, down,
-    onward). Returns the same at the end, and whether all surfaces were met and passed. Every
-    surface is met in coordinates of its own vertex: nothing large is ever added.
+    ``place`` (2 arrays) and ``direction`` (3 arrays, a unit vector) are (right, down) and
+    (right, down, onward). Returns the same at the end, and whether all surfaces were hit and
+    passed. Every surface has coordinates about its own vertex, to avoid rounding errors.
     """
-    (x, y), (u, v, w) = place, way
+    (x, y), (u, v, w) = place, direction
     z, met, before = 0.0, True, float(lens[0, 3])
     distance = float(lens[0, 2])
     for radius, conic, after, index in lens[1:].tolist():

@@ -1,90 +1,91 @@
-"""Geometry of paths that must close: what is left of a path's length at a vertex, and its use.
+"""Geometry of paths that must close: the excess length of a path at a vertex, and its use.
 
-With the telescope at the distance h and a path l still to go, home included, the *budget* l - h is
-what the path is longer than the way straight home. A flight at the angle theta from the direction
-away from home uses up the more of it the less it leads home: far from the telescope 1 + cos(theta)
-times its length. All ends of flights that use up the same lie on an ellipsoid around the vertex and
-the telescope.
+With the telescope at the distance h and a remaining path l, up to the telescope, the *excess
+length* is l - h: the remaining path less the straight distance. A flight at the angle theta from
+the direction away from the telescope consumes part of it, far from the telescope 1 + cos(theta)
+times its length. The ends of all flights that consume the same part lie on an ellipsoid whose foci
+are the vertex and the telescope point.
 
-A vertex in air of the same extinction all around brings the more the shorter ways use up a budget:
-as 1 / (1 + cos(theta)), flights homeward by far the most. `Way.sample` draws such directions.
+In air of uniform extinction the contribution of a direction is proportional to d(length)/d(excess),
+about 1 / (1 + cos(theta)): flights towards the telescope contribute by far the most.
+`OpenPath.sample` draws such directions.
 """
 
 import drjit as dr
 import mitsuba as mi
 
 
-class Way:
-    """What a path has left at a vertex.
+class OpenPath:
+    """The remaining part of a path at a vertex, before it is closed.
 
     Parameters
     ----------
     away : direction from the telescope point to the vertex.
     distance : between them, m.
-    budget : length of the rest of the path less the distance, m.
+    excess : length of the remaining path less the distance, m.
     field : tangent of half the widest angle, as seen from the telescope, between the vertex and
         anything in the field of view.
-    room : how far homeward there may be any air, m.
+    reach : how far towards the telescope there may be any air, m.
     """
 
-    def __init__(self, away, distance, budget, field, room):
-        self.away, self.distance, self.budget = away, distance, budget
-        self.field, self.room = field, room
+    def __init__(self, away, distance, excess, field, reach):
+        self.away, self.distance, self.excess = away, distance, excess
+        self.field, self.reach = field, reach
 
     def widened(self, factor):
         """The same with a wider field."""
-        return Way(self.away, self.distance, self.budget, factor * self.field, self.room)
+        return OpenPath(self.away, self.distance, self.excess, factor * self.field, self.reach)
 
-    def raised(self, direction):
+    def one_plus_cosine(self, direction):
         """1 + cos(theta), exact where it is small."""
         return 0.5 * dr.squared_norm(self.away + direction)
 
-    def leg(self, used, raised):
-        """Length of a flight that uses up ``used`` of the budget."""
-        return used * (0.5 * used + self.distance) / (used + self.distance * raised)
+    def leg(self, used, one_plus_cosine):
+        """Length of a flight that consumes ``used`` of the excess length."""
+        return used * (0.5 * used + self.distance) / (used + self.distance * one_plus_cosine)
 
-    def slope(self, used, raised, leg):
-        """Derivative of the budget used up with respect to the length of the flight."""
-        return (used + self.distance * raised) / (self.distance + used - leg)
+    def slope(self, used, one_plus_cosine, leg):
+        """Derivative of the excess length consumed with respect to the length of the flight."""
+        return (used + self.distance * one_plus_cosine) / (self.distance + used - leg)
 
     def sample(self, used, sample):
-        """Direction of a flight that uses up ``used``; two numbers in [0, 1)."""
-        least, most, soft = self._span(used)
-        raised = dr.clip(least * dr.exp(dr.log(most / least) * sample.x) - soft, 0, 2)
-        sine = dr.sqrt(raised * (2 - raised))
+        """Direction of a flight that consumes ``used``; two numbers in [0, 1)."""
+        least, most, offset = self._limits(used)
+        one_plus_cosine = dr.clip(least * dr.exp(dr.log(most / least) * sample.x) - offset, 0, 2)
+        sine = dr.sqrt(one_plus_cosine * (2 - one_plus_cosine))
         sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
-        local = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, raised - 1)
+        local = mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, one_plus_cosine - 1)
         return mi.Frame3f(self.away).to_world(local)
 
-    def density(self, used, raised):
+    def density(self, used, one_plus_cosine):
         """Of `sample`, per steradian."""
-        least, most, soft = self._span(used)
-        place = raised + soft
+        least, most, offset = self._limits(used)
+        place = one_plus_cosine + offset
         inside = (place >= least) & (place <= most)
         return dr.select(inside, dr.inv_two_pi / (dr.log(most / least) * place), 0)
 
-    def _span(self, used):
-        """Least and greatest ``raised + soft`` of flights that end in view, and ``soft``.
+    def _limits(self, used):
+        """Least and largest ``one_plus_cosine + offset`` of flights that end in view; ``offset``.
 
         On an ellipsoid of eccentricity e the angles psi and theta at its foci obey
         tan(psi / 2) = (1 - e) / (1 + e) tan(theta / 2); here (1 - e) / (1 + e) is
-        used / (used + 2 distance). Flights homeward end where the air does; twice that far, since
-        its border need not be square to them.
+        used / (used + 2 distance). Flights towards the telescope end where the air does; twice
+        that far, as its boundary may be oblique.
         """
-        soft = used / self.distance
+        offset = used / self.distance
         wide = dr.square(self.field * (2 * self.distance + used))
         least = 2 * dr.square(used) / (dr.square(used) + wide)
-        least = dr.maximum(least, used / (used + 2 * self.room))
-        return least + soft, 2 + soft, soft
+        least = dr.maximum(least, used / (used + 2 * self.reach))
+        return least + offset, 2 + offset, offset
 
 
 def quarter_turn(axis, direction):
-    """A direction turned by 90 degrees about an axis."""
+    """A direction rotated by 90 degrees about an axis."""
     return axis * dr.dot(axis, direction) + dr.cross(axis, direction)
 
 
 def closing_distance(offset, direction, path):
-    """Where a flight must end for the rest of its path to be ``path`` long.
+    """Length of the flight whose path, from its start to the goal, is ``path`` long.
 
     From ``offset`` (start minus goal) along ``direction`` to t, and from there to the goal:
     t + |offset + t direction| = path, t = (path^2 - |offset|^2) / (2 (path + offset.direction)).
@@ -96,10 +97,11 @@ def closing_distance(offset, direction, path):
 
 
 def sample_near(least, most, scale, sample, again):
-    """Distance of a vertex from where a flight along the beam would close the path.
+    """Distance of a vertex in front of the point where the beam would close the path.
 
-    Of directions of isotropic scattering there, weighted by the length they close at, a fraction of
-    ln(1 + (scale / left)^2) leads back into view. Uniform, if that falls out of the range.
+    Of isotropic scattering there, weighted by the length at which directions close the path, the
+    fraction that returns into view is proportional to ln(1 + (scale / left)^2). Uniform, if that
+    is out of the range.
     """
     left = scale * sample.x * dr.tan(0.5 * dr.pi * sample.y)
     return dr.select((left > least) & (left < most), left, dr.lerp(least, most, again))
@@ -113,6 +115,6 @@ def near_density(left, least, most, scale):
 
 
 def _near_chance(left, scale):
-    """Integral of ln(1 + (scale / left)^2) / (pi scale) from 0 on."""
+    """Integral of ln(1 + (scale / left)^2) / (pi scale) from 0 to ``left``."""
     value = left * dr.log(1 + dr.square(scale / left)) + 2 * scale * dr.atan(left / scale)
     return dr.select(left > 0, value / (dr.pi * scale), 0)

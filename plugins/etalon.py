@@ -70,9 +70,9 @@ from .registration import register
 NAME, KIND = "etalon", "bsdf"
 
 SPEED_OF_LIGHT = 299_792_458.0
-# of the strongest harmonic: what is left out of a folded line
+# relative amplitude of the neglected harmonics of a folded line
 NEGLECTED = 1e-8
-# transmittance below which a mirror is taken for opaque
+# transmittance below which a mirror counts as opaque
 LEAST_PASSED = 1e-6
 
 
@@ -171,7 +171,7 @@ def define():
         def _mirror_on_axis(self, frequency):
             """`_stack` at a frequency relative to the laser's, at normal incidence, in float64."""
             layers = [(n, n * d * 2 * np.pi / self.wavelength * frequency) for n, d in self.coating]
-            with np.errstate(all="ignore"):  # a thick metal's NaN is refused as what it is: opaque
+            with np.errstate(all="ignore"):  # NaN of a thick metal is refused as opaque
                 return _stack(layers, self.index, self.plate_index, np)
 
         def _mirrors(self, sine2):
@@ -216,8 +216,8 @@ def define():
         def matrices(self, sine2, offset, defects, reflects=True):
             """Mueller elements (m00, m01, m22, m23) of transmitted and of reflected light.
 
-            About the axis perpendicular to the plane of incidence. ``offset`` (Hz) is what a ray
-            has beyond the laser line if sampled, the line's shift if folded.
+            About the axis perpendicular to the plane of incidence. ``offset`` (Hz) is the ray's
+            frequency less the laser line's if sampled, the line's shift if folded.
             """
             order = self.order_of(sine2, offset)
             if self.line_shape == "sampled":

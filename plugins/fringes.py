@@ -66,7 +66,7 @@ def define():
             self.physical = Physical(NAME)
             # called with (paths done, paths in all) after every pass, when set
             self.progress = None
-            # where passes are kept, when set; see gated_volpath
+            # stores finished passes, when set; see gated_volpath
             self.batches = None
 
         def aov_names(self):
@@ -155,9 +155,9 @@ def define():
                 point = sensor.sample_stop(pair(rng))
                 place, arrives = sensor.receive(point, direction)
                 # from before the first surface to the stop, and no further
-                way = dr.opaque(mi.Float, _reach(scene, sensor))
-                ray = mi.Ray3f(point - direction * way, direction)
-                ray.maxt = way
+                length = dr.opaque(mi.Float, _reach(scene, sensor))
+                ray = mi.Ray3f(point - direction * length, direction)
+                ray.maxt = length
                 ray.time = source.line.sample(rng.next_float32(), pair(rng))
                 stokes = source.sample_stokes(direction, rng.next_float32(), pair(rng))
                 matrix = _surfaces(scene, ray, rng, context, arrives)
@@ -179,7 +179,7 @@ def define():
             return [*(s * energy for s in stokes), dr.sqrt(variance) * energy]
 
         def _kept(self, pixels):
-            """How many passes an earlier run kept, and what they have given."""
+            """Number of passes stored by an earlier run, and their results."""
             passes, arrays = self.batches.kept() if self.batches else (0, {})
             if not passes:
                 return 0, [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
@@ -257,7 +257,7 @@ def _reach(scene, sensor) -> float:
 
 
 def _check_straight(scene):
-    """Surfaces that refract light would be ignored: that is an error of the scene."""
+    """Refuse surfaces that refract light, which would be ignored."""
     kinds = mi.BSDFFlags
     bending = kinds.DiffuseTransmission | kinds.GlossyTransmission | kinds.DeltaTransmission
     for shape in scene.shapes():

@@ -93,8 +93,8 @@ def define():
             self.physical = Physical(NAME)
             # called with (samples done, samples in all) after every pass, when set
             self.progress = None
-            # where passes are kept, when set: `kept()` gives how many, and arrays by name; `keep`
-            # is called with their number and a function that gives the arrays
+            # stores finished passes, when set: `kept()` returns their number and arrays by name;
+            # `keep` takes their number and a function that returns the arrays
             self.batches = None
 
         def aov_names(self):
@@ -121,7 +121,7 @@ def define():
             trace = self._gated if self.estimator == "gated" else self._analog
             before, arrays = self.batches.kept() if self.batches else (0, {})
             if arrays and int(arrays.get("samples_per_pass", -1)) != self.samples_per_pass:
-                before, arrays = 0, {}  # passes of another size, for another machine's memory
+                before, arrays = 0, {}  # passes of another size
             image = _float(arrays.get("image"), beams * gates * quantities)
             done, total = 0, _moments(arrays)
             with dr.suspend_grad(), _nothing_freed():
@@ -217,7 +217,7 @@ def define():
             return sensor, seed, samples
 
         def _unit(self, sensor) -> int:
-            """Gated samples come in rounds of one sample per gate."""
+            """Samples per round: one per gate with the gated estimator."""
             return sensor.gate_count if self.estimator == "gated" else 1
 
         def _passes(self, sensor, samples):
@@ -257,23 +257,23 @@ def define():
             number = (lane - cell * rounds_ + dr.opaque(mi.UInt32, start)) * gates + gate
             beam += dr.opaque(mi.UInt32, first)
             lidar = Lidar(scene, sensor, differentiable)
-            photon = lidar.emit(seed, beam, number)
+            sample = lidar.emit(seed, beam, number)
 
-            low, high = sensor.ranges(photon.frame.n)
+            low, high = sensor.ranges(sample.frame.n)
             width = 2 * (high - low) / gates
-            near = 2 * (low - photon.delay) + width * gate
-            where = photon.rng.next_float32()
+            near = 2 * (low - sample.delay) + width * gate
+            where = sample.rng.next_float32()
             by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
             stokes = lidar.forced(
-                photon, near, near + width, where, self.max_order, self.orders, by_order, cell
+                sample, near, near + width, where, self.max_order, self.orders, by_order, cell
             )
             dr.eval(stokes, by_order)
             means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
             off = [
                 s - dr.gather(mi.Float, m, cell) for s, m in zip(stokes[:2], means[:2], strict=True)
             ]
-            spreads = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
-            return rounds, means + self._per_order(by_order, rounds), spreads
+            deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
+            return rounds, means + self._per_order(by_order, rounds), deviations
 
         def _analog(self, scene, sensor, seed, first, count, start, rounds):
             """The same, with analog free flights."""
@@ -283,19 +283,19 @@ def define():
             beam = lane // rounds_
             number = lane - beam * rounds_ + dr.opaque(mi.UInt32, start)
             lidar = Lidar(scene, sensor)
-            photon = lidar.emit(seed, beam + dr.opaque(mi.UInt32, first), number)
+            sample = lidar.emit(seed, beam + dr.opaque(mi.UInt32, first), number)
 
             by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
             sums = [dr.zeros(mi.Float, count * gates) for _ in STOKES]
             products = {pair: dr.zeros(mi.Float, count * gates) for pair in self._products()}
             lidar.analog(
-                photon, self.max_order, beam * gates, gates, sums, products, self.orders, by_order
+                sample, self.max_order, beam * gates, gates, sums, products, self.orders, by_order
             )
             dr.eval(sums, products, by_order)
             number = _opaque(rounds)
             means = [s / number for s in sums]
-            spreads = [p - number * means[i] * means[j] for (i, j), p in products.items()]
-            return rounds, means + self._per_order(by_order, rounds), spreads
+            deviations = [p - number * means[i] * means[j] for (i, j), p in products.items()]
+            return rounds, means + self._per_order(by_order, rounds), deviations
 
         def _products(self):
             """The pairs of Stokes components whose products are summed."""
@@ -318,10 +318,10 @@ def define():
 
 @contextlib.contextmanager
 def _nothing_freed():
-    """Hold Python's garbage collection off while kernels are recorded.
+    """Suspend Python's garbage collection while kernels are recorded.
 
-    A scene without references, freed between two virtual calls, makes them differ in what they may
-    meet; Dr.Jit 1.5 then emits a function twice and aborts.
+    A scene freed between two virtual calls changes the set of instances that they may call; Dr.Jit
+    1.5 then emits a function twice and aborts.
     """
     enabled = gc.isenabled()
     gc.disable()
@@ -346,55 +346,55 @@ def _arrays(image, total):
     """Finished beams, and the moments of those that are not, for NumPy."""
     arrays = {"image": image.numpy()}
     if total is not None:
-        number, means, spreads = total
+        number, means, deviations = total
         arrays |= {
             "number": np.array(number),
             "means": np.stack([mean.numpy() for mean in means]),
-            "spreads": np.stack([spread.numpy() for spread in spreads]),
+            "spreads": np.stack([part.numpy() for part in deviations]),
         }
     return arrays
 
 
 def _moments(arrays):
-    """The moments that `_arrays` took apart."""
+    """The moments from the arrays of `_arrays`."""
     if "number" not in arrays:
         return None
-    means, spreads = ([mi.Float(row) for row in arrays[name]] for name in ("means", "spreads"))
-    return int(arrays["number"]), means, spreads
+    means, deviations = ([mi.Float(row) for row in arrays[name]] for name in ("means", "spreads"))
+    return int(arrays["number"]), means, deviations
 
 
-def _results(number, means, spreads):
+def _results(number, means, deviations):
     """The image's quantities from the moments of all samples."""
-    errors = _errors(_opaque(number), spreads)
+    errors = _errors(_opaque(number), deviations)
     return [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:]]
 
 
 def _merge(first, second):
     """Moments of two sets of samples together (Chan, Golub & LeVeque 1983)."""
-    n1, means1, spreads1 = first
-    n2, means2, spreads2 = second
+    n1, means1, deviations1 = first
+    n2, means2, deviations2 = second
     fraction, weight = _opaque(n2 / (n1 + n2)), _opaque(n1 * n2 / (n1 + n2))
     off = [b - a for a, b in zip(means1, means2, strict=True)]
     means = [a + o * fraction for a, o in zip(means1, off, strict=True)]
-    spreads = [
+    deviations = [
         a + b + off[i] * off[j] * weight
-        for a, b, (i, j) in zip(spreads1, spreads2, PRODUCTS[: len(spreads1)], strict=True)
+        for a, b, (i, j) in zip(deviations1, deviations2, PRODUCTS[: len(deviations1)], strict=True)
     ]
-    return n1 + n2, means, spreads
+    return n1 + n2, means, deviations
 
 
-def _errors(number, spreads):
+def _errors(number, deviations):
     """Standard error of S0, and with all three sums that of S1 and their correlation."""
-    variances = [dr.maximum(s, 0) / (number * (number - 1.0)) for s in spreads[:2]]
+    variances = [dr.maximum(s, 0) / (number * (number - 1.0)) for s in deviations[:2]]
     errors = [dr.sqrt(v) for v in variances]
-    if len(spreads) == 1:
+    if len(deviations) == 1:
         return errors
-    both = dr.sqrt(dr.maximum(spreads[0], 0)) * dr.sqrt(dr.maximum(spreads[1], 0))
-    return [*errors, dr.select(both > 0, dr.clip(spreads[2] / both, -1, 1), 0)]
+    both = dr.sqrt(dr.maximum(deviations[0], 0)) * dr.sqrt(dr.maximum(deviations[1], 0))
+    return [*errors, dr.select(both > 0, dr.clip(deviations[2] / both, -1, 1), 0)]
 
 
 def _check_blends(scene, sensor):
-    """Parts of a blend that would pass for a Mueller matrix without being one."""
+    """Refuse blends of polarised with unpolarised phase functions."""
     media = [sensor.get_medium()]
     for shape in scene.shapes():
         media += [shape.interior_medium(), shape.exterior_medium()]
@@ -405,7 +405,7 @@ def _check_blends(scene, sensor):
                 NAME,
                 "blendphase",
                 part.class_name(),
-                "phase functions that all know polarisation, such as mueller, or none that does",
+                "phase functions that are all polarised, such as mueller, or all unpolarised",
             )
 
 

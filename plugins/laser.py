@@ -67,10 +67,10 @@ def define():
             # fraction of an uncut beam inside the aperture; radii are drawn from that fraction
             self.m_inside = dr.opaque(mi.Float, -math.expm1(-2 * (cut / radius) ** 2))
             self.m_divergence_half = dr.opaque(mi.Float, divergence / 2)
-            self.m_flags = mi.EmitterFlags.DeltaDirection  # seen by no ray traced backwards
+            self.m_flags = mi.EmitterFlags.DeltaDirection  # not hit by rays traced backwards
 
         def sample_local(self, sample_position, sample_direction):
-            """Origin and direction of a photon in the laser's own frame, axis along +z."""
+            """Origin and direction of a ray in the laser's own frame, axis along +z."""
             origin = mi.Point3f(0, 0, 0)
             radius = self.m_radius * dr.sqrt(-0.5 * dr.log(1 - self.m_inside * sample_position.x))
             sine, cosine = dr.sincos(dr.two_pi * sample_position.y)
@@ -81,7 +81,7 @@ def define():
             return origin, dr.normalize(mi.Vector3f(tangent * cosine, tangent * sine, 1))
 
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
-            """A photon of the beam; the weight's first column is its Stokes vector, in joules."""
+            """A ray of the beam; the weight's first column is its Stokes vector, in joules."""
             origin, local = self.sample_local(sample2, sample3)
             to_world = self.m_pose
             direction = dr.normalize(to_world @ local)

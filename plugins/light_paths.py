@@ -1,13 +1,13 @@
-"""Light paths of a lidar: from the laser over the air's vertices to a point of the telescope.
+"""Light paths of a lidar: from the laser over vertices in the air to a point of the telescope.
 
-`Lidar.forced` finds paths that end in a gate, `Lidar.analog` lets photons fly as nature draws them
-and sees whether they do. Both bring back Stokes vectors about the instrument's horizontal axis.
+`Lidar.forced` samples paths that end in a gate, `Lidar.analog` samples free flights from their
+physical distribution. Both give Stokes vectors about the instrument's horizontal axis.
 """
 
 import drjit as dr
 import mitsuba as mi
 
-from .closed_paths import Way, closing_distance, near_density, quarter_turn, sample_near
+from .closed_paths import OpenPath, closing_distance, near_density, quarter_turn, sample_near
 from .media import Air, coefficients, collision, interaction, slabs, transmittance
 from .polarization import apply_phase_function, rotate_stokes, transverse
 from .random_numbers import generator, pair
@@ -17,27 +17,27 @@ SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
 
 # Fraction of first vertices sampled where isotropic scattering closes paths most often.
-NEAR_SHARE = 0.35
-# Of last flights, the share whose direction is the phase function's, and the largest share that is
-# looked for from the telescope.
-PHASE_SHARE = 0.2
-BACK_SHARE = 0.5
-# Of flights between, the share whose direction is the phase function's; the others mostly stay in
-# a field of view that is wider than the telescope's by this factor.
-PHASE_FLIGHT_SHARE = 0.3
+NEAR_FRACTION = 0.35
+# Of last flights, the fraction with directions sampled from the phase function, and the largest
+# fraction with directions sampled from the telescope.
+PHASE_FRACTION = 0.2
+BACK_FRACTION = 0.5
+# Of intermediate flights, the fraction with directions sampled from the phase function; the others
+# mostly stay in a field of view that is wider than the telescope's by this factor.
+PHASE_FLIGHT_FRACTION = 0.3
 WIDER = 1.6
-# Of flights between, the share that leaves as much of the path as first vertices do.
-NEAR_FLIGHT_SHARE = 0.3
-# Probability of survival over the weight of the last flight.
-FOLLOWED = 30.0
+# Of intermediate flights, the fraction whose remaining path is sampled as that of first vertices.
+NEAR_FLIGHT_FRACTION = 0.3
+# Russian roulette: probability of survival over the weight.
+ROULETTE_FACTOR = 30.0
 
 
-class Photon:
-    """Photons at the laser, each with the telescope point it will be connected to.
+class Sample:
+    """Monte Carlo samples at the laser, each with the telescope point it will be connected to.
 
     World coordinates. ``frame`` holds the beam's axes in the lidar's own frame, ``axes`` in the
-    world. ``delay`` is half the light path (m) by which the photon left after the middle of the
-    pulse. ``stokes`` refers to ``mi.mueller.stokes_basis(direction)``.
+    world. ``delay`` is half the light path (m) by which the sample is emitted after the middle of
+    the pulse. ``stokes`` refers to ``mi.mueller.stokes_basis(direction)``.
     """
 
     def __init__(self, rng, frame, axes, origin, direction, aperture, delay, stokes):
@@ -57,8 +57,8 @@ class Lidar:
         self.area = sensor.aperture_area()
         self.context = mi.PhaseFunctionContext()
 
-    def emit(self, seed, beam, number) -> Photon:
-        """Photons of beams by their index, with random numbers of their own."""
+    def emit(self, seed, beam, number) -> Sample:
+        """Samples of beams by their index, with independent random numbers."""
         rng = generator(seed, beam, number)
         sensor, laser = self.sensor, self.sensor.laser
         to_world = sensor.world_transform()
@@ -80,29 +80,29 @@ class Lidar:
                 transverse(axes.s, direction),
                 mi.mueller.stokes_basis(direction),
             )
-        return Photon(rng, frame, axes, origin, direction, aperture, delay, list(stokes))
+        return Sample(rng, frame, axes, origin, direction, aperture, delay, list(stokes))
 
-    def forced(self, photon, low, high, share, max_order, split, by_order, cell):
-        """Stokes vector (about e_h) that a photon returns from its gate.
+    def forced(self, sample, low, high, position, max_order, split, by_order, cell):
+        """Stokes vector (about e_h) received from each sample's gate.
 
-        ``low`` and ``high`` are twice the gate's ranges less the photon's delay, ``share`` (0 to
-        1) says where between them this photon's whole path is. The sum of all orders up to
+        ``low`` and ``high`` are twice the gate's ranges less the sample's delay, ``position`` (0
+        to 1) is the place of the sample's whole path between them. The sum of all orders up to
         ``max_order``; with ``split`` each order's S0 is also added to ``by_order``.
         """
         medium = mi.MediumPtr(self.sensor.get_medium())
-        offset = photon.origin - photon.aperture
-        path = dr.lerp(low, high, share)
-        closure = closing_distance(offset, photon.direction, path)
-        home = dr.normalize(photon.aperture - (photon.origin + photon.direction * closure))
-        volume = (high - low) / (1 - dr.dot(photon.direction, home))
+        offset = sample.origin - sample.aperture
+        path = dr.lerp(low, high, position)
+        closure = closing_distance(offset, sample.direction, path)
+        back = dr.normalize(sample.aperture - (sample.origin + sample.direction * closure))
+        volume = (high - low) / (1 - dr.dot(sample.direction, back))
         total = self._connect(
-            photon,
-            photon.rng,
-            photon.origin,
-            photon.direction,
+            sample,
+            sample.rng,
+            sample.origin,
+            sample.direction,
             closure,
             medium,
-            photon.stokes,
+            sample.stokes,
             volume,
             (path > 0) & (closure > 0),
         )
@@ -111,19 +111,19 @@ class Lidar:
         if max_order == 1:
             return total
         further = self._forced_further(
-            photon, medium, path, high - low, mi.UInt32(max_order), split, by_order, cell, max_order
+            sample, medium, path, high - low, mi.UInt32(max_order), split, by_order, cell, max_order
         )
         return _sum(total, further)
 
     @dr.syntax
-    def _forced_further(self, photon, medium, path, width, last, split, by_order, cell, max_order):
+    def _forced_further(self, sample, medium, path, width, last, split, by_order, cell, max_order):
         """Orders from two on: the path is closed once from every vertex but the last."""
-        # a local name, since the loop carries local variables, not what objects hold
-        aperture, rng = photon.aperture, photon.rng
+        # local names, as the loop records local variables only
+        aperture, rng = sample.aperture, sample.rng
         total, order = _copied([0, 0, 0, 0]), mi.UInt32(2)
         path, medium = mi.Float(path), mi.MediumPtr(medium)
-        position, direction = mi.Point3f(photon.origin), mi.Vector3f(photon.direction)
-        stokes = _copied(photon.stokes)
+        position, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
+        stokes = _copied(sample.stokes)
         flight, weight = self._first_flight(rng, position, direction, aperture, path)
         active = flight > 0
         while dr.hint(active, label="scattering orders"):
@@ -143,23 +143,23 @@ class Lidar:
             mei = interaction(medium, position, direction, self.wavelengths)
             scattering, _ = coefficients(medium, mei, self.channel, active)
             weight *= out * scattering
-            # the first vertex plays no roulette: in thin air it is the signal
-            followed = dr.select(order == 2, 1, dr.minimum(FOLLOWED * weight, 1))
-            active &= (weight > 0) & (rng.next_float32(active) < followed)
-            stokes = _scaled(stokes, dr.select(active, weight / followed, 0))
+            # no roulette at the first vertex: in thin air it is the signal
+            survival = dr.select(order == 2, 1, dr.minimum(ROULETTE_FACTOR * weight, 1))
+            active &= (weight > 0) & (rng.next_float32(active) < survival)
+            stokes = _scaled(stokes, dr.select(active, weight / survival, 0))
             path -= flight
 
             away = position - aperture
             distance = dr.norm(away)
-            away, budget = away / distance, path - distance
-            active &= budget > 0
-            _, room = slabs(self.low, self.high, position, -away)
-            way = Way(away, distance, budget, self._half_field(photon.axes, away), room)
-            closing, bent, leg, volume = self._last_flight(
-                rng, photon, medium, mei, stokes, way, active
+            away, excess = away / distance, path - distance
+            active &= excess > 0
+            _, reach = slabs(self.low, self.high, position, -away)
+            rest = OpenPath(away, distance, excess, self._half_field(sample.axes, away), reach)
+            closing, scattered, leg, volume = self._last_flight(
+                rng, sample, medium, mei, stokes, rest, active
             )
             gain = self._connect(
-                photon, rng, position, closing, leg, medium, bent, width * volume, volume > 0
+                sample, rng, position, closing, leg, medium, scattered, width * volume, volume > 0
             )
             total = _sum(total, gain)
             if dr.hint(split, mode="scalar"):
@@ -168,25 +168,25 @@ class Lidar:
             order += 1
             active &= order <= last
             direction, stokes, flight, weight = self._next_flight(
-                rng, medium, mei, stokes, way, active
+                rng, medium, mei, stokes, rest, active
             )
             active &= weight > 0
         return total
 
     def _first_flight(self, rng, origin, direction, aperture, path):
-        """Length of a first flight and one over its density; -1 where the beam meets no air."""
+        """Length of a first flight and the inverse of its density; -1 where there is no air."""
         reach = closing_distance(origin - aperture, direction, path)
         enters, leaves = slabs(self.low, self.high, origin, direction)
         least, most = reach - dr.minimum(leaves, reach), reach - dr.maximum(enters, 0)
-        # half the field of view's radius where the path turns back
+        # half the field of view's radius at half the path
         scale = 0.25 * path * self.sensor.m_fov_tan
         choice, near = pair(rng), sample_near(least, most, scale, pair(rng), rng.next_float32())
-        # steeper phase functions than the isotropic one fall later
+        # for phase functions with a stronger forward peak than the isotropic one
         steps = dr.log((most + scale) / (least + scale))
         far = (least + scale) * dr.exp(steps * choice.y) - scale
-        left = dr.select(choice.x < NEAR_SHARE, near, far)
+        left = dr.select(choice.x < NEAR_FRACTION, near, far)
         density = dr.lerp(
-            dr.rcp((left + scale) * steps), near_density(left, least, most, scale), NEAR_SHARE
+            dr.rcp((left + scale) * steps), near_density(left, least, most, scale), NEAR_FRACTION
         )
         return dr.select((path > 0) & (most > least), reach - left, -1), dr.rcp(density)
 
@@ -200,83 +200,85 @@ class Lidar:
     def _half_fov(self):
         return self.sensor.m_fov_tan / (1 + dr.sqrt(1 + dr.square(self.sensor.m_fov_tan)))
 
-    def _last_flight(self, rng, photon, medium, mei, stokes, way, active):
+    def _last_flight(self, rng, sample, medium, mei, stokes, rest, active):
         """Direction, Stokes vector and length of the flight to the last vertex; its weight.
 
-        Of two candidates one is taken, by its contribution if nothing is in the way and the air
-        is the same there. The weight includes d(length)/d(path).
+        One of two candidates, selected by its contribution if there is no obstacle and the medium
+        is the same. The weight includes d(length)/d(path).
         """
-        phase, axes, path = medium.phase_function(), photon.axes, way.distance + way.budget
-        # the telescope finds last vertices far off, in units of the field of view's radius
-        beside = way.field / self._half_fov() - 1
-        ahead = 0.5 * way.budget / (way.distance * self.sensor.m_fov_tan)
+        phase, axes, path = medium.phase_function(), sample.axes, rest.distance + rest.excess
+        # sampling from the telescope is best for last vertices far off, in radii of its field
+        beside = rest.field / self._half_fov() - 1
+        ahead = 0.5 * rest.excess / (rest.distance * self.sensor.m_fov_tan)
         far = dr.square(beside) + dr.square(ahead)
-        backward = BACK_SHARE * (1 - dr.rcp(1 + far))
-        sort = rng.next_float32(active)
-        by_phase, by_back = sort < PHASE_SHARE, sort > 1 - backward
+        backward = BACK_FRACTION * (1 - dr.rcp(1 + far))
+        strategy = rng.next_float32(active)
+        by_phase, by_back = strategy < PHASE_FRACTION, strategy > 1 - backward
 
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
-        aimed = way.sample(way.budget, pair(rng))
+        aimed = rest.sample(rest.excess, pair(rng))
         inward = self._in_field(axes, rng)
         first = dr.select(by_phase, drawn, dr.select(by_back, inward, aimed))
-        axis = dr.select(by_phase, -mei.wi, dr.select(by_back, axes.n, way.away))
+        axis = dr.select(by_phase, -mei.wi, dr.select(by_back, axes.n, rest.away))
         tried = []
         for wo in (first, quarter_turn(axis, first)):
-            end = photon.aperture + wo * closing_distance(photon.aperture - mei.p, wo, path)
+            end = sample.aperture + wo * closing_distance(sample.aperture - mei.p, wo, path)
             wo = dr.select(by_back, dr.normalize(end - mei.p), wo)
-            raised = way.raised(wo)
-            leg = way.leg(way.budget, raised)
-            volume = dr.rcp(way.slope(way.budget, raised, leg))
+            one_plus_cosine = rest.one_plus_cosine(wo)
+            leg = rest.leg(rest.excess, one_plus_cosine)
+            volume = dr.rcp(rest.slope(rest.excess, one_plus_cosine, leg))
             end = mei.p + wo * leg
-            seen = active & self.sensor.in_field_of_view(axes, end - photon.aperture)
-            # both legs meet the ellipsoid under the same angle
-            found = dr.select(seen, dr.square(leg / (path - leg)) / self._field_solid_angle(), 0)
-            seen &= dr.all((end > self.low) & (end < self.high))
-            bent, pdf = self._scatter(medium, mei, stokes, wo, seen)
+            in_view = active & self.sensor.in_field_of_view(axes, end - sample.aperture)
+            # both legs meet the ellipsoid at the same angle
+            from_telescope = dr.square(leg / (path - leg)) / self._field_solid_angle()
+            from_telescope = dr.select(in_view, from_telescope, 0)
+            in_view &= dr.all((end > self.low) & (end < self.high))
+            scattered, pdf = self._scatter(medium, mei, stokes, wo, in_view)
             there = interaction(medium, end, wo, self.wavelengths)
-            home = dr.normalize(photon.aperture - end)
-            received, chance = self._scatter(medium, there, bent, home, seen)
-            density = PHASE_SHARE * pdf + backward * found
-            density += (1 - PHASE_SHARE - backward) * way.density(way.budget, raised)
-            # never 0 where there may be light: the air may be another there
-            worth = (0.95 * received[0] + 0.05 * bent[0] * chance) * volume
-            worth = dr.select(seen & (density > 0), worth, 0)
-            tried.append((worth, density, (wo, bent, leg, volume)))
-        (wo, bent, leg, volume), weight = choose(rng, *tried)
-        return wo, bent, leg, volume * weight
+            back = dr.normalize(sample.aperture - end)
+            received, back_pdf = self._scatter(medium, there, scattered, back, in_view)
+            density = PHASE_FRACTION * pdf + backward * from_telescope
+            aimed_density = rest.density(rest.excess, one_plus_cosine)
+            density += (1 - PHASE_FRACTION - backward) * aimed_density
+            # never 0 where there may be light: the medium may be a different one there
+            target = (0.95 * received[0] + 0.05 * scattered[0] * back_pdf) * volume
+            target = dr.select(in_view & (density > 0), target, 0)
+            tried.append((target, density, (wo, scattered, leg, volume)))
+        (wo, scattered, leg, volume), weight = choose(rng, *tried)
+        return wo, scattered, leg, volume * weight
 
-    def _next_flight(self, rng, medium, mei, stokes, way, active):
-        """Direction, Stokes vector (of unchanged S0), length and weight of a flight between."""
-        phase, way = medium.phase_function(), way.widened(WIDER)
-        by_phase = rng.next_float32(active) < PHASE_FLIGHT_SHARE
+    def _next_flight(self, rng, medium, mei, stokes, rest, active):
+        """Direction, Stokes vector (of unchanged S0), length and weight of a further flight."""
+        phase, rest = medium.phase_function(), rest.widened(WIDER)
+        by_phase = rng.next_float32(active) < PHASE_FLIGHT_FRACTION
         drawn, _, _ = phase.sample(self.context, mei, rng.next_float32(active), pair(rng), active)
-        # optical paths to the gate differ little, so that any use of the budget is about as likely
-        most, scale = 0.5 * way.budget, 0.5 * way.distance * self.sensor.m_fov_tan
+        # transmittances to the gate differ little: any part of the excess length is about as likely
+        most, scale = 0.5 * rest.excess, 0.5 * rest.distance * self.sensor.m_fov_tan
         choice, near = pair(rng), sample_near(0, most, scale, pair(rng), rng.next_float32(active))
-        left = dr.select(choice.x < NEAR_FLIGHT_SHARE, near, most * choice.y)
-        spread = dr.lerp(dr.rcp(most), near_density(left, 0, most, scale), NEAR_FLIGHT_SHARE)
-        spread *= 0.5
-        used = way.budget - 2 * left
+        left = dr.select(choice.x < NEAR_FLIGHT_FRACTION, near, most * choice.y)
+        left_density = near_density(left, 0, most, scale)
+        left_density = 0.5 * dr.lerp(dr.rcp(most), left_density, NEAR_FLIGHT_FRACTION)
+        used = rest.excess - 2 * left
         sample = pair(rng)
         mirrored = mi.Point2f(1 - sample.x, sample.y + 0.25)
-        # two candidates again, across each other; the steep one is paired with a flat one
+        # two candidates again, with opposite azimuth and complementary polar sample
         tried = []
         for wo in (
-            dr.select(by_phase, drawn, way.sample(used, sample)),
-            dr.select(by_phase, quarter_turn(-mei.wi, drawn), way.sample(used, mirrored)),
+            dr.select(by_phase, drawn, rest.sample(used, sample)),
+            dr.select(by_phase, quarter_turn(-mei.wi, drawn), rest.sample(used, mirrored)),
         ):
-            raised = way.raised(wo)
-            leg = way.leg(used, raised)
-            bent, pdf = self._scatter(medium, mei, stokes, wo, active)
-            density = dr.lerp(way.density(used, raised), pdf, PHASE_FLIGHT_SHARE)
-            density *= way.slope(used, raised, leg) * spread
+            one_plus_cosine = rest.one_plus_cosine(wo)
+            leg = rest.leg(used, one_plus_cosine)
+            scattered, pdf = self._scatter(medium, mei, stokes, wo, active)
+            density = dr.lerp(rest.density(used, one_plus_cosine), pdf, PHASE_FLIGHT_FRACTION)
+            density *= rest.slope(used, one_plus_cosine, leg) * left_density
             end = mei.p + wo * leg
             inside = active & (leg > 0) & dr.all((end > self.low) & (end < self.high))
-            worth = dr.select(inside & (density > 0), bent[0], 0)
-            tried.append((worth, density, (wo, bent, leg)))
-        (wo, bent, leg), weight = choose(rng, *tried)
-        kept = dr.select(weight > 0, stokes[0] / bent[0], 0)
-        return wo, _scaled(bent, kept), leg, dr.select(kept > 0, weight / kept, 0)
+            target = dr.select(inside & (density > 0), scattered[0], 0)
+            tried.append((target, density, (wo, scattered, leg)))
+        (wo, scattered, leg), weight = choose(rng, *tried)
+        factor = dr.select(weight > 0, stokes[0] / scattered[0], 0)
+        return wo, _scaled(scattered, factor), leg, dr.select(factor > 0, weight / factor, 0)
 
     def _field_solid_angle(self):
         cosine = dr.rsqrt(1 + dr.square(self.sensor.m_fov_tan))
@@ -285,19 +287,19 @@ class Lidar:
     def _in_field(self, axes, rng):
         """A direction of the field of view, uniform in solid angle."""
         sample = pair(rng)
-        # 1 - cos, kept apart from 1: fields of view are milliradians
+        # 1 - cos, without the difference of numbers next to one: fields of view are milliradians
         below = sample.x * self._field_solid_angle() * dr.inv_two_pi
         sine = dr.safe_sqrt(below * (2 - below))
         sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample.y)
         return axes.to_world(mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, 1 - below))
 
-    def _connect(self, photon, rng, position, direction, distance, medium, stokes, volume, active):
+    def _connect(self, sample, rng, position, direction, distance, medium, stokes, volume, active):
         """Scatter at ``distance`` along a flight, where the path closes: Stokes vector about e_h.
 
         ``volume``: width of the gate (as whole path) times d(distance)/d(path).
         """
         vertex = position + direction * distance
-        active = active & self.sensor.in_field_of_view(photon.axes, vertex - photon.aperture)
+        active = active & self.sensor.in_field_of_view(sample.axes, vertex - sample.aperture)
         out, medium = transmittance(
             self.air,
             medium,
@@ -313,15 +315,15 @@ class Lidar:
         mei = interaction(medium, vertex, direction, self.wavelengths)
         active = active & (medium != None)
         scattering, _ = coefficients(medium, mei, self.channel, active)
-        return self._receive(photon, rng, medium, mei, stokes, active, out * scattering * volume)
+        return self._receive(sample, rng, medium, mei, stokes, active, out * scattering * volume)
 
-    def _receive(self, photon, rng, medium, mei, stokes, active, weight):
+    def _receive(self, sample, rng, medium, mei, stokes, active, weight):
         """Next-event estimation from an interaction to the telescope point."""
-        back = photon.aperture - mei.p
+        back = sample.aperture - mei.p
         distance = dr.norm(back)
         wo = back / distance
-        active = active & self.sensor.in_field_of_view(photon.axes, -back)
-        home, _ = transmittance(
+        active = active & self.sensor.in_field_of_view(sample.axes, -back)
+        out, _ = transmittance(
             self.air,
             medium,
             mei.p,
@@ -333,13 +335,13 @@ class Lidar:
             active,
             self.differentiable,
         )
-        weight = weight * home * self.area * -dr.dot(wo, photon.axes.n) / (distance * distance)
+        weight = weight * out * self.area * -dr.dot(wo, sample.axes.n) / (distance * distance)
         received, _ = self._scatter(medium, mei, stokes, wo, active)
         if not mi.is_polarized:
             received = [*received, mi.Float(0), mi.Float(0), mi.Float(0)]
         else:
             received = rotate_stokes(
-                received, wo, mi.mueller.stokes_basis(wo), transverse(photon.axes.s, wo)
+                received, wo, mi.mueller.stokes_basis(wo), transverse(sample.axes.s, wo)
             )
         return [dr.select(active, r * weight, 0) for r in received]
 
@@ -349,18 +351,19 @@ class Lidar:
         return apply_phase_function(value, stokes, self.channel), pdf
 
     @dr.syntax
-    def analog(self, photon, max_order, base, gates, sums, products, split, by_order):
+    def analog(self, sample, max_order, base, gates, sums, products, split, by_order):
         """Analog free flights; every collision is connected to the telescope.
 
-        A photon's apparent range never falls from one order to the next (triangle inequality), so
-        what it brings to a gate is complete when a later gate is reached: only then is it squared.
+        A sample's apparent range does not decrease from one order to the next (triangle
+        inequality), so its contribution to a gate is complete when a later gate is reached: only
+        then is it squared.
         """
-        rng, aperture = photon.rng, photon.aperture
-        low, high = self.sensor.ranges(photon.frame.n)
-        position, direction = mi.Point3f(photon.origin), mi.Vector3f(photon.direction)
-        stokes = _copied(photon.stokes)
+        rng, aperture = sample.rng, sample.aperture
+        low, high = self.sensor.ranges(sample.frame.n)
+        position, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
+        stokes = _copied(sample.stokes)
         medium = mi.MediumPtr(self.sensor.get_medium())
-        travelled, order = mi.Float(2 * photon.delay), mi.UInt32(1)
+        travelled, order = mi.Float(2 * sample.delay), mi.UInt32(1)
         gate, held = mi.UInt32(0), _copied([0, 0, 0, 0])
         active = mi.Bool(True)
         while dr.hint(active, label="scattering orders"):
@@ -383,10 +386,10 @@ class Lidar:
             albedo = dr.select(active, scattering / extinction, 0)
             stokes = _scaled(stokes, albedo)
             range_ = 0.5 * (travelled + dr.norm(aperture - position))
-            share = (range_ - low) / (high - low)
-            counts = active & (share >= 0) & (share < 1)
-            gain = self._receive(photon, rng, medium, mei, stokes, counts, mi.Float(1))
-            now = dr.select(counts, mi.UInt32(dr.clip(share * gates, 0, gates - 1)), gate)
+            fraction = (range_ - low) / (high - low)
+            counts = active & (fraction >= 0) & (fraction < 1)
+            gain = self._receive(sample, rng, medium, mei, stokes, counts, mi.Float(1))
+            now = dr.select(counts, mi.UInt32(dr.clip(fraction * gates, 0, gates - 1)), gate)
             done = now != gate
             _deposit(sums, products, base + gate, held, done)
             held = _sum(_scaled(held, dr.select(done, 0, 1)), gain)
@@ -410,7 +413,7 @@ def _add(total, value, cell, active=True):
 
 
 def _deposit(sums, products, cell, held, active):
-    """Add contributions of photons to their gates, and products of their components."""
+    """Add contributions of samples to their gates, and products of their components."""
     active = active & (held[0] != 0)
     for total, value in zip(sums, held, strict=True):
         _add(total, value, cell, active)

@@ -21,8 +21,8 @@ class Air:
 
     Where all of these are cubes that let light pass, a straight line's crossings are found in
     closed form, in less than half of the time. For any other scene rays are traced, and only
-    within the box that holds all surfaces: outside, most of the way between telescope and slab,
-    there is nothing to search.
+    within the box that holds all surfaces. Outside, on most of the path between telescope and slab,
+    there is nothing to intersect.
     """
 
     def __init__(self, scene):
@@ -210,7 +210,7 @@ def _walk(air, medium, origin, direction, distance, where, channel, wavelengths,
         )
         skip = SURFACE_SKIP * (size + end)
         inside = active & (medium != None)
-        # the extinction in the middle of the segment stands for all of it, the rest is tracked
+        # control variate: the extinction in the middle of the segment; the remainder is tracked
         middle = origin + direction * (0.5 * (travelled + end))
         mei = interaction(medium, middle, direction, wavelengths)
         _, control = coefficients(medium, mei, channel, inside)
@@ -237,7 +237,7 @@ def _walk(air, medium, origin, direction, distance, where, channel, wavelengths,
 def collision(air, medium, origin, direction, distance, channel, wavelengths, rng, active):
     """Distance to the first real collision by delta tracking, its medium, and whether it happened.
 
-    Nothing is forced: a photon that leaves ``distance`` behind or meets an opaque surface is lost.
+    Not forced: a sample without a collision within ``distance``, or at an opaque surface, is lost.
     """
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)

@@ -1,4 +1,4 @@
-"""Reading plugin parameters: a wrong value is named with its plugin, field and what is allowed."""
+"""Reading plugin parameters; messages name plugin, field, value and what is allowed."""
 
 import math
 from pathlib import Path
@@ -70,7 +70,7 @@ def pose(props, plugin: str, field: str = "to_world"):
 
 
 def check_pose(placed, plugin: str, field: str = "to_world") -> None:
-    """Refuse a pose that is no rotation and shift: instruments have their size by themselves."""
+    """Refuse a pose that is not a rotation and translation: it must not scale an instrument."""
     matrix = np.array(placed.matrix, float).reshape(4, 4)
     turn = matrix[:3, :3]
     rigid = np.abs(turn @ turn.T - np.eye(3)).max() < 1e-3 and np.linalg.det(turn) > 0

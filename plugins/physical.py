@@ -1,9 +1,9 @@
-"""Refusing scenes that nature does not have: media, surfaces and poses, each with its reason.
+"""Checks for unphysical scenes: media, surfaces and poses, each with its reason.
 
-Media and volumes are mostly Mitsuba's own, which take any number: a negative extinction coefficient
-or an albedo of 2 render without a word. An integrator asks `Physical` before it traces. Arrays that
-have passed are remembered and not looked at again until they are replaced, so an optimisation pays
-for what it changes: the extremes of one array.
+Media and volumes are mostly Mitsuba's own, which accept any number: a negative extinction
+coefficient or an albedo of 2 render without a warning. An integrator calls `Physical` before it
+traces. Arrays that have passed are not checked again until they are replaced, so that an
+optimisation only needs the extremes of the array that it changes.
 """
 
 import math
@@ -27,7 +27,7 @@ RULES = (
     (re.compile(r"phase_function\..*weight\..*\b(value|values|data)$"), 0.0, 1.0, "0 to 1"),
     (re.compile(r"phase_function\.(.*\.)?g$"), -0.99999, 0.99999, "above -1, below 1"),
 )
-"""Parameters of a medium, their least and largest value, and what a message says is allowed."""
+"""Parameters of a medium, their least and largest value, and the allowed range in words."""
 
 
 class Physical:
@@ -36,7 +36,7 @@ class Physical:
     Parameters
     ----------
     plugin : str
-        Whose name messages begin with.
+        Its name, with which messages begin.
     """
 
     def __init__(self, plugin: str):
@@ -44,13 +44,13 @@ class Physical:
         self.passed: dict = {}
 
     def check(self, scene, sensor) -> None:
-        """Say what is unphysical.
+        """Raise an error for the first unphysical parameter.
 
         Raises
         ------
         ValueError
             A coefficient, albedo, weight or asymmetry out of its range or NaN; a shape or volume
-            whose place is not finite.
+            whose position is not finite.
         """
         media = {}
         if sensor.get_medium() is not None:
@@ -79,10 +79,10 @@ class Physical:
 
     def _place(self, field, box):
         if not (box.valid() and all(math.isfinite(end) for end in (*box.min, *box.max))):
-            fail(self.plugin, field, str(box), "a place that is finite, as its transform is")
+            fail(self.plugin, field, str(box), "a finite position; its transform is not finite")
 
     def check_values(self, field, arrays, least, most, allowed):
-        """Say which of a parameter's values is out of its range."""
+        """Raise an error if a parameter has a value out of its range."""
         highest = most + ROUNDING if most == 1 else most
         for array in arrays:
             values = np.array(array)
@@ -103,7 +103,7 @@ def _flat(value) -> list:
 
 
 def _is_coefficient(node, value) -> bool:
-    """Whether a parameter is the quantity itself: spectral variants make polynomials of colours."""
+    """Whether a parameter is the quantity itself: in spectral variants colours are polynomials."""
     if not mi.is_spectral:
         return True
     colours = node.class_name().startswith("SRGB")
@@ -111,6 +111,6 @@ def _is_coefficient(node, value) -> bool:
 
 
 def _same(before, now) -> bool:
-    """Whether arrays are the very same ones as before, without a look at their values."""
+    """Whether arrays are identical to those before, without reading their values."""
     identities = [[getattr(part, "index", part) for part in parts] for parts in (before, now)]
     return identities[0] == identities[1]

@@ -61,8 +61,8 @@ def define():
                 fail(NAME, "field_half_mrad", half * 1e3, "less than a half space, 1570.8 mrad")
             self.field_half = half
             radius = positive(props, NAME, "radiance_radius_mrad", math.inf) * 1e-3
-            self.even = math.isinf(radius)
-            scale = radius if self.even else math.tan(min(radius, 1.57))
+            self.uniform = math.isinf(radius)
+            scale = radius if self.uniform else math.tan(min(radius, 1.57))
             self.stokes = numbers(props, NAME, "stokes", "1, 0, 0, 0")
             if (
                 len(self.stokes) != 4
@@ -79,7 +79,7 @@ def define():
             sine2 = limit * (nodes + 1) / 2
             radiance = np.exp(-2 * sine2 / (1 - sine2) / scale**2)
             self.m_flux = dr.opaque(mi.Float, math.pi * limit * (weights @ radiance) / 2)
-            drawn = -math.expm1(-2 * limit / scale**2) * scale**2 / 2 if not self.even else limit
+            drawn = -math.expm1(-2 * limit / scale**2) * scale**2 / 2 if not self.uniform else limit
             self.m_drawn = dr.opaque(mi.Float, math.pi * drawn)
             self.m_pose = pose(props, NAME)
             dr.make_opaque(self.m_pose)
@@ -91,7 +91,7 @@ def define():
 
         def sample_direction_of_light(self, sample):
             """A direction of propagation (world), its weight (at most 1), the sampled flux."""
-            if self.even:
+            if self.uniform:
                 disc = mi.warp.square_to_uniform_disk(sample) * self.m_sine
             else:
                 inside = 1 - dr.exp(-2 * dr.square(self.m_sine) / self.m_scale2)
@@ -101,7 +101,7 @@ def define():
             sine2 = dr.squared_norm(disc)
             weight = (
                 mi.Float(1)
-                if self.even
+                if self.uniform
                 else dr.exp(-2 * sine2 * sine2 / ((1 - sine2) * self.m_scale2))
             )
             local = mi.Vector3f(-dr.sqrt(1 - sine2), disc.x, disc.y)
@@ -111,7 +111,9 @@ def define():
             """Radiance of light travelling along ``direction`` (world), 1 in the middle."""
             local = self.m_pose.inverse() @ direction
             sine2 = dr.square(local.y) + dr.square(local.z)
-            value = mi.Float(1) if self.even else dr.exp(-2 * sine2 / (1 - sine2) / self.m_scale2)
+            value = (
+                mi.Float(1) if self.uniform else dr.exp(-2 * sine2 / (1 - sine2) / self.m_scale2)
+            )
             return dr.select((local.x < 0) & (sine2 <= dr.square(self.m_sine)), value, 0)
 
         def mean_stokes(self, direction):
@@ -135,7 +137,7 @@ def define():
 
         def eval(self, si, active=True):
             """Radiance, for integrators that look along a ray."""
-            direction = si.wi  # of a ray that left the scene: the way the light comes
+            direction = si.wi  # of a ray that left the scene: the direction of the light
             value = dr.select(active, self.radiance(direction), 0)
             if not mi.is_polarized:
                 return mi.Spectrum(value)

@@ -78,9 +78,9 @@ def rotate_from_scattering_plane(incident, scattered, elements):
 def first_unpolarized_in_blend(medium):
     """The first scalar phase function of a medium that is blended with polarised ones, or None.
 
-    Such a function (``hg``, ``isotropic``) answers with a multiple of the unit matrix between any
-    two axes. Alone it is recognised and depolarises; added to a Mueller matrix it cannot be told
-    apart. None where nothing is blended, or where all or none of the parts know polarisation.
+    Such a function (``hg``, ``isotropic``) returns a multiple of the unit matrix between any two
+    axes. Alone it is recognised and depolarises; added to a Mueller matrix it cannot be
+    recognised. None without a blend, or if all or none of its parts are polarised.
     """
     leaves = []
 

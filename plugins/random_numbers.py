@@ -1,4 +1,4 @@
-"""Random numbers of photons: independent generators, and pairs of numbers."""
+"""Random numbers of samples: independent generators, and pairs of numbers."""
 
 import mitsuba as mi
 

@@ -1,9 +1,9 @@
-"""Registering plugins with Mitsuba, in the variant in force and in every later one.
+"""Registration of plugins with Mitsuba, in the variant in force and in every later one.
 
 A Mitsuba class belongs to one variant, and so does a registration. Every plugin module calls
-`register` at its end. This serves three ways of loading it: `lidar_mi.plugins`, which imports all;
-Mitsuba 3.10, which imports the modules that entry points name and reloads them after every change
-of variant; and a user's own import. Registering a plugin again replaces it.
+`register` at its end. It can be loaded in three ways: by `lidar_mi.plugins`, which imports all; by
+Mitsuba 3.10, which imports the modules named by entry points and reloads them after every change
+of variant; and by a user's own import. Registering a plugin again replaces it.
 """
 
 from collections.abc import Callable
@@ -15,14 +15,14 @@ _following_variants = False
 
 
 def register(kind: str, name: str, define: Callable[[], type]) -> None:
-    """Make one plugin known to Mitsuba, now and after every change of variant.
+    """Register one plugin with Mitsuba, now and after every change of variant.
 
     Parameters
     ----------
     kind : str
-        Of Mitsuba's: emitter, sensor, integrator, phase, texture or bsdf.
+        Kind of Mitsuba plugin: emitter, sensor, integrator, phase, texture or bsdf.
     name : str
-        By which scenes call it.
+        Type name in scenes.
     define : callable
         Builds the plugin's class for the variant in force.
     """
@@ -35,10 +35,10 @@ def register(kind: str, name: str, define: Callable[[], type]) -> None:
 
 
 def register_plugins() -> None:
-    """Make the plugins of lidar-mi known to Mitsuba, in the variant in force and every later one.
+    """Register the plugins of lidar-mi with Mitsuba, in the variant in force and every later one.
 
     May be called at any time and any number of times, before or after ``mi.set_variant``. Scalar
-    variants do not know the plugins.
+    variants do not have the plugins.
 
     Examples
     --------
@@ -53,7 +53,7 @@ def register_plugins() -> None:
 
 
 def _register_now(name: str) -> None:
-    # Python plugins handle arrays of rays: the scalar variants have none.
+    # Python plugins handle arrays of rays, which scalar variants do not have.
     variant = mi.variant()
     if variant and not variant.startswith("scalar"):
         kind, define = _known[name]

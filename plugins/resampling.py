@@ -1,4 +1,4 @@
-"""One of two candidates, by what they contribute."""
+"""One of two candidates, selected by contribution."""
 
 import drjit as dr
 

@@ -113,7 +113,7 @@ def define():
             return dr.pi * self.m_aperture * self.m_aperture
 
         def in_field_of_view(self, frame, to_source):
-            """Whether light from the direction ``to_source`` (any length) is seen by a beam."""
+            """Whether the direction ``to_source`` (any length) is in a beam's field of view."""
             local = frame.to_local(to_source)
             limit = self.m_fov_tan * local.z
             return (local.z > 0) & (dr.squared_norm(local.xy) <= limit * limit)
@@ -130,7 +130,7 @@ def define():
             return self.m_pose
 
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
-            """The axis of the beam at a film position: lets any integrator look along the scan."""
+            """The axis of the beam at a film position, for any other integrator."""
             width, height = self.film().size()
             column = dr.clip(mi.UInt32(sample2.x * width), 0, width - 1)
             row = dr.clip(mi.UInt32(sample2.y * height), 0, height - 1)
@@ -202,7 +202,7 @@ def read_directions(source, count: int) -> np.ndarray:
     """A table of beam directions (tensor or file name), checked and normalised, (count, 3)."""
     table = read_table(NAME, "directions", source, 3)
     if table.shape != (count, 3):
-        fail(NAME, "directions", f"shape {table.shape}", f"({count}, 3), one beam a film pixel")
+        fail(NAME, "directions", f"shape {table.shape}", f"({count}, 3), one beam per film pixel")
     length = np.linalg.norm(table.astype(float), axis=1, keepdims=True)
     if not (np.isfinite(length).all() and (length > 0).all()):
         fail(NAME, "directions", "a row of zero length or NaN", "finite vectors")

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from benchmarks.measure import fresh_process
 
-from . import GROUPS, OPEN, report
+from . import FORMER_NAMES, GROUPS, OPEN, report
 from . import __doc__ as description
 from .eradiate import provenance
 from .group import run
@@ -30,12 +30,13 @@ def main(arguments: list[str] | None = None) -> int:
         "--eradiate",
         metavar="PYTHON",
         default=os.environ.get("LIDAR_MI_ERADIATE_PYTHON"),
-        help="interpreter with eradiate-mitsuba to run beside (default: its stored numbers)",
+        help="interpreter with eradiate-mitsuba, to compute its numbers (default: stored ones)",
     )
     parser.add_argument(
         "-o", "--out", type=Path, default=PAGE, help="page to write when all groups run"
     )
     options = parser.parse_args(arguments)
+    options.groups = [FORMER_NAMES.get(name, name) for name in options.groups]
     unknown = [name for name in options.groups if name not in (*GROUPS, *OPEN)]
     if unknown:
         parser.error(f"NAME: {unknown[0]!r} is none of {', '.join((*GROUPS, *OPEN))}")
@@ -47,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options.groups or GROUPS:
         with console.status(f"checking: {name}"), fresh_process() as process:
             future = process.submit(run, name, effort)
-            # a group that breaks must not cost the others
+            # an exception in one group does not stop the others
             if error := future.exception():
                 failed.append(f"{name}: {error!r}")
                 continue

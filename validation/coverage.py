@@ -32,17 +32,17 @@ METHODS = ("variational", "vortex_fit")
 TOLERANCE = {"coverage_68": 0.05, "coverage_95": 0.05}
 EXPECTED = {"coverage_68": 0.683, "coverage_95": 0.950}
 STRIDE = 4
-"""Vectors of one template share their pixels; every fourth one tells nearly as much as all."""
+"""Vectors of one template share their pixels; every fourth one is nearly as informative as all."""
 BLOCK = 10
-"""Vectors along the side of a block: 20 m, several times what errors correlate over."""
+"""Vectors along the side of a block: 20 m, several correlation lengths of the errors."""
 
 Pair = tuple[xr.DataArray, xr.DataArray, xr.Dataset, float | xr.DataArray | None]
-"""Both images, the true wind at mid-time, the noise that the retrieval is told."""
+"""Both images, the true wind at mid-time, the noise given to the retrieval."""
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How errors of valid vectors compare with their standard errors; each with its own error.
+    """Errors of valid vectors against their standard errors, each number with its own error.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class Coverage:
     rmse, stated : float
         Rms error of v and w, and rms standard error, m/s.
     wind : float
-        Rms of the true wind, m/s: an error as large is no skill.
+        Rms of the true wind, m/s, the error without any skill.
     coverage_68, coverage_95, variance : (float, float)
         Value and standard error.
     valid : float
@@ -99,7 +99,7 @@ def replaced_texture(fraction: float, seed: int, noise: float = 0.01) -> Pair:
 
 
 def instrument(change: str, seed: int, noise: float = 0.01) -> Pair:
-    """Exactly advected texture behind an instrument of 5 % fault.
+    """Exactly advected texture, observed with an instrumental error of 5 %.
 
     ``gain``: image 2 is brighter; ``gradient``: by an amount that grows from edge to edge;
     ``pattern``: both images are multiplied by a pattern that does not move.
@@ -118,23 +118,23 @@ def instrument(change: str, seed: int, noise: float = 0.01) -> Pair:
     return _with_noise(first, second, y, z, wind, noise, seed, noise)
 
 
-def uneven_noise(told: bool, seed: int) -> Pair:
-    """Noise from 1 % to 10 % across the image; its map is told or not."""
+def nonuniform_noise(given: bool, seed: int) -> Pair:
+    """Noise from 1 % to 10 % across the image; its map is given to the retrieval or not."""
     y, z, wind = _vortex_wind(219, 139)
     grid = np.meshgrid(y, z)
     waves = plane_waves(seed, 3.0, 0.5)
     first, second = texture(waves, *grid), texture(waves, *origin(wind, *grid, 0.1))
     level = 0.01 * 10 ** ((grid[0] - y.min()) / np.ptp(y))
     return _with_noise(
-        first, second, y, z, wind, level, seed, data_array(level, y, z) if told else None
+        first, second, y, z, wind, level, seed, data_array(level, y, z) if given else None
     )
 
 
-def _with_noise(first, second, y, z, wind, level, seed, told) -> Pair:
+def _with_noise(first, second, y, z, wind, level, seed, noise) -> Pair:
     random = np.random.default_rng([seed, 1])
     images = [image + level * random.standard_normal(image.shape) for image in (first, second)]
     v, w = (data_array(a, y, z) for a in wind(*np.meshgrid(y, z)))
-    return *(data_array(image, y, z) for image in images), xr.Dataset({"v": v, "w": w}), told
+    return *(data_array(image, y, z) for image in images), xr.Dataset({"v": v, "w": w}), noise
 
 
 CASES: dict[str, Callable[[int], Pair]] = {
@@ -153,8 +153,8 @@ CASES: dict[str, Callable[[int], Pair]] = {
     "gain of 5 %": partial(instrument, "gain"),
     "gradient of 5 %": partial(instrument, "gradient"),
     "fixed pattern of 5 %": partial(instrument, "pattern"),
-    "noise of 1 to 10 %, map told": partial(uneven_noise, True),
-    "noise of 1 to 10 %, not told": partial(uneven_noise, False),
+    "noise of 1 to 10 %, map given": partial(nonuniform_noise, True),
+    "noise of 1 to 10 %, map not given": partial(nonuniform_noise, False),
 }
 """Image pairs by seed."""
 
@@ -166,12 +166,12 @@ def measured(case: str, method: str, seeds) -> Coverage:
         first, second, truth, noise = CASES[case](seed)
         wind = retrieve_wind(first, second, 0.1, method, stride=STRIDE, noise=noise)
         true = truth_at_vectors(wind, truth)
-        good = (wind["flag"] == 0).values
+        is_valid = (wind["flag"] == 0).values
         for name in "vw":
-            errors.append(np.where(good, (wind[name] - true[name]).values, np.nan))
-            stated.append(np.where(good, wind[f"{name}_stderr"].values, np.nan))
+            errors.append(np.where(is_valid, (wind[name] - true[name]).values, np.nan))
+            stated.append(np.where(is_valid, wind[f"{name}_stderr"].values, np.nan))
             winds.append(true[name].values)
-        valid.append(good)
+        valid.append(is_valid)
     error, stderr = np.stack(errors), np.stack(stated)
     score = error / stderr
     return Coverage(
@@ -195,7 +195,7 @@ def table(repeats: int) -> Iterator[Coverage]:
 
 
 def coverage(effort) -> Check:
-    """Rows for 68 and 95 %, and the whole table in words."""
+    """Rows for 68 and 95 %, and the table of all numbers as text."""
     repeats = 1 if effort.scale == 1 else 12
     found = list(table(repeats))
     rows = [
@@ -253,7 +253,7 @@ def _indicator(score: np.ndarray, limit: float) -> np.ndarray:
 
 
 def _mean_and_error(values: np.ndarray) -> tuple[float, float]:
-    """Mean, and its standard error from the scatter of the blocks' sums about it.
+    """Mean, and its standard error from the scatter of the sums over blocks.
 
     Both components of a block count as one: (images, z, y), images of v and w in turn.
     """
@@ -267,6 +267,6 @@ def _mean_and_error(values: np.ndarray) -> tuple[float, float]:
         return np.nan, np.nan
     mean = total.sum() / number.sum()
     blocks = (number > 0).sum()
-    rest = total - mean * number
-    error = np.sqrt((rest**2).sum() * blocks / max(blocks - 1, 1)) / number.sum()
+    deviation = total - mean * number
+    error = np.sqrt((deviation**2).sum() * blocks / max(blocks - 1, 1)) / number.sum()
     return float(np.nanmean(values)), float(error)

@@ -1,4 +1,4 @@
-"""Steady states of Eradiate: run beside in its own environment, or as stored."""
+"""Steady states of Eradiate: computed in its own environment, or as stored."""
 
 import json
 import os
@@ -8,11 +8,11 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 STORED = HERE / "eradiate_reference.json"
-PHOTONS = 1_000_000  # of every case, times the effort
+SAMPLES = 1_000_000  # of every case, times the effort
 
 
 def reference(python: str | None, scale: int) -> dict:
-    """Output of ``eradiate_reference.py``: made anew by the given interpreter, else stored."""
+    """Output of ``eradiate_reference.py``, computed by the given interpreter, else as stored."""
     if python is None:
         return json.loads(STORED.read_text())
     with tempfile.TemporaryDirectory() as folder:
@@ -20,13 +20,13 @@ def reference(python: str | None, scale: int) -> dict:
         script = HERE / "eradiate_reference.py"
         # its own Mitsuba must not be hidden by one on our path
         environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
-        command = [python, str(script), "-n", str(PHOTONS * scale), "-o", str(out)]
+        command = [python, str(script), "-n", str(SAMPLES * scale), "-o", str(out)]
         subprocess.run(command, check=True, env=environment)
         return json.loads(out.read_text())
 
 
 def provenance(python: str | None = None) -> str:
-    """Where Eradiate's numbers come from."""
+    """Source of Eradiate's numbers."""
     if python is not None:
         return (
             "The numbers of Eradiate were computed together with this page, by "

@@ -1,17 +1,17 @@
 """Steady states by Eradiate's kernel (eradiate-mitsuba), as numbers in a JSON file.
 
-It replaces mitsuba, so it runs in an environment of its own and knows nothing of lidar-mi::
+It replaces mitsuba, so it runs in an environment of its own, without lidar-mi::
 
     python -m venv eradiate && eradiate/bin/pip install eradiate-mitsuba
     eradiate/bin/python validation/eradiate_reference.py -o validation/eradiate_reference.json
 
-Every case is a plane-parallel slab of optical thickness 1, lit at right angles by a plane wave that
-is polarised along y. Asked for is the light that comes back inside a cone about the surface's
-normal: power per area of the surface over the irradiance, I and Q about the part of y across the
-light.
+Every case is a plane-parallel slab of optical thickness 1, illuminated at normal incidence by a
+plane wave that is polarised along y. The result is the light returned inside a cone about the
+surface's normal: power per area of the surface over the irradiance, I and Q about the part of y
+perpendicular to the light.
 
-Of Eradiate this uses medium, phase functions, integrator and emitter sampling; only the emitter is
-ours, because its own are unpolarised.
+Medium, phase functions, integrator and emitter sampling are Eradiate's; only the emitter is ours,
+because its own are unpolarised.
 """
 
 import argparse
@@ -54,7 +54,7 @@ def phase(name: str) -> dict:
 
 def table(rows: np.ndarray) -> dict:
     """Columns angle, a1, a2, a3, a4, b1, b2; theirs is linear in the cosine, so nodes are added."""
-    # single precision cannot tell cosines of smaller angles apart from 1
+    # in single precision cosines of smaller angles are equal to 1
     nodes = np.unique(np.cos(np.radians(np.linspace(0, 180, 3601))).astype(np.float32))
     angle = np.degrees(np.arccos(nodes.astype(float)))
     a1, a2, a3, a4, b1, b2 = (np.interp(angle, rows[:, 0], column) for column in rows[:, 1:].T)
@@ -108,7 +108,7 @@ def polarized_sun():
     return PolarizedSun
 
 
-def steady_state(name: str, order: int, photons: int, seed: int) -> dict:
+def steady_state(name: str, order: int, samples: int, seed: int) -> dict:
     """Mean and standard error of I and Q."""
     place = mi.ScalarTransform4f().translate([0.5, 0, 0]).scale([0.5, 1000, 1000])
     medium = {"type": "homogeneous", "sigma_t": 1.0, "albedo": ALBEDO, "phase": phase(name)}
@@ -126,7 +126,7 @@ def steady_state(name: str, order: int, photons: int, seed: int) -> dict:
     )
     integrator = mi.load_dict({"type": "volpath", "max_depth": order + 1, "rr_depth": 1000})
     batch, sums, squares, count = 1_000_000, np.zeros(2), np.zeros(2), 0
-    for k in range(-(-photons // batch)):
+    for k in range(-(-samples // batch)):
         sampler = mi.load_dict({"type": "independent"})
         sampler.seed(seed * 10_000 + k, batch)
         cosine = dr.lerp(np.cos(CONE), 1, sampler.next_1d())
@@ -146,20 +146,22 @@ def steady_state(name: str, order: int, photons: int, seed: int) -> dict:
         sums, squares, count = sums + stokes.sum(1), squares + (stokes**2).sum(1), count + batch
     mean = sums / count
     error = np.sqrt((squares / count - mean**2) / (count - 1))
-    return {"stokes": mean.tolist(), "stderr": error.tolist(), "photons": count}
+    return {"stokes": mean.tolist(), "stderr": error.tolist(), "samples": count}
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--out", type=Path, default=HERE / "eradiate_reference.json")
-    parser.add_argument("-n", "--photons", type=int, default=8_000_000, help="of every case")
+    parser.add_argument(
+        "-n", "--samples", "--photons", type=int, default=8_000_000, help="of every case"
+    )
     options = parser.parse_args()
     mi.set_variant("llvm_ad_spectral_polarized")
     mi.set_log_level(mi.LogLevel.Error)
     mi.register_emitter("polarized_sun", polarized_sun())
     packages = ("eradiate-mitsuba", "drjit", "numpy")
     found = {
-        "command": f"python validation/eradiate_reference.py -n {options.photons}",
+        "command": f"python validation/eradiate_reference.py -n {options.samples}",
         "versions": {name: version(name) for name in packages}
         | {"python": platform.python_version()},
         "variant": mi.variant(),
@@ -168,7 +170,7 @@ def main():
         "cone_half_angle": CONE,
         "cases": {
             name: {"phase": kind, "max_order": order}
-            | steady_state(kind, order, options.photons, seed)
+            | steady_state(kind, order, options.samples, seed)
             for seed, (name, (kind, order)) in enumerate(CASES.items())
         },
     }

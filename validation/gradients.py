@@ -1,4 +1,4 @@
-"""Derivatives of a rendered picture against those of the lidar equation."""
+"""Derivatives of a rendered image against those of the lidar equation."""
 
 import drjit as dr
 import mitsuba as mi
@@ -19,7 +19,7 @@ LOW, HIGH = 480.0, 520.0
 CENTRES = LOW + 4 * (np.arange(10) + 0.5)
 VALUES = 5e-3 * (1 + 0.5 * np.cos(np.arange(10)))
 EDGES = np.array([500.0, 508.0])
-PHOTONS, SEEDS = 400_000, 8
+SAMPLES, SEEDS = 400_000, 8
 
 
 def signal(values):
@@ -49,7 +49,7 @@ def derivatives(effort):
     for seed in range(SEEDS):
         dr.enable_grad(parameters[KEY])
         parameters.update()
-        image = mi.render(loaded, parameters, spp=PHOTONS * effort.scale // SEEDS, seed=500 + seed)
+        image = mi.render(loaded, parameters, spp=SAMPLES * effort.scale // SEEDS, seed=500 + seed)
         chosen = np.zeros(image.shape, np.float32)
         chosen[0, 0, 0] = scale
         dr.backward(dr.sum(image * mi.TensorXf(chosen)))

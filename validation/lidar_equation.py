@@ -71,7 +71,7 @@ def layered(edges, steps, secant=1.0):
 
 
 def compared(name, found, truth, bias=TRUNCATION):
-    """Two rows: the sum over everything, and each beam and gate within its own error."""
+    """Two rows: the sum over all beams and gates, and the z-scores of each."""
     value, error = found["S0"], found["S0_stderr"]
     total = Row(
         f"{name}: rendered over expected",
@@ -106,7 +106,7 @@ def scan_of_a_slab(effort):
 
 
 def profile_through_layers(effort):
-    """Many gates, faces of media inside them."""
+    """Many gates, boundaries of media inside them."""
     steps = [(0, 1e-3), (300, 5e-3), (350, 2e-2), (416.25, 5e-3), (450, 1e-3)]
     edges = np.linspace(250, 500, 101)
     outer = {"type": "ref", "id": "outer"}
@@ -145,18 +145,18 @@ def profile_through_layers(effort):
 
 
 def valley_of_extinction(effort):
-    """A grid that is linear between cell centres: no middle or mean value stands for it."""
+    """A grid that is linear between cell centres, with a minimum of the extinction."""
     size, edges = (9, 7), np.linspace(500, 540, 5)
     centres = 400 + 10 * (np.arange(20) + 0.5)
     values = 1e-3 * (1 + np.abs(centres - 465) / 10)
     low, high = (400, -90, -90), (600, 90, 90)
     rows = []
-    for name, raised in (("majorant as it is", 1.0), ("majorant raised 20 times", 20.0)):
+    for name, factor in (("majorant as it is", 1.0), ("majorant raised 20 times", 20.0)):
         filled = np.broadcast_to(values, (24, 24, 20)).copy()
-        filled[0, 0, 0] = raised * values.max()
+        filled[0, 0, 0] = factor * values.max()
         shape = box(low, high, grid(filled, low, high))
         loaded = scene((500, 540), {"slab": shape}, size, gate_count=4, **SCAN)
-        found = render(loaded, 30 + int(raised), 40_000 * effort.scale)
+        found = render(loaded, 30 + int(factor), 40_000 * effort.scale)
         secant = secants(loaded, size)
 
         def depth(r, secant=secant):

@@ -1,4 +1,4 @@
-"""All orders in a dense slab against a simulation that shares no code with lidar-mi."""
+"""All orders in a dense slab against a simulation without common code."""
 
 import math
 import os
@@ -26,16 +26,16 @@ REFERENCE = "independent simulation (numpy)"
 RAYLEIGH = Case()
 FORWARD = Case(asymmetry=0.7, albedo=0.95, fov_half=20e-3)
 ORDERS, BATCHES = 6, 64
-PHOTONS = {RAYLEIGH: 6_000_000, FORWARD: 16_000_000}  # of the reference
+SAMPLES = {RAYLEIGH: 6_000_000, FORWARD: 16_000_000}  # of the reference
 RENDERED = {"gated": 4_000_000, "analog": 8_000_000}
 
 
 @cache
-def reference(case: Case, photons: int) -> np.ndarray:
+def reference(case: Case, samples: int) -> np.ndarray:
     """Batches of the independent simulation, (batches, gates, orders, 2)."""
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         runs = pool.map(
-            lambda seed: simulate(case, photons // BATCHES, ORDERS, seed)[0], range(BATCHES)
+            lambda seed: simulate(case, samples // BATCHES, ORDERS, seed)[0], range(BATCHES)
         )
         return np.stack(list(runs))
 
@@ -59,9 +59,9 @@ def dense(case: Case, estimator: str, interior: dict | None = None, orders: int 
     )
 
 
-def rendered(case, estimator, seed, photons, interior=None, number=BATCHES):
+def rendered(case, estimator, seed, samples, interior=None, number=BATCHES):
     """Batches of I by order (batches, gates, orders), and of I and Q (batches, gates)."""
-    found = batches(dense(case, estimator, interior), seed, photons, number)
+    found = batches(dense(case, estimator, interior), seed, samples, number)
     found = {name: values[..., 0, 0] for name, values in found.items()}
     by_order = np.stack([found[f"order{k}.S0"] for k in range(1, ORDERS + 1)], -1)
     return by_order, found["S0"], found["S1"]
@@ -88,11 +88,11 @@ def depolarisation(i, q):
 
 
 def _compare(case, label, effort):
-    other = reference(case, PHOTONS[case] * effort.scale)
-    rows, pictures = [], {}
-    for number, (estimator, photons) in enumerate(RENDERED.items()):
-        by_order, i, q = rendered(case, estimator, 100 + number, photons * effort.scale)
-        pictures[estimator] = by_order, i, q
+    other = reference(case, SAMPLES[case] * effort.scale)
+    rows, images = [], {}
+    for number, (estimator, samples) in enumerate(RENDERED.items()):
+        by_order, i, q = rendered(case, estimator, 100 + number, samples * effort.scale)
+        images[estimator] = by_order, i, q
         rows.append(
             difference(f"{estimator}: all gates and orders", i.sum(1), other[..., 0].sum((1, 2)))
         )
@@ -128,11 +128,11 @@ def _compare(case, label, effort):
                     BATCHES,
                 )
             )
-    caption = _draw_orders(effort.folder / f"orders_{label}.png", case, pictures["gated"][0], other)
+    caption = _draw_orders(effort.folder / f"orders_{label}.png", case, images["gated"][0], other)
     drawn = [(f"orders_{label}.png", caption)]
     if case.asymmetry is None:
         place = effort.folder / f"depolarisation_{label}.png"
-        _draw_depolarisation(place, case, pictures, other)
+        _draw_depolarisation(place, case, images, other)
         drawn.append((place.name, "Linear depolarisation ratio of all orders together."))
     return tuple(rows), tuple(drawn)
 
@@ -157,7 +157,7 @@ def _draw_orders(place, case, ours, other):
     return "Order by order: points rendered (gated), lines and bands the reference; 2 sigma each."
 
 
-def _draw_depolarisation(place, case, pictures, other):
+def _draw_depolarisation(place, case, images, other):
     range_ = (np.array(case.gates[1:]) + case.gates[:-1]) / 2
     expected, error = mean_and_error(depolarisation(*np.moveaxis(other.sum(2), -1, 0)))
     with figures.figure(place) as axis:
@@ -169,7 +169,7 @@ def _draw_depolarisation(place, case, pictures, other):
             label="independent simulation, 2 sigma",
         )
         for (estimator, (_, i, q)), colour, shift in zip(
-            pictures.items(), (figures.OURS, figures.OTHER), (-0.7, 0.7), strict=True
+            images.items(), (figures.OURS, figures.OTHER), (-0.7, 0.7), strict=True
         ):
             got, own = mean_and_error(depolarisation(i, q))
             axis.errorbar(range_ + shift, got, 2 * own, fmt=".", color=colour, label=estimator)
@@ -203,7 +203,7 @@ def forward_peak(effort):
 
 def majorants(effort):
     """The slab as a grid: null collisions with any majorant."""
-    other = reference(RAYLEIGH, PHOTONS[RAYLEIGH] * effort.scale)
+    other = reference(RAYLEIGH, SAMPLES[RAYLEIGH] * effort.scale)
     low, high = (500.0, -1000.0, -1000.0), (600.0, 1000.0, 1000.0)
     rows = []
     for factor in (1, 4, 20):
@@ -230,10 +230,10 @@ def majorants(effort):
 
 
 def sharpness(effort):
-    """The reference is what it is said to be: 3 sigma of 1 %, gate by gate."""
+    """The reference is as accurate as stated: a standard error of at most 1 % in every gate."""
     rows = []
     for name, case in (("molecules", RAYLEIGH), ("forward scatterers", FORWARD)):
-        mean, error = mean_and_error(reference(case, PHOTONS[case] * effort.scale)[..., 0].sum(2))
+        mean, error = mean_and_error(reference(case, SAMPLES[case] * effort.scale)[..., 0].sum(2))
         rows.append(
             Row(
                 f"{name}: largest standard error of the reference in a gate",
@@ -243,7 +243,7 @@ def sharpness(effort):
                 tolerance=0.01,
             )
         )
-    # by hand: the beam's single scattering, all of it in view
+    # in closed form: the beam's single scattering, all of it in view
     case = replace(RAYLEIGH, divergence_half=1e-9, fov_half=0.2)
     found = np.stack([simulate(case, 20_000, 1, 500 + k)[0][:, 0, 0] for k in range(BATCHES)])
     range_ = (np.arange(500, 600, 0.01) + 0.005).reshape(10, -1)

@@ -1,4 +1,4 @@
-"""What checks found: rows, a table on the terminal and a page of the documentation."""
+"""Results of checks: rows, a table on the terminal and a page of the documentation."""
 
 import math
 import os
@@ -12,31 +12,31 @@ from rich.console import Console
 from rich.table import Table
 
 SIGMAS = 4
-"""A row passes within so many standard errors; of 1000 right ones, 0.06 do not."""
+"""A row passes within so many standard errors; of 1000 correct ones, 0.06 do not."""
 
 PACKAGES = ("lidar-mi", "mitsuba", "drjit", "numpy", "scipy", "scatrs", "rustmatrix", "miepython")
 
 
 @dataclass(frozen=True)
 class Row:
-    """One number held against its reference.
+    """One number compared with its reference.
 
     Parameters
     ----------
     name, reference : str
-        What is compared, and where ``expected`` comes from.
+        The quantity compared, and the source of ``expected``.
     expected, got : float
     sigma : float
-        Standard error of ``got - expected``; 0 for numbers without chance.
+        Standard error of ``got - expected``; 0 for numbers without random error.
     tolerance : float
-        What the reference or the comparison leaves open beside chance: rounding of published
-        digits, a stated truncation.
+        Systematic uncertainty of the reference or the comparison: rounding of published digits,
+        a stated truncation.
     unit : str
 
     Raises
     ------
     ValueError
-        Neither a standard error nor a tolerance: such a row says nothing.
+        Neither a standard error nor a tolerance: such a row is meaningless.
     """
 
     name: str
@@ -59,7 +59,7 @@ class Row:
 
     @property
     def deviation(self) -> float:
-        """In standard errors, or in tolerances where there is no chance."""
+        """In standard errors, or in tolerances where there is no random error."""
         return (self.got - self.expected) / (self.sigma or self.tolerance)
 
     @property
@@ -69,7 +69,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Check:
-    """Rows that belong together, with what has to be known to read them.
+    """Rows of one topic, with the information needed to read them.
 
     ``figures`` are the names of PNGs beside the page and their captions; ``name`` is that of the
     function that made it, with its group's.
@@ -87,7 +87,7 @@ class Check:
 
 
 def largest(name: str, reference: str, got, expected, tolerance: float, unit: str = "") -> Row:
-    """A row for arrays without chance: their largest difference, which should be none."""
+    """A row for arrays without random error: their largest difference, expected to be 0."""
     difference = np.asarray(got, float) - np.asarray(expected, float)
     worst = np.abs(difference).max() if np.isfinite(difference).all() else math.nan
     return Row(name, reference, 0.0, worst, 0.0, tolerance, unit)
@@ -100,10 +100,10 @@ def mean_and_error(batches) -> tuple[np.ndarray, np.ndarray]:
 
 
 def spread(name: str, reference: str, z, batches: float = math.inf) -> Row:
-    """Mean square of independent z-scores: tells of errors in any of them, and of their bars.
+    """Mean square of independent z-scores: sensitive to errors of any of them or of their sigma.
 
-    ``batches`` are those that the standard errors were taken from: z is then Student's, with a
-    wider distribution than the normal one.
+    ``batches`` is the number from which the standard errors are estimated: z then has Student's
+    distribution, which is wider than the normal one.
     """
     z = np.asarray(z, float).ravel()
     freedom = batches - 1
@@ -142,9 +142,9 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
     ----------
     groups : sequence of (title, introduction, checks)
     command : str
-        What makes the page again.
+        The command that computes the page again.
     notes : sequence of str
-        Lines about where stored references come from.
+        Lines about the sources of stored references.
     """
     checks = [check for _, _, found in groups for check in found]
     rows = [row for check in checks for row in check.rows]

@@ -1,4 +1,4 @@
-"""Scattering matrices against published tables, other solvers, and laws all of them obey."""
+"""Scattering matrices against published tables, other solvers, and general laws."""
 
 import math
 from functools import cache
@@ -49,7 +49,7 @@ def coherency(elements):
 
 
 def laws(effort):
-    """What every sum of particles obeys, for all tables that ship."""
+    """Inequalities that hold for every sum of particles, for all shipped tables."""
     rows = []
     for name in sorted(AEROSOLS):
         path = files("lidar_mi.scenes") / f"aerosol_{name}_532nm.txt"
@@ -336,7 +336,7 @@ def spheres(effort):
     for radius, index in ((0.05e-6, 1.75 + 0.44j), (0.4e-6, 1.53 + 0.008j), (2e-6, 1.334 + 1e-9j)):
         table = one_size(radius, index)
         x = 2 * math.pi * radius / GREEN
-        # its imaginary parts have the other sign, and so has its S34
+        # its imaginary parts and its S34 have the opposite sign
         extinction, scattering, backward, asymmetry = miepython.efficiencies_mx(np.conj(index), x)
         s1, s2 = miepython.S1_S2(np.conj(index), x, np.cos(np.radians(table.angle)), norm="4pi")
         expected = np.stack(
@@ -427,7 +427,7 @@ def small_spheroids(effort):
 
 
 def shipped(effort):
-    """The tables that ship are what they say."""
+    """The shipped tables against their stated particles."""
     table = read_table(str(files("lidar_mi.scenes") / "aerosol_droplets_532nm.txt"))
     area = math.pi * 7 * 8 / 1.5**2  # mean r^2 of r^6 exp(-1.5 r)
     rows = [

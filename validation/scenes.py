@@ -1,4 +1,4 @@
-"""Scenes the checks render, and their pictures as numpy arrays."""
+"""Scenes rendered by the checks, and their images as numpy arrays."""
 
 import gc
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ def box(low, high, interior: dict, exterior: dict | None = None) -> dict:
 
 
 def layer(start: float, stop: float, interior: dict, exterior=None, half_width=2000.0) -> dict:
-    """A box between two planes across the x axis, wider than any light that counts."""
+    """A box between two planes across the x axis, wide enough to contain all relevant light."""
     low, high = (start, -half_width, -half_width), (stop, half_width, half_width)
     return box(low, high, interior, exterior)
 
@@ -76,11 +76,11 @@ def lidar(size, gate, laser=None, environment=None, **parameters) -> dict:
 
 
 def scene(gate, shapes: dict, size=(1, 1), laser=None, integrator=None, environment=None, **more):
-    """A `lidar` and the shapes it looks at; ``more`` are parameters of the lidar.
+    """A `lidar` and the shapes that it observes; ``more`` are parameters of the lidar.
 
     ``environment`` is the medium around all, which shapes refer to as `ENVIRONMENT`.
     """
-    gc.collect()  # live scenes hold cycles, and take part in the kernels of later ones
+    gc.collect()  # live scenes hold reference cycles and enter the kernels of later ones
     sensor = lidar(size, gate, laser, ENVIRONMENT if environment else None, **more)
     return mi.load_dict(
         {
@@ -93,18 +93,18 @@ def scene(gate, shapes: dict, size=(1, 1), laser=None, integrator=None, environm
     )
 
 
-def render(loaded, seed: int, photons: int) -> dict[str, np.ndarray]:
-    """What a scan measured: quantity to float64 array (gates, rows, columns)."""
-    image = np.array(mi.render(loaded, seed=seed, spp=photons)).astype(float)
+def render(loaded, seed: int, samples: int) -> dict[str, np.ndarray]:
+    """The rendered scan: quantity to float64 array (gates, rows, columns)."""
+    image = np.array(mi.render(loaded, seed=seed, spp=samples)).astype(float)
     names = loaded.integrator().channel_names(loaded.sensors()[0])
     quantities = list(dict.fromkeys(name.partition(".")[2] for name in names))
     image = image.reshape(*image.shape[:2], -1, len(quantities))
     return {name: image[..., k].transpose(2, 0, 1) for k, name in enumerate(quantities)}
 
 
-def batches(loaded, seed: int, photons: int, number: int) -> dict[str, np.ndarray]:
+def batches(loaded, seed: int, samples: int, number: int) -> dict[str, np.ndarray]:
     """`render` with several seeds: arrays (number, gates, rows, columns)."""
-    found = [render(loaded, 1000 * seed + k, photons // number) for k in range(number)]
+    found = [render(loaded, 1000 * seed + k, samples // number) for k in range(number)]
     return {name: np.stack([one[name] for one in found]) for name in found[0]}
 
 

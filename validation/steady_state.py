@@ -1,4 +1,4 @@
-"""All ranges together: what a slab returns in the end, however long light stays in it."""
+"""The steady-state reflectance of a slab: the signal summed over all ranges."""
 
 import math
 from importlib.resources import files
@@ -20,7 +20,7 @@ INTRODUCTION = (
 
 BATCHES = 32
 ORDERS = 8
-# a slab of 10 m: the gate ends where a photon would have had to stay for 19 mean free paths
+# a slab of 10 m: the gate ends at paths of 19 mean free paths inside the slab
 EXTINCTION, THICKNESS, NEAR = 0.1, 10.0, 500.0
 
 
@@ -35,9 +35,9 @@ def returned(
     near=NEAR,
     aperture=250.0,
     stop=600.0,
-    photons=2_000_000,
+    samples=2_000_000,
 ):
-    """Batches of what the slab returns: quantity to (batches,)."""
+    """Batches of the light returned by the slab: quantity to (batches,)."""
     shapes = {
         "slab": layer(near, near + THICKNESS, medium(EXTINCTION, phase, albedo), half_width=1e4)
     }
@@ -50,7 +50,7 @@ def returned(
         fov_half_mrad=1e3 * cone,
         aperture_radius=aperture,
     )
-    found = batches(loaded, seed, photons * effort.scale, BATCHES)
+    found = batches(loaded, seed, samples * effort.scale, BATCHES)
     return {name: values[:, 0, 0, 0] for name, values in found.items()}
 
 
@@ -82,7 +82,7 @@ def source_functions(albedo, orders, thickness=1.0, cells=1000):
 
 
 def leaving(source, edge, cosine):
-    """Power that leaves through the surface at directions steeper than ``cosine``, by order."""
+    """Power through the surface in directions with a cosine above ``cosine``, by order."""
 
     # integral of exp(-t / mu) dmu from cosine to 1 is E_2(t) - cosine E_2(t / cosine)
     def outward(t):
@@ -127,23 +127,23 @@ def isotropic(effort):
 
 
 def energy(effort):
-    """Nothing is lost or made: conservative slab, nearly all directions."""
+    """Energy is conserved: conservative slab, nearly all directions."""
     orders, cone = 40, 1.4
     source, edge = source_functions(1.0, orders)
-    everything, seen = leaving(source, edge, 0.0), leaving(source, edge, math.cos(cone))
+    reflected, in_view = leaving(source, edge, 0.0), leaving(source, edge, math.cos(cone))
     below = leaving(source[:, ::-1], edge, 0.0)
     direct = math.exp(-1)
-    grazing = everything.sum() - seen.sum()
+    grazing = reflected.sum() - in_view.sum()
     rows = [
         Row(
             "the reference: reflected and transmitted",
             "conservation of energy",
             1.0,
-            everything.sum() + below.sum() + direct,
+            reflected.sum() + below.sum() + direct,
             tolerance=1e-6,
         )
     ]
-    for seed, (estimator, photons) in enumerate({"gated": 2_000_000, "analog": 4_000_000}.items()):
+    for seed, (estimator, samples) in enumerate({"gated": 2_000_000, "analog": 4_000_000}.items()):
         found = returned(
             effort,
             estimator,
@@ -155,7 +155,7 @@ def energy(effort):
             near=100.0,
             aperture=1000.0,
             stop=550.0,
-            photons=photons,
+            samples=samples,
         )
         rows.append(
             compared(

@@ -1,6 +1,6 @@
 """An independent analog simulation of a lidar over a homogeneous slab, in plain numpy.
 
-It shares nothing with the plugins: float64, its own Stokes algebra with explicit reference axes,
+It is independent of the plugins: float64, its own Stokes algebra with explicit reference axes,
 free flights from the exponential law, every collision connected to a random telescope point.
 Geometry: telescope at the origin looking along x, slab between two planes, vacuum around it.
 """
@@ -25,32 +25,32 @@ class Case:
     gates: tuple[float, ...] = tuple(np.arange(500.0, 601.0, 10.0))
 
 
-def simulate(case: Case, photons: int, max_order: int, seed: int):
+def simulate(case: Case, samples: int, max_order: int, seed: int):
     """Received Stokes (I, Q about the horizontal axis) over emitted energy.
 
     Returns
     -------
     mean, error : (gates, orders, 2) and (gates, 2) arrays
-        Order by order, and the standard error of the sum over orders (photon by photon).
+        Order by order, and the standard error of the sum over orders of each sample.
     """
     rng = np.random.default_rng(seed)
     gates = len(case.gates) - 1
     mean, total, square = np.zeros((gates, max_order, 2)), 0.0, np.zeros((gates, 2))
-    for start in range(0, photons, 250_000):
-        batch = min(250_000, photons - start)
-        brought = np.zeros((batch, gates, 2))
-        for order, photon, gate, stokes in _histories(case, batch, max_order, rng):
-            np.add.at(brought, (photon, gate), stokes)
+    for start in range(0, samples, 250_000):
+        batch = min(250_000, samples - start)
+        received = np.zeros((batch, gates, 2))
+        for order, sample, gate, stokes in _histories(case, batch, max_order, rng):
+            np.add.at(received, (sample, gate), stokes)
             np.add.at(mean[:, order], gate, stokes)
-        total = total + brought.sum(0)
-        square += (brought**2).sum(0)
-    mean /= photons
-    variance = square / photons - (total / photons) ** 2
-    return mean, np.sqrt(variance / photons)
+        total = total + received.sum(0)
+        square += (received**2).sum(0)
+    mean /= samples
+    variance = square / samples - (total / samples) ** 2
+    return mean, np.sqrt(variance / samples)
 
 
 def _histories(case, count, max_order, rng):
-    """Yield (order, photons, gates, Stokes I and Q) for every connection that is seen."""
+    """Yield (order, samples, gates, Stokes I and Q) for every connection in view."""
     radius = case.beam_radius * np.sqrt(-0.5 * np.log(1 - rng.random(count)))
     turn = 2 * np.pi * rng.random(count)
     position = np.stack([np.zeros(count), radius * np.cos(turn), radius * np.sin(turn)], 1)
@@ -77,17 +77,17 @@ def _histories(case, count, max_order, rng):
             a[inside] for a in (position, direction, axis, stokes, path, telescope, number)
         )
         stokes = stokes * case.albedo
-        home = telescope - position
-        distance = np.linalg.norm(home, axis=1)
-        back = home / distance[:, None]
+        back = telescope - position
+        distance = np.linalg.norm(back, axis=1)
+        back = back / distance[:, None]
         gate = np.searchsorted(case.gates, 0.5 * (path + distance), side="right") - 1
-        seen = (gate >= 0) & (gate < len(case.gates) - 1) & (-back[:, 0] > np.cos(case.fov_half))
+        in_view = (gate >= 0) & (gate < len(case.gates) - 1) & (-back[:, 0] > np.cos(case.fov_half))
         through = (position[:, 0] - case.slab[0]) / -back[:, 0]
         weight = area * -back[:, 0] / distance**2 * np.exp(-case.extinction * through)
         received, arrived = _scatter(case, stokes, axis, direction, back)
         level = _across(np.broadcast_to([0.0, 1.0, 0.0], back.shape), back)
         received = _turn(received, arrived, level, back) * weight[:, None]
-        yield order, number[seen], gate[seen], received[seen, :2]
+        yield order, number[in_view], gate[in_view], received[in_view, :2]
         onward, density = _sample(case, direction, rng)
         stokes, axis = _scatter(case, stokes, axis, direction, onward)
         stokes = stokes / density[:, None]

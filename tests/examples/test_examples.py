@@ -13,14 +13,14 @@ pytestmark = pytest.mark.usefixtures("variant")
 
 
 def test_a_blurred_slab_is_recovered_by_gradient_descent():
-    """With 1/10 of the full example's beams and 1/5 of its steps the error falls by a quarter.
+    """With 1/10 of the full example's beams and 1/5 of its steps the error decreases by 25 %.
 
     From 11 % of blur against the true air; 20 % are required, as the seeds change it by 1 % of the
     whole. The remaining misfit is mostly the noise of 32 samples per beam.
     """
     example = runpy.run_path(str(EXAMPLES / "recover_slab.py"))
     truth = example["port_vortex"](10, 8)
-    guess, found, misfits = example["recover"](truth, steps=12, photons=32, learning_rate=0.05)
+    guess, found, misfits = example["recover"](truth, steps=12, samples=32, learning_rate=0.05)
     error = example["error"]
     assert error(guess, truth) > 0.08
     assert error(found, truth) < 0.8 * error(guess, truth)
@@ -29,9 +29,9 @@ def test_a_blurred_slab_is_recovered_by_gradient_descent():
 
 
 def test_the_example_runs_from_the_command_line(tmp_path, monkeypatch, capsys):
-    picture = tmp_path / "slab.png"
-    options = ["--steps", "1", "--photons", "4", "--out", str(picture)]
+    image = tmp_path / "slab.png"
+    options = ["--steps", "1", "--samples", "4", "--out", str(image)]
     monkeypatch.setattr(sys, "argv", ["recover_slab.py", *options])
     runpy.run_path(str(EXAMPLES / "recover_slab.py"), run_name="__main__")
     assert "error" in capsys.readouterr().out
-    assert matplotlib.image.imread(picture).std() > 0.1
+    assert matplotlib.image.imread(image).std() > 0.1

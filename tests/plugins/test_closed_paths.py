@@ -8,11 +8,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from plugins.closed_paths import Way
+from plugins.closed_paths import OpenPath
 
 pytestmark = pytest.mark.usefixtures("variant")
 
-# distance, budget, half field of view (rad), angle of the vertex off the axis (rad), room (m)
+# distance, excess, half field of view (rad), angle of the vertex off the axis (rad), reach (m)
 CASES = [
     (500.0, 30.0, 25e-3, 0.0, 1e9),
     (500.0, 0.3, 0.1e-3, 0.0, 1e9),
@@ -22,56 +22,58 @@ CASES = [
 ]
 
 
-def way(distance, budget, fov, offset, room):
+def open_path(distance, excess, fov, offset, reach):
     """Telescope at the origin; the vertex along +z."""
-    return Way(
+    return OpenPath(
         mi.Vector3f(0, 0, 1),
         mi.Float(distance),
-        mi.Float(budget),
+        mi.Float(excess),
         mi.Float(np.tan((fov + offset) / 2)),
-        mi.Float(room),
+        mi.Float(reach),
     )
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_flights_close_the_path(case):
-    distance, budget, *_ = case
+    distance, excess, *_ = case
     cosine = np.linspace(-0.999, 1, 4001)
     vertex, sine = np.array([0, distance]), np.sqrt(1 - cosine**2)
-    raised = mi.Float(1 + cosine)
+    one_plus_cosine = mi.Float(1 + cosine)
 
     def path(leg):
         end = vertex + np.stack([leg * sine, leg * cosine], -1)
         return leg + np.linalg.norm(end, axis=-1)
 
-    leg = np.array(way(*case).leg(mi.Float(budget), raised), float)
-    np.testing.assert_allclose(path(leg), distance + budget, rtol=1e-5)
+    leg = np.array(open_path(*case).leg(mi.Float(excess), one_plus_cosine), float)
+    np.testing.assert_allclose(path(leg), distance + excess, rtol=1e-5)
     step = 1e-3 * leg
-    slope = np.array(way(*case).slope(mi.Float(budget), raised, mi.Float(leg)), float)
+    slope = np.array(
+        open_path(*case).slope(mi.Float(excess), one_plus_cosine, mi.Float(leg)), float
+    )
     numeric = (path(leg + step) - path(leg - step)) / (2 * step)
     np.testing.assert_allclose(slope, numeric, rtol=1e-3)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_density_is_that_of_the_samples(case):
-    one, budget = way(*case), mi.Float(case[1])
-    soft = case[1] / case[0]
+    one, excess = open_path(*case), mi.Float(case[1])
+    offset = case[1] / case[0]
     # solid angle in 1 + cosine, finest where it is small
-    edges = np.geomspace(soft, 2 + soft, 200_001) - soft
+    edges = np.geomspace(offset, 2 + offset, 200_001) - offset
     middle = (edges[1:] + edges[:-1]) / 2
-    density = np.array(one.density(budget, mi.Float(middle)), float)
-    share = 2 * np.pi * density * np.diff(edges)
-    assert abs(share.sum() - 1) < 2e-3
+    density = np.array(one.density(excess, mi.Float(middle)), float)
+    fraction = 2 * np.pi * density * np.diff(edges)
+    assert abs(fraction.sum() - 1) < 2e-3
     number = 400_000
     rng = np.random.default_rng(1)
-    drawn = one.sample(budget, mi.Point2f(rng.random((2, number)).astype(np.float32)))
+    drawn = one.sample(excess, mi.Point2f(rng.random((2, number)).astype(np.float32)))
     vectors = np.array(drawn, float)
     np.testing.assert_allclose(np.linalg.norm(vectors, axis=0), 1, rtol=1e-5)
-    raised = np.sort(np.array(one.raised(drawn), float))
+    one_plus_cosine = np.sort(np.array(one.one_plus_cosine(drawn), float))
     # Kolmogorov-Smirnov, 4 sigma and the quadrature's error
-    expected = np.interp(raised, edges[1:], np.cumsum(share))
-    seen = (np.arange(number) + 0.5) / number
-    assert np.abs(expected - seen).max() < 2 / np.sqrt(number) + 2e-3
+    expected = np.interp(one_plus_cosine, edges[1:], np.cumsum(fraction))
+    empirical = (np.arange(number) + 0.5) / number
+    assert np.abs(expected - empirical).max() < 2 / np.sqrt(number) + 2e-3
     # uniform azimuth
     azimuth = np.arctan2(vectors[1], vectors[0])
     for order in (1, 2):
@@ -80,22 +82,22 @@ def test_density_is_that_of_the_samples(case):
 
 @pytest.mark.parametrize("case", CASES)
 def test_all_directions_into_view_are_drawn(case):
-    distance, budget, fov, offset, room = case
+    distance, excess, fov, offset, reach = case
     rng = np.random.default_rng(2)
-    # isotropic, and as many again close to the way home
+    # isotropic, and as many again close to the direction of the telescope
     cosine = rng.uniform(-1, 1, 200_000)
     cosine = np.concatenate([cosine, -1 + 10 ** rng.uniform(-6, 0, 200_000)])
     azimuth = rng.uniform(0, 2 * np.pi, cosine.size)
     sine = np.sqrt(1 - cosine**2)
     wo = np.stack([sine * np.cos(azimuth), sine * np.sin(azimuth), cosine])
     # leg from the law of cosines
-    path = distance + budget
+    path = distance + excess
     leg = (path**2 - distance**2) / (2 * (path + distance * cosine))
     end = np.array([[0], [0], [distance]]) + leg * wo
-    # the axis is tilted against the way to the vertex
+    # the axis is tilted against the direction to the vertex
     axis = np.array([np.sin(offset), 0, np.cos(offset)])
     angle = np.arccos(np.clip(axis @ end / np.linalg.norm(end, axis=0), -1, 1))
-    seen = (angle < fov * (1 - 1e-3)) & (end[2] > distance - room)
-    assert seen.sum() > 100
-    density = np.array(way(*case).density(mi.Float(budget), mi.Float(1 + cosine)), float)
-    assert (density[seen] > 0).all()
+    in_view = (angle < fov * (1 - 1e-3)) & (end[2] > distance - reach)
+    assert in_view.sum() > 100
+    density = np.array(open_path(*case).density(mi.Float(excess), mi.Float(1 + cosine)), float)
+    assert (density[in_view] > 0).all()

@@ -208,7 +208,7 @@ def test_another_interpreter_is_asked(tmp_path):
     fake = tmp_path / "python"
     fake.write_text('#!/bin/sh\necho "{\\"asked\\": \\"$3\\"}" > "$5"\ntest -f "$1"\n')
     fake.chmod(fake.stat().st_mode | stat.S_IXUSR)
-    assert eradiate.reference(str(fake), 2) == {"asked": str(2 * eradiate.PHOTONS)}
+    assert eradiate.reference(str(fake), 2) == {"asked": str(2 * eradiate.SAMPLES)}
 
 
 # --- the command

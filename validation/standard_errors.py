@@ -1,4 +1,4 @@
-"""Standard errors that pictures state, against the scatter of pictures."""
+"""Standard errors stated by images, against the scatter of images."""
 
 import math
 from importlib.resources import files
@@ -46,14 +46,14 @@ def _draw(place, scores):
 
 def single_scattering(effort):
     """The paper's scan: 30 441 beams, each against the lidar equation."""
-    size, photons = (219, 139), 1024 * effort.scale
+    size, samples = (219, 139), 1024 * effort.scale
     shapes = {"slab": layer(490, 512, medium(2e-2), ENVIRONMENT)}
     loaded = scene((500, 502.5), shapes, size, environment=medium(1e-4), **SCAN)
-    found = render(loaded, 400, photons)
+    found = render(loaded, 400, samples)
     truth = layered([500, 502.5], [(0, 1e-4), (490, 2e-2)], secants(loaded, size))
     z = (found["S0"] - truth) / found["S0_stderr"]
-    # means over so many photons are normal but for a few parts in their number
-    slack = 4 / photons
+    # means over n samples are normal up to a few 1/n
+    slack = 4 / samples
     rows = [
         Row(
             f"mean square of {z.size} z-scores",
@@ -82,7 +82,7 @@ def single_scattering(effort):
     ]
     return Check(
         "Single scattering, beam by beam",
-        f"219 x 139 beams over 12.4 by 7.8 degrees, {photons} samples each, slab of 0.02 / m, "
+        f"219 x 139 beams over 12.4 by 7.8 degrees, {samples} samples each, slab of 0.02 / m, "
         "gate of 2.5 m at 500 m.",
         tuple(rows),
     )
@@ -92,7 +92,7 @@ def multiple_scattering(effort):
     """Dense slabs, gate by gate, over seeds."""
     rows, scores = [], {}
     seeds = 100
-    for number, (name, case, estimator, photons) in enumerate(
+    for number, (name, case, estimator, samples) in enumerate(
         (
             ("molecules, gated", RAYLEIGH, "gated", 30_000),
             ("molecules, analog", RAYLEIGH, "analog", 30_000),
@@ -100,9 +100,9 @@ def multiple_scattering(effort):
             ("forward scatterers, analog", FORWARD, "analog", 60_000),
         )
     ):
-        found = batches(dense(case, estimator), 410 + number, seeds * photons, seeds)
+        found = batches(dense(case, estimator), 410 + number, seeds * samples, seeds)
         value, error = (found[key][..., 0, 0] for key in ("S0", "S0_stderr"))
-        # variances: a mean of squared errors is unbiased, a z-score of skewed photons is not
+        # variances: a mean of squared errors is unbiased, a z-score of skewed samples is not
         ratio = value.var(0, ddof=1) / (error**2).mean(0)
         excess = ((value - value.mean(0)) ** 4).mean(0) / value.var(0) ** 2 - 1
         sigma = np.sqrt((excess / seeds).mean() / ratio.size)
@@ -132,7 +132,7 @@ def multiple_scattering(effort):
 
 def rare_paths(effort):
     """The paper's scan with all orders: the rare ones make up 0.2 to 0.5 % of the signal."""
-    size, photons = (219, 139), 256 * effort.scale
+    size, samples = (219, 139), 256 * effort.scale
     table = str(files("lidar_mi.scenes") / "aerosol_spheroids_532nm.txt")
     phases = {"molecules": "rayleigh_polarized", "spheroids": {"type": "mueller", "table": table}}
     rows, scores = [], {}
@@ -146,19 +146,19 @@ def rare_paths(effort):
             environment=medium(1e-4, phase),
             **SCAN,
         )
-        one, two = (render(loaded, 420 + 2 * number + k, photons) for k in (0, 1))
+        one, two = (render(loaded, 420 + 2 * number + k, samples) for k in (0, 1))
         difference = one["S0"] - two["S0"]
         stated = one["S0_stderr"] ** 2 + two["S0_stderr"] ** 2
         scores[name] = (difference / np.sqrt(stated)).ravel()
-        # relative to a beam's own signal, so that all beams weigh alike
+        # relative to a beam's own signal, so that all beams have the same weight
         weight = ((one["S0"] + two["S0"]) / 2) ** -2
-        seen, said = (weight * difference**2).ravel(), (weight * stated).ravel()
-        ratio = seen.mean() / said.mean()
-        noise = (seen - ratio * said).std() / math.sqrt(seen.size) / said.mean()
+        observed, expected = (weight * difference**2).ravel(), (weight * stated).ravel()
+        ratio = observed.mean() / expected.mean()
+        noise = (observed - ratio * expected).std() / math.sqrt(observed.size) / expected.mean()
         rows += [
             Row(
                 f"{name}: variance of differences / stated",
-                f"{seen.size} pairs of beams",
+                f"{observed.size} pairs of beams",
                 1.0,
                 ratio,
                 noise,
@@ -175,7 +175,7 @@ def rare_paths(effort):
     _draw(place, scores)
     return Check(
         "Rare paths in a thin slab",
-        f"The paper's scan with {photons} samples per beam, orders 1 to 4. Contributions of "
+        f"The paper's scan with {samples} samples per beam, orders 1 to 4. Contributions of "
         "orders above one "
         "are rare and large. Differences of two seeds over all beams.",
         tuple(rows),
