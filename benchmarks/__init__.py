@@ -1,8 +1,8 @@
 """lidar-mi side by side with other ways to the same result, measured in one run.
 
-``make bench`` (or ``python -m benchmarks``) prints one table a comparison and writes
-``outputs/benchmarks.json``. What counts are the ratios: both sides take turns, and a ratio is the
-median over the turns, because machines are noisy and differ.
+``make bench`` (or ``python -m benchmarks``) prints one table per comparison and writes
+``outputs/benchmarks.json``. The ratios are the result: both sides take turns, and a ratio is the
+median over the turns, as times are noisy and depend on the machine.
 
 estimators   the gated estimator against the analog one
 transient    the renderer against mitransient's volumetric integrator
@@ -10,9 +10,9 @@ velocimetry  cross-correlation against OpenPIV
 methods      wind from exact images by all methods, and by public codes
 threads      winds on one thread and on several, on a quiet and on a busy machine
 settings     wind after each setting of a method is halved and doubled
-rendered     wind from rendered pictures by all methods, and the share of every cause of error
+rendered     wind from rendered images by all methods, and the fraction of every cause of error
 renderer     speed and memory of the renderer alone
-rings        wind from ring pictures, all rings at once, against a 2-D fit and scipy
+rings        wind from ring images, all rings at once, against a 2-D fit and scipy
 """
 
 import lidar_mi  # noqa: F401  chooses the LLVM before any of the modules here imports drjit

@@ -46,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     for name in options.comparisons or COMPARISONS:
         with console.status(f"comparing: {name}"), fresh_process() as process:
             future = process.submit(import_module(f"benchmarks.{name}").compare, options.repeats)
-            # a peer that breaks must not cost the other tables
+            # a peer's exception does not stop the other comparisons
             error = future.exception()
             found[name] = (
                 report.Comparison(name, "", "", reason=f"failed: {error!r}")

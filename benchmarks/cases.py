@@ -1,7 +1,7 @@
-"""The image pair that velocity retrievals are measured on: exact images of an exactly known wind.
+"""The image pair of the velocity benchmarks: exact images of an exactly known wind.
 
-Two Lamb-Oseen vortices carry a band-limited texture, a sum of plane waves that is evaluated where
-the air of every pixel came from: no interpolation, so all error is the method's.
+Two Lamb-Oseen vortices advect a band-limited texture, a sum of plane waves that is evaluated at the
+origin of the air of every pixel: without interpolation, so all error is the method's.
 """
 
 from collections.abc import Sequence
@@ -58,14 +58,14 @@ def vortex_pair_images(
     correlation_length: float = CORRELATION_LENGTH,
     vortices: Sequence[Vortex] | None = None,
 ) -> Pair:
-    """The pair: image 2 shows at every pixel the texture the air there had at time 0.
+    """The pair: image 2 is at every pixel the texture of the air there, as it was at time 0.
 
     Parameters
     ----------
     noise : float
         Standard deviation of the white noise of each image, as a fraction of its mean.
     seed : int
-        Of texture and noise; the same texture at every noise level.
+        Of texture and noise; the texture does not depend on the noise level.
     columns, rows : int
         Pixels along y and z, 0.5 m each.
     circulation : float

@@ -1,10 +1,10 @@
-"""The gated estimator against the analog one in dense air, where nature's photons count often.
+"""The gated estimator against the analog one in dense air, where analog samples often contribute.
 
 A homogeneous slab from 500 to 600 m, extinction 20 / km, in a vacuum; gates of 10 m. Every pixel of
-a picture is the same beam again, so that the variance of a render is seen, not taken from its error
-bar. Efficiency = 1 / (variance x time). A gate rendered alone is what the gated estimator is for:
-the photons of the analog one that fall into other gates are lost there. Of ten gates at once they
-all count, while a gated photon still serves one (its gate's own), at ten times the photons.
+an image is the same beam, so that the variance is that over pixels, not the stated standard error.
+Efficiency = 1 / (variance x time). The gated estimator is meant for one gate: analog samples that
+fall into other gates are lost there. With ten gates at once all of them contribute, while a gated
+sample contributes to its own gate only, with ten times as many samples.
 """
 
 import mitsuba as mi
@@ -30,7 +30,7 @@ def compare(repeats: int = 5, beams: int = 1600) -> Comparison:
     for name, (phase, albedo, fov) in CASES.items():
         for first, last in GATES:
             scene = _scene(phase, albedo, fov, (first, last), 1, beams)
-            # as many that both take long against recording and launching a kernel
+            # enough samples that both take much longer than recording and launching a kernel
             lines += _rows(f"{name}; {first:.0f} to {last:.0f} m alone", scene, repeats, 500, 1500)
         scene = _scene(phase, albedo, fov, (500.0, 600.0), 10, beams)
         lines += _rows(f"{name}; ten gates, the median one", scene, repeats, 200, 500)
@@ -43,7 +43,7 @@ def compare(repeats: int = 5, beams: int = 1600) -> Comparison:
         "gated",
         "analog",
         tuple(lines),
-        ("Relative variance of one photon's contribution; time of one photon: all cores.",),
+        ("Relative variance of one sample's contribution; time of one sample: all cores.",),
     )
 
 
@@ -55,13 +55,13 @@ def _time_of_gates(profile, one, repeats):
     times = {name: [s for s, _ in turns] for name, turns in found.items()}
     return [
         row(
-            "as many gated photons in one gate",
+            "as many gated samples in one gate",
             "time, 500 gates (left) and one",
             "s",
             times["profile"],
             times["one"],
             "lower",
-            "what more gates cost",
+            "cost of more gates",
         )
     ]
 
@@ -103,25 +103,25 @@ def _scene(phase, albedo, fov, gates, count, beams):
     )
 
 
-def _rows(case, scene, repeats, gated_photons, analog_photons):
+def _rows(case, scene, repeats, gated_samples, analog_samples):
     analog = mi.load_dict({"type": "gated_volpath", "estimator": "analog", "max_order": ORDERS})
     gates = scene.sensors()[0].gate_count
-    sides = {"gated": (scene.integrator(), gated_photons), "analog": (analog, analog_photons)}
+    sides = {"gated": (scene.integrator(), gated_samples), "analog": (analog, analog_samples)}
 
-    def task(integrator, photons):
+    def task(integrator, samples):
         return lambda turn: np.array(
-            mi.render(scene, integrator=integrator, spp=photons, seed=turn), float
+            mi.render(scene, integrator=integrator, spp=samples, seed=turn), float
         ).reshape(-1, gates, 5)[..., 0]
 
     found = in_turns({name: task(*side) for name, side in sides.items()}, repeats)
     variances, times = {}, {}
-    for name, (_, photons) in sides.items():
+    for name, (_, samples) in sides.items():
         images = [image for _, image in found[name]]
         mean = np.mean(images, axis=(0, 1))
         variances[name] = [
-            float(np.median(photons * image.var(0, ddof=1) / mean**2)) for image in images
+            float(np.median(samples * image.var(0, ddof=1) / mean**2)) for image in images
         ]
-        times[name] = [s / (photons * len(images[0])) for s, _ in found[name]]
+        times[name] = [s / (samples * len(images[0])) for s, _ in found[name]]
     products = {
         name: [1e9 * v * t for v, t in zip(variances[name], times[name], strict=True)]
         for name in sides
@@ -130,7 +130,7 @@ def _rows(case, scene, repeats, gated_photons, analog_photons):
         row(case, "relative variance", "", variances["gated"], variances["analog"], "lower"),
         row(
             case,
-            "time of one photon",
+            "time of one sample",
             "ns",
             [1e9 * t for t in times["gated"]],
             [1e9 * t for t in times["analog"]],

@@ -1,10 +1,10 @@
 """The gated estimator against the analog one, in the paper's scan.
 
 Efficiency = 1 / (variance x time). Both estimators render the same scene with the same beams, so
-variances per photon are compared beam by beam and then averaged. The analog photon that scatters
-in the gate at all, one in 1 / (T tau) with the slab's optical depth tau and the transmittance T to
-it, carries about the weight every gated photon has: the ratio of relative variances is
-(1 / (T tau)) / cv^2, cv being the spread of a gated photon's weight.
+variances per Monte Carlo sample are compared beam by beam and then averaged. The fraction T tau of
+the analog samples scatters in the gate, with the slab's optical depth tau and the transmittance T
+to it. Their weight is about that of every gated sample: the ratio of relative variances is
+(1 / (T tau)) / cv^2, with cv the coefficient of variation of a gated sample's weight.
 """
 
 import mitsuba as mi
@@ -14,11 +14,11 @@ from .measure import Timed, in_turns
 from .report import Comparison, Row, row
 from .scans import paper_scan, set_extinction
 
-# the brightest and the darkest beams of the textured wake, shares of all beams
+# the brightest and the darkest beams of the textured wake, fractions of all beams
 BRIGHTEST, DARKEST = 0.01, 0.1
 
 
-def compare(repeats: int = 5, photons: int = 64, columns: int = 219, rows: int = 139) -> Comparison:
+def compare(repeats: int = 5, samples: int = 64, columns: int = 219, rows: int = 139) -> Comparison:
     """Both estimators at peak and at environment extinction, homogeneous and in the wake."""
     scan = paper_scan(columns, rows)
     scene = scan.scene()
@@ -31,7 +31,7 @@ def compare(repeats: int = 5, photons: int = 64, columns: int = 219, rows: int =
 
         def render(integrator):
             return lambda turn: np.array(
-                mi.render(scene, integrator=integrator, spp=photons, seed=seed + turn), float
+                mi.render(scene, integrator=integrator, spp=samples, seed=seed + turn), float
             ).reshape(columns * rows, -1)[:, :5]
 
         return in_turns({"gated": render(gated), "analog": render(analog)}, repeats)
@@ -44,7 +44,7 @@ def compare(repeats: int = 5, photons: int = 64, columns: int = 219, rows: int =
         case = f"homogeneous slab, {name} extinction {1e3 * extinction:.1f} / km"
         every = np.ones(columns * rows, bool)
         expected = f"1 / tau of the gate = {1 / (extinction * scan.thickness):.0f}"
-        lines += _rows(case, found["gated"], found["analog"], photons, every, expected)
+        lines += _rows(case, found["gated"], found["analog"], samples, every, expected)
     found = measured(scan.fields[0], 1000 * len(homogeneous))
     brightness = np.mean([image[:, 0] for _, image in found["gated"]], axis=0)
     for name, chosen in (
@@ -52,20 +52,20 @@ def compare(repeats: int = 5, photons: int = 64, columns: int = 219, rows: int =
         (f"darkest {DARKEST:.0%}", brightness <= np.quantile(brightness, DARKEST)),
     ):
         case = f"textured wake, {name} of the beams"
-        lines += _rows(case, found["gated"], found["analog"], photons, chosen)
+        lines += _rows(case, found["gated"], found["analog"], samples, chosen)
     return Comparison(
-        f"Gated against analog estimator ({columns} x {rows} beams, {photons} photons a beam)",
+        f"Gated against analog estimator ({columns} x {rows} beams, {samples} samples per beam)",
         "gated",
         "analog",
         tuple(lines),
         (
-            "Photons for one that counts: that scatters in the gate. Times: whole calls, all "
+            "Samples per contributing one: one that scatters in the gate. Times: whole calls, all "
             "beams.",
             (
-                "Relative variance: of one photon's weight, over the squared mean, beam by beam. "
-                "Its ratio is how many times more photons the analog estimator needs. It exceeds "
-                "1 / tau because gated photons all count and weigh nearly the same; in the wake, "
-                "texture within a beam makes them differ more."
+                "Relative variance: of one sample's weight, over the squared mean, beam by beam. "
+                "Its ratio is the factor by which the analog estimator needs more samples. It "
+                "exceeds 1 / tau because all gated samples contribute with nearly equal weights; "
+                "in the wake, texture within a beam increases their variance."
             ),
         ),
     )
@@ -75,7 +75,7 @@ def _rows(
     case: str,
     gated: list[Timed],
     analog: list[Timed],
-    photons: int,
+    samples: int,
     chosen: np.ndarray,
     expected: str = "",
 ) -> list[Row]:
@@ -83,22 +83,22 @@ def _rows(
     mean = np.mean([image[chosen, 0] for _, image in gated], axis=0)
 
     def variance(images):
-        return [np.mean((image[chosen, 4] / mean) ** 2) * photons for _, image in images]
+        return [np.mean((image[chosen, 4] / mean) ** 2) * samples for _, image in images]
 
     def seconds(images):
-        return [s / (photons * len(image)) for s, image in images]
+        return [s / (samples * len(image)) for s, image in images]
 
     ours, other = variance(gated), variance(analog)
     time, other_time = seconds(gated), seconds(analog)
-    # E[w^2] of a photon: 1 + cv^2 when all count, (1 + cv^2) / p when a share p does
+    # E[w^2] of a sample: 1 + cv^2 if all contribute, (1 + cv^2) / p if a fraction p does
     one_in = [(1 + a) / (1 + g) for g, a in zip(ours, other, strict=True)]
     need = [max(2.0, np.ceil(v / 1e-4)) for v in ours]
     lines = [
-        row(case, "photons for one that counts", "", [1.0], one_in, "lower", expected),
-        row(case, "relative variance of one photon", "", ours, other, "lower"),
+        row(case, "samples per contributing one", "", [1.0], one_in, "lower", expected),
+        row(case, "relative variance of one sample", "", ours, other, "lower"),
         row(
             case,
-            "photons a beam for 1 %",
+            "samples per beam for 1 %",
             "",
             need,
             [v / 1e-4 for v in other],
@@ -107,7 +107,7 @@ def _rows(
         ),
         row(
             case,
-            "time of one photon",
+            "time of one sample",
             "ns",
             [1e9 * t for t in time],
             [1e9 * t for t in other_time],
@@ -115,7 +115,7 @@ def _rows(
         ),
         row(
             case,
-            "variance x time of one photon",
+            "variance x time of one sample",
             "ns",
             [1e9 * v * t for v, t in zip(ours, time, strict=True)],
             [1e9 * v * t for v, t in zip(other, other_time, strict=True)],
@@ -123,16 +123,21 @@ def _rows(
             "ratio of efficiencies",
         ),
     ]
-    # do both mean the same, and are the reported standard errors those over the seeds?
+    # are both means equal, and the reported standard errors those over the seeds?
     total = np.mean([image[chosen, 0].mean() for _, image in analog]) / mean.mean() - 1
-    error = np.sqrt(np.mean(other) / (photons * len(analog) * chosen.sum()))
+    error = np.sqrt(np.mean(other) / (samples * len(analog) * chosen.sum()))
     lines.append(
         row(case, "mean signal / gated mean", "", [1.0], [1 + total], note=f"+- {error:.2g}")
     )
     if len(gated) > 1:
-        honest = []
+        variance_ratios = []
         for images in (gated, analog):
-            seen = np.var([image[chosen, 0] for _, image in images], axis=0, ddof=1).mean()
-            honest.append(seen / np.mean([image[chosen, 4] ** 2 for _, image in images]))
-        lines.append(row(case, "variance over seeds / reported", "", honest[:1], honest[1:]))
+            observed = np.var([image[chosen, 0] for _, image in images], axis=0, ddof=1).mean()
+            reported = np.mean([image[chosen, 4] ** 2 for _, image in images])
+            variance_ratios.append(observed / reported)
+        lines.append(
+            row(
+                case, "variance over seeds / reported", "", variance_ratios[:1], variance_ratios[1:]
+            )
+        )
     return lines

@@ -1,10 +1,10 @@
-"""The fringe camera's renderer against plain ways to the same picture.
+"""The fringe camera's renderer against straightforward methods for the same image.
 
-Forward against numpy in double precision, written as one would: plane waves of random direction and
-frequency, Airy's formula, a histogram; through the ideal lens, which is all it can. From the camera
-against Mitsuba's own ``path`` integrator in the same scene, which draws a lobe of the plates and
-splats into a film: time for the same noise. And what single precision costs when the whole orders
-of the gap are not split off.
+Forward: against numpy in double precision, with plane waves of random direction and frequency,
+Airy's formula and a histogram, for the ideal lens only. From the camera: against Mitsuba's own
+``path`` integrator in the same scene, which samples a lobe of the plates and splats into a film;
+the time for the same noise. Finally the error of single precision if the whole orders of the gap
+are not subtracted.
 """
 
 import mitsuba as mi
@@ -27,14 +27,14 @@ FORWARD = (
     ("forward, the line folded in, ideal lens", {"estimator": "forward"}),
     ("forward, frequencies drawn, ideal lens", {"estimator": "forward", "line_shape": "sampled"}),
     (
-        "photon by photon, frequencies drawn, real lens",
+        "single photons, frequencies drawn, real lens",
         {"estimator": "analog", "line_shape": "sampled", "lens": "singlet"},
     ),
 )
 
 
 def compare(repeats: int = 5, width: int = 960, height: int = 780, samples: int = 16) -> Comparison:
-    """Paths per second, time at equal noise, velocity lost in single precision."""
+    """Paths per second, time at equal noise, velocity error of single precision."""
     use_variant(VARIANT)
     pressure, temperature = standard_atmosphere(8500.0)
     line = backscatter_line(WAVELENGTH, temperature, pressure)
@@ -67,7 +67,7 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780, samples: int 
     )
     noise = [float(np.median(image[..., 4] / image[..., 0])) for _, image in found["ours"]]
     first, second = (image[..., 0] for _, image in (found["path"] * 2)[:2])
-    if repeats == 1:  # two pictures for a difference
+    if repeats == 1:  # two images for a difference
         second = draw(scene, integrator=own, spp=samples)(repeats)[..., 0]
     bright = first + second > np.median(first + second)
     other_noise = float(np.std((first - second)[bright] / (first + second)[bright])) * 2**0.5
@@ -104,18 +104,18 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780, samples: int 
     lines.append(
         row(
             "single precision",
-            "velocity lost in the phase, rms",
+            "velocity error of the phase, rms",
             "m/s",
             [ours],
             [other],
             "lower",
-            "other: whole orders left in",
+            "other: whole orders not subtracted",
         )
     )
     return Comparison(
-        f"Fringes ({width} x {height} pixels, {VARIANT}) against plain ways to them",
+        f"Fringes ({width} x {height} pixels, {VARIANT}) against straightforward methods",
         "lidar-mi",
-        "plain",
+        "other",
         tuple(lines),
     )
 
@@ -136,18 +136,18 @@ def plain_forward(
     radius = camera.focal_length * np.sqrt(sine2) / cosine / camera.pixel
     x, y = camera.centre_pixel
     size = camera.height, camera.width
-    picture, _, _ = np.histogram2d(
+    image, _, _ = np.histogram2d(
         y + radius * np.sin(turn),
         x + radius * np.cos(turn),
         size,
         [(-0.5, n - 0.5) for n in size],
         weights=passed,
     )
-    return picture / paths
+    return image / paths
 
 
 def velocity_errors(etalon: Etalon, camera: FringeCamera) -> tuple[float, float]:
-    """Rms error of the phase over the CCD as a velocity: the plugin's, and plain float32's, m/s."""
+    """Rms error of the phase over the CCD, as a velocity in m/s: of the plugin and in float32."""
     cosine = camera.cosine(camera.radius_squared()).ravel()
     sine2 = (1 - cosine**2).astype(np.float32)
     gap = etalon.tuned_gap(WAVELENGTH)

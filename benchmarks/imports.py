@@ -1,6 +1,6 @@
 """Time to import the package and to print the command's help, in processes of their own.
 
-Beside the bare interpreter, which is the least that any of them takes.
+Compared with the interpreter alone, the lower limit of them all.
 """
 
 import subprocess

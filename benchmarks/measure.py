@@ -1,4 +1,4 @@
-"""Measuring in turns, in processes of their own, and the memory they took."""
+"""Timing in turns, in separate processes, and their memory."""
 
 import multiprocessing
 import re
@@ -10,17 +10,17 @@ from typing import Any, NamedTuple
 
 
 class Timed(NamedTuple):
-    """What a call returned and how long it took."""
+    """The result of a call and its duration."""
 
     seconds: float
     result: Any
 
 
 def in_turns(tasks: Mapping[str, Callable[[int], Any]], repeats: int) -> dict[str, list[Timed]]:
-    """Call all tasks one after the other, again and again: a slow moment hits all alike.
+    """Call all tasks in turns, so that disturbances of the machine affect all of them alike.
 
     A task is called with the number of the turn, 0 ... repeats - 1, and before the first turn once
-    with ``repeats``, untimed, so that nothing is compiled while the clock runs.
+    with ``repeats``, untimed, so that nothing is compiled in the timed calls.
     """
     for task in tasks.values():
         task(repeats)
@@ -34,10 +34,10 @@ def in_turns(tasks: Mapping[str, Callable[[int], Any]], repeats: int) -> dict[st
 
 
 def fresh_process() -> ProcessPoolExecutor:
-    """One new process that shares nothing with this one: scenes, kernels, plugins, memory.
+    """One new process, with scenes, kernels, plugins and memory of its own.
 
-    Live scenes and media of one process take part in each other's kernels, and the memory of a
-    process is never given back to measure again.
+    Live scenes and media of one process enter each other's kernels, and the peak memory of a
+    process never decreases.
     """
     return ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))
 

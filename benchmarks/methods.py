@@ -1,7 +1,7 @@
-"""All ways to the wind side by side: ours, OpenPIV, OpenCV and scikit-image, at four noise levels.
+"""All methods for the wind: lidar-mi, OpenPIV, OpenCV and scikit-image, at four noise levels.
 
-Errors are those of v at a method's own vectors, at least 8 px inside the picture, each compared
-with the wind where it belongs (see `velocimetry`).
+Errors are those of v at a method's own vectors, at least 8 px inside the image, each compared with
+the wind at the vector's position (see `velocimetry`).
 """
 
 import time
@@ -26,13 +26,13 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
     """Errors averaged over as many textures as ``repeats``, and the fastest call's time."""
     title = f"Wind from an image pair of {columns} x {rows} px, all methods"
     sides = ("everywhere", "beyond 2 core radii")
-    sought = {f"lidar-mi {name}": (ours(name), "") for name in METHODS}
+    methods = {f"lidar-mi {name}": (ours(name), "") for name in METHODS}
     for name, (find, package) in PEERS.items():
-        sought[name] = (find, "" if find_spec(package) else f"skipped: pip install {PIP[package]}")
+        methods[name] = (find, "" if find_spec(package) else f"skipped: pip install {PIP[package]}")
     lines = []
     for noise in NOISE:
         pairs = [vortex_pair_images(noise, seed, columns, rows) for seed in range(1, repeats + 1)]
-        for name, (find, skipped) in sought.items():
+        for name, (find, skipped) in methods.items():
             case = f"noise of {noise:.0%} of the mean"
             if skipped:
                 lines.append(row(case, name, "m/s", [], [], note=skipped))
@@ -57,10 +57,10 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
                 "winds, with white noise. No vector is left out."
             ),
             (
-                "lidar-mi: default settings, one vector a pixel, time with quality flags. OpenPIV: "
-                "windef.simple_multipass with windows of 32, 16, 8, 8 px. OpenCV: DIS optical "
-                "flow, medium preset, on 8 bits. scikit-image: TV-L1 and iterative Lucas-Kanade "
-                "as they come."
+                "lidar-mi: default settings, one vector per pixel, time with quality flags. "
+                "OpenPIV: windef.simple_multipass with windows of 32, 16, 8, 8 px. OpenCV: DIS "
+                "optical flow, medium preset, on 8 bits. scikit-image: TV-L1 and iterative "
+                "Lucas-Kanade with their defaults."
             ),
         ),
     )
@@ -123,9 +123,9 @@ def rms_errors(pair: Pair, field: Field) -> tuple[float, float]:
     v, _ = velocity(pair.vortices, y + field.moved * dy, z + field.moved * dz)
     square = (dy / DT - v) ** 2
     edge = [float(np.abs(pair.first[name]).max()) - RIM * SPACING for name in ("z", "y")]
-    seen = np.isfinite(square) & (np.abs(z) < edge[0]) & (np.abs(y) < edge[1])
+    inside = np.isfinite(square) & (np.abs(z) < edge[0]) & (np.abs(y) < edge[1])
     distance = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0)
     return tuple(
         float(np.sqrt(square[chosen].mean()))
-        for chosen in (seen, seen & (distance > 2 * CORE_RADIUS))
+        for chosen in (inside, inside & (distance > 2 * CORE_RADIUS))
     )

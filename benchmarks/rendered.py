@@ -1,9 +1,9 @@
-"""All methods on rendered images of the exactly known wind, and what their errors come from.
+"""All methods on rendered images of the exactly known wind, and the causes of their errors.
 
-The case of the tables of winds, seen by the backscatter lidar: the texture is extinction, 1 / km on
-average, of spheroids (the experiments' aerosol), in a slab of 2.5 m at 500 m and, 0.1 s later, at
-485 m; a Gaussian beam of 2 mrad; a detector by day. Light is scattered once: multiple scattering is
-0.3 % of the signal there.
+The case of the tables of winds, observed by the backscatter lidar: the texture is extinction, 1 /
+km on average, of spheroids (the experiments' aerosol), in a slab of 2.5 m at 500 m and, 0.1 s
+later, at 485 m; a Gaussian beam of 2 mrad; a detector by day. Single scattering only: multiple
+scattering is 0.3 % of the signal there.
 """
 
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ def compare(
     found = {}
     for seed in range(1, repeats + 1):
         pair = vortex_pair_images(0.0, seed, columns, rows)
-        truth, experiment = seen_air(pair), sensor(pair, samples, methods)
+        truth, experiment = slab_of(pair), sensor(pair, samples, methods)
         cores = [Core(o.y, o.z, o.core_radius, o.circulation) for o in pair.vortices]
         scans = images(experiment, truth, seed)
         for energy in ENERGIES:
@@ -72,7 +72,7 @@ def compare(
     lines = []
     for energy, turns in found.items():
         noise = np.mean([level for level, _ in turns])
-        case = f"{energy * 1e3:g} mJ a beam: noise of {noise:.1%} of the mean"
+        case = f"{energy * 1e3:g} mJ per beam: noise of {noise:.1%} of the mean"
         for method in methods:
             mean = {
                 key: float(np.mean([limits[method][key] for _, limits in turns]))
@@ -96,11 +96,11 @@ def compare(
         (
             f"Rms error of v, mean over {repeats} textures, no vector left out; default settings.",
             (
-                "Remark: by how many per cent the mean square error of v falls without a cause, "
+                "Remark: percentage by which the mean square error of v decreases without a cause, "
                 "everywhere / beyond 2 core radii: the detector's noise; the simulation's "
-                f"({samples} photons a beam); the beam's width; averaging over the window; shear "
+                f"({samples} samples per beam); the beam's width; averaging over the window; shear "
                 "within it; curved paths in the time step; the method on perfect images. They "
-                "need not add up."
+                "need not add up to 100 %."
             ),
         ),
     )
@@ -116,8 +116,8 @@ def fractions(metrics: dict[str, float]) -> str:
     return ", ".join(parts)
 
 
-def seen_air(pair: Pair) -> Truth:
-    """The two images as extinction of a slab that is the same all through its depth."""
+def slab_of(pair: Pair) -> Truth:
+    """The two images as extinction of a slab, uniform through its depth."""
     fields = tuple(
         (EXTINCTION * image).expand_dims(x=[501.25]).transpose("x", "y", "z")
         for image in (pair.first, pair.second)

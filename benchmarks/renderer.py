@@ -1,8 +1,8 @@
 """Speed and memory of the renderer alone: the demo's two scans of the wake, polarised.
 
-Every number comes from a process of its own, so that no scene, kernel or memory of another
-measurement takes part. Kernels are cached on disk by Dr.Jit; the first process finds an empty
-cache, the second the cache that the first has left.
+Every number is from a separate process, without scenes, kernels or memory of another measurement.
+Kernels are cached on disk by Dr.Jit; the first process starts with an empty cache, the second with
+the cache of the first.
 """
 
 import math
@@ -22,7 +22,7 @@ MANY = 1024
 
 
 def compare(
-    repeats: int = 5, columns: int = 219, rows: int = 139, photons: int = 64, many: int = MANY
+    repeats: int = 5, columns: int = 219, rows: int = 139, samples: int = 64, many: int = MANY
 ) -> Comparison:
     """First scan, later scans, the scan at 1 % noise, memory."""
     cold, cached = [], []
@@ -30,20 +30,20 @@ def compare(
         with tempfile.TemporaryDirectory() as cache:
             for starts in (cold, cached):
                 with _cache(cache), fresh_process() as process:
-                    starts.append(process.submit(first_scans, columns, rows, photons).result())
+                    starts.append(process.submit(first_scans, columns, rows, samples).result())
     with fresh_process() as process:
-        warm = process.submit(warm_scans, repeats, columns, rows, photons).result()
+        warm = process.submit(warm_scans, repeats, columns, rows, samples).result()
     with fresh_process() as process:
-        few = process.submit(memory, columns, rows, photons).result()
+        few = process.submit(memory, columns, rows, samples).result()
     with fresh_process() as process:
         most = process.submit(memory, columns, rows, many).result()
 
     size = f"{columns} x {rows} beams"
     start = "a new process, scene loading and rendering"
-    each = f"warm, {photons} photons a beam"
+    each = f"warm, {samples} samples per beam"
     scan = f"warm, median standard error of {NOISE:.0%}"
     space = "peak memory of the process"
-    rate = [1e-6 * columns * rows * photons / s for s in warm["seconds"]]
+    rate = [1e-6 * columns * rows * samples / s for s in warm["seconds"]]
     return Comparison(
         f"The renderer ({size} of the textured wake, llvm_ad_mono_polarized)",
         "lidar-mi",
@@ -56,29 +56,29 @@ def compare(
                 "second scan (t2)",
                 "s",
                 [s[1] for s in cold],
-                note="moved telescope, other air: compiles nothing",
+                note="moved telescope, other air: no compilation",
             ),
-            row(each, "photons per second", "million", rate),
+            row(each, "samples per second", "million", rate),
             row(each, "time of the scan", "s", warm["seconds"]),
-            row(scan, "photons a beam", "", [float(warm["need"])]),
+            row(scan, "samples per beam", "", [float(warm["need"])]),
             row(scan, "median standard error reached", "%", [100 * warm["reached"]]),
             row(scan, "time of the scan", "s", warm["need_seconds"]),
             row(space, "before rendering", "GB", [1e-9 * few[0]]),
-            row(space, f"{photons} photons a beam", "GB", [1e-9 * few[1]]),
+            row(space, f"{samples} samples per beam", "GB", [1e-9 * few[1]]),
             row(
                 space,
-                f"{many} photons a beam",
+                f"{many} samples per beam",
                 "GB",
                 [1e-9 * most[1]],
-                note=f"{1e-6 * many * columns * rows:.0f} million photons, in passes",
+                note=f"{1e-6 * many * columns * rows:.0f} million samples, in passes",
             ),
         ),
     )
 
 
-def first_scans(columns: int, rows: int, photons: int) -> list[float]:
-    """Seconds from the extinction to the first picture, and from there to the second."""
-    rendered = paper_scan(columns, rows).render(photons, seed=1)
+def first_scans(columns: int, rows: int, samples: int) -> list[float]:
+    """Seconds from the extinction to the first image, and from there to the second."""
+    rendered = paper_scan(columns, rows).render(samples, seed=1)
     seconds = []
     for _ in range(2):
         start = time.perf_counter()
@@ -87,8 +87,8 @@ def first_scans(columns: int, rows: int, photons: int) -> list[float]:
     return seconds
 
 
-def warm_scans(repeats: int, columns: int, rows: int, photons: int) -> dict:
-    """Times of scans after the first, with ``photons`` and with as many as 1 % takes."""
+def warm_scans(repeats: int, columns: int, rows: int, samples: int) -> dict:
+    """Times of scans after the first, with ``samples`` and with as many as 1 % requires."""
     scene = paper_scan(columns, rows).scene()
 
     def render(count):
@@ -99,8 +99,8 @@ def warm_scans(repeats: int, columns: int, rows: int, photons: int) -> dict:
     def noise(images):
         return float(np.median([image[:, 4] / image[:, 0] for _, image in images]))
 
-    full = in_turns({"full": render(photons)}, repeats)["full"]
-    need = max(2, math.ceil(photons * (noise(full) / NOISE) ** 2))
+    full = in_turns({"full": render(samples)}, repeats)["full"]
+    need = max(2, math.ceil(samples * (noise(full) / NOISE) ** 2))
     enough = in_turns({"enough": render(need)}, repeats)["enough"]
     return {
         "seconds": [seconds for seconds, _ in full],
@@ -110,11 +110,11 @@ def warm_scans(repeats: int, columns: int, rows: int, photons: int) -> dict:
     }
 
 
-def memory(columns: int, rows: int, photons: int) -> tuple[float, float]:
+def memory(columns: int, rows: int, samples: int) -> tuple[float, float]:
     """Peak memory before and after both scans, bytes."""
     scan = paper_scan(columns, rows)
     before = peak_memory()
-    for _ in scan.render(photons, seed=1):
+    for _ in scan.render(samples, seed=1):
         pass
     return before, peak_memory()
 

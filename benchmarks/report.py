@@ -1,4 +1,4 @@
-"""What a comparison found, as a table and as JSON."""
+"""The result of a comparison, as a table and as JSON."""
 
 import json
 import math
@@ -28,7 +28,7 @@ class Row:
     ours, other : float or None
         Medians over the turns; None where a side has none.
     ratio : float or None
-        How many times better lidar-mi is (above 1: better), median over the turns; None where
+        Factor by which lidar-mi is better (above 1: better), median over the turns; None where
         neither more nor less of the quantity is better.
     ratio_range : (float, float) or None
         Smallest and largest ratio of a turn.
@@ -47,7 +47,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A table: its rows and what has to be known to read them, or the reason why it has none."""
+    """A table: its rows and the notes needed to read them, or the reason why it has none."""
 
     title: str
     ours: str
@@ -66,7 +66,7 @@ def row(
     better: Literal["lower", "higher", ""] = "",
     note: str = "",
 ) -> Row:
-    """A row from what was measured turn by turn; ``better`` says which way the ratio goes.
+    """A row from measurements turn by turn; ``better`` gives the direction of the ratio.
 
     A side measured once is compared with every turn of the other.
     """
@@ -86,7 +86,7 @@ def row(
 
 
 def missing(*packages: str) -> str:
-    """Why a comparison is skipped, where a package is missing; empty when all are there."""
+    """Reason for which a comparison is skipped if a package is missing; empty if none is."""
     absent = [name for name in packages if find_spec(name) is None]
     return f"skipped: pip install {' '.join(absent)}" if absent else ""
 

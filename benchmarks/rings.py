@@ -1,8 +1,8 @@
-"""Wind from ring pictures: the annular fit against the 2-D fit and against a fit with scipy.
+"""Wind from ring images: the annular fit against the 2-D fit and against a fit with scipy.
 
-All three fit the same model with everything free. scipy's ``least_squares`` gets every pixel of one
-picture, the analytic Jacobian and the weights of its starting values: what one would write for a
-single picture. Errors are those of the same pictures.
+All three fit the same model with all parameters free. scipy's ``least_squares`` gets every pixel of
+one image, the analytic Jacobian and the weights at the starting values, a straightforward fit of a
+single image. Errors are those of the same images.
 """
 
 import numpy as np
@@ -23,11 +23,11 @@ from .measure import in_turns
 from .report import Comparison, row
 
 PHOTONS, SPEED = 2.4e7, 20.0
-ANNULAR, FLAT, SCIPY = 32, 2, 1  # pictures a call
+ANNULAR, FLAT, SCIPY = 32, 2, 1  # images per call
 
 
 def compare(repeats: int = 5, width: int = 960, height: int = 780) -> Comparison:
-    """Pictures a second and errors of the wind."""
+    """Images per second and errors of the wind."""
     camera = FringeCamera(width=width, height=height, pixel=7.4e-6 * 960 / width)
     model, noise = air_rings(DopplerLidar(), Etalon(), camera), pixel_noise(CCD())
     mean = expected(model, SPEED, PHOTONS).float()
@@ -55,13 +55,13 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780) -> Comparison
         for side, number in (("flat", FLAT), ("scipy", SCIPY))
     }
     return Comparison(
-        "Wind from pictures of an etalon's rings",
+        "Wind from images of an etalon's rings",
         "annular fit",
         "other",
         (
             row(
                 case,
-                "pictures a second",
+                "images per second",
                 "",
                 speed["annular"],
                 speed["flat"],
@@ -70,12 +70,12 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780) -> Comparison
             ),
             row(
                 case,
-                "pictures a second",
+                "images per second",
                 "",
                 speed["annular"],
                 speed["scipy"],
                 "higher",
-                "other: scipy, one picture at a time",
+                "other: scipy, one image at a time",
             ),
             row(
                 case,
@@ -84,23 +84,23 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780) -> Comparison
                 [rms],
                 [bound],
                 "",
-                f"{ANNULAR} pictures; other: Cramer-Rao bound",
+                f"{ANNULAR} images; other: Cramer-Rao bound",
             ),
             row(case, "largest difference of v_LOS to the 2-D fit", "m/s", [away["flat"]]),
             row(case, "largest difference of v_LOS to scipy's fit", "m/s", [away["scipy"]]),
         ),
         (
             (
-                f"{PHOTONS:g} photons and {noise.read_noise:.2g} electrons of read noise a "
-                "picture; the 2-D fit starts from the annular one, scipy's from 5 m/s and 1 px "
-                "beside the truth."
+                f"{PHOTONS:g} photons and {noise.read_noise:.2g} electrons of read noise per "
+                "image; the 2-D fit starts from the annular one, scipy's from 5 m/s and 1 px off "
+                "the truth."
             ),
         ),
     )
 
 
 def scipy_fit(image: torch.Tensor, model: RingModel, noise) -> float:
-    """v_LOS of one picture, by scipy's Levenberg-Marquardt over all pixels."""
+    """v_LOS of one image, by scipy's Levenberg-Marquardt over all pixels."""
     cells = pixels(model.shape, model.centre)
     values = image.double().flatten()
     level = float(values.mean())

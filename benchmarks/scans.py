@@ -1,4 +1,4 @@
-"""The scan that is measured: the paper's, over the wake that ships with the project."""
+"""The scan of the benchmarks: the paper's, over the shipped wake."""
 
 from dataclasses import dataclass
 from importlib.resources import files
@@ -18,7 +18,7 @@ from lidar_mi.rendering.variant import use_variant
 
 @dataclass(frozen=True)
 class PaperScan:
-    """The demo experiment up to the picture: extinction (x, y, z) and scan geometry at t1, t2."""
+    """The demo experiment before rendering: extinction (x, y, z) and scan geometry at t1, t2."""
 
     experiment: Experiment
     fields: tuple[xr.DataArray, ...]
@@ -46,10 +46,10 @@ class PaperScan:
             )
         )
 
-    def render(self, photons: int, seed: int):
-        """Both scans as an experiment renders them, one after the other."""
+    def render(self, samples: int, seed: int):
+        """Both scans as in an experiment, one after the other."""
         use_variant(self.experiment.render.variant)
-        settings = self.experiment.render.model_copy(update={"samples_per_beam": photons})
+        settings = self.experiment.render.model_copy(update={"samples_per_beam": samples})
         return render_scans(
             self.fields, self.plans, self.experiment.lidar, *self.air(), settings, seed
         )

@@ -1,4 +1,4 @@
-"""How sensitive winds are to the settings of the methods: each field halved and doubled in turn."""
+"""Sensitivity of winds to the settings of the methods: each field halved and doubled in turn."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import fields, is_dataclass, replace
@@ -23,7 +23,7 @@ from .report import Comparison, row
 NOISE = 0.03
 VOLUME = (16, 40, 56)
 VOLUME_NOISE = 0.01
-# images are solved directly; a seed has no size
+# images are solved directly; a seed has no magnitude
 UNUSED = {
     "images": ("solver",),
     "volumes": ("solver.seed", "largest_ratio", "largest_change_divergence"),
@@ -54,9 +54,9 @@ def compare(
                 for other in (less, more)
             ]
             change = [[] if f is None else [100 * (f[0] / base[0] - 1)] for f in found]
-            reduced = " / ".join("" if f is None else f"{f[1]:.2f}" for f in found)
+            normalised = " / ".join("" if f is None else f"{f[1]:.2f}" for f in found)
             quantity = f"{path} = {shown(value)}: {shown(less)} / {shown(more)}"
-            lines.append(row(name, quantity, "%", *change, note=f"normalised errors {reduced}"))
+            lines.append(row(name, quantity, "%", *change, note=f"normalised errors {normalised}"))
     return Comparison(
         "Settings of the methods, halved and doubled",
         "halved",
@@ -67,7 +67,7 @@ def compare(
                 f"Change of the rms error of all vectors, mean over {repeats} textures. Images: "
                 f"vortex pair of {columns} x {rows} px with {NOISE:.0%} noise. Volumes: vortices "
                 f"with a wavy wind along them, {' x '.join(map(str, volume))} voxels, "
-                f"{VOLUME_NOISE:.0%} noise, a tenth of the texture. Switches are turned over."
+                f"{VOLUME_NOISE:.0%} noise, 10 % of the texture. Switches are inverted."
             ),
         ),
     )
@@ -156,7 +156,7 @@ def changed(settings, path: str, value):
 
 
 def shown(value) -> str:
-    """A value as short as it can be read."""
+    """A value as short text."""
     if isinstance(value, tuple):
         return ", ".join(map(shown, value))
     return str(value) if isinstance(value, bool) else f"{value:.3g}"

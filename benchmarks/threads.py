@@ -1,4 +1,4 @@
-"""Retrievals on one thread and on torch's default number, alone and beside busy processes."""
+"""Retrievals on one thread and on torch's default number, alone and with other load."""
 
 import multiprocessing
 import os
@@ -29,8 +29,8 @@ def compare(
         with _load(busy):
             lines += [_row(pair, method, busy, repeats) for pair in pairs for method in METHODS]
     note = (
-        f"Default: {torch.get_num_threads()} threads. Busy: {os.cpu_count()} processes beside it "
-        "that never wait."
+        f"Default: {torch.get_num_threads()} threads. Busy: {os.cpu_count()} other processes "
+        "at full load."
     )
     return Comparison(
         "Threads of a retrieval", "lidar-mi", "torch's default", tuple(lines), (note,)

@@ -5,11 +5,11 @@ Rayleigh scattering, unpolarised (``llvm_ad_mono``); one time gate of 500 to 502
 is thicker than the gate, so that both see the gate filled everywhere.
 
 mitransient traces paths from a pinhole camera (``perspective``) through ``transient_hdr_film``;
-light comes from a point emitter at the same place. A pixel's solid angle stands for the field of
-view: with an intensity of 1 W/sr its radiance times the telescope's area is what a lidar that
-emits 1 J into that field of view receives. All its rays see lit air, none is lost; off the axis
-of a real laser beam they would be. Its cost is that a path scatters in the gate only by chance.
-Both values are held against the lidar equation.
+light is from a point emitter at the same place. A pixel's solid angle is the field of view: with an
+intensity of 1 W/sr its radiance times the telescope's area is the energy received by a lidar that
+emits 1 J into that field of view. All its rays are in illuminated air, unlike rays off the axis of
+a real laser beam. Paths scatter in the gate only by chance, which costs efficiency. Both values are
+compared with the lidar equation.
 """
 
 import gc
@@ -39,7 +39,7 @@ LONGEST = 1 << 22
 
 
 def compare(repeats: int = 5, columns: int = 219, rows: int = 139, samples: int = 64) -> Comparison:
-    """Noise, time and truth of both; ``samples``: a beam, where the noise is measured."""
+    """Noise, time and error of both; ``samples`` per beam, for the measurement of the noise."""
     title = f"Single scattering against mitransient, one gate, {NOISE:.0%} standard error"
     sides = ("lidar-mi", "mitransient")
     if reason := missing("mitransient"):
@@ -58,11 +58,11 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139, samples: int 
         (
             (
                 f"Same air, gate ({GATE[0]:g} to {GATE[1]:g} m), phase function, {VARIANT}; "
-                "processes of their own take turns. What differs: lidar-mi has a laser of 2 mrad "
+                "separate processes take turns. Differences: lidar-mi has a laser of 2 mrad "
                 "and a telescope of 0.5 m radius in a field of view of 5 mrad; mitransient a "
                 "point emitter and a pinhole at the same place, a pixel being the field of view "
-                "(10 mrad for the single beam, 1 mrad in the scan), so no ray of its misses the "
-                "light."
+                "(10 mrad for the single beam, 1 mrad in the scan), so that none of its rays "
+                "misses the light."
             ),
             (
                 "Scan: lidar-mi renders all beams at once as a lidar; mitransient renders all "
@@ -70,13 +70,13 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139, samples: int 
             ),
             (
                 "mitransient times are scaled linearly from renders of "
-                f"{LONGEST:,} samples (single beam) and {samples} samples a pixel (scan) where 1 % "
-                "needs more."
+                f"{LONGEST:,} samples (single beam) and {samples} samples per pixel (scan) where "
+                "1 % requires more."
             ),
             (
                 "mitransient fills all its time bins with one render: for a profile of G gates "
                 "divide the ratios by G. Homogeneous air only: its time of flight is wrong in "
-                "heterogeneous media. There a gated photon of lidar-mi varies more, see the "
+                "heterogeneous media. There gated samples of lidar-mi vary more, see the "
                 "estimators."
             ),
         ),
@@ -100,7 +100,7 @@ def _case(case, peer, extinction, repeats, columns, rows, samples):
     at_once = min(math.ceil(other_need), LONGEST)
     seconds, other_seconds, lone = _beams(peer, extinction, repeats, need, at_once)
 
-    # how right mitransient is: mean of all samples it has drawn
+    # the error of mitransient, from the mean of all its samples
     weights = beams * samples, at_once
     value, other_value = scan.value[0], np.average([scan.value[1], lone], weights=weights)
     error = math.sqrt(variance / (beams * samples * repeats))
@@ -118,7 +118,7 @@ def _case(case, peer, extinction, repeats, columns, rows, samples):
         row(case, "relative variance of one sample", "", [variance], [other_variance], "lower"),
         row(
             case,
-            "samples a beam for 1 %",
+            "samples per beam for 1 %",
             "",
             [need],
             [other_need],
@@ -149,7 +149,7 @@ def _case(case, peer, extinction, repeats, columns, rows, samples):
             seconds,
             [t * other_need / at_once for t in other_seconds],
             "lower",
-            "lidar-mi: the time to start a kernel",
+            "lidar-mi: time to launch a kernel",
         ),
         row(
             case,
@@ -163,7 +163,7 @@ def _case(case, peer, extinction, repeats, columns, rows, samples):
 
 
 def _scans(peer, extinction, repeats, columns, rows, samples) -> _Scan:
-    """All beams with ``samples`` each, ours also with as many as 1 % takes."""
+    """All beams with ``samples`` each, ours also with as many as 1 % requires."""
     beams = columns * rows
     truth = lidar_equation(extinction, scan_directions(columns, rows)[:, 0])
     scene = _our_scene(extinction, columns, rows)
@@ -188,15 +188,15 @@ def _scans(peer, extinction, repeats, columns, rows, samples) -> _Scan:
     )
 
 
-def _beams(peer, extinction, repeats, photons, samples):
+def _beams(peer, extinction, repeats, our_samples, samples):
     """Seconds of a single beam on both sides, and mitransient's value over the lidar equation."""
-    gc.collect()  # live scenes take part in each other's kernels
+    gc.collect()  # live scenes enter each other's kernels
     scene = _our_scene(extinction, 1, 1)
     peer.submit(_load_peer, extinction, 1, 1).result()
     found = in_turns(
         {
-            "ours": lambda turn: np.array(mi.render(scene, spp=photons, seed=turn)),
-            # seeds of its own: lanes of equal number and seed draw the same in any render
+            "ours": lambda turn: np.array(mi.render(scene, spp=our_samples, seed=turn)),
+            # other seeds: lanes of equal number and seed have the same random numbers in any render
             "theirs": lambda turn: peer.submit(_render_peer, samples, 1000 + turn).result(),
         },
         repeats,
@@ -207,7 +207,7 @@ def _beams(peer, extinction, repeats, photons, samples):
 
 
 def _enough(variance: float) -> int:
-    """Photons for the noise asked for; a standard error takes two."""
+    """Samples for the required noise; a standard error requires two."""
     return max(2, math.ceil(variance / NOISE**2))
 
 
@@ -294,7 +294,7 @@ def _our_scene(extinction: float, columns: int, rows: int):
     )
 
 
-# The other side, in a process of its own: it keeps its scene from call to call.
+# The other side, in a separate process, which keeps its scene from call to call.
 _peer_scene = None
 
 

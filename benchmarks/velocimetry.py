@@ -1,11 +1,11 @@
 """Cross-correlation against OpenPIV on one image pair with exactly known wind.
 
-Two Lamb-Oseen vortices carry a band-limited texture, a sum of plane waves that is evaluated where
-the air of every pixel came from: no interpolation, no noise, so all error is the method's. Vectors
-are compared at the same places, and every vector with the wind where it belongs: a template of the
-first image belongs half its displacement further on, a vector from windows in both images (or from
-images deformed symmetrically) to the windows' centre. OpenPIV's own coordinates lie half a pixel
-beyond that centre; it is not charged for this.
+Two Lamb-Oseen vortices advect a band-limited texture, a sum of plane waves that is evaluated at the
+origin of the air of every pixel: without interpolation and noise, so all error is the method's.
+Vectors are compared at the same places, each with the wind at its position. The vector of a
+template of the first image is half its displacement further on; that of windows in both images (or
+in images deformed symmetrically) is at the windows' centre. OpenPIV's own coordinates lie half a
+pixel beyond that centre; this is corrected.
 """
 
 import contextlib
@@ -35,10 +35,10 @@ from .report import Comparison, missing, row
 
 @dataclass(frozen=True)
 class Field:
-    """Displacements (px) of windows that lie one pixel apart.
+    """Displacements (px) of windows one pixel apart.
 
-    ``start`` is where the first window's centre lies in the image (px along z and y), ``moved``
-    says which part of its displacement a vector belongs further on.
+    ``start`` is the position of the first window's centre in the image (px along z and y),
+    ``moved`` the fraction of its displacement by which a vector's position is further on.
     """
 
     dz: np.ndarray
@@ -50,7 +50,7 @@ class Field:
 def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison:
     """Errors and times for windows of 8 and 16 pixels, one pass and iterated deformation.
 
-    Calls are short, so there are twice as many turns as ``repeats``.
+    As calls are short, there are twice as many turns as ``repeats``.
     """
     title = f"Wind from an image pair of {columns} x {rows} px against OpenPIV"
     sides = ("lidar-mi cc", "OpenPIV")
@@ -58,7 +58,7 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
         return Comparison(title, *sides, reason=reason)
     pair = vortex_pair_images(columns=columns, rows=rows)
     cases = {
-        # of its four correlations the one with the smallest error each
+        # the one of its four correlations with the smallest error in each case
         "8 px windows: cc 8 in 16 | extended search 8 in 16": (
             (8, 16),
             lambda: extended_search(pair, 8, 16, "linear"),
@@ -87,7 +87,7 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
         )
         ours, other = (found[side][0].result for side in ("ours", "theirs"))
         errors, vectors = wind_errors(pair, ours, other)
-        share = f"{vectors} vectors both have"
+        remark = f"{vectors} vectors of both"
         for (where, component), (left, right) in errors.items():
             lines.append(
                 row(
@@ -97,10 +97,10 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
                     [left],
                     [right],
                     "lower",
-                    share,
+                    remark,
                 )
             )
-            share = ""
+            remark = ""
         per_vector = [
             [1e6 * seconds / field.dz.size for seconds, field in found[side]]
             for side in ("ours", "theirs")
@@ -117,18 +117,18 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
                 f"Vortex pair of {CIRCULATION:g} m2/s, {SEPARATION:g} m apart, core radius "
                 f"{CORE_RADIUS:g} m; {SPACING:g} m pixels, {DT:g} s; texture with "
                 f"{CORRELATION_LENGTH:g} px correlation length and {CONTRAST:.0%} contrast, no "
-                "noise; one vector a pixel."
+                "noise; one vector per pixel."
             ),
             (
                 "lidar-mi's time includes its quality flags, which OpenPIV's one-pass times do "
                 "not; it computes on all cores, OpenPIV on one."
             ),
-            "Flagged vectors take part: rms over all that both sides return.",
+            "Flagged vectors are included: rms over all that both sides return.",
             (
                 "extended search and one pass: extended_search_area_piv with normalised "
                 "correlation, Gaussian sub-pixel fit, vectorised. Window deformation: "
                 "windef.simple_multipass, default correlation, windows as named, the last at one "
-                "vector a pixel."
+                "vector per pixel."
             ),
         ),
     )
@@ -156,7 +156,7 @@ def extended_search(pair: Pair, window: int, search: int, correlation: str) -> F
             sig2noise_method=None,
             use_vectorized=True,
         )
-    # windows of one size see the same air in both images: the vector belongs to their centre
+    # windows of one size contain the same air in both images: the vector is at their centre
     return Field(dz, dy, start=(search - 1) / 2, moved=0.5 if window < search else 0.0)
 
 
@@ -175,7 +175,7 @@ def window_deformation(pair: Pair, windows: tuple[int, ...], steps: tuple[int, .
     )
     with _quiet():
         _, _, dy, up, _ = simple_multipass(pair.first.values, pair.second.values, settings)
-    # rows are z, ascending; OpenPIV takes them for a picture's, descending, and turns the sign
+    # rows are z, ascending; OpenPIV assumes descending ones, and inverts the sign
     return Field(-up, dy, start=(windows[-1] - 1) / 2, moved=0.0)
 
 
@@ -214,7 +214,7 @@ def wind_errors(pair: Pair, ours: Field, other: Field) -> tuple[dict, int]:
 
 @contextlib.contextmanager
 def _quiet():
-    """OpenPIV prints and warns about every peak it cannot fit."""
+    """Without OpenPIV's messages and warnings about every peak that it cannot fit."""
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         yield

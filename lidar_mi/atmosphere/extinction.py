@@ -134,7 +134,7 @@ def extinction_from_speed(
 ) -> xr.DataArray:
     """Extinction from the cross-flow speed (v^2 + w^2)^(1/2), the paper's alternative.
 
-    For data without a tracer. As the paper says, such structures may be physically incorrect:
+    For data without a tracer. According to the paper, such structures may be physically incorrect:
     speed is not an aerosol. E = background + (maximum - background) (1 - (1 - x)^stretch),
     x = speed/reference.
 

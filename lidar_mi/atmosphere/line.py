@@ -190,7 +190,7 @@ def backscatter_line(
     laser_width : float
         Full width at half maximum of the emitted line, Hz.
     aerosol_fraction : float
-        Fraction of the backscattered photons that comes from aerosol, 0 to 1; aerosol is too
+        Fraction of the backscattered photons from aerosol, 0 to 1; aerosol is too
         heavy to broaden the line.
     shape : {"rayleigh", "rayleigh_brillouin"}
         Of the molecular line.

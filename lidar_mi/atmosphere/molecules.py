@@ -122,7 +122,7 @@ def anisotropy(king: float, band: str) -> float:
 def depolarization_factor(king: float, band: str = "cabannes") -> float:
     """Depolarisation factor of natural light at 90 degrees, 6 e/(45 + 7 e).
 
-    This is what the ``rayleigh_polarized`` phase function takes.
+    It is the parameter of the ``rayleigh_polarized`` phase function.
     """
     e = anisotropy(king, band)
     return 6 * e / (45 + 7 * e)

@@ -47,7 +47,7 @@ class ScatteringTable:
     number_density : float
         Particles per m^3 that go with this table.
     provenance : str
-        One line: how the numbers were made.
+        One line: the source of the numbers.
 
     Raises
     ------

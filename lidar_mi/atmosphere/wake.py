@@ -21,7 +21,7 @@ def check_nodes(spacing: float, counts: Mapping[str, int], most: int = MOST_NODE
     Raises
     ------
     InputError
-        More than ``most`` nodes. 1e8 take 0.8 GB a field.
+        More than ``most`` nodes. 1e8 take 0.8 GB per field.
     """
     if math.prod(counts.values()) > most:
         counted = " x ".join(f"{count} ({name})" for name, count in counts.items())
@@ -58,7 +58,7 @@ def resample(
     Raises
     ------
     InputError
-        A spacing that is not positive, does not divide an extent or makes too many nodes, fewer
+        A spacing that is not positive, does not divide an extent or gives too many nodes, fewer
         than 4 nodes.
     """
     if not (np.isfinite(spacing) and spacing > 0):

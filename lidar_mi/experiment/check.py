@@ -1,4 +1,4 @@
-"""What an experiment will do, before it does it: checked as a run would, in numbers."""
+"""Summary of an experiment before its run, with the checks of a run, in numbers."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -21,20 +21,20 @@ from lidar_mi.retrieval.method_names import ImageMethod
 def sections(
     asked: Experiment, beside: str | Path = ".", notice: Notice = silent
 ) -> Iterator[Section]:
-    """Titled tables of what an experiment looks at, and with what; nothing is written.
+    """Titled tables of an experiment's instruments and the observed air; nothing is written.
 
     Parameters
     ----------
     asked : Experiment
     beside : path
-        Folder in which files named by the experiment are looked for first.
+        Folder in which files named by the experiment are searched first.
     notice : callable
-        Called with what is running.
+        Called with the name of the running step.
 
     Raises
     ------
     InputError
-        Whatever a run would refuse before it starts.
+        Anything that a run would refuse before it starts.
     """
     ahead = experiment.prepare(asked, beside, notice).results
     if asked.wake:
@@ -84,7 +84,7 @@ def _forecast(asked: Experiment, plan: ScanPlan) -> list[tuple[str, str]]:
 
 
 def duration(seconds: float) -> str:
-    """A time as people say it: 40 s, 3 min, 5 h, 12 days."""
+    """A time in a suitable unit: 40 s, 3 min, 5 h, 12 days."""
     for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * length:
             return f"{seconds / length:.0f} {unit}"
@@ -92,7 +92,7 @@ def duration(seconds: float) -> str:
 
 
 def _displacements(asked: Experiment, wind, pixel: float) -> list[tuple[str, str]]:
-    """The fastest wind beside the fastest that windows of this size can follow, per axis."""
+    """The fastest wind and the fastest that windows of this size can follow, per axis."""
     settings = asked.retrieval
     reach = ((settings.search - settings.template) // 2 - 0.5) * pixel / asked.platform.dt
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
@@ -119,7 +119,7 @@ def _sensor(asked: Experiment, tables: Mapping) -> Section:
     sensor = asked.sensor
     columns, rows = sensor.directions.columns, sensor.directions.rows
     count = columns * rows
-    # a run tells the rest
+    # further checks are made by a run
     flat = "; all in one plane: no wind from both" if min(columns, rows) == 1 else ""
     return "both as one sensor", [
         ("lines of sight", f"{count}, {sensor.pulses} pulses each{flat}"),

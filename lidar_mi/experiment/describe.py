@@ -1,4 +1,4 @@
-"""What a file, a folder of results or a named scatterer holds, as titled tables of text."""
+"""Contents of a file, a folder of results or a named scatterer, as titled tables of text."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -146,7 +146,7 @@ def _netcdf(path: Path) -> Iterator[Section]:
         for name, variable in data.variables.items():
             shape = " x ".join(f"{d} {n}" for d, n in variable.sizes.items())
             span = ""
-            # of what is larger, a part at a time would be wanted
+            # larger variables would have to be read in parts
             if variable.dtype.kind in "fiu" and variable.size and fits(path, variable.nbytes):
                 values = load_variable(xr.DataArray(variable, name=name), path)
                 span = f"{float(values.min()):.4g} ... {float(values.max()):.4g}"
@@ -162,7 +162,7 @@ def _folder(folder: Path) -> Iterator[Section]:
 
 
 def _study(folder: Path) -> Iterator[Section]:
-    """What differs between a study's variants, and what came of it, one column a variant."""
+    """Settings in which a study's variants differ, and their results, one column per variant."""
     from lidar_mi.assessment.report.comparison import differences, flat, results, setting
     from lidar_mi.experiment.study import read_study
 
@@ -211,7 +211,7 @@ def _files(folder: Path, beside: Iterable[str] = ()) -> Section:
 
 
 def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
-    """The keys that distinguish experiments at a glance, as far as it has them."""
+    """The main keys of an experiment, as far as it has them."""
     for key in (
         "seed",
         "wake.file",

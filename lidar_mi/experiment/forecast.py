@@ -1,4 +1,4 @@
-"""What a run will take, before it does: memory, time, and whether its images will have light."""
+"""Estimates before a run: its memory, its time, and whether its images will have light."""
 
 import math
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from lidar_mi.rendering.memory import (
 PER_NODE = 160
 """Bytes of a node of the wake: twenty fields in double precision."""
 PER_VECTOR = 400
-"""Bytes of a vector, for every method and source: 25 variables, and once more where they meet."""
+"""Bytes of a vector, per method and source: 25 variables, twice where they are concatenated."""
 PER_VOXEL = 200
 """Bytes of a voxel of a volume whose wind is retrieved."""
 SAMPLES_PER_SECOND = 8e6
@@ -34,11 +34,11 @@ VECTORS_PER_SECOND = 15e3
 SINGLE = 1e-17
 """S0 whose squared error is the smallest number of single precision."""
 CONTRIBUTIONS = 5
-"""Samples of a pixel that must bring light, on average: 0.7 % of all pixels then have none."""
+"""Contributing samples required per pixel, on average: 0.7 % of all pixels then have none."""
 
 
 class Forecast(NamedTuple):
-    """What a run takes: memory in bytes, time of rendering and retrieval on one core in s."""
+    """Memory of a run in bytes, time of its rendering and retrieval on one core in s."""
 
     memory: float
     seconds: float
@@ -83,12 +83,12 @@ def _vectors_per_beam(experiment: Experiment) -> float:
 
 
 def check_size(experiment: Experiment, plan: ScanPlan) -> None:
-    """Refuse a run that would take more memory than it may.
+    """Refuse a run that needs more memory than the limit.
 
     Raises
     ------
     InputError
-        With what it would take.
+        The memory needed is above the limit.
     """
     check_memory(
         forecast(experiment, plan).memory,
@@ -101,7 +101,7 @@ def check_size(experiment: Experiment, plan: ScanPlan) -> None:
 def most_nodes(experiment: Experiment) -> int:
     """Nodes of the wake that a run can have in memory; every one has a beam with ``aim: grid``."""
     beams = experiment.scan.aim == "grid" and experiment.wake.depth == "plane"
-    # of the gates `check_size` says what they take
+    # the memory of the gates is checked by `check_size`
     each = _per_beam(experiment, 1) if beams else PER_NODE
     left = ceiling(experiment.render.memory) - PROGRAM
     return max(1, min(MOST_NODES, int(left / each)))
@@ -115,8 +115,8 @@ def check_brightness(
     Raises
     ------
     InputError
-        Too few samples bring light: free flights that end elsewhere, or a field of view that holds
-        hardly any of the beam; or light so weak that single precision loses its error.
+        Too few samples contribute: free flights that end elsewhere, or a field of view that
+        contains hardly any of the beam; or light too weak for its error in single precision.
     """
     lidar, render, mapping = experiment.lidar, experiment.render, experiment.wake.extinction
     inside = float(np.median([np.median(field.values) for field in extinction]))
@@ -137,7 +137,7 @@ def check_brightness(
             f"back, not {light * arriving**2:.1g}"
         )
     if render.estimator == "analog":
-        # of all samples of a beam those count that collide in the gate
+        # samples contribute if they collide in the gate
         key, value, fraction = "render.estimator", "analog", seen * inside * length * arriving
     else:
         key, value, fraction = "lidar.fov_half", f"{lidar.fov_half:g} rad", seen / plan.gate_count
@@ -154,11 +154,12 @@ def overlap(lidar: BackscatterLidar, distance: float) -> float:
     """Fraction of the light from a distance (m) that arrives within the field of view.
 
     Mean over the beam's Gaussian cross-section and the telescope's disc, which are concentric: a
-    place at r from the axis is seen from points of the disc within ``fov_half`` times the distance.
+    point at r from the axis is in view of points of the disc within ``fov_half`` times the
+    distance.
     """
     seen = math.tan(lidar.fov_half) * distance
     sigma = float(lidar.radius_at(distance)) / 2
-    # of a Gaussian in the plane, the share beyond r is exp(-r^2 / 2 sigma^2): its quantiles
+    # of a Gaussian in the plane, the fraction beyond r is exp(-r^2 / 2 sigma^2): its quantiles
     share = (np.arange(1000) + 0.5) / 1000
     gap = sigma * np.sqrt(-2 * np.log(share))
     area = math.pi * lidar.aperture_radius**2

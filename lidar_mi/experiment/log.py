@@ -1,4 +1,4 @@
-"""What a run says while it runs: to its log file and to the person in front of the screen."""
+"""Messages of a run, to its log file and to the terminal."""
 
 import os
 import re
@@ -16,7 +16,7 @@ _TAIL = 1 << 16
 
 
 def silent(text: str, fraction: float | None) -> None:
-    """The `Notice` of those who do not want to know."""
+    """A `Notice` that does nothing."""
 
 
 class Log:
@@ -25,9 +25,9 @@ class Log:
     Attributes
     ----------
     path : Path or None
-        File that lines are added to, once there is one.
+        File to which lines are appended, if there is one.
     warnings : list of str
-        What a reader of the results must know.
+        Those that matter for the results.
     """
 
     def __init__(self, notice: Notice = silent, path: Path | None = None):
@@ -35,7 +35,7 @@ class Log:
         self.warnings: list[str] = []
 
     def __call__(self, text: str) -> None:
-        """Say a line, and write it into the file.
+        """Show a line, and write it into the file.
 
         Raises
         ------
@@ -46,15 +46,15 @@ class Log:
         self.notice(text, None)
 
     def remark(self, text: str) -> None:
-        """Warn of something that a reader of the results must know."""
+        """Warn of something that matters for the results."""
         self.warnings.append(text)
         self(f"warning: {text}")
 
     def fail(self, error: Exception) -> None:
-        """Say why the run ended, so that nobody takes it for one that can be resumed.
+        """Write the reason of a failure, so that the run is not mistaken for one to be resumed.
 
-        Of what is not bad input the traceback is written, too. A disk that takes nothing more has
-        failed already: that it takes no line about it is no other error.
+        With the traceback, unless it is bad input. If the disk is full, a failure to write this
+        line is no further error.
         """
         text = f"{FAILED}{one_line(error) or type(error).__name__}"
         with suppress(InputError):
@@ -81,16 +81,16 @@ class Log:
 
 
 def _no_link(path: str, flags: int) -> int:
-    """A log that leads elsewhere would grow there."""
+    """A link is removed, as lines would be appended to its target."""
     return os.open(path, flags | os.O_NOFOLLOW, 0o666)
 
 
 def failure(path: Path) -> str | None:
-    """What the run of a log file failed from; None: it did not, or was only stopped."""
+    """The error that ended the run of a log file; None: none, or it was only stopped."""
     if not path.is_file():
         return None
     with path.open("rb") as file:
-        # the end tells, and someone else may have written into it
+        # only the end matters, and the file may have been edited
         file.seek(max(0, path.stat().st_size - _TAIL))
         lines = file.read(_TAIL).decode(errors="backslashreplace").splitlines()
     last = re.fullmatch(rf"\S+ \S+ {FAILED}(.*)", lines[-1]) if lines else None

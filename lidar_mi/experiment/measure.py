@@ -1,4 +1,4 @@
-"""From the results of a run to its metrics: which result is measured by what."""
+"""From the results of a run to its metrics."""
 
 import math
 from collections.abc import Mapping
@@ -38,7 +38,7 @@ def measure(
     results : mapping
         Of the stages of the experiment, by name.
     seconds : mapping of str to float
-        What steps took.
+        Duration of the steps.
     """
     metrics: dict[str, float] = {}
     if "wind" in results:
@@ -102,7 +102,7 @@ def judged(
 def measured(
     experiment: Experiment, metrics: Mapping[str, float], table: RequirementTable
 ) -> dict[str, float | None]:
-    """What the sensor does, as `requirements.judge` takes it; errors beyond two core radii.
+    """The sensor's properties for `requirements.judge`; errors beyond two core radii.
 
     Points are lines of sight where velocities along them are required, else valid vectors whose
     windows do not overlap.

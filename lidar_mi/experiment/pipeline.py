@@ -1,4 +1,4 @@
-"""The stages of an experiment: what is computed from what."""
+"""The stages of an experiment and their dependencies."""
 
 from collections.abc import Callable
 from typing import Any
@@ -43,7 +43,7 @@ from lidar_mi.experiment.truth import make_truth
 from lidar_mi.retrieval.method_names import ImageMethod
 
 GIVEN = ("beside",)
-"""What is there from the start: the folder in which files of an experiment are looked for first."""
+"""Given from the start: the folder in which files of an experiment are searched first."""
 
 RING_RETRIEVAL = "doppler_retrieve"
 
@@ -69,7 +69,7 @@ def has_detector(experiment: Experiment) -> bool:
 
 
 def has_error_budget(experiment: Experiment) -> bool:
-    """Whether winds are retrieved without each cause of error, too."""
+    """Whether winds are also retrieved without each cause of error."""
     return has_wake(experiment) and experiment.retrieval.error_budget
 
 
@@ -84,7 +84,7 @@ def has_sensor(experiment: Experiment) -> bool:
 
 
 def has_vortices_without_sensor(experiment: Experiment) -> bool:
-    """Whether vortex pairs are fitted to what the backscatter lidar measures alone."""
+    """Whether vortex pairs are fitted to the backscatter lidar's measurements alone."""
     fitted = has_images(experiment) and ImageMethod.VORTEX_FIT in experiment.retrieval.methods
     return fitted and not has_sensor(experiment)
 
@@ -95,7 +95,7 @@ def has_vortices(experiment: Experiment) -> bool:
 
 
 def _quiet(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A stage's ``compute`` from a function that has nothing to say while it runs."""
+    """A stage's ``compute`` from a function without a log."""
     return lambda *needed, log: function(*needed)
 
 
@@ -180,7 +180,7 @@ STAGES = (
     Stage("doppler_alone", doppler_alone, ("lines",), has_sensor, timing="sensor"),
     Stage("costs", _quiet(lidar_costs), ("slab_wind",), has_sensor),
     Stage("pulses_needed", _quiet(pulses_needed), ("requirements", "lines"), has_sensor),
-    # the vortices, fitted to the best vectors that there are
+    # the vortices, fitted to the most accurate vectors available
     Stage("vectors", _quiet(combined_vectors), ("wind3d",), has_sensor),
     Stage("vectors", _quiet(image_vectors), ("wind",), has_vortices_without_sensor),
     Stage("vortices", fit_pairs, ("scans", "vectors"), has_vortices, timing="vortex"),

@@ -22,7 +22,7 @@ BESIDE_VARIANTS = (
     "report.html",
     "figures",
 )
-"""What a study or a run has in its folder: no variant, whose folder is there too, is called so."""
+"""Names of files in the folder of a study or a run, which no variant may have."""
 
 
 def load_experiment(name: str | Path, *, variant: str | None = None, **changes: Any) -> Experiment:
@@ -33,7 +33,7 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
     name : path or str
         An experiment file, or the name of a shipped experiment, see `experiments`.
     variant : str, optional
-        Which, where the file describes several.
+        The name of the variant, if the file describes several.
     **changes
         Keys of the experiment file with their new values, as numbers in SI units or text with a
         unit: sections as dicts, which merge with what is there, or dotted keys,
@@ -42,8 +42,8 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
     Returns
     -------
     Experiment
-        Frozen and checked. Quantities are in SI units. It remembers its file's folder, where the
-        files that it names are looked for first.
+        Frozen and checked. Quantities are in SI units. It stores its file's folder, in which the
+        files that it names are searched first.
 
     Raises
     ------
@@ -140,7 +140,7 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
 
 
 def _merged(data: Any, changes: dict) -> dict:
-    """``data`` with ``changes`` in it, section by section; null: without. Neither is touched."""
+    """``data`` with ``changes``, section by section; null removes. Both remain unchanged."""
     merged = copy.deepcopy(data)
     for key, value in changes.items():
         inner = merged.get(key)
@@ -210,11 +210,11 @@ def _override(data: dict, text: str) -> None:
 
 def _first_fault(error: ValidationError) -> str:
     faults = error.errors()
-    # a misspelt key also leaves one missing: what is there tells more
+    # a misspelt key also leaves one missing: report the misspelt one
     fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
     where, word = _key(fault["loc"]), ""
     if len(where) < len(fault["loc"]) and fault["type"] == "literal_error":
-        # a word or a number: the number's fault tells more
+        # a word or a number: report the number's fault
         word = fault["ctx"]["expected"] + " or "
         fault = next(f for f in faults if f is not fault and _key(f["loc"]) == where)
     field = ".".join(where)
@@ -234,7 +234,7 @@ def _first_fault(error: ValidationError) -> str:
     shown = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
     if fault["type"] in ("out_of_range", "finite_number", "int_parsing_size") and within:
         if unit and not isinstance(value, float):
-            # as it was understood: a metre is no nanometre
+            # as it was understood, with its unit
             shown = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
         expected = word + within.words(symbol)
     elif fault["type"].startswith("model_"):
@@ -257,7 +257,7 @@ def _key(location: tuple) -> list[str]:
 
 
 def _metadata_at(location: tuple, kind: type) -> Any:
-    """What the annotation of the key at a location holds of a kind; None if it has none."""
+    """The part of a kind in the annotation of the key at a location; None if there is none."""
     model: Any = Experiment
     field: Any = None
     for part in location:

@@ -33,7 +33,7 @@ Metrics = Mapping[str, float]
 def chapters(
     experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
 ) -> tuple[list[Chapter], dict[str, float]]:
-    """Draw all figures into a folder and put the chapters of the report together.
+    """Draw all figures into a folder and assemble the chapters of the report.
 
     Parameters
     ----------
@@ -45,9 +45,9 @@ def chapters(
     Returns
     -------
     chapters : list of Chapter
-        One for each instrument, in the order in which they are read.
+        One per instrument, in their order in the report.
     seconds : dict
-        What drawing took, by step.
+        Duration of the drawing, by step.
     """
     found: list[Chapter] = []
     seconds: dict[str, float] = defaultdict(float)
@@ -113,7 +113,7 @@ def _vortices(experiment, results, metrics, folder, log) -> Chapter:
     return vortex_chapter(metrics, fits.pairs, fits.refused, drawn, vectors_method(experiment))
 
 
-# result that a chapter is about, step that its figures are counted for
+# result of a chapter, step to which the time of its figures is added
 _CHAPTERS: tuple[tuple[str, str, Callable[..., Chapter]], ...] = (
     ("wind", "figures", _backscatter),
     ("wind_volume", "figures", _volume),

@@ -1,4 +1,4 @@
-"""What a run holds: an experiment, its results, its metrics."""
+"""A run: an experiment, its results, its metrics."""
 
 import webbrowser
 from collections import defaultdict
@@ -25,21 +25,21 @@ from lidar_mi.tables import Table, Tabular
 class Run(Tabular):
     """An experiment with its results.
 
-    Shows itself as the errors that people ask for first; `show` adds an image.
+    Displayed as its main errors; `show` adds an image.
 
     Attributes
     ----------
     experiment : Experiment
     results : dict
-        Of the stages that are done, by name; `lidar_mi.experiment.pipeline` says which there are.
+        Of the completed stages, by name; see `lidar_mi.experiment.pipeline`.
     metrics : dict of str to float
         Flat; empty until everything is done.
     folder : Path or None
-        Where results are kept.
+        Folder of the files.
     log : Log
-        What the run said; ``log.warnings`` is what a reader of the results must know.
+        Lines of the log; ``log.warnings`` are those that matter for the results.
     seconds : dict of str to float
-        What steps took.
+        Duration of the steps.
     """
 
     experiment: Experiment
@@ -51,7 +51,7 @@ class Run(Tabular):
 
     @property
     def warnings(self) -> list[str]:
-        """What a reader of the results must know."""
+        """Warnings that matter for the results."""
         return self.log.warnings
 
     @property
@@ -95,7 +95,7 @@ class Run(Tabular):
         return self.results.get("vortices")
 
     def tables(self) -> list[Table]:
-        """What was run, and the errors that people ask for first."""
+        """The experiment and its main errors."""
         doppler = self.experiment.doppler
         seconds = sum(self.seconds.values())
         rows = [("experiment", self.experiment.name), ("computed in", f"{seconds:.1f} s")]

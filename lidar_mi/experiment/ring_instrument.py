@@ -1,6 +1,6 @@
-"""From the fringe-imaging instrument and the air to what ring analysis needs to know of them.
+"""From the fringe-imaging instrument and the air to the model of the ring analysis.
 
-The only module that imports both the instrument's room and the retrieval's.
+The only module that imports both `lidar_mi.instrument` and `lidar_mi.retrieval` for rings.
 """
 
 import math
@@ -27,7 +27,7 @@ def ring_model(
     line: Line | Callable[[float], Line],
     temperatures: Sequence[float] = (),
 ) -> RingModel:
-    """The rings of a line, as the retrieval takes them.
+    """The model of a line's rings for the retrieval.
 
     Parameters
     ----------
@@ -66,7 +66,7 @@ def ring_model(
 
 
 def air_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> RingModel:
-    """Rings of the backscatter at the lidar's altitude, for its temperature within a quarter."""
+    """Rings of the backscatter at the lidar's altitude, for its temperature within 25 %."""
     pressure, temperature = standard_atmosphere(lidar.altitude)
 
     def line(kelvin: float) -> Line:
@@ -83,6 +83,6 @@ def air_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> Ring
 
 
 def pixel_noise(ccd: CCD, modes: float = math.inf) -> PixelNoise:
-    """The CCD's noise; a digitiser's step adds its twelfth to the variance."""
+    """The CCD's noise; a digitiser's step adds 1/12 of its square to the variance."""
     step = 0.0 if ccd.bits is None else ccd.gain
     return PixelNoise(math.hypot(ccd.read_noise, step / math.sqrt(12)), modes)

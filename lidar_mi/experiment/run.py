@@ -1,9 +1,8 @@
-"""One experiment, start to end: truth, sensor, images, estimate, verdict.
+"""One experiment: truth, sensor, images, estimate, verdict.
 
-A run may live in a folder. Images are kept there as soon as they are rendered; a run that was
-stopped is resumed with those, and everything after them is computed again. What is kept and
-whether it is used again is decided in `run_folder`, batches of an image's samples in
-`rendering.batches`.
+A run may have a folder, where images are saved as soon as they are rendered. A stopped run is
+resumed with them, and everything after them is computed again. `run_folder` decides which files are
+saved and reused, `rendering.batches` stores the samples of unfinished images.
 """
 
 import time
@@ -41,22 +40,22 @@ def run(
     ----------
     experiment : Experiment
     folder : path, optional
-        Made if missing. If it holds a run of the same experiment, its images are used again.
-        Figures and a report are made for a folder alone.
+        Created if missing. If it holds a run of the same experiment, its images are used again.
+        Figures and a report are only made with a folder.
     beside : path, optional
-        Folder in which files named by the experiment are looked for first. Default: the one that
-        the experiment was read from.
+        Folder in which files named by the experiment are searched first. Default: the folder of
+        the experiment file.
     overwrite : bool
         Replace a run of a different experiment instead of refusing.
     notice : callable, optional
-        Called with what is running, and how far it is (0 to 1, or None). Default: shown on the
-        terminal or in the notebook.
+        Called with the name of the running step and its progress (0 to 1, or None). Default:
+        shown on the terminal or in the notebook.
 
     Returns
     -------
     Run
         ``metrics`` (flat, SI units), ``wind`` (Dataset), ``scans``, ``truth``, ``vortices``, ...;
-        shows itself as tables, and by ``show()`` as an image or a report.
+        displayed as tables, and by ``show()`` as an image or a report.
 
     Raises
     ------
@@ -85,12 +84,12 @@ def run(
 def prepare(
     experiment: Experiment, beside: str | Path | None = None, notice: Notice = silent
 ) -> Run:
-    """Check all that can be checked before anything is rendered or written.
+    """Run all checks that are possible before anything is rendered or written.
 
     Returns
     -------
     Run
-        With the truth and what else is computed ahead; `complete` runs the rest.
+        With the truth and the other results computed ahead; `complete` runs the rest.
 
     Raises
     ------
@@ -140,7 +139,7 @@ def _complete(run: Run, kept: RunFolder | None) -> Run:
         if stage.name not in run.results:
             _carry_out(stage, run, kept)
     if run.scans:
-        # of images from an earlier run what they took then
+        # of images from an earlier run the time that they took then
         run.seconds["render"] = sum(scan.attrs["render_seconds"] for scan in run.scans)
     run.metrics = measure(run.experiment, run.results, run.seconds)
     if kept is not None:

@@ -1,4 +1,4 @@
-"""The folder of a run: whose it is, which file belongs to which result, how far it came."""
+"""The folder of a run: its experiment, the file of each result, its progress."""
 
 import hashlib
 import json
@@ -34,9 +34,9 @@ RECORD, LOG, METRICS, REPORT = "experiment.yaml", "log.txt", "metrics.json", "re
 FIGURES = "figures"
 IMAGES = tuple(f"{name}.exr" for name in rendering.IMAGES)
 RENDERED = (*IMAGES, "fringes_*.exr")
-"""Images that an earlier run of the same experiment leaves to the next one."""
+"""Images of an earlier run of the same experiment that a resumed run reuses."""
 BATCHES = "_batches.npz"
-"""Behind the name of an image that is not finished: the samples that there are."""
+"""Suffix to the name of an unfinished image: its samples so far."""
 RESULTS = {
     "wind": "wind.nc",
     "wind_volume": "wind_volume.nc",
@@ -47,18 +47,18 @@ RESULTS = {
 }
 """File of a result, by its stage."""
 
-# other versions of these may give other images
+# images may depend on the versions of these
 _RENDERED_BY = ("lidar-mi", "mitsuba", "drjit")
 MADE_BY = "run_sha256"
-"""Attribute of every result: what made it, as of `RunFolder.made_by`."""
+"""Attribute of every result: the hash `RunFolder.made_by`."""
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "torch", "kornia", "OpenEXR", "xarray")
 
 
 class RunFolder:
-    """What a run keeps, each result in its file as soon as it is there.
+    """The files of a run, each result saved as soon as it is complete.
 
-    Rendered images are read back, so that a resumed run and one that was not see the same float32
-    values.
+    Rendered images are read back, so that a resumed run has the same float32 values as an
+    uninterrupted one.
 
     Parameters
     ----------
@@ -72,8 +72,8 @@ class RunFolder:
     record : dict
         The experiment, checksums of its files and of its metrics, versions.
     made_by : str
-        SHA-256 of what decides over the images in the record. Every result carries it; one that
-        carries another is none of this run.
+        SHA-256 of those parts of the record that determine the images. Every result has it as an
+        attribute; a result with another hash is not of this run.
     """
 
     def __init__(self, path: str | Path, experiment: Experiment, beside: str | Path):
@@ -96,24 +96,24 @@ class RunFolder:
 
     @contextmanager
     def claimed(self, overwrite: bool) -> Iterator[None]:
-        """Make the folder this run's alone, keeping images of the very same experiment.
+        """Lock the folder for this run, keeping images of the same experiment.
 
         Raises
         ------
         InputError
-            Another run is at work in the folder; it holds images of another experiment or version,
-            and ``overwrite`` is not set; or it is no run folder.
+            Another run is using the folder; it holds images of another experiment or version, and
+            ``overwrite`` is not set; or it is no run folder.
         """
         refuse_strangers(self.path, RECORD, "run folder")
         make_folder(self.path)
         with locked(self.path):
-            # who held the lock before may have made it another's
+            # the former holder of the lock may have changed its experiment
             refuse_strangers(self.path, RECORD, "run folder")
             self._begin(overwrite)
             yield
 
     def _begin(self, overwrite: bool) -> None:
-        """Write the record; of what an earlier run left, keep what is of this experiment."""
+        """Write the record; keep the files of an earlier run that are of this experiment."""
         folder, marker = self.path, self.path / RECORD
         images = [path for pattern in RENDERED for path in folder.glob(pattern)]
         results = [folder / name for name in (METRICS, REPORT, *RESULTS.values())]
@@ -130,18 +130,18 @@ class RunFolder:
                 f"{folder}: holds {what}; expected an empty folder (-o DIR), or --overwrite to "
                 "replace it"
             )
-        # nothing of another experiment may be taken for a result of this one
+        # results of another experiment must not be mistaken for those of this one
         drawn = [*self.figures.glob("*.png"), self.log] if other else []
 
         def remove_old() -> None:
             for path in (*old, *drawn):
                 path.unlink(missing_ok=True)
 
-        # if the disk is full, the earlier run stays as it is
+        # if the disk is full, the earlier run remains unchanged
         write_atomically(marker, encoded(to_yaml(self.record)), first=remove_old)
 
     def _refuse_inputs(self, *, changed: bool) -> None:
-        """Leave files alone that this run reads."""
+        """Do not overwrite files that this run reads."""
         here = self.path.resolve()
         written = {METRICS, REPORT, LOG, *RESULTS.values()}
         for field, path in self._inputs.items():
@@ -170,18 +170,18 @@ class RunFolder:
             return None
         try:
             image = exr.read_scan(path) if part in rendering.IMAGES else exr.read_fringes(path)
-        except InputError:  # damaged: it is rendered again
+        except InputError:  # damaged: the image is rendered again
             return None
         if image.attrs.pop(MADE_BY, None) != self.made_by:
             raise InputError(
                 f"{path}: was made by another experiment; expected the image of this one"
             )
-        # a kill may have left samples beside the image that they became
+        # a killed process may have left samples beside the finished image
         self._batches(part).unlink(missing_ok=True)
         return without_noise(image) if part in rendering.IMAGES else image
 
     def unfinished(self, part: str) -> dict[str, Any] | None:
-        """Samples of an image that an earlier run did not finish; None: there are none."""
+        """Samples of an image unfinished by an earlier run; None: there are none."""
         path = self._batches(part)
         if not path.is_file():
             return None
@@ -192,7 +192,7 @@ class RunFolder:
         return arrays if str(arrays.pop(MADE_BY, "")) == self.made_by else None
 
     def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
-        """Keep samples of an image until the image itself is kept."""
+        """Save samples of an image until the image itself is saved."""
         write_arrays(self._batches(part), arrays | {MADE_BY: self.made_by})
 
     def keep_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
@@ -207,7 +207,7 @@ class RunFolder:
         return value.assign_attrs({MADE_BY: self.made_by})
 
     def _is_foreign(self, image: Path) -> bool:
-        """Whether an image was made by something else, or cannot be read."""
+        """Whether an image is of another experiment or version, or cannot be read."""
         try:
             return exr.read_header(image).get(MADE_BY) != self.made_by
         except InputError:
@@ -229,7 +229,7 @@ class RunFolder:
             write_netcdf(self._signed(value), path)
 
     def keep_verdict(self, metrics: Mapping[str, float], page: str) -> None:
-        """Write report and metrics: the run is done. The record says which metrics are its own."""
+        """Write report and metrics: the run is complete. The record has the metrics' checksum."""
         text = to_json(metrics)
         (self.path / METRICS).unlink(missing_ok=True)
         record = self.record | {"metrics": hashlib.sha256(text.encode()).hexdigest()}
@@ -244,14 +244,14 @@ class RunFolder:
         return self.path / f"{part}{BATCHES}"
 
     def _keep_noise(self, scans: list[xr.Dataset]) -> None:
-        """Put noisy images beside those without noise, in the same files."""
+        """Add noisy images to the files of those without noise."""
         for part, scan in zip(rendering.IMAGES, scans, strict=True):
             if "Y_noisy" in scan and "Y_noisy" not in exr.read_scan(self._image(part)):
                 exr.write_scan(self._image(part), self._signed(scan))
 
 
 def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
-    """Leave a folder alone that holds something else than what a file in it stands for.
+    """Refuse a folder that is not empty and lacks a marker file.
 
     Raises
     ------
@@ -263,7 +263,7 @@ def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
 
 
 def _made_by(record: dict) -> str:
-    """Hash of the parts of a record that decide over what is rendered."""
+    """Hash of the parts of a record that determine the rendered images."""
     decisive = {
         "experiment": record["experiment"],
         "files": record["files"],
@@ -273,7 +273,7 @@ def _made_by(record: dict) -> str:
 
 
 def _difference(before: dict, now: dict) -> str | None:
-    """What makes an earlier run's images another experiment's; None: nothing does."""
+    """The first difference to an earlier run that affects its images; None: there is none."""
     if any(before.get(key) != now[key] for key in ("experiment", "files")):
         return "another experiment"
     for name in _RENDERED_BY:
@@ -284,7 +284,7 @@ def _difference(before: dict, now: dict) -> str | None:
 
 
 def _inputs(experiment: Experiment, beside: str | Path) -> dict[str, Path]:
-    """The files an experiment names, by its keys: a changed file is another experiment."""
+    """The files named by an experiment, by key: a changed file makes another experiment."""
     if experiment.wake is None:
         return {}
     paths = table_files(experiment.scattering, beside)
@@ -320,7 +320,7 @@ def read_record(folder: str | Path) -> dict:
 
 
 def read_metrics(folder: str | Path) -> dict[str, float] | None:
-    """Metrics of the run or the study in a folder, by today's names; None: it is not done.
+    """Metrics of the run or the study in a folder, by today's names; None: not complete.
 
     Raises
     ------
@@ -348,5 +348,5 @@ def _is_number(value: object) -> bool:
 
 
 def failure(folder: str | Path) -> str | None:
-    """What the last run in a folder failed from; None: it did not, or was only stopped."""
+    """The error that ended the last run in a folder; None: none, or it was only stopped."""
     return log.failure(Path(folder) / LOG)

@@ -1,4 +1,4 @@
-"""What an experiment file may say: every key, its unit, its default and its limits.
+"""The keys of an experiment file, each with its unit, its default and its limits.
 
 The air's keys are in `schema_air`, the instruments' in `lidar_mi.instrument`.
 """
@@ -51,9 +51,9 @@ class Retrieval(Section):
     min_texture: Annotated[Number, Within(0, 1000, "noise without signal has about 1")] = 0.01
     min_isotropy: Annotated[Number, Within(0, 1, "definition of a ratio")] = 0.2
     blur: Literal["beam"] | Annotated[Length, Within(0, 1000, "the widest beam")] = Field(
-        0.0, description="standard deviation of what a beam averages over, corrected by variational"
+        0.0, description="standard deviation of the beam's blur, corrected by variational"
     )
-    error_budget: bool = Field(False, description="retrieve winds without each cause of error, too")
+    error_budget: bool = Field(False, description="also retrieve winds without each cause of error")
 
     @model_validator(mode="after")
     def _each_once(self):
@@ -153,22 +153,20 @@ class Sensor(Section):
 
     directions: DopplerScan = DopplerScan()
     pulses: Annotated[int, Within(1, 10000, "100 s of pulses at 100 Hz")] = Field(
-        20, description="averaged in a direction of a slab"
+        20, description="averaged per direction of a slab"
     )
     slabs_per_second: Annotated[
         Frequency, Within(1e-6, 1e6, "from one a week to one for every echo from 150 m")
     ] = Field(10.0, description="that are measured")
-    method: ImageMethod = Field(
-        ImageMethod.VARIATIONAL, description="that the cross-flow wind is taken from"
-    )
+    method: ImageMethod = Field(ImageMethod.VARIATIONAL, description="of the cross-flow wind")
     crossflow_std: (
         Annotated[Speed, Within(1e-9, 1000, "from rounding errors to the fastest wind")] | None
-    ) = Field(None, description="standard error of v and w; default: as the method says")
+    ) = Field(None, description="standard error of v and w; default: that of the method")
     errors: PlatformErrors = PlatformErrors()
     requirements: str | None = Field(None, description="requirement table; default: the paper's")
     exposure: Annotated[
         Time, Within(0, 30000, "exposure limits are defined up to 30 000 s", "(]")
-    ] = Field(10.0, description="time of looking into the beams")
+    ] = Field(10.0, description="time of exposure to the beams")
 
 
 class Volume(Section):
@@ -190,16 +188,16 @@ class Volume(Section):
         return self
 
 
-# keys of the backscatter lidar, which looks at a wake
+# keys of the backscatter lidar, which observes a wake
 BACKSCATTER = ("platform", "lidar", "detector", "scan", "scattering", "render", "retrieval")
 
 
 NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
-"""What an experiment or a variant may be called: both name folders."""
+"""Allowed names of experiments and variants, which are names of folders."""
 
 
 class Experiment(Tabular, Section):
-    """One experiment, start to end: a wake for the backscatter lidar, a Doppler lidar, or both."""
+    """One experiment: a wake for the backscatter lidar, a Doppler lidar, or both."""
 
     name: str = Field(pattern=f"^{NAME}$")
     seed: Annotated[int, Within(0, 2**31 - 1, "integers of an image header")] = 1
@@ -220,11 +218,11 @@ class Experiment(Tabular, Section):
 
     @property
     def folder(self) -> Path:
-        """Where it was read from: files that it names are looked for there first."""
+        """The folder of its file, in which files that it names are searched first."""
         return self._folder
 
     def tables(self) -> list[Table]:
-        """Keys that are not left to their defaults, in SI units."""
+        """Keys that differ from their defaults, in SI units."""
         given = self.model_dump(mode="json", exclude_defaults=True, exclude={"name"})
         return [Table(f"experiment {self.name}; keys without their default", _rows(given))]
 

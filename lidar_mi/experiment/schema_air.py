@@ -1,4 +1,4 @@
-"""What an experiment file may say of the air: its flow, its extinction, how it scatters."""
+"""The keys of the air in an experiment file: flow, extinction, scattering."""
 
 from typing import Annotated, Any, Literal
 
@@ -54,7 +54,7 @@ class VortexPair(Section):
 
 
 class Turbine(Section):
-    """The analytic wake of a wind turbine, as seen downstream from its nacelle."""
+    """The analytic wake of a wind turbine, viewed downstream from its nacelle."""
 
     diameter: Annotated[
         Length, Within(0.1, 1000, "from models in a tunnel to four times the largest rotor")
@@ -113,7 +113,7 @@ class ExtinctionMapping(Section):
 
 
 class Texture(Section):
-    """Sub-grid aerosol texture that a simulation's grid has lost; rms 0 switches it off."""
+    """Sub-grid aerosol texture, not resolved by a simulation's grid; rms 0: none."""
 
     rms: Annotated[Number, Within(0, 2, "a log-normal field of 2 consists of few peaks")] = 0.1
     outer_scale: Annotated[
@@ -122,19 +122,19 @@ class Texture(Section):
 
 
 class Wake(Section):
-    """The flow and what drifts in it."""
+    """The flow and the tracers in it."""
 
     file: str | None = Field(None, description="NetCDF file; beside the experiment or shipped")
     vortex_pair: VortexPair | None = None
     turbine: Turbine | None = None
     time: _Moment | None = Field(None, description="needed when the file holds several")
     second: Literal["advect"] | _Moment = Field("advect", description="t2: advected, or a time")
-    x: _Place | None = Field(None, description="plane put in the middle of the gates")
+    x: _Place | None = Field(None, description="plane placed in the middle of the gates")
     depth: Literal["plane", "volume"] = Field(
         "plane", description="one plane extruded over the gates, or all planes of the file"
     )
     centre: tuple[_Place, _Place] | None = Field(
-        None, description="(y, z) of the wake put on the beam axis; default: the domain's middle"
+        None, description="(y, z) of the wake placed on the beam axis; default: the domain's middle"
     )
     spacing: Annotated[
         Length, Within(0.001, 1000, "from the smallest eddies to models of a region")
@@ -173,11 +173,11 @@ class Wake(Section):
 
 
 class _Scatterer(Section):
-    """What any kind of scatterer may be asked."""
+    """The keys common to all kinds of scatterers."""
 
     aerosol: str | None = Field(None, description="name of an aerosol, with phase: aerosol")
     band: Literal["cabannes", "rayleigh"] = Field(
-        "cabannes", description="of molecules: the line a narrow filter lets through, or all"
+        "cabannes", description="of molecules: the line transmitted by a narrow filter, or all"
     )
     depolarization: Annotated[
         Number, Within(0, 0.5, "anisotropy of molecules allows no more", "[)")
@@ -204,7 +204,7 @@ class Part(_Scatterer):
 
 
 class Scattering(_Scatterer):
-    """How the air scatters, in the slab and around it."""
+    """Scattering by the air, in the slab and around it."""
 
     phase: Literal[
         "rayleigh", "molecules", "isotropic", "henyey_greenstein", "aerosol", "table", "mixture"

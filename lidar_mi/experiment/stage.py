@@ -1,4 +1,4 @@
-"""Stages: the steps of an experiment, put in order by what they need, each computed once."""
+"""Stages: the steps of an experiment, ordered by their dependencies, each computed once."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ def _always(experiment: Experiment) -> bool:
 class Stage:
     """One step of an experiment, from results to a result.
 
-    It knows no folder: it neither reads nor writes what a run keeps, nor draws.
+    It neither reads nor writes the files of a run, nor draws.
 
     Attributes
     ----------
@@ -25,21 +25,21 @@ class Stage:
     compute : callable
         ``compute(experiment, *results that it needs, log=log)``, returns the result.
     needs : tuple of str
-        Names of the results it needs, in the order in which it takes them.
+        Names of the results it needs, in the order of its arguments.
     wanted : callable
         ``wanted(experiment)``: whether the experiment has this stage.
     ahead : bool
-        Computed before anything is written: cheap, and needed to say what would fail later.
+        Computed before anything is written: cheap, and needed to foresee later failures.
     check : callable, optional
-        ``check(experiment, *those of needs that are computed ahead)`` raises InputError for what
-        would otherwise fail after hours.
+        ``check(experiment, *those of needs that are computed ahead)`` raises InputError for faults
+        that would otherwise appear after hours.
     parts : callable, optional
         ``parts(experiment)``, names of the parts of a result that takes long. Then ``compute`` also
-        takes ``missing=``, the names of those to be made, and ``keeper=``, where unfinished ones
-        are kept, and yields (name, part) one by one: each can be kept as soon as it is there. The
-        result is a dictionary of all parts.
+        takes ``missing=``, the names of those to be computed, and ``keeper=``, the store of
+        unfinished ones, and yields (name, part) one by one: each is saved as soon as it is
+        complete. The result is a dictionary of all parts.
     timing : str, optional
-        Step that the time it takes is counted for.
+        Step to which its duration is added.
     """
 
     name: str
@@ -53,38 +53,38 @@ class Stage:
 
 
 class Keeper(Protocol):
-    """Where results are kept while a run goes on."""
+    """Storage of results during a run."""
 
     def kept(self, part: str) -> Any:
-        """A part that is there from an earlier run; None: it is not."""
+        """A part from an earlier run; None: there is none."""
 
     def unfinished(self, part: str) -> dict[str, Any] | None:
-        """What an earlier run kept of a part that it did not finish; None: nothing."""
+        """Unfinished part of an earlier run; None: there is none."""
 
     def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
-        """Keep what there is of a part that takes long, until the part itself is kept."""
+        """Save an unfinished part, until the part itself is saved."""
 
     def keep_part(self, part: str, value: Any) -> Any:
-        """Keep a part; returns it as `kept` would."""
+        """Save a part; returns it as `kept` would."""
 
     def keep(self, name: str, value: Any) -> None:
-        """Keep a result, if it is one of those that are kept."""
+        """Save a result, if it is one of those that are saved."""
 
 
 def in_order(stages: Sequence[Stage], given: Sequence[str] = ()) -> list[Stage]:
-    """Stages so that each stands behind those it needs, else as they are.
+    """Stages so that each follows those it needs, otherwise in the given order.
 
     Parameters
     ----------
     stages : sequence of Stage
     given : sequence of str
-        Names of results that are there from the start.
+        Names of results given from the start.
 
     Raises
     ------
     ValueError
-        Two stages of one name, a need that no stage gives, needs in a circle, a stage that is
-        computed ahead and needs one that is not.
+        Two stages of one name, a result that no stage gives, circular dependencies, a stage
+        computed ahead that needs one that is not.
     """
     names = [*given, *(stage.name for stage in stages)]
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -116,7 +116,7 @@ def result_of(
     log: Log,
     keeper: Keeper | None = None,
 ) -> Any:
-    """The result of one stage from those it needs, kept if there is a keeper."""
+    """The result of one stage from those it needs, saved if there is a keeper."""
     needed = [results[need] for need in stage.needs]
     if stage.parts is None:
         result = stage.compute(experiment, *needed, log=log)

@@ -1,6 +1,6 @@
 """Several variants of one experiment, run one after the other and compared.
 
-Each variant is a run of its own in a folder of its own; beside these folders lie the comparison's
+Each variant is a separate run in its own folder. The folder of the study also has the comparison's
 report, its figure and all metrics, named VARIANT.METRIC.
 """
 
@@ -62,7 +62,7 @@ def run(
     """
     folder = Path(folder)
     refuse_strangers(folder, RECORD, "study's folder")
-    # what is wrong with the last one is said before the first one has taken its time
+    # faults of the last one are reported before the first one is run
     ready = {
         key: experiment.prepare(one, beside, _of(key, notice)) for key, one in variants.items()
     }
@@ -93,7 +93,7 @@ def run(
 def read_study(
     folder: str | Path,
 ) -> tuple[str, dict[str, dict | None], dict[str, dict[str, float]]]:
-    """What a study's folder says it holds.
+    """The contents of a study's folder.
 
     Returns
     -------
@@ -130,9 +130,9 @@ def _of(variant: str, notice: Notice) -> Notice:
 
 
 def _shown(run: Run) -> tuple[xr.DataArray, xr.Dataset, list[tuple[float, float]]]:
-    """First image as the instrument gives it, wind by the first method, places of true cores.
+    """First image of the instrument, wind by the first method, positions of true cores.
 
-    Of winds in three dimensions the layer nearest to the first gate, whose image it is.
+    Of winds in three dimensions the layer nearest to the first gate, that of the image.
     """
     scan = run.scans[0]
     wind = run.wind.isel(source=-1, algorithm=0)  # behind the detector, where there is one

@@ -25,7 +25,7 @@ Flows = tuple[xr.Dataset, xr.Dataset | None]
 
 @dataclass(frozen=True)
 class Truth:
-    """What the lidar looks at, in the lidar's frame at t1 (metres, m^-1, m s^-1).
+    """The observed air, in the lidar's frame at t1 (metres, m^-1, m s^-1).
 
     ``extinction`` and ``smooth`` (without sub-grid texture) hold the fields at t1 and t2, dims
     (x, y, z); ``wind`` has v, w on (z, y), averaged over the depth of the first gate.
@@ -36,7 +36,7 @@ class Truth:
     wind: xr.Dataset
 
     def image(self, which: int, smooth: bool = False) -> xr.DataArray:
-        """Extinction averaged over depth as an image (z, y): what an ideal lidar would see."""
+        """Extinction averaged over depth as an image (z, y): that of an ideal lidar."""
         field = (self.smooth if smooth else self.extinction)[which]
         return _slab_mean(field, self.wind.attrs["gates"])
 
@@ -50,7 +50,7 @@ def make_truth(
     ----------
     experiment : Experiment
     beside : path, optional
-        Folder in which the wake's file is looked for first. Default: the experiment's.
+        Folder in which the wake's file is searched first. Default: the experiment's.
     flows : optional
         From `read_flows` of an experiment that differs in extinction and texture alone.
 
@@ -63,7 +63,7 @@ def make_truth(
     Raises
     ------
     InputError
-        A file that is not there or not as the experiment says.
+        A file that is missing or inconsistent with the experiment.
 
     Examples
     --------
@@ -119,12 +119,12 @@ def make_truth(
 
 
 def moves_along(experiment: Experiment) -> bool:
-    """Whether air moves along x between the images; a plane of air is the same all along it."""
+    """Whether air moves along x between the images; a plane of air is uniform along it."""
     return experiment.wake.turbine is not None or experiment.volume is not None
 
 
 def _advected(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> xr.DataArray:
-    """A field after dt, in the frame that goes along with the gates."""
+    """A field after dt, in the frame of the gates."""
     v, w, dt = flow["v"], flow["w"], experiment.platform.dt
     if float(field.min()) == float(field.max()):
         return field
@@ -147,7 +147,7 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
     if wake.turbine:
         return _turbine(experiment, gate_middle), None
     mapping = wake.extinction
-    # what the extinction is made from goes by our names from here on, and must be in the file
+    # tracers of the extinction are renamed to our names, and must be in the file
     needed = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
     needed = {n: t for n, t in needed.items() if t and mapping.source == "tracer"}
     names = wake.names | {n: t for n, t in needed.items() if t != n}
@@ -181,7 +181,7 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
 
 
 def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
-    """Wind behind a turbine on planes that hold the gates and the air that blows through them."""
+    """Wind behind a turbine on planes that contain the gates and the air that passes them."""
     wake, turbine, scan = experiment.wake, experiment.wake.turbine, experiment.scan
     mean = TurbineWake(
         **turbine.model_dump(
@@ -189,7 +189,7 @@ def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
         ),
         downstream=turbine.downstream or gate_middle,
     )
-    # what comes in at an end must not reach the gates: the wake's air moves at 0 to the full wind
+    # air from beyond the ends must not reach the gates: the wake's air moves at 0 to the full wind
     fastest = max(abs(scan.follow), abs(turbine.wind_speed - scan.follow))
     margin = fastest * experiment.platform.dt + 2 * wake.spacing
     half = math.ceil((scan.thickness / 2 + margin) / wake.spacing)
@@ -228,7 +228,7 @@ def _extinction(flow, mapping, first, second) -> xr.DataArray:
         fastest = max(float(np.hypot(s["v"], s["w"]).max()) for s in states)
         field = extinction_from_speed(flow, **limits, stretch=mapping.stretch, reference=fastest)
     else:
-        # an analytic flow carries neither: then the background is all there is
+        # an analytic flow has neither: then there is only the background
         tracer = "tracer" if mapping.tracer and "tracer" in flow else None
         aerosol = "aerosol" if mapping.aerosol and "aerosol" in flow else None
         if tracer is None and aerosol is None:
@@ -287,13 +287,12 @@ def blur_by_beam(image: xr.DataArray, lidar, distance: float, depth: float = 0.0
 
     Between nodes the air varies linearly, as the renderer's grid does. A beam is a Gaussian with
     the variance per axis of its truncated aperture plus its divergence, so a node k spacings away
-    weighs g(k+1) - 2 g(k) + g(k-1), where g(x) is the mean of max(0, x + sigma X) for normal X.
-    The spacing adds 1/6 px^2 to the Gaussian's variance: for 0.5 m and the paper's beam, two
-    thirds more. Oblique beams also smear the plane over the gate's ``depth`` (m), along the way
+    has the weight g(k+1) - 2 g(k) + g(k-1), where g(x) is the mean of max(0, x + sigma X) for
+    normal X. The spacing adds 1/6 px^2 to the Gaussian's variance: for 0.5 m and the paper's beam,
+    two thirds more. Oblique beams also smear the plane over the gate's ``depth`` (m), along the way
     they take through it; a pulse weighs the gate's middle more than its ends. What is left out
-    costs less than 0.1 % of a pixel on textured air: the aperture's truncation beyond its
-    variance, and that smear where ``depth`` is 0 (500 m, gates of 2.5 m; at 150 m it is wider
-    than the beam).
+    costs less than 0.1 % of a pixel on textured air: the aperture's truncation beyond its variance,
+    and that smear where ``depth`` is 0 (500 m, gates of 2.5 m; at 150 m it is wider than the beam).
     """
     metres = lidar.radius_at(distance) / 2
     steps, weights = _depths(lidar, depth)
@@ -308,13 +307,13 @@ def blur_by_beam(image: xr.DataArray, lidar, distance: float, depth: float = 0.0
 
 
 def _depths(lidar, depth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Places along a gate from its middle, m, and their fractions of the light from within it."""
+    """Positions along a gate from its middle, m, and their fractions of the light from it."""
     if not depth > 0:
         return np.zeros(1), np.ones(1)
     nodes, weights = np.polynomial.legendre.leggauss(6)
     nodes = nodes * depth / 2
     if lidar.pulse_duration > 0:
-        # ranges are off by the place in the pulse, FWHM of a Gaussian
+        # ranges differ by the position in the pulse, FWHM of a Gaussian
         spread = lidar.pulse_duration * constants.c / 2 / np.sqrt(8 * np.log(2))
         ends = [stats.norm.cdf((end - nodes) / spread) for end in (depth / 2, -depth / 2)]
         weights = weights * (ends[0] - ends[1])
@@ -330,7 +329,7 @@ def _beam_weights(axis: np.ndarray, stretch: float, metres: float) -> np.ndarray
     x = np.arange(-reach - 1, len(axis) + reach + 1) - places[:, None]
     g = x * stats.norm.cdf(x / sigma) + sigma * stats.norm.pdf(x / sigma)
     weights = np.diff(g, 2)
-    # beyond the plane its edge holds
+    # beyond the plane the value of its edge
     inside = weights[:, reach:-reach].copy()
     inside[:, 0] += weights[:, :reach].sum(1)
     inside[:, -1] += weights[:, -reach:].sum(1)

@@ -22,7 +22,7 @@ def attenuated_backscatter(
     aperture_area : float
         m^2.
     environment : float
-        Extinction coefficient on the way, m^-1.
+        Extinction coefficient up to the gate, m^-1.
     """
     r = plan.ranges()
     transmittance = np.exp(-2 * environment * r)

@@ -1,4 +1,4 @@
-"""The CCD behind the etalon: how it counts photons, and the noise it adds."""
+"""The CCD behind the etalon: detection of photons, and its noise."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from lidar_mi.units import Frequency, Number, Time, Within, quantity
 
 
 class CCD(BaseModel):
-    """How a CCD counts; numbers of photoelectrons unless said otherwise.
+    """A CCD; numbers of photoelectrons unless stated otherwise.
 
     ``quantum_efficiency`` is 1 by default because the paper's photon numbers count the photons
     that the CCD detects. The other defaults are those of a scientific camera, not the paper's.
@@ -60,23 +60,23 @@ def expose(
     """Read the CCD: noisy images, in photoelectrons.
 
     The mean of a pixel is drawn from a Gamma distribution of shape ``modes`` (speckle), the number
-    of photoelectrons from a Poisson one and clipped at the full well; Gaussian read noise is
-    added, the sum rounded to the digitiser's steps and clipped to its range, and bias and gain are
-    taken out again. What background and dark current add on average is left in. Pixels are
-    independent of each other: speckles are taken as smaller than a pixel.
+    of photoelectrons from a Poisson one and clipped at the full well; Gaussian read noise is added,
+    the sum rounded to the digitiser's steps and clipped to its range, and bias and gain are
+    corrected. The means of background and dark current are not subtracted. Pixels are independent
+    of each other: speckles are assumed to be smaller than a pixel.
 
     Parameters
     ----------
     expected : tensor (height, width) or (N, height, width)
         Mean photons of every pixel; noise is drawn on its device.
     seed : int
-        Image k of a seed has its own stream of random numbers, whatever else is drawn.
+        Image k of a seed has its own stream of random numbers.
     images : int or sequence of int, optional
-        How many images, or the numbers k of the images; default: 1 or N.
+        Number of images, or the numbers k of the images; default: 1 or N.
     modes : float or tensor
         Degrees of freedom M of the speckle in a pixel, above 0; infinite: none.
     background : float
-        Mean photons of incoherent light, a pixel.
+        Mean photons of incoherent light per pixel.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def expose(
     means = expected * ccd.quantum_efficiency
     floor = background * ccd.quantum_efficiency + ccd.dark_current * ccd.integration_time
     frames = expected.new_empty((len(numbers), *expected.shape[-2:]), dtype=torch.float32)
-    # one image at a time, so that its noise depends on its own number alone
+    # one image at a time, so that its noise depends only on its own number
     for i, (frame, number) in enumerate(zip(frames, numbers, strict=True)):
         mean = means if means.ndim == 2 else means[i]
         frame[:] = _read(mean, floor, modes, ccd, _generator(seed, number, expected.device))
@@ -107,7 +107,7 @@ def _read(mean, floor, modes, ccd, generator):
     """One image in photoelectrons."""
     if not bool(torch.isinf(modes).all()):
         shape = modes.expand(mean.shape)
-        # what torch.distributions.Gamma draws with, which takes no generator
+        # the sampler of torch.distributions.Gamma, which accepts no generator
         drawn = torch._standard_gamma(torch.nan_to_num(shape, posinf=1.0), generator=generator)
         mean = torch.where(torch.isinf(shape), mean, mean * drawn / shape)
     electrons = torch.poisson(mean + floor, generator=generator).clamp(max=ccd.full_well)

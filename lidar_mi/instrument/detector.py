@@ -11,9 +11,9 @@ from lidar_mi.units import Frequency, Length, Number, SpectralRadiance, Within, 
 
 
 class Detector(BaseModel):
-    """What lies between the telescope and the numbers; defaults: a photomultiplier by day.
+    """Optics and detector behind the telescope; defaults: a photomultiplier by day.
 
-    Transmission of the filter at the laser's wavelength belongs to ``optics_efficiency``.
+    Transmission of the filter at the laser's wavelength is part of ``optics_efficiency``.
 
     ``excess_noise_factor`` is <g^2> / <g>^2 of the gain g of one photoelectron: d / (d - 1) for a
     photomultiplier whose every dynode multiplies by d (1.25 for 5); k G + (1 - k)(2 - 1 / G) for an
@@ -132,7 +132,7 @@ def background_photoelectrons(
 
 
 def dark_counts(detector: Detector, duration: ArrayLike) -> np.ndarray:
-    """Mean photoelectrons that come without light in ``duration`` (s)."""
+    """Mean dark counts in ``duration`` (s), photoelectrons."""
     return detector.dark_rate * np.asarray(duration, float)
 
 

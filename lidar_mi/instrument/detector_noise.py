@@ -87,7 +87,7 @@ def detect(
     seed: int | Sequence[int],
     polarization: ArrayLike = 1.0,
 ) -> Detection:
-    """Read the detector once, every pixel with noise of its own.
+    """Read the detector once, with independent noise of every pixel.
 
     The signal's mean is drawn from a Gamma distribution (speckle), photoelectrons of signal,
     background and dark current together from a Poisson one, their summed gain from a Gamma one of
@@ -205,7 +205,7 @@ def noisy_scan(
 
 
 def without_noise(scan: xr.Dataset) -> xr.Dataset:
-    """A scan without what `noisy_scan` adds to it."""
+    """A scan without the variables of `noisy_scan`."""
     noise = ("S0_noisy", "S0_noise_std", "Y_noisy", "Y_noise_std")
     kept = scan.drop_vars(noise, errors="ignore")
     kept.attrs = {k: value for k, value in scan.attrs.items() if not k.startswith("detector_")}
@@ -213,7 +213,7 @@ def without_noise(scan: xr.Dataset) -> xr.Dataset:
 
 
 def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) -> dict[str, float]:
-    """What the noise of a scan is made of: medians over all pixels and gates.
+    """Contributions to the noise of a scan: medians over all pixels and gates.
 
     Keys ``photons`` (at the telescope), ``signal``, ``background``, ``dark`` (photoelectrons),
     ``speckle_modes`` (not without speckle), and the relative standard deviation of S0 by cause,
@@ -268,12 +268,12 @@ def _polarization(scan: xr.Dataset) -> np.ndarray:
     if not scan.attrs.get("polarized"):
         return np.ones_like(s0)
     polarized = np.sqrt(sum(scan[name].values.astype(float) ** 2 for name in ("S1", "S2", "S3")))
-    # Monte Carlo rounding may leave a little more than all of the light
+    # rounding may make it exceed 1 by a little
     return np.minimum(1, np.divide(polarized, s0, out=np.ones(s0.shape), where=s0 > 0))
 
 
 def _plan(scan: xr.Dataset) -> ScanPlan:
-    """Where the gates of a scan lie, from the attributes of the scan."""
+    """The gates of a scan, from its attributes."""
     names = ("gate_start", "gate_stop", "gate_kind", "gate_count")
     for name in (*names, "environment_extinction"):
         if name not in scan.attrs:

@@ -1,4 +1,4 @@
-"""The fringe-imaging Doppler lidar: its photons, its sunlight and its speckle."""
+"""The fringe-imaging Doppler lidar: signal photons, sunlight and speckle."""
 
 import math
 from typing import Annotated, Literal
@@ -128,7 +128,7 @@ class DopplerLidar(BaseModel):
 
 
 def photons(lidar: DopplerLidar) -> float:
-    """Photons of a pulse received from the range bin, at the place that ``lidar.counted`` names.
+    """Photons of a pulse received from the range bin, counted as in ``lidar.counted``.
 
     The single-scattering lidar equation n = E lambda / (h c) k A / r^2 beta dr exp(-2 alpha r). It
     is evaluated at the middle of the bin: the mean of 1 / r^2 over 10 m at 56 m gives 0.8 % more.

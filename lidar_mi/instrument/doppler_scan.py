@@ -200,7 +200,7 @@ def scan_wind(
     speed: float = 0.0,
     errors: PlatformErrors | None = None,
 ) -> xr.Dataset:
-    """What a Doppler lidar measures of a wind field, line by line.
+    """Measurement of a wind field by a Doppler lidar, line by line.
 
     The velocity is the wind's projection averaged over the volume (`sight_volumes`) plus the
     platform's own, plus normal noise. Photons arrive evenly from all of the volume: extinction and
@@ -218,7 +218,7 @@ def scan_wind(
     speed : float
         Of the platform along x, as measured on board, m/s.
     errors : PlatformErrors
-        Errors of that knowledge; by default none.
+        Errors of the assumed attitude, pointing and speed; by default none.
 
     Returns
     -------
@@ -229,7 +229,7 @@ def scan_wind(
     Raises
     ------
     InputError
-        A field that does not hold the scan; a standard error that is negative.
+        A field that does not contain the scan; a negative standard error.
     """
     directions, ranges, errors = scan.directions(), scan.ranges(lidar), errors or PlatformErrors()
     std = np.broadcast_to(np.asarray(v_los_std, float), len(directions)).copy()

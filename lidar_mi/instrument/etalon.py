@@ -1,4 +1,4 @@
-"""The etalon: two mirrors with a gap, which lets light through in rings.
+"""The etalon: two mirrors with a gap, which transmits light in rings.
 
 The order of light at the angle theta inside the gap is m = 2 n d nu cos(theta) / c, counted so that
 light passes where m is an integer: the phase of reflection is tuned away with the gap. m is about
@@ -26,10 +26,10 @@ from lidar_mi.errors import InputError
 from lidar_mi.units import Length, Number, Within
 
 POLARIZATIONS = ("s", "p")
-# A mirror that transmits less is taken for opaque: even lossless, it would transmit no photon of a
-# pulse.
+# Transmittance below which a mirror counts as opaque: even lossless, it would transmit no photon of
+# a pulse.
 _LEAST_TRANSMITTANCE = 1e-6
-# A finesse of 9000: the series is for rings on a camera, and is kept in memory.
+# A finesse of 9000: the series is for rings on a camera, and has to fit into memory.
 _MOST_HARMONICS = 100_000
 
 
@@ -42,7 +42,7 @@ class Layer(NamedTuple):
 
 
 class Mirrors(NamedTuple):
-    """What one mirror reflects and transmits, and how it shifts the orders (phase over pi)."""
+    """Reflectance and transmittance of one mirror, and its shift of the orders (phase over pi)."""
 
     reflectance: float
     transmittance: float
@@ -156,12 +156,12 @@ def mirrors(etalon: Etalon, wavelength: float) -> Mirrors:
             f"not allowed; expected at least {_LEAST_TRANSMITTANCE:g}"
         )
     phase = float(np.angle(r)) / np.pi
-    # a whole order more or less is the same phase
+    # the phase is periodic in the order
     return Mirrors(float(abs(r) ** 2), transmittance, phase - round(phase))
 
 
 def cosine_inside(etalon: Etalon, cosine: ArrayLike) -> np.ndarray:
-    """Cosine of the angle in the gap, of light that comes from outside (index 1): Snell's law."""
+    """Cosine of the angle in the gap, of light from outside (index 1): Snell's law."""
     cosine = np.asarray(cosine, float)
     return np.sqrt(1 - (1 - cosine**2) / etalon.index**2)
 
@@ -186,7 +186,7 @@ def fractional_order(
 
 
 def plate_defects(etalon: Etalon, wavelength: float, n: ArrayLike) -> np.ndarray:
-    """What uneven plates leave of harmonic ``n`` of the transmission.
+    """Factor of harmonic ``n`` of the transmission by plate defects.
 
     Irregularities vary the order by a Gaussian of standard deviation 2 n rms / wavelength; a bow,
     over a circular aperture in even light, uniformly by 2 n bow / wavelength about the mean gap,
@@ -312,7 +312,7 @@ def coated_transmission(
 
 
 def _round_trip(etalon, wavelength, cosine, offset):
-    """Phase factor of the way there and back through the gap, without the mirrors'."""
+    """Phase factor of a round trip through the gap, without the mirrors'."""
     gap = 2 * etalon.index * etalon.tuned_gap(wavelength) / wavelength
     return np.exp(2j * np.pi * _less_whole_orders(gap, gap, wavelength, cosine, offset))
 
@@ -343,7 +343,7 @@ def _mirror_amplitudes(etalon, wavelength, cosine, offset, polarization):
 
     gap, _ = admittance(etalon.index)
     plate, _ = admittance(etalon.plate_index)
-    # Fields (E, H) at the gap from those at the plate, and the other way round
+    # Fields (E, H) at the gap from those at the plate, and vice versa
     a, b, c, d = 1 + 0j, 0j, 0j, 1 + 0j
     for layer in reversed(etalon.coatings):
         index = layer.index + 1j * layer.extinction

@@ -41,7 +41,7 @@ class PulseLimit:
 
 @dataclass(frozen=True)
 class ViewingAid:
-    """Binoculars or a telescope, through which a person looks into the beam; default: 7 x 50.
+    """Binoculars or a telescope used to look into the beam; default: 7 x 50.
 
     ``transmission`` 1 is the worst case; real ones pass 70 to 90 %.
     """
@@ -270,15 +270,15 @@ def scan_hazard_distance(
 ) -> float:
     """Distance from which an eye may look into a whole scan, m.
 
-    Beams side by side, ``spacing`` (rad) apart in both directions, overlap near the scanner, where
-    they leave one aperture, and, if they diverge by more than the spacing, anywhere. An eye at the
-    distance r gets the light of n pulses in every scan, n = (pi w^2 / 2) / (spacing r)^2 for the
-    1/e^2 radius w, between 1 and ``beams``, each taken as strong as the one that points at it.
+    Neighbouring beams, ``spacing`` (rad) apart in both directions, overlap near the common aperture
+    of the scanner, and at any distance if they diverge by more than the spacing. An eye at the
+    distance r receives the light of n pulses in every scan, n = (pi w^2 / 2) / (spacing r)^2 for
+    the 1/e^2 radius w, between 1 and ``beams``, each taken as strong as the one that points at it.
 
     Parameters
     ----------
     scan_rate : float
-        Scans a second, Hz.
+        Scans per second, Hz.
     exposure_duration : float
         s.
 
@@ -304,7 +304,7 @@ def scan_hazard_distance(
         beam = (pulse_energy, beam_radius, divergence_full, limit.aperture)
         return exposure_at(distance, *beam) / limit.exposure - 1
 
-    # limits step where rules change: look for the farthest place that is not safe
+    # limits have steps where rules change: search for the farthest unsafe distance
     places = [10 ** (k / 20) for k in range(-40, 140)]
     unsafe = [place for place in places if excess(place) > 0]
     if not unsafe:
@@ -388,7 +388,7 @@ def _infrared(nm: float, t: float) -> float:
         return 1e3 * t
     if 1500 <= nm < 1800:
         return 1e13 * t if t < 1e-9 else 1e4
-    # plateau of short pulses, and where the quarter-power law takes over
+    # plateau of short pulses, and the start of the quarter-power law
     level, until = (1e3, 1e-3) if nm < 2600 else (1e2, 1e-7)
     if t < 1e-9:
         return level * 1e9 * t

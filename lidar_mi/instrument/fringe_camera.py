@@ -107,11 +107,11 @@ def fringe_image(
     photons : float
         Photons of an image.
     counted : {"detected", "before_etalon"}
-        Where they are counted: ``photons`` is the sum over the image, or what that sum would be
-        without an etalon; then the ratio of the image to it is the etalon's mean transmission.
+        Place of the count: ``photons`` is the sum over the image, or the sum without an etalon,
+        whose mean transmission is then the ratio of the image to it.
     subsamples : {1, 2}
-        Points a pixel is averaged over, along each axis. With 1 the rings are sampled in the middle
-        of the pixels, which leaves up to 0.3 % too much contrast in the corners of the default
+        Points per pixel in its average, along each axis. With 1 the rings are sampled in the middle
+        of the pixels, which makes the contrast up to 0.3 % too large in the corners of the default
         camera.
 
     Returns

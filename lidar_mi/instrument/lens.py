@@ -1,4 +1,4 @@
-"""A real lens that maps angles to places as an ideal one does: an aspheric singlet of fused silica.
+"""A real lens with the mapping of an ideal one: an aspheric singlet of fused silica.
 
 The lens in front of a fringe camera has one task: light at the angle theta must fall f tan(theta)
 from the axis, all of it. One piece of glass can: the conic constant of its front removes spherical
@@ -50,7 +50,7 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
     stop_radius : float
         Of the light, m; at most 0.1 focal lengths.
     field : float
-        Half angle of the image that is to be sharp, rad; at most 0.05.
+        Half angle of the corrected image, rad; at most 0.05.
 
     Returns
     -------
@@ -116,19 +116,19 @@ def singlet(focal_length: float, wavelength: float, stop_radius: float, field: f
 def trace(
     lens: np.ndarray, across: ArrayLike, along: ArrayLike, angle: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where light through points of the stop arrives, by Snell's law at every surface.
+    """Positions on the CCD of light through points of the stop, by Snell's law at every surface.
 
     Parameters
     ----------
     lens : array (N, 4)
         As `singlet` returns it.
     across, along : array
-        Places on the stop; the light comes in at ``angle`` (rad) in the plane of the first.
+        Positions on the stop; the light arrives at ``angle`` (rad) in the plane of the first.
 
     Returns
     -------
     tuple of two arrays
-        Places on the CCD, in the lens's unit of length.
+        Positions on the CCD, in the lens's unit of length.
     """
     across, along = np.broadcast_arrays(np.asarray(across, float), np.asarray(along, float))
     place = np.stack([across.ravel(), along.ravel(), np.zeros(across.size)])
@@ -138,7 +138,7 @@ def trace(
         place[2] -= distance
         curvature = 1 / radius if radius else 0.0
         stretch = np.array([[1], [1], [1 + conic]])
-        # the conic c (x^2 + y^2 + (1 + k) z^2) = 2 z on the line place + step way
+        # the conic c (x^2 + y^2 + (1 + k) z^2) = 2 z on the line place + step direction
         square = curvature * (stretch * way * way).sum(0)
         slope = way[2] - curvature * (stretch * place * way).sum(0)
         rest = curvature * (stretch * place * place).sum(0) - 2 * place[2]

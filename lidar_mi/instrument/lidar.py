@@ -1,4 +1,4 @@
-"""The backscatter lidar: what its laser sends and its telescope receives."""
+"""The backscatter lidar: laser and telescope."""
 
 import math
 from typing import Annotated

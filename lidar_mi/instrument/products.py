@@ -81,7 +81,7 @@ def depolarization_image(scan: xr.Dataset) -> xr.Dataset:
 
     The standard error follows from ``S0_stderr``, ``S1_stderr`` and ``S0_S1_correlation`` if the
     scan has them; from ``S0_stderr`` alone it is `depolarization_stderr_bound`, an upper bound.
-    Attribute ``stderr_is_bound`` of ``depolarization_stderr`` says which.
+    See the attribute ``stderr_is_bound`` of ``depolarization_stderr``.
 
     Raises
     ------
@@ -213,7 +213,7 @@ def with_products(scan: xr.Dataset) -> xr.Dataset:
 
     Adds the variables of `depolarization_image`, if light polarised along e_h was rendered in a
     polarised variant, and of `multiple_scattering_image`, if the scan has separate orders.
-    Attributes ``NAME_is_bound`` say whether NAME, a standard error, is an upper bound.
+    Attributes ``NAME_is_bound`` state whether NAME, a standard error, is an upper bound.
     """
     images = []
     if scan.attrs.get("polarized") and _emitted_along_e_h(scan):

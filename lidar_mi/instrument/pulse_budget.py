@@ -1,4 +1,4 @@
-"""Pulses and photons a scanning lidar needs for so many directions so many times a second."""
+"""Pulses and photons of a scanning lidar for a number of directions and a rate of scans."""
 
 import math
 from dataclasses import dataclass
@@ -10,19 +10,19 @@ from lidar_mi.errors import InputError
 
 @dataclass(frozen=True)
 class PulseBudget:
-    """What a scan costs.
+    """Pulses, power and photons of a scan.
 
     Attributes
     ----------
     pulses_per_second : float
         Of all directions together, Hz.
     average_power : float
-        Light sent, W.
+        Emitted light, W.
     echo_time : float
-        From a pulse's leaving to its echo's arrival from the farthest range, s.
+        From a pulse's emission to its echo's arrival from the farthest range, s.
     beams : int
-        Directions that must be measured at the same time, as one receiver can wait for one
-        echo at a time: 1 if the pulses can follow each other.
+        Directions that must be measured simultaneously, as a receiver handles one echo at a time:
+        1 if pulses can follow each other.
     photons_per_direction : float
         Received from one range bin, of all pulses of a direction in one slab.
     """
@@ -51,14 +51,13 @@ def pulse_budget(
     slabs_per_second : float
         Hz.
     pulses_per_direction : int
-        That are averaged in one direction of one slab, see `pulses_for_error`.
+        Averaged in one direction of one slab, see `pulses_for_error`.
     pulse_energy : float
         J.
     farthest : float
         End of the farthest range bin, m.
     photons_per_pulse : float
-        That come back from one range bin, as by `lidar_mi.instrument.doppler.photons`; NaN: not
-        known.
+        Received from one range bin, see `lidar_mi.instrument.doppler.photons`; NaN: not known.
 
     Raises
     ------

@@ -82,8 +82,8 @@ class ScanPlan:
     gate_kind : "planar" or "spherical"
     gate_count : int
     position : float
-        How far the telescope has come along x since the first scan, in the frame of the air that
-        the gates stay with.
+        Distance of the telescope along x from the first scan, in the frame of the air, in which the
+        gates are fixed.
     """
 
     y: np.ndarray
@@ -138,8 +138,8 @@ def plan_scans(
     y, z : arrays
         Nodes of the wake's grid (used with ``aim: grid``), m, ascending.
     travelled : sequence of float
-        How far the telescope has come along x at each scan, m, in the frame of the air; the gates
-        stay with the air, so they come nearer by as much. Negative: the air goes away.
+        Distance of the telescope along x at each scan, m, in the frame of the air. The gates are
+        fixed in that frame, so they are nearer by as much. Negative: the air moves away.
 
     Raises
     ------

@@ -10,7 +10,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 
 
 def footprint_radius(lidar: BackscatterLidar, distance: ArrayLike) -> np.ndarray:
-    """1/e^2 radius of the beam at a distance (m), as far as the field of view holds it, m.
+    """1/e^2 radius of the beam at a distance (m), limited by the field of view, m.
 
     A Gaussian with the variance of the truncated aperture plus the divergence. Area pi w^2 is
     (integral of I)^2 / integral of I^2; it is exact for an uncut beam and for one cut far inside
@@ -24,7 +24,7 @@ def footprint_radius(lidar: BackscatterLidar, distance: ArrayLike) -> np.ndarray
 
 
 def temporal_modes(line_width: float, duration: ArrayLike) -> np.ndarray:
-    """Independent speckle patterns in the time a gate is recorded.
+    """Independent speckle patterns in the recording time of a gate.
 
     M = [2/T int_0^T (1 - t/T) |g(t)|^2 dt]^-1 for a Gaussian line (Goodman, Statistical Optics,
     1985, section 6.1), whose coherence time int |g|^2 dt is sqrt(2 ln 2 / pi) / line_width =

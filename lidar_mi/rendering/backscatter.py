@@ -24,7 +24,7 @@ MOST_CELLS = 1e8  # of an extended plane: 0.8 GB
 
 
 def extrude(plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar) -> xr.DataArray:
-    """A plane of air (z, y) made as deep as every beam of the scan needs it, (x, y, z).
+    """A plane of air (z, y) extended to the depth and width of all beams of the scan, (x, y, z).
 
     Beams are wide and oblique: at the slab's faces and rims some of their light crosses outside
     the gate's planes and the outermost nodes. The plane is extended by that much (the outermost
@@ -36,10 +36,10 @@ def extrude(plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar) -> xr.
         Beams so wide that the extended plane would not fit into the memory.
     """
     radius = lidar.beam_cut if np.isfinite(lidar.beam_cut) else 3 * lidar.beam_radius
-    # the Gaussian divergence exceeds 2.2 times its 1/e^2 angle once in 16 000 photons
+    # the Gaussian divergence exceeds 2.2 times its 1/e^2 angle once in 16 000 samples
     radius += 2.2 * lidar.divergence_full / 2 * plan.gate_stop
     slope = np.hypot(np.abs(plan.y).max(), np.abs(plan.z).max()) / plan.centre
-    # spherical gates bulge: their rim lies nearer by the beam's obliquity
+    # spherical gates are curved: their rim lies nearer by the beam's obliquity
     bulge = (plan.obliquity().max() - 1) * plan.gate_stop if plan.gate_kind == "spherical" else 0
     margin = radius * slope + bulge
     pad = {axis: int(np.ceil(radius / _spacing(plane, axis))) for axis in ("y", "z")}
@@ -82,7 +82,7 @@ def render_scans(
         Extinction coefficient (m^-1) at cell centres, x from the telescope's place at the first
         scan, all on one grid; a single x plane has its depth in ``x.attrs["cell_width"]``.
     environment : float
-        Extinction coefficient around the slab and on the way, m^-1.
+        Extinction coefficient around the slab and up to it, m^-1.
     phase : dict
         Mitsuba phase function of slab and environment.
     albedo : float
@@ -90,13 +90,13 @@ def render_scans(
     seed : int
         Scan k uses seed + k * 2^16, far apart for neighbouring experiments.
     progress : callable, optional
-        Called with (scan, photons done, photons in all).
+        Called with (scan, samples done, samples in all).
     scans : sequence of int, optional
         Which of the scans to render; default: all.
     molecules : Molecules, optional
-        A part of all ``extinctions`` and of ``environment`` that scatters in a way of its own.
+        Part of all ``extinctions`` and of ``environment`` with a phase function of its own.
     batches : callable, optional
-        Gives what keeps the samples of a scan while it is rendered.
+        Returns the store of a scan's samples while it is rendered.
 
     Yields
     ------
@@ -131,7 +131,7 @@ def render_scans(
         start = time.perf_counter()
         seed_here = (seed + (index << 16)) % 2**31  # a header holds 32 bits with a sign
         image = np.array(mi.render(scene, seed=seed_here))
-        dr.flush_malloc_cache()  # what was traced with is as large as the image
+        dr.flush_malloc_cache()  # the buffers of the tracing are as large as the image
         names = scene.integrator().quantities()
         scan = _as_dataset(image, names, plan, lidar, environment, settings, seed_here)
         earlier = kept.seconds if kept else 0.0

@@ -1,4 +1,4 @@
-"""Samples of an image that takes long, kept while it is rendered."""
+"""Storage of the finished samples of an image while it is rendered."""
 
 import time
 from collections.abc import Callable
@@ -7,28 +7,28 @@ from typing import Any
 import numpy as np
 
 INTERVAL = 30.0
-"""Seconds between two times that samples are kept."""
+"""Seconds between two times that samples are stored."""
 
 Arrays = dict[str, np.ndarray]
 
 
 class Batches:
-    """What the passes of one image have given so far.
+    """The results of an image's finished passes.
 
-    The integrators of the plugins ask for what is `kept` at their start, and offer what they have
-    after every pass.
+    The integrators of the plugins read the `kept` passes at their start, and call `keep` after
+    every pass.
 
     Parameters
     ----------
     load : callable
-        Returns what an earlier run kept of the image, or None.
+        Returns the arrays stored by an earlier run, or None.
     save : callable
-        Takes what is to be kept.
+        Stores arrays.
 
     Attributes
     ----------
     seconds : float
-        What earlier runs took for the passes that are kept.
+        Time spent by earlier runs on the stored passes.
     """
 
     def __init__(self, load: Callable[[], Arrays | None], save: Callable[[Arrays], None]):
@@ -38,7 +38,7 @@ class Batches:
         self._next = self._start + INTERVAL
 
     def kept(self) -> tuple[int, Arrays]:
-        """How many passes are kept, and what they have given."""
+        """Number of stored passes, and their results."""
         arrays = self._load()
         if arrays is None:
             return 0, {}
@@ -46,12 +46,12 @@ class Batches:
         return int(arrays.pop("passes")), arrays
 
     def keep(self, passes: int, arrays: Callable[[], dict[str, Any]]) -> None:
-        """Keep what so many passes have given, if it is time to."""
+        """Store the results of so many passes, if the interval is over."""
         start = time.monotonic()
         if start < self._next:
             return
         seconds = self.seconds + start - self._start
         self._save({"passes": np.array(passes), "seconds": np.array(seconds)} | arrays())
         end = time.monotonic()
-        # of large images on slow disks, a tenth of the time is enough
+        # for large images on slow disks, at most 10 % of the time is spent on storage
         self._next = end + max(INTERVAL, 10 * (end - start))

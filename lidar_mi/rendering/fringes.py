@@ -19,7 +19,7 @@ from lidar_mi.io.exr import label_fringes
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.settings import FringeSettings
 
-# from the stop to the etalon, m: any distance that leaves room for a lens
+# from the stop to the etalon, m: any distance that is large enough for a lens
 _ETALON_AT = 0.05
 _UNITS = (
     "Stokes: received energy over the energy sent through the stop; frequencies: Hz; lengths: m"
@@ -37,7 +37,7 @@ def render_fringes(
     images: Sequence[int] | None = None,
     batches: Callable[[int], Batches] | None = None,
 ) -> Iterator[xr.Dataset]:
-    """Render one velocity after the other in one scene; only the first compiles anything.
+    """Render one velocity after the other in one scene; only the first compiles kernels.
 
     In Mitsuba's variant in force.
 

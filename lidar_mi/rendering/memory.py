@@ -1,4 +1,4 @@
-"""Memory that images of the backscatter lidar take, and samples that fit into what may be taken."""
+"""Memory used by images of the backscatter lidar, and number of samples within the limit."""
 
 from lidar_mi.errors import InputError
 from lidar_mi.system.memory import GIB, machine_memory
@@ -9,18 +9,18 @@ PER_SAMPLE = 100
 """Bytes of a sample while it is traced, with the sums of its gate; measured: 65."""
 PER_PIXEL = 500
 """Bytes of a pixel of the fringe camera: sixty images in double precision."""
-SHARE = 0.25
+FRACTION = 0.25
 """Of the memory, for samples that are traced at once."""
 
 
 def ceiling(memory: float | None) -> float:
-    """Bytes that a run may take: what is asked for, or half of the machine's memory."""
+    """Limit of a run's memory, bytes: as given, or half of the machine's memory."""
     return machine_memory() / 2 if memory is None else memory
 
 
 def samples_at_once(samples_per_pass: int, memory: float | None) -> int:
-    """Samples of a pass, as asked for or as many as memory holds; images do not depend on it."""
-    return max(1024, min(samples_per_pass, int(SHARE * ceiling(memory) / PER_SAMPLE)))
+    """Samples of a pass, as given or as many as fit into memory; images do not depend on it."""
+    return max(1024, min(samples_per_pass, int(FRACTION * ceiling(memory) / PER_SAMPLE)))
 
 
 def image_bytes(beams: int, gates: int, quantities: int) -> float:
@@ -37,12 +37,12 @@ def image_bytes(beams: int, gates: int, quantities: int) -> float:
 def check_memory(
     needed: float, memory: float | None, what: str, remedy: str, key: str = "render.memory"
 ) -> None:
-    """Refuse what would not fit.
+    """Refuse to exceed the limit of the memory.
 
     Raises
     ------
     InputError
-        With what it would take.
+        The memory needed is above the limit.
     """
     allowed = ceiling(memory)
     if needed > allowed:

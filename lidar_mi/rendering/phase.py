@@ -1,4 +1,4 @@
-"""Which Mitsuba phase function and albedo stand for the scattering an experiment describes."""
+"""Mitsuba phase function and albedo for the scattering of an experiment."""
 
 import math
 from pathlib import Path
@@ -39,7 +39,7 @@ def molecules(extinction: float, wavelength: float, band: str = "cabannes") -> M
     wavelength : float
         m.
     band : "cabannes" or "rayleigh"
-        Whose light is received.
+        Of the received light.
     """
     if extinction == 0:
         return None
@@ -54,18 +54,18 @@ def scatterer(
     wavelength: float = 532e-9,
     notice: Notice = lambda text, fraction: None,
 ) -> Scatterer:
-    """How the air of an experiment scatters.
+    """Phase function and albedo of an experiment's air.
 
     Parameters
     ----------
     scattering : lidar_mi.experiment.schema_air.Scattering
-        Its own albedo stands over that of the scatterers.
+        Its own albedo, if given, replaces that of the scatterers.
     beside : path
-        Folder in which tables are looked for.
+        Folder of the tables.
     wavelength : float
         Of the laser, m; aerosols and molecules scatter accordingly.
     notice : callable, optional
-        Called with the progress of a table that must be made first.
+        Called with the progress of a table that must be computed first.
 
     Raises
     ------

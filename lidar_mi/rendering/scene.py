@@ -99,7 +99,7 @@ def render_file(
 
 
 def files_of(scene_path: str | Path, definitions: dict[str, str]) -> list[Path]:
-    """A scene file and the files that it names, as far as they exist.
+    """A scene file and the existing files that it names.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ def _as_dataset(image: np.ndarray, names: list[str], sensor) -> xr.Dataset:
 
 
 def _reason(error: Exception) -> str:
-    """Mitsuba's message in one line; of a plugin's traceback only what it ends with."""
+    """Mitsuba's message in one line; of a plugin's traceback only the last line."""
     text = re.sub(r"Traceback \(most recent call last\):\n(  .*\n)+", "", str(error))
     text = re.sub(r"^\[[\w.]+:\d+\] ", "", text)
     return " ".join(text.split())[:300]

@@ -1,4 +1,4 @@
-"""How the light transport is run."""
+"""Settings of the light transport."""
 
 from typing import Annotated, Literal, get_args
 
@@ -25,7 +25,7 @@ _CEILING = Within(1e8, 1e15, "from a small scene to the largest machine")
 
 
 class RenderSettings(BaseModel):
-    """How the light transport is run."""
+    """Settings of the light transport."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -46,7 +46,7 @@ class RenderSettings(BaseModel):
 
 
 class FringeSettings(BaseModel):
-    """How the rings of a fringe camera are rendered."""
+    """Settings of the rendering of a fringe camera's rings."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 

@@ -1,4 +1,4 @@
-"""Setting Mitsuba's variant, with a clear word where it cannot be set."""
+"""Setting Mitsuba's variant, with a clear message if it cannot be set."""
 
 import mitsuba as mi
 

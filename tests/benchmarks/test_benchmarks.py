@@ -1,7 +1,7 @@
-"""The benchmarks, tiny. Detects a ratio turned round, a table or JSON that loses numbers, a missing
-peer that crashes, a peer's failure that costs the other tables, 5 % in the share of analog photons
-that count, a peer scene that is not the air the lidar equation describes, a wrong place or sign of
-a vector.
+"""The benchmarks, tiny. Detects an inverted ratio, a table or JSON that loses numbers, a missing
+peer that crashes, a peer's failure that costs the other tables, 5 % in the fraction of analog
+samples that contribute, a peer scene that is not the air the lidar equation describes, a wrong
+place or sign of a vector.
 
 How fast anything is, is not tested: that depends on the machine.
 """
@@ -54,7 +54,7 @@ def lines(comparison):
 # --- tables and JSON
 
 
-def test_ratio_says_how_many_times_better_we_are():
+def test_ratio_is_the_factor_by_which_we_are_better():
     time = report.row("case", "time", "s", [1.0, 2.0, 4.0], [8.0, 8.0, 8.0], "lower")
     assert (time.ours, time.other, time.ratio, time.ratio_range) == (2, 8, 4, (2, 8))
     rate = report.row("case", "rate", "", [3.0], [6.0], "higher")
@@ -190,15 +190,15 @@ def test_memory_of_a_fresh_process_is_its_own():
 # --- the comparisons
 
 
-def test_share_of_analog_photons_is_the_gates_optical_depth(variant):
-    columns, rows, photons = 15, 9, 4096
-    found = lines(estimators.compare(2, photons, columns, rows))
+def test_fraction_of_contributing_analog_samples_is_the_optical_depth_of_the_gate(variant):
+    columns, rows, samples = 15, 9, 4096
+    found = lines(estimators.compare(2, samples, columns, rows))
     slab, gate, environment = 1.8e-3, 2.5, 1e-4
-    share = math.exp(-environment * 500) * -math.expm1(-slab * gate)
+    fraction = math.exp(-environment * 500) * -math.expm1(-slab * gate)
     case = "homogeneous slab, peak extinction 1.8 / km"
-    # 4 700 photons count, 1.5 %: three times that, and 0.3 % for the slab before the gate
-    measured = found[case, "photons for one that counts"]
-    assert measured.other * share == pytest.approx(1, abs=0.05)
+    # 4 700 samples contribute, 1.5 %: three times that, and 0.3 % for the slab before the gate
+    measured = found[case, "samples per contributing one"]
+    assert measured.other * fraction == pytest.approx(1, abs=0.05)
     assert measured.ratio == measured.other
     mean = found[case, "mean signal / gated mean"]
     assert mean.other == pytest.approx(1, abs=4 * float(mean.note.removeprefix("+- ")))
@@ -207,19 +207,19 @@ def test_share_of_analog_photons_is_the_gates_optical_depth(variant):
     parts = [
         found[case, name]
         for name in (
-            "relative variance of one photon",
-            "time of one photon",
-            "variance x time of one photon",
+            "relative variance of one sample",
+            "time of one sample",
+            "variance x time of one sample",
         )
     ]
     assert parts[2].other == pytest.approx(parts[0].other * parts[1].other, rel=0.5)
     assert len({name for name, _ in found}) == 4
 
 
-def test_renderer_needs_no_more_photons_than_it_says(variant):
+def test_renderer_needs_no_more_samples_than_reported(variant):
     found = renderer.warm_scans(1, 15, 9, 64)
     assert found["need"] >= 2 and len(found["seconds"]) == 1
-    # the median of 135 beams with few photons each scatters by some 10 %
+    # the median of 135 beams with few samples each scatters by some 10 %
     assert found["reached"] == pytest.approx(renderer.NOISE, rel=0.4)
 
 
@@ -256,9 +256,9 @@ def test_mitransient_renders_the_same_signal(variant, monkeypatch):
     assert abs(value.other) < 4 * errors[1] < 5
     assert abs(value.ours) < 4 * errors[0] + 2e-3
     variance = found[case, "relative variance of one sample"]
-    share = math.exp(-0.0484 - 1.8e-3 * 15) * -math.expm1(-1.8e-3 * 2.5)
-    assert variance.other == pytest.approx(1 / share, rel=0.2)
-    assert found[case, "samples a beam for 1 %"].other == pytest.approx(1e4 * variance.other)
+    fraction = math.exp(-0.0484 - 1.8e-3 * 15) * -math.expm1(-1.8e-3 * 2.5)
+    assert variance.other == pytest.approx(1 / fraction, rel=0.2)
+    assert found[case, "samples per beam for 1 %"].other == pytest.approx(1e4 * variance.other)
 
 
 def test_errors_are_zero_for_the_true_wind_wherever_the_grids_begin():
@@ -323,8 +323,8 @@ def test_numpy_s_rings_are_the_renderer_s(variant):
 
 def test_fringes_compare(variant):
     found = lines(fringes.compare(1, 48, 39, 4))
-    lost = found["single precision", "velocity lost in the phase, rms"]
-    assert lost.ours < 0.01 and lost.other > 1
+    error = found["single precision", "velocity error of the phase, rms"]
+    assert error.ours < 0.01 and error.other > 1
     noise = found["from the camera", "noise of a pixel at 4 paths"]
     assert 0 < noise.ours and noise.ratio > 1
     rates = [line for (_, quantity), line in found.items() if quantity == "paths per second"]
@@ -334,7 +334,7 @@ def test_fringes_compare(variant):
 def test_methods_table_has_every_method_and_says_which_peer_is_missing(monkeypatch):
     monkeypatch.setattr(methods, "NOISE", (0.01,))
     monkeypatch.setattr(methods, "find_spec", lambda name: None)
-    # both vortices lie in the picture: where there is none to find, the fit tries long
+    # both vortices lie in the image: without one the fit takes long
     found = methods.compare(1, 110, 60)
     notes = {line.quantity: line for line in found.rows}
     for name in ("cc", "multipass", "variational"):
@@ -361,12 +361,12 @@ def test_rendered_pictures_have_a_row_for_every_energy_and_method(monkeypatch):
         for energy in ("0.1 mJ", "10 mJ")
     )
     for weak, strong in zip(dark, bright, strict=True):
-        # a hundredth of the light: noise decides, and takes the largest share
+        # 1 % of the light: noise dominates and has the largest fraction
         assert 0 < strong.ours < weak.ours and 0 < strong.other < weak.other
-        shares = dict(part.split(" ", 1) for part in weak.note.split(", "))
-        everywhere = {cause: float(text.split(" / ")[0]) for cause, text in shares.items()}
+        fractions = dict(part.split(" ", 1) for part in weak.note.split(", "))
+        everywhere = {cause: float(text.split(" / ")[0]) for cause, text in fractions.items()}
         assert max(everywhere, key=everywhere.get) == "detector" and everywhere["detector"] > 50
-        assert {"simulation", "beam", "window", "method"} < set(shares)
+        assert {"simulation", "beam", "window", "method"} < set(fractions)
     assert "paths" in dark[0].note and "paths" not in dark[1].note
 
 
@@ -402,5 +402,5 @@ def test_errors_of_settings_are_those_of_the_truth():
     """Images and volumes of the default case: errors far below the winds of 10 m/s."""
     for case, method, defaults, errors in settings.cases(90, 70, (12, 24, 44)):
         if method != "variational":
-            rms, reduced = settings.mean_errors(errors, defaults, [1])
-            assert 0.05 < rms < 2 and 0.5 < reduced < 2, case
+            rms, normalised = settings.mean_errors(errors, defaults, [1])
+            assert 0.05 < rms < 2 and 0.5 < normalised < 2, case

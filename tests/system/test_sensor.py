@@ -103,13 +103,13 @@ def test_the_whole_chain(whole):
     for text in (
         "flight control, from wind vectors, landing",
         "at most 2.5 m/s",
-        "safe for eyes from",
+        "safe for eyes beyond",
         "0.002 J/m² per pulse",
         "up to nine by least squares",
-        "the required error of v_LOS takes 1 pulse per direction",
-        "The images take 77000 pulses per second",
+        "the required error of v_LOS needs 1 pulse per direction",
+        "The images require 77000 pulses per second",
         "2.1 s later",
-        "u is off by",
+        "u has an rms error of",
         "The wind from both lidars",
     ):
         assert text in report, text
@@ -170,7 +170,9 @@ def test_the_vortices_are_told_and_kept(whole):
         rmse = np.sqrt(((model["w"].values - wind["w_true"].values) ** 2).mean())
     # a grid a little smaller than the slab
     assert metrics["vortex.images.rmse_w"] == pytest.approx(rmse, rel=0.2)
-    assert "From the images, circulation is off by" in (folder / "report.html").read_text()
+    assert (
+        "From the images, the error of the circulation is" in (folder / "report.html").read_text()
+    )
 
 
 def again(whole, tmp_path, monkeypatch, spoil):
@@ -206,7 +208,7 @@ def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypat
         "at most 2.5 m/s",
         "not known",
         "undetermined",
-        "From the images, circulation is off by",
+        "From the images, the error of the circulation is",
     ):
         assert text in report, text
     assert not (folder / "wind3d.nc").exists()
@@ -226,7 +228,7 @@ def test_lines_that_cannot_be_read_are_said_and_the_rest_is_shown(whole, tmp_pat
     )
     assert "Warning: no wind from both lidars: " in report
     assert "0 of 15 lines of sight were retrieved" in report
-    assert "From the images, circulation is off by" in report
+    assert "From the images, the error of the circulation is" in report
     metrics = json.loads((folder / "metrics.json").read_text())
     assert "sensor.rmse_v_los" not in metrics
 

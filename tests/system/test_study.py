@@ -332,7 +332,7 @@ def test_turbine_is_seen_by_both(tmp_path):
     assert metrics["sensor.lines_retrieved"] == 63
     assert metrics["sensor.rmse_u"] < 0.5 < metrics["sensor.triples.rmse_u"]
     report = (tmp_path / "run" / "report.html").read_text()
-    assert "The platform stands still: there is no look-ahead time" in report
+    assert "The platform is at rest: there is no look-ahead time" in report
     assert "flight control do not apply" in report and " s later" not in report
     assert 'id="verdict-1"' not in report and "fulfilled" not in report
     assert not [key for key in metrics if key.endswith(".margin")]

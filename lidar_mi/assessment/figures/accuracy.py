@@ -1,4 +1,4 @@
-"""Figures of the errors of winds: beside what the noise allows, and by the structure of the air."""
+"""Figures of the errors of winds: against the Cramer-Rao bound, and by the air's structure."""
 
 from collections.abc import Mapping
 
@@ -24,20 +24,20 @@ def draw_normalised_errors(axes: Axes, errors: Mapping[str, np.ndarray], **style
 
 
 def draw_normal_density(axes: Axes) -> None:
-    """The density that normalised errors have where standard errors are right."""
+    """The density of normalised errors with correct standard errors."""
     middle = np.linspace(-4.9, 4.9, 50)
     axes.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
     axes.set(xlabel="normalised error", ylabel="density")
 
 
 def truth_vectors(wind: xr.Dataset) -> xr.Dataset:
-    """True wind at the places of a retrieval's vectors, as a retrieval without flags."""
+    """True wind at the positions of a retrieval's vectors, as a retrieval without flags."""
     true = wind[["v_true", "w_true", "y_vector", "z_vector"]].rename(v_true="v", w_true="w")
     return true.assign(flag=xr.zeros_like(wind["flag"]))
 
 
 def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
-    """Rms errors in groups of vectors of like Cramer-Rao bound; None where no noise bounds any."""
+    """Rms errors in groups of vectors by Cramer-Rao bound; None without noise."""
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     span = []
     for axes, name in zip(figure.subplots(1, 2), ("v", "w"), strict=True):
@@ -71,10 +71,10 @@ def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
     return figure, (
-        "Errors of valid vectors, in groups by what the images' noise allows any unbiased method "
-        "that uses one template alone. Below the line: methods that use more than a template. "
-        "Far above it on the left: errors that are not the noise's, as of flow that a window or a "
-        "smooth field cannot follow."
+        "Errors of valid vectors, in groups by the Cramer-Rao bound of any unbiased method that "
+        "uses a single template. Below the line: methods that use more than a template. Far above "
+        "it on the left: errors that are not from noise, for example of flow that a window or a "
+        "smooth field does not resolve."
     )
 
 
@@ -83,7 +83,7 @@ def error_by_texture(found: xr.Dataset, sweep: xr.Dataset) -> tuple[Figure, str]
     figure = Figure(figsize=(13, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     for name, marker in (("v", "o"), ("w", "s")):
-        # air without any structure gives no displacement, hence no error either
+        # air without any structure gives no displacement, hence no error
         left.plot(100 * sweep["texture"], sweep[f"rmse_{name}"], marker=marker, label=name)
     left.set(
         xlabel="sub-grid texture, rms / %",
@@ -117,11 +117,11 @@ def error_by_texture(found: xr.Dataset, sweep: xr.Dataset) -> tuple[Figure, str]
         by_factors(axes)
         axes.grid(alpha=0.3, which="both")
     left.legend(fontsize=8)
-    # many lines: there is room below alone
+    # with many lines there is only space below
     right.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
     return figure, (
-        "Winds can only be as good as the structure that moves with them. Left: the extinction "
-        "pair with more and less sub-grid texture. Right: this run's vectors, grouped by whether "
-        "their windows have structure in both directions; along a mere edge the "
+        "The accuracy of winds is limited by the structure that moves with them. Left: the "
+        "extinction pair with more and less sub-grid texture. Right: this run's vectors, grouped "
+        "by whether their windows have structure in both directions; along an edge the "
         "displacement is undetermined (aperture problem)."
     )

@@ -1,6 +1,6 @@
 """The figures of a run: an overview, the paper's figures 5 to 11, errors and products.
 
-All of them show the slab as the pilot sees it: port (+y) on the left, up (+z) at the top.
+All of them show the slab from the pilot's view: port (+y) on the left, up (+z) at the top.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from lidar_mi.assessment.metrics.names import Source
 
 @dataclass(frozen=True)
 class Scale:
-    """What all wind maps of a run have in common.
+    """Common settings of all wind maps of a run.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class Scale:
 
 def _scale(truth) -> Scale:
     speed = np.hypot(truth.wind["v"], truth.wind["w"])
-    # the few nodes of a core must not make all others dark and short
+    # the few nodes of a core must not determine the scale of all others
     limit = float(speed.quantile(0.999)) or 1.0
     return Scale(limit, truth.wind["y"].values, truth.wind["z"].values)
 
@@ -92,13 +92,13 @@ def draw_all(
         ),
         (
             "fig11_deviation_from_extinction_winds",
-            "What the instrument changes in the winds",
+            "Change of the winds by the instrument",
             _deviation_maps(found, "backscatter", "extinction"),
         ),
         ("fig12_error_by_texture", "Error and texture", error_by_texture(found, sweep)),
     )
     if (drawn := error_and_bound(found)) is not None:
-        plates += (("fig12b_error_and_bound", "Errors and what the noise allows", drawn),)
+        plates += (("fig12b_error_and_bound", "Errors and Cramer-Rao bound", drawn),)
     if "depolarization" in scans[0]:
         plates += (
             (
@@ -130,7 +130,7 @@ def draw_all(
 
 
 def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale) -> None:
-    """Vectors where they belong, about 45 across; flagged ones grey, valid ones by speed."""
+    """Vectors at their positions, about 45 across; flagged ones grey, valid ones by speed."""
     every = max(1, round(wind.sizes["y"] / 45))
     step = every * float(wind["y"][1] - wind["y"][0]) if wind.sizes["y"] > 1 else 1.0
     thin = wind.isel(z=slice(every // 2, None, every), y=slice(every // 2, None, every))
@@ -205,7 +205,7 @@ def _extinction(truth):
         )
     return figure, (
         "Extinction coefficient of the slab at t1 and t2, averaged over the gate's depth. "
-        "The difference in dt is hardly visible; the retrieval finds it."
+        "The change in dt is hardly visible, but is detected by the retrieval."
     )
 
 
@@ -260,7 +260,7 @@ def _deviation_maps(found, source, reference):
             if reference is None
             else found.sel(source=reference, algorithm=method)
         )
-        # a vector that its own flags call wrong says nothing of the method
+        # flagged vectors do not characterise the method
         error = deviations(wind, other).where((wind["flag"] == 0) & (other["flag"] == 0))
         limit = _upper(abs(error["speed"]), 0.99) or 1.0
         for axis in row:
@@ -292,9 +292,9 @@ def _deviation_maps(found, source, reference):
 
 
 def _bright(fields) -> Normalize:
-    """From 0, or from the darkest pixels where nothing is dark, to the brightest.
+    """From 0, or from the darkest pixels where none is near 0, to the brightest.
 
-    Single bright pixels must not darken all others.
+    Single bright pixels must not determine the scale.
     """
     low = min(float(field.quantile(0.001)) for field in fields)
     high = max(_upper(field, 0.999) for field in fields)
@@ -344,9 +344,9 @@ def _product(scan, name, label, caption):
 
 
 def _span(field: xr.DataArray) -> Normalize:
-    """The middle 99 % of the values: single bright pixels must not decide the colours."""
+    """The middle 99 % of the values: single bright pixels must not determine the colours."""
     low, high = (float(field.quantile(q)) for q in (0.005, 0.995))
-    # equal values get one colour, not that of their rounding
+    # equal values get one colour, independent of rounding
     half = max((high - low) / 2, 1e-5 * abs(high + low), 1e-9)
     return Normalize((low + high) / 2 - half, (low + high) / 2 + half)
 
@@ -369,7 +369,7 @@ def _image_differences(truth, scans):
             cmap="RdBu_r",
         )
     return figure, (
-        "Backscatter over its mean minus extinction over its mean: the beam's width rounds off "
-        "sharp structure, Monte Carlo noise adds grain, and a pulse that is long beside the slab "
-        "mixes in the air before and behind it."
+        "Backscatter over its mean minus extinction over its mean: the beam's width smooths "
+        "sharp structure, Monte Carlo noise adds grain, and a pulse longer than the slab's depth "
+        "adds light from the air before and behind it."
     )

@@ -21,8 +21,8 @@ def draw_comparison(
     Parameters
     ----------
     rows : mapping of variant to (image, winds, cores)
-        Attenuated backscatter (m^-1 sr^-1) and winds on (z, y), these with w_true and flag; places
-        (y, z) of the true cores, m.
+        Attenuated backscatter (m^-1 sr^-1) and winds on (z, y), these with w_true and flag;
+        positions (y, z) of the true cores, m.
     """
     figure = Figure(figsize=(19, 4.0 * len(rows)), layout="compressed")
     axes = figure.subplots(len(rows), 3, squeeze=False)
@@ -35,7 +35,7 @@ def draw_comparison(
     largest = [
         float(abs(error).quantile(0.99)) for error in errors.values() if error.notnull().any()
     ]
-    # one variant without skill must not hide the errors of those that have some
+    # the scale must not be that of a variant without skill
     top = min(float(np.median(largest)) if largest else 0.0, limit) or limit
     for row, (name, (image, wind, cores)) in zip(axes, rows.items(), strict=True):
         low, high = (float(1e6 * image.quantile(q)) for q in (0.002, 0.998))

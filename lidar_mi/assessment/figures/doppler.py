@@ -19,10 +19,10 @@ PUBLISHED = {
     "free": {"averaged": 20, "std": 2.5, "bias": 7.0},
     "known": {"averaged": 20, "std": 2.0, "bias": 2.0},
 }
-"""What the paper states, m/s: with the centre found, and upper limits with the centre known."""
+"""The paper's values, m/s: with the centre fitted, and upper limits with the centre known."""
 
 REQUIRED = 0.5
-"""Largest standard deviation of v_LOS that the paper's table 1 allows, m/s."""
+"""Largest standard deviation of v_LOS allowed by the paper's table 1, m/s."""
 
 _COLOURS = dict(zip(READERS, ("C0", "C9", "C3", "C2", "C1", "C4"), strict=True))
 _BY_COORDINATE = {"r": _COLOURS["ca"], "r2": _COLOURS["ca_r2"]}
@@ -67,7 +67,7 @@ def draw_all(
     ]
     if set(doppler.retrieval.methods) & set(PEAK_READERS):
         bias = _bias(doppler, exposure, found)
-        plates.insert(-1, ("fig17_doppler_bias", "Why peaks of rings are biased", bias))
+        plates.insert(-1, ("fig17_doppler_bias", "Bias of the peaks of rings", bias))
     return save_all(folder, plates, log)
 
 
@@ -78,12 +78,12 @@ def _rings(doppler, exposure, samples):
     axes = figure.subplots(1, panels)
     shown = [(exposure.noisy, f"one pulse, air at {doppler.v_los[0]:g} m/s", "photoelectrons")]
     if samples is not None:
-        # every path carries the same energy
+        # every path has the same energy
         hits = samples["S0"].values * samples["S0"].size * samples.attrs["samples_per_pixel"]
         shown.append((hits, "the laser's light, traced path by path through a lens", "samples"))
     # the last panel holds profiles
     for axis, (image, title, label) in zip(axes, shown, strict=False):
-        # single noisy pixels must not darken all others
+        # single noisy pixels must not determine the scale
         mesh = axis.imshow(image, cmap="inferno", vmin=0, vmax=np.quantile(image, 0.998))
         axis.set(title=title, xlabel="x / px", ylabel="y / px")
         figure.colorbar(mesh, ax=axis, label=label, extend="max", shrink=0.85)
@@ -93,7 +93,7 @@ def _rings(doppler, exposure, samples):
         (exposure.received, f"received, {doppler.v_los[0]:g} m/s", {"color": "C3"}),
     ):
         radius, mean, weight = circular_average(image, centre)
-        near = weight > 30  # beyond, circles have a few pixels in the corners only
+        near = weight > 30  # beyond, circles have only a few pixels in the corners
         axes[-1].plot(radius[near], mean[near], label=label, **style)
     axes[-1].set(
         title="means over circles, without noise", xlabel="radius / px", ylabel="photons per pixel"
@@ -141,11 +141,11 @@ def _cuts(doppler, exposure):
         axis.legend(loc="upper right")
         axis.grid(alpha=0.3)
     left.set_ylabel("photoelectrons per pixel")
-    # room above the cut for the legend
+    # space above the cut for the legend
     left.set_ylim(top=1.3 * np.nanmax(single))
     return figure, (
         "As the paper's figure 4: a cut through the image of one pulse from the centre to the "
-        "rim (red), and the same ring profile with less noise (blue). Left: 360 such cuts behind a "
+        "rim (red), and the same ring profile with less noise (blue). Left: 360 such cuts after a "
         "Savitzky-Golay filter. Right: mean over circles."
     )
 
@@ -199,8 +199,8 @@ def _errors(doppler, metrics):
     axes[1, 0].set_ylabel("size of the bias / m s$^{-1}$")
     return figure, (
         "Standard deviation (above) and bias (below) of the line-of-sight wind against the number "
-        "of images that are averaged, over all speeds, with standard errors; stars: what the "
-        "paper states. Peaks are those of the innermost ring, the bound is that at the first speed."
+        "of images that are averaged, over all speeds, with standard errors; stars: values "
+        "of the paper. Peaks are those of the innermost ring, the bound is that at the first speed."
     )
 
 
@@ -238,10 +238,10 @@ def _bias(doppler, exposure, found):
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
     return figure, (
-        "A line that is broadened symmetrically in frequency makes a ring that is symmetric in r² "
-        "(middle), not in r (left): a Gaussian fitted in r takes the skew for a shift. Right: the "
+        "A line that is broadened symmetrically in frequency gives a ring that is symmetric in r² "
+        "(middle), not in r (left): a Gaussian fitted in r has a bias by the skewness. Right: the "
         "error of the wind by the piece of the profile that is fitted. The laser's own ring is "
-        "narrow, its skew small: the difference of both does not take the error away."
+        "narrow, with little skewness: the difference of both does not cancel the error."
     )
 
 

@@ -20,7 +20,7 @@ from lidar_mi.assessment.report.digits import whole_percent
 
 
 def draw_all(folder: Path, budgets: Budgets, log: Callable) -> list[Drawn]:
-    """Draw the fractions of all causes as a PNG into ``folder``; nothing where none is known.
+    """Draw the fractions of all causes as a PNG into ``folder``; nothing if none is known.
 
     Parameters
     ----------
@@ -69,12 +69,12 @@ def _bars(budgets: Budgets):
         panel.grid(alpha=0.3, axis="x")
         panel.set_axisbelow(True)
         panel.xaxis.set_major_formatter(PercentFormatter(1.0))
-        # what makes things many times worse must not flatten the others: its number stands there
+        # large negative fractions must not flatten the others: they are written as numbers
         panel.set_xlim(min(-0.35, 1.1 * max(least, -1)), 1.15)
     panels[0].set_yticks(rows, [CAUSES[cause] for cause in used])
     figure.legend(bars.values(), bars.keys(), loc="outside lower right", ncols=2, fontsize=9)
     return figure, (
-        "By how much the mean square error of v and w falls without each cause of error in turn, "
-        "and the rms error with all of them (of a component). Fractions need not add up to 100 %; "
-        "below 0 the wind is worse without the cause."
+        "Decrease of the mean square error of v and w without each cause of error in turn, and "
+        "the rms error with all of them (per component). Fractions need not add up to 100 %; below "
+        "0 the errors are larger without the cause."
     )

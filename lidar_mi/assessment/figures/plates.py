@@ -1,4 +1,4 @@
-"""What all figures share: files, panels as the pilot sees the slab, axes by factors."""
+"""Common parts of all figures: files, panels in the pilot's view, logarithmic axes."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ def image_panel(
     )
     frame(axes, y, z, title)
     bar = axes.figure.colorbar(mesh, ax=axes, label=label, pad=0.02, extend=extend)
-    # whole numbers, not what they have beyond one that stands elsewhere
+    # whole numbers, without an offset
     bar.formatter.set_useOffset(False)
 
 

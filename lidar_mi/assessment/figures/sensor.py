@@ -75,15 +75,15 @@ def _scan(lines, cores):
             panel.plot(core.y, core.z, "+", color="crimson", ms=9)
         panel.set(title=title, aspect="equal", xlabel="y / m (port is left)", ylabel="z / m")
         figure.colorbar(dots, ax=panel, label=label, pad=0.02)
-    # at least as wide as high, also for lines above each other
+    # at least as wide as high, even for lines above each other
     middle, half = (
         (place[:, 1].max() + place[:, 1].min()) / 2,
         np.ptp(place[:, 1:], axis=0).max() / 2,
     )
     panels[0].set_xlim(middle + half + 4, middle - half - 4)
     return figure, (
-        "Middles of the range bins; what the aircraft flies is part of the velocity. Black "
-        "crosses: lines of sight whose rings gave no velocity. Red crosses: true cores."
+        "Middles of the range bins; the velocity includes the aircraft's motion. Black crosses: "
+        "lines of sight whose rings gave no velocity. Red crosses: true cores."
     )
 
 
@@ -115,7 +115,7 @@ def _maps(found, lines, cores):
             figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
             for core in cores:
                 panel.plot(core.y, core.z, "+", color="k", ms=8)
-    # lines of sight where they are used
+    # lines of sight where they were used
     axes[0, 1].plot(place[:, 1], place[:, 2], "k.", ms=2)
     axes[0, 0].set_xlim(float(y.max()), float(y.min()))
     axes[0, 0].set_ylim(float(z.min()), float(z.max()))
@@ -124,8 +124,8 @@ def _maps(found, lines, cores):
     for panel in axes[:, 0]:
         panel.set_ylabel("z / m")
     return figure, (
-        "Rows: u from the lines of sight (dots: their middles) with the cross-flow wind of the "
-        "images taken out, v and w from the images. Valid vectors alone; crosses: true cores."
+        "Rows: u from the lines of sight (dots: their middles), corrected for the cross-flow wind "
+        "of the images; v and w from the images. Valid vectors only; crosses: true cores."
     )
 
 
@@ -165,13 +165,13 @@ def _uncertainty(found):
     axes[-1].set_title("errors over standard errors")
     axes[-1].legend()
     return figure, (
-        "Left, middle: standard errors of valid vectors. Right: how errors against the truth, in "
-        "units of their standard errors, are distributed; the last bins hold all beyond."
+        "Left, middle: standard errors of valid vectors. Right: distribution of the errors "
+        "against the truth over their standard errors; the last bins hold all beyond."
     )
 
 
 def _colours(values: np.ndarray) -> dict:
-    """Two-sided about 0, or of the values' own range where all of them point the same way."""
+    """Symmetric about 0, or the values' own range if all of them have the same sign."""
     known = values[np.isfinite(values)]
     low, high = np.quantile(known, (0.005, 0.995)) if known.size else (0.0, 0.0)
     if low > 0 or high < 0:

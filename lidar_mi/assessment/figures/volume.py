@@ -58,7 +58,7 @@ def _volume_section(volumes, cores):
         axes[1, column].set_title(f"{when} scan, z = {z:.1f} m")
         figure.colorbar(mesh, ax=axes[:, column], label=BACKSCATTER, pad=0.02, extend="both")
     return figure, (
-        "Top: one of the gates, as the pilot sees it. Bottom: a cut through all gates from above "
+        "Top: one of the gates, in the pilot's view. Bottom: a cut through all gates from above "
         "at the height of a vortex, the flight path upwards."
     )
 
@@ -76,7 +76,7 @@ def _cuts(wind, cores):
         panel.set_xlabel("")
     return figure, (
         f"A cut across the flight path at x = {float(cut['x']):.2f} m, by the last method of the "
-        "experiment. Valid vectors alone; crosses: true cores. The errors have scales of their own."
+        "experiment. Valid vectors only; crosses: true cores. The errors have their own scales."
     )
 
 
@@ -90,7 +90,7 @@ def _along_x(wind, cores):
         panel.set_xlabel("")
     return figure, (
         f"The same from above, at z = {float(cut['z']):.1f} m, the height of a vortex, x twice as "
-        "large as y: what no single slab shows."
+        "large as y, which no single slab shows."
     )
 
 
@@ -106,7 +106,7 @@ def _row(panels, cut, name, across, up, stretch=1):
         mesh = _map(panel, field, across, up, "RdBu_r", -bound, bound)
         panel.set(title=title, aspect=stretch)
         bar = panel.figure.colorbar(mesh, ax=panel, label=_SPEED, pad=0.02, extend="both")
-        # few numbers beside low panels
+        # few ticks beside low panels
         bar.locator = MaxNLocator(7 if stretch == 1 else 3)
 
 
@@ -130,7 +130,7 @@ def _map(panel, field, across, up, colours, low, high):
 def _errors(found):
     figure = Figure(figsize=(17, 8.4), layout="compressed")
     axes = figure.subplots(2, 3)
-    # an experiment may have one method alone
+    # an experiment may have a single method
     colours = dict(zip(found["algorithm"].values, ("tab:orange", "tab:blue"), strict=False))
     for column, name in enumerate(_COMPONENTS):
         profile, density = axes[:, column]
@@ -152,12 +152,12 @@ def _errors(found):
         by_factors(profile)
         draw_normal_density(density)
         density.set_title(f"errors of {name} over standard errors")
-    # between the errors and the wind, of which v and w have much
+    # between the errors and the wind, which is large for v and w
     axes[0, 1].legend(fontsize="small", loc="center")
     axes[1, 0].legend(fontsize="small")
     return figure, (
         "Top: rms errors of valid vectors against the truth, gate by gate, the standard errors "
-        "that the methods state, and the rms of the wind itself: an error above that line means "
+        "stated by the methods, and the rms of the wind itself: an error above that line means "
         "no skill. Bottom: errors over standard errors; the last bins hold all beyond."
     )
 

@@ -1,4 +1,4 @@
-"""The figure of fitted vortex pairs over what they were fitted to, beside the truth."""
+"""The figure of fitted vortex pairs over their data, with the truth."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

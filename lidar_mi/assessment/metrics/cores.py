@@ -1,4 +1,4 @@
-"""Where the vortices of a cross-flow wind field are."""
+"""Positions, radii and circulations of the vortices of a cross-flow wind field."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ class Core:
 def find_cores(wind: xr.Dataset, least_circulation: float = 20.0) -> list[Core]:
     """The strongest vortex of either sense of rotation in a wind field (v, w on z, y).
 
-    The centre is the centroid of the vorticity around its peak (iterated over a disc of 5 m, which
-    a core of up to twice that radius does not bias; where the field's edge cuts that disc, the
-    centre is drawn inwards: 0.1 m at 3 m from the edge for a core of 3 m). The core radius is
-    that of the ring, of rings half a cell apart, on which the mean swirl is largest. Rings reach as
-    far as the nearest edge of the field; a swirl that still grows there (a core at the edge, or
-    plain shear) is no core.
+    The centre is the centroid of the vorticity around its peak, iterated over a disc of 5 m. A core
+    of up to twice that radius is not biased; where the field's edge cuts the disc, the centre is
+    biased inwards: 0.1 m at 3 m from the edge for a core of 3 m. The core radius is that of the
+    ring, of rings half a cell apart, on which the mean swirl is largest. Rings extend to the
+    nearest edge of the field; a swirl that still increases there (a core at the edge, or uniform
+    shear) is no core.
 
     Returns
     -------
@@ -86,8 +86,8 @@ def ring_averages(
 
     Circulation is 2 pi r times the mean swirl, which vortices beyond the rings do not change (as
     Holzaepfel et al., J. Atmos. Ocean. Technol. 20, 2003, average it). The mean wind on a ring is
-    that which carries the vortex: a vortex within adds nothing to it, one beyond what it
-    makes at the centre.
+    that which advects the vortex: a vortex within does not contribute to it, one beyond
+    contributes its wind at the centre.
 
     Returns
     -------
@@ -113,8 +113,8 @@ def _ring_means(v, w, y, z, cy: float, cz: float, rings: np.ndarray) -> np.ndarr
     """Means of v, w and the tangential velocity on rings around (cy, cz), (3, rings), m/s.
 
     Tangential is positive from +y towards +z.
-    By cubic interpolation at equal angles: averaging the nodes that happen to lie near a ring
-    instead would turn a passing flow of 10 m/s into a swirl of some tenths of a metre per second.
+    By cubic interpolation at equal angles: an average over the nodes near a ring would give a
+    spurious swirl of some 0.1 m/s in a uniform flow of 10 m/s.
     """
     angle = np.arange(180) * (2 * np.pi / 180)
     rows = (cz + rings[:, None] * np.sin(angle) - z[0]) / (z[1] - z[0])

@@ -1,7 +1,7 @@
-"""What limits the wind: how much better it would be without each cause of error in turn.
+"""Error budget of the wind: its errors without each cause of error in turn.
 
-Causes that act on the images are taken out of them and the wind is retrieved again; those that lie
-in what a vector means are taken out of the truth it is compared with.
+Causes that act on the images are removed from them and the wind is retrieved again. Causes in the
+definition of a vector (window, path) are removed from the truth it is compared with.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,17 +25,17 @@ CAUSES = {
     "time_step": "curved paths in the time step",
     "method": "the method itself",
 }
-"""Causes of error by key, and how they are called."""
+"""Causes of error by key, and their names."""
 
 PLACES = {"": "all", "outside_cores.": "beyond two core radii"}
-"""Which vectors keys of `error_budget` are about, and how these are called."""
+"""Sets of vectors in the keys of `error_budget`, and their names."""
 
 Budgets = Mapping[str, Mapping[str, float]]
 """From `error_budget`, by method."""
 
 Pair = Sequence[xr.DataArray]
 
-# Methods that compare windows as they are, shifted: a vector is the mean chord over one.
+# Methods that compare undeformed windows: a vector is the mean chord over one.
 _BOXES = (ImageMethod.CC, ImageMethod.WS)
 
 
@@ -43,7 +43,7 @@ def image_scale(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, floa
     """Gain and offset that turn the air's extinction into the rendered images.
 
     By least squares over both images, weighted by 1 / `noise`^2 (standard errors of the rendered
-    ones). The offset is light that a pulse longer than the gate brings from the air around it.
+    ones). The offset is the light of a pulse longer than the gate from the air around it.
     """
     x, y, s = (
         np.concatenate([i.values.ravel() for i in pair]) for pair in (blurred, rendered, noise)
@@ -62,25 +62,25 @@ def images_without(
     rendered: Pair | None = None,
     advected: Pair | None = None,
 ) -> dict[str, Pair]:
-    """Images without one cause of error each, all else as it fell.
+    """Images without one cause of error each, with the same realisation of the others.
 
-    Noise is not drawn anew: that of the detector is what it added to the rendered image, that of
-    the simulation what the rendered image differs from the blurred air by. So two cases differ by
-    the cause alone and not by chance. The detector's noise stays what it was in the image it was
-    drawn for, though its photons follow the signal: where blur takes 20 % of it, noise is 10 % off.
-    What the blur leaves out of the light transport (multiple scattering, extinction within the
-    slab: 0.5 % of the signal in the paper's case, nearly even) goes with the simulation's noise.
+    Noise is not drawn again: the detector's is its difference to the rendered image, the
+    simulation's the difference of the rendered image to the blurred air. So two cases differ by
+    the cause alone and not by chance. The detector's noise is kept although its photons follow the
+    signal: where blur reduces that by 20 %, the noise is in error by 10 %. Light transport beyond
+    the blur (multiple scattering, extinction within the slab: 0.5 % of the signal in the paper's
+    case, nearly uniform) is part of the simulation's noise.
 
     Parameters
     ----------
     measured : two xr.DataArray, dims (z, y)
         Images with all noise.
     blurred, sharp : pair
-        The air averaged over the beams' width without noise, and as it is; unit of `measured`.
+        The air averaged over the beams' width without noise, and without blur; unit of `measured`.
     rendered : pair, optional
         Without the noise of a detector; left out: there is none.
     advected : pair, optional
-        As `blurred`, of air that the slab's mean wind has advected as a whole.
+        As `blurred`, of air advected by the slab's mean wind only.
 
     Returns
     -------
@@ -105,17 +105,17 @@ def _plus_difference(base: Pair, more: Pair, less: Pair) -> list[xr.DataArray]:
 
 
 def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.ndarray, np.ndarray]:
-    """Mean wind over dt of the air whose way has its middle at given places.
+    """Mean wind over dt of the air whose path has its middle at given places.
 
-    Straight displacements between two images are the chord of a curved path. In a solid rotation
-    at the rate a it is the wind at the chord's middle times tan(a dt / 2) / (a dt / 2).
+    The displacement between two images is the chord of a curved path. In a solid rotation at the
+    rate a the mean wind is that at the chord's middle times tan(a dt / 2) / (a dt / 2).
 
     Parameters
     ----------
     truth : xr.Dataset
-        v, w (m s^-1) on (z, y); the flow stands still over dt. Beyond the field its edge holds.
+        v, w (m s^-1) on (z, y); the flow is steady over dt. Beyond the field its edge is repeated.
     y, z : arrays
-        Middles between where the air is in either image, m.
+        Middles between the positions of the air in both images, m.
     dt : float
         s.
     steps : int
@@ -155,7 +155,7 @@ def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.n
             here = here + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
         return here
 
-    # each turn leaves 1 - cos of the angle that the air turns by in dt / 2
+    # each iteration reduces the error to 1 - cos of the rotation in dt / 2
     for _ in range(4):
         before, after = moved(middle, -dt / 2), moved(middle, dt / 2)
         middle = middle + place - (before + after) / 2
@@ -165,7 +165,7 @@ def chord_wind(truth: xr.Dataset, y, z, dt: float, steps: int = 2) -> tuple[np.n
 
 
 def window_mean(truth: xr.Dataset, template: int, method: str) -> xr.Dataset | None:
-    """The true wind as a method's windows average it; None for a method that has none.
+    """The true wind averaged over a method's windows; None for a method without windows.
 
     Parameters
     ----------
@@ -204,17 +204,17 @@ def moved_rigidly(
     truth: xr.Dataset,
     retrieve: Callable[[Pair, int], xr.Dataset],
 ) -> xr.Dataset | None:
-    """The wind retrieved where the air of every window moves rigidly, with the window's mean wind.
+    """The wind retrieved if the air of every window moves rigidly, with the window's mean wind.
 
-    Shear deforms what a window holds, so that its two images do not match at any shift. Here
-    every window's search region is an image of its own, all of them laid side by side: the second
-    shows the blurred air of the first, advected by the mean wind over the template, and what the
-    second measured image has besides its own blurred air.
+    Shear deforms the air in a window, so that its two images do not match at any shift. Here
+    every window's search region is a separate image, and all of them are placed side by side. The
+    second image is the blurred air of the first, advected by the mean wind over the template, plus
+    the difference of the second measured image to its own blurred air.
 
     Parameters
     ----------
     found : xr.Dataset
-        From `retrieve_wind`; its attributes say method, template, search, stride and dt.
+        From `retrieve_wind`, with the attributes method, template, search, stride and dt.
     measured, blurred : pair
         See `images_without`.
     truth : xr.Dataset
@@ -276,25 +276,25 @@ def error_budget(
 ) -> dict[str, float]:
     """Errors of a wind with all causes of error, and without each of them in turn.
 
-    The fraction of a cause is 1 - (rms error without it)^2 / (rms error with it)^2. Fractions
-    need not add up to 1: causes act together, and one alone may even help (noise smooths what
-    adapts to it), which makes its fraction negative.
+    The fraction of a cause is 1 - (rms error without it)^2 / (rms error with it)^2. Fractions need
+    not add up to 1: causes interact, and one may even reduce errors (methods that adapt to noise
+    smooth more), which makes its fraction negative.
 
     Parameters
     ----------
     found : xr.Dataset
-        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`; its attributes say method,
-        template and dt.
+        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`; with the attributes
+        method, template and dt.
     without : mapping of xr.Dataset
         The same from `images_without`, by cause, and from `moved_rigidly` as `shear`.
     truth : xr.Dataset
         v, w on (z, y).
     cores : sequence of Core
     perfect : xr.Dataset, optional
-        The same from the air as it is, without noise or blur: the cause `method` is how that
-        deviates from the truth.
+        The same from the air without noise or blur: the cause `method` is its deviation from the
+        truth.
     flagged : bool
-        Take every vector that has a displacement, not those without a flag alone.
+        Include every vector with a displacement, flagged or not.
 
     Returns
     -------
@@ -354,10 +354,10 @@ def _fractions(errors: Mapping[str, np.ndarray], chosen: np.ndarray) -> dict[str
 
 
 def causes_of(budget: Mapping[str, float]) -> list[str]:
-    """Causes that a budget from `error_budget` holds."""
+    """Causes in a budget from `error_budget`."""
     return [cause for cause in CAUSES if f"{cause}.fraction" in budget]
 
 
 def component_rmse(budget: Mapping[str, float], place: str) -> float:
-    """Rms error of v and w together, a component, m s^-1; ``place`` of `PLACES`."""
+    """Rms error of v and w together, per component, m s^-1; ``place`` of `PLACES`."""
     return float(np.hypot(budget[f"{place}rmse_v"], budget[f"{place}rmse_w"]) / np.sqrt(2))

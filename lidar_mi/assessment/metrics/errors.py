@@ -10,14 +10,14 @@ from lidar_mi.assessment.metrics.cores import Core, outside_cores
 
 
 def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
-    """The true wind where and when each retrieved vector belongs, NaN where it has no place.
+    """The true wind at the position and time of each retrieved vector, NaN without a position.
 
     Parameters
     ----------
     wind : xr.Dataset
         From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`: coordinates y_vector, z_vector.
     truth : xr.Dataset
-        v, w (m s^-1) on (z, y); its flow is taken to stand still over dt. Cubic interpolation.
+        v, w (m s^-1) on (z, y); the flow is taken to be steady over dt. Cubic interpolation.
     """
     axes = {name: truth[name].values for name in ("z", "y")}
     places = {name: wind[f"{name}_vector"].values for name in axes}
@@ -52,7 +52,7 @@ def deviations(wind: xr.Dataset, reference: xr.Dataset) -> xr.Dataset:
 
 
 def error_statistics(error, stderr=None, where=True) -> dict[str, float]:
-    """Statistics of errors, and whether they are what their standard errors say.
+    """Statistics of errors, and their consistency with the standard errors.
 
     Parameters
     ----------
@@ -60,9 +60,9 @@ def error_statistics(error, stderr=None, where=True) -> dict[str, float]:
         Estimate less truth; NaN where there is no estimate.
     stderr : array, optional
         Standard errors as stated, of the same shape and unit. Errors without a positive, finite one
-        count in ``rmse`` and ``bias`` alone.
+        are included in ``rmse`` and ``bias`` only.
     where : array of bool, optional
-        Which errors count.
+        Which errors are included.
 
     Returns
     -------
@@ -131,7 +131,7 @@ def _statistics(error: xr.Dataset, chosen: np.ndarray) -> dict[str, float]:
 def error_by_quality(
     wind: xr.Dataset, truth: xr.Dataset, quality: str, bins: int = 12
 ) -> xr.Dataset:
-    """How the error depends on what a window holds: rms error of v and w in bins of a quality.
+    """Dependence of the error on a window's texture: rms error of v and w in bins of a quality.
 
     All vectors with a displacement, flagged or not, in ``bins`` groups of equal number. Returns
     ``rmse`` (m s^-1, both components together), ``valid`` (fraction of unflagged vectors) and the
@@ -155,7 +155,7 @@ def error_by_quality(
 
 
 def commonest_flag(flag: xr.DataArray) -> str:
-    """Which flag most vectors have, in words; ``flag`` has its CF attributes."""
+    """The most frequent flag, in words; ``flag`` has its CF attributes."""
     meanings, masks = flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"])
     fractions = {
         text: float(((flag.values & mask) != 0).mean())

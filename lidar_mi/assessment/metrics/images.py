@@ -18,7 +18,7 @@ def light_metrics(scan: xr.Dataset) -> dict[str, float]:
     Parameters
     ----------
     scan : xr.Dataset
-        As rendered; what it does not hold is left out.
+        As rendered; metrics of missing variables are left out.
     """
     first = scan.isel(gate=0)
     metrics = noise_metrics(first)

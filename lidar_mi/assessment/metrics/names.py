@@ -1,11 +1,11 @@
-"""Names of metrics, made here alone: ``source.method.quantity`` and the like."""
+"""Names of metrics, defined only here: ``source.method.quantity`` and so on."""
 
 import re
 from enum import StrEnum
 
 
 class Source(StrEnum):
-    """What winds are retrieved from, and what metrics of them begin with."""
+    """Data that winds are retrieved from: first part of the names of their metrics."""
 
     EXTINCTION = "extinction"
     WITHOUT_TEXTURE = "extinction_without_texture"
@@ -15,24 +15,24 @@ class Source(StrEnum):
 
 
 EXACT = (Source.EXTINCTION, Source.WITHOUT_TEXTURE)
-"""Sources that no instrument has measured."""
+"""Sources without an instrument."""
 
 RENDERED = (Source.BACKSCATTER, Source.NOISY)
 """Sources that are images of the lidar; the second one behind a detector."""
 
 
 def wind_key(source: str, method: str, quantity: str) -> str:
-    """Of the winds that a method retrieves from a source."""
+    """Of a method's winds from a source."""
     return f"{source}.{method}.{quantity}"
 
 
 def ring_key(method: str, centre: str, averaged: int, quantity: str) -> str:
-    """Of the line-of-sight velocities that a method reads from averages of so many images."""
+    """Of a method's line-of-sight velocities from averages of a number of images."""
     return f"doppler.{method}.centre_{centre}.averaged_{averaged}.{quantity}"
 
 
 def bound_key(centre: str, averaged: int) -> str:
-    """Of the least standard deviation that line-of-sight velocities can have (Cramer-Rao)."""
+    """Of the Cramer-Rao bound of line-of-sight velocities."""
     return ring_key("bound", centre, averaged, "std")
 
 
@@ -52,11 +52,11 @@ def vortex_key(origin: str, quantity: str) -> str:
 
 
 def timing_key(step: str) -> str:
-    """Of the time that a step takes, s."""
+    """Of the duration of a step, s."""
     return f"timing.{step}_s"
 
 
-# Former names as patterns, and what stands there today: metrics.json of older runs has the former.
+# Former names as patterns, and their replacements, for metrics.json of older runs.
 _RENAMED = (
     (r"\.reduced_variance_(u|v|w|v_los)$", r".normalised_error_variance_\1"),
     (r"\.found_fraction$", ".retrieved_fraction"),
@@ -69,7 +69,7 @@ _RENAMED = (
 
 
 def current_name(key: str) -> str:
-    """The name that a metric has today, of whichever one it had when it was written."""
+    """Today's name of a metric, from any former one."""
     for former, current in _RENAMED:
         key = re.sub(former, current, key)
     return key

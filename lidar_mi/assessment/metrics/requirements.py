@@ -25,7 +25,7 @@ QUANTITIES: Mapping[str, tuple[str, str]] = {
     "error_v": ("error of v", "m/s"),
     "error_w": ("error of w", "m/s"),
 }
-"""Rows that a requirement table may have: name, what it is and its SI unit."""
+"""Rows that a requirement table may have: name, meaning and SI unit."""
 
 _LIMITS = {"min": "minimum", "max": "maximum", "max_of_range": "fraction_of_range"}
 
@@ -42,7 +42,7 @@ class Requirement:
 
 @dataclass(frozen=True)
 class RequirementTable:
-    """What one application asks for in one phase of flight."""
+    """Requirements of one application in one phase of flight."""
 
     application: str
     title: str
@@ -59,11 +59,11 @@ class Finding:
     quantity : str
         A key of `QUANTITIES`.
     minimum, maximum : float
-        What is required at the measured range; NaN if that takes a range and there is none.
+        Required limits at the measured range; NaN if they depend on a range and there is none.
     measured : float
         NaN: not known.
     passed : bool or None
-        None: undetermined, as something is not known.
+        None: undetermined, as a value is not known.
     margin : float
         Distance from the nearer limit as a fraction of it: 0.2 is 20 % better than required, -0.2
         20 % worse; NaN where undetermined.
@@ -107,13 +107,13 @@ def judge(table: RequirementTable, measured: Mapping[str, float | None]) -> list
     ----------
     table : RequirementTable
     measured : mapping
-        What the sensor does, SI, by names of `QUANTITIES`; None, NaN or left out: not known. Names
-        without a row in the table are not judged.
+        The sensor's values, SI, by names of `QUANTITIES`; None, NaN or left out: not known. Names
+        without a row in the table are ignored.
 
     Raises
     ------
     InputError
-        An unknown name, or a value that no sensor has.
+        An unknown name, or an impossible value.
     """
     for name, value in measured.items():
         _known(name, "measured")
@@ -136,7 +136,7 @@ def fulfilled(findings: list[Finding]) -> bool | None:
 
 
 def look_ahead(distance: float, speed: float) -> float:
-    """Time until the aircraft is where it has measured, s: range over air speed; inf at rest.
+    """Time until the aircraft reaches the measured air, s: range over air speed; inf at rest.
 
     Raises
     ------

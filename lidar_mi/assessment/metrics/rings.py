@@ -1,4 +1,4 @@
-"""What the images of a Doppler lidar are made of, and what can be read from them at best."""
+"""Light in the images of a Doppler lidar, and limits of the velocities from them."""
 
 import math
 from collections.abc import Mapping
@@ -9,7 +9,7 @@ from lidar_mi.assessment.metrics.names import bound_key
 
 @dataclass(frozen=True)
 class RingBudget:
-    """Light, line and etalon of a Doppler lidar, and limits of the velocities that it can read.
+    """Light, line and etalon of a Doppler lidar, and limits of its velocities.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class RingBudget:
     relative_error : float
         Monte Carlo standard error of a rendered image's pixel over its signal, median.
     largest_error : float
-        Of velocities read from the rendered images without noise, m s^-1.
+        Of velocities retrieved from the rendered images without noise, m s^-1.
     """
 
     photons: float

@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class ScanSafety:
-    """From where on eyes may look into the backscatter lidar's beams.
+    """Eye safety of the backscatter lidar's beams.
 
     Attributes
     ----------

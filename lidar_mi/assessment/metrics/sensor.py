@@ -1,4 +1,4 @@
-"""Verdict on both lidars as one sensor: vectors, lines of sight, what the lidars cost."""
+"""Verdict on both lidars as one sensor: vectors, lines of sight, cost of the lidars."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ COMPONENTS = ("u", "v", "w")
 
 @dataclass(frozen=True)
 class LidarCost:
-    """What a scan takes of a lidar, and from where on eyes are safe.
+    """Cost of a lidar's scan, and distances from which eyes are safe.
 
     Attributes
     ----------
@@ -24,7 +24,7 @@ class LidarCost:
     average_power : float
         W.
     beams : int
-        Directions that must be looked into at the same time, as light is on its way.
+        Directions that must be measured simultaneously, because of the time of flight.
     photons_per_direction : float, optional
     permissible_exposure : float, optional
         J m^-2, of each pulse; None: its pulses have no duration, hence no limit.
@@ -77,12 +77,12 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
 
 
 def line_metrics(lines: xr.Dataset) -> dict[str, float]:
-    """How many lines of sight were read, and their errors; m/s.
+    """Number of lines of sight with a velocity, and their errors; m/s.
 
     Parameters
     ----------
     lines : xr.Dataset, dim (line)
-        ``v_los``, ``v_los_true``, ``v_los_std`` (m s^-1); NaN where nothing was read.
+        ``v_los``, ``v_los_true``, ``v_los_std`` (m s^-1); NaN without a velocity.
     """
     error = (lines["v_los"] - lines["v_los_true"]).values
     metrics: dict[str, float] = {
@@ -102,7 +102,7 @@ def doppler_alone_metrics(winds: Mapping[str, xr.Dataset], truth: xr.Dataset) ->
     Parameters
     ----------
     winds : mapping of str to xr.Dataset
-        By how lines of sight are put together: u, v, w, flag at z, y.
+        By combination of lines of sight: u, v, w, flag at z, y.
     truth : xr.Dataset
         u, v, w on (z, y).
     """
@@ -118,13 +118,13 @@ def doppler_alone_metrics(winds: Mapping[str, xr.Dataset], truth: xr.Dataset) ->
 
 
 def limit_metrics(left: Mapping[str, float]) -> dict[str, float]:
-    """What limits u, ``sensor.error_budget.CAUSE.rmse_u`` (m/s) and ``.fraction_u``.
+    """Error budget of u, ``sensor.error_budget.CAUSE.rmse_u`` (m/s) and ``.fraction_u``.
 
     Parameters
     ----------
     left : mapping of str to float
         Mean square error of u (m^2 s^-2): with all causes as "", without each of them, and
-        "sampling", what is left without all. Empty: not known.
+        "sampling", the remainder without all. Empty: not known.
     """
     if not left:
         return {}
@@ -139,7 +139,7 @@ def limit_metrics(left: Mapping[str, float]) -> dict[str, float]:
 
 
 def cost_metrics(costs: Mapping[str, LidarCost]) -> dict[str, float]:
-    """What the lidars take, ``sensor.LIDAR.pulses_per_second`` and so on."""
+    """Cost of the lidars, ``sensor.LIDAR.pulses_per_second`` and so on."""
     return {
         f"sensor.{lidar}.{name}": value
         for lidar, cost in costs.items()
@@ -151,7 +151,7 @@ def cost_metrics(costs: Mapping[str, LidarCost]) -> dict[str, float]:
 def margin_metrics(
     judged: Sequence[tuple[RequirementTable, Sequence[Finding]]],
 ) -> dict[str, float]:
-    """Margins to what is required, ``sensor.APPLICATION.PHASE.QUANTITY.margin``."""
+    """Margins to the requirements, ``sensor.APPLICATION.PHASE.QUANTITY.margin``."""
     return {
         f"sensor.{table.application}.{table.phase}.{row.quantity}.margin": row.margin
         for table, findings in judged

@@ -1,4 +1,4 @@
-"""Units of metrics, by the quantity that their names end with."""
+"""Units of metrics, by the quantity at the end of their names."""
 
 from lidar_mi.retrieval.vortices.pair import MEANING
 

@@ -16,10 +16,10 @@ READERS = {
     RingMethod.ML: "ML, peak in r",
     RingMethod.SG: "Savitzky-Golay, peak in r",
 }
-"""What the methods are called in figures and tables."""
+"""Names of the methods in figures and tables."""
 
 PEAK_READERS = (RingMethod.CA, RingMethod.CA_R2, RingMethod.ML, RingMethod.SG)
-"""Those that read the peak of the innermost ring."""
+"""Methods that use the peak of the innermost ring."""
 
 CENTRES = {RingCentre.FREE: "centre found", RingCentre.KNOWN: "centre known"}
 
@@ -35,9 +35,9 @@ def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
     bias_lowest, bias_highest   mean error of the speed at which it is lowest, highest
     std             standard deviation about each speed's own mean, pooled over all speeds
     std_stderr      its standard error, std / sqrt(2 degrees of freedom), for normal errors
-    expected_std    root mean square of the standard deviations that the fits state
+    expected_std    root mean square of the standard deviations stated by the fits
 
-    Measures that the images do not determine are left out.
+    Undetermined measures are left out.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Verdict on a fitted vortex pair: what the true wind says of its vortices, errors of the fit."""
+"""Verdict on a fitted vortex pair: vortices of the true wind, errors of the fit."""
 
 from collections.abc import Mapping, Sequence
 from enum import StrEnum
@@ -13,18 +13,18 @@ from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
 class Origin(StrEnum):
-    """What a vortex pair is fitted to."""
+    """Data that a vortex pair is fitted to."""
 
     IMAGES = "images"
     VECTORS = "vectors"
 
 
 ORIGIN_NAMES = {Origin.IMAGES: "images", Origin.VECTORS: "wind vectors"}
-"""What a pair is fitted to, as figures, tables and warnings call it."""
+"""Names of the origins in figures, tables and warnings."""
 
 
 def true_pair(wind: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
-    """What a true wind says of its vortices, by the names of `VortexPairFit.quantities`.
+    """Vortices of a true wind, by the names of `VortexPairFit.quantities`.
 
     Circulations and the velocity of the pair are averages over rings of 5 to 15 m about the cores
     (`cores.ring_averages`); what is undetermined (one vortex only, rings beyond the field) is left

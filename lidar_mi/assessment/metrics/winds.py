@@ -1,4 +1,4 @@
-"""Verdict on the cross-flow winds of a run: errors, what the noise allows, the true wind itself."""
+"""Verdict on the cross-flow winds of a run: errors, efficiencies, strength of the true wind."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, fl
     ----------
     found : xr.Dataset, dims (source, algorithm, z, y)
         v, w, ``v_true``, ``w_true``, ``v_bound``, ``w_bound`` (m s^-1), flag and the vectors'
-        places.
+        positions.
     cores : sequence of Core
         True vortices.
     """
@@ -32,10 +32,10 @@ def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, fl
 
 
 def efficiency(wind: xr.Dataset) -> dict[str, float]:
-    """What the images' noise allows over the errors of a method, of v and w; valid vectors only.
+    """Cramer-Rao bound over the errors of a method, of v and w; valid vectors only.
 
-    ``bound_*``: rms of the Cramer-Rao bound of one template, m/s. ``efficiency_*``: that over the
-    rms error; above 1 where a method smooths over more than a template. Nothing without noise.
+    ``bound_*``: rms of the bound of one template, m/s. ``efficiency_*``: that over the rms error;
+    above 1 where a method smooths over more than a template. Empty without noise.
     """
     metrics: dict[str, float] = {}
     for name in ("v", "w"):
@@ -52,12 +52,12 @@ def efficiency(wind: xr.Dataset) -> dict[str, float]:
 def true_wind_metrics(
     wind: xr.Dataset, cores: Sequence[Core], components: Sequence[str] = ("v", "w")
 ) -> dict[str, float]:
-    """How strong the true wind is, rms, m/s: a retrieval with errors as large has no skill.
+    """Rms of the true wind, m/s: a retrieval with errors as large has no skill.
 
     Parameters
     ----------
     wind : xr.Dataset, dims (..., z, y)
-        The true wind where vectors are looked for.
+        The true wind at the positions of the vectors.
     """
     far = outside_cores(wind["y"].values, wind["z"].values[:, None], list(cores))
     metrics: dict[str, float] = {}

@@ -19,8 +19,8 @@ _ROWS = (
     ("p50_direction", "median error of direction", "rad"),
     ("outside_cores.rmse_v", "rms error of v beyond two core radii", "m/s"),
     ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
-    ("all.rmse_v", "rms error of v, flagged vectors too", "m/s"),
-    ("all.rmse_w", "rms error of w, flagged vectors too", "m/s"),
+    ("all.rmse_v", "rms error of v, including flagged vectors", "m/s"),
+    ("all.rmse_w", "rms error of w, including flagged vectors", "m/s"),
     ("valid_fraction", "fraction of valid vectors", "%"),
 )
 
@@ -48,16 +48,16 @@ def backscatter_chapter(
             f"a vortex at y = {core.y:.1f} m, z = {core.z:.1f} m (core radius {core.radius:.1f} m)"
             for core in cores
         )
-        lead.append(f"The true flow holds {places}.")
+        lead.append(f"The true flow has {places}.")
     else:
         lead.append("No vortex core in the true flow.")
     numbers = Tables(
         heading="Accuracy of the cross-flow winds",
-        legend="Valid vectors against the truth at their place and time. Columns: what the winds "
-        "were retrieved from. Blurred is the extinction averaged over the beam's width, without "
-        "noise: its difference to the extinction is what the beam's width costs. The last column "
-        "is the rms of the true wind there: an error near it means no skill, as zero wind would "
-        "be no worse.",
+        legend="Valid vectors against the truth at their position and time. Columns: data that the "
+        "winds were retrieved from. Blurred is the extinction averaged over the beam's width, "
+        "without noise: its difference to the extinction is the effect of the beam's width. The "
+        "last column is the rms of the true wind there: an error near it means no skill, as zero "
+        "wind would be no worse.",
         tables=list(_tables(experiment, metrics)),
     )
     if vectors:
@@ -83,7 +83,7 @@ def _tables(experiment, metrics):
         rows = []
         for key, label, unit in _ROWS:
             values = [metrics.get(wind_key(source, method, key)) for source in sources]
-            # what zero wind instead of the found one would be off by
+            # the error of zero wind
             nothing = key.replace("rmse_", "rms_").removeprefix("all.")
             values.append(metrics.get(f"true_wind.{nothing}"))
             rows.append((label, unit, in_row(values, unit)))

@@ -13,7 +13,7 @@ from lidar_mi.assessment.report.page import embedded, template
 from lidar_mi.io.yaml import to_yaml
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 
-# rows of the comparison: key, name, unit; {} stands for a method's winds
+# rows of the comparison: key, name, unit; {}: a method's winds
 _ROWS = (
     ("backscatter.mc_relative_error", "Monte Carlo noise of a pixel over its signal, median", "%"),
     ("detector.signal", "photoelectrons of a pixel, median", ""),
@@ -34,7 +34,7 @@ _ROWS = (
     ("sensor.triples.rmse_v", "lines of sight alone: v", "m/s"),
     ("sensor.triples.rmse_w", "lines of sight alone: w", "m/s"),
     ("sensor.rmse_v_los", "rms error of a line-of-sight velocity", "m/s"),
-    ("sensor.doppler.photons_per_direction", "Doppler lidar: photons of a direction", ""),
+    ("sensor.doppler.photons_per_direction", "Doppler lidar: photons per direction", ""),
     ("sensor.doppler.hazard_distance", "Doppler lidar: hazard distance, unaided", "m"),
     ("safety.permissible_exposure", "permissible exposure by a pulse", "J/m²"),
     ("safety.hazard_distance", "hazard distance of a beam, unaided", "m"),
@@ -43,7 +43,7 @@ _ROWS = (
     ("safety.scan_power", "average power of the scan", "W"),
 )
 
-# of the Doppler lidar's readings of single pulses: measure of `velocity_metrics`, name
+# of the Doppler lidar's velocities from single pulses: quantity of `velocity_metrics`, name
 _RETRIEVALS = (
     ("bias", "bias"),
     ("std", "standard deviation"),

@@ -1,4 +1,4 @@
-"""How reports write numbers: as many digits as mean something."""
+"""Numbers in reports, with significant digits."""
 
 import math
 from collections.abc import Sequence

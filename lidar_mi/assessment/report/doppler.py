@@ -19,7 +19,7 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
         From `lidar_mi.experiment.measure.measure`.
     """
     purpose = (
-        "A Doppler lidar sends its backscatter through an etalon onto a CCD; the wind along the "
+        "A Doppler lidar images its backscatter through an etalon onto a CCD; the wind along the "
         "line of sight follows from the radii of the rings."
     )
     modes = metrics.get("doppler.speckle_modes")
@@ -41,7 +41,7 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
         legend="Winds that each method retrieves from noisy images, or from averages of several "
         "(columns), over all speeds, with standard errors. "
         f"{_abbreviations(doppler.retrieval.methods)}The bound (Cramér-Rao) is the least standard "
-        "deviation without bias; its row belongs to no method.",
+        "deviation without bias; its row is not of a method.",
         tables=[
             _doppler_table(doppler.retrieval, centre, metrics)
             for centre in doppler.retrieval.centre

@@ -14,12 +14,12 @@ from lidar_mi.assessment.metrics.error_budget import (
 from lidar_mi.assessment.report.digits import fixed, whole_percent
 from lidar_mi.assessment.report.page import Chapter, Tables
 
-# A cause with less of the mean square error is no limit.
+# A cause with a smaller fraction of the mean square error is not named.
 _LEAST = 0.1
 
 
 def limit_sentence(budget: Mapping[str, float], method: str) -> str:
-    """What limits a method's wind, in one sentence; beyond two core radii where there are cores."""
+    """Error budget of a method's wind, in one sentence; beyond two core radii of any cores."""
     name = METHOD_NAMES[method]
     causes = causes_of(budget)
     if not causes:
@@ -35,11 +35,11 @@ def limit_sentence(budget: Mapping[str, float], method: str) -> str:
     error = f"{component_rmse(budget, place):.2f} m/s"
     if not parts:
         return (
-            f"The wind by {name} is off by {error} rms{where}; no single cause has "
+            f"The wind by {name} has an rms error of {error}{where}; no single cause has "
             f"{whole_percent(_LEAST)} of the mean square error."
         )
     text = (
-        f"The wind by {name} is off by {error} rms{where}, limited by "
+        f"The wind by {name} has an rms error of {error}{where}, limited by "
         + "), then ".join([f"{parts[0]} of the mean square error", *parts[1:]])
         + ")."
     )
@@ -52,7 +52,7 @@ def limit_sentence(budget: Mapping[str, float], method: str) -> str:
 
 
 def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
-    """What limits the cross-flow wind.
+    """The error budget of the cross-flow wind.
 
     Parameters
     ----------
@@ -63,9 +63,9 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
     numbers = Tables(
         heading="Errors without each cause in turn",
         legend="Rms errors in m/s of v and w, and the fraction of the mean square error of both "
-        "that goes with the cause: over valid vectors, always the same, and over those beyond two "
-        "core radii. Noise is taken out as it fell, not drawn anew. The method itself: its error "
-        "on images of the air as it is, without blur and noise.",
+        "due to the cause: over the same valid vectors, and over those beyond two core radii. "
+        "Noise is removed as realised, not drawn again. The method itself: its error on images of "
+        "the air without blur and noise.",
         tables=[_table(budget, method) for method, budget in budgets.items()],
     )
     lead = [limit_sentence(budget, method) for method, budget in budgets.items()]
@@ -77,7 +77,7 @@ def budget_chapter(budgets: Budgets, drawn: Sequence[Drawn]) -> Chapter:
             f"{' and '.join(whole)}, fitted to whole images along curved paths: "
             "smoothing is part of the method."
         )
-    return Chapter("What limits the cross-flow wind", lead, drawn, numbers)
+    return Chapter("Error budget of the cross-flow wind", lead, drawn, numbers)
 
 
 def _table(budget: Mapping[str, float], method: str):

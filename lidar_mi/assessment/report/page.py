@@ -1,4 +1,4 @@
-"""The report of a run: one HTML file that needs nothing else."""
+"""The report of a run: one self-contained HTML file."""
 
 import base64
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ class Tables(NamedTuple):
 
 
 class Chapter(NamedTuple):
-    """What the report says of one instrument.
+    """The part of the report on one instrument.
 
     Attributes
     ----------
@@ -36,7 +36,7 @@ class Chapter(NamedTuple):
     drawn : sequence of Drawn
     numbers : Tables
     verdict : Tables, optional
-        Compliance with the requirements; stands before all chapters' numbers.
+        Compliance with the requirements; placed before all chapters' numbers.
     vectors : dict, optional
         `vector_map.map_data` with a ``title``, for an interactive map of the vectors.
     """
@@ -57,7 +57,7 @@ def page(
     chapters: Sequence[Chapter],
     warnings: Sequence[str] = (),
 ) -> str:
-    """The report as HTML, images embedded, everything named by the user escaped.
+    """The report as HTML, with embedded images; all text of the user is escaped.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def page(
         All numbers of the run.
     chapters : sequence of Chapter
     warnings : sequence of str
-        What a reader of the results must know.
+        Those that matter for the results.
     """
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]
@@ -92,7 +92,7 @@ def page(
 
 
 def template(name: str) -> jinja2.Template:
-    """One of the pages of this package; whatever is put into it is escaped."""
+    """One of the templates of this package; inserted text is escaped."""
     return jinja2.Environment(
         autoescape=True,
         undefined=jinja2.StrictUndefined,

@@ -36,9 +36,9 @@ def sensor_chapter(
     )
     if speed:
         ahead = look_ahead(experiment.scan.range + experiment.scan.thickness / 2, speed)
-        warning = f"At {speed:g} m/s the aircraft is there {ahead:.2g} s later."
+        warning = f"At {speed:g} m/s the look-ahead time is {ahead:.2g} s."
     else:
-        warning = "The platform stands still: there is no look-ahead time"
+        warning = "The platform is at rest: there is no look-ahead time"
         warning += "." if judged else ", and requirements for flight control do not apply."
     verdicts = {True: "fulfilled", False: "not fulfilled", None: "undetermined"}
     tables = [
@@ -88,7 +88,7 @@ def sensor_chapter(
     )
 
 
-# A cause with less of u's mean square error is no limit.
+# A cause with a smaller fraction of u's mean square error is not named.
 _LEAST = 0.05
 _CAUSES = {
     "sampling": "sampling error between the lines of sight",
@@ -111,10 +111,10 @@ def _limit_of_u(metrics) -> list[str]:
     ]
     little = [_CAUSES[c] for c in ranked if fractions[c] < _LEAST]
     rmse = metrics.get("sensor.outside_cores.rmse_u", metrics["sensor.rmse_u"])
-    text = f"u is off by {rmse:.2g} m/s rms, limited by " + "), then ".join(
+    text = f"u has an rms error of {rmse:.2g} m/s, limited by " + "), then ".join(
         [f"{parts[0]} of the mean square error", *parts[1:]]
     )
-    return [f"{text})" + (f"; next to nothing by {' or '.join(little)}." if little else ".")]
+    return [f"{text})" + (f"; {' or '.join(little)}: negligible." if little else ".")]
 
 
 def _not_stated(errors) -> list[str]:
@@ -122,8 +122,8 @@ def _not_stated(errors) -> list[str]:
     if errors == type(errors)():
         return []
     text = (
-        "The platform's attitude, pointing or speed is not what it is taken for (sensor.errors). "
-        "Standard errors do not include this: what turns all lines alike adds to them."
+        "The platform's attitude, pointing or speed differs from the assumed one (sensor.errors). "
+        "Standard errors do not include this error, which is common to all lines."
     )
     return [text]
 
@@ -131,15 +131,15 @@ def _not_stated(errors) -> list[str]:
 def _costs(metrics) -> list[str]:
     needed = metrics.get("sensor.doppler.pulses_needed")
     text = (
-        f"The Doppler lidar's directions take {_rate(metrics, 'doppler')}, and give "
+        f"The Doppler lidar's directions require {_rate(metrics, 'doppler')}, and give "
         f"{three(metrics['sensor.doppler.photons_per_direction'])} photons each"
         + (
-            f"; the required error of v_LOS takes {needed} pulse{'s' * (needed != 1)} per "
+            f"; the required error of v_LOS needs {needed} pulse{'s' * (needed != 1)} per "
             "direction."
             if needed
             else "."
         )
-        + f" The images take {_rate(metrics, 'backscatter')}."
+        + f" The images require {_rate(metrics, 'backscatter')}."
     )
     safety = []
     for name, title in (("doppler", "Doppler"), ("backscatter", "backscatter")):
@@ -149,7 +149,7 @@ def _costs(metrics) -> list[str]:
         aided = metrics[f"sensor.{name}.aided_hazard_distance"]
         where = "where it leaves"
         if aided > 0:
-            where = f"from {three(distance)} m on, with binoculars from {three(aided)} m"
+            where = f"beyond {three(distance)} m, with binoculars beyond {three(aided)} m"
         limit = three(metrics[f"sensor.{name}.permissible_exposure"])
         safety.append(
             f"The {title} lidar's beam is safe for eyes {where}: {limit} J/m² per pulse are "
@@ -177,8 +177,12 @@ def _numbers(metrics):
         ("normalised_error_variance_{}", "variance of normalised errors", ""),
         ("coverage_68_{}", "within one standard error", "%"),
         ("coverage_95_{}", "within 1.96 standard errors", "%"),
-        ("triples.rmse_{}", "rms error, lines of sight alone, in threes", "m/s"),
-        ("neighbours.rmse_{}", "rms error, the same, up to nine by least squares", "m/s"),
+        ("triples.rmse_{}", "rms error, lines of sight alone, triples", "m/s"),
+        (
+            "neighbours.rmse_{}",
+            "rms error, lines of sight alone, up to nine by least squares",
+            "m/s",
+        ),
     ):
         values = [metrics.get(f"sensor.{key.format(name)}") for name in (*COMPONENTS, "v_los")]
         rows.append((label, unit, in_row(values, unit)))

@@ -111,7 +111,7 @@ def _verdict(metrics, name) -> str | None:
         for side in sides
     ]
     return (
-        f"From the {ORIGIN_NAMES[name]}, circulation is off by {100 * deviations[0]:.1f} % (port) "
+        f"From the {ORIGIN_NAMES[name]}, the error of the circulation is {100 * deviations[0]:.1f} % (port) "
         f"and {100 * deviations[1]:.1f} % (starboard), places by {places[0]:.2f} and "
         f"{places[1]:.2f} m."
     )

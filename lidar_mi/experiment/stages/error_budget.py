@@ -21,7 +21,7 @@ from lidar_mi.experiment.stages.winds import known_blur, rendered_pairs, window_
 from lidar_mi.experiment.truth import Truth, blur_by_beam
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
-# Pictures of air as it is: a method that undoes the beam's blur has none to undo there.
+# Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")
 
 
@@ -54,7 +54,7 @@ def budgets(
     ----------
     scans : the two rendered scans
     progress : callable, optional
-        Called with what is done, and its fraction.
+        Called with the name of the step and the fraction done.
     known : xr.Dataset, optional
         Winds that need not be retrieved again, from
         `lidar_mi.experiment.stages.winds.cross_flow_winds`.
@@ -99,9 +99,9 @@ def budgets(
 
 
 def _images(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataArray]]:
-    """Images and their noise: as measured, without each cause, and of the air as it is.
+    """Images and their noise: as measured, without each cause, and of the air itself.
 
-    Beside them the air averaged over the beams.
+    Also the air averaged over the beams.
     """
     rendered = rendered_pairs(experiment, scans)
     pair, noise = rendered[Source.BACKSCATTER]
@@ -132,7 +132,7 @@ def _images(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataArr
     without = images_without(
         measured, blurred, sharp, pair if experiment.detector else None, advected
     )
-    # without the simulation's noise the detector's is left, if there is one
+    # without the simulation's noise the detector's remains, if there is one
     counts = np.sqrt(np.maximum(level**2 - noise**2, 0)) if experiment.detector else 0.0
     levels = {"detector_noise": noise, "monte_carlo": counts}
     return {

@@ -10,11 +10,11 @@ from lidar_mi.instrument.eye_safety import assess_pulses, scan_hazard_distance
 from lidar_mi.instrument.scan import ScanPlan
 
 EXPOSURE = 10.0
-"""Time of looking into the beams, s, where no sensor says another."""
+"""Time of exposure to the beams, s, unless given by the sensor."""
 
 
 def scan_safety(experiment: Experiment, plans: Sequence[ScanPlan]) -> ScanSafety | None:
-    """From where on eyes are safe; None: pulses have no duration, so that no limit applies.
+    """Distances from which eyes are safe; None: pulses have no duration, so that no limit applies.
 
     Every direction has a pulse each ``platform.dt``.
     """

@@ -19,9 +19,9 @@ from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 
-# Speeds at which images without noise are made; those between are interpolated (Chebyshev).
+# Speeds at which noise-free images are rendered; those between are interpolated (Chebyshev).
 _NODES = 7
-# First number of the lines' images, which make their random streams.
+# First number of the lines' images, which selects their random streams.
 _STREAMS = 1 << 24
 
 
@@ -38,18 +38,18 @@ def requirement_tables(
     path = experiment.sensor.requirements
     if path:
         return read_requirements(find_file(path, beside, "sensor.requirements"))
-    # the paper's are those of flight control: nothing to ask of a platform that stands
+    # the paper's are those of flight control: they do not apply to a platform at rest
     return read_requirements() if experiment.platform.speed else {}
 
 
 def slab_wind(experiment: Experiment, truth: Truth) -> xr.Dataset:
-    """True u, v, w (m s^-1) on (z, y), averaged over the slab; u is 0 in a wake that has none."""
+    """True u, v, w (m s^-1) on (z, y), averaged over the slab; u is 0 in a wake without it."""
     wind = truth.wind
     return wind if "u" in wind else wind.assign(u=xr.zeros_like(wind["v"]))
 
 
 def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
-    """Say whether both lidars observe the same air, in the Doppler lidar's velocity range.
+    """Check that both lidars observe the same air, in the Doppler lidar's velocity range.
 
     Raises
     ------
@@ -85,7 +85,7 @@ def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
 def measure_lines(
     experiment: Experiment, truth: xr.Dataset, rings: Rings, *, log: Log
 ) -> xr.Dataset:
-    """Line-of-sight velocities as the Doppler lidar retrieves them from its rings.
+    """Line-of-sight velocities retrieved from the Doppler lidar's rings.
 
     Images without noise are made at a few speeds and interpolated between them (their rings
     move by far less than an order); each line's are drawn by the CCD and evaluated by the annular
@@ -128,7 +128,7 @@ def measure_lines(
         for index in chunk:
             farther = doppler.lidar.model_copy(update={"range": float(lines["range"][index])})
             image = torch.tensordot(weights[index], images, 1) * (photons(farther) / light)
-            # numbers of their own, apart from those of the images of the Doppler lidar's chapter
+            # random streams different from those of the images of the Doppler lidar's chapter
             frames.append(
                 exposed_frames(
                     doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]

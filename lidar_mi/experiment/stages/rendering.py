@@ -57,7 +57,7 @@ def scattering_air(experiment: Experiment, beside: str | Path, *, log: Log) -> S
 
 
 def environment_extinction(experiment: Experiment) -> float:
-    """Extinction coefficient around the slab and on the way, m^-1."""
+    """Extinction coefficient around the slab and up to it, m^-1."""
     mapping = experiment.wake.extinction
     return mapping.background + mapping.molecules
 
@@ -65,13 +65,13 @@ def environment_extinction(experiment: Experiment) -> float:
 def check_light(
     experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], air: Scatterer
 ) -> None:
-    """Say what would leave the images dark or their noise undetermined.
+    """Check that the images will not be dark or their noise undetermined.
 
     Raises
     ------
     InputError
-        Air that does not scatter, a detector that does not go with the pulse, beams wider than a
-        medium can be made for.
+        Air that does not scatter, a detector inconsistent with the pulse, beams too wide for the
+        largest medium.
     """
     check_size(experiment, plans[0])
     _media(experiment, truth, plans)
@@ -140,7 +140,7 @@ def render_images(
 def batches_of(
     names: Sequence[str], keeper: Keeper | None, log: Log
 ) -> Callable[[int], Batches] | None:
-    """What keeps the samples of an image while it is rendered, by its place among the names."""
+    """Storage of an image's samples while it is rendered, by its index among the names."""
     if keeper is None:
         return None
 
@@ -161,14 +161,14 @@ def batches_of(
 def detect_images(
     experiment: Experiment, images: Mapping[str, xr.Dataset], plans: Sequence[ScanPlan]
 ) -> list[xr.Dataset]:
-    """The scans behind the detector: noisy images beside those without noise; or as they are."""
+    """The scans with noisy images in addition, if there is a detector."""
     scans = [images[name] for name in IMAGES]
     if experiment.detector is None:
         return scans
     lidar, detector, seed = experiment.lidar, experiment.detector, experiment.seed
-    # of what a file holds, geometry and air are single precision: here they are known
+    # geometry and air are in single precision in a file: here they are known exactly
     air = {"environment_extinction": environment_extinction(experiment)}
-    # random numbers of their own, apart from those of the light transport
+    # random numbers different from those of the light transport
     return [
         noisy_scan(scan.assign_attrs(air), lidar, detector, [seed, index, 1], plan)
         for index, (scan, plan) in enumerate(zip(scans, plans, strict=True))
@@ -176,12 +176,12 @@ def detect_images(
 
 
 def detector_noise(experiment: Experiment, scans: Sequence[xr.Dataset]) -> dict[str, float]:
-    """What the noise of the first scan is made of, as of `noise_budget`."""
+    """Contributions to the noise of the first scan, see `noise_budget`."""
     return noise_budget(scans[0], experiment.lidar, experiment.detector)
 
 
 def _media(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan]) -> list[xr.DataArray]:
-    """The extinction at both times as deep and wide as the beams need it."""
+    """The extinction at both times, extended to the depth and width of the beams."""
     fields = truth.extinction
     if fields[0].sizes["x"] > 1:
         return list(fields)

@@ -30,7 +30,7 @@ EMITTED, PHOTONS = "fringes_emitted", "fringes_photons"
 
 
 class Rings(NamedTuple):
-    """What the images of a Doppler lidar follow from."""
+    """Instrument and air of a Doppler lidar's images."""
 
     line: Line
     model: RingModel
@@ -61,7 +61,7 @@ class Exposure:
 
 
 def ring_instrument(doppler: Doppler) -> Rings:
-    """What the images follow from, checked.
+    """Instrument and air of the images, checked.
 
     Raises
     ------
@@ -121,12 +121,12 @@ def ring_instrument(doppler: Doppler) -> Rings:
 
 
 def check_rings(experiment: Experiment, rings: Rings) -> None:
-    """Say whether scenes of the rings can be made.
+    """Check that scenes of the rings can be built.
 
     Raises
     ------
     InputError
-        Settings of etalon, camera and rendering that do not go together.
+        Inconsistent settings of etalon, camera and rendering.
     """
     use_variant(experiment.doppler.render.variant)
     for line, settings in ((rings.line, experiment.doppler.render), _path_by_path(experiment)):
@@ -171,7 +171,7 @@ def render_ring_images(
         if absent:
             size = f"{doppler.camera.width} x {doppler.camera.height}"
             log(f"rendering {names[absent[0]]} ... {names[absent[-1]]}, {size} pixels")
-            # the number of an image makes its seed: a resumed run renders the same ones
+            # the seed depends on the number of an image: a resumed run renders the same ones
             rendered = render_fringes(
                 doppler.etalon,
                 doppler.camera,
@@ -191,7 +191,7 @@ def render_ring_images(
 
 
 def ring_images(experiment: Experiment, parts: Mapping[str, xr.Dataset]) -> RingImages:
-    """The images by what they show."""
+    """The images by their content."""
     received = [parts[name] for name in _received(experiment)]
     return RingImages(parts[EMITTED], received, parts.get(PHOTONS))
 
@@ -238,7 +238,7 @@ def exposed_frames(doppler, rings, expected, averaged, seed, numbers) -> torch.T
     def one(number: int) -> torch.Tensor:
         return expose(mean, ccd, seed, [number], modes, background)
 
-    # every image has a stream of its own, so that it is the same from any thread
+    # every image has its own random stream, so that it does not depend on the thread
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         return torch.cat(list(pool.map(one, numbers)))
 
@@ -247,8 +247,8 @@ def summed(ccd: CCD, images: int) -> CCD:
     """A CCD whose single image has the statistics of the sum of several by the given one.
 
     Poisson numbers, speckle and read noise of several pulses add up to numbers of the same kind;
-    rounding by the digitiser is taken as Gaussian noise of a twelfth of a squared step, which holds
-    where the read noise is half a step or more. For pixels that are not full.
+    rounding by the digitiser is taken as Gaussian noise of 1/12 of a squared step, which holds
+    where the read noise is half a step or more. For pixels that are not saturated.
     """
     if images == 1:
         return ccd

@@ -28,7 +28,7 @@ from lidar_mi.retrieval.rings.bound import cramer_rao
 from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
 
 FITS = (RingMethod.ANNULAR, RingMethod.PIXELS)
-# way to the radius and coordinate of the fit, as `ring_peaks.ring_radius` takes them
+# method and coordinate of the radius, see `lidar_mi.retrieval.rings.peaks.ring_radius`
 PEAKS = {
     RingMethod.CA: ("ca", "r"),
     RingMethod.CA_R2: ("ca", "r2"),
@@ -36,7 +36,7 @@ PEAKS = {
     RingMethod.SG: ("sg", "r"),
 }
 
-# half widths of the fitted piece, in radii, for which the bias of peak fits is looked at
+# half widths of the fitted piece, in radii, for which the bias of peak fits is computed
 PIECES = tuple(np.linspace(0.1, 0.5, 9).round(3).tolist())
 
 FRAMES = 16  # noisy images in memory at a time
@@ -115,9 +115,9 @@ def velocities(
     -------
     xr.Dataset
         ``tried`` (algorithm), the images of every case that were given to it; ``v`` and its
-        standard deviation ``v_std`` as the fit says, m/s, dims (algorithm, centre, averaged, v_los,
-        image), NaN where there is none; and ``peak_bias`` (coordinate, piece) of the innermost
-        ring's peak without any noise, m/s, at the first speed.
+        standard deviation ``v_std`` stated by the fit, m/s, dims (algorithm, centre, averaged,
+        v_los, image), NaN where there is none; and ``peak_bias`` (coordinate, piece) of the
+        innermost ring's peak without any noise, m/s, at the first speed.
     """
     settings, speeds = doppler.retrieval, doppler.v_los
     shape = (
@@ -205,12 +205,12 @@ def velocities(
                 {"units": "1", "long_name": "half width of the fitted piece in radii"},
             ),
         },
-        attrs={"Conventions": "CF-1.11", "title": "Line-of-sight winds read from rings"},
+        attrs={"Conventions": "CF-1.11", "title": "Line-of-sight winds retrieved from rings"},
     )
 
 
 def fitted_speeds(frames, doppler, model, noise, method, centre) -> tuple[np.ndarray, np.ndarray]:
-    """v_LOS and its standard deviation by `fit_rings`; NaN of images that it refuses."""
+    """v_LOS and its standard deviation by `fit_rings`; NaN for images that it refuses."""
     known = {}
     if centre == RingCentre.KNOWN:
         free = [name for name in model.parameters if name not in ("x", "y")]
@@ -227,7 +227,7 @@ def fitted_speeds(frames, doppler, model, noise, method, centre) -> tuple[np.nda
 
 
 def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, float]:
-    """Innermost ring's radius (px) by all peak methods wanted; NaN where one finds none."""
+    """Innermost ring's radius (px) by the given peak methods; NaN where one fails."""
     methods = [name for name in doppler.retrieval.methods if name in PEAKS]
     centres, radii, near = {}, {}, None
     for name in methods:
@@ -240,7 +240,7 @@ def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, f
                     doppler.camera.centre_pixel if known else ring_peaks.find_centre(image, finder)
                 )
             place = centres[finder]
-            # the crest to a pixel: what a fit in r is off by goes with the piece about it
+            # the crest to a pixel: the bias of a fit in r depends on the piece about it
             near = near or ring_peaks.ring_radius(image, place, "ca", "r2")
             radii[name] = ring_peaks.ring_radius(image, place, way, coordinate, near)
         except InputError:
@@ -271,9 +271,9 @@ def _peak_bias(doppler: Doppler, rendered: RingImages) -> np.ndarray:
 
 
 def _emitted_velocity(doppler: Doppler, emitted: xr.Dataset, total: float) -> float:
-    """What the fit reads from the laser's own image: the zero of all speeds.
+    """Fit of the laser's own image: the zero of all speeds.
 
-    As many of its images can be averaged as one likes: it has no noise here.
+    Without noise, as any number of its images can be averaged.
     """
     line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
     model = ring_model(doppler.etalon, doppler.camera, line)

@@ -1,7 +1,7 @@
-"""Both lidars as one sensor: the wind in three dimensions, and what limits it along x.
+"""Both lidars as one sensor: the wind in three dimensions, and the error budget of u.
 
-The Doppler lidar scans the slab that the backscatter lidar has looked at. All of its lines of sight
-and the cross-flow wind together give (u, v, w).
+The Doppler lidar scans the slab observed by the backscatter lidar. All of its lines of sight and
+the cross-flow wind together give (u, v, w).
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
 from lidar_mi.retrieval.lines.combine import combine
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, wind_from_neighbours, wind_from_triples
 
-# Lines of sight of a least-squares vector of the Doppler lidar alone: one and those around it.
+# Lines of sight per least-squares vector of the Doppler lidar alone: one and those around it.
 _AROUND = 9
-# What counts as no error and no length in a budget of errors, m/s and m.
+# Values of a negligible error and length in a budget of errors, m/s and m.
 _SURE, _SHORT = 0.01, 0.1
 
 
@@ -59,7 +59,7 @@ def combined_wind(
 def doppler_alone(experiment: Experiment, lines: xr.Dataset, *, log: Log) -> dict[str, xr.Dataset]:
     """Vectors of the Doppler lidar alone, from "triples" of lines and from "neighbours" of each.
 
-    Empty where lines that could be read do not give any, which is logged as a warning.
+    Empty where the valid lines do not give any, which is logged as a warning.
     """
     try:
         triples = wind_from_triples(lines)
@@ -73,13 +73,13 @@ def doppler_alone(experiment: Experiment, lines: xr.Dataset, *, log: Log) -> dic
 
 
 def crossflow(experiment: Experiment, wind: xr.Dataset) -> xr.Dataset:
-    """The images' wind that the sensor takes v and w from."""
+    """The images' wind used by the sensor for v and w."""
     source = Source.NOISY if experiment.detector else Source.BACKSCATTER
     return wind.sel(source=source, algorithm=experiment.sensor.method)
 
 
 def _oblique_view(experiment: Experiment) -> dict[str, float]:
-    """Settings of `combine` by which it includes that images show some of the motion along x."""
+    """Settings of `combine` for the apparent motion in the images by motion along x."""
     if not moves_along(experiment):
         return {}
     scan, platform = experiment.scan, experiment.platform
@@ -92,7 +92,7 @@ def _oblique_view(experiment: Experiment) -> dict[str, float]:
 def with_truth(
     experiment: Experiment, truth: xr.Dataset, lines: xr.Dataset, crossflow: xr.Dataset
 ) -> xr.Dataset:
-    """The wind that `combine` makes of lines and cross-flow wind, with the truth at its nodes."""
+    """The wind of `combine` from lines and cross-flow wind, with the truth at its nodes."""
     found = combine(
         crossflow, lines, crossflow_std=experiment.sensor.crossflow_std, **_oblique_view(experiment)
     )
@@ -125,7 +125,7 @@ def limits_of_u(
     found: xr.Dataset | None,
     cores: Sequence[Core],
 ) -> dict[str, float]:
-    """What limits u; see `mean_squares_without`. Empty where there is no wind from both lidars."""
+    """Error budget of u, see `mean_squares_without`. Empty without a wind from both lidars."""
     if found is None:
         return {}
     return mean_squares_without(experiment, truth, lines, crossflow(experiment, wind), found, cores)
@@ -141,12 +141,12 @@ def mean_squares_without(
 ) -> dict[str, float]:
     """Mean square error of u without each cause, and without all of them at once, m^2 s^-2.
 
-    Causes: `line_noise` (what the rings' noise leaves), `range_bin` (averaging along it, here over
+    Causes: `line_noise` (from the rings' noise), `range_bin` (averaging along it, here over
     `_SHORT`), `crossflow` (errors of v and w) and, where there are any, `pointing`
-    (``sensor.errors``). What is left without all of them is the sampling error (`sampling`).
-    Without a cause the estimate also knows that it is gone, and the result is that of one draw: in
-    `wake_sensor` the noise of lines scatters u, over draws, by 9 % of the mean square error; its
-    fraction is 23 % with the draw of seed 1, whose lines are off by 0.05 m/s in the mean (2.9
+    (``sensor.errors``). Without all of them the sampling error remains (`sampling`). The estimate
+    without a cause also assumes that it is absent, and the result is that of one draw: in
+    `wake_sensor` the noise of lines contributes, over draws, 9 % of the mean square error of u; its
+    fraction is 23 % with the draw of seed 1, whose lines have a mean error of 0.05 m/s (2.9
     sigma; seeds 2 to 4 0.00).
 
     Returns
@@ -178,7 +178,7 @@ def mean_squares_without(
             experiment.platform.speed,
             missed,
         )
-        # lines that were not read stay so
+        # lines without a velocity remain without
         noise, std = lines["v_los"] - lines["v_los_true"], lines["v_los_std"]
         if "line_noise" in causes:
             noise, std = 0 * noise, xr.full_like(std, _SURE)

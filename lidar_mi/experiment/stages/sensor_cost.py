@@ -1,4 +1,4 @@
-"""What both lidars take: pulses, power, beams at a time, distances from which eyes are safe."""
+"""Cost of both lidars: pulses, power, simultaneous beams, distances from which eyes are safe."""
 
 import math
 from collections.abc import Mapping
@@ -53,7 +53,7 @@ def lidar_costs(experiment: Experiment, truth: xr.Dataset) -> dict[str, LidarCos
 def pulses_needed(
     experiment: Experiment, tables: Mapping[tuple[str, str], RequirementTable], lines: xr.Dataset
 ) -> int | None:
-    """Pulses a direction takes for the least error of v_LOS that is required; None: none is."""
+    """Pulses per direction for the smallest required error of v_LOS; None: none is required."""
     rows = (row for table in tables.values() for row in table.rows)
     limits = [r.maximum for r in rows if r.quantity == "error_v_los" and math.isfinite(r.maximum)]
     stated = lines["v_los_std"].where(lines["v_los"].notnull(), drop=True)
@@ -64,7 +64,7 @@ def pulses_needed(
 
 
 def _eye_safety(beam, radius: float, rate: float, exposure: float) -> dict[str, float]:
-    """Limits of one beam, as `LidarCost` calls them; none of pulses without a duration."""
+    """Limits of one beam, by the names of `LidarCost`; none for pulses without a duration."""
     if not beam.pulse_duration > 0:
         return {}
     safety = assess_pulses(

@@ -1,4 +1,4 @@
-"""How well winds are retrieved from the extinction by how much sub-grid texture it has."""
+"""Errors of winds retrieved from the extinction against its sub-grid texture."""
 
 import numpy as np
 import xarray as xr

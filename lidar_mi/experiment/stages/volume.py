@@ -1,7 +1,7 @@
 """Wind in three dimensions: all gates of two scans as volumes, the flow between them.
 
-The backscatter lidar looks at the same stack of thin slabs twice. Beams spread from gate to gate,
-and the telescope comes nearer between the scans: both stacks are brought onto one grid in the air.
+The backscatter lidar observes the same stack of thin slabs twice. Beams spread from gate to gate,
+and the telescope moves between the scans: both stacks are interpolated to one grid in the air.
 """
 
 from collections.abc import Sequence
@@ -46,7 +46,7 @@ class Volumes:
 
 
 def check_volume(experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan]) -> None:
-    """Say whether a wind in three dimensions can be retrieved.
+    """Check that a wind in three dimensions can be retrieved.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def _check_gates(experiment: Experiment, flow: xr.Dataset) -> None:
 
 
 def grid(experiment: Experiment, plans: Sequence[ScanPlan]) -> tuple[np.ndarray, ...]:
-    """Nodes x, z, y (m) of the volumes: middles of the gates at t1, and what all gates see.
+    """Nodes x, z, y (m) of the volumes: middles of the gates at t1, and what all gates cover.
 
     Along z and y whole multiples of wake.spacing, inside the beams of the nearest gate.
     """
@@ -90,7 +90,7 @@ def grid(experiment: Experiment, plans: Sequence[ScanPlan]) -> tuple[np.ndarray,
 
 
 def _places(plan: ScanPlan, axis: str) -> np.ndarray:
-    """Where the beams are in the middles of the gates, (gates, beams), m."""
+    """Positions of the beams in the middles of the gates, (gates, beams), m."""
     edges = np.linspace(plan.gate_start, plan.gate_stop, plan.gate_count + 1)
     middle = (edges[1:] + edges[:-1]) / 2
     return middle[:, None] / plan.centre * getattr(plan, axis)
@@ -105,9 +105,8 @@ def scan_volume(
 ) -> xr.DataArray:
     """Attenuated backscatter (m^-1 sr^-1) of all gates on one grid in the air, dims (x, z, y).
 
-    Gate by gate by bicubic splines, from where the beams are to the nodes. A beam is as wide as
-    its gate is thin or wider, so that little is lost; of the variance of white noise `PASSED` is
-    left.
+    Gate by gate by bicubic splines, from the beams to the nodes. Beams are wider than gates are
+    thick, so that little structure is lost; the variance of white noise is reduced to `PASSED`.
 
     Parameters
     ----------
@@ -116,9 +115,9 @@ def scan_volume(
     plan : ScanPlan
         Planar gates.
     environment : float
-        Extinction coefficient on the way, m^-1.
+        Extinction coefficient up to the gates, m^-1.
     nodes : x, z, y of the grid, m
-        x in the frame of the air, one a gate; inside the beams of every gate.
+        x in the frame of the air, one per gate; inside the beams of every gate.
     """
     x, z, y = nodes
     values = attenuated_backscatter(
@@ -171,7 +170,7 @@ def volume_winds(experiment: Experiment, flows: Flows, volumes: Volumes, *, log:
     Returns
     -------
     xr.Dataset, dims (source, algorithm, x, z, y)
-        What `retrieve_wind_volume` gives and ``u_true``, ``v_true``, ``w_true`` (m s^-1).
+        The variables of `retrieve_wind_volume` and ``u_true``, ``v_true``, ``w_true`` (m s^-1).
     """
     settings = experiment.volume
     sources = []
@@ -195,7 +194,7 @@ def volume_winds(experiment: Experiment, flows: Flows, volumes: Volumes, *, log:
         sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
     found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
     found = found.assign_coords(source=list(volumes.pairs), algorithm=list(settings.methods))
-    # the gates go along with a wind that is none in their frame
+    # the gates move with the mean wind, which is 0 in their frame
     about = found["u"].attrs
     found["u"] = (found["u"] + experiment.scan.follow).assign_attrs(about)
     for name, values in true_wind(flows[0], found).items():

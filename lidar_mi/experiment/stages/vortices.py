@@ -1,7 +1,7 @@
 """The vortices of an experiment: a pair fitted to the images and to the wind retrieved from them.
 
-The fit says what wake vortices are described by, and is a model of the wind that can be evaluated
-anywhere: what a controller would fly with.
+The fit gives the parameters of the wake vortices, and a model of the wind that can be evaluated
+anywhere, for use by a controller.
 """
 
 from collections.abc import Sequence
@@ -23,14 +23,14 @@ from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
 
 @dataclass(frozen=True)
 class VortexFits:
-    """Vortex pairs by what they were fitted to.
+    """Vortex pairs by the data they were fitted to.
 
     Attributes
     ----------
     pairs : dict of str to VortexPairFit
         The accepted ones, by `Origin`.
     refused : dict of str to str
-        Why there is no other.
+        Reasons for which there is no other.
     """
 
     pairs: dict[str, VortexPairFit]
@@ -38,7 +38,7 @@ class VortexFits:
 
 
 def combined_vectors(experiment: Experiment, wind3d: xr.Dataset | None) -> xr.Dataset | None:
-    """Cross-flow wind of both lidars, flagged by what v and w need; None: there is none."""
+    """Cross-flow wind of both lidars, with the flags of v and w; None: there is none."""
     if wind3d is None:
         return None
     # v and w do not need lines of sight

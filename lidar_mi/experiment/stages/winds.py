@@ -20,7 +20,7 @@ from lidar_mi.retrieval.velocimetry.windows import Windows
 
 
 def check_windows(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan]) -> None:
-    """Say whether windows fit into the images.
+    """Check that windows fit into the images.
 
     Raises
     ------
@@ -122,8 +122,8 @@ def rendered_pairs(
         noisy = np.hypot(noise, scans[0]["Y_noise_std"])
         pairs[Source.NOISY] = [scan["Y_noisy"] for scan in scans], noisy
     if experiment.scan.aim == "angles":
-        # the noise has no structure to interpolate: its level goes along, the rms, as few pixels
-        # have most of it where photons are few
+        # noise cannot be interpolated: its rms level is used, as a few pixels have most of it
+        # where photons are few
         pairs = {
             name: (resample_pair(*pair, experiment.wake.spacing), float((level**2).mean() ** 0.5))
             for name, (pair, level) in pairs.items()
@@ -161,7 +161,7 @@ def _warn_of_wide_beams(experiment, truth, plans, log) -> None:
 
 
 def _warn_of_no_vectors(found: xr.Dataset, log) -> None:
-    """Sources of rendered images that gave no valid vector, and which flags say why."""
+    """Sources of rendered images that gave no valid vector, and the flags of their vectors."""
     for source in (name for name in found["source"].values if name in RENDERED):
         for method in found["algorithm"].values:
             wind = found.sel(source=source, algorithm=method)

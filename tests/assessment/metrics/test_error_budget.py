@@ -342,8 +342,8 @@ def described(place="", **shares):
 def test_the_sentence_names_the_largest_causes_in_turn():
     metrics = described(beam_blur=0.2, detector_noise=0.7, window=0.01, method=-0.4)
     assert limit_sentence(metrics, "cc") == (
-        "The wind by cross-correlation is off by 0.35 m/s rms, limited by noise of the detector "
-        "(70 % of the mean square error), then width of the beam (20 %)."
+        "The wind by cross-correlation has an rms error of 0.35 m/s, limited by noise of the "
+        "detector (70 % of the mean square error), then width of the beam (20 %)."
     )
     # beyond the cores where there are any; that noise of the simulation is not the lidar's is said
     both = described(beam_blur=0.9, detector_noise=0.1, monte_carlo=0.1)
