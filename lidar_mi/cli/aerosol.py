@@ -33,7 +33,7 @@ def aerosol(
     ] = None,
     name: Annotated[
         str | None,
-        typer.Option(help="Name of the new aerosol; needed when something below is changed."),
+        typer.Option(help="Name of the new aerosol; needed if a parameter below is changed."),
     ] = None,
     index: Annotated[
         str | None,
@@ -65,7 +65,8 @@ def aerosol(
         ),
     ] = None,
     number_density: Annotated[
-        str | None, typer.Option(help="Particles that go with the table, such as '2e8 / m^3'.")
+        str | None,
+        typer.Option(help="Number density of the table's particles, such as '2e8 / m^3'."),
     ] = None,
     nodes: Annotated[
         int | None,
@@ -75,7 +76,7 @@ def aerosol(
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
-    """Make the scattering table of an aerosol: a named one, or one changed to taste.
+    """Compute the scattering table of an aerosol: a named one, or one with changed parameters.
 
     The table holds the six elements of the scattering matrix over angle (T-matrix method for
     spheroids, Lorenz-Mie theory for spheres), averaged over sizes and orientations, and the

@@ -1,4 +1,4 @@
-"""The command line, put together: one command per file beside this one."""
+"""The command line: one command per file in this folder."""
 
 from typing import Annotated
 
@@ -9,7 +9,7 @@ from lidar_mi.cli.exit_codes import exit_by
 
 app = typer.Typer(
     name="lidar-mi",
-    help="Virtual lidars that look at wake vortices: from a simulated wake to retrieved winds.",
+    help="Virtual lidars that observe wake vortices: from a simulated wake to retrieved winds.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

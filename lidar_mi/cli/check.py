@@ -1,4 +1,4 @@
-"""``lidar-mi check``: whether an experiment can be run, and what it will look at."""
+"""``lidar-mi check``: whether an experiment can be run, and a summary of it."""
 
 from lidar_mi.cli.options import Changes, ExperimentName
 from lidar_mi.cli.terminal import output, print_rows
@@ -12,7 +12,7 @@ EXAMPLES = (
 
 
 def check(experiment: ExperimentName, set_: Changes = None) -> None:
-    """Say whether an experiment can be run, and in numbers what it will look at and with what.
+    """Check whether an experiment can be run; show its instruments and the observed air in numbers.
 
     Reads the wake, the scattering and the requirements as run does, and writes nothing.
     """

@@ -1,15 +1,15 @@
-"""``lidar-mi doctor``: what this machine can run."""
+"""``lidar-mi doctor``: checks of this machine."""
 
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-EXAMPLES = "Example: `lidar-mi doctor` (exit code 0: everything that is needed is there)"
+EXAMPLES = "Example: `lidar-mi doctor` (exit code 0: all requirements are met)"
 
 
 def doctor() -> None:
-    """Explain what this machine can run, and what to install for the rest."""
+    """Check what this machine can run, and list what to install for the rest."""
     from lidar_mi.system.doctor import doctor as examine
 
     console = Console()

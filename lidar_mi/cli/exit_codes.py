@@ -15,19 +15,19 @@ from lidar_mi.errors import InputError, Stopped, causes, is_interrupt, notes, on
 
 BAD_INPUT = 2
 BY_SIGNAL = 128
-"""And the number of the signal."""
+"""Plus the number of the signal."""
 
 STOPPING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 TRACEBACK = "LIDAR_MI_TRACEBACK"
-"""Environment variable; set, it lets the traceback of any error through."""
+"""Environment variable; if set, tracebacks of all errors are shown."""
 
-# what typer finds wrong with arguments and options, whichever library it takes this from
+# typer's errors of arguments and options, from either library
 _USAGE_ERROR = typer.BadParameter.__mro__[1]
 
 
 def exit_by(app: Callable[..., int | None]) -> None:
-    """Run a typer app; what ends it before its end is said in one line.
+    """Run a typer app; errors and signals are reported in one line.
 
     Exit code 2: bad input, a disk or a file that fails, too little memory, equations that have no
     solution. Exit code 128 + n: signal n (Ctrl-C, SIGTERM, SIGHUP).
@@ -50,7 +50,7 @@ def exit_by(app: Callable[..., int | None]) -> None:
 
 
 def _message(error: BaseException) -> str | None:
-    """What to say of an error; None: it is one of the program."""
+    """Message of an error; None: it is a fault of the program."""
     if isinstance(error, InputError):
         return str(error)
     if isinstance(error, OSError):
@@ -61,7 +61,7 @@ def _message(error: BaseException) -> str | None:
             f"not enough memory ({one_line(error, 100) or 'in all'}); expected fewer beams, gates "
             "or samples, or a larger machine"
         )
-    # numpy, scipy and torch have each their own
+    # numpy, scipy and torch each have their own
     if type(error).__name__.lstrip("_") == "LinAlgError":
         reason = one_line(error, 100)
         return f"equations without a solution ({reason}); expected data that determine it"
@@ -70,7 +70,7 @@ def _message(error: BaseException) -> str | None:
 
 def _fail(message: str, code: int) -> NoReturn:
     line = one_line(message)
-    with suppress(OSError):  # the terminal may be gone
+    with suppress(OSError):  # the terminal may be closed
         errors.print(f"lidar-mi: {line}", style="red", highlight=False, soft_wrap=True)
     sys.exit(code)
 
@@ -87,7 +87,7 @@ def _fail_usage(error: Any) -> NoReturn:
 
 @contextmanager
 def _raised_signals() -> Iterator[None]:
-    """Let signals that ask for the end raise `Stopped`, but those that are ignored (nohup)."""
+    """Let terminating signals raise `Stopped`, except those that are ignored (nohup)."""
     before = {number: signal.getsignal(number) for number in STOPPING}
     caught = [number for number, handler in before.items() if handler != signal.SIG_IGN]
     try:
@@ -104,13 +104,13 @@ def _raise_stopped(number: int, frame: FrameType | None) -> None:
 
 
 def _stop(error: BaseException) -> int | None:
-    """The signal that stopped the program; None: none did."""
+    """The signal that stopped the program, or None."""
     stops = [cause for cause in causes(error) if isinstance(cause, Stopped)]
     return stops[0].number if stops else signal.SIGINT if is_interrupt(error) else None
 
 
 def _plugin_message(error: BaseException) -> str | None:
-    """The one line a plugin said about a wrong parameter, from under the layers above it."""
+    """The one-line message of a plugin about a wrong parameter, without Mitsuba's own."""
     for cause in causes(error):
         for line in str(cause).splitlines():
             if " is not allowed; expected " in line:

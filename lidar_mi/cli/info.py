@@ -1,4 +1,4 @@
-"""``lidar-mi info``: what a file, a folder of results or a scatterer is."""
+"""``lidar-mi info``: contents of a file or a folder of results, properties of a scatterer."""
 
 from pathlib import Path
 from typing import Annotated
@@ -31,9 +31,9 @@ def info(
         str | None, typer.Option(help="Of molecules, in the standard atmosphere. Default: 0 m.")
     ] = None,
 ) -> None:
-    """Say what a file or a folder of results holds, or how an aerosol or air scatters.
+    """Show the contents of a file or a folder of results, or the scattering by an aerosol or air.
 
-    Of scatterers: extinction and backscatter coefficient and the number of particles they go with,
+    Of scatterers: extinction and backscatter coefficient with the number of particles,
     single-scattering albedo, lidar ratio, depolarisation ratio.
     """
     from lidar_mi.assessment.report.summary import summary

@@ -1,4 +1,4 @@
-"""Arguments and options that several commands take."""
+"""Arguments and options common to several commands."""
 
 from typing import Annotated, overload
 
@@ -25,7 +25,7 @@ Variant = Annotated[
 ]
 
 Overwrite = Annotated[
-    bool, typer.Option("--overwrite", help="Replace a file that is no result of lidar-mi.")
+    bool, typer.Option("--overwrite", help="Replace a file even if it is no result of lidar-mi.")
 ]
 
 
@@ -34,7 +34,7 @@ def quantity(option: str, text: str, unit: str, example: str) -> float: ...
 @overload
 def quantity(option: str, text: str | None, unit: str, example: str) -> float | None: ...
 def quantity(option: str, text: str | None, unit: str, example: str) -> float | None:
-    """An option's value in SI; None where it is not given."""
+    """An option's value in SI; None if it is not given."""
     from lidar_mi.units import to_si
 
     if text is None:

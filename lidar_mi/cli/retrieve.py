@@ -49,7 +49,7 @@ def retrieve(
     device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
     overwrite: Overwrite = False,
 ) -> None:
-    """Find the cross-flow wind (v, w) in any two images of the same air."""
+    """Retrieve the cross-flow wind (v, w) from any two images of the same air."""
     from lidar_mi import __version__
     from lidar_mi.io.images import read_image, read_noise
     from lidar_mi.io.netcdf import write_netcdf
@@ -65,7 +65,7 @@ def retrieve(
     if noise is None:
         level = read_noise(first, layer, spacing)
         if level is not None and pair[0] is not images[0]:
-            # noise has no structure to interpolate: its median is taken
+            # noise cannot be interpolated: its median is used
             level = float(level.median())
     wind = retrieve_wind(
         *pair,

@@ -20,8 +20,8 @@ def rings(
     centre: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            help="Where the rings' centre is known: x to the right, y down, pixels from "
-            "the middle of the top left one. Default: found."
+            help="Centre of the rings, if known: x to the right, y down, pixels from "
+            "the middle of the top left one. Default: fitted."
         ),
     ] = None,
     out: Annotated[
@@ -31,7 +31,7 @@ def rings(
         str | None, typer.Option(help="Layer of an EXR file. Default: Y, or the only one.")
     ] = None,
     saturation: Annotated[
-        float | None, typer.Option(help="Value from which on a pixel is full.")
+        float | None, typer.Option(help="Value from which a pixel is saturated.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:

@@ -1,4 +1,4 @@
-"""``lidar-mi run``: run an experiment, start to end."""
+"""``lidar-mi run``: run an experiment."""
 
 from pathlib import Path
 from typing import Annotated
@@ -27,7 +27,7 @@ def run(
         bool, typer.Option("--overwrite", help="Replace a run of a different experiment.")
     ] = False,
 ) -> None:
-    """Run an experiment, start to end.
+    """Run an experiment.
 
     Writes images (EXR), winds (NetCDF), metrics (JSON), figures and a report into the run folder.
     A run that was stopped is resumed with the images it has.
@@ -61,7 +61,7 @@ def run(
 
 
 def _run_study(variants, out, path, overwrite, start) -> None:
-    """Variants of one experiment, each in a folder of its own, and their comparison."""
+    """Variants of one experiment, each in its own folder, and their comparison."""
     from lidar_mi.assessment.report.summary import summary
 
     first, experiment = next(iter(variants.items()))
@@ -77,5 +77,5 @@ def _run_study(variants, out, path, overwrite, start) -> None:
 
 
 def _averaged(experiment) -> tuple[int, ...]:
-    """How many images of rings an experiment averages."""
+    """Numbers of images of rings that an experiment averages."""
     return experiment.doppler.retrieval.averaged if experiment.doppler else ()

@@ -1,4 +1,4 @@
-"""What commands print, to the terminal or into a pipe."""
+"""Output of commands, to the terminal or into a pipe."""
 
 from collections.abc import Sequence
 
@@ -12,7 +12,7 @@ errors = Terminal(stderr=True)
 
 
 def print_rows(title: str, rows: Sequence[Sequence[str]]) -> None:
-    """A table without a head: a name and what there is to say of it, line by line."""
+    """A table without a head: names and values, line by line."""
     print_table(Table(title, rows))
 
 

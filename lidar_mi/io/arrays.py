@@ -20,7 +20,7 @@ def write_arrays(path: str | Path, arrays: Mapping[str, Any]) -> None:
 
 
 def read_arrays(path: str | Path) -> dict[str, np.ndarray]:
-    """All that `write_arrays` wrote, bit by bit; checksums within the file are checked.
+    """The contents of a file by `write_arrays`, exactly; checksums within the file are checked.
 
     Raises
     ------

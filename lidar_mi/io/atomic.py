@@ -1,4 +1,4 @@
-"""Files that are never half written, and that last once they are there."""
+"""Atomic and durable writing of files."""
 
 import errno
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lidar_mi.errors import InputError
 
-# of a process that was killed while it wrote, only such a file can be left
+# a process killed while writing can only leave such a file
 TEMPORARY = ".lidar-mi.*.part"
 
 _numbers = count()
@@ -21,22 +21,22 @@ def write_atomically(
 ) -> None:
     """Write a file under a temporary name beside the final one, sync it to the disk, rename it.
 
-    Until the file is renamed, an error or a kill leaves what was there before as it was. When this
-    function returns, the file outlasts a loss of power. Temporary files of killed processes in the
+    Until the file is renamed, an error or a kill leaves the former file unchanged. When this
+    function returns, the file survives a loss of power. Temporary files of killed processes in the
     same folder are removed.
 
     Parameters
     ----------
     path : str or Path
     content : bytes
-        All of the file.
+        Of the whole file.
     first : callable, optional
         Called when the content is on the disk, before the file is renamed.
 
     Raises
     ------
     InputError
-        The file cannot be written there, or something else than a file is in its place.
+        The file cannot be written there, or the path is not that of an ordinary file.
     """
     path = Path(path)
     try:
@@ -64,7 +64,7 @@ def write_atomically(
 
 
 def sync_folder(folder: str | Path) -> None:
-    """Let names in a folder last: without it, a loss of power may undo that a file was renamed."""
+    """Sync a folder: without it, a loss of power may undo the renaming of a file."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -88,7 +88,7 @@ def _own_prefix() -> str:
 
 
 def _remove_leftovers(folder: Path) -> None:
-    """Remove temporary files of processes of this machine that are no more."""
+    """Remove temporary files of processes of this machine that have ended."""
     for path in folder.glob(TEMPORARY):
         process = path.name.removeprefix(_own_prefix()).split(".")[0]
         if path.name.startswith(_own_prefix()) and process.isdigit() and not _lives(int(process)):
@@ -100,6 +100,6 @@ def _lives(process: int) -> bool:
         os.kill(process, 0)
     except ProcessLookupError:
         return False
-    except (PermissionError, OverflowError):  # someone else's; no process has such a number
+    except (PermissionError, OverflowError):  # of another user; no process has such a number
         return True
     return True

@@ -1,16 +1,16 @@
 """Images as OpenEXR files: one file per scan, one layer per gate and Stokes component.
 
-A scan's file shows what the pilot sees: top row = largest z, left column = largest y. Layers are
+A scan's file has the pilot's view: top row = largest z, left column = largest y. Layers are
 ``gate000.S0`` ... ``gate000.S3`` and ``gate000.S0_stderr`` for every gate (and
 ``gate000.order1.S0``, ... where orders of scattering were separated), and ``Y``, the attenuated
 backscatter of the first gate, corrected for range, gate length and the environment's
-transmittance, so that any viewer shows something at once. Of a run,
-``gate000.depolarization`` and ``gate000.multiple_scattering_fraction`` with their ``_stderr`` stand
-beside them, and with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``, ``Y_noisy`` and
+transmittance, which any viewer shows. Files of a run also have
+``gate000.depolarization`` and ``gate000.multiple_scattering_fraction`` with their ``_stderr``, and
+with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``, ``Y_noisy`` and
 ``Y_noise_std``. Everything else (beam positions, gates, instrument, units, seed, version) is in
 typed header attributes: those of the data set, which `lidar_mi.rendering.backscatter` and
 `lidar_mi.rendering.fringes` fill. A fringe camera's file has the layers ``S0`` ... ``S3``,
-``S0_stderr`` and ``Y``, seen as the camera sees it.
+``S0_stderr`` and ``Y``, in the camera's view.
 """
 
 import re
@@ -75,7 +75,7 @@ def write_scan(path: str | Path, scan: xr.Dataset) -> None:
 def write_fringes(path: str | Path, image: xr.Dataset) -> None:
     """Write the image of a fringe camera: S0 ... S3, S0_stderr with dims (y, x), y downwards.
 
-    ``Y`` is S0 once more, so that any viewer shows the rings. Files, values and attributes as in
+    ``Y`` is a copy of S0, so that any viewer shows the rings. Files, values and attributes as in
     `write_scan`.
     """
     layers = {name: image[name].transpose("y", "x").values for name in QUANTITIES}
@@ -163,7 +163,7 @@ def _read(path: str | Path, *, header_only: bool = False) -> tuple[dict, dict[st
             header = {k: v for k, v in file.header().items() if k not in _STRUCTURE}
             channels = {} if header_only else file.channels()
             layers = {k: np.array(c.pixels) for k, c in channels.items()}
-    except Exception:  # whatever the library meets in a damaged file
+    except Exception:  # any exception of the library in a damaged file
         raise InputError(f"{path}: not a readable OpenEXR image") from None
     if not header_only and len({pixels.shape for pixels in layers.values()}) != 1:
         raise InputError(f"{path}: not a readable OpenEXR image (its layers differ in size)")
@@ -251,12 +251,12 @@ def read_scan(path: str | Path) -> xr.Dataset:
 
 
 def _quantities(scan: xr.Dataset) -> list[str]:
-    """What a scan holds of every gate."""
+    """Variables of a scan for every gate."""
     return [str(name) for name, variable in scan.data_vars.items() if "gate" in variable.dims]
 
 
 def _once_per_scan(scan: xr.Dataset) -> list[str]:
-    """What a scan holds once: Y, and Y_noisy with its standard deviation behind a detector."""
+    """Variables of a scan without gates: Y, and with a detector Y_noisy and its error."""
     return [
         str(name) for name, variable in scan.data_vars.items() if set(variable.dims) == {"z", "y"}
     ]

@@ -1,4 +1,4 @@
-"""What an OpenEXR file declares, from its header alone."""
+"""Size declared by an OpenEXR file, from its header alone."""
 
 import struct
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Folders of results: made, told from those of others, held by one process at a time."""
+"""Folders of results: created, identified, locked by one process at a time."""
 
 import fcntl
 import os
@@ -13,7 +13,7 @@ _LOCK = ".lock"
 
 
 def is_free(folder: str | Path) -> bool:
-    """Whether there is no such folder, or nothing in it but what a killed process left."""
+    """Whether a folder is missing, or empty except for files left by a killed process."""
     folder = Path(folder)
     if not folder.exists():
         return True
@@ -23,12 +23,12 @@ def is_free(folder: str | Path) -> bool:
 
 
 def make_folder(folder: str | Path) -> None:
-    """Make a folder and those above it, where they are missing.
+    """Create a folder and its parents, where they are missing.
 
     Raises
     ------
     InputError
-        It cannot be made.
+        It cannot be created.
     """
     folder = Path(folder)
     try:
@@ -43,16 +43,16 @@ def make_folder(folder: str | Path) -> None:
 
 @contextmanager
 def locked(folder: str | Path) -> Iterator[None]:
-    """Hold a folder while the context lasts.
+    """Lock a folder within the context.
 
     The operating system holds the lock (``flock`` on a file in the folder) and releases it when the
-    process ends, however it ends. The file is removed at the end; one that a killed process left
-    means nothing.
+    process ends in any way. The file is removed at the end; one left by a killed process has no
+    effect.
 
     Raises
     ------
     InputError
-        Another process, or another thread, holds the folder; or no file can be locked in it.
+        Another process or thread has locked the folder; or no file can be locked in it.
     """
     path = Path(folder) / _LOCK
     try:
@@ -69,7 +69,7 @@ def locked(folder: str | Path) -> Iterator[None]:
     try:
         yield
     finally:
-        # while the lock is held: nobody else can hold a file of this name
+        # with the lock held, so that no other process can lock a file of this name
         with suppress(OSError):
             path.unlink()
         os.close(descriptor)

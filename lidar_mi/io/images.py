@@ -19,7 +19,7 @@ def read_pixels(path: str | Path, layer: str | None = None) -> np.ndarray:
     """Image of an EXR, PNG, TIFF, BMP, JPEG or FITS file, float64, (height, width), top row first.
 
     Colours are averaged, transparency is left out. Values are those of the file: 8 or 16 bit
-    numbers, floats. A FITS image is taken as it is stored, first row first.
+    numbers, floats. A FITS image is read as stored, first row first.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def read_image(
     """Pixels as `read_pixels` gives them, on axes (z, y), ascending, in metres.
 
     The top row has the largest z and the left column the largest y. Axes come from the header
-    attributes ``y`` and ``z`` that the EXR files of our scans carry; for other files ``spacing``
+    attributes ``y`` and ``z`` of the EXR files of our scans; for other files ``spacing``
     (m, from pixel to pixel) puts the image's middle at zero.
 
     Parameters
@@ -104,7 +104,7 @@ def read_image(
 def read_noise(
     path: str | Path, layer: str | None = None, spacing: float | None = None
 ) -> xr.DataArray | None:
-    """Standard deviation of an image's noise, as `read_image` gives the image; None if unsaid.
+    """Standard deviation of an image's noise, on the axes of `read_image`; None if not stated.
 
     For ``Y`` and ``Y_noisy`` of a run's scans: the light transport's standard error and, with a
     detector, its noise. For any other layer: the one of the same name with ``_stderr``.
@@ -118,7 +118,7 @@ def read_noise(
     Returns
     -------
     xr.DataArray, dims (z, y), m, or None
-        In the image's unit; None where the file does not say.
+        In the image's unit; None if the file does not state it.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def as_webp(path: str | Path) -> bytes:
     content = BytesIO()
     try:
         with Image.open(path) as image:
-            # more effort takes twice as long for 3 % less
+            # more compression takes twice as long for 3 % less
             image.convert("RGB").save(content, "WEBP", lossless=True, quality=25, method=1)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: no readable image ({_short(error)})") from None
@@ -208,7 +208,7 @@ def _fits(path):
             found = [part.data for part in parts if part.is_image and part.data is not None]
     except InputError:
         raise
-    except Exception as error:  # whatever the library meets in a damaged file
+    except Exception as error:  # any exception of the library in a damaged file
         raise InputError(f"{path}: no readable FITS file ({_short(error)})") from None
     if not found or found[0].squeeze().ndim != 2:
         shape = " x ".join(map(str, found[0].shape)) if found else "none"
@@ -217,7 +217,7 @@ def _fits(path):
 
 
 def _opened(path):
-    """An image of one of the kinds that cameras write: others may run programs to be read."""
+    """An image of one of the formats of cameras: reading others may execute programs."""
     from PIL import Image
 
     with warnings.catch_warnings():
@@ -235,7 +235,7 @@ def _image(path):
             bands, pixels = image.getbands(), np.asarray(image)
     except InputError:
         raise
-    except Exception as error:  # whatever the library meets in a damaged file
+    except Exception as error:  # any exception of the library in a damaged file
         raise InputError(f"{path}: no readable image ({_short(error)})") from None
     if pixels.ndim == 2:
         return pixels

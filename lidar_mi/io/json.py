@@ -15,7 +15,7 @@ def read_json(path: str | Path, expected: str) -> Any:
     ----------
     path : str or Path
     expected : str
-        What kind of file was asked for, for the message: "a file of vortex pairs".
+        Kind of file expected, for the message: "a file of vortex pairs".
 
     Raises
     ------

@@ -43,12 +43,12 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
         # axes without a name, of HDF5 that is no NetCDF, are named without a warning
         unnamed: dict[str, Any] = {"phony_dims": "access"} if engine == "h5netcdf" else {}
         return xr.open_dataset(path, engine=engine, decode_times=False, **unnamed)
-    except Exception as error:  # whatever the libraries meet in a damaged file
+    except Exception as error:  # any exception of the libraries in a damaged file
         raise _damaged(path, error) from None
 
 
 def _declared(path):
-    """What opening reads at once, and the largest piece that any value takes to be read."""
+    """Bytes read on opening, and the largest chunk that must be read for a value."""
     found = []
     try:
         with h5py.File(path, "r") as file:
@@ -80,7 +80,7 @@ def load_variable(variable: xr.DataArray, path: str | Path) -> xr.DataArray:
     Raises
     ------
     InputError
-        The file is damaged where the values are, or there are more than it can hold.
+        The file is damaged at the values, or declares more than it can hold.
     """
     check_size(path, variable.nbytes, str(variable.name))
     try:
@@ -97,7 +97,7 @@ def _damaged(path, error):
 def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
     """Write a data set as compressed NetCDF-4, whole or not at all.
 
-    The file is composed in memory: HDF5 does not survive a disk that is full.
+    The file is composed in memory, as HDF5 crashes if the disk is full.
 
     Raises
     ------

@@ -18,7 +18,7 @@ def write_png(figure: Figure, path: str | Path, *, cropped: bool = False) -> Non
     figure : matplotlib.figure.Figure
     path : str or Path
     cropped : bool
-        Without the room around the panels, but for 0.1 inch: panels of equal scales leave much.
+        Without the space around the panels except 0.1 inch, which is large with equal scales.
     """
     room: dict[str, Any] = {"bbox_inches": "tight", "pad_inches": 0.1} if cropped else {}
     write_atomically(path, _png(figure, dpi=110, **room))

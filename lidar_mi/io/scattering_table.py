@@ -1,4 +1,4 @@
-"""Scattering tables as text files, and those that ship with the package."""
+"""Scattering tables as text files, and those shipped with the package."""
 
 import math
 from importlib.resources import files
@@ -25,10 +25,10 @@ _HEADER = {
 
 
 def write_table(table: ScatteringTable, path: str | Path) -> None:
-    """Write a table as text: ``# key: value`` lines, then angle and six elements a line.
+    """Write a table as text: ``# key: value`` lines, then angle and six elements per line.
 
-    `numpy.loadtxt` and the ``mueller`` phase function read it as it is. The derived numbers
-    (lidar ratio and so on) are written for the reader of the file; `read_table` computes them.
+    `numpy.loadtxt` and the ``mueller`` phase function read it directly. The derived numbers
+    (lidar ratio and so on) are written as information; `read_table` computes them.
     """
     values = {
         "name": table.name,
@@ -54,7 +54,7 @@ def write_table(table: ScatteringTable, path: str | Path) -> None:
 
 
 def read_table(path: str | Path) -> ScatteringTable:
-    """Read what `write_table` wrote.
+    """Read a table written by `write_table`.
 
     Raises
     ------
@@ -111,7 +111,7 @@ def is_complete(path: Path) -> bool:
 def aerosol_table(
     name: str, wavelength: float, notice: Notice = lambda text, fraction: None
 ) -> ScatteringTable:
-    """The table of a named aerosol: the one that ships, or else a new one from `make_table`.
+    """The table of a named aerosol: the shipped one, or else a new one from `make_table`.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How much memory a file may ask for: what it declares is held against what it is."""
+"""Limits of the memory for a file: its declared size against its real size."""
 
 from pathlib import Path
 
@@ -16,9 +16,9 @@ def fits(path: str | Path, size: int) -> bool:
 
 
 def check_size(path: str | Path, size: int, what: str = "it") -> None:
-    """Refuse what a file declares before it is read.
+    """Refuse a declared size out of proportion to the file, before it is read.
 
-    A few hundred bytes can declare an array of gigabytes, all of it zero or not there.
+    A few hundred bytes can declare an array of gigabytes, all of it zero or missing.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Where a command may write: not over what it reads, nor unasked over what others made."""
+"""Checks of output files: no input is overwritten, nor, without a flag, a foreign file."""
 
 import os
 import re
@@ -17,21 +17,21 @@ _OURS = "lidar-mi "
 def check_target(
     path: str | Path, inputs: Iterable[str | Path] = (), *, overwrite: bool = False
 ) -> None:
-    """Refuse a place that nothing may be written to, before any work is done for it.
+    """Refuse an output path that must not be written, before any work is done.
 
     Parameters
     ----------
     path : path
     inputs : iterable of path
-        What is read: never replaced, under any name.
+        Input files, which are never replaced, under any name.
     overwrite : bool
         Replace a file that is no result of lidar-mi.
 
     Raises
     ------
     InputError
-        There is no such folder; an input, or something else than a file, is in the place; or a file
-        of someone else, and ``overwrite`` is not set.
+        There is no such folder; the path is that of an input or of no ordinary file; or it is a
+        foreign file, and ``overwrite`` is not set.
     """
     path = Path(path)
     if not path.parent.is_dir():
@@ -50,7 +50,7 @@ def check_target(
 
 
 def software(path: str | Path) -> str:
-    """What a file says it was written by: EXR, NetCDF, PNG or text; empty: nothing."""
+    """The program stated in a file as its writer: EXR, NetCDF, PNG or text; empty: none."""
     path = Path(path)
     try:
         with path.open("rb") as file:

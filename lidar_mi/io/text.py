@@ -17,10 +17,9 @@ def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
     ----------
     path : str or Path
     expected : str
-        What kind of file was asked for, for the message: "an experiment file".
+        Kind of file expected, for the message: "an experiment file".
     longest : int
-        Bytes; nothing is read of a file that is longer, and nothing of devices and pipes, which
-        have no end.
+        Bytes; longer files are not read, nor devices and pipes, which have no end.
 
     Raises
     ------

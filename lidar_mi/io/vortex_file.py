@@ -1,4 +1,4 @@
-"""Vortex pairs as a small JSON file: what a controller reads to know the wind ahead anywhere."""
+"""Vortex pairs as a small JSON file, from which a controller can compute the wind ahead."""
 
 import math
 from collections.abc import Mapping
@@ -15,12 +15,12 @@ from lidar_mi.retrieval.vortices.pair import VortexPairFit
 FORMAT = "lidar-mi vortex pairs 1"
 
 _FRAME = (
-    "y to port, z up, m, from the telescope's axis; circulation > 0 turns from +y towards +z; "
+    "y to port, z up, m, from the telescope's axis; circulation > 0 rotates from +y towards +z; "
     "parameters in SI units, log_radius the natural logarithm of the core radius in m; "
     "wind at mid-time of the two images"
 )
 _NUMBERS = ("chi2", "correlation", "model_error", "model_error_length")
-# names in older files, by those of today
+# names in older files, by today's names
 _FORMER = {"model_error": "flow_error", "model_error_length": "flow_error_length"}
 
 
@@ -34,7 +34,7 @@ def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about:
     path : path
     fits : mapping of str to VortexPairFit
     **about
-        What else the file says of itself, such as ``source``.
+        Further attributes of the file, such as ``source``.
 
     Examples
     --------

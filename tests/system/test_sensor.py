@@ -171,7 +171,8 @@ def test_the_vortices_are_told_and_kept(whole):
     # a grid a little smaller than the slab
     assert metrics["vortex.images.rmse_w"] == pytest.approx(rmse, rel=0.2)
     assert (
-        "From the images, the error of the circulation is" in (folder / "report.html").read_text()
+        "From the images, the errors of the circulations are"
+        in (folder / "report.html").read_text()
     )
 
 
@@ -208,7 +209,7 @@ def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypat
         "at most 2.5 m/s",
         "not known",
         "undetermined",
-        "From the images, the error of the circulation is",
+        "From the images, the errors of the circulations are",
     ):
         assert text in report, text
     assert not (folder / "wind3d.nc").exists()
@@ -228,7 +229,7 @@ def test_lines_that_cannot_be_read_are_said_and_the_rest_is_shown(whole, tmp_pat
     )
     assert "Warning: no wind from both lidars: " in report
     assert "0 of 15 lines of sight were retrieved" in report
-    assert "From the images, the error of the circulation is" in report
+    assert "From the images, the errors of the circulations are" in report
     metrics = json.loads((folder / "metrics.json").read_text())
     assert "sensor.rmse_v_los" not in metrics
 

@@ -1,4 +1,4 @@
-"""The few numbers of a run that people ask for first, as tables: for terminals and notebooks."""
+"""The main numbers of a run, as tables for terminals and notebooks."""
 
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -18,12 +18,12 @@ def summary(metrics: Mapping[str, float], averaged: Sequence[int] = ()) -> list[
     metrics : mapping of str to float
         Of a run.
     averaged : sequence of int
-        How many images of rings the experiment averages, ``doppler.retrieval.averaged``.
+        Numbers of images of rings that the experiment averages, ``doppler.retrieval.averaged``.
 
     Returns
     -------
     list of Table
-        Of what the run has.
+        Of the run's results.
     """
     tables = []
     if averaged:
@@ -46,7 +46,7 @@ def _line_of_sight(metrics: Mapping[str, float], numbers: Sequence[int]) -> Tabl
         keys = [ring_key(method, centre, n, name) for n in numbers for name in ("std", "bias")]
         rows.append((method, centre, keys))
     return Table(
-        "line-of-sight wind from averages of so many images, m/s",
+        "line-of-sight wind from averages of images, m/s",
         [
             (str(name), str(centre), *(_shown(metrics.get(key), 3) for key in keys))
             for name, centre, keys in rows
@@ -84,7 +84,7 @@ def _sensor(metrics: Mapping[str, float]) -> Table:
     rows = []
     for label, key in (
         ("both lidars", f"sensor.{place}rmse_"),
-        ("lines of sight alone, all over", "sensor.triples.rmse_"),
+        ("lines of sight alone, everywhere", "sensor.triples.rmse_"),
         ("true wind (rms)", f"sensor.{place}rms_"),
     ):
         values = [metrics.get(f"{key}{name}") for name in "uvw"]

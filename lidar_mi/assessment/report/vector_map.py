@@ -7,7 +7,7 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core
 
-# A map about as dense as fingers and screens can tell apart.
+# A map about as dense as vectors can be selected on a screen.
 _COLUMNS = 55
 
 
@@ -18,7 +18,7 @@ def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core])
     ----------
     wind : xr.Dataset, dims (z, y)
         ``NAME`` and ``NAME_true`` of every component, m/s, v and w among them; ``NAME_stderr``
-        where there are any; ``flag`` with its CF attributes. Vectors stand at y_vector, z_vector
+        where there are any; ``flag`` with its CF attributes. Vectors are at y_vector, z_vector
         or, where these are missing, at the nodes.
     components : sequence of str
     cores : sequence of Core
@@ -27,7 +27,7 @@ def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core])
     Returns
     -------
     dict
-        Lists of equal length for all vectors, row by row from below; numbers that are not are None.
+        Lists of equal length for all vectors, row by row from below; NaN becomes None.
     """
     every = max(1, round(wind.sizes["y"] / _COLUMNS))
     thin = wind.isel(z=slice(every // 2, None, every), y=slice(every // 2, None, every))

@@ -33,8 +33,8 @@ def volume_chapter(experiment, metrics: Mapping[str, float], drawn: Sequence[Dra
     )
     numbers = Tables(
         heading="Accuracy of the winds in three dimensions",
-        legend="Valid vectors against the truth at their place. The true wind's own rms stands "
-        "beside the errors: an error near it means no skill.",
+        legend="Valid vectors against the truth at their position. The true wind's own rms is "
+        "given with the errors: an error near it means no skill.",
         tables=list(_tables(experiment, metrics)),
     )
     return Chapter("Wind in three dimensions", [purpose, noise], drawn, numbers)
@@ -48,7 +48,7 @@ def _tables(experiment, metrics):
             for key, label, unit in (
                 ("rmse_{}", "rms error", "m/s"),
                 ("outside_cores.rmse_{}", "rms error beyond two core radii", "m/s"),
-                ("all.rmse_{}", "rms error, flagged vectors too", "m/s"),
+                ("all.rmse_{}", "rms error, including flagged vectors", "m/s"),
                 ("bias_{}", "bias", "m/s"),
                 ("stderr_{}", "rms standard error, as stated", "m/s"),
                 ("normalised_error_variance_{}", "variance of normalised errors", ""),

@@ -1,4 +1,4 @@
-"""The vortices' chapter of a report: the fitted pairs beside the truth."""
+"""The vortices' chapter of a report: the fitted pairs and the truth."""
 
 from collections.abc import Mapping, Sequence
 
@@ -47,7 +47,7 @@ def vortex_chapter(
     drawn: Sequence[Drawn],
     method: str | None = None,
 ) -> Chapter:
-    """Parameters of the fitted vortices, beside the truth.
+    """Parameters of the fitted vortices, and the truth.
 
     Parameters
     ----------
@@ -56,9 +56,9 @@ def vortex_chapter(
     fits : mapping of str to VortexPairFit
         The accepted ones, by `Origin`.
     refused : mapping of str to str
-        Why there is no other.
+        Reasons for which there is no other.
     method : str, optional
-        By which the wind vectors were retrieved.
+        That of the wind vectors.
     """
     vectors = f" of the {METHOD_NAMES[method]}" if method else ""
     purpose = (
@@ -81,11 +81,11 @@ def vortex_chapter(
     ]
     tables = [("The vortex pair", heads, pair)]
     if fits:
-        tables.append(("The pair's wind against the truth, all over the slab", heads[1:], errors))
+        tables.append(("The pair's wind against the truth, over the whole slab", heads[1:], errors))
     numbers = Tables(
         heading="Vortex parameters and standard errors",
         legend="Values with standard errors, at mid-time of the images; core radius and "
-        "circulation far from the core belong to the profile that was fitted (Lamb-Oseen), a true "
+        "circulation far from the core are those of the fitted profile (Lamb-Oseen), a true "
         "core radius is that of the largest swirl. True circulations and velocities are averages "
         "over rings of 5 to 15 m; a dash: undetermined.",
         tables=tables,
@@ -94,7 +94,7 @@ def vortex_chapter(
 
 
 def _verdict(metrics, name) -> str | None:
-    """How far circulation and places of a fit are off, in one sentence."""
+    """Errors of circulations and positions of a fit, in one sentence."""
     true, found = (
         {key: metrics.get(vortex_key(which, key)) for key, _, _ in _ROWS}
         for which in ("truth", name)
@@ -111,9 +111,9 @@ def _verdict(metrics, name) -> str | None:
         for side in sides
     ]
     return (
-        f"From the {ORIGIN_NAMES[name]}, the error of the circulation is {100 * deviations[0]:.1f} % (port) "
-        f"and {100 * deviations[1]:.1f} % (starboard), places by {places[0]:.2f} and "
-        f"{places[1]:.2f} m."
+        f"From the {ORIGIN_NAMES[name]}, the errors of the circulations are "
+        f"{100 * deviations[0]:.1f} % (port) and {100 * deviations[1]:.1f} % (starboard), those of "
+        f"the positions {places[0]:.2f} and {places[1]:.2f} m."
     )
 
 
