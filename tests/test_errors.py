@@ -29,7 +29,7 @@ def test_a_shortened_message_is_not_shortened_again():
 
 
 @pytest.mark.parametrize("text", ["\x1b[31mred", "\x9b31m", "\u202eright to left", "\udc80"])
-def test_what_a_terminal_obeys_is_escaped(text, capsys):
+def test_control_characters_are_escaped(text, capsys):
     assert printable(text).isascii() and "\\" in printable(text)
     shown = Terminal(width=80)
     shown.print(text)

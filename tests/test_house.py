@@ -265,7 +265,7 @@ def test_every_room_has_its_rule():
     assert len(found) < 10  # campaign and encounter are still to come
 
 
-def test_what_is_mended_leaves_the_list():
+def test_fixed_exceptions_leave_the_list():
     assert NOT_YET <= {one for rule in RULES for one in rule()}
 
 

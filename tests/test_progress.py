@@ -46,7 +46,7 @@ def test_a_pipe_gets_every_step_as_one_line():
     ]
 
 
-def test_a_terminal_gets_a_bar_whose_clock_goes_on():
+def test_a_terminal_gets_a_bar_with_a_running_clock():
     """After a step that was done to the end, too."""
     said = shown(terminal=True, pause=1.1)
     assert re.search(r"retrieving .* 0:00:01", said)

@@ -53,7 +53,7 @@ def test_help_loads_nothing_heavy():
     assert modules_after(code).isdisjoint(set(HEAVY) - {"rich"})
 
 
-def test_stub_names_exactly_what_is_public():
+def test_stub_lists_exactly_the_public_names():
     (listed,) = (
         ast.literal_eval(node.value)
         for node in stub().body

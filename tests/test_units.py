@@ -131,7 +131,7 @@ def test_anything_else_is_named_with_an_example(kind, text):
 
 
 @pytest.mark.parametrize("text", [2, 2.0, "2", "-0.1"])
-def test_an_angle_must_say_its_unit(text):
+def test_an_angle_needs_its_unit(text):
     with pytest.raises(ValidationError, match="has no unit; expected an angle such as '2 mrad'"):
         Quantities(angle=text)
 

@@ -14,7 +14,7 @@ from lidar_mi.errors import InputError
 GREEN = 532e-9
 
 
-def test_share_left_out_in_closed_form():
+def test_omitted_fraction_in_closed_form():
     """Area is log-normal too, about median exp(2 ln^2 sigma): a normal tail."""
     sizes = LogNormal(0.2e-6, 1.7, 0.03e-6, 1.5e-6)
     spread = math.log(1.7)

@@ -118,7 +118,7 @@ def test_negative_or_missing_values_are_refused(wake):
         extinction_from_tracer(wake)
 
 
-def test_a_wake_without_any_tracer_is_told():
+def test_a_wake_without_any_tracer_is_reported():
     wake = xr.Dataset({"tracer": ("y", np.zeros(4)), "aerosol": ("y", np.ones(4))})
     with pytest.raises(
         InputError, match=r"extinction.tracer: 0 everywhere, so there is no contrast"

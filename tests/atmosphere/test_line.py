@@ -139,7 +139,7 @@ def test_laser_and_air_add_their_variances(shape, share):
     assert line.weights[narrow].sum() == pytest.approx(share, abs=1e-12)
 
 
-def test_width_of_what_is_emitted():
+def test_width_of_the_emitted_line():
     assert laser_line(WAVELENGTH, 100e6).width == pytest.approx(100e6, rel=1e-6)
     assert laser_line(WAVELENGTH, 0.0).width == 0
 

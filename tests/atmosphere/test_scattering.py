@@ -88,7 +88,7 @@ def test_mixture_of_one_is_itself():
     assert alone.number_density == pytest.approx(table.number_density, rel=1e-12)
 
 
-def test_description_prints_what_the_table_says(tmp_path):
+def test_description_agrees_with_the_table(tmp_path):
     text = describe(haze())
     assert text["wavelength"] == "532 nm"
     assert text["extinction coefficient"] == "0.0001 m^-1"

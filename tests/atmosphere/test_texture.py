@@ -87,7 +87,7 @@ def test_structure_function_is_isotropic():
 
 
 @pytest.mark.parametrize("rms", [0.05, 0.2, 0.5])
-def test_mean_and_rms_are_those_asked_for(rms):
+def test_mean_and_rms_are_those_given(rms):
     factors = np.stack([corrsin_obukhov(Y, Z, rms, 10.0, seed).values for seed in range(5)])
     assert (factors > 0).all()
     # log is normalised exactly, so the rest is the sample's skewness.

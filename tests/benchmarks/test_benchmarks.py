@@ -127,7 +127,7 @@ def test_table_shows_case_sides_ratio_and_range():
 @pytest.mark.parametrize(
     ("module", "package"), [(transient, "mitransient"), (velocimetry, "openpiv")]
 )
-def test_missing_peer_is_a_row_that_says_what_to_type(module, package, monkeypatch):
+def test_missing_peer_is_a_row_with_the_command_to_type(module, package, monkeypatch):
     monkeypatch.setattr(report, "find_spec", lambda name: None if name == package else name)
     found = module.compare(1)
     assert found.rows == () and found.reason == f"skipped: pip install {package}"
@@ -136,7 +136,7 @@ def test_missing_peer_is_a_row_that_says_what_to_type(module, package, monkeypat
     assert found.reason in out.getvalue()
 
 
-def test_command_goes_on_after_a_failure_and_says_so(monkeypatch, tmp_path, capsys):
+def test_command_continues_after_a_failure_and_reports_it(monkeypatch, tmp_path, capsys):
     good = report.Comparison("Good", "we", "they", (report.row("a", "b", "", [1.0], [2.0]),))
 
     def compare(name):
@@ -160,7 +160,7 @@ def test_command_goes_on_after_a_failure_and_says_so(monkeypatch, tmp_path, caps
 @pytest.mark.parametrize(
     ("arguments", "message"), [(["speed"], "'speed' is none of"), (["-n", "0"], "--repeats: 0")]
 )
-def test_command_names_what_it_does_not_know(arguments, message, capsys):
+def test_command_names_unknown_arguments(arguments, message, capsys):
     with pytest.raises(SystemExit) as stop:
         command.main(arguments)
     assert stop.value.code == 2 and message in capsys.readouterr().err
@@ -291,7 +291,7 @@ def test_cross_correlation_sees_the_vortices():
 
 
 @pytest.mark.skipif(find_spec("openpiv") is None, reason="openpiv is not installed")
-def test_openpiv_finds_the_same_wind():
+def test_openpiv_retrieves_the_same_wind():
     pair = cases.vortex_pair_images(columns=112, rows=88)
     ours = velocimetry.cross_correlation(pair, 16, 24)
     for theirs, start in (
@@ -331,7 +331,7 @@ def test_fringes_compare(variant):
     assert len(rates) == 4 and all(line.ours > 0 and line.other > 0 for line in rates)
 
 
-def test_methods_table_has_every_method_and_says_which_peer_is_missing(monkeypatch):
+def test_methods_table_has_every_method_and_lists_missing_peers(monkeypatch):
     monkeypatch.setattr(methods, "NOISE", (0.01,))
     monkeypatch.setattr(methods, "find_spec", lambda name: None)
     # both vortices lie in the image: without one the fit takes long

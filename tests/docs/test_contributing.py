@@ -11,7 +11,7 @@ GUIDE = ROOT / "CONTRIBUTING.md"
 pytestmark = pytest.mark.skipif(not GUIDE.is_file(), reason="a page of the source tree")
 
 
-def test_names_what_is_there():
+def test_named_files_exist():
     quoted = re.findall(r"`([^`\n]+)`", GUIDE.read_text(encoding="utf-8"))
     paths = [q for q in quoted if re.fullmatch(r"[\w./]+(/|\.(py|md|yml|yaml|toml))", q)]
     paths = [path for path in paths if "NAME" not in path]

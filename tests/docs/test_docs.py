@@ -316,7 +316,7 @@ def check_xml(block):
 
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("pages", [["docs/theory.md"], ["docs/user_guide.md", "README.md"]])
-def test_what_is_printed_runs(pages, workplace, capsys):
+def test_printed_code_runs(pages, workplace, capsys):
     """Block by block, as a reader would: files written by one are there for the next.
 
     Of the README, which names files of the reader's own, command lines are run by no test: see

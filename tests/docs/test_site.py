@@ -34,7 +34,7 @@ def test_every_page_is_listed_and_there():
     assert found == sorted(set(DOCS.rglob("*.md")) - {DOCS / "index.md"})
 
 
-def test_pictures_are_there():
+def test_images_exist():
     for page in DOCS.rglob("*.md"):
         for picture in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page.read_text()):
             assert (page.parent / picture).is_file(), f"{page.name}: {picture}"

@@ -82,12 +82,12 @@ def test_images_with_light_are_not(changes):
     check_brightness(experiment, air(1e-3), plan, 1.0)
 
 
-def test_check_refuses_what_the_retrieval_would_fail_on(tmp_path):
+def test_check_refuses_input_on_which_the_retrieval_would_fail(tmp_path):
     with pytest.raises(InputError, match=r"render\.estimator: analog"):
         list(sections(check(small() | {"render": {"estimator": "analog"}}), tmp_path))
 
 
-def test_memory_against_what_runs_took():
+def test_memory_against_that_of_runs():
     """Resident memory at most, measured: 0.7 GB for wake_backscatter; 1.02 GB for 110 x 70 beams,
     200 gates, 400 samples, two orders and vectors at every fourth pixel."""
     whole = {"retrieval": {"methods": ["cc", "ws"]}, "render": {"samples_per_beam": 64}}
@@ -103,7 +103,7 @@ def test_memory_against_what_runs_took():
 
 
 @pytest.mark.parametrize(("gates", "fits"), [(1, True), (100, True), (2000, False), (10000, False)])
-def test_a_run_that_memory_does_not_hold_is_refused_with_what_it_would_take(gates, fits):
+def test_a_run_beyond_the_memory_is_refused_with_its_requirement(gates, fits):
     experiment, plan = planned(
         scan={"gate_count": gates}, render={"memory": "8 GB", "max_order": 4}
     )

@@ -86,7 +86,7 @@ def test_progress_is_shown_unless_someone_listens(done, monkeypatch, capsys):
     assert capsys.readouterr().err == "" and "rendering" in steps
 
 
-def test_an_experiment_shows_what_is_not_default():
+def test_an_experiment_shows_changed_keys():
     experiment = check(small("shown", spacing=0.25) | {"seed": 3})
     said = repr(experiment).splitlines()
     assert said[0] == "experiment shown; keys without their default"

@@ -28,7 +28,7 @@ def names(stages):
     return [stage.name for stage in stages]
 
 
-def test_stages_stand_behind_what_they_need():
+def test_stages_follow_those_they_need():
     stages = [Stage("c", add, ("b", "a")), Stage("b", add, ("a",)), Stage("a", add, ("given",))]
     assert names(in_order(stages, ("given",))) == ["a", "b", "c"]
     # those that need nothing of each other stay as they are
@@ -49,7 +49,7 @@ def test_stages_that_do_not_go_together_are_named(stages, message):
         in_order(stages)
 
 
-def test_a_result_is_made_of_what_it_needs_in_that_order():
+def test_a_result_is_computed_from_its_needs_in_order():
     seen = []
     stage = Stage("c", lambda experiment, *given, log: seen.append(given), ("b", "a"))
     result_of(stage, None, {"a": 1, "b": 2, "other": 3}, Log())

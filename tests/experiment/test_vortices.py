@@ -47,7 +47,7 @@ def test_vortex_fit_alone_has_no_vectors():
     assert image_vectors(experiment, winds(["vortex_fit"])) is None
 
 
-def test_a_sensor_s_own_method_is_taken_and_the_report_says_it():
+def test_a_sensor_s_own_method_is_used_and_reported():
     experiment = lm.load_experiment("wake_sensor")
     assert vectors_method(experiment) == experiment.sensor.method
     chapter = vortex_chapter({}, {}, {}, [], "multipass")

@@ -47,7 +47,7 @@ def test_the_promise_holds(kind, sandbox):
 
 
 @pytest.mark.parametrize("path", CORPUS, ids=[path.stem for path in CORPUS])
-def test_what_once_broke_holds(path, sandbox):
+def test_former_failures_stay_fixed(path, sandbox):
     assert fault(Case.from_text(path.read_text()), sandbox) is None
 
 

@@ -249,7 +249,7 @@ def test_bad_light_is_refused(changes, message):
 
 
 @pytest.mark.parametrize("name", ["gate_start", "gate_kind", "environment_extinction"])
-def test_scan_that_does_not_say_its_gates(name):
+def test_scan_without_its_gates(name):
     scan = a_scan()
     del scan.attrs[name]
     with pytest.raises(InputError, match=f"attribute {name} is missing"):

@@ -51,7 +51,7 @@ def test_directions_as_a_pilot_reads():
     assert np.allclose(elevation, np.linspace(14, -14, 7)[:, None])
 
 
-def test_a_wing_of_sixty_metres_is_held_from_76_m_on():
+def test_a_wing_of_sixty_metres_is_covered_beyond_76_m():
     reach = (SCAN.ranges(LIDAR)[:, None] * SCAN.directions())[:, 1]
     assert reach.max() == pytest.approx(30, abs=0.1)
 
@@ -62,7 +62,7 @@ def test_planar_and_spherical_gates():
     assert np.allclose(DopplerScan(gates="spherical").ranges(LIDAR), 76)
 
 
-def test_one_direction_looks_ahead():
+def test_one_direction_points_ahead():
     assert np.allclose(DopplerScan(columns=1, rows=1).directions(), [[1, 0, 0]])
 
 

@@ -70,7 +70,7 @@ def test_depolarization_of_a_rayleigh_scatterer():
     assert linear_depolarization(1.0, (1 - d) / (1 + d)) == pytest.approx(d)
 
 
-def test_nothing_received_has_no_depolarization():
+def test_without_signal_there_is_no_depolarization():
     assert np.isnan(linear_depolarization(0.0, 0.0))
     assert np.isnan(depolarization_stderr(0.0, 0.0, 0.0, 0.0, 0.0))
     assert np.isnan(depolarization_stderr_bound(0.0, 0.0, 0.0, 64))
@@ -98,7 +98,7 @@ def test_error_of_independent_channels():
     assert found == pytest.approx(x / p * math.hypot(dp / p, dx / x), rel=1e-12)
 
 
-def test_photons_that_agree_leave_no_error():
+def test_identical_samples_have_no_error():
     """S1 = 0.6 S0 photon by photon, in float32 as in an image: 3e-4 of S0's error remain."""
     s0, s1, first = np.float32(8e-11), np.float32(0.6 * 8e-11), np.float32(8e-13)
     assert depolarization_stderr(s0, s1, first, np.float32(0.6) * first, np.float32(1)) < 3e-6
@@ -111,7 +111,7 @@ def test_bound_is_never_below_the_spread(kind):
     assert depolarization_stderr_bound(s0.mean(), s1.mean(), first, PHOTONS) > spread
 
 
-def test_bound_is_reached_by_photons_of_one_kind_each():
+def test_bound_is_reached_by_samples_of_a_single_order():
     """Half of equal photons cross-polarised: delta = 1, and its error is 2 / sqrt(n)."""
     random = np.random.default_rng(2)
     n = 10_000
@@ -176,7 +176,7 @@ def test_light_without_the_papers_polarization_is_refused(attrs, message):
 
 
 @pytest.mark.parametrize("name", ["samples_per_beam", "estimator", "gate_count"])
-def test_bound_needs_the_number_of_photons(name):
+def test_bound_needs_the_number_of_samples(name):
     scan = a_scan()
     del scan.attrs[name]
     with pytest.raises(InputError, match=f"attribute {name} is missing"):

@@ -53,7 +53,7 @@ def test_angles_are_equidistant_and_given_for_each_time():
     assert abs(first.y[-1] - second.y[-1]) < 0.7 and abs(first.y[-1] - second.y[-1]) > 0.05
 
 
-def test_single_column_looks_straight_ahead():
+def test_single_column_points_straight_ahead():
     (scan,) = plan_scans(Scan(aim="angles", columns=1, rows=1), Y, Z, (0.0,))
     assert scan.directions().tolist() == [[1, 0, 0]]
 

@@ -92,7 +92,7 @@ def test_temporary_files_of_living_processes_stay(tmp_path):
     assert sorted(content(tmp_path)) == [("a.txt", "a"), ("b.txt", "b")]
 
 
-def test_what_is_no_file_is_not_replaced(tmp_path):
+def test_no_ordinary_file_is_not_replaced(tmp_path):
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "pipe")
     for place in (tmp_path / "folder", tmp_path / "pipe", "/dev/null"):

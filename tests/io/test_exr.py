@@ -272,7 +272,7 @@ class TestErrors:
         assert "declares 3.6e+09 bytes in a file of" in self.fault(path)
 
 
-def test_what_float32_cannot_hold_is_not_written_as_infinity(tmp_path):
+def test_values_beyond_float32_are_not_written_as_infinity(tmp_path):
     scan = make_scan()
     scan["S0"] = scan["S0"].astype(float)
     scan["S0"][0, 0, 0] = 1e300

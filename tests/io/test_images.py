@@ -105,7 +105,7 @@ def test_spacing_is_needed(tmp_path, spacing):
         read_image(path, spacing=spacing)
 
 
-def test_a_colour_picture_is_the_same_to_both_commands(tmp_path, monkeypatch):
+def test_a_colour_image_is_the_same_to_both_commands(tmp_path, monkeypatch):
     """The mean of the colours, transparency left out."""
     random = np.random.default_rng(2)
     colours = random.integers(0, 256, (40, 50, 4), dtype=np.uint8)

@@ -22,7 +22,7 @@ def test_round_trip(tmp_path):
         assert "_FillValue" not in stored["y"].encoding  # CF 2.5.1
 
 
-def test_netcdf_3_and_4_are_told_by_their_content(tmp_path):
+def test_netcdf_3_and_4_are_distinguished_by_their_content(tmp_path):
     for engine, name in (("scipy", "old.nc"), ("h5netcdf", "new.cdf")):
         DATA.to_netcdf(tmp_path / name, engine=engine)
         with open_netcdf(tmp_path / name) as data:
@@ -47,7 +47,7 @@ def test_damaged_files_give_one_line(tmp_path, cut):
 @pytest.mark.parametrize(
     ("shape", "chunks"), [((30_000, 30_000), (10, 10)), ((10, 10), None), ((9_000, 9_000), None)]
 )
-def test_what_a_file_declares_is_bounded_by_what_it_is(tmp_path, shape, chunks):
+def test_declared_size_is_bounded_by_the_file_size(tmp_path, shape, chunks):
     """Values that were never written take no room in the file."""
     path = tmp_path / "sparse.nc"
     with h5py.File(path, "w") as file:

@@ -7,7 +7,7 @@ from PIL import Image
 from lidar_mi.io.png import write_png
 
 
-def test_figures_are_written_whole_and_cropped_where_asked(tmp_path):
+def test_figures_are_written_whole_and_cropped_on_request(tmp_path):
     figure = Figure(figsize=(4, 3))
     figure.add_axes((0.4, 0.4, 0.2, 0.2)).imshow(np.eye(3))
     write_png(figure, tmp_path / "whole.png")

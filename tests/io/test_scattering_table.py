@@ -71,7 +71,7 @@ def test_unreadable_files(tmp_path):
 
 
 @pytest.mark.parametrize("name", sorted(AEROSOLS))
-def test_shipped_table_is_what_it_says(name):
+def test_shipped_table_agrees_with_its_header(name):
     """`read_table` checks normalisation, inequalities and the relations at 0 and 180 degrees."""
     table = read_table(shipped(name))
     preset = AEROSOLS[name]
@@ -136,7 +136,7 @@ def test_shipped_spheroids_can_be_made_again(scatrs, name):
     assert again.extinction_cross_section == pytest.approx(table.extinction_cross_section, rel=5e-3)
 
 
-def test_named_aerosol_comes_from_the_shipped_table_only_at_its_wavelength(monkeypatch):
+def test_named_aerosol_is_from_the_shipped_table_only_at_its_wavelength(monkeypatch):
     made = []
     monkeypatch.setattr(scattering_table, "make_table", lambda *given, **_: made.append(given))
     assert aerosol_table("dust", GREEN).name == "dust" and not made

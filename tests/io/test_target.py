@@ -32,7 +32,7 @@ def test_an_input_is_never_a_target(tmp_path):
             check_target(tmp_path / name, [tmp_path / "other.exr", path], overwrite=True)
 
 
-def test_what_is_no_file_is_never_a_target(tmp_path):
+def test_no_ordinary_file_is_never_a_target(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "null").symlink_to("/dev/null")
     for path in (tmp_path, tmp_path / "pipe", tmp_path / "null", "/dev/null"):
@@ -51,7 +51,7 @@ def test_what_is_no_file_is_never_a_target(tmp_path):
         b"\xff",
     ],
 )
-def test_files_of_others_are_replaced_only_when_asked(tmp_path, content):
+def test_foreign_files_are_replaced_only_on_request(tmp_path, content):
     path = tmp_path / "theirs"
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"is no result of lidar-mi; .*--overwrite"):
@@ -67,7 +67,7 @@ def test_winds_of_others_are_not_ours(tmp_path):
     check_target(tmp_path / "ours.nc")
 
 
-def test_pictures_of_ours_are_known(tmp_path):
+def test_our_images_are_recognised(tmp_path):
     write_png(Figure(), tmp_path / "ours.png")
     check_target(tmp_path / "ours.png")
     Figure().savefig(tmp_path / "theirs.png")

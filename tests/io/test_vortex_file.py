@@ -68,7 +68,7 @@ def test_names_of_older_files_are_read(tmp_path):
     )
 
 
-def test_what_is_no_file_of_pairs_is_named(tmp_path):
+def test_a_file_without_pairs_is_named(tmp_path):
     path = tmp_path / "vortex.json"
     matrix = some_pair().covariance.tolist()
     matrix[0][1] += 1.0
@@ -94,7 +94,7 @@ def test_what_is_no_file_of_pairs_is_named(tmp_path):
         assert message in str(error.value) and "\n" not in str(error.value)
 
 
-def test_info_tells_a_pair(tmp_path):
+def test_info_prints_a_pair(tmp_path):
     write_vortices(tmp_path / "vortex.json", {"images": some_pair()})
     ((title, rows),) = sections(str(tmp_path / "vortex.json"))
     assert "images" in title and "lamb oseen" in title

@@ -201,7 +201,7 @@ def test_values_that_are_not_finite(write):
     fails(write(data), "'y'", "index 3", time=1.0)
 
 
-def test_a_negative_tracer_is_named_where_it_is_asked_for(write):
+def test_a_negative_tracer_is_named_where_it_is_used(write):
     data = example()
     data = data.rename(tracer="smoke")
     data.smoke[0, 2, 3, 4] = -0.25

@@ -32,7 +32,7 @@ def test_included_files_are_looked_at(tmp_path):
         check_scene_file(scene)
 
 
-def test_what_is_no_xml_is_named(tmp_path):
+def test_invalid_xml_is_named(tmp_path):
     path = tmp_path / "scene.xml"
     path.write_text("<scene><shape></scene>")
     with pytest.raises(

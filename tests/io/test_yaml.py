@@ -31,7 +31,7 @@ PLAIN = st.recursive(
 
 
 @given(PLAIN)
-def test_plain_data_comes_back(data):
+def test_plain_data_round_trip(data):
     assert parse_yaml(to_yaml(data), "text") == data
 
 

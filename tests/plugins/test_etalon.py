@@ -283,7 +283,7 @@ def test_mueller_matrix_turns_fields_as_their_s_and_p_parts(optics, mode, compon
 
 
 @pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_rgb"], indirect=True)
-def test_both_lobes_together_lose_nothing():
+def test_both_lobes_together_conserve_energy():
     """Drawn with their shares: every weight is T + R, and the lobes' shares are T and R."""
     bsdf = etalon(absorption=0.03)
     number = 1 << 16

@@ -195,7 +195,7 @@ def test_both_directions_give_the_analytic_rings(estimator, shape, lens, statist
         pytest.param("forward", "sampled", LENS, 32, None, marks=pytest.mark.slow),
     ],
 )
-def test_velocity_of_a_picture_without_noise(estimator, shape, lens, paths, allowed):
+def test_velocity_of_an_image_without_noise(estimator, shape, lens, paths, allowed):
     """Full size: 960 x 780 pixels of 7.4 um. Maximum likelihood of the analytic rings.
 
     The camera's direction has next to no noise: 0.005 m/s, with a real lens, for which some lines
@@ -238,7 +238,7 @@ def test_uneven_light_and_a_centre_off_the_middle(estimator, statistics):
 
 
 @pytest.mark.parametrize("estimator", ["camera", "forward"])
-def test_picture_is_upright(estimator):
+def test_image_is_upright(estimator):
     """A plate tilted towards the top left moves the rings there: top is +z, left is +y."""
     angle = np.degrees(np.array([2e-3, 3e-3]))
     t = mi.ScalarTransform4f()
@@ -540,7 +540,7 @@ def test_mitsuba_s_own_integrator_sees_the_same_rings(statistics):
 
 
 @pytest.mark.parametrize("estimator", ["camera", "forward"])
-def test_velocity_gap_and_line_compile_nothing(estimator):
+def test_velocity_gap_and_line_need_no_compilation(estimator):
     """A first picture compiles; others, of other scenes too, do not."""
 
     def misses(loaded, seed):

@@ -91,7 +91,7 @@ class TestAnalogAgreesWithGated:
 
 
 @pytest.mark.parametrize("case", ["gated", "gated, half in view", "analog"])
-def test_standard_error_is_honest(world, statistics, case):
+def test_standard_error_is_correct(world, statistics, case):
     """100 seeds x 100 equal beams: z-scores have unit variance, in all, per seed, per beam.
 
     All beams see the same (spherical gates, homogeneous air), so their grand mean is the truth.
@@ -130,7 +130,7 @@ def test_standard_error_is_honest(world, statistics, case):
 
 
 @pytest.mark.parametrize("photons", [64, 400])
-def test_standard_error_is_honest_in_a_thin_textured_slab(world, statistics, photons):
+def test_standard_error_is_correct_in_a_thin_textured_slab(world, statistics, photons):
     """The lidar's own case: optical depth 0.008, cells of 20 % variation, few photons a beam.
 
     Null collisions are rare there. If each of them changed the transmittance much, most error
@@ -217,7 +217,7 @@ class TestPasses:
         assert parts == pytest.approx(whole, rel=2e-6, abs=1e-6 * whole[:, 0].mean())
         assert parts_error == pytest.approx(whole_error, rel=1e-4)
 
-    def test_progress_counts_up_to_all_photons(self, world):
+    def test_progress_counts_up_to_all_samples(self, world):
         scene = scan(world, (5, 3), integrator={"samples_per_pass": 300})
         calls = []
         scene.integrator().progress = lambda done, total: calls.append((done, total))
@@ -297,7 +297,7 @@ class TestKernels:
         assert kernels(lambda: dr.eval(mi.render(scene, seed=4, spp=64))) <= first
 
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
-    def test_photons_are_traced_once(self, world, estimator):
+    def test_samples_are_traced_once(self, world, estimator):
         """One large kernel a pass: statistics must not make Dr.Jit trace them again."""
         scene = scan(world, integrator={"estimator": estimator})
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
@@ -309,7 +309,7 @@ class TestKernels:
 
 class TestSeeds:
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
-    def test_same_seed_same_picture_other_seed_another(self, world, estimator):
+    def test_same_seed_same_image_other_seed_another(self, world, estimator):
         scene = scan(world, integrator={"estimator": estimator})
         one, again, other = (world.render(scene, seed=s, spp=2000)[0] for s in (5, 5, 6))
         if estimator == "gated":
@@ -319,7 +319,7 @@ class TestSeeds:
         lit = one[0, 0] > 0
         assert lit.any() and (one[0, 0][lit] != other[0, 0][lit]).all()
 
-    def test_more_samples_add_to_the_same_photons(self, world):
+    def test_more_samples_add_to_the_same_ones(self, world):
         """A sample's random numbers depend on seed, beam and number, not on the scan's size."""
         small = scan(world, (1, 1), azimuth_min_deg=0.0, azimuth_max_deg=0.0)
         large = world.scene(
@@ -373,7 +373,7 @@ class TestOpaqueTargets:
 
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
     @pytest.mark.parametrize("x", [300.0, 495.0])
-    def test_nothing_comes_from_behind_a_wall(self, world, estimator, x):
+    def test_no_light_from_behind_a_wall(self, world, estimator, x):
         stokes, error = world.render(self.scene(world, self.wall(x), estimator), spp=2000)
         assert (stokes == 0).all() and (error == 0).all()
 

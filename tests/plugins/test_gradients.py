@@ -124,7 +124,7 @@ def test_blurred_slab_is_recovered_by_gradient_descent(slab):
     assert float(misfit(1000).array[0]) < 0.02 * before
 
 
-def test_gradient_of_the_albedo_is_the_picture_over_the_albedo(variant, world):
+def test_gradient_of_the_albedo_is_the_image_over_the_albedo(variant, world):
     """Single scattering is proportional to the albedo where the vertex is: Euler's relation."""
     medium = world.homogeneous(2e-3, albedo=0.8)
     scene = world.scene(

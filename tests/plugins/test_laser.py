@@ -129,7 +129,7 @@ def test_unpolarised_weight_is_the_pulse_energy(variant):
 @pytest.mark.parametrize(
     "variant", ["llvm_ad_spectral", "llvm_ad_spectral_polarized"], indirect=True
 )
-def test_spectral_photons_carry_the_wavelength(variant):
+def test_spectral_rays_have_the_wavelength(variant):
     half = mi.Point2f(0.5)
     ray, _ = laser(wavelength=354.7e-9).sample_ray(mi.Float(0), mi.Float(0.5), half, half)
     assert np.array(ray.wavelengths).ravel() == pytest.approx(354.7)

@@ -274,7 +274,7 @@ class TestGates:
         both = np.sqrt((error**2).sum(0) + total_error[0] ** 2)
         statistics.assert_agree(many[:, 0].sum(0), both, together[0, 0], gates * photons)
 
-    def test_every_gate_gets_the_same_number_of_photons(self, world):
+    def test_every_gate_gets_the_same_number_of_samples(self, world):
         """Samples that do not divide by the gates are rounded up: the same picture."""
         pictures = [
             world.render(

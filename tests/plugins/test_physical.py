@@ -117,7 +117,7 @@ def test_a_scene_that_is_mended_renders_again(world):
     np.testing.assert_array_equal(np.array(mi.render(loaded, seed=1)), first)
 
 
-def test_what_has_passed_is_not_looked_at_again(world, monkeypatch):
+def test_passed_arrays_are_not_checked_again(world, monkeypatch):
     """Every array once; then that which is replaced, also where its values stay the same."""
     loaded = scene(world)
     physical = loaded.integrator().physical
@@ -159,7 +159,7 @@ def shifted(*way):
     ],
     ids=["NaN", "infinite", "stretched", "mirrored", "flat"],
 )
-def test_instruments_are_turned_and_shifted_alone(kind, place):
+def test_poses_are_rotations_and_translations_only(kind, place):
     film = {"type": "hdrfilm", "width": 1, "height": 1, "rfilter": {"type": "box"}}
     own = {
         "scanning_lidar": {"gate_start": 5.0, "gate_stop": 6.0, "laser": {"type": "laser"}},

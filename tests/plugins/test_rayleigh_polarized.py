@@ -121,7 +121,7 @@ def test_stokes_vectors_are_those_of_radiating_dipoles(optics, depolarization):
 
 
 @pytest.mark.parametrize("depolarization", [0.0, 0.028, 0.3])
-def test_depolarisation_is_what_its_name_says(optics, depolarization):
+def test_depolarisation_factor_is_that_of_natural_light(optics, depolarization):
     rng = np.random.default_rng(4)
     incident = optics.unit_vectors(rng, 100)
     across = optics.perpendicular(incident, rng)

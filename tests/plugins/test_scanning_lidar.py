@@ -44,7 +44,7 @@ class TestWherePixelsLook:
         assert elevation == pytest.approx(expected, abs=1e-5)
         assert np.linalg.norm(found, axis=-1) == pytest.approx(1, abs=1e-7)
 
-    def test_single_pixel_looks_along_the_middle_of_the_angles(self, world):
+    def test_single_pixel_points_to_the_middle_of_the_angles(self, world):
         sensor = mi.load_dict(
             world.lidar(
                 (1, 1),
@@ -59,12 +59,12 @@ class TestWherePixelsLook:
         assert math.degrees(math.atan2(y, x)) == pytest.approx(3, abs=1e-5)
         assert math.degrees(math.atan2(z, x)) == pytest.approx(-3, abs=1e-5)
 
-    def test_without_angles_a_single_pixel_looks_straight_ahead(self, world):
+    def test_without_angles_a_single_pixel_points_straight_ahead(self, world):
         assert directions(mi.load_dict(world.lidar((1, 1), GATE)))[0] == pytest.approx([1, 0, 0])
 
     @pytest.mark.parametrize("row", [0, 2])
     @pytest.mark.parametrize("column", [0, 3])
-    def test_a_cloud_lights_the_pixel_that_looks_at_it(self, world, row, column):
+    def test_a_cloud_is_imaged_by_the_pixel_that_points_at_it(self, world, row, column):
         """Largest elevation in the top row, largest azimuth in the left column, in the picture."""
         azimuth = np.radians(np.linspace(4, -4, 4))[column]
         elevation = np.radians(np.linspace(3, -3, 3))[row]
@@ -100,7 +100,7 @@ class TestWherePixelsLook:
         sensor = mi.load_dict(world.lidar((3, 2), GATE, directions=source, gate_kind="spherical"))
         assert np.abs(directions(sensor) - optics.normalized(table)).max() < 1e-6
 
-    def test_sample_ray_looks_along_the_beam_of_the_film_position(self, world):
+    def test_sample_ray_is_along_the_beam_of_the_film_position(self, world):
         pose = mi.ScalarTransform4f().translate([10, -2, 3]).rotate([0, 0, 1], 30)
         sensor = mi.load_dict(
             world.lidar(
@@ -215,7 +215,7 @@ class TestUpdates:
             ),
         )
 
-    def test_changed_parameters_give_the_picture_of_a_new_scene(self, world):
+    def test_changed_parameters_give_the_image_of_a_new_scene(self, world):
         angles = {"azimuth_min_deg": -4.0, "azimuth_max_deg": 4.0, "elevation_max_deg": 2.0}
         scene = self.slab(world, GATE, **angles)
         before, _ = world.render(scene, seed=1)

@@ -110,7 +110,7 @@ def same_scene(world):
     )
 
 
-def test_xml_and_dictionary_give_the_same_picture_in_every_variant(world, scene_file):
+def test_xml_and_dictionary_give_the_same_image_in_every_variant(world, scene_file):
     """Back and forth between variants, in one process."""
     pictures = {}
     for name in (

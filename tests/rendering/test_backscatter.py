@@ -177,7 +177,7 @@ class TestMovingBlob:
 
     @pytest.mark.parametrize("aim", ["grid", "angles"])
     @pytest.mark.parametrize("gates", ["planar", "spherical"])
-    def test_it_is_seen_where_it_is(self, tmp_path, aim, gates):
+    def test_a_scatterer_is_imaged_at_its_position(self, tmp_path, aim, gates):
         """0.05 px = 25 mm, in the image and in its file; seed 1.
 
         Axes of the image are where beams meet the plane in the middle of the gates. A spherical
@@ -255,7 +255,7 @@ class TestScans:
                 plane(1e-3 * rng.uniform(0.5, 1.5, (len(Z), len(Y)))), plans[0], BackscatterLidar()
             )
 
-    def test_a_moved_scene_gives_the_picture_of_a_new_one(self):
+    def test_a_moved_scene_gives_the_image_of_a_new_one(self):
         """The second scan from the first's scene, and rendered alone."""
         plans = self.plans()
         fields = list(self.fields(plans))
@@ -284,7 +284,7 @@ class TestScans:
         z = (one["S0"] - two["S0"]) / np.hypot(one["S0_stderr"], two["S0_stderr"])
         assert float(np.abs(z).max()) < 5
 
-    def test_the_largest_seed_is_told_as_it_was_used(self, tmp_path):
+    def test_the_largest_seed_is_recorded_as_used(self, tmp_path):
         """In the file too, whose whole numbers have 32 bits with a sign."""
         plans = self.plans()
         fields = list(self.fields(plans))

@@ -81,7 +81,7 @@ def rendered(scene, path=None, passes=None):
         (ring_scene, "forward"),
     ],
 )
-def test_a_killed_image_goes_on_where_it_was(variant, tmp_path, monkeypatch, make, estimator):
+def test_a_killed_image_resumes_where_it_was(variant, tmp_path, monkeypatch, make, estimator):
     """Killed after every single pass, one pass in each life."""
     monkeypatch.setattr(batches, "INTERVAL", 0)
     scene, path = make(estimator), tmp_path / "batches.npz"

@@ -120,7 +120,7 @@ def test_coatings_reach_the_scene():
     assert z.var() < 1 + 5 * math.sqrt(2 / z.size)
 
 
-def test_velocities_come_in_turn_and_are_said():
+def test_velocities_are_rendered_in_turn_and_reported():
     speeds = [-250.0, 0.0, 33.3]
     pictures = render(v_los=speeds)
     camera = FringeCamera(**CAMERA)
@@ -137,7 +137,7 @@ def test_velocities_come_in_turn_and_are_said():
     assert pictures[0].attrs["units"] and pictures[0]["S0"].attrs["units"] == "1"
 
 
-def test_picture_and_header_survive_the_file(tmp_path):
+def test_image_and_header_survive_the_file(tmp_path):
     (picture,) = render(Etalon(bow=3e-9), v_los=[12.5])
     path = tmp_path / "fringes.exr"
     write_fringes(path, picture)
@@ -219,7 +219,7 @@ def test_lens_and_field_fit_any_camera():
         (lambda: render(camera={"centre": (-500.0, 0.0)}, lens="singlet"), "field: .*up to 0.05"),
     ],
 )
-def test_what_cannot_be_rendered_is_said(call, message):
+def test_impossible_renderings_are_reported(call, message):
     with pytest.raises(InputError, match=message):
         call()
 

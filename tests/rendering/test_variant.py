@@ -26,7 +26,7 @@ def test_others_are_refused(variant, name):
     assert mi.variant() == variant
 
 
-def test_a_variant_that_cannot_run_here_says_so(variant):
+def test_a_variant_that_cannot_run_here_is_reported(variant):
     """Where there is a CUDA device it can, and is set."""
     try:
         use_variant("cuda_ad_mono_polarized")

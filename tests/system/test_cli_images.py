@@ -62,7 +62,7 @@ def test_rendered_slab_obeys_the_lidar_equation(there, lidar_mi):
     assert (scan["Y"].values / theory).mean() == pytest.approx(1, abs=1e-3)
 
 
-def test_scene_says_how_many_photons_when_the_command_does_not(there, lidar_mi):
+def test_number_of_samples_is_the_scene_s_by_default(there, lidar_mi):
     assert lidar_mi("render", "slab.xml", "-o", "a.exr")[0] == 0
     assert read_scan(there / "a.exr").attrs["samples_per_beam"] == 64
 
@@ -81,7 +81,7 @@ def test_retrieve_equals_the_run(demo, there, lidar_mi):
         assert f"{float((wind['flag'] == 0).mean()):.1%} valid" in out
 
 
-def test_retrieve_takes_any_picture_with_a_spacing(there, lidar_mi):
+def test_retrieve_accepts_any_image_with_a_spacing(there, lidar_mi):
     """A random picture moved by 2 px to the left (+y) and 1 px down, 0.25 m a pixel, 0.5 s."""
     noise = np.random.default_rng(5).random((60, 70)).astype(np.float32)
     noise = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1) + 1).astype(np.float32)
@@ -112,7 +112,7 @@ def test_retrieve_takes_any_picture_with_a_spacing(there, lidar_mi):
         assert np.median(wind["w"].values[valid]) == pytest.approx(-0.5, abs=0.05)
 
 
-def test_retrieve_brings_scans_by_angles_onto_one_grid(there, lidar_mi):
+def test_retrieve_resamples_scans_by_angles_to_one_grid(there, lidar_mi):
     assert lidar_mi("render", "slab.xml", "-s", 4, "-o", "far.exr")[0] == 0
     assert (
         lidar_mi(
@@ -138,7 +138,7 @@ def tool(name, package):
     return path
 
 
-def test_exrheader_reads_the_pictures(demo):
+def test_exrheader_reads_the_images(demo):
     done = subprocess.run(
         [tool("exrheader", "openexr"), demo.folder / "image_t2.exr"],
         capture_output=True,
@@ -161,7 +161,7 @@ def test_exrheader_reads_the_pictures(demo):
         assert line in done.stdout
 
 
-def test_iinfo_reads_the_pictures(demo):
+def test_iinfo_reads_the_images(demo):
     done = subprocess.run(
         [tool("iinfo", "openimageio-tools"), "-v", demo.folder / "image_t1.exr"],
         capture_output=True,

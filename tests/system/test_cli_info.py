@@ -41,7 +41,7 @@ def test_info_on_a_run_folder(demo, lidar_mi):
     assert f"{demo.metrics['true_wind.rms_w']:.2f}" in out and "no skill" in out
 
 
-def test_info_on_a_picture_and_on_winds(demo, lidar_mi):
+def test_info_on_an_image_and_on_winds(demo, lidar_mi):
     code, out, _ = lidar_mi("info", demo.folder / "image_t1.exr")
     assert code == 0
     for word in ("gate000.S0_stderr", "219 x 139", "float32", "wavelength", "samples_per_beam"):

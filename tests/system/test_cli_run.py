@@ -13,7 +13,7 @@ from lidar_mi.io.exr import read_scan
 from tests.support.command_line import files_in, words_of
 
 
-def test_run_writes_where_it_is_told_and_says_so(there, lidar_mi, quick):
+def test_run_writes_into_the_given_folder_and_prints_it(there, lidar_mi, quick):
     code, out, err = lidar_mi(
         "run",
         "tiny.yaml",
@@ -46,7 +46,7 @@ def test_run_folder_is_named_after_the_experiment(there, lidar_mi, quick):
     assert lidar_mi("run", "tiny.yaml", "--set", "seed=2", "--overwrite")[0] == 0
 
 
-def test_check_tells_what_a_run_would_do(there, lidar_mi):
+def test_check_summarises_a_run(there, lidar_mi):
     """Numbers that follow from the file by hand; nothing is written."""
     changes = ("scan.range=210 m", "platform.speed=70 m/s", "platform.dt=0.2 s")
     before = files_in(there)
@@ -88,7 +88,7 @@ def test_names_are_no_markup(there, lidar_mi):
         pytest.param(signal.SIGTERM, "stopped by SIGTERM", marks=pytest.mark.slow),
     ],
 )
-def test_a_signal_stops_cleanly_and_the_run_goes_on(there, number, said):
+def test_a_signal_stops_cleanly_and_the_run_can_be_resumed(there, number, said):
     """In the middle of rendering, where Dr.Jit puts its own exception in the interrupt's place."""
     slow = [
         "run",

@@ -56,20 +56,20 @@ def test_an_input_is_never_replaced(images, lidar_mi, command, target):
     ("target", "says"),
     [("notes.txt", "is no result of lidar-mi"), ("/dev/null", "is no ordinary file")],
 )
-def test_what_is_not_ours_is_kept(images, lidar_mi, command, target, says):
+def test_foreign_files_are_kept(images, lidar_mi, command, target, says):
     (images / "notes.txt").write_text("mine")
     code, _, err = lidar_mi(*command, "-o", target)
     assert code == 2 and f"{target}: {says}" in err
     assert (images / "notes.txt").read_text() == "mine"
 
 
-def test_overwriting_is_asked_for(images, lidar_mi):
+def test_overwriting_needs_its_option(images, lidar_mi):
     (images / "notes.txt").write_text("mine")
     assert lidar_mi(*RETRIEVE, "-o", "notes.txt", "--overwrite")[0] == 0
     assert (images / "notes.txt").read_bytes().startswith(b"\x89HDF")
 
 
-def test_a_run_never_replaces_what_it_reads(there, lidar_mi, quick):
+def test_a_run_never_replaces_its_input(there, lidar_mi, quick):
     """The record of a run is an experiment file, too."""
     assert lidar_mi("run", "tiny.yaml", "-o", "run")[0] == 0
     again = ("run", "run/experiment.yaml", "-o", "run")

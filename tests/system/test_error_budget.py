@@ -45,7 +45,7 @@ def ran(tmp_path_factory):
     gc.collect()
 
 
-def test_a_weak_pulse_is_what_limits(ran):
+def test_a_weak_pulse_is_the_largest_cause(ran):
     """1 mJ from air of 0.1 / km by day: sky and photons drown the structure."""
     _, folder, metrics = ran
     for method in ("multipass", "cc"):
@@ -69,7 +69,7 @@ def test_a_weak_pulse_is_what_limits(ran):
     assert "limited by noise of the detector" in page and "curved paths in the time step" in page
 
 
-def test_winds_of_the_run_are_used_as_they_would_be_found_again(ran):
+def test_winds_of_the_run_are_used_as_they_would_be_retrieved_again(ran):
     experiment, folder, metrics = ran
     scans = [exr.read_scan(folder / "out" / name) for name in IMAGES]
     again = budgets(experiment, make_truth(experiment, folder), scans)
@@ -88,7 +88,7 @@ def noise_free_scans(experiment, truth):
     return scans
 
 
-def test_blur_is_undone_where_there_is_some(tmp_path):
+def test_blur_is_corrected_only_where_present(tmp_path):
     """`variational` is told of the beam's width, but not of air as it is: the winds are those of
     `retrieve_wind` told the same."""
     text = SMALL.replace("[multipass, cc]", "[variational]").replace("detector: {}\n", "")

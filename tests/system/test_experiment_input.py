@@ -25,7 +25,7 @@ from tests.support.experiments import check, small, write_wake
         ({"wake": {"file": "text.nc"}}, "text.nc: is not NetCDF"),
     ],
 )
-def test_bad_input_is_told_before_anything_is_written(tmp_path, change, words):
+def test_bad_input_is_reported_before_anything_is_written(tmp_path, change, words):
     (tmp_path / "text.nc").write_text("no NetCDF")
     with pytest.raises(InputError, match=words) as caught:
         run(check(small() | change), tmp_path / "run", beside=tmp_path)
@@ -51,7 +51,7 @@ def test_gates_that_reach_beyond_the_wake(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_beams_wider_than_a_template_are_told_of(tmp_path, quick):
+def test_beams_wider_than_a_template_are_reported(tmp_path, quick):
     """At 5 km the paper's beam is 10 m wide, a template 4 m: nothing is left to follow, and the
     report says so."""
     told = []
@@ -68,7 +68,7 @@ def test_beams_wider_than_a_template_are_told_of(tmp_path, quick):
         assert text.removeprefix("warning: ") in page and text in log
 
 
-def test_air_without_vortices_is_told_of(tmp_path, quick):
+def test_air_without_vortices_is_reported(tmp_path, quick):
     """Nothing turns: the report says that, and shows the rest."""
     data = small(texture={"rms": 0.3, "outer_scale": "5 m"})
     data["wake"]["vortex_pair"]["circulation"] = 1e-3

@@ -145,7 +145,7 @@ def test_rings_lie_where_the_wind_puts_them(small, name, v):
     assert abs(got - r2(77247)) / per_speed < 1.0
 
 
-def test_pictures_say_what_they_are(small):
+def test_images_are_described_by_their_headers(small):
     received = [read_fringes(small[0] / f"fringes_received_{k:02d}.exr") for k in (0, 1)]
     assert [picture.attrs["v_los"] for picture in received] == list(SPEEDS)
     photons = read_fringes(small[0] / "fringes_photons.exr")
@@ -198,7 +198,7 @@ def test_both_fits_agree(found):
     assert float(abs(fits[0] - fits[1]).max()) < 0.5 * float(found["v_std"].max())
 
 
-def test_one_picture_of_an_average_has_the_noise_of_a_sum():
+def test_one_image_of_an_average_has_the_noise_of_a_sum():
     """Mean and variance of 2000 pixels, against sums of five pictures, within 5 sigma."""
     ccd = CCD(read_noise=3, dark_current="20 Hz")
     flat = torch.full((40, 50), 30.0)
@@ -215,7 +215,7 @@ def test_one_picture_of_an_average_has_the_noise_of_a_sum():
 # ---------------------------------------------------------------- the folder
 
 
-def test_folder_holds_what_it_should(small):
+def test_folder_has_all_files(small):
     folder, metrics = small
     assert {path.name for path in folder.iterdir()} == FILES
     assert {path.stem for path in (folder / "figures").iterdir()} == FIGURES
@@ -263,7 +263,7 @@ def test_metrics_are_the_stable_ones(small):
     assert small[1]["doppler.velocity_range"] == pytest.approx(speed_of_light / 2 / 77248.5)
 
 
-def test_report_tells_the_numbers(small):
+def test_report_contains_the_numbers(small):
     page = (small[0] / "report.html").read_text()
     metrics = small[1]
     for n in (1, 9):
@@ -282,7 +282,7 @@ def without_times(metrics):
     return {key: value for key, value in metrics.items() if not key.startswith("timing.")}
 
 
-def test_a_stopped_run_goes_on_with_its_pictures(tmp_path, quick):
+def test_a_stopped_run_resumes_with_its_images(tmp_path, quick):
     settings = check(**QUICK | {"v_los": [0, 20]})
     first = run(settings, tmp_path / "run").metrics
     before, last = written(tmp_path / "run"), "fringes_received_01.exr"
@@ -347,7 +347,7 @@ def test_both_lidars_in_one_experiment(tmp_path, quick, monkeypatch):
         ({"etalon": {"coatings": [[1.5, "100 nm", 50]]}}, "a mirror that transmits"),
     ],
 )
-def test_what_cannot_work_is_said_before_anything_is_written(tmp_path, changes, message):
+def test_impossible_settings_are_reported_before_anything_is_written(tmp_path, changes, message):
     with pytest.raises(InputError) as error:
         run(check(**QUICK | changes), tmp_path / "run")
     assert message in str(error.value) and "\n" not in str(error.value)

@@ -139,7 +139,7 @@ def test_a_bad_path_set_by_the_user_is_explained(name, create, complaint, tmp_pa
 
 
 @linux
-def test_a_library_that_lies_about_its_version_is_found_out(tmp_path):
+def test_a_library_with_a_wrong_version_is_detected(tmp_path):
     """The version comes from the library itself: the C library under LLVM's name has none."""
     mapped = Path("/proc/self/maps").read_text().splitlines()
     libc = next((line.split()[-1] for line in mapped if re.search(r"/libc[.-]", line)), None)

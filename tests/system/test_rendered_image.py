@@ -73,7 +73,7 @@ def test_blur_by_beam_keeps_even_and_linear_air(rough):
     np.testing.assert_allclose(blurred.values[6:-6, 6:-6], linear.values[6:-6, 6:-6], rtol=1e-12)
 
 
-def test_picture_is_the_blurred_extinction_within_its_standard_errors():
+def test_image_is_the_blurred_extinction_within_its_standard_errors():
     """Single scattering by the textured wake against theory, at both times, pixel by pixel.
 
     Y = 3/(8 pi) x extinction seen by the beam x exp(-2 (extinction - environment) x way in the
@@ -113,7 +113,7 @@ def test_picture_is_the_blurred_extinction_within_its_standard_errors():
         assert (sums[k] / theory)[inner].mean() == pytest.approx(1, abs=2e-4)
 
 
-def test_volume_picture_is_the_mean_over_the_gate(tmp_path, quick):
+def test_volume_image_is_the_mean_over_the_gate(tmp_path, quick):
     """As for the plane, in three dimensions: structure that differs from plane to plane (texture
     of 20 %), gates of 2.5 m across planes of 1 m. Equal weights for the two planes inside the
     gates give a ratio of 22."""

@@ -47,7 +47,7 @@ def test_the_wake_is_read_once(tmp_path, monkeypatch):
     assert len(read) == 1 and "texture_sweep.40_percent.rmse_v" in metrics
 
 
-def test_a_rerun_uses_the_pictures(tmp_path, quick):
+def test_a_rerun_uses_the_images(tmp_path, quick):
     folder = tmp_path / "run"
     before = run(check(small()), folder).metrics
     stamps = pictures_of(folder)
@@ -59,7 +59,7 @@ def test_a_rerun_uses_the_pictures(tmp_path, quick):
     assert without_timing(after) == without_timing(before)
 
 
-def test_a_missing_picture_is_rendered_again_and_the_same(tmp_path, quick):
+def test_a_missing_image_is_rendered_again_and_identical(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
     stamps, before = pictures_of(folder), layers(folder)
@@ -149,7 +149,7 @@ def test_a_file_in_the_folders_place_is_refused(tmp_path):
         "retrieving winds",
     ],
 )
-def test_stopped_anywhere_it_goes_on(tmp_path, quick, step):
+def test_stopped_anywhere_it_resumes(tmp_path, quick, step):
     """An interrupt at any step leaves whole files only, and the next start ends as if nothing had
     happened."""
     folder = tmp_path / "run"
@@ -200,8 +200,8 @@ def test_the_seed_decides(tmp_path, quick):
     assert runs["one"][0] != runs["other"][0]
 
 
-def test_a_run_that_fails_says_so_in_its_log(tmp_path, quick, monkeypatch):
-    """And one that is stopped does not; see `test_stopped_anywhere_it_goes_on`."""
+def test_a_failed_run_is_recorded_in_its_log(tmp_path, quick, monkeypatch):
+    """And one that is stopped does not; see `test_stopped_anywhere_it_resumes`."""
     folder = tmp_path / "run"
 
     def broken(*_, log):

@@ -97,7 +97,7 @@ def test_a_damaged_image_is_rendered_again(tmp_path, quick):
     assert (read_scan(image)["S0"] == before["S0"]).all()
 
 
-def test_results_say_what_made_them(tmp_path, quick):
+def test_results_identify_their_run(tmp_path, quick):
     hashes = {}
     for name, seed in (("one", 1), ("again", 1), ("other", 2)):
         folder = tmp_path / name
@@ -118,7 +118,7 @@ def test_metrics_of_another_run_are_not_shown(tmp_path, quick, lidar_mi):
     assert code == 2 and "metrics.json: was changed or copied here" in err
 
 
-def test_results_without_images_are_not_replaced_unasked(tmp_path, quick):
+def test_results_without_images_are_not_replaced_by_default(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
     for image in folder.glob("*.exr"):

@@ -160,7 +160,7 @@ def test_metrics_follow_from_the_wind_file(demo):
     )
 
 
-def test_pictures_say_what_they_show(demo):
+def test_images_are_described_by_their_metadata(demo):
     for index, name in enumerate(IMAGES):
         scan = read_scan(demo.folder / name)
         start = 500.0 - 15.0 * index

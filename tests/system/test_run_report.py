@@ -49,7 +49,7 @@ def test_figures_are_readable_and_not_blank(demo, name):
 @pytest.mark.parametrize(
     "figure, of", [("fig08_backscatter", "backscatter"), ("fig05_extinction", "extinction")]
 )
-def test_figures_show_what_the_pilot_sees(demo, figure, of):
+def test_figures_have_the_pilot_s_view(demo, figure, of):
     """Brightness of the drawn pictures against the data: port (+y) on the left, up at the top.
     Mirrored either way or turned by 180 degrees they do not match."""
     if of == "backscatter":
@@ -93,7 +93,7 @@ class Links(HTMLParser):
         self.words.append(data)
 
 
-def test_report_needs_nothing_else(demo):
+def test_report_is_self_contained(demo):
     page = (demo.folder / "report.html").read_text()
     links = Links(page)
     assert len(links.targets) == len(FIGURES)
@@ -108,7 +108,7 @@ def test_report_needs_nothing_else(demo):
     assert "url(" not in page and "@import" not in page
 
 
-def test_report_tells_the_numbers(demo):
+def test_report_contains_the_numbers(demo):
     words = " ".join(Links((demo.folder / "report.html").read_text()).words)
     assert "wake_backscatter" in words and "seed: 1" in words
     for text in ("wake_slab_40s.nc at 40 s", "532 nm, 1 mJ", "mitsuba 3.", "64 samples per beam"):

@@ -155,7 +155,7 @@ def test_files_keep_the_conventions(whole, name):
             assert set(axes) == {"x", "y", "z"} and float(data["x"]) == 150
 
 
-def test_the_vortices_are_told_and_kept(whole):
+def test_the_vortices_are_reported_and_saved(whole):
     """On a grid of 1 m: circulation to 10 %, places to 1 m; the file says the same."""
     folder, metrics = whole
     fit = read_vortices(folder / "vortex.json")["images"]
@@ -194,7 +194,7 @@ def again(whole, tmp_path, monkeypatch, spoil):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("variant")
-def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
+def test_no_valid_vector_is_reported_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
     report, folder = again(
         whole,
         tmp_path,
@@ -220,7 +220,7 @@ def test_no_good_vector_is_said_and_the_rest_is_shown(whole, tmp_path, monkeypat
 
 
 @pytest.mark.usefixtures("variant")
-def test_lines_that_cannot_be_read_are_said_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
+def test_lines_without_a_velocity_are_reported_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
     report, folder = again(
         whole,
         tmp_path,
@@ -235,7 +235,7 @@ def test_lines_that_cannot_be_read_are_said_and_the_rest_is_shown(whole, tmp_pat
 
 
 @pytest.mark.usefixtures("variant")
-def test_two_lines_give_no_vector_and_that_is_said(whole, tmp_path, monkeypatch):
+def test_two_lines_give_no_vector_which_is_reported(whole, tmp_path, monkeypatch):
     report, folder = again(
         whole,
         tmp_path,
@@ -305,7 +305,7 @@ def test_errors_of_a_known_field():
         pytest.param(0.0, 0.01, {"yaw": "20 mrad"}, "pointing", marks=pytest.mark.slow),
     ],
 )
-def test_what_limits_u_is_found(amplitude, noise, errors, limit):
+def test_largest_cause_of_error_of_u_is_reported(amplitude, noise, errors, limit):
     """An even u is limited by the noise of its lines, or by a yaw that is not known; a u of 4 m
     waves by what lies between them."""
     experiment = changed(sensor={"errors": errors})
@@ -342,7 +342,7 @@ def test_what_limits_u_is_found(amplitude, noise, errors, limit):
 
 
 @pytest.mark.slow
-def test_the_share_of_noise_is_between_what_draws_and_the_lines_say():
+def test_the_fraction_of_noise_is_between_those_of_draws_and_of_the_lines():
     """Mean square error less that without noise, over 8 draws: no less than the variance of u over
     the draws (less 3 sigma), as the estimate also gains by knowing that noise is gone; no more than
     one line's variance."""
@@ -423,7 +423,7 @@ def test_bad_descriptions_are_named(sections, message):
         ),
     ],
 )
-def test_what_does_not_go_together_is_said_ahead(sections, start):
+def test_inconsistent_settings_are_reported_ahead(sections, start):
     with pytest.raises(InputError) as error:
         prepare(changed(**sections))
     assert str(error.value).startswith(start) and "\n" not in str(error.value)
@@ -431,7 +431,7 @@ def test_what_does_not_go_together_is_said_ahead(sections, start):
 
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize(("columns", "rows", "told"), [(5, 3, False), (5, 1, True), (1, 3, True)])
-def test_a_check_tells_of_lines_in_one_plane(columns, rows, told):
+def test_a_check_reports_lines_in_one_plane(columns, rows, told):
     directions = SMALL["sensor"]["directions"] | {"columns": columns, "rows": rows}
     *_, (_, ((_, lines), *_)) = check.sections(changed(sensor={"directions": directions}))
     assert lines.startswith(f"{columns * rows}, 20 pulses each")

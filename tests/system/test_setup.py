@@ -174,7 +174,7 @@ def test_a_broken_environment_is_made_anew(machine, damage):
     assert machine.log() == ["venv", "pip"]
 
 
-def test_without_network_it_says_so_and_can_be_repeated(machine):
+def test_without_network_it_reports_this_and_can_be_repeated(machine):
     machine.fact("no_network")
     done = machine.set_up()
     assert done.returncode == 1
@@ -185,7 +185,7 @@ def test_without_network_it_says_so_and_can_be_repeated(machine):
     assert machine.log() == ["pip"]
 
 
-def test_without_the_venv_module_it_says_what_to_install(machine):
+def test_without_the_venv_module_it_prints_what_to_install(machine):
     machine.fact("no_venv")
     done = machine.set_up()
     assert done.returncode == 1
@@ -229,7 +229,7 @@ def test_another_llvm_is_installed_where_there_is_no_19(machine):
 
 
 @pytest.mark.parametrize("obstacle", ["no apt", "no sudo", "sudo asks", "no network"])
-def test_llvm_that_cannot_be_installed_is_asked_for(machine, obstacle):
+def test_llvm_that_cannot_be_installed_is_requested(machine, obstacle):
     machine.fact("good_llvm", there=False)
     if obstacle != "no apt":
         machine.has_apt()

@@ -322,7 +322,7 @@ def small_run(name, folder, more=()):
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("variant")
-def test_turbine_is_seen_by_both(tmp_path):
+def test_turbine_is_observed_by_both(tmp_path):
     """The mean wake's deficit of 4 m/s from lines of sight 11 m apart, to 0.5 m/s rms.
 
     Without gusts, which lines step over; and no look-ahead time of a platform that stands, nor a

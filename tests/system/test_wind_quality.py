@@ -21,7 +21,7 @@ from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 SCENES = Path(str(files("lidar_mi.scenes")))
 
 
-def test_the_pictures_alone_tell_of_the_vortices(demo):
+def test_the_images_alone_determine_the_vortices(demo):
     """The paper's case: circulation to 5 % of what the simulation's file says, places to 1 m."""
     scans = [read_scan(demo.folder / name) for name in IMAGES]
     (pair, noise), *_ = rendered_pairs(demo.experiment, scans).values()
@@ -36,7 +36,7 @@ def test_the_pictures_alone_tell_of_the_vortices(demo):
             assert fit.quantities[f"{side}_{axis}"].value == pytest.approx(true, abs=1.0)
 
 
-def test_the_readme_tells_the_demo_s_numbers(demo):
+def test_the_readme_states_the_demo_s_numbers(demo):
     """Within 0.02 m/s and 1 %, by which another order of rounding may change them; two digits are
     printed of the larger ones."""
     rows = {
@@ -105,13 +105,13 @@ def test_every_step_of_the_instrument_costs(demo):
         assert demo.metrics[f"extinction_without_texture.cc.all.rmse_{name}"] > 2 * seen
 
 
-def test_noise_of_the_pictures(demo):
+def test_noise_of_the_images(demo):
     """16 photons a beam are to give 1 % a pixel, so 64 give 0.5 %; a tenth more for the slab's
     structure within the beam."""
     assert demo.metrics["backscatter.mc_relative_error"] < 0.0055
 
 
-def test_multiple_scattering_is_a_small_share(demo):
+def test_multiple_scattering_is_a_small_fraction(demo):
     """Light scattered twice has met another 0.1 / km on 500 m: a share of 0.05 if all of it came
     back through the field of view, which takes in 2.5 m of those 500 m."""
     assert 0 < demo.metrics["backscatter.multiple_scattering_fraction"] < 0.05
@@ -143,7 +143,7 @@ def test_the_air_between_the_vortices_moves_down(demo):
         assert mean("v", (-27, -19), (6, 14)) > 3
 
 
-def test_swapped_pictures_turn_the_wind_round(demo):
+def test_swapped_images_reverse_the_wind(demo):
     pair = on_one_grid(*(read_scan(demo.folder / name)["Y"] for name in IMAGES))
     forth = retrieve_wind(*pair, dt=0.1, stride=4)
     back = retrieve_wind(*pair[::-1], dt=0.1, stride=4)

@@ -18,7 +18,7 @@ def test_standard_error_of_independent_values():
     assert error == pytest.approx(1 / np.sqrt(values.size), rel=0.4)
 
 
-def test_standard_error_of_blocks_that_are_alike():
+def test_standard_error_of_uniform_blocks():
     blocks = np.random.default_rng(2).normal(size=(1, 12, 16))
     size = coverage.BLOCK
     values = np.tile(np.kron(blocks, np.ones((1, size, size))), (2, 1, 1))

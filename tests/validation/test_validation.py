@@ -99,7 +99,7 @@ def test_spread_of_z_scores(batches):
 # --- checks that fail when they should
 
 
-def test_a_wrong_cross_section_is_found(effort, monkeypatch):
+def test_a_wrong_cross_section_is_detected(effort, monkeypatch):
     molecules = group("molecules")
     assert all(check(effort).passed for check in molecules.CHECKS)
     right = molecules.molecules.cross_section
@@ -107,7 +107,7 @@ def test_a_wrong_cross_section_is_found(effort, monkeypatch):
     assert not molecules.cross_sections(effort).passed
 
 
-def test_a_wrong_picture_is_found(effort, monkeypatch):
+def test_a_wrong_image_is_detected(effort, monkeypatch):
     """0.01 % too little Q."""
     equation = group("lidar_equation")
     assert equation.depolarisation(effort).passed
@@ -121,7 +121,7 @@ def test_a_wrong_picture_is_found(effort, monkeypatch):
     assert not equation.depolarisation(effort).passed
 
 
-def test_wrong_light_transport_is_found(effort, monkeypatch):
+def test_wrong_light_transport_is_detected(effort, monkeypatch):
     """The independent simulation with 3 % more extinction, or 1 % less albedo."""
     scattering = group("multiple_scattering")
     other = np.stack([scattering.simulate(scattering.RAYLEIGH, 10_000, 3, s)[0] for s in range(32)])
@@ -141,7 +141,7 @@ def test_wrong_light_transport_is_found(effort, monkeypatch):
     assert scattering.difference("all", again[..., 0].sum((1, 2)), other[..., 0].sum((1, 2))).passed
 
 
-def test_an_impossible_matrix_is_found():
+def test_an_impossible_matrix_is_detected():
     """The coherency matrix of Rayleigh scattering is positive; a2 above a1 is not possible."""
     matrices = group("scattering_matrices")
     cosine = np.linspace(-1, 1, 21)
@@ -203,7 +203,7 @@ def test_stored_numbers_belong_to_the_cases():
     assert stored["command"] not in eradiate.provenance("python")
 
 
-def test_another_interpreter_is_asked(tmp_path):
+def test_another_interpreter_is_called(tmp_path):
     eradiate = import_module("validation.eradiate")
     fake = tmp_path / "python"
     fake.write_text('#!/bin/sh\necho "{\\"asked\\": \\"$3\\"}" > "$5"\ntest -f "$1"\n')
@@ -236,13 +236,13 @@ def test_command_ends_with_an_error_where_a_row_fails(quick, capsys):
     assert "FAILS: Check gradients, one | of: expected 1, got 2" in capsys.readouterr().out
 
 
-def test_command_goes_on_after_a_group_that_breaks_and_writes_no_page(quick, capsys):
+def test_command_continues_after_a_failing_group_and_writes_no_page(quick, capsys):
     assert command.main(["-o", str(quick)]) == 1
     printed = capsys.readouterr().out
     assert "broke" in printed and "Check gradients" in printed and not quick.exists()
 
 
-def test_page_tells_of_failures(quick, monkeypatch):
+def test_page_lists_failures(quick, monkeypatch):
     monkeypatch.setattr(command, "GROUPS", ("lidar_equation", "gradients"))
     assert command.main(["--slow", "-o", str(quick)]) == 1
     text = quick.read_text()
@@ -250,7 +250,7 @@ def test_page_tells_of_failures(quick, monkeypatch):
     assert "| one \\| of | 1 | 2 | \\|1.0e-01\\| | +10.0 | **FAIL** | two |" in text
 
 
-def test_command_names_what_it_does_not_know(capsys):
+def test_command_names_unknown_arguments(capsys):
     with pytest.raises(SystemExit) as stop:
         command.main(["speed"])
     assert stop.value.code == 2 and "'speed' is none of" in capsys.readouterr().err
@@ -329,6 +329,6 @@ def test_links_of_the_page_lead_somewhere(page):
         assert anchor in {report._anchor(heading) for heading in headings}
 
 
-def test_page_is_found_from_the_readme():
+def test_page_is_linked_from_the_readme():
     assert "(docs/validation.md)" in (ROOT / "README.md").read_text()
     assert re.search(r"^validate:", (ROOT / "Makefile").read_text(), re.MULTILINE)

@@ -22,7 +22,7 @@ def test_winds_of_one_direction_are_coloured_over_their_own_range():
     assert (nothing["vmin"], nothing["vmax"]) == (-1, 1)
 
 
-def test_pictures_begin_at_nothing_unless_all_is_lit():
+def test_colours_begin_at_zero_unless_all_pixels_are_bright():
     ramp = xr.DataArray(np.linspace(0.0, 1.0, 1001))
     assert _bright([ramp]).vmin == 0 and _bright([ramp]).vmax == pytest.approx(1, abs=2e-3)
     lit = _bright([1 + ramp, 1.5 + ramp])

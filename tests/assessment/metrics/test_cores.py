@@ -53,7 +53,7 @@ def test_pair(model, core_radius, place):
         assert core.circulation == pytest.approx(expected, rel=2e-3)
 
 
-def test_circulation_at_the_core_radius_is_lamb_and_oseens_share():
+def test_circulation_at_the_core_radius_is_lamb_and_oseens_fraction():
     (core, _) = find_cores(flow_of(*vortex_pair(458.0)))
     assert core.radius == pytest.approx(3.0, abs=1e-9)  # 3 m is a ring
     assert core.circulation == pytest.approx(458.0 * (1 - np.exp(-1.2564)), rel=2e-3)
@@ -146,7 +146,7 @@ def test_outside_cores():
 
 
 @pytest.mark.parametrize("model", ["lamb_oseen", "burnham_hallock"])
-def test_rings_give_circulation_and_what_carries_the_vortex(model):
+def test_rings_give_circulation_and_advecting_wind(model):
     """Circulation: the mean of its closed form. The partner and a wind of (3, -1) m/s carry it."""
     pair = vortex_pair(458.0, 47.1, 3.0, model=model)
     flow = flow_of(*pair)
@@ -162,7 +162,7 @@ def test_rings_give_circulation_and_what_carries_the_vortex(model):
         assert rings.w == pytest.approx(-1.0 - 458 / (2 * np.pi * 47.1), abs=0.02)
 
 
-def test_rings_that_hold_something_else_tell_nothing():
+def test_rings_around_another_core_are_undetermined():
     flow = flow_of(*vortex_pair(458.0, 20.0))
     port, starboard = (Core(s * 10.0, 0.0, 3.0, s * 458.0) for s in (1, -1))
     assert ring_averages(flow, port, [starboard]) is None

@@ -79,7 +79,7 @@ def test_without_detector_and_depth_there_are_two_causes():
     np.testing.assert_allclose(found["monte_carlo"][1], blurred[1], rtol=1e-12)
 
 
-def test_image_scale_finds_gain_and_offset_through_uneven_noise():
+def test_image_scale_fits_gain_and_offset_with_nonuniform_noise():
     rng = np.random.default_rng(2)
     (air,) = pairs(1)
     noise = [field(1e-9 * (1 + 50 * rng.random((20, 30)))) for _ in range(2)]
@@ -189,7 +189,7 @@ def test_displacements_in_a_core_are_off_by_the_time_step_alone():
 # --- shares
 
 
-def test_shares_of_independent_errors_are_those_of_their_variances():
+def test_fractions_of_independent_errors_are_those_of_their_variances():
     """Errors of variance 4, 1 and 0.25 (v): shares 4/5.25 and 1/5.25; 4 sigma of 4941 vectors."""
     rng = np.random.default_rng(3)
     parts = {
@@ -210,7 +210,7 @@ def test_shares_of_independent_errors_are_those_of_their_variances():
                 assert budget[f"{place}{cause}.{key}"] == pytest.approx(share, abs=0.06)
 
 
-def test_a_cause_that_helps_has_a_negative_share_and_vectors_are_the_same():
+def test_a_cause_that_reduces_errors_has_a_negative_fraction_and_vectors_are_the_same():
     v, w = np.full((10, 12), 1.0), np.zeros((10, 12))
     flag = np.zeros((10, 12), np.uint8)
     flag[0] = 4
@@ -230,7 +230,7 @@ def test_a_cause_that_helps_has_a_negative_share_and_vectors_are_the_same():
     assert none == {}
 
 
-def test_the_method_is_what_it_does_to_perfect_pictures():
+def test_the_cause_method_is_its_error_on_perfect_images():
     truth = flow(lambda y, z: y, lambda y, z: z)
     y, z = np.meshgrid(truth["y"], truth["z"])
     rng = np.random.default_rng(5)
@@ -279,7 +279,7 @@ def test_noise_alone_has_all_of_it(method):
 
 
 @pytest.mark.parametrize("method", ["cc", "multipass"])
-def test_share_of_noise_is_what_noise_drawn_anew_scatters_winds_by(method):
+def test_fraction_of_noise_is_the_scatter_of_winds_over_noise_draws(method):
     """Noise taken away as it fell, or drawn anew six times: its share of the error is the same.
 
     The difference of the two scatters by 0.02 over sets of six draws; four times that is allowed.
@@ -353,12 +353,12 @@ def test_the_sentence_names_the_largest_causes_in_turn():
     assert "render.samples_per_beam" in text
 
 
-def test_nothing_to_name_is_said():
+def test_a_budget_without_large_causes_is_reported():
     assert "no single cause has 10 %" in limit_sentence(described(beam_blur=0.05), "cc")
     assert "no vector is valid" in limit_sentence({}, "cc")
 
 
-def test_what_a_method_has_not_is_said():
+def test_causes_that_a_method_lacks_are_reported():
     """A fit of whole images has no window, and so no row for what happens within one."""
     with_window = described(beam_blur=0.2, window=0.1)
     budgets = {"cc": with_window, "variational": described(beam_blur=0.2)}

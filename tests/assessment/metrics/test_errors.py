@@ -123,7 +123,7 @@ def test_statistics_of_known_errors():
     }
 
 
-def test_flagged_vectors_count_only_where_all_are_asked_for():
+def test_flagged_vectors_are_included_only_in_all():
     wind = winds([1.0, 1.0, 7.0, np.nan], [0.0, 0.0, 7.0, np.nan], flag=[0, 0, 4, 0])
     metrics = wind_metrics(wind, winds(np.zeros(4), np.zeros(4)), [])
     assert metrics["rmse_v"] == 1
@@ -175,7 +175,7 @@ def test_error_by_quality_groups():
     np.testing.assert_allclose(groups["valid"], [0, 0, 0.5] + 9 * [1])
 
 
-def test_error_by_quality_leaves_out_what_is_unknown():
+def test_error_by_quality_leaves_out_unknown_values():
     wind = winds([1.0, np.nan, 3.0], [1.0, 2.0, 3.0], texture=[0.1, 0.2, np.nan])
     groups = error_by_quality(wind, winds(np.zeros(3), np.zeros(3)), "texture")
     assert groups.sizes["group"] == 1

@@ -70,7 +70,7 @@ GOOD = {
 }
 
 
-def test_a_sensor_that_does_it_and_what_is_left():
+def test_a_sensor_that_complies_and_its_margins():
     findings = judge(TABLES["flight_control", "landing"], GOOD | {"error_v_los": 0.6})
     assert fulfilled(findings) is True
     margins = {f.quantity: f.margin for f in findings}
@@ -106,7 +106,7 @@ def test_each_row_can_fail(changed, margin):
     assert found.margin == pytest.approx(margin)
 
 
-def test_what_is_not_known_does_not_pass():
+def test_unknown_values_do_not_pass():
     for missing in (math.nan, None):
         findings = judge(TABLES["flight_control", "landing"], GOOD | {"error_v": missing})
         row = next(f for f in findings if f.quantity == "error_v")
@@ -122,7 +122,7 @@ def test_what_is_not_known_does_not_pass():
     assert all(f.passed is None for f in nothing)
 
 
-def test_a_share_of_the_range_and_a_limit_of_its_own():
+def test_a_fraction_of_the_range_and_a_fixed_limit():
     table = RequirementTable(
         "a", "a", "p", (Requirement("slab_depth", maximum=5.0, fraction_of_range=0.1),)
     )

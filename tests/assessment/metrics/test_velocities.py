@@ -64,7 +64,7 @@ def test_standard_errors_are_those_of_repeated_experiments():
     assert np.std(column["std"]) == pytest.approx(np.mean(column["std_stderr"]), rel=0.13)
 
 
-def test_what_is_not_determined_is_left_out():
+def test_undetermined_measures_are_left_out():
     one = measures([[1.0], [2.0]], 1)
     assert "std" not in one and "bias_stderr" not in one and one["bias"] == 1.5
     assert measures([[np.nan, np.nan]], 2) == {"retrieved_fraction": 0.0}

@@ -57,7 +57,7 @@ def test_three_digits(value, text):
         (13.2, "1320"),
     ],
 )
-def test_shares(share, text):
+def test_fractions(share, text):
     assert percent(share) == f"{text} %"
 
 
@@ -75,7 +75,7 @@ def test_values_with_errors(value, stderr, text):
     assert with_error(value, stderr) == text.replace("|", f"{BLANK}±{BLANK}")
 
 
-def test_what_is_written_is_what_is_meant():
+def test_written_numbers_equal_the_values():
     """Within half of the last digit, over twelve decades and both signs."""
     values = np.random.default_rng(1).normal(size=500) * 10 ** np.linspace(-6, 6, 500)
     for value in values:
@@ -86,6 +86,6 @@ def test_what_is_written_is_what_is_meant():
         assert float(number) == pytest.approx(value, rel=5.1e-3)
 
 
-def test_rows_show_shares_in_per_cent_and_what_is_missing_as_a_dash():
+def test_rows_show_fractions_in_per_cent_and_missing_values_as_a_dash():
     assert in_row([0.6827, None], "%") == ["68.3", "-"]
     assert in_row([0.1224, None, -0.0006], "m/s") == ["0.122", "-", "-0.001"]

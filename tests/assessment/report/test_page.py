@@ -99,7 +99,7 @@ def test_the_map_holds_the_wind():
     assert data["cores"] == [[1.23, 2.0]] and data["step"] == 2.0
 
 
-def test_the_map_takes_what_a_retrieval_leaves_out():
+def test_the_map_accepts_missing_vectors():
     """No standard errors, no number at some places, vectors off their nodes, too many of them."""
     wind = some_wind(220, 9).drop_vars(["u", "u_true", "u_stderr", "v_stderr"])
     wind["v"][4, 30] = np.nan
@@ -119,7 +119,7 @@ BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 
 @pytest.mark.slow
 @pytest.mark.skipif(not BROWSER, reason="no Chromium here")
-def test_a_browser_draws_the_map_and_tells_of_a_vector(tmp_path):
+def test_a_browser_draws_the_map_and_describes_a_vector(tmp_path):
     vectors = {"title": "wind"} | map_data(some_wind(), ("u", "v", "w"), [Core(1.0, 0.0, 1.0, 9.0)])
     path = tmp_path / "report.html"
     path.write_text(some_page(vectors=vectors))

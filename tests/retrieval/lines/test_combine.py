@@ -279,7 +279,7 @@ def test_errors_are_as_stated():
 @pytest.mark.parametrize(
     ("draws", "coverage"), [(15, 0.12), pytest.param(200, 0.05, marks=pytest.mark.slow)]
 )
-def test_errors_are_as_stated_where_the_statistics_of_u_are_found(draws, coverage):
+def test_errors_are_as_stated_where_the_statistics_of_u_are_estimated(draws, coverage):
     """As above, to 4 sigma; in the long test intervals hold what they say to 5 points.
 
     Whether u is rough or smooth is known here; test_combine_ensemble.py has flows of all kinds.
@@ -291,7 +291,7 @@ def test_errors_are_as_stated_where_the_statistics_of_u_are_found(draws, coverag
         assert (abs(values) < 2).mean() == pytest.approx(0.954, abs=coverage / 2)
 
 
-def test_statistics_of_u_are_found():
+def test_statistics_of_u_are_estimated():
     """Most probable values within a factor of 2.5 of 2 m/s and 12 m, in the median of 9 draws."""
     random = np.random.default_rng(6)
     found = [combine(*scene(random, u_std=2.0)[1:]).attrs for _ in range(9)]
@@ -452,7 +452,7 @@ def test_jitter_of_the_lines_is_taken_for_a_scatter_of_u():
 # flags
 
 
-def test_where_images_gave_nothing_u_is_left():
+def test_without_valid_image_vectors_u_remains():
     """A hole of 10 m: no v and w, u with errors that are as stated (12 draws, some 3 degrees of
     freedom each, 4 sigma) and more than without the hole."""
     square = []

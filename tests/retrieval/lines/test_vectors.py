@@ -62,7 +62,7 @@ METHODS = {
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_uniform_wind_is_exact_and_the_platforms_motion_gone(method):
+def test_uniform_wind_is_exact_and_the_platforms_motion_removed(method):
     for speed in (0.0, 150.0):
         found = METHODS[method](scanned(noisy=False, speed=speed))
         np.testing.assert_allclose(

@@ -58,7 +58,7 @@ def test_noisy_backscatter_off_centre():
 
 
 @pytest.mark.parametrize("fractions", [(0.75,), (0.59, 0.89), (0.2, 0.45, 0.7)])
-def test_lines_and_orders_are_told_apart(fractions):
+def test_lines_and_orders_are_distinguished(fractions):
     image = split_rings((500, 640), (300.3, 262.8), 20000.0, fractions)
     found = analyse_rings(image)
     np.testing.assert_allclose(found.centre, (300.3, 262.8), atol=0.03)
@@ -71,7 +71,7 @@ def test_lines_and_orders_are_told_apart(fractions):
         np.testing.assert_allclose(split[:2], [expected] * 2, atol=5e-3)
 
 
-def test_laboratory_like_picture():
+def test_laboratory_like_image():
     """Split line, 8 bits, tilted camera, ellipses, sloping light: stands in for the real pictures.
 
     The same instrument sees the line single and split: one centre, equal splitting in both
@@ -98,7 +98,7 @@ def test_laboratory_like_picture():
 
 
 @pytest.mark.skipif(not LABORATORY.is_dir(), reason="the laboratory pictures are not here")
-def test_laboratory_pictures():
+def test_laboratory_images():
     """Real pictures of one line, single and split: what any right analysis must find."""
     single, split = (
         analyse_rings(np.array(Image.open(LABORATORY / f"fabry_perot_{name}.jpg")))

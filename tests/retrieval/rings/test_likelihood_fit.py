@@ -133,7 +133,7 @@ def test_nuisances_do_no_harm():
             assert abs(pull.std() - 1) < 4 / np.sqrt(64), place
 
 
-def test_pictures_do_not_touch_each_other():
+def test_images_are_independent_of_each_other():
     """A batch gives what its pictures give alone, one with another centre among them too."""
     model = ring_model(**COARSE)
     centres = [(119.5, 97.0), (119.9, 97.4), (131.0, 90.0)]
@@ -157,7 +157,7 @@ def test_known_centre_stays():
     assert (fit.std[0, [1, 2, 5, 6]] == 0).all() and fit.std[0, 0] > 0
 
 
-def test_emitted_picture_takes_the_instrument_off():
+def test_emitted_image_removes_the_instrument():
     """Etalon and laser drift by 0.03 orders: 58 m/s in both images, nothing in their difference."""
     order = reference.ORDER + 0.03
     air = ring_model(order_at_centre=order, **COARSE)

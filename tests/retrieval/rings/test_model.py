@@ -21,7 +21,7 @@ from tests.support.ring_models import TABLE, TEMPERATURES, ring_model
     ("v_los", "centre", "temperature"),
     [(0.0, None, 232.9), (-300.0, (300.0, 250.0), 232.9), (47.0, (481.3, 391.9), 255.0)],
 )
-def test_picture_is_airy_convolved_with_the_line(v_los, centre, temperature):
+def test_image_is_airy_convolved_with_the_line(v_los, centre, temperature):
     """To 3e-5 of the mean: what 0.001 m/s is (5e-7 orders, slope up to 60) and interpolation."""
     truth = reference.picture(v_los, 2.4e7, centre, temperature)
     found = expected(ring_model(), v_los, 2.4e7, centre=centre, temperature=temperature)
@@ -86,7 +86,7 @@ def test_bounds_of_the_default_instrument(case):
     assert found == pytest.approx(bound, abs=0.0011 if bound < 0.15 else 0.0051)
 
 
-def test_bound_equals_differences_of_the_reference_pictures():
+def test_bound_equals_differences_of_the_reference_images():
     """F from central differences of pictures by quadrature, no derivative of ours."""
     noise, steps = PixelNoise(5, 10), {"v_los": 1.0, "x": 0.05, "y": 0.05, "temperature": 2.0}
     shape, pixel = (195, 240), 4 * reference.PIXEL
@@ -119,7 +119,7 @@ def test_bound_falls_with_the_root_of_the_photons():
     assert bounds[0] / bounds[1] == pytest.approx(10, rel=1e-9)
 
 
-def test_what_is_not_known_costs():
+def test_free_parameters_increase_the_bound():
     known = cramer_rao(ring_model(), 2.4e7, free=("v_los",))["v_los"]
     found = cramer_rao(ring_model(), 2.4e7)
     assert set(found) == set(PARAMETERS) and found["temperature"] < 1

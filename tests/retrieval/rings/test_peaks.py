@@ -131,7 +131,7 @@ def test_radius_of_the_emitted_ring(pictures):
 
 
 @pytest.mark.slow
-def test_twenty_pictures():
+def test_twenty_images():
     """The paper: 20 pictures at 56 m, v_LOS averaged; 7 m/s bias and 2.5 m/s scatter with CA.
 
     Its bias depends on the width of the fitted piece, which it does not tell: here 0.15 radii

@@ -57,7 +57,7 @@ def test_known_numbers_of_the_vortex_pair(noise):
         assert yy.mean().sqrt() * SPACING / DT == pytest.approx(known * noise, rel=0.12)
 
 
-def test_noise_is_found_and_not_taken_for_texture():
+def test_noise_is_estimated_and_not_taken_for_texture():
     """The bound with the noise left out, against the one from clean slopes and the true noise."""
     noise = 0.06
     clean = tensors(vortex_pair_images(0.0, 2))[0]

@@ -109,7 +109,7 @@ def test_tiles_change_nothing(monkeypatch):
 
 
 @pytest.mark.parametrize("shift_z, shift_y", [(0, 0), (1, -2), (-3, 3), (2, 0)])
-def test_whole_pixels_are_found_everywhere(shift_z, shift_y):
+def test_whole_pixels_are_retrieved_everywhere(shift_z, shift_y):
     y, z = np.meshgrid(np.arange(60.0), np.arange(50.0))
     first = torch.as_tensor(texture(plane_waves(2, 3.0), y, z))
     second = torch.as_tensor(texture(plane_waves(2, 3.0), y - shift_y, z - shift_z))

@@ -52,7 +52,7 @@ def test_paths_in_a_volume_are_helices():
 
 
 @pytest.mark.parametrize(("number", "spread"), [(2, 0.028), (3, 0.016), (20, 0.0075)])
-def test_noise_of_a_burst_is_what_still_images_differ_by(number, spread):
+def test_noise_of_a_burst_is_the_difference_of_images_at_rest(number, spread):
     """The variance to 4 times its relative spread over textures and noises of 12 seeds."""
     random = np.random.default_rng(8)
     z, y = np.arange(80), np.arange(90)

@@ -72,7 +72,7 @@ def shifted(dz, dy, pattern=None, rows=60, columns=70, seed=3):
 
 
 @pytest.mark.parametrize("shift", [(0.0, 0.5), (0.25, -1.3), (-3.4, 2.7)])
-def test_uniform_shift_is_found(shift):
+def test_uniform_shift_is_retrieved(shift):
     found = multipass(*shifted(*shift))
     for d, true in zip((found.dz, found.dy), shift, strict=True):
         # windows at the rim lose what leaves the picture
@@ -117,7 +117,7 @@ def test_stripes_leave_one_direction_open():
     assert float((zy / (zz * yy).sqrt()).median()) < -0.9
 
 
-def test_texture_that_is_not_carried_is_flagged():
+def test_texture_that_is_not_advected_is_flagged():
     """Unrelated textures, and one moved beyond what the first pass can see."""
     first = shifted(0, 0, seed=6)[0]
     pairs = [(first, shifted(0, 0, seed=7)[0]), shifted(25.0, 25.0)]

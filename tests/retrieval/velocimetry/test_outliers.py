@@ -47,7 +47,7 @@ def test_median_test_is_the_published_formula(size, spacing, room, monkeypatch):
     np.testing.assert_array_equal(found, residual > 2)
 
 
-def test_median_test_finds_the_one_wrong_vector():
+def test_median_test_detects_the_one_wrong_vector():
     y, z = np.meshgrid(np.arange(20.0), np.arange(20.0))
     dz, dy = torch.as_tensor(0.1 * y), torch.as_tensor(-0.1 * z)  # solid rotation
     dy[8, 9] += 1.0
@@ -64,7 +64,7 @@ def test_lonely_vectors_are_not_judged():
 
 
 @pytest.mark.parametrize("place", [(0, 0, 0), (0, 3, 3), (4, 2, 5), (2, 2, 2)])
-def test_outliers_in_volumes_are_found_at_faces_and_corners_too(place):
+def test_outliers_in_volumes_are_detected_at_faces_and_corners(place):
     """A shear of 0.4 px a neighbour is none; one vector 3 px off is, and its neighbours are not."""
     x, z, y = torch.meshgrid(torch.arange(5.0), torch.arange(6.0), torch.arange(6.0), indexing="ij")
     d = torch.stack([0.2 * z, 0.4 * y, -0.1 * x])

@@ -102,7 +102,7 @@ def burst(number, noise, columns=90, rows=80, seed=3):
     return images, v * DT / 2 / SPACING, w * DT / 2 / SPACING
 
 
-def test_a_burst_tells_more_than_a_pair_and_unlike_brightness_costs_nothing():
+def test_a_burst_is_more_accurate_than_a_pair_whatever_the_brightness():
     """Three images hold four times the information of the first two."""
     (first, second, third), v, w = burst(3, 0.05)
     pair = variational(first, second, noise=0.05)
@@ -181,7 +181,7 @@ def test_known_noise_of_dark_air_beside_bright_is_used_and_not_misread():
     assert float(errors.square().mean()) < float(other.square().mean())
 
 
-def test_noise_does_not_pull_displacements_to_whole_pixels():
+def test_noise_does_not_bias_displacements_to_whole_pixels():
     """Fine texture that is weak in half the picture: the other half has the filter let noise pass.
 
     Splines through pixels damp noise half way between them, which alone would pull by 0.11 px.
@@ -204,7 +204,7 @@ def test_noise_does_not_pull_displacements_to_whole_pixels():
 
 
 @pytest.mark.parametrize("moved", [0.7, 1.35])
-def test_short_waves_do_not_pull_displacements_to_whole_pixels(moved):
+def test_short_waves_do_not_bias_displacements_to_whole_pixels(moved):
     """Texture down to waves of 2 px; read by a cubic spline through pixels, 0.7 became 0.77."""
     z, y = grid(80, 110)
     random = np.random.default_rng(11)
@@ -220,7 +220,7 @@ def test_short_waves_do_not_pull_displacements_to_whole_pixels(moved):
     assert float(found.dz.mean()) == pytest.approx(0, abs=0.01)
 
 
-def test_where_images_share_less_standard_errors_are_larger():
+def test_where_images_differ_standard_errors_are_larger():
     """In a patch one picture holds texture that the other does not."""
     z, y = grid(90, 120)
     pattern, other = waves(5, 3.0), waves(6, 3.0)
@@ -240,7 +240,7 @@ def test_where_images_share_less_standard_errors_are_larger():
     assert float((error / inside).square().mean()) < 4
 
 
-def test_a_flow_that_diverges_everywhere_is_found():
+def test_a_flow_that_diverges_everywhere_is_retrieved():
     """As of wind through the plane; the prior starts from divergence 0.1 of vorticity."""
     z, y = grid(80, 110)
     pattern = waves(8, 3.0)
@@ -289,7 +289,7 @@ def blurred_errors(seed, noise, sigma):
     return np.reshape(errors, (2, 2, 2))
 
 
-def test_blur_that_is_known_is_undone_in_the_cores():
+def test_known_blur_is_corrected_in_the_cores():
     """It commutes with shifts, not with what turns and shears; beyond the cores it costs little."""
     plain, undone = blurred_errors(1, 0.01, 1.0)
     assert (undone[0] < 0.85 * plain[0]).all()

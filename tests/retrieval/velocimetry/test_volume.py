@@ -110,7 +110,7 @@ def test_standard_errors_know_how_the_components_err_together():
         assert abs(float(found["uv_correlation"].median())) < 0.3, method
 
 
-def test_where_volumes_share_less_standard_errors_are_larger():
+def test_where_volumes_differ_standard_errors_are_larger():
     """In one half a volume holds fine texture that the other does not; noise is stated as it is."""
     shape = (14, 20, 40)
     pair = shifted(shape, 0.3 * SHIFT, 0.01, seed=5)
@@ -231,7 +231,7 @@ def test_attenuation_and_brightness_are_no_wind():
 
 
 @pytest.mark.parametrize("method", ["correlation", "variational"])
-def test_what_holds_no_wind_is_flagged(method):
+def test_volumes_without_wind_information_are_flagged(method):
     shape = (10, 12, 14)
     rng = np.random.default_rng(0)
     flat = volume(np.ones(shape))

@@ -57,7 +57,7 @@ def test_volumes_are_read_between_voxels_as_they_are(part):
         assert float((slope[0] - true).square().mean().sqrt()) < 0.02 * float(true.std())
 
 
-def test_brightness_of_volumes_is_found_from_what_both_hold():
+def test_brightness_of_volumes_is_from_their_common_air():
     """Offset, factor and a decay along x; bright air that only one of them sees."""
     pattern = torch.tensor(random_waves(4)(nodes((12, 16, 16))))
     x = torch.arange(12.0)[:, None, None]

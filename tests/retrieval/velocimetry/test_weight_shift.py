@@ -92,7 +92,7 @@ def test_compact_blob_on_nothing(dy, dz):
     assert found.flag[i, j] == 0
 
 
-def test_nothing_to_weigh_is_no_match():
+def test_zero_weight_is_no_match():
     for value in (0.0, 0.1, -1.0):
         flat = torch.full((30, 30), value)
         found = weight_shift(flat, flat)

@@ -92,7 +92,7 @@ def test_ws_of_a_vortex_pair(pairs):
     assert good < 0.75 * no_wind and 0.5 < fraction < 0.9
 
 
-def test_vortex_core_comes_out_where_it_is():
+def test_vortex_core_is_retrieved_at_its_position():
     """A vortex in a wind of (10, -6) m/s: at mid-time its core is V dt/2 further on.
 
     The core is found by fitting the closed form to the vectors. Right: within 0.1 m. Vectors left
@@ -209,7 +209,7 @@ def test_no_vector_is_good_without_a_number(method):
     assert float((dataset.flag == 0).mean()) < 0.01
 
 
-def test_beyond_the_search_range_nothing_is_good():
+def test_beyond_the_search_range_no_vector_is_valid():
     """22 m/s are 4.4 px; 8 in 16 sees up to 3.5 px."""
     dataset = retrieve_wind(*moved(22.0, 0.0), DT)
     assert float((dataset.flag & Flag.PEAK_ON_RIM.value > 0).mean()) > 0.8

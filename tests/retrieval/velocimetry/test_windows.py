@@ -55,7 +55,7 @@ def test_window_sums_are_weighted_sums():
             torch.testing.assert_close(sums, pieces @ kernel)
 
 
-def test_averaged_is_a_gaussian_mean_of_what_is_known():
+def test_averaged_is_a_gaussian_mean_of_known_values():
     random = torch.Generator().manual_seed(5)
     for shape in ((13, 17), (9, 10, 11)):
         field = torch.randn(shape, generator=random, dtype=torch.float64)
@@ -85,7 +85,7 @@ def test_separable_and_linear_weights_are_those_of_numpy():
     torch.testing.assert_close(separable(field[:, 0], matrices[1:]), expected)
 
 
-def test_windows_of_volumes_share_what_the_stride_leaves_over():
+def test_windows_of_volumes_divide_the_margin_of_the_stride():
     """Templates lie inside, search regions need not."""
     windows = Windows((10, 12, 17), 8, 16, 4)
     assert windows.count == (1, 2, 3) and windows.reach == 4

@@ -108,7 +108,7 @@ def test_reduced_errors_have_unit_variance():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.01, 0.06])
-def test_intervals_cover_what_they_say(noise):
+def test_intervals_have_the_stated_coverage(noise):
     reduced = np.abs(reduced_errors(noise, range(100, 160)))
     assert (reduced < 1).mean() == pytest.approx(0.683, abs=0.05)
     assert (reduced < 1.96).mean() == pytest.approx(0.95, abs=0.05)
@@ -161,7 +161,7 @@ def test_missing_pixels_and_a_map_of_the_noise():
     assert stderr[4] > 1.5 * stderr[0]
 
 
-def test_a_map_that_says_too_little():
+def test_a_noise_map_that_is_too_low():
     """Half of the noise that there is: what the filter takes for texture would be noise, which
     draws displacements to where splines damp it. Twice ten parameters within errors for the
     whole."""

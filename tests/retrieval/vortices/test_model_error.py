@@ -114,6 +114,6 @@ def test_noise_of_pixels_is_no_flow():
     assert np.mean(found) < 2e-4
 
 
-def test_nothing_known_is_no_error():
+def test_without_residuals_there_is_no_model_error():
     nothing = torch.zeros(3, 20, 20, dtype=torch.float64)
     assert model_error(nothing[:2], nothing, 1.0) == ModelError()

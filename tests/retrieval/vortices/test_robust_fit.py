@@ -83,7 +83,7 @@ def test_normal_matrix_and_cost_without_outliers():
     assert found.cost == pytest.approx(1, abs=4 * np.sqrt(2 / X.size))
 
 
-def test_what_is_not_valid_has_no_weight():
+def test_invalid_residuals_have_no_weight():
     values, valid = data(), np.ones(X.shape, bool)
     values[2, 3:8], valid[2, 3:8] = 1e3, False
     whole = fitted(evaluation(data(), valid))

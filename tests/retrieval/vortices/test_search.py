@@ -48,7 +48,7 @@ def misfit(start, data):
 
 @pytest.mark.parametrize("angle", [None, 0.9], ids=["v and w", "one component"])
 @pytest.mark.parametrize("mean", [(0.0, 0.0), (8.0, -3.0)])
-def test_the_pair_is_found_whatever_wind_carries_it(angle, mean):
+def test_the_pair_is_detected_whatever_wind_advects_it(angle, mean):
     """To the step of the places that are tried, 60 m x 40 m by 700: 1.9 m."""
     start = starting_points(observed(PAIR, mean, 0.3, angle=angle), 1, "lamb_oseen")[0].numpy()
     places = start[[2, 3, 6, 7]]
@@ -61,7 +61,7 @@ def test_the_pair_is_found_whatever_wind_carries_it(angle, mean):
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-def test_starts_are_pairs_in_order_of_what_they_explain(profile):
+def test_starts_are_pairs_in_order_of_misfit(profile):
     """Oppositely rotating, three core radii apart, each better than the next by least squares of
     its own (which knows the Lamb-Oseen profile alone)."""
     data = observed(PAIR, noise=0.3)
