@@ -113,7 +113,7 @@ def test_without_collisions_brillouin_is_rayleigh():
 
 
 def test_collisions_move_the_outer_peaks_to_the_speed_of_sound():
-    """At y = 1, the end of the fit, within a tenth of +-2 (1.4)^(1/2) v0 / wavelength."""
+    """At y = 1, the end of the fit, within 10 % of +-2 (1.4)^(1/2) v0 / wavelength."""
     line = rayleigh_brillouin(WAVELENGTH, TEMPERATURE, ONE)
     assert line.offsets[[0, 2]] == pytest.approx(
         np.sqrt(1.4) * THERMAL * np.array([-1, 1]), rel=0.1

@@ -42,7 +42,7 @@ def test_derived_numbers_in_closed_form():
 
 
 def test_asymmetry_converges_with_the_angles():
-    """Linear interpolation is of second order: half the step, a quarter of the error."""
+    """Linear interpolation is of second order: half the step, 25 % of the error."""
     errors = [abs(haze(step=step).asymmetry - 0.7) for step in (1.0, 0.5, 0.25)]
     assert errors[0] / errors[1] == pytest.approx(4, rel=0.1)
     assert errors[1] / errors[2] == pytest.approx(4, rel=0.1)

@@ -34,7 +34,7 @@ def mean_line_spectra(shape, spacing, outer, seeds):
 
 
 def test_line_spectra_fall_with_minus_five_thirds():
-    """Between 4 k0 and a quarter of the largest wavenumber both ends bend the law by less than
+    """Between 4 k0 and 25 % of the largest wavenumber both ends bend the law by less than
     6 % (k0^2/k^2 x 5/6 below, waves the grid does not hold above), which over this factor of 8
     in k is 0.03 in the slope each; ten seeds of 512 lines scatter by 0.01."""
     spacing, outer = 0.5, 128.0

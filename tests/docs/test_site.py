@@ -1,6 +1,6 @@
 """The documentation as a site.
 
-Detects a page that the site lists but does not have, or has but does not list, a picture or link
+Detects a page that the site lists but does not have, or has but does not list, an image or link
 that leads nowhere, a formula that is left as its source, and styled letters that browsers would
 draw plain.
 """

@@ -14,7 +14,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 NOTEBOOKS = sorted(path.name for path in EXAMPLES.glob("*.ipynb"))
 
 EXPECTED = {
-    # an eighth of the true wind's rms; cores as the truth has them, to half a node of 1 m
+    # 12 % of the true wind's rms; cores as the truth has them, to half a node of 1 m
     "first_steps.ipynb": """
 assert rmse < rms / 8 and rmse < 1.5 * stated
 assert pair.success and len(result.cores) == 2

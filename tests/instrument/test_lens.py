@@ -41,7 +41,7 @@ def test_focal_length_is_the_lensmaker_s(lens):
 
 def test_paths_to_the_focus_are_equally_long(lens):
     """Fermat: of all ways through both surfaces light takes the shortest, and on the axis all
-    shortest ways are alike to a hundredth of a wavelength."""
+    shortest ways are alike to 1 % of a wavelength."""
 
     def sag(height, radius, conic):
         return height**2 / radius / (1 + np.sqrt(1 - (1 + conic) * height**2 / radius**2))

@@ -1,4 +1,4 @@
-"""Depolarisation and share of multiple scattering, values and errors.
+"""Depolarisation and fraction of multiple scattering, values and errors.
 
 Errors are compared with the spread of 4000 simulated experiments (4 sigma: 5 %) and with the
 formula for a ratio of independent channels (rounding).

@@ -1,4 +1,4 @@
-"""Pictures of every kind become the same numbers by every command, and `rings` measures them.
+"""Images of every kind become the same numbers in every command, and `rings` measures them.
 
 Detects: a kind of file that is read with other values, upside down, mirrored or not at all, a layer
 or colour that is taken for another or read by two rules, a wrong spacing, and files that end in a
@@ -128,7 +128,7 @@ def test_a_colour_image_is_the_same_to_both_commands(tmp_path, monkeypatch):
             cli.main()
     to_rings, to_retrieve = given
     np.testing.assert_allclose(to_rings, colours[..., :3].sum(-1) / 3.0, rtol=1e-12)
-    # z and y ascend: the last row is the picture's top, the last column its left
+    # z and y ascend: the last row is the image's top, the last column its left
     np.testing.assert_array_equal(to_retrieve[::-1, ::-1], to_rings)
 
 

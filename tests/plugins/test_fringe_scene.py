@@ -1,7 +1,7 @@
 """Rings from source, etalon, lens and CCD against numpy: float64, exact angles, no code of ours.
 
 Detects: 0.05 m/s of bias, 1 % of energy between the directions of tracing, a wrong frequency,
-direction or polarisation distribution, light displaced by 0.01 px at a lens, a picture turned over,
+direction or polarisation distribution, light displaced by 0.01 px at a lens, an image turned over,
 an axis of Stokes vectors turned, a kernel compiled again for a new velocity.
 """
 
@@ -217,7 +217,7 @@ def test_velocity_of_an_image_without_noise(estimator, shape, lens, paths, allow
         for _ in range(2):
             here, there = (4 * rings(**quarter, v_los=guess + d) for d in (-0.5, 0.5))
             model, slope = (here + there) / 2, there - here
-            # the score of a Poisson picture; its level is known
+            # the score of a Poisson image; its level is known
             information = (slope**2 / model).sum()
             guess += (slope / model * (picture - model)).sum() / information
         # weights of forward paths lie below one: their noise is below that of counts
@@ -369,7 +369,7 @@ def test_coated_plates_polarise_along_the_ring(estimator, centre, stokes_index):
     )
     light = (1 - sine2) ** 2  # the pixels' solid angles
     level, linear = (np.array(m, float).reshape(sine2.shape) * light for m in (m00, m01))
-    # light travels to the CCD, to -x of the scene, right of the picture is -y, down is -z
+    # light travels to the CCD, to -x of the scene, right of the image is -y, down is -z
     way = np.stack([-FOCAL * np.ones_like(x), x, y], -1)
     way /= np.linalg.norm(way, axis=-1, keepdims=True)
 
@@ -475,7 +475,7 @@ def test_lens_is_followed_to_a_thousandth_of_a_pixel():
         )
         expected = np.array([snell(h, s) for h, s in zip(heights, slopes, strict=True)]) / 7.4e-6
         found = np.array(getattr(place, axis), float) - (479.5 if axis == "x" else 389.5)
-        # right is -y and down is -z of the scene; the picture is upright
+        # right is -y and down is -z of the scene; the image is upright
         np.testing.assert_allclose(found, -expected, atol=2e-3)
         inside = np.abs(expected) < (479 if axis == "x" else 389)
         assert np.array_equal(np.array(arrives), inside)
@@ -541,7 +541,7 @@ def test_mitsuba_s_own_integrator_sees_the_same_rings(statistics):
 
 @pytest.mark.parametrize("estimator", ["camera", "forward"])
 def test_velocity_gap_and_line_need_no_compilation(estimator):
-    """A first picture compiles; others, of other scenes too, do not."""
+    """A first image compiles; others, of other scenes too, do not."""
 
     def misses(loaded, seed):
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

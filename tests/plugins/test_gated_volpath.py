@@ -131,7 +131,7 @@ def test_standard_error_is_correct(world, statistics, case):
 
 @pytest.mark.parametrize("photons", [64, 400])
 def test_standard_error_is_correct_in_a_thin_textured_slab(world, statistics, photons):
-    """The lidar's own case: optical depth 0.008, cells of 20 % variation, few photons a beam.
+    """The lidar's own case: optical depth 0.008, cells of 20 % variation, few samples per beam.
 
     Null collisions are rare there. If each of them changed the transmittance much, most error
     bars would miss them: pure ratio tracking gives a variance of 1.37 with 64 photons.
@@ -384,7 +384,7 @@ class TestOpaqueTargets:
         assert behind[0, 0] == pytest.approx(far[0, 0], rel=1e-5)
 
     def test_half_a_wall_hides_the_beams_on_its_side(self, world):
-        """A wall on the port side (+y): the left half of the picture is dark."""
+        """A wall on the port side (+y): the left half of the image is dark."""
         stokes, _ = world.render(self.scene(world, self.wall(300.0, 0.0, 100.0), "gated"))
         assert (stokes[0, 0, :, :4] == 0).all() and (stokes[0, 0, :, 4:] > 0).all()
 

@@ -1,4 +1,4 @@
-"""Gradients of the picture with respect to the extinction grid.
+"""Gradients of the image with respect to the extinction grid.
 
 Detects: 2 % in a directional derivative against central differences (k sigma over seeds), a
 gradient that reaches cells no beam crosses.
@@ -102,7 +102,7 @@ def test_cells_outside_every_beam_have_no_gradient(slab):
 
 
 def test_blurred_slab_is_recovered_by_gradient_descent(slab):
-    """From a flat start, Adam brings the picture of the slab back to the true one."""
+    """From a flat start, Adam brings the image of the slab back to the true one."""
     scene, parameters = slab
     put(parameters, BASE)
     target = np.array(mi.render(scene, spp=20_000, seed=77))[..., :1]
@@ -138,7 +138,7 @@ def test_gradient_of_the_albedo_is_the_image_over_the_albedo(variant, world):
     dr.backward(dr.sum(image[..., 0]) * 1e7)
     gradient = float(np.ravel(np.array(dr.grad(parameters[key])))[0])
     signal, error = (np.array(image)[..., k].astype(float) for k in (0, 4))
-    # the gradient's photons are others than the picture's
+    # the gradient's photons are others than the image's
     sigma = 1e7 * np.sqrt(2 * (error**2).sum()) / 0.8
     assert sigma < 1e-2 * gradient
     assert abs(gradient - 1e7 * signal.sum() / 0.8) < 4 * sigma

@@ -275,7 +275,7 @@ class TestGates:
         statistics.assert_agree(many[:, 0].sum(0), both, together[0, 0], gates * photons)
 
     def test_every_gate_gets_the_same_number_of_samples(self, world):
-        """Samples that do not divide by the gates are rounded up: the same picture."""
+        """Samples that do not divide by the gates are rounded up: the same image."""
         pictures = [
             world.render(
                 slab_scene(world, (5, 4), (500.0, 508.0), gate_count=4), seed=9, spp=samples

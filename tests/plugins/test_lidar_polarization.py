@@ -53,7 +53,7 @@ def scan(world, emitted, phase, environment=None, **parameters):
 @pytest.mark.parametrize("name", EMITTED)
 @pytest.mark.parametrize("phase", ["rayleigh_polarized", "mueller"])
 def test_backscatter_turns_the_signs_of_u_and_v(world, name, phase):
-    """diag(1, 1, -1, -1): the field stays, the direction it is looked at from turns round."""
+    """diag(1, 1, -1, -1): the field stays, the direction of view is reversed."""
     if phase == "mueller":
         angle = np.linspace(0, 180, 19)
         cosine = np.cos(np.radians(angle))

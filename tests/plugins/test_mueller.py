@@ -49,7 +49,7 @@ def directions_at(optics, rng, degrees):
 def test_rayleigh_table_equals_rayleigh(optics, step):
     """Within the truncation error of linear interpolation, h^2 / 8 max |f''|.
 
-    |f''| <= 1.5 / (4 pi) for every element; the scale factor carries the same relative error.
+    |f''| <= 1.5 / (4 pi) for every element; the scale factor has the same relative error.
     """
     rng = np.random.default_rng(1)
     degrees = np.concatenate([[0, 180, 179.9], rng.uniform(0, 180, 500)])

@@ -87,7 +87,7 @@ def test_blend_beyond_its_parts_is_refused(world):
     ],
 )
 def test_updates_are_checked(world, name, value, says):
-    """A scene that has rendered well, and then is told something else."""
+    """A scene that has rendered well, and then is given something else."""
     loaded = scene(world)
     assert np.isfinite(np.array(mi.render(loaded))).all()
     parameters = mi.traverse(loaded)

@@ -65,7 +65,7 @@ class TestWherePixelsLook:
     @pytest.mark.parametrize("row", [0, 2])
     @pytest.mark.parametrize("column", [0, 3])
     def test_a_cloud_is_imaged_by_the_pixel_that_points_at_it(self, world, row, column):
-        """Largest elevation in the top row, largest azimuth in the left column, in the picture."""
+        """Largest elevation in the top row, largest azimuth in the left column, in the image."""
         azimuth = np.radians(np.linspace(4, -4, 4))[column]
         elevation = np.radians(np.linspace(3, -3, 3))[row]
         centre = 501.25 * np.array([1, math.tan(azimuth), math.tan(elevation)])

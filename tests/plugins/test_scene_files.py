@@ -163,7 +163,7 @@ SCENES = Path(str(files("lidar_mi.scenes")))
 
 
 def shipped(name, samples, **definitions):
-    """Picture of a shipped scene as channel name: (rows, columns), and its sensor."""
+    """Image of a shipped scene as channel name: (rows, columns), and its sensor."""
     mi.set_variant("llvm_ad_mono_polarized")
     mi.set_log_level(mi.LogLevel.Error)
     scene = mi.load_file(str(SCENES / name), **definitions)
@@ -211,7 +211,7 @@ def test_profile_of_500_gates():
 
 
 def test_puff_from_a_grid():
-    """The grid that ships is the Gaussian it says; its picture obeys the lidar equation along the
+    """The shipped grid is the stated Gaussian; its image obeys the lidar equation along the
     axis of every beam, blurred by the beam's 0.16 m. Cells of 1 m: trilinear air lies below the
     Gaussian where that bends down, by up to h^2/8 of the second derivative, 1 %."""
     values = np.array(mi.VolumeGrid(str(SCENES / "puff.vol"))).reshape(24, 24, 24)

@@ -239,7 +239,7 @@ class TestVolume:
             plan = plans[0] if scan.attrs["telescope_position"] == 0 else plans[1]
             apparent = s0 * plan.ranges().mean((1, 2)) ** 2 / lidar.aperture_area
             apparent /= plan.gate_length().mean()
-            # extinction is linear between cell centres: at gate centres a quarter of the way
+            # extinction is linear between cell centres: at gate centres 25 % of the way
             expected = np.interp(500.5 + np.arange(10), x, sigma) * BACKSCATTER
             assert apparent == pytest.approx(expected, rel=3e-3)
 
@@ -276,7 +276,7 @@ class TestScans:
         assert alone.attrs["telescope_position"] == 15
 
     def test_scans_differ_in_their_random_numbers(self):
-        """Equal air, equal place: only the seeds differ, and the pictures do."""
+        """Equal air, equal place: only the seeds differ, and the images do."""
         first = self.plans()[0]
         field = next(iter(self.fields([first])))
         one, two = render([field, field], [first, first])

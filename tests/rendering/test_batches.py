@@ -55,7 +55,7 @@ class Killed(Exception):
 
 
 def rendered(scene, path=None, passes=None):
-    """The image; what is kept in a file; ends after so many passes, if it is told to."""
+    """The image; what is kept in a file; ends after so many passes, if requested."""
     made = []
 
     def progress(done, total):
@@ -97,7 +97,7 @@ def test_a_killed_image_resumes_where_it_was(variant, tmp_path, monkeypatch, mak
 
 
 def test_batches_are_kept_every_half_minute(monkeypatch):
-    """And less often where that takes long: a tenth of the time is spent on it at most."""
+    """And less often where that takes long: 10 % of the time is spent on it at most."""
     clock, kept, slow = [0.0], [], [0.0]
     monkeypatch.setattr(batches.time, "monotonic", lambda: clock[0])
 

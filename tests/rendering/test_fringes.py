@@ -1,7 +1,7 @@
-"""From etalon, camera and line to a rendered picture and its file.
+"""From etalon, camera and line to a rendered image and its file.
 
 Detects: a parameter of a description that does not reach the scene, another velocity than asked
-for, a picture turned over, a layer or header entry lost on the way to the file, a scene file that
+for, an image turned over, a layer or header entry lost on the way to the file, a scene file that
 does not render. That the rings are right is tested with the plugins.
 """
 
@@ -26,7 +26,7 @@ from lidar_mi.rendering.settings import FringeSettings
 pytestmark = pytest.mark.usefixtures("variant")
 
 WAVELENGTH = 354.7e-9
-# the usual field on a tenth of the pixels
+# the usual field on 10 % of the pixels
 CAMERA = {"width": 96, "height": 78, "pixel": 74e-6}
 LINE = backscatter_line(WAVELENGTH, 232.9, 33_154.0, aerosol_fraction=0.1)
 SCENE = Path(str(files("lidar_mi.scenes"))) / "fringes.xml"
@@ -46,7 +46,7 @@ def render(etalon=None, camera=None, line=LINE, v_los=(0.0,), seed=1, **settings
 
 
 def z_scores(picture, expected):
-    """Of the shares of the light, in blocks of 3 x 3 pixels; 3e-4 are left to the reference."""
+    """Of the fractions of the light, in blocks of 3 x 3 pixels; 3e-4 are left to the reference."""
 
     def blocks(values):
         rows, columns = values.shape

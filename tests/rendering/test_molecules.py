@@ -1,7 +1,7 @@
 """Molecules beside particles, each with a scattering matrix and an albedo of its own.
 
-Detects a wrong share of either (0.3 %) in slab or environment, a share that stays behind when the
-scene moves on, and molecules that carry texture.
+Detects a wrong fraction of either (0.3 %) in slab or environment, a part that remains when
+the scene moves, and molecules with texture.
 """
 
 import numpy as np

@@ -73,7 +73,7 @@ def blob(y0, z0, sigma=1.5):
 
 
 def as_seen(path):
-    """The picture as any EXR program has it: row 0 at the top, column 0 at the left."""
+    """The image as any EXR program has it: row 0 at the top, column 0 at the left."""
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return np.array(file.channels()["Y"].pixels)
 

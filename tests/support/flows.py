@@ -1,4 +1,4 @@
-"""Air that carries a texture: images of exactly known motion.
+"""Air that advects a texture: images of exactly known motion.
 
 A texture is a sum of plane waves, evaluated wherever the air of a pixel came from. Nothing is
 interpolated, so all error in what is retrieved is the method's.

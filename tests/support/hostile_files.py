@@ -221,7 +221,7 @@ def wake_file(engine: str) -> bytes:
 
 @st.composite
 def wake_cases(draw: st.DrawFn) -> Case:
-    """NetCDF files, looked at and used as a wake."""
+    """NetCDF files, checked and used as a wake."""
     data = BASE | {"wake": {"file": "a.nc", "time": 1, "x": 1}, "retrieval": {"search": 10}}
     asked = draw(st.sampled_from(({}, {}, {"time": 0}, {"depth": "volume"}, {"second": 1})))
     data["wake"] = data["wake"] | asked

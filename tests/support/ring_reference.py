@@ -1,4 +1,4 @@
-"""Pictures of etalon rings without the program: Airy's formula, quadrature, extended precision."""
+"""Images of etalon rings without the program: Airy's formula, quadrature, extended precision."""
 
 import numpy as np
 from numpy.polynomial.legendre import leggauss

@@ -18,7 +18,7 @@ from tests.support.experiments import as_seen, blob, check, small, without_figur
 @pytest.fixture(scope="module")
 def blob_run(tmp_path_factory):
     """A bright blob at y = 8.25 m, z = -3.75 m (port, below; the middle of a template, between
-    pixels), carried by v = 10, w = 5 m/s."""
+    pixels), advected by v = 10, w = 5 m/s."""
     beside = tmp_path_factory.mktemp("blob")
     name = write_wake(beside / "a <b>blob & more.nc", blob(8.25, -3.75))
     data = {

@@ -76,13 +76,13 @@ def test_retrieve_equals_the_run(demo, there, lidar_mi):
         same = run.sel(source="backscatter", algorithm="cc")
         for name in ("v", "w", "y_vector"):
             np.testing.assert_array_equal(wind[name].values, same[name].values)
-        # the noise comes with the pictures, so that flags agree too
+        # the noise comes with the images, so that flags agree too
         np.testing.assert_array_equal(wind["flag"].values, same["flag"].values)
         assert f"{float((wind['flag'] == 0).mean()):.1%} valid" in out
 
 
 def test_retrieve_accepts_any_image_with_a_spacing(there, lidar_mi):
-    """A random picture moved by 2 px to the left (+y) and 1 px down, 0.25 m a pixel, 0.5 s."""
+    """A random image moved by 2 px to the left (+y) and 1 px down, 0.25 m a pixel, 0.5 s."""
     noise = np.random.default_rng(5).random((60, 70)).astype(np.float32)
     noise = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1) + 1).astype(np.float32)
     for name, picture in (("a", noise[5:45, 5:55]), ("b", noise[4:44, 7:57])):

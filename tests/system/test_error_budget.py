@@ -1,4 +1,4 @@
-"""The error budget of an experiment. Detects causes switched off in the wrong picture, a slab's
+"""The error budget of an experiment. Detects causes switched off in the wrong image, a slab's
 depth that is forgotten, winds found again that are not those of the run, and a report that does not
 say what limits."""
 
@@ -89,7 +89,7 @@ def noise_free_scans(experiment, truth):
 
 
 def test_blur_is_corrected_only_where_present(tmp_path):
-    """`variational` is told of the beam's width, but not of air as it is: the winds are those of
+    """`variational` is given the beam's width, but not for unblurred air: the winds are those of
     `retrieve_wind` told the same."""
     text = SMALL.replace("[multipass, cc]", "[variational]").replace("detector: {}\n", "")
     (tmp_path / "told.yaml").write_text(text.replace("error_budget", "blur: beam, error_budget"))
@@ -111,8 +111,8 @@ def test_blur_is_corrected_only_where_present(tmp_path):
 
 
 def test_wind_that_changes_through_the_slab_is_a_cause(tmp_path):
-    """v from 0 to 10 m/s through 2.5 m of structured air: pictures of a slab that moves as one with
-    the mean of 5 m/s give it to a tenth of the error."""
+    """v from 0 to 10 m/s through 2.5 m of structured air: images of a slab that moves as one with
+    the mean of 5 m/s give it to 10 % of the error."""
     x, y, z = np.arange(0, 4.1, 0.5), np.arange(0.0, 41), np.arange(0.0, 31)
     shape = (len(x), len(y), len(z))
     v = np.broadcast_to(5 + 4 * (x - 2)[:, None, None], shape)

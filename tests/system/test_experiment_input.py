@@ -52,8 +52,8 @@ def test_gates_that_reach_beyond_the_wake(tmp_path):
 
 
 def test_beams_wider_than_a_template_are_reported(tmp_path, quick):
-    """At 5 km the paper's beam is 10 m wide, a template 4 m: nothing is left to follow, and the
-    report says so."""
+    """At 5 km the paper's beam is 10 m wide, a template 4 m: nothing is left to follow, as the
+    report states."""
     told = []
     data = small() | {"scan": {"range": "5 km"}}
     metrics = run(check(data), tmp_path / "run", notice=lambda text, _: told.append(text)).metrics

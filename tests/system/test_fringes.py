@@ -2,7 +2,7 @@
 
 Detects: rings in the wrong place or moved the wrong way by the wind, winds worse than the Cramer-
 Rao bound allows for or biased, a stated uncertainty that is not met, averages whose noise is not
-that of averages, a paper's chain without its bias, pictures that are not used again or not the same
+that of averages, a paper's chain without its bias, images that are not used again or not the same
 when rendered again, results of another experiment taken for this one's, changed or non-finite
 metrics, experiments of both lidars that lose one, and input that only fails later."""
 
@@ -29,7 +29,7 @@ from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.io.exr import read_fringes
 from tests.support.experiments import leave_out_figures
 
-# a quarter of the default camera's pixels see the same four rings
+# 25 % of the default camera's pixels see the same four rings
 CAMERA = {"width": 480, "height": 390, "pixel": "14.8 um"}
 SPEEDS = (50.0, -300.0)
 SMALL = {
@@ -106,7 +106,7 @@ QUICK = {
 }
 
 
-# ---------------------------------------------------------------- pictures
+# ---------------------------------------------------------------- images
 
 
 def mean_r2(picture, low, high):
@@ -164,7 +164,7 @@ def test_winds_scatter_as_the_bound_says(small, found, centre, averaged):
     bound = small[1][f"doppler.bound.centre_{centre}.averaged_{averaged}.std"]
     error = (case["v"] - case["v_los"]).values.ravel()
     low, high = stats.chi2.ppf([1e-4, 1 - 1e-4], error.size)
-    # the rendered pictures have noise of their own
+    # the rendered images have noise of their own
     own = small[1]["doppler.render.largest_error"]
     assert own < 0.03
     assert low * bound**2 < (error**2).sum() < high * (bound**2 + own**2)
@@ -199,7 +199,7 @@ def test_both_fits_agree(found):
 
 
 def test_one_image_of_an_average_has_the_noise_of_a_sum():
-    """Mean and variance of 2000 pixels, against sums of five pictures, within 5 sigma."""
+    """Mean and variance of 2000 pixels, against sums of five images, within 5 sigma."""
     ccd = CCD(read_noise=3, dark_current="20 Hz")
     flat = torch.full((40, 50), 30.0)
     n, repeats = 5, 10
@@ -237,7 +237,7 @@ def test_metrics_are_the_stable_ones(small):
     expected = {f"doppler.bound.{case}.std" for case in cases}
     for method in SMALL["doppler"]["retrieval"]["methods"]:
         more = {"expected_std"} if method in ("annular", "pixels") else set()
-        # one picture at a speed has no spread
+        # one image at a speed has no spread
         spread = {"bias_stderr", "std", "std_stderr"} if method != "annular" else set()
         expected |= {
             f"doppler.{method}.{c}.{name}" for c in cases for name in (measures | more) - spread

@@ -77,7 +77,7 @@ def test_image_is_the_blurred_extinction_within_its_standard_errors():
     """Single scattering by the textured wake against theory, at both times, pixel by pixel.
 
     Y = 3/(8 pi) x extinction seen by the beam x exp(-2 (extinction - environment) x way in the
-    slab). Expected deviations: the pixels' own standard errors. Those are honest on average but
+    slab). Expected deviations: the pixels' own standard errors. Those are correct on average but
     small where the value came out small (rare null collisions), so the ratio of sums is taken:
     its scatter is (2/25000)^(1/2) = 0.01. What the theory leaves out (smear of oblique beams over
     the depth, attenuation by structure) is 0.05 % of a pixel, 0.01 of the noise's square here. A

@@ -96,12 +96,12 @@ def test_pictures_of_another_version_are_kept_out(tmp_path, quick):
     assert pictures_of(folder) == stamps
     run(check(small()), folder, overwrite=True)
     assert pictures_of(folder) != stamps
-    record["versions"]["numpy"] = "1.0"  # which makes no pictures
+    record["versions"]["numpy"] = "1.0"  # which makes no images
     run(check(small()), folder)
 
 
 def test_a_changed_wake_file_is_another_experiment(tmp_path, quick):
-    """Same name, other content: the old pictures must not be taken for it."""
+    """Same name, other content: the old images must not be taken for it."""
     data = small()
     data["wake"] = {"file": write_wake(tmp_path / "w.nc", blob(8, -4)), "texture": {"rms": 0}}
     run(check(data), tmp_path / "run", beside=tmp_path)

@@ -98,7 +98,7 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
             *(f"{part}{s}" for part in ("", "outside_cores.", "all.") for s in STATISTICS),
         )
     }
-    # the noise of a picture that was rendered is known, and so how well a wind can be found in it
+    # the noise of an image that was rendered is known, and so how well a wind can be found in it
     expected |= {
         f"backscatter.{method}.{q}_{name}"
         for method in ("cc", "ws")

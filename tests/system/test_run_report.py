@@ -25,7 +25,7 @@ SCENES = Path(str(files("lidar_mi.scenes")))
 
 
 def axes_in(path):
-    """The pictures inside a figure file, largest two: blocks of pixels that are not white. A thin
+    """The images inside a figure file, largest two: blocks of pixels that are not white. A thin
     frame joins nothing to them, colour bars are smaller."""
     pixels = plt_imread(path)[..., :3]
     inked, _ = ndimage.label(ndimage.binary_opening((pixels < 0.97).any(-1), np.ones((9, 9))))
@@ -50,7 +50,7 @@ def test_figures_are_readable_and_not_blank(demo, name):
     "figure, of", [("fig08_backscatter", "backscatter"), ("fig05_extinction", "extinction")]
 )
 def test_figures_have_the_pilot_s_view(demo, figure, of):
-    """Brightness of the drawn pictures against the data: port (+y) on the left, up at the top.
+    """Brightness of the drawn images against the data: port (+y) on the left, up at the top.
     Mirrored either way or turned by 180 degrees they do not match."""
     if of == "backscatter":
         data = [read_scan(demo.folder / name)["Y"] for name in IMAGES]

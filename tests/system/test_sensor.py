@@ -177,7 +177,7 @@ def test_the_vortices_are_reported_and_saved(whole):
 
 
 def again(whole, tmp_path, monkeypatch, spoil):
-    """The same run with its pictures as they are and its winds spoilt: the report's text."""
+    """The same run with its images as they are and its winds spoilt: the report's text."""
     folder, _ = whole
     shutil.copytree(folder, tmp_path / "run")
     (tmp_path / "run" / "wind3d.nc").write_text("of another run")

@@ -168,7 +168,7 @@ VOLUME = {
 @pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_volumes_are_compared(file, tmp_path, monkeypatch):
-    """Their wind is another file with a layer more: drawn is the one nearest to the picture."""
+    """Their wind is another file with a layer more: drawn is the one nearest to the image."""
     monkeypatch.setattr("lidar_mi.assessment.figures.volume.draw_all", lambda *_: [])
     drawn, draw = {}, study.draw_comparison
     monkeypatch.setattr(
@@ -241,7 +241,7 @@ def test_info_on_a_study_that_was_stopped(tmp_path):
 
 
 def test_a_fault_in_the_last_stops_the_first(file, tmp_path):
-    """What a chain finds out ahead is said before anything is written."""
+    """What a chain finds out ahead is reported before anything is written."""
     variants = SMALL["variants"] | {"bad": {"retrieval": {"template": 60, "search": 70}}}
     with pytest.raises(InputError):
         study.run("two", config.load_variants(file(variants=variants)), tmp_path / "out")

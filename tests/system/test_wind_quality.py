@@ -106,13 +106,13 @@ def test_every_step_of_the_instrument_costs(demo):
 
 
 def test_noise_of_the_images(demo):
-    """16 photons a beam are to give 1 % a pixel, so 64 give 0.5 %; a tenth more for the slab's
+    """16 samples per beam are to give 1 % a pixel, so 64 give 0.5 %; a tenth more for the slab's
     structure within the beam."""
     assert demo.metrics["backscatter.mc_relative_error"] < 0.0055
 
 
 def test_multiple_scattering_is_a_small_fraction(demo):
-    """Light scattered twice has met another 0.1 / km on 500 m: a share of 0.05 if all of it came
+    """Light scattered twice has met another 0.1 / km on 500 m: a fraction of 0.05 if all of it came
     back through the field of view, which takes in 2.5 m of those 500 m."""
     assert 0 < demo.metrics["backscatter.multiple_scattering_fraction"] < 0.05
 
@@ -127,7 +127,7 @@ def test_the_cores_are_those_of_the_wake(demo):
 
 
 def test_the_air_between_the_vortices_moves_down(demo):
-    """Seen in the pictures, not in the truth: the port vortex (y > 0) has omega_x > 0, so air
+    """Seen in the images, not in the truth: the port vortex (y > 0) has omega_x > 0, so air
     sinks inboard, rises outboard and drifts to starboard above the core."""
     with xr.open_dataset(demo.folder / "wind.nc") as wind:
         seen = wind.sel(source="backscatter", algorithm="cc")

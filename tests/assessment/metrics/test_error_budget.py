@@ -280,7 +280,7 @@ def test_noise_alone_has_all_of_it(method):
 
 @pytest.mark.parametrize("method", ["cc", "multipass"])
 def test_fraction_of_noise_is_the_scatter_of_winds_over_noise_draws(method):
-    """Noise taken away as it fell, or drawn anew six times: its share of the error is the same.
+    """Noise taken away as it fell, or drawn anew six times: its fraction of the error is the same.
 
     The difference of the two scatters by 0.02 over sets of six draws; four times that is allowed.
     """
@@ -345,7 +345,8 @@ def test_the_sentence_names_the_largest_causes_in_turn():
         "The wind by cross-correlation has an rms error of 0.35 m/s, limited by noise of the "
         "detector (70 % of the mean square error), then width of the beam (20 %)."
     )
-    # beyond the cores where there are any; that noise of the simulation is not the lidar's is said
+    # beyond the cores where there are any; that noise of the simulation is not the lidar's is
+    # reported
     both = described(beam_blur=0.9, detector_noise=0.1, monte_carlo=0.1)
     both |= described("outside_cores.", beam_blur=0.1, detector_noise=0.2, monte_carlo=0.5)
     text = limit_sentence(both, "cc")

@@ -1,7 +1,7 @@
 """Error measures of line-of-sight winds.
 
 Detects: a spread that takes a speed's own bias for noise, degrees of freedom or standard errors
-that are wrong, a bias weighted by how many pictures were read, missing readings taken for zero.
+that are wrong, a bias weighted by how many images were read, missing readings taken for zero.
 """
 
 import numpy as np

@@ -7,7 +7,7 @@ of each. v and w are the truth plus errors of the covariance that is stated.
 
 Detects standard errors that do not hold over a class of flows: shares within 1 and 1.96 of them off
 by more than 5 points of 68 and 95 % plus 2 standard errors of the mean over draws. What lines
-cannot tell is said below, class by class.
+cannot determine is listed below, class by class.
 """
 
 import functools

@@ -1,7 +1,7 @@
-"""Rings in any picture: what the command `lidar-mi rings` finds, on made and on real pictures.
+"""Rings in any image: what the command `lidar-mi rings` finds, on made and on real images.
 
 Detects: a centre off by its error bar, radii off by 0.1 px, lines taken for orders or orders for
-lines, unequal splitting, a tilted camera mistaken for another centre, and pictures without two
+lines, unequal splitting, a tilted camera mistaken for another centre, and images without two
 rings that give a number.
 """
 
@@ -24,7 +24,7 @@ RADII = reference.FOCAL_LENGTH / reference.PIXEL * np.sqrt((1 - ORDERS / 77248.5
 def split_rings(shape, centre, spacing, fractions, finesse=60.0, ellipticity=0.0, tilt=0.0):
     """Airy rings of several lines, seen by a tilted camera that makes ellipses of circles.
 
-    ``tilt`` is that of a pinhole's picture plane, in 1/px: exact, not to first order.
+    ``tilt`` is that of a pinhole's image plane, in 1/px: exact, not to first order.
     """
     x = np.arange(shape[1]) - centre[0]
     y = (np.arange(shape[0]) - centre[1])[:, None]
@@ -72,7 +72,7 @@ def test_lines_and_orders_are_distinguished(fractions):
 
 
 def test_laboratory_like_image():
-    """Split line, 8 bits, tilted camera, ellipses, sloping light: stands in for the real pictures.
+    """Split line, 8 bits, tilted camera, ellipses, sloping light: stands in for the real images.
 
     The same instrument sees the line single and split: one centre, equal splitting in both
     orders, and the pair's mean where the single ring was.
@@ -99,7 +99,7 @@ def test_laboratory_like_image():
 
 @pytest.mark.skipif(not LABORATORY.is_dir(), reason="the laboratory pictures are not here")
 def test_laboratory_images():
-    """Real pictures of one line, single and split: what any right analysis must find."""
+    """Real images of one line, single and split: what any right analysis must find."""
     single, split = (
         analyse_rings(np.array(Image.open(LABORATORY / f"fabry_perot_{name}.jpg")))
         for name in ("single", "split")

@@ -73,7 +73,7 @@ def test_crests_lie_on_the_ring():
         before, behind = points[direction, ..., direction]
         assert (before < centre[direction]).all() and (behind > centre[direction]).all()
         np.testing.assert_allclose((before + behind) / 2, centre[direction], atol=0.02)
-    # half of the ring out of the picture: no chord along x, those along y are left
+    # half of the ring out of the image: no chord along x, those along y are left
     cut = midpoint_points(gaussian_ring((120, 90), centre, radius), centre, radius, 10.0)
     assert np.isnan(cut[0, 1]).all() and np.isfinite(cut[0, 0]).all()
 

@@ -1,8 +1,8 @@
-"""Winds from all rings at once, on pictures made without the program (`ring_reference`).
+"""Winds from all rings at once, on images made without the program (`ring_reference`).
 
 Detects: a bias of 0.1 m/s, a standard deviation 1.2 times the Cramer-Rao bound or more (slow; the
 default suite sees 1.4 times), error bars that are not the scatter, an order lost between -300 and
-+300 m/s, and pictures that are no rings but give a number.
++300 m/s, and images that are no rings but give a number.
 """
 
 import numpy as np
@@ -71,7 +71,7 @@ def bound_of(case, v_los=20.0, **size):
     ],
 )
 def test_reaches_the_bound(case):
-    """64 pictures: std known to 9 %, mean to an eighth of it; both within 4 sigma."""
+    """64 images: std known to 9 %, mean to 12 % of it; both within 4 sigma."""
     number = 64
     images = exposures(case, number, 7, **COARSE)
     fit = fit_rings(images, ring_model(**COARSE), TABLE[case][2])
@@ -82,7 +82,7 @@ def test_reaches_the_bound(case):
     torch.testing.assert_close(fit.v_los_std, torch.full_like(fit.v_los, bound), rtol=0.05, atol=0)
     cells = 1 / (fit.chi_square.std() ** 2) * 2  # what its scatter says of their number
     assert abs(fit.chi_square.mean() - 1) < 0.02 and cells > 1000
-    # the 2-D fit of the same pictures finds the same, but for the little that the cells lose
+    # the 2-D fit of the same images finds the same, but for the little that the cells lose
     flat = fit_rings(images[:4], ring_model(**COARSE), TABLE[case][2], method="pixels")
     assert (abs(flat.v_los - fit.v_los[:4]) < bound).all()
     assert (flat.v_los_std / fit.v_los_std[:4] - 1).abs().max() < 0.02
@@ -91,9 +91,9 @@ def test_reaches_the_bound(case):
 @pytest.mark.slow
 @pytest.mark.parametrize("case", TABLE)
 def test_reaches_the_bound_on_the_whole_camera(case):
-    """400 pictures of 960 x 780 px: std to 4 %, bias to 0.01 m/s. The 2-D fit sees 24 of them.
+    """400 images of 960 x 780 px: std to 4 %, bias to 0.01 m/s. The 2-D fit sees 24 of them.
 
-    Both fits see the same noise: that they differ by less than a fifth of the bound makes the 2-D
+    Both fits see the same noise: that they differ by less than 20 % of the bound makes the 2-D
     fit's standard deviation that of the annular one within 2 %.
     """
     number, some = 400, 24
@@ -134,7 +134,7 @@ def test_nuisances_do_no_harm():
 
 
 def test_images_are_independent_of_each_other():
-    """A batch gives what its pictures give alone, one with another centre among them too."""
+    """A batch gives what its images give alone, one with another centre among them too."""
     model = ring_model(**COARSE)
     centres = [(119.5, 97.0), (119.9, 97.4), (131.0, 90.0)]
     images = torch.as_tensor(

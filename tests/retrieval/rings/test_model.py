@@ -1,4 +1,4 @@
-"""The mean picture of rings, its derivatives and the bound, against Airy's formula by quadrature.
+"""The mean image of rings, its derivatives and the bound, against Airy's formula by quadrature.
 
 Detects: an order that loses digits (naive float32 is off by 3.5 m/s, here 0.001 m/s would show), a
 wrong sign or factor of any derivative, cells that forget where their pixels lie, a bound that is
@@ -87,7 +87,7 @@ def test_bounds_of_the_default_instrument(case):
 
 
 def test_bound_equals_differences_of_the_reference_images():
-    """F from central differences of pictures by quadrature, no derivative of ours."""
+    """F from central differences of images by quadrature, no derivative of ours."""
     noise, steps = PixelNoise(5, 10), {"v_los": 1.0, "x": 0.05, "y": 0.05, "temperature": 2.0}
     shape, pixel = (195, 240), 4 * reference.PIXEL
     at = {"v_los": 20.0, "x": 110.0, "y": 99.0, "temperature": reference.TEMPERATURE}

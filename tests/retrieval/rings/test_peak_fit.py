@@ -1,5 +1,5 @@
 """Places of peaks: physics tests against the Cramer-Rao bound and closed forms. Detect a scatter 20
-% above the bound, a bias of a quarter of it, and a place given where there is no peak."""
+% above the bound, a bias of 25 % of it, and a place given where there is no peak."""
 
 import numpy as np
 import pytest

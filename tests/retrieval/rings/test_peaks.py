@@ -58,7 +58,7 @@ def test_centres_without_noise(pictures, kind):
 
 
 def test_centres_with_noise():
-    """1.3e7 photons, read noise 5: a tenth of a pixel, either way."""
+    """1.3e7 photons, read noise 5: 10 % of a pixel, either way."""
     rng = np.random.default_rng(1)
     image = reference.noisy(reference.picture(0.0, 1.3e7, CENTRE), rng, 5.0)
     assert find_centre(image, "ca") == pytest.approx(CENTRE, abs=0.1)
@@ -112,7 +112,7 @@ def test_gaussian_over_r_is_biased(pictures, method):
 
 @pytest.mark.parametrize(("piece", "bias"), [(0.15, -8.2), (0.35, -29.6)])
 def test_bias_grows_with_the_fitted_piece(pictures, piece, bias):
-    """Over r by the ring's skew within the piece; a tenth of a m/s over r^2."""
+    """Over r by the ring's skew within the piece; 10 % of a m/s over r^2."""
     pair = pictures["still"], pictures["emitted"]
     assert paper_velocity(*pair, centre=CENTRE, piece=piece) == pytest.approx(bias, abs=1.0)
     assert abs(paper_velocity(*pair, coordinate="r2", centre=CENTRE, piece=piece)) < 0.3
@@ -132,7 +132,7 @@ def test_radius_of_the_emitted_ring(pictures):
 
 @pytest.mark.slow
 def test_twenty_images():
-    """The paper: 20 pictures at 56 m, v_LOS averaged; 7 m/s bias and 2.5 m/s scatter with CA.
+    """The paper: 20 images at 56 m, v_LOS averaged; 7 m/s bias and 2.5 m/s scatter with CA.
 
     Its bias depends on the width of the fitted piece, which it does not tell: here 0.15 radii
     give 8 m/s. The mean of 20 scatters by less than 2.5 m/s; over r^2 the bias is gone.

@@ -44,7 +44,7 @@ def test_stripes_leave_their_own_direction_open():
     one = wave(0.6, 0.6)
     zz, yy, zy = displacement_bound(one, one, 1e-6, 16)
     # but for the image's edge, nothing at all is known along the stripes; across them a window of
-    # 16 px tells sqrt(2) noise / (rms slope sqrt(256)), a fifth of the noise
+    # 16 px tells sqrt(2) noise / (rms slope sqrt(256)), 20 % of the noise
     assert (zz[15:-15, 15:-15].sqrt() > 30e-6).all()
 
 

@@ -75,7 +75,7 @@ def shifted(dz, dy, pattern=None, rows=60, columns=70, seed=3):
 def test_uniform_shift_is_retrieved(shift):
     found = multipass(*shifted(*shift))
     for d, true in zip((found.dz, found.dy), shift, strict=True):
-        # windows at the rim lose what leaves the picture
+        # windows at the rim lose what leaves the image
         rim = 4 + math.ceil(max(map(abs, shift)))
         inner = d[rim:-rim, rim:-rim]
         assert abs(float(inner.mean()) - true) < 0.005
@@ -103,7 +103,7 @@ def test_paths_in_a_solid_rotation_are_arcs():
 
 
 def test_stripes_leave_one_direction_open():
-    """Waves nearly along (1, 1): the covariance is large along (1, -1) and says so."""
+    """Waves nearly along (1, 1): the covariance is large along (1, -1), as it should be."""
 
     def stripes(y, z):
         return 1 + 0.1 * (np.cos(0.6 * y + 0.6 * z) + np.cos(0.55 * y + 0.65 * z + 1))

@@ -61,7 +61,7 @@ def test_rate_of_false_alarms():
 
 @pytest.mark.parametrize("noise", [0.0, 0.06])
 def test_related_images_lose_no_vector(noise):
-    """Vortices, noise of up to a third of the texture: every vector is where images are related."""
+    """Vortices, noise of up to 1/3 of the texture: every vector is where images are related."""
     for seed, columns, rows, length in ((21, 60, 52, 2.2), (22, 111, 77, 4.0)):
         pair = vortex_pair_images(noise, seed, columns, rows, correlation_length=length)
         pixels = [torch.as_tensor(i.values) for i in (pair.first, pair.second)]

@@ -126,7 +126,7 @@ def test_bright_and_missing_pixels_spoil_little():
 
 
 def test_stripes_leave_one_direction_open():
-    """Waves nearly along (1, 1): little is known along (1, -1), and the covariance says so."""
+    """Waves nearly along (1, 1): little is known along (1, -1), as in the covariance."""
     z, y = np.meshgrid(np.arange(60.0), np.arange(70.0), indexing="ij")
     random = np.random.default_rng(5)
 
@@ -159,7 +159,7 @@ def grid(rows, columns):
 def test_known_noise_of_dark_air_beside_bright_is_used_and_not_misread():
     """Air 20 times as bright goes out, so means and contrasts differ by more than the dark noise.
 
-    Levelled by these, or rung into by a step between the picture's ends, dark air errs by 1 px.
+    Levelled by these, or rung into by a step between the image's ends, dark air errs by 1 px.
     """
     z, y = grid(80, 110)
     pattern = waves(7, 4.0)
@@ -182,7 +182,7 @@ def test_known_noise_of_dark_air_beside_bright_is_used_and_not_misread():
 
 
 def test_noise_does_not_bias_displacements_to_whole_pixels():
-    """Fine texture that is weak in half the picture: the other half has the filter let noise pass.
+    """Fine texture that is weak in half the image: the other half has the filter let noise pass.
 
     Splines through pixels damp noise half way between them, which alone would pull by 0.11 px.
     """
@@ -221,7 +221,7 @@ def test_short_waves_do_not_bias_displacements_to_whole_pixels(moved):
 
 
 def test_where_images_differ_standard_errors_are_larger():
-    """In a patch one picture holds texture that the other does not."""
+    """In a patch one image holds texture that the other does not."""
     z, y = grid(90, 120)
     pattern, other = waves(5, 3.0), waves(6, 3.0)
     random = np.random.default_rng(5)
@@ -235,7 +235,7 @@ def test_where_images_differ_standard_errors_are_larger():
     stderr = found.covariance[1, 1].sqrt()
     inside, outside = stderr[35:48, 25:38], stderr[:, 70:]
     assert float(inside.median()) > 2 * float(outside.median())
-    # it errs there: by what is said, within a factor of two
+    # its errors there are as stated, within a factor of two
     error = (found.dy - 1.2)[35:48, 25:38]
     assert float((error / inside).square().mean()) < 4
 
@@ -264,7 +264,7 @@ def test_a_flow_that_diverges_everywhere_is_retrieved():
 
 
 def blurred_errors(seed, noise, sigma):
-    """Errors in the cores, with and without `blur`, of pictures blurred after the air has moved."""
+    """Errors in the cores, with and without `blur`, of images blurred after the air has moved."""
     pair = vortex_pair_images(0.0, seed, correlation_length=2.0, columns=160, rows=100)
     random = np.random.default_rng(seed)
     pictures = [

@@ -18,8 +18,8 @@ from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 SIMULATION = Path(__file__).parents[4] / "shared" / "data" / "wake_les_40s.nc"
-# Variance of a picture's noise in units of the extinction (m^-1) by its powers: what simulation and
-# detector leave in the pictures of the wake_sensor experiment.
+# Variance of an image's noise in units of the extinction (m^-1) by its powers: what simulation and
+# detector leave in the images of the wake_sensor experiment.
 NOISE = 7.3e-13, 2.1e-9, 2.7e-8
 
 
@@ -61,7 +61,7 @@ def check(reduced, allowed=0.05):
 
 def test_coverage_on_the_shipped_wake():
     reduced, errors = zip(*(reduced_errors(seed, 1.0) for seed in (1, 2)), strict=True)
-    # neighbours share their errors: the shares of one pair of pictures scatter by 2.5 points
+    # neighbours share their errors: the fractions of one pair of images scatter by 2.5 points
     check(np.concatenate(reduced), 0.05 + 2 * 0.025 / np.sqrt(2))
     assert np.sqrt(np.mean(np.concatenate(errors) ** 2)) < 0.1
 

@@ -76,7 +76,7 @@ def test_smooth_flows_are_not_drawn_to_whole_voxels(moved):
 
 @pytest.mark.parametrize("method", ["correlation", "variational"])
 def test_rigid_shift(method):
-    """Nothing bends: errors are those of the noise, 1 % of the mean, a tenth of the texture."""
+    """Nothing bends: errors are those of the noise, 1 % of the mean, 10 % of the texture."""
     level, normalised = [], []
     for seed in (0, 1):
         pair = shifted((16, 24, 28), SHIFT, 0.01, seed)
@@ -180,7 +180,7 @@ def test_errors_reach_the_bound_of_a_known_shift():
 
     One rigid shift of both volumes, texture unknown: the differences of the volumes have twice the
     noise, so the information is that of sum |grad texture|^2 / (2 noise^2). A window of the
-    correlation sees the Gaussian's share of it, has gradients to find as well, and can do no
+    correlation sees the Gaussian's fraction of it, has gradients to find as well, and can do no
     better.
     """
     shape, noise, step = (12, 12, 12), 0.01, 1e-2

@@ -22,9 +22,9 @@ def grid(rows, columns):
 
 @pytest.mark.parametrize("length", [2.5, 4.0, 7.0])
 def test_waves_are_read_between_pixels_as_they_are(length):
-    """A spline through pixels would lose a third of a wave of 2.5 px half way between them."""
+    """A spline through pixels would lose 1/3 of a wave of 2.5 px half way between them."""
     z, y = grid(90, 100)
-    # that go on where they are mirrored at the edges
+    # that continue where they are mirrored at the edges
     down, across = (math.pi / (n - 1) * round(2 * (n - 1) / length) for n in (90, 100))
     image = torch.tensor(np.cos(down * z) + np.cos(across * y))
     spline, _ = band_limited(image[None], 0.0)

@@ -21,7 +21,7 @@ from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
 
 def moved(v, w, spacing_y=0.5, spacing_z=0.5, rows=60, columns=80):
-    """A texture of 3 m correlation length carried by a uniform wind."""
+    """A texture of 3 m correlation length advected by a uniform wind."""
     y = np.arange(columns) * spacing_y
     z = np.arange(rows) * spacing_z
     grid = np.meshgrid(y, z)

@@ -178,7 +178,7 @@ def test_a_noise_map_that_is_too_low():
 
 def test_noise_that_lies_in_one_place():
     """Around one core four times that of elsewhere, said to be even: residuals tell, and the errors
-    of that vortex are of the size that it is off by (3.5 times too small by what is said alone)."""
+    of that vortex agree with its error (3.5 times too small from the stated noise alone)."""
     reduced = []
     for seed in (1, 2, 3):
         pair = vortex_pair_images(0.0, seed=seed, vortices=uneven(), **SMALL)
@@ -304,7 +304,7 @@ def test_simulated_wake_with_texture():
 
 
 def test_simulated_wake_without_texture():
-    """Where correlation is off by 4 m/s: 15 % of the circulation, 1 m, and it says so."""
+    """Where correlation is off by 4 m/s: 15 % of the circulation, 1 m, as stated."""
     truth, found = simulated(0.0, 0.0)
     assert found.success
     for name, expected in (
