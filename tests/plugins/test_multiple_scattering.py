@@ -101,7 +101,7 @@ def test_any_majorant_gives_the_same(world, truth, factor):
     agree(found, mean, error)
 
 
-def test_standard_error_is_honest(world):
+def test_standard_error_is_correct(world):
     """z-scores of 20 seeds against their common mean have unit variance.
 
     20 000 photons a gate: single ones are skewed (relative spread 0.5 to 5), which raises the

@@ -86,7 +86,7 @@ def leave_out_figures(patch):
 
 @contextmanager
 def sketched_figures():
-    """Figures at 40 dots per inch and without layout, in a fifth of the time."""
+    """Figures at 40 dots per inch and without layout, in 20 % of the time."""
 
     def sketch(figure, **_):
         buffer = BytesIO()

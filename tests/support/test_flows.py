@@ -24,7 +24,7 @@ def test_air_turns_around_a_single_vortex():
 @pytest.mark.parametrize("spacing", [1.0, 0.5])
 def test_texture_has_the_contrast_and_the_correlation_it_is_given(spacing):
     """exp(-(r / length)^2) over 5 seeds of 120 x 90 px: some 900 independent cells of a texture of
-    3 px each, a tenth of which the random wave vectors cost; 4 standard errors are 0.06."""
+    3 px each, 10 % of which the random wave vectors cost; 4 standard errors are 0.06."""
     grid = np.meshgrid(*axes(120, 90, spacing))
     products = []
     for seed in range(5):

@@ -84,7 +84,7 @@ def test_another_experiment_is_kept_out(tmp_path, quick):
 
 
 @pytest.mark.slow
-def test_pictures_of_another_version_are_kept_out(tmp_path, quick):
+def test_images_of_another_version_are_not_used(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
     record = yaml.safe_load((folder / "experiment.yaml").read_text())

@@ -72,8 +72,8 @@ def test_images_of_a_second_snapshot_are_those_of_advection(plain, variation):
         assert metrics[key] == pytest.approx(plain[1][key], rel=0.1)
 
 
-def test_detector_adds_a_noisy_picture_and_its_winds(variation):
-    """Weak pulses by day: noise of the stated size in the pictures, worse winds."""
+def test_detector_adds_a_noisy_image_and_its_winds(variation):
+    """Weak pulses by day: noise of the stated size in the images, worse winds."""
     weak = ["detector={}", "lidar.pulse_energy=1 mJ", "render.samples_per_beam=256"]
     folder, metrics = variation(*weak)
     for index in (0, 1):

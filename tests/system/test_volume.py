@@ -141,7 +141,7 @@ def test_bad_descriptions_are_named(sections, message):
         pytest.param({"volume": {"search": 8}}, "search: 8 voxels", marks=pytest.mark.slow),
     ],
 )
-def test_what_does_not_go_together_is_said_ahead(sections, start, air):
+def test_inconsistent_settings_are_reported_ahead(sections, start, air):
     with pytest.raises(InputError) as error:
         prepare(changed(**sections), air)
     assert str(error.value).startswith(start) and "\n" not in str(error.value)

@@ -33,7 +33,7 @@ def test_values_that_are_not_known_do_not_count():
 
 
 @pytest.mark.parametrize("fraction", [pytest.param(0.05, marks=pytest.mark.slow), 0.3])
-def test_replaced_fraction_is_what_images_do_not_share(fraction):
+def test_replaced_fraction_is_the_uncorrelated_variance(fraction):
     moved = coverage.replaced_texture(0.0, 1, noise=0.0)
     changed = coverage.replaced_texture(fraction, 1, noise=0.0)
     np.testing.assert_array_equal(changed[0], moved[0])

@@ -110,7 +110,7 @@ def test_an_area_that_saturates_in_one_image_alone():
     [pytest.param(m, marks=pytest.mark.slow) for m in ("cc", "ws", "variational")] + ["multipass"],
 )
 def test_images_clipped_at_the_brightest_2_percent(method):
-    """Texture that is cut off moves with the air: few vectors are lost, and all are honest."""
+    """Texture that is cut off moves with the air: few vectors are lost, and all are correct."""
     images, v = pair(65)
     clean = retrieved(images, method)
     level = np.quantile(images[0], 0.98)

@@ -76,7 +76,7 @@ def test_brightness_of_volumes_is_from_their_common_air():
 
 
 def test_noise_is_estimated_from_what_an_image_holds():
-    """A hole has no noise: counted as if it had, a tenth of the image lost 17 % of the variance."""
+    """A hole has no noise: counted as if it had, 10 % of the image lost 17 % of the variance."""
     levels = []
     for seed in range(12):
         random = np.random.default_rng([71, seed])

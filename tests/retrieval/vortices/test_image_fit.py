@@ -194,7 +194,7 @@ def test_noise_that_lies_in_one_place():
     assert np.sqrt(np.mean(np.square(reduced))) < 2.4
 
 
-def test_nothing_is_made_up():
+def test_no_pair_without_evidence():
     y, z = (np.arange(n) * 0.5 for n in (48, 40))
     random = np.random.default_rng(4)
     flat = data_array(np.ones((40, 48)), y, z)
