@@ -11,10 +11,14 @@ from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
 from lidar_mi.retrieval.velocimetry.outliers import validated
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.warping import Spline
-from lidar_mi.retrieval.velocimetry.windows import Windows, separable
+from lidar_mi.retrieval.velocimetry.windows import Windows, averaged, separable
 
 # Voxels of shifted volumes that are correlated at once: more do not fit into a core's cache.
 _AT_ONCE = 2**17
+# Correlation by which smaller windows must surpass larger ones to take their place.
+_BETTER = 0.1
+# Px; the highest correlation of smaller windows is as often chance.
+_SMALLEST = 8
 
 
 class Grid(NamedTuple):
@@ -67,28 +71,75 @@ class Grid(NamedTuple):
 
 
 def first_pass(
-    images: list[torch.Tensor], spline: Spline | None, windows: Windows, grid: Grid
+    images: list[torch.Tensor], spline: Spline, windows: Windows, grid: Grid
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Displacement (components, *grid.shape) by large windows, and where it was replaced.
 
-    Windows with a flag, and outliers of the median test, take the median of their neighbours.
+    Windows that the correlation flags or their neighbours contradict take the neighbours' median.
+    Images are also correlated by windows of half and of a quarter of the size. These count where
+    the images, warped by what they find, correlate better by 0.1: in a rotation of 0.3 px per px
+    the texture at the rim of a window of 32 px moves 5 px away from that in the middle.
 
     Parameters
     ----------
     images : list of torch.Tensor
-        The first two of them are used.
-    spline : Spline, optional
-        Through the images, band-limited: volumes are correlated from it.
+        The first two of them count.
+    spline : Spline
+        Through the images, band-limited.
     windows : Windows
         Of the last pass.
     grid : Grid
     """
-    search = _of_images if windows.dims == 2 else _of_volumes
-    d, centres = search(images, spline, windows)
-    d, wrong = validated(d, 1, continued=windows.dims > 2)
+    if windows.dims > 2:
+        d, centres = _of_volumes(images, spline, windows)
+        return _on(grid, d, centres, continued=True)
+    coarse, *smaller = _sizes(windows)
+    d, replaced = _on(grid, *_of_images(images, coarse))
+    width = windows.template / 2
+    score = _alike(spline, grid, d, width)
+    for size in smaller:
+        other, filled = _on(grid, *_of_images(images, size))
+        found = _alike(spline, grid, other, width)
+        better = found > score + _BETTER
+        d, replaced, score = (
+            torch.where(better, new, old)
+            for new, old in ((other, d), (filled, replaced), (found, score))
+        )
+    return d, replaced
+
+
+def _sizes(windows: Windows) -> list[Windows]:
+    """Windows of images from large to small, all of the same range but for the largest."""
+    sizes = [coarse_windows(windows)]
+    for template in (windows.template, windows.template // 2):
+        if _SMALLEST <= template < sizes[-1].template:
+            search = windows.search - windows.template + template
+            sizes.append(Windows(windows.shape, template, search, max(1, template // 2)))
+    return sizes
+
+
+def _on(
+    grid: Grid, d: torch.Tensor, centres: list[torch.Tensor], continued: bool = False
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Vectors at some centres, validated, on the whole grid, and where they were replaced."""
+    d, wrong = validated(d, 1, continued=continued)
     known = [at.to(grid.like) - grid.offset for at in centres]
     replaced = grid.interpolated(wrong[None].to(d), known)[0] > 0.5
     return grid.interpolated(d, known), replaced
+
+
+def _alike(spline: Spline, grid: Grid, d: torch.Tensor, width: float) -> torch.Tensor:
+    """Correlation, over Gaussians, of two images that are warped to mid-time by displacements."""
+    places = [
+        torch.stack([p - part / 2, p + part / 2]) for p, part in zip(grid.places(), d, strict=True)
+    ]
+    inside = spline.holds(*places).all(0)
+    one, two = spline._replace(coefficients=spline.coefficients[:2]).sample(*places)[0]
+    mean1, mean2, square1, square2, cross = (
+        averaged(field, inside, width) for field in (one, two, one**2, two**2, one * two)
+    )
+    contrast = (square1 - mean1**2) * (square2 - mean2**2)
+    return (cross - mean1 * mean2) / contrast.clamp(min=1e-12 * float(contrast.abs().max())).sqrt()
 
 
 def coarse_windows(windows: Windows) -> Windows:
@@ -98,13 +149,12 @@ def coarse_windows(windows: Windows) -> Windows:
     return Windows(windows.shape, template, search, max(1, template // 2))
 
 
-def _of_images(images, _, windows: Windows) -> tuple[torch.Tensor, list[torch.Tensor]]:
-    """Windows twice as large over twice the range, where such search regions fit into the image."""
-    coarse = coarse_windows(windows)
-    found = cross_correlation(*images[:2], coarse.template, coarse.search, coarse.stride)
+def _of_images(images, windows: Windows) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Displacements of windows of images, NaN where the correlation is flagged, and centres."""
+    found = cross_correlation(*images[:2], windows.template, windows.search, windows.stride)
     usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
     d = torch.where(usable, found.d, torch.nan)
-    return d, [coarse.centres(axis).to(d.device) for axis in (0, 1)]
+    return d, [windows.centres(axis).to(d.device) for axis in (0, 1)]
 
 
 def _of_volumes(images, spline: Spline, windows: Windows):

@@ -31,6 +31,10 @@ _SLOWEST = 1.0
 _SIZES = (1, 3, 5, 9)
 # Standard deviations of the image, of spots of one size, that a spot must exceed.
 _OUTSTANDING = 5.0
+# Rolls by thirds of the sides: what lies at one place in both images then does so by chance.
+_THIRDS = tuple((i, j) for i in range(3) for j in range(3) if i or j)
+# Spots alike at rest must be so many times those that are by chance.
+_BEYOND_CHANCE = 3.0
 # Px; spots give way to the mean over Gaussians of this width before the motion is looked for.
 _FILLED = 3.0
 
@@ -174,9 +178,19 @@ class _Spots(NamedTuple):
 
 def _spots(pair: torch.Tensor) -> _Spots:
     one, two = pair
-    least = torch.minimum(one.abs(), two.abs())
-    outstanding = _OUTSTANDING * 1.4826 * torch.maximum(one.abs().median(), two.abs().median())
-    return _Spots(one, two, (least > outstanding) & ((two - one).abs() < 0.3 * least))
+    least = _OUTSTANDING * 1.4826 * torch.maximum(one.abs().median(), two.abs().median())
+    alike = _alike(one, two, least)
+    # among many bright particles some lie by chance where others were
+    rows, columns = two.shape
+    turned = [two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in _THIRDS]
+    chance = sum(float(_alike(one, other, least).sum()) for other in turned) / len(turned)
+    few = float(alike.sum()) < _BEYOND_CHANCE * chance
+    return _Spots(one, two, alike & (not few))
+
+
+def _alike(one: torch.Tensor, two: torch.Tensor, least: torch.Tensor) -> torch.Tensor:
+    lower = torch.minimum(one.abs(), two.abs())
+    return (lower > least) & ((two - one).abs() < 0.3 * lower)
 
 
 def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:

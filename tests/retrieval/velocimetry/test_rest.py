@@ -14,6 +14,7 @@ from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.velocimetry.windows import Windows
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
+from tests.support.turning import turning_pair
 from tests.support.volumes import shifted
 
 DT = 0.1
@@ -66,6 +67,14 @@ def test_nothing_is_at_rest_in_moving_air(length, noise):
         images, _ = pair(seed, length, noise, mean, 350.0)
         found = found_at_rest(images)
         assert not bool(found.structure.any()) and not bool(found.saturated.any())
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_dense_particles_are_not_at_rest(seed):
+    """Some lie where another one was: by chance, and where shear hides their motion."""
+    images = [torch.as_tensor(image.values) for image in turning_pair("particles", seed)]
+    found = all_at_rest(images, Windows(tuple(images[0].shape), 16, 32, 4))
+    assert not found.structure.any() and not found.saturated.any()
 
 
 @pytest.mark.parametrize(
