@@ -1,4 +1,8 @@
-"""Settings of the methods, frozen: each field with its unit and its source or its effect."""
+"""Settings of the methods, frozen: each field with its unit and its source or its effect.
+
+How much the errors change where a field is halved or doubled is in ``docs/accuracy.md``, measured
+by ``python -m benchmarks settings``.
+"""
 
 from dataclasses import dataclass
 
