@@ -8,6 +8,7 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema import BACKSCATTER, NAME, Experiment
 from lidar_mi.experiment.shipped import experiment_file
@@ -25,6 +26,7 @@ BESIDE_VARIANTS = (
 """Names of files in the folder of a study or a run, which no variant may have."""
 
 
+@checked_arguments
 def load_experiment(name: str | Path, *, variant: str | None = None, **changes: Any) -> Experiment:
     """Read an experiment, and change some of its keys.
 

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 from lidar_mi import __version__
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.names import timing_key
 from lidar_mi.assessment.report.page import page
 from lidar_mi.errors import InputError, is_interrupt
@@ -26,6 +27,7 @@ from lidar_mi.progress import Notice, progress
 RESUMED = "start it again to resume the run"
 
 
+@checked_arguments
 def run(
     experiment: Experiment,
     folder: str | Path | None = None,

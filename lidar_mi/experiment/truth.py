@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 from scipy import constants, integrate, stats
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.advection import advect
 from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
 from lidar_mi.atmosphere.texture import corrsin_obukhov
@@ -41,6 +42,7 @@ class Truth:
         return _slab_mean(field, self.wind.attrs["gates"])
 
 
+@checked_arguments
 def make_truth(
     experiment: Experiment, beside: str | Path | None = None, flows: Flows | None = None
 ) -> Truth:

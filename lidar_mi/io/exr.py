@@ -22,6 +22,7 @@ import numpy as np
 import OpenEXR
 import xarray as xr
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.exr_header import declared_size
@@ -190,6 +191,7 @@ def axis_of(header: dict, name: str, size: int, path: str | Path) -> np.ndarray:
     return values
 
 
+@checked_arguments
 def read_scan(path: str | Path) -> xr.Dataset:
     """Read a scan of the backscatter lidar from an EXR file; the round trip is exact in float32.
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import xarray as xr
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.exr import axis_of, read_layers
 from lidar_mi.io.size import check_size
@@ -45,6 +46,7 @@ def read_pixels(path: str | Path, layer: str | None = None) -> np.ndarray:
     return np.array(image, dtype=float)
 
 
+@checked_arguments
 def read_image(
     path: str | Path, layer: str | None = None, spacing: float | None = None
 ) -> xr.DataArray:
@@ -101,6 +103,7 @@ def read_image(
     return xr.DataArray(pixels[::-1, ::-1].copy(), axes, ("z", "y"), layer)
 
 
+@checked_arguments
 def read_noise(
     path: str | Path, layer: str | None = None, spacing: float | None = None
 ) -> xr.DataArray | None:

@@ -7,6 +7,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.json import read_json, write_json
 from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile
@@ -24,6 +25,7 @@ _NUMBERS = ("chi2", "correlation", "model_error", "model_error_length")
 _FORMER = {"model_error": "flow_error", "model_error_length": "flow_error_length"}
 
 
+@checked_arguments
 def write_vortices(path: str | Path, fits: Mapping[str, VortexPairFit], **about: str) -> None:
     """Write vortex pairs by name, with their covariance and derived quantities.
 
@@ -84,6 +86,7 @@ def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
+@checked_arguments
 def read_vortices(path: str | Path) -> dict[str, VortexPairFit]:
     """Vortex pairs by name, as a run writes them into ``vortex.json``.
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import find_peaks, peak_widths, savgol_filter
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.centre import gradient_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
@@ -142,6 +143,7 @@ class Rings(Tabular):
         return [Table("pattern", whole), Table("rings", single, ("order", "line", "radius"))]
 
 
+@checked_arguments
 def analyse_rings(
     image, centre: tuple[float, float] | None = None, saturation: float | None = None
 ) -> Rings:

@@ -22,7 +22,10 @@ def checked(images: torch.Tensor, saturation: float | None = None) -> torch.Tens
         Other shapes, images below 16 px, NaN or infinity, saturated pixels.
     """
     if not isinstance(images, torch.Tensor):
-        images = torch.as_tensor(np.array(images))
+        images = np.array(images)
+        if images.dtype.kind not in "fiub":
+            raise InputError(f"images: {images.dtype} is not allowed; expected real numbers")
+        images = torch.as_tensor(images)
     if images.ndim not in (2, 3) or min(images.shape) < 1 or min(images.shape[-2:]) < 16:
         raise InputError(
             f"images: shape {tuple(images.shape)} is not allowed; expected (height, width) or "

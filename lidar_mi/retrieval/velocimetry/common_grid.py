@@ -4,6 +4,7 @@ import numpy as np
 import xarray as xr
 from scipy.interpolate import RectBivariateSpline
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 
 
@@ -92,6 +93,7 @@ def resample_pair(
     return first, second
 
 
+@checked_arguments
 def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArray, xr.DataArray]:
     """The pair as it is if both images share one uniform grid, else resampled onto one.
 

@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import torch
 import xarray as xr
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
@@ -27,6 +28,7 @@ METHODS: Mapping[str, Callable[..., Displacement]] = {
 """Methods by name."""
 
 
+@checked_arguments
 def retrieve_wind_volume(
     volume1: xr.DataArray,
     volume2: xr.DataArray,

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 import xarray as xr
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
@@ -24,6 +25,7 @@ from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, Variation
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
 
+@checked_arguments
 def retrieve_wind(
     image1: xr.DataArray,
     image2: xr.DataArray,

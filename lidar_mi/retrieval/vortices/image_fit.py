@@ -12,6 +12,7 @@ import torch
 import xarray as xr
 from kornia.filters import gaussian_blur2d
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.brightness import normalised
@@ -107,6 +108,7 @@ class _Images:
         return Misfit(residual, jacobian, slope.mean(0), valid, self.variance, self.scatter)
 
 
+@checked_arguments
 def fit_vortices(
     image1: xr.DataArray,
     image2: xr.DataArray,

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 import xarray as xr
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
@@ -47,6 +48,7 @@ class _Vectors:
         return Misfit(residual, jacobian, -self.root.transpose(0, 1), valid, one, one)
 
 
+@checked_arguments
 def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -> VortexPairFit:
     """Two vortices and a mean wind fitted to retrieved vectors.
 

@@ -266,7 +266,7 @@ def test_bad_input_is_named():
     for call, start in (
         (lambda: retrieve_wind(one, two, DT, "piv"), "method: 'piv' is not one of cc, ws"),
         (lambda: retrieve_wind(one, two, 0), "dt: 0 s"),
-        (lambda: retrieve_wind(one, two, "soon"), "dt: 'soon' s"),
+        (lambda: retrieve_wind(one, two, "soon"), "dt: 'soon'"),
         (lambda: retrieve_wind(one, two, DT, template=1), "template: 1 px"),
         (lambda: retrieve_wind(one, two, DT, search=9), "search: 9 px"),
         (lambda: retrieve_wind(one, two, DT, stride=0), "stride: 0 px"),
