@@ -108,7 +108,7 @@ def test_the_whole_chain(whole):
         "up to nine by least squares",
         "the required error of v_LOS needs 1 pulse per direction",
         "The images require 77000 pulses per second",
-        "2.1 s later",
+        "the look-ahead time is 2.1 s",
         "u has an rms error of",
         "The wind from both lidars",
     ):
