@@ -82,6 +82,8 @@ def retrieve(
     valid = float((wind["flag"] == 0).mean())
     if "fit" in wind.attrs:
         _print_vortices(wind)
+    if "fixed_pattern" in wind.attrs:
+        output.print(f"warning: {wind.attrs['fixed_pattern']} in all images")
     output.print(f"{wind.sizes['y']} x {wind.sizes['z']} vectors, {valid:.1%} valid")
     output.print(f"winds    {out}")
 

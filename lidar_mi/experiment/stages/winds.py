@@ -71,6 +71,8 @@ def cross_flow_winds(
                 # the extinction itself has passed no instrument
                 blur=0.0 if source in EXACT else blur,
             )
+            if "fixed_pattern" in wind.attrs and not methods:
+                log.remark(f"{source}: {wind.attrs['fixed_pattern']} in all images")
             wind = wind.assign(
                 {name: (field.dims, field.data, field.attrs) for name, field in bound.items()}
             )

@@ -38,9 +38,9 @@ class Flag(enum.IntFlag):
     UNRELATED = 256
     """The images around it correlate no better than unrelated textures (`relation`)."""
     SATURATED = 512
-    """The template holds an area saturated in all images, or is saturated by a quarter (`rest`)."""
+    """The template holds a saturated area at rest, or is saturated by a quarter (`rest`)."""
     AT_REST = 1024
-    """The template holds structure that stays while the air around it moves (`rest`)."""
+    """The template holds structure at rest in moving air, or a pattern spoils all (`rest`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:

@@ -4,27 +4,18 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from torch.nn.functional import grid_sample, max_pool2d, pad
+from torch.nn.functional import pad
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
-from lidar_mi.retrieval.velocimetry.first_pass import coarse_windows
+from lidar_mi.retrieval.velocimetry.fixed_pattern import FixedPattern, fixed_pattern
+from lidar_mi.retrieval.velocimetry.motion import motion_around, moved
 from lidar_mi.retrieval.velocimetry.quality import Flag, non_finite
 from lidar_mi.retrieval.velocimetry.saturation import saturated, saturated_areas
-from lidar_mi.retrieval.velocimetry.windows import (
-    Windows,
-    averaged,
-    box_sum,
-    linear_weights,
-    separable,
-    working,
-)
+from lidar_mi.retrieval.velocimetry.windows import Windows, averaged, box_sum, working
 
 # Fraction of a template at the largest value that leaves too little to see.
 _SATURATED = 0.25
-# Coarse vectors along each axis whose median is the motion around a place.
-_AROUND = 5
 # Px; slower air and structure at rest look alike.
 _SLOWEST = 1.0
 # Sizes of the spots that are looked for, px.
@@ -35,8 +26,9 @@ _OUTSTANDING = 5.0
 _THIRDS = tuple((i, j) for i in range(3) for j in range(3) if i or j)
 # Spots alike at rest must be so many times those that are by chance.
 _BEYOND_CHANCE = 3.0
-# Px; spots give way to the mean over Gaussians of this width before the motion is looked for.
-_FILLED = 3.0
+# Px; width of the Gaussians over which images without spots are averaged before the motion is
+# looked for.
+_SOFT = 1.5
 
 
 class AtRest(NamedTuple):
@@ -50,15 +42,19 @@ class AtRest(NamedTuple):
         Areas of them of at least half a template, see `saturation.saturated_areas`.
     structure : torch.Tensor
         That of `at_rest`.
+    pattern : FixedPattern
+        All over the images, without these pixels.
     """
 
     piled: torch.Tensor
     saturated: torch.Tensor
     structure: torch.Tensor
+    pattern: FixedPattern
 
     def left_out(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """The images, NaN in place of what is at rest."""
-        return [_left_out(image, self.saturated | self.structure) for image in images]
+        """The images without the fixed pattern, NaN in place of what is at rest."""
+        pixels = self.saturated | self.structure
+        return [_left_out(image, pixels) for image in self.pattern.removed(images)]
 
     def flags(
         self, found: Displacement, images: Sequence[torch.Tensor], windows: Windows, left_out: bool
@@ -85,7 +81,7 @@ class AtRest(NamedTuple):
         # an area of another brightness spoils a correlation from afar
         for bit, pixels, here, reach in (
             (Flag.SATURATED, self.saturated, piled, wide if left_out else ~bad),
-            (Flag.AT_REST, self.structure, torch.zeros_like(bad), wide),
+            (Flag.AT_REST, self.structure, torch.full_like(bad, self.pattern.spoils), wide),
         ):
             here = here | (windows.of_templates(working(pixels)) > 0)
             here |= reach & (windows.of_regions(working(pixels)) > 0)
@@ -110,13 +106,17 @@ def _matched(pixels: torch.Tensor, windows: Windows, d: torch.Tensor) -> torch.T
 
 
 def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
-    """Saturated areas of images or volumes, and structure at rest of images."""
+    """Saturated areas of images or volumes; structure and a fixed pattern at rest of images."""
     piled = torch.stack([saturated(image) for image in images])
     areas = saturated_areas(piled, windows)
+    none = torch.zeros_like(areas)
     if windows.dims > 2:
-        return AtRest(piled, areas, torch.zeros_like(areas))
-    first, second = (_left_out(image, areas) for image in images[:2])
-    return AtRest(piled, areas, at_rest(first, second, windows) & ~areas)
+        return AtRest(piled, areas, none, FixedPattern(torch.ones(1)))
+    pair = [_left_out(image, areas) for image in images[:2]]
+    pattern = fixed_pattern(pair, windows)
+    pair = pattern.removed(pair)
+    structure, d = at_rest(*pair, windows)
+    return AtRest(piled, areas, structure & ~areas, pattern.with_pixels(pair, d))
 
 
 def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
@@ -126,12 +126,15 @@ def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     return torch.where(pixels, torch.nan, image)
 
 
-def at_rest(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:
+def at_rest(
+    image1: torch.Tensor, image2: torch.Tensor, windows: Windows
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Pixels with structure that stays where it is while the air around it moves.
 
     Spots of 1, 3, 5 and 9 px count (mean over a square less that over one three times as large):
     beyond 5 robust standard deviations in both images, and alike there to 0.3 of their height. The
-    motion d around them is the median of 5 x 5 coarse vectors of the images without these spots.
+    motion d around them is the median of 5 x 5 coarse vectors of the images without these spots,
+    averaged over Gaussians of 1.5 px, which hide gains of pixels.
     Spots are at rest where the images differ by 0.7 of the height along d, forward from image 1
     and back from image 2. Gaussian texture has one pixel beyond 5 standard deviations in two
     millions, in one image alone.
@@ -147,20 +150,22 @@ def at_rest(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> tor
 
     Returns
     -------
-    torch.Tensor of bool, shape (z, y)
+    structure : torch.Tensor of bool, shape (z, y)
+    d : torch.Tensor, shape (2, z, y)
+        Px.
     """
     first, second = normalised([image1, image2]).nan_to_num(0.0)
     means = {size: _means(first, second, size) for size in {*_SIZES, *(3 * n for n in _SIZES)}}
     spots = [_spots(means[size] - means[3 * size]) for size in _SIZES]
     candidates = torch.stack([_grown(s.alike, z) for s, z in zip(spots, _SIZES, strict=True)])
     candidates = candidates.any(0)
+    d = motion_around(*(_soft(image, ~candidates) for image in (image1, image2)), windows)
     if not bool(candidates.any()):
-        return candidates
-    d = _around(*(_filled(image, candidates) for image in (image1, image2)), windows)
+        return candidates, d
     found = torch.zeros_like(candidates)
     for spot, size in zip(spots, _SIZES, strict=True):
         found |= _grown(spot.alike & spot.apart(d), size)
-    return _grown(found & (d.norm(dim=0) >= _SLOWEST), 3)
+    return _grown(found & (d.square().sum(0) >= _SLOWEST**2), 3), d
 
 
 class _Spots(NamedTuple):
@@ -172,7 +177,7 @@ class _Spots(NamedTuple):
 
     def apart(self, d: torch.Tensor) -> torch.Tensor:
         """Where spots neither came along d nor go on."""
-        off = (self.two - _moved(self.one, -d)).abs(), (self.one - _moved(self.two, d)).abs()
+        off = (self.two - moved(self.one, -d)).abs(), (self.one - moved(self.two, d)).abs()
         return torch.minimum(*off) > 0.7 * torch.minimum(self.one.abs(), self.two.abs())
 
 
@@ -180,6 +185,8 @@ def _spots(pair: torch.Tensor) -> _Spots:
     one, two = pair
     least = _OUTSTANDING * 1.4826 * torch.maximum(one.abs().median(), two.abs().median())
     alike = _alike(one, two, least)
+    if not bool(alike.any()):
+        return _Spots(one, two, alike)
     # among many bright particles some lie by chance where others were
     rows, columns = two.shape
     turned = [two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in _THIRDS]
@@ -194,7 +201,8 @@ def _alike(one: torch.Tensor, two: torch.Tensor, least: torch.Tensor) -> torch.T
 
 
 def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:
-    return max_pool2d(pixels[None].double(), size, 1, size // 2)[0] > 0
+    pixels = pad(pixels.double(), (size // 2,) * 4)
+    return box_sum(box_sum(pixels, size, -1), size, -2) > 0
 
 
 def _means(first: torch.Tensor, second: torch.Tensor, size: int) -> torch.Tensor:
@@ -202,31 +210,6 @@ def _means(first: torch.Tensor, second: torch.Tensor, size: int) -> torch.Tensor
     return box_sum(box_sum(images, size, -1), size, -2) / size**2
 
 
-def _filled(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+def _soft(image: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
     image = working(image)
-    return torch.where(pixels, averaged(image, torch.isfinite(image) & ~pixels, _FILLED), image)
-
-
-def _around(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """The motion around every pixel, (2, z, y); 0 where none was found."""
-    coarse = coarse_windows(windows)
-    found = cross_correlation(image1, image2, coarse.template, coarse.search, coarse.stride)
-    usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
-    d = pad(torch.where(usable, found.d, torch.nan), (_AROUND // 2,) * 4, value=torch.nan)
-    d = d.unfold(1, _AROUND, 1).unfold(2, _AROUND, 1).flatten(3).nanmedian(-1).values
-    weights = [
-        linear_weights(coarse.centres(axis).to(d), torch.arange(n).to(d))
-        for axis, n in enumerate(windows.shape)
-    ]
-    return separable(d.nan_to_num(0.0), weights)
-
-
-def _moved(image: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """The image read d further on, by cubics."""
-    place = [torch.arange(n).to(d) for n in image.shape]
-    at = [
-        2 * (p + part) / (n - 1) - 1
-        for p, part, n in zip(torch.meshgrid(*place, indexing="ij"), d, image.shape, strict=True)
-    ]
-    grid = torch.stack([at[1], at[0]], -1)[None]
-    return grid_sample(image[None, None], grid, "bicubic", "border", align_corners=True)[0, 0]
+    return averaged(image, torch.isfinite(image) & known, _SOFT)

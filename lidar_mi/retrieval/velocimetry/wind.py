@@ -99,7 +99,8 @@ def retrieve_wind(
         position of the vector at mid-time: the centre and, with "cc" and "ws", half the
         displacement. "vortex_fit" adds the pair's numbers (`port_circulation` and so on,
         each with `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or
-        NaN if there is none); nothing is replaced.
+        NaN if there is none); nothing is replaced. Gains of a detector's columns and rows are
+        removed beforehand, see `fixed_pattern`; the attribute of that name says so.
 
     Raises
     ------
@@ -150,19 +151,19 @@ def retrieve_wind(
         "settings": settings,
     }
     with threads_for(image1.size):
-        resting = all_at_rest([pixels1, pixels2, *rest], windows)
-        pair = [pixels1, pixels2]
-        if chosen.centred:
-            # these leave out pixels; a correlation of windows would lose all that see one
-            pair = resting.left_out(pair)
-            offered["more"] = resting.left_out(rest)
+        whole = [pixels1, pixels2, *rest]
+        resting = all_at_rest(whole, windows)
+        # a correlation of windows would lose all that see a pixel that is left out
+        remedy = resting.left_out if chosen.centred else resting.pattern.removed
+        first, second, *offered["more"] = remedy(whole)
         options = {name: offered[name] for name in chosen.options}
-        found = chosen.find(*pair, template, search, stride, **options)
+        found = chosen.find(first, second, template, search, stride, **options)
         level = 0.0 if noise is None else noise
+        pixels1, pixels2 = resting.pattern.removed(whole[:2])
         texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
-        flag = resting.flags(found, [pixels1, pixels2, *rest], windows, chosen.centred)
+        flag = resting.flags(found, whole, windows, chosen.centred)
         if found.covariance is not None:
             flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
         if chosen.local:
@@ -189,6 +190,8 @@ def retrieve_wind(
         attributes["blur"] = blur
     if "min_correlation" in options:
         attributes["min_correlation"] = min_correlation
+    if str(resting.pattern):
+        attributes["fixed_pattern"] = str(resting.pattern)
     found = found._replace(flag=flag)
     steps = spacing(image1)
     variables = winds(found, image1.dims, steps, dt)

@@ -1,0 +1,40 @@
+"""The motion around every pixel, from coarse vectors, and images read further on along it."""
+
+import torch
+from torch.nn.functional import grid_sample, pad
+
+from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
+from lidar_mi.retrieval.velocimetry.first_pass import coarse_windows
+from lidar_mi.retrieval.velocimetry.quality import Flag
+from lidar_mi.retrieval.velocimetry.windows import Windows, linear_weights, separable
+
+# Coarse vectors along each axis whose median is the motion around a place.
+_AROUND = 5
+
+
+def motion_around(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:
+    """Displacement around every pixel, (2, z, y) px: the median of 5 x 5 coarse vectors.
+
+    0 where none was found.
+    """
+    coarse = coarse_windows(windows)
+    found = cross_correlation(image1, image2, coarse.template, coarse.search, coarse.stride)
+    usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
+    d = pad(torch.where(usable, found.d, torch.nan), (_AROUND // 2,) * 4, value=torch.nan)
+    d = d.unfold(1, _AROUND, 1).unfold(2, _AROUND, 1).flatten(3).nanmedian(-1).values
+    weights = [
+        linear_weights(coarse.centres(axis).to(d), torch.arange(n).to(d))
+        for axis, n in enumerate(windows.shape)
+    ]
+    return separable(d.nan_to_num(0.0), weights)
+
+
+def moved(image: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+    """The image (z, y) read d (2, z, y) px further on, by cubics."""
+    place = [torch.arange(n).to(d) for n in image.shape]
+    at = [
+        2 * (p + part) / (n - 1) - 1
+        for p, part, n in zip(torch.meshgrid(*place, indexing="ij"), d, image.shape, strict=True)
+    ]
+    grid = torch.stack([at[1], at[0]], -1)[None]
+    return grid_sample(image[None, None], grid, "bicubic", "border", align_corners=True)[0, 0]
