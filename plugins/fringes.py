@@ -181,7 +181,8 @@ def define():
         def _kept(self, pixels):
             """Number of passes stored by an earlier run, and their results."""
             passes, arrays = self.batches.kept() if self.batches else (0, {})
-            if not passes:
+            # passes of another size, for another machine's memory, end at other paths
+            if not passes or int(arrays.get("samples_per_pass", -1)) != self.samples_per_pass:
                 return 0, [dr.zeros(mi.Float, pixels) for _ in self.quantities()]
             return passes, [mi.Float(row) for row in arrays["values"]]
 
@@ -190,8 +191,13 @@ def define():
             if self.progress or self.batches:
                 dr.sync_thread()
             if self.batches and done < total:
+                size = np.array(self.samples_per_pass)
                 self.batches.keep(
-                    passes, lambda: {"values": np.stack([value.numpy() for value in values])}
+                    passes,
+                    lambda: {
+                        "values": np.stack([value.numpy() for value in values]),
+                        "samples_per_pass": size,
+                    },
                 )
             if self.progress:
                 self.progress(done, total)

@@ -6,7 +6,10 @@ traceback.
 """
 
 import re
+import struct
 import sys
+import tracemalloc
+from zlib import crc32
 
 import numpy as np
 import OpenEXR
@@ -161,3 +164,43 @@ def test_webp_is_lossless(tmp_path):
         np.testing.assert_array_equal(np.asarray(image), pixels)
     with pytest.raises(InputError, match=r"no.png: no readable image"):
         as_webp(tmp_path / "no.png")
+
+
+DATA = struct.pack(">I", 0) + b"IDAT" + struct.pack(">I", crc32(b"IDAT"))
+
+
+def png_header(width, height):
+    """The first bytes of a grey PNG."""
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
+    return (
+        b"\x89PNG\r\n\x1a\n"
+        + struct.pack(">I", 13)
+        + chunk
+        + struct.pack(">I", crc32(chunk))
+        + DATA
+    )
+
+
+def fits_header(width, height):
+    cards = (
+        "SIMPLE  = T",
+        "BITPIX  = 8",
+        "NAXIS   = 2",
+        f"NAXIS1  = {width}",
+        f"NAXIS2  = {height}",
+    )
+    return "".join(f"{card:80}" for card in (*cards, "END")).ljust(2880).encode()
+
+
+@pytest.mark.parametrize(("suffix", "header"), [(".png", png_header), (".fits", fits_header)])
+def test_what_a_file_declares_is_not_believed(tmp_path, suffix, header):
+    """Of 12 000 x 12 000 pixels a few bytes are there: refused before memory is asked for."""
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(header(12_000, 12_000))
+    tracemalloc.start()
+    try:
+        with pytest.raises(InputError, match=r"declares 1\.15e\+09 bytes in a file of \d"):
+            read_pixels(path)
+        assert tracemalloc.get_traced_memory()[1] < 1e8
+    finally:
+        tracemalloc.stop()

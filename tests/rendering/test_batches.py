@@ -20,21 +20,21 @@ LIDAR = """<integer name="max_order" value="2"/> <boolean name="orders" value="t
     <boolean name="covariance" value="true"/> <integer name="samples_per_pass" value="20"/>"""
 
 
-def lidar_scene(estimator):
+def lidar_scene(estimator, size=20):
     """3 x 2 beams of 50 samples, a beam at a time in passes of 20, 20 and 10."""
     text = (SCENES / "slab.xml").read_text()
     for old, new in (
         ('"219"', '"3"'),
         ('"139"', '"2"'),
         ('<integer name="sample_count" value="64"/>', '<integer name="sample_count" value="50"/>'),
-        ('<integer name="max_order" value="1"/>', LIDAR),
+        ('<integer name="max_order" value="1"/>', LIDAR.replace("20", str(size))),
     ):
         assert old in text
         text = text.replace(old, new)
     return mi.load_string(text, estimator=estimator)
 
 
-def ring_scene(estimator):
+def ring_scene(estimator, size=1000):
     """40 x 30 pixels; 8 paths each in passes of 1000."""
     text = (SCENES / "fringes.xml").read_text()
     for old, new in (
@@ -42,7 +42,9 @@ def ring_scene(estimator):
         ('"780"', '"30"'),
         (
             'value="$estimator"/> <',
-            'value="$estimator"/> <integer name="samples_per_pass" value="1000"/> <',
+            'value="$estimator"/> <integer name="samples_per_pass" value="SIZE"/> <'.replace(
+                "SIZE", str(size)
+            ),
         ),
     ):
         assert old in text
@@ -93,6 +95,25 @@ def test_a_killed_image_resumes_where_it_was(variant, tmp_path, monkeypatch, mak
         assert "Killed" in repr((caught.value, caught.value.__cause__))
     image, made = rendered(scene, path)
     assert made == passes[-1:]
+    np.testing.assert_array_equal(image.view(np.uint32), whole.view(np.uint32))
+
+
+@pytest.mark.parametrize(
+    ("make", "estimator", "other"),
+    [(ring_scene, "camera", 700), pytest.param(lidar_scene, "gated", 15, marks=pytest.mark.slow)],
+)
+def test_passes_of_another_size_are_not_taken(
+    variant, tmp_path, monkeypatch, make, estimator, other
+):
+    """As a machine with less memory makes them: their number says nothing of these."""
+    monkeypatch.setattr(batches, "INTERVAL", 0)
+    path, resumed = tmp_path / "batches.npz", make(estimator, other)
+    whole, passes = rendered(resumed)
+    with pytest.raises(Exception) as caught:
+        rendered(make(estimator), path, passes=3)
+    assert "Killed" in repr((caught.value, caught.value.__cause__)) and path.is_file()
+    image, made = rendered(resumed, path)
+    assert made == passes
     np.testing.assert_array_equal(image.view(np.uint32), whole.view(np.uint32))
 
 

@@ -59,6 +59,26 @@ def test_a_missing_argument_is_a_usage_error(lidar_mi):
 
 
 @pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("run",), "missing argument"),
+        (("run", "a.yaml", "--nope"), "no such option: --nope"),
+        (("nope",), "no such command 'nope'"),
+        (("render", "a.xml", "-s", "many"), "invalid value for '-s'"),
+        (("retrieve", "a.exr", "b.exr", "--dt", "x\x1b[31m"), "invalid value for '--dt'"),
+        (("check", "a.yaml", "b" * 3000), "unexpected extra argument"),
+    ],
+)
+def test_wrong_usage_is_one_line(lidar_mi, arguments, says):
+    """Where typer alone draws a box of five."""
+    code, out, err = lidar_mi(*arguments)
+    (line,) = err.splitlines()
+    assert code == 2 and out == "" and says in line.lower()
+    assert line.startswith("lidar-mi: ") and line.isprintable() and len(line) <= 300
+    assert line.endswith(" --help")
+
+
+@pytest.mark.parametrize(
     ("ok", "code", "end"), [(True, 0, "all checks passed"), (False, 1, "1 of 2")]
 )
 def test_doctor_ends_as_its_findings_say(lidar_mi, monkeypatch, ok, code, end):

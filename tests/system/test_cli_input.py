@@ -285,3 +285,30 @@ def test_bad_input_in_a_fresh_process(there):
     (line,) = done.stderr.splitlines()
     expected = "expected 0.1 to 100000 m (from a wind tunnel to the top of the atmosphere)"
     assert line == f"lidar-mi: tiny.yaml: scan.range: -5 m is not allowed; {expected}"
+
+
+LONG = "a" * 300
+"""A name that no file system takes."""
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("check", LONG),
+        ("check", f"{LONG}.yaml"),
+        ("info", LONG),
+        ("render", f"{LONG}.xml"),
+        ("rings", f"{LONG}.png"),
+        ("retrieve", f"{LONG}.exr", "rgb.exr", "--dt", "0.1"),
+        ("check", "tiny.yaml", "--set", f"name={LONG}"),
+        ("check", "wake.yaml", "--set", f"wake.file={LONG}.nc"),
+        ("check", "tiny.yaml", "--set", f"scattering={{phase: table, table: {LONG}.txt}}"),
+    ],
+    ids=lambda arguments: " ".join(one.replace(LONG, "LONG") for one in arguments),
+)
+def test_names_that_are_too_long(there, lidar_mi, arguments):
+    before = files_in(there)
+    code, _, err = lidar_mi(*arguments)
+    (line,) = [line for line in err.splitlines() if line.startswith("lidar-mi: ")]
+    assert code == 2 and "Traceback" not in err and len(line) <= 300
+    assert files_in(there) == before

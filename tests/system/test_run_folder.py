@@ -9,16 +9,21 @@ import signal
 import subprocess
 import sys
 from contextlib import contextmanager
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.run_folder import MADE_BY, read_metrics
+from lidar_mi.experiment.run_folder import MADE_BY, RunFolder, read_metrics
 from lidar_mi.io.exr import read_scan
 from lidar_mi.io.folder import locked
+from lidar_mi.io.json import read_json
 from lidar_mi.io.netcdf import read_netcdf
-from tests.support.experiments import check, small
+from lidar_mi.io.vortex_file import read_vortices
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from tests.support.experiments import blob, check, small, write_wake
 
 
 @contextmanager
@@ -126,3 +131,35 @@ def test_results_without_images_are_not_replaced_by_default(tmp_path, quick):
     with pytest.raises(InputError, match="holds a run of another experiment"):
         run(check(small() | {"seed": 2}), folder)
     assert (folder / "wind.nc").is_file()
+
+
+def test_vortices_identify_their_run(tmp_path):
+    """They are written as JSON, which has no attributes."""
+    folder = RunFolder(tmp_path, check(small()), tmp_path)
+    parameters = np.array([300.0, 1.0, 15.0, 0.0, -300.0, 1.0, -15.0, 0.0, 0.0, 0.0])
+    fit = VortexPairFit(parameters, np.eye(10), "lamb_oseen", 1.0, 1.0, 0.0, 0.0)
+    folder.keep("vortices", SimpleNamespace(pairs={"mine": fit}))
+    assert read_json(tmp_path / "vortex.json", "vortices")[MADE_BY] == folder.made_by
+    assert read_vortices(tmp_path / "vortex.json")["mine"].port.circulation == 300
+    folder.keep("vortices", None)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["wind.nc", "image_t1.exr", "metrics.json"])
+def test_a_wake_file_is_never_written_over(tmp_path, name):
+    """Not even with ``overwrite``, in the folder of an earlier run."""
+    with RunFolder(tmp_path / "run", check(small()), tmp_path).claimed(overwrite=False):
+        pass
+    before = {path: path.read_bytes() for path in (tmp_path / "run").iterdir()}
+    wake = tmp_path / "run" / name
+    write_wake(wake, blob(8, -4))
+    before[wake] = wake.read_bytes()
+    data = small()
+    data["wake"] = {"file": f"run/{name}"}
+    again = RunFolder(tmp_path / "run", check(data), tmp_path)
+    with (
+        pytest.raises(InputError, match=rf"wake.file: .*{name} lies where this run writes"),
+        again.claimed(overwrite=True),
+    ):
+        pytest.fail("claimed")
+    assert {path: path.read_bytes() for path in (tmp_path / "run").iterdir()} == before
