@@ -330,7 +330,7 @@ def test_both_lidars_in_one_experiment(tmp_path, quick, monkeypatch):
     assert "backscatter.cc.valid_fraction" in metrics
     assert "doppler.annular.centre_known.averaged_1.bias" in metrics
     page = (tmp_path / "report.html").read_text()
-    assert "A backscatter lidar scans" in page and "A Doppler lidar sends" in page
+    assert "A backscatter lidar scans" in page and "A Doppler lidar images" in page
 
 
 # ---------------------------------------------------------------- input
