@@ -65,13 +65,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .light_paths import Lidar
 from .parameters import choice, fail, whole
+from .path_sampling import Lidar
 from .physical import Physical
 from .polarization import first_unpolarized_in_blend
 from .registration import register
 
-# how samples scatter and where they fly next is in `light_paths`, of both estimators
+# how samples scatter and where they fly next is in `path_sampling`, of both estimators
 NAME, KIND = "gated_volpath", "integrator"
 
 STOKES = ("S0", "S1", "S2", "S3")

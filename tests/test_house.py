@@ -48,7 +48,7 @@ that its files hold; only `experiment` and what lies above it see all."""
 OPENS = {
     "assessment/report/page.py": "its own script, a resource of the package",
     "experiment/log.py": "the log, line by line",
-    "experiment/run_folder.py": "checksums of what a run depends on",
+    "experiment/resumable_folder.py": "checksums of what a run depends on",
     "system/doctor.py": "a file of its own in a program that it tries",
     "system/llvm.py": "/proc",
     "system/memory.py": "/proc, /sys/fs/cgroup",

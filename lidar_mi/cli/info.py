@@ -38,7 +38,7 @@ def info(
     """
     from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment.describe import sections, value_at
-    from lidar_mi.experiment.run_folder import failure, read_metrics, read_record
+    from lidar_mi.experiment.resumable_folder import failure, read_metrics, read_record
     from lidar_mi.experiment.study import RECORD
 
     with progress() as notice:

@@ -34,8 +34,8 @@ def run(
     """
     from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment import reading, study
+    from lidar_mi.experiment.resumable_folder import RESULTS
     from lidar_mi.experiment.run import run as start
-    from lidar_mi.experiment.run_folder import RESULTS
 
     path, changes = experiment_file(experiment), list(set_ or [])
     variants = reading.load_variants(path, changes)

@@ -188,7 +188,7 @@ def _study(folder: Path) -> Iterator[Section]:
 
 
 def _run_folder(folder: Path) -> Iterator[Section]:
-    from lidar_mi.experiment.run_folder import read_record
+    from lidar_mi.experiment.resumable_folder import read_record
 
     record = read_record(folder)
     experiment = record["experiment"]

@@ -13,7 +13,7 @@ from lidar_mi.assessment.figures.backscatter import overview
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.report.summary import summary
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.run_folder import REPORT
+from lidar_mi.experiment.resumable_folder import REPORT
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.vortices import VortexFits
 from lidar_mi.experiment.truth import Truth

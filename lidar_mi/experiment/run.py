@@ -1,8 +1,8 @@
 """One experiment: truth, sensor, images, estimate, verdict.
 
 A run may have a folder, where images are saved as soon as they are rendered. A stopped run is
-resumed with them, and everything after them is computed again. `run_folder` decides which files are
-saved and reused, `rendering.batches` stores the samples of unfinished images.
+resumed with them, and everything after them is computed again. `resumable_folder` decides which
+files are saved and reused, `rendering.batches` stores the samples of unfinished images.
 """
 
 import time
@@ -19,7 +19,7 @@ from lidar_mi.experiment.pipeline import stages_of
 from lidar_mi.experiment.reading import dump
 from lidar_mi.experiment.report import chapters
 from lidar_mi.experiment.results import Run
-from lidar_mi.experiment.run_folder import RunFolder
+from lidar_mi.experiment.resumable_folder import RunFolder
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Stage, result_of
 from lidar_mi.progress import Notice, progress

@@ -17,7 +17,7 @@ from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.log import Log, Notice, silent
 from lidar_mi.experiment.reading import dump
 from lidar_mi.experiment.results import Run
-from lidar_mi.experiment.run_folder import (
+from lidar_mi.experiment.resumable_folder import (
     FIGURES,
     LOG,
     METRICS,
@@ -26,7 +26,7 @@ from lidar_mi.experiment.run_folder import (
     read_record,
     refuse_strangers,
 )
-from lidar_mi.experiment.run_folder import RECORD as RUN
+from lidar_mi.experiment.resumable_folder import RECORD as RUN
 from lidar_mi.experiment.schema import NAME, Experiment
 from lidar_mi.io.folder import locked, make_folder
 from lidar_mi.io.json import write_json
@@ -100,7 +100,7 @@ def read_study(
     name : str
         Of the study.
     records : dict
-        By variant, as of `run_folder.read_record`; None: not run yet.
+        By variant, as of `resumable_folder.read_record`; None: not run yet.
     metrics : dict
         By variant; of those that are done.
 

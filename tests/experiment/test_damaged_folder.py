@@ -7,9 +7,9 @@ and names in a record that lead out of the folder.
 import pytest
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import reading, run_folder, study
+from lidar_mi.experiment import reading, resumable_folder, study
 from lidar_mi.experiment.log import Log, failure
-from lidar_mi.experiment.run_folder import read_metrics
+from lidar_mi.experiment.resumable_folder import read_metrics
 from lidar_mi.experiment.study import read_study
 
 
@@ -56,11 +56,11 @@ def test_variants_of_a_record_stay_in_its_folder(tmp_path, name):
 def test_no_variant_is_called_like_a_file_beside_it(tmp_path):
     ours = {
         study.RECORD,
-        run_folder.RECORD,
-        run_folder.LOG,
-        run_folder.METRICS,
-        run_folder.REPORT,
-        run_folder.FIGURES,
+        resumable_folder.RECORD,
+        resumable_folder.LOG,
+        resumable_folder.METRICS,
+        resumable_folder.REPORT,
+        resumable_folder.FIGURES,
     }
     assert ours == set(reading.BESIDE_VARIANTS)
     for name in (*ours, "Report.HTML"):

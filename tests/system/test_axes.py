@@ -10,8 +10,8 @@ import pytest
 import xarray as xr
 from scipy import ndimage
 
+from lidar_mi.experiment.resumable_folder import IMAGES
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.run_folder import IMAGES
 from tests.support.experiments import as_seen, blob, check, small, without_figures, write_wake
 
 

@@ -11,8 +11,8 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
 from lidar_mi.experiment import reading as config
+from lidar_mi.experiment.resumable_folder import IMAGES
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.run_folder import IMAGES
 from lidar_mi.experiment.stages.error_budget import budgets
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import attenuated_backscatter_stderr

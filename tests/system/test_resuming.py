@@ -9,10 +9,10 @@ import xarray as xr
 import yaml
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import run_folder
+from lidar_mi.experiment import resumable_folder
 from lidar_mi.experiment import truth as truth_module
+from lidar_mi.experiment.resumable_folder import IMAGES
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.run_folder import IMAGES
 from lidar_mi.io.exr import read_scan
 from lidar_mi.io.wake_file import read_wake
 from tests.support.experiments import blob, check, replace_stages, small, write_wake
@@ -211,6 +211,6 @@ def test_a_failed_run_is_recorded_in_its_log(tmp_path, quick, monkeypatch):
         replace_stages(patch, wind=broken)
         with pytest.raises(InputError):
             run(check(small()), folder)
-    assert run_folder.failure(folder) == "wind: 7 is not allowed; expected 8"
+    assert resumable_folder.failure(folder) == "wind: 7 is not allowed; expected 8"
     run(check(small()), folder)
-    assert run_folder.failure(folder) is None
+    assert resumable_folder.failure(folder) is None

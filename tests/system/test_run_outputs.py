@@ -16,7 +16,7 @@ import xarray as xr
 import yaml
 
 from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.run_folder import IMAGES
+from lidar_mi.experiment.resumable_folder import IMAGES
 from lidar_mi.io.exr import read_scan
 from tests.support.experiments import FIGURES, SOURCES
 

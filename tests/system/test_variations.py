@@ -11,8 +11,8 @@ import pytest
 import xarray as xr
 
 from lidar_mi.experiment import reading as config
+from lidar_mi.experiment.resumable_folder import IMAGES
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.run_folder import IMAGES
 from lidar_mi.experiment.truth import blur_by_beam, make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.io.exr import read_scan

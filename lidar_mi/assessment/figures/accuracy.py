@@ -1,33 +1,14 @@
 """Figures of the errors of winds: against the Cramer-Rao bound, and by the air's structure."""
 
-from collections.abc import Mapping
-
 import numpy as np
 import xarray as xr
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy import stats
 
 from lidar_mi.assessment.figures.plates import by_factors
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.errors import error_by_quality
 from lidar_mi.assessment.metrics.names import RENDERED, Source
 from lidar_mi.retrieval.method_names import ImageMethod
-
-
-def draw_normalised_errors(axes: Axes, errors: Mapping[str, np.ndarray], **style: str) -> None:
-    """Histogram of errors over standard errors, by label; the last bins hold all beyond 5."""
-    edges = np.linspace(-5, 5, 51)
-    for label, values in errors.items():
-        known = values[np.isfinite(values)]
-        axes.hist(np.clip(known, -5, 5), edges, density=True, histtype="step", label=label, **style)
-
-
-def draw_normal_density(axes: Axes) -> None:
-    """The density of normalised errors with correct standard errors."""
-    middle = np.linspace(-4.9, 4.9, 50)
-    axes.plot(middle, stats.norm.pdf(middle), "k:", label="as stated")
-    axes.set(xlabel="normalised error", ylabel="density")
 
 
 def truth_vectors(wind: xr.Dataset) -> xr.Dataset:

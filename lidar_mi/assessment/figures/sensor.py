@@ -7,7 +7,10 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.accuracy import draw_normal_density, draw_normalised_errors
+from lidar_mi.assessment.figures.normalised_errors import (
+    draw_normal_density,
+    draw_normalised_errors,
+)
 from lidar_mi.assessment.figures.plates import Drawn, save_all
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.retrieval.lines.vectors import COMPONENTS

@@ -8,7 +8,10 @@ import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from lidar_mi.assessment.figures.accuracy import draw_normal_density, draw_normalised_errors
+from lidar_mi.assessment.figures.normalised_errors import (
+    draw_normal_density,
+    draw_normalised_errors,
+)
 from lidar_mi.assessment.figures.plates import Drawn, by_factors, save_all
 from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES
 from lidar_mi.assessment.metrics.cores import Core

@@ -28,7 +28,7 @@ from lidar_mi.retrieval.lines.grid_lines import (
     lines_on_grid,
     with_slopes,
 )
-from lidar_mi.retrieval.lines.u_statistics import correlation, probable_statistics, relative_std
+from lidar_mi.retrieval.lines.u_prior import correlation, probable_statistics, relative_std
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, error_variables, flag_attributes
 
 # Prior standard deviation of the mean of u, m/s.
