@@ -6,6 +6,7 @@ import operator
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar
 
 from lidar_mi.errors import InputError
@@ -51,7 +52,9 @@ def _is(value: Any, annotation: Any) -> bool:
     if annotation is Any:
         return True
     if origin in (typing.Union, types.UnionType):
-        return any(_is(value, part) for part in inner)
+        named = Path in inner and isinstance(value, str | Path)
+        # no file has a name with a NUL in it
+        return any(_is(value, part) for part in inner) and not (named and "\0" in str(value))
     if origin is Literal:
         return isinstance(value, tuple(map(type, inner)))
     if origin is tuple:

@@ -10,6 +10,7 @@ from typing import Literal
 
 import numpy as np
 import pytest
+import xarray as xr
 
 import lidar_mi as lm
 from lidar_mi.arguments import checked_arguments
@@ -66,6 +67,7 @@ def test_of_the_right_type(given):
         ({"whole": 1.0}, "whole: 1.0 is not allowed; expected a whole number"),
         ({"text": 3}, "text: 3 is not allowed; expected text or None"),
         ({"path": b"a" * 99}, "expected text or Path"),
+        ({"path": "a\0"}, r"path: 'a\x00' is not allowed; expected text or Path"),
         ({"pair": (1,)}, "pair: tuple is not allowed; expected (a number, a number)"),
         ({"pair": "ab"}, "expected (a number, a number)"),
         ({"several": [1, "a"]}, "several: list is not allowed; expected a list of a whole number"),
@@ -90,6 +92,7 @@ def test_of_another_type(given, says):
         (lambda: lm.analyse_rings(None), "images: object is not allowed; expected real numbers"),
         (lambda: lm.analyse_rings(np.eye(20), centre=3), "centre: 3 is not allowed"),
         (lambda: lm.on_one_grid(1, 2), "image1: 1 is not allowed; expected DataArray"),
+        (lambda: lm.on_one_grid(*[xr.DataArray(np.eye(4))] * 2), "image1: dims ('dim_0', 'dim_1')"),
     ],
 )
 def test_public_functions_name_the_argument(call, says):

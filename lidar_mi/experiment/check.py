@@ -76,7 +76,7 @@ def _backscatter(asked: Experiment, truth: Truth, plan: ScanPlan) -> Iterator[Se
 
 def _forecast(asked: Experiment, plan: ScanPlan) -> list[tuple[str, str]]:
     """Memory and time, to a factor of two."""
-    expected, allowed = forecast(asked, plan), ceiling(asked.render.memory)
+    expected, allowed = forecast(asked, plan.y.size * plan.z.size), ceiling(asked.render.memory)
     return [
         ("memory", f"about {expected.memory / 1e9:.2g} GB, at most {allowed / 1e9:.3g} GB"),
         ("time on one core", f"about {duration(expected.seconds)}, figures not counted"),

@@ -12,6 +12,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.io.exr import MOST_LAYERS
 from lidar_mi.rendering.memory import (
     PER_SAMPLE,
     PROGRAM,
@@ -44,16 +45,12 @@ class Forecast(NamedTuple):
     seconds: float
 
 
-def forecast(experiment: Experiment, plan: ScanPlan) -> Forecast:
+def forecast(experiment: Experiment, beams: int) -> Forecast:
     """Memory and time of the backscatter lidar's part of a run, to a factor of two."""
-    render, beams = experiment.render, plan.y.size * plan.z.size
-    samples = beams * max(render.samples_per_beam, 2 * plan.gate_count)
+    render, gates = experiment.render, experiment.scan.gate_count
+    samples = beams * max(render.samples_per_beam, 2 * gates)
     at_once = samples_at_once(render.samples_per_pass, render.memory)
-    memory = (
-        PROGRAM
-        + _per_beam(experiment, plan.gate_count) * beams
-        + PER_SAMPLE * min(samples, at_once)
-    )
+    memory = PROGRAM + _per_beam(experiment, gates) * beams + PER_SAMPLE * min(samples, at_once)
     vectors = _vectors_per_beam(experiment) * beams
     seconds = 2 * samples * render.max_order / SAMPLES_PER_SECOND + vectors / VECTORS_PER_SECOND
     return Forecast(memory, seconds)
@@ -82,20 +79,43 @@ def _vectors_per_beam(experiment: Experiment) -> float:
     return len(experiment.retrieval.methods) * sources / experiment.retrieval.stride**2
 
 
-def check_size(experiment: Experiment, plan: ScanPlan) -> None:
-    """Refuse a run that needs more memory than the limit.
+def check_size(experiment: Experiment, columns: int, rows: int) -> None:
+    """Refuse images that would take more memory than a run may, or more layers than files hold.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    columns, rows : int
+        Of beams in an image.
 
     Raises
     ------
     InputError
-        The memory needed is above the limit.
+        With what it would take.
     """
+    gates, each = experiment.scan.gate_count, _layers_per_gate(experiment)
+    most = (MOST_LAYERS - 3) // each  # three are not of a gate: Y, with noise, and its error
+    if gates > most:
+        raise InputError(
+            f"scan.gate_count: {gates} is not allowed with {each} layers each; expected at most "
+            f"{most}, as an EXR file has at most {MOST_LAYERS} layers"
+        )
     check_memory(
-        forecast(experiment, plan).memory,
+        forecast(experiment, columns * rows).memory,
         experiment.render.memory,
-        f"scan: {plan.y.size} x {plan.z.size} beams x {plan.gate_count} gates",
+        f"scan: {columns} x {rows} beams x {gates} gates",
         "a larger wake.spacing, retrieval.stride or fewer gates",
     )
+
+
+def _layers_per_gate(experiment: Experiment) -> int:
+    """Layers of an image for each of its gates."""
+    render = experiment.render
+    polarised = "polarized" in render.variant
+    depolarisation = polarised and tuple(experiment.lidar.stokes) == (1, 1, 0, 0)
+    orders = render.max_order + 2 if render.max_order > 1 else 0
+    noisy = 2 * bool(experiment.detector)
+    return 5 + 2 * polarised + 2 * depolarisation + orders + noisy
 
 
 def most_nodes(experiment: Experiment) -> int:

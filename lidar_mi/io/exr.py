@@ -28,6 +28,8 @@ from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.exr_header import declared_size
 from lidar_mi.io.size import check_size
 
+MOST_LAYERS = 2**15 - 1
+"""Of a file: the library counts them in 16 bits."""
 QUANTITIES = ("S0", "S1", "S2", "S3", "S0_stderr")
 _MEANING = {
     "S0": "received energy over emitted pulse energy",
@@ -129,6 +131,11 @@ def _write(path: Path, attributes: dict, channels: dict[str, np.ndarray]) -> Non
                 f"{path}: layer {name} has values beyond {np.finfo(np.float32).max:.3g}, the "
                 "largest of an EXR file; expected smaller ones"
             )
+    if len(singles) > MOST_LAYERS:
+        raise InputError(
+            f"{path}: {len(singles)} layers are not allowed; expected at most {MOST_LAYERS} in an "
+            "EXR file"
+        )
     buffer = BytesIO()
     OpenEXR.File(header, singles).write(buffer)
     write_atomically(path, buffer.getvalue())

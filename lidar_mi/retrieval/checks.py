@@ -8,6 +8,8 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 
+LARGEST = 1e100
+"""Of the values of an image: sums of their products are finite."""
 _METRES = ("m", "metre", "metres", "meter", "meters")
 
 
@@ -62,6 +64,9 @@ def checked_image(name: str, image: xr.DataArray, axes: Sequence[str] = ("z", "y
         raise InputError(f"{name}: dims {tuple(image.dims)} are not {tuple(axes)}")
     if image.dtype.kind not in "fiu":
         raise InputError(f"{name}: values of type {image.dtype} are not real numbers")
+    largest = float(np.abs(image.values[np.isfinite(image.values)]).max(initial=0))
+    if largest > LARGEST:
+        raise InputError(f"{name}: values up to {largest:g}; expected at most {LARGEST:g}")
     for axis in axes:
         if axis not in image.coords:
             raise InputError(f"{name}.{axis}: coordinate missing; give it in m")

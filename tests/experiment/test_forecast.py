@@ -91,28 +91,49 @@ def test_memory_against_that_of_runs():
     """Resident memory at most, measured: 0.7 GB for wake_backscatter; 1.02 GB for 110 x 70 beams,
     200 gates, 400 samples, two orders and vectors at every fourth pixel."""
     whole = {"retrieval": {"methods": ["cc", "ws"]}, "render": {"samples_per_beam": 64}}
-    found = forecast(*planned(**whole))
+    found = forecast(check(small() | whole), 219 * 139)
     assert 0.7e9 / 1.5 < found.memory < 0.7e9 * 1.5
-    experiment, _ = planned(
-        scan={"gate_count": 200},
-        render={"samples_per_beam": 400, "max_order": 2},
-        retrieval={"methods": ["cc"], "stride": 4},
-    )
-    plan = plan_scans(experiment.scan, np.arange(110.0), np.arange(70.0), (0.0,))[0]
-    assert 1.02e9 / 1.5 < forecast(experiment, plan).memory < 1.02e9 * 1.5
+    changes = {
+        "scan": {"gate_count": 200},
+        "render": {"samples_per_beam": 400, "max_order": 2},
+        "retrieval": {"methods": ["cc"], "stride": 4},
+    }
+    experiment = check(small() | changes)
+    assert 1.02e9 / 1.5 < forecast(experiment, 110 * 70).memory < 1.02e9 * 1.5
 
 
-@pytest.mark.parametrize(("gates", "fits"), [(1, True), (100, True), (2000, False), (10000, False)])
+@pytest.mark.parametrize(("gates", "fits"), [(1, True), (100, True), (2000, False)])
 def test_a_run_beyond_the_memory_is_refused_with_its_requirement(gates, fits):
-    experiment, plan = planned(
-        scan={"gate_count": gates}, render={"memory": "8 GB", "max_order": 4}
-    )
+    render = {"memory": "8 GB", "max_order": 4}
+    experiment = check(small() | {"scan": {"gate_count": gates}, "render": render})
     if fits:
-        return check_size(experiment, plan)
+        return check_size(experiment, 219, 139)
     with pytest.raises(
         InputError, match=rf"219 x 139 beams x {gates} gates .* would take [\d.]+e?"
     ):
-        check_size(experiment, plan)
+        check_size(experiment, 219, 139)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        # OpenEXR counts layers in 16 bits, and failed after all was rendered
+        ({"scan": {"gate_count": 10_000}}, "gate_count: 10000 is not allowed with 9 layers"),
+        ({"scan": {"aim": "angles", "columns": 4000, "rows": 2000}}, "4000 x 2000 beams x 1 gates"),
+        ({"scan": {"gate_count": 2000}, "wake": {"spacing": "0.1 m"}}, "beams x 2000 gates"),
+    ],
+)
+def test_check_refuses_from_the_forecast_before_the_truth(changes, says, tmp_path, monkeypatch):
+    """A spacing of 0.05 m took minutes before it was refused."""
+
+    def computed(*_):
+        pytest.fail("the truth was computed")
+
+    monkeypatch.setattr("lidar_mi.experiment.truth._extinction", computed)
+    data = small(**changes.get("wake", {})) | {k: v for k, v in changes.items() if k != "wake"}
+    data["render"] = data["render"] | {"memory": "8 GB"}
+    with pytest.raises(InputError, match=says):
+        list(sections(check(data), tmp_path))
 
 
 def test_a_spacing_that_memory_does_not_hold_is_refused_before_the_air_is_made():

@@ -33,9 +33,22 @@ def scan_plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
 
 
 def read_truth(experiment: Experiment, beside: str | Path, *, log: Log) -> Flows:
-    """The flow at both times; see `read_flows`."""
+    """The flow at both times; see `read_flows`.
+
+    Raises
+    ------
+    InputError
+        A wake that cannot be read, or images of it that a run cannot hold: before more is made of
+        it.
+    """
     log.bar("reading the wake", None)
-    return read_flows(experiment, beside)
+    scan = experiment.scan
+    if scan.aim == "angles":
+        check_size(experiment, scan.columns, scan.rows)
+    flows = read_flows(experiment, beside)
+    if scan.aim == "grid":  # a beam for every node
+        check_size(experiment, flows[0].sizes["y"], flows[0].sizes["z"])
+    return flows
 
 
 def true_cores(experiment: Experiment, truth: Truth) -> list[Core]:
@@ -73,7 +86,6 @@ def check_light(
         Air that does not scatter, a detector inconsistent with the pulse, beams too wide for the
         largest medium.
     """
-    check_size(experiment, plans[0])
     _media(experiment, truth, plans)
     if experiment.detector:
         for plan in plans:

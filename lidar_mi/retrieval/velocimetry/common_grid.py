@@ -130,6 +130,13 @@ def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArra
     >>> bool((first["y"] == second["y"]).all()), first.sizes["y"]
     (True, 7)
     """
+    for name, image in (("image1", image1), ("image2", image2)):
+        on_axes = {"z", "y"} == set(image.dims) <= set(image.coords)
+        if not on_axes or image.ndim != 2 or min(image.shape) < 2:
+            raise InputError(
+                f"{name}: dims {tuple(image.dims)} of {image.shape} px; expected z and y with "
+                "coordinates, two pixels or more each"
+            )
     if image1.shape != image2.shape:
         sizes = " and ".join(f"{i.sizes['y']} x {i.sizes['z']}" for i in (image1, image2))
         raise InputError(f"image2: sizes {sizes} px (y x z) differ; expected two of one size")

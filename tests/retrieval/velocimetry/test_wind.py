@@ -280,6 +280,7 @@ def test_bad_input_is_named():
         (lambda: retrieve_wind(one.values, two, DT), "image1: ndarray"),
         (lambda: retrieve_wind(one.expand_dims("gate"), two, DT), "image1: dims"),
         (lambda: retrieve_wind(one.drop_vars("z"), two, DT), "image1.z: coordinate missing"),
+        (lambda: retrieve_wind(1e300 * one, two, DT), "image1: values up to"),
         (lambda: retrieve_wind(one + 1j, two, DT), "image1: values of type complex128"),
         (lambda: retrieve_wind(one, two, DT, device="abacus"), "device: 'abacus'"),
         (lambda: retrieve_wind(one, two, DT, noise=one[1:]), "noise: sizes"),
