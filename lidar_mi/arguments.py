@@ -26,7 +26,7 @@ _WORDS = {
 def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
     """Let a function refuse arguments of other types than its annotations, each by its name.
 
-    Whether a value is in range is for the function to say. Arguments of ``**`` are its own.
+    Whether a value is in range is for the function to say.
     """
     signature = inspect.signature(function)
     hints: dict[str, Any] = {}
@@ -36,12 +36,13 @@ def checked_arguments(function: Callable[P, R]) -> Callable[P, R]:
         if not hints:
             hints.update(typing.get_type_hints(function))
         for name, value in signature.bind(*given, **named).arguments.items():
-            one = signature.parameters[name]
             expected = hints.get(name, Any)
-            if one.kind not in (one.VAR_KEYWORD, one.VAR_POSITIONAL) and not _is(value, expected):
-                raise InputError(
-                    f"{name}: {_shown(value)} is not allowed; expected {_in_words(expected)}"
-                )
+            more = signature.parameters[name].kind is inspect.Parameter.VAR_KEYWORD
+            for key, one in value.items() if more else [(name, value)]:
+                if not _is(one, expected):
+                    raise InputError(
+                        f"{key}: {_shown(one)} is not allowed; expected {_in_words(expected)}"
+                    )
         return function(*given, **named)
 
     return checked

@@ -91,6 +91,7 @@ def test_of_another_type(given, says):
         (lambda: lm.fit_vortices_to_wind(-1), "vectors: -1 is not allowed; expected Dataset"),
         (lambda: lm.analyse_rings(None), "images: object is not allowed; expected real numbers"),
         (lambda: lm.analyse_rings(np.eye(20), centre=3), "centre: 3 is not allowed"),
+        (lambda: lm.write_vortices("a", {}, source=3), "source: 3 is not allowed; expected text"),
         (lambda: lm.on_one_grid(1, 2), "image1: 1 is not allowed; expected DataArray"),
         (lambda: lm.on_one_grid(*[xr.DataArray(np.eye(4))] * 2), "image1: dims ('dim_0', 'dim_1')"),
     ],
