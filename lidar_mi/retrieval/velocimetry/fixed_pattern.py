@@ -34,8 +34,10 @@ _BLOCK, _RIM = 16, 8
 _FEW_BLOCKS = 5
 # Correlation at rest of what the motion leaves: noise-free texture of 2 px leaves up to 0.16.
 _LEAST = 0.25
-# Of the local contrast, from which lines and pixels make errors larger than stated.
-_SPOILS = 0.1, 0.2
+# Of the local contrast, from which gains of pixels make errors larger than stated.
+_SPOILS = 0.2
+# The same of what is left of lines: that is detected, or that their estimate leaves open.
+_LEFT = 0.1, 0.16
 
 
 class FixedPattern(NamedTuple):
@@ -78,7 +80,7 @@ class FixedPattern(NamedTuple):
         """
         relative = [_relative(image) for image in images[:2]]
         pixels = _pixels(relative, d, false_alarm)
-        spoils = pixels**2 > _SPOILS[1] ** 2 * (_contrast(relative) - pixels**2)
+        spoils = pixels**2 > _SPOILS**2 * (_contrast(relative) - pixels**2)
         return self._replace(pixels=pixels, spoils=self.spoils or spoils)
 
     def __str__(self) -> str:
@@ -118,18 +120,20 @@ def fixed_pattern(
     if not prior:
         return FixedPattern(_gain({}, images[0]))
     gains = {axis: found[axis][1] for axis in prior}
+    unknown = {}
     for _ in range(_TURNS):
         now = [working(image) / _gain(gains, image) for image in images]
         d = motion_around(*now, windows).cpu().numpy()
         for axis in prior:
             others = _gain({other: p for other, p in gains.items() if other != axis}, now[0])
             rest = [_relative(working(image) / others) for image in images]
-            gains[axis] = _solved(rest, d, axis, prior[axis])
+            gains[axis], unknown[axis] = _solved(rest, d, axis, prior[axis])
     gain = _gain(gains, images[0])
     relative = [_relative(working(image) / gain) for image in images]
     left = max(_lines(_turned(relative, axis), false_alarm)[0] for axis in prior)
     columns, rows = (float(gains[axis].std()) if axis in gains else 0.0 for axis in (1, 0))
-    spoils = left > _SPOILS[0] ** 2 * _contrast(relative)
+    detected, undetermined = (limit**2 * _contrast(relative) for limit in _LEFT)
+    spoils = bool(left > detected or max(unknown.values()) > undetermined)
     return FixedPattern(gain, columns, rows, spoils=spoils)
 
 
@@ -202,8 +206,13 @@ def _autocorrelation(profile: np.ndarray, lags: int) -> np.ndarray:
     return np.array([np.sum(profile[k:] * profile[:-k]) / square for k in range(1, lags + 1)])
 
 
-def _solved(relative: Sequence[np.ndarray], d: np.ndarray, axis: int, prior: float) -> np.ndarray:
-    """Gains of columns (axis 1) or rows (0) from what the motion d does not explain."""
+def _solved(
+    relative: Sequence[np.ndarray], d: np.ndarray, axis: int, prior: float
+) -> tuple[np.ndarray, float]:
+    """Gains of columns (axis 1) or rows (0) from what the motion d does not explain.
+
+    And the mean of their variances: near the prior one where the air hardly moves across the lines.
+    """
     one, two = relative
     here = np.indices(one.shape)
     there = here + d
@@ -219,10 +228,14 @@ def _solved(relative: Sequence[np.ndarray], d: np.ndarray, axis: int, prior: flo
     values = np.concatenate([np.ones_like(part), part - 1, -part])
     place = np.tile(number, 3), np.concatenate([here, low, low + 1])
     matrix = sparse.csr_matrix((values, place), shape=(off.size, size))
-    # neighbours share their errors: a correlation length of 2 px counts as one
-    weight = 4 * np.mean(off**2) / prior
-    gains = np.linalg.solve((matrix.T @ matrix).toarray() + weight * np.eye(size), matrix.T @ off)
-    return gains - gains.mean()
+    normal, right, rest = (matrix.T @ matrix).toarray(), matrix.T @ off, off
+    for _ in range(2):
+        # what the gains do not explain; neighbours, over a correlation length of 2 px, share it
+        weight = 4 * np.mean(rest**2) / prior
+        inverse = np.linalg.inv(normal + weight * np.eye(size))
+        gains = inverse @ right
+        rest = off - matrix @ gains
+    return gains - gains.mean(), prior * weight * float(np.trace(inverse)) / size
 
 
 def _pixels(relative: Sequence[np.ndarray], d: torch.Tensor, false_alarm: float) -> float:

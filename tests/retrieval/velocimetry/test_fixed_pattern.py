@@ -120,7 +120,9 @@ def test_gains_are_detected_by_their_size(kind, size):
         seen.append(sizes[-1] > 0)
         others = {"columns", "rows", "pixels"} - {kind}
         assert all(getattr(found, other) < 0.25 * size for other in others)
-        assert found.spoils == (kind == "pixels")
+        # of gains of lines of 10 % more may stay undetermined than is allowed
+        if kind == "pixels" or size < 0.1:
+            assert found.spoils == (kind == "pixels")
     assert all(seen)
     assert abs(np.mean(sizes) / size - 1) < 0.25
 
@@ -148,6 +150,15 @@ def test_gains_of_columns_and_rows_are_removed(method):
     assert rms(off) < (3.0 if method == "variational" else 1.6) * rms(clean)
     if np.isfinite(ratio).all():
         assert rms(ratio) < 1.5 * max(1.0, rms(least))
+
+
+@pytest.mark.parametrize("mean", [(0.0, 12.0), (1.0, 1.0)])
+def test_gains_that_the_motion_does_not_determine_are_flagged(mean):
+    """Air that hardly moves across columns: valid vectors were off by 3 standard errors."""
+    for seed in (301, 302):
+        images, _ = pair(seed, mean=mean)
+        found = pattern([image * gains(seed, "columns", 0.05) for image in images])
+        assert found.columns and found.spoils
 
 
 def test_gains_of_pixels_that_spoil_winds_are_flagged():
