@@ -48,11 +48,11 @@ def test_a_pipe_gets_every_step_as_one_line():
 
 def test_a_terminal_gets_a_bar_with_a_running_clock():
     """After a step that was done to the end, too."""
-    said = shown(terminal=True, pause=1.1)
-    assert re.search(r"retrieving .* 0:00:01", said)
+    output = shown(terminal=True, pause=1.1)
+    assert re.search(r"retrieving .* 0:00:01", output)
     # the bar is wiped, the warning is a line of its own
-    assert said.endswith("\x1b[2K") or "\x1b[2K" in said[-20:]
-    assert "\nwarning: <few> vectors" in said.replace("\r", "\n").replace("\x1b[2K", "")
+    assert output.endswith("\x1b[2K") or "\x1b[2K" in output[-20:]
+    assert "\nwarning: <few> vectors" in output.replace("\r", "\n").replace("\x1b[2K", "")
 
 
 class Handle:
@@ -71,8 +71,8 @@ def test_a_notebook_gets_few_messages_and_keeps_warnings(monkeypatch, capsys):
     with progress(console) as notice:
         for step in STEPS:
             notice(*step)
-        for share in range(1000):
-            notice("retrieving", share / 1000)
+        for fraction in range(1000):
+            notice("retrieving", fraction / 1000)
     assert page[0].startswith('<progress value="0.000">') and "[scan]" in page[0]
     assert "&lt;few&gt;" in page[1] and page[-1] == ""
     assert len(page) < 20

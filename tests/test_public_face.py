@@ -98,8 +98,8 @@ EXAMPLES = [
 def test_examples_of_the_documentation_run(example, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     runner = doctest.DocTestRunner(optionflags=doctest.NORMALIZE_WHITESPACE)
-    said = []
-    assert runner.run(example, out=said.append).failed == 0, "".join(said)
+    output = []
+    assert runner.run(example, out=output.append).failed == 0, "".join(output)
 
 
 @pytest.mark.parametrize("name", sorted(set(lm.__all__) - {"__version__"}))

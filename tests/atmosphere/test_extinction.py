@@ -41,10 +41,10 @@ def test_stretch_one_is_linear(wake):
 def test_stretch_is_monotone_with_its_slope_for_thin_tracer(stretch):
     tracer = np.concatenate([[0.0, 1e-7], np.linspace(1e-3, 1, 500)])
     wake = xr.Dataset({"tracer": ("y", tracer)})
-    share = (extinction_from_tracer(wake, 0.0, 1.0, stretch, aerosol=None)).values
-    assert (np.diff(share) > 0).all()
-    assert share[0] == 0 and share[-1] == 1
-    assert share[1] == pytest.approx(stretch * 1e-7, rel=1e-6)
+    fraction = (extinction_from_tracer(wake, 0.0, 1.0, stretch, aerosol=None)).values
+    assert (np.diff(fraction) > 0).all()
+    assert fraction[0] == 0 and fraction[-1] == 1
+    assert fraction[1] == pytest.approx(stretch * 1e-7, rel=1e-6)
 
 
 def test_either_part_may_be_left_out(wake):

@@ -128,15 +128,15 @@ def test_more_pressure_more_width():
 
 
 @pytest.mark.parametrize("shape", ["rayleigh", "rayleigh_brillouin"])
-@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
-def test_laser_and_air_add_their_variances(shape, share):
+@pytest.mark.parametrize("fraction", [0.0, 0.3, 1.0])
+def test_laser_and_air_add_their_variances(shape, fraction):
     """Aerosol has the laser's, air both."""
     laser = 100e6 / 2.354820
-    line = backscatter_line(WAVELENGTH, TEMPERATURE, PRESSURE, 100e6, share, shape)
+    line = backscatter_line(WAVELENGTH, TEMPERATURE, PRESSURE, 100e6, fraction, shape)
     air = backscatter_line(WAVELENGTH, TEMPERATURE, PRESSURE, 0.0, 0.0, shape)
-    assert variance(line) == pytest.approx(laser**2 + (1 - share) * variance(air), rel=1e-6)
+    assert variance(line) == pytest.approx(laser**2 + (1 - fraction) * variance(air), rel=1e-6)
     narrow = line.sigmas < 1.001 * laser
-    assert line.weights[narrow].sum() == pytest.approx(share, abs=1e-12)
+    assert line.weights[narrow].sum() == pytest.approx(fraction, abs=1e-12)
 
 
 def test_width_of_the_emitted_line():

@@ -79,9 +79,9 @@ def test_swirl_is_that_of_its_circulation():
     """Around the core, well inside the wake, nearly all of Gamma; far outside none. +y to +z."""
     one = wake(hub_core=1.0, downstream=300.0)
     angle = np.arange(3600) * (2 * math.pi / 3600)
-    for r, share in ((3.0, 1.0), (5 * one.width, 0.0)):
+    for r, fraction in ((3.0, 1.0), (5 * one.width, 0.0)):
         ring = 2 * math.pi * r * float(one.tangential_speed(r))
-        assert ring / one.circulation == pytest.approx(share, abs=0.01)
+        assert ring / one.circulation == pytest.approx(fraction, abs=0.01)
     flow = turbine_flow(one, 0.0, np.arange(-20, 20.1, 0.1), np.arange(-20, 20.1, 0.1)).isel(x=0)
     y, z = 3 * np.cos(angle), 3 * np.sin(angle)
     at = {"y": xr.DataArray(y), "z": xr.DataArray(z)}
@@ -142,9 +142,9 @@ def test_turbulence_has_von_karmans_spectrum():
     k = 2 * math.pi * np.fft.rfftfreq(n, h)
     other = 2 * math.pi * np.fft.fftfreq(2 * n, h)
     k2, k3 = np.meshgrid(other, other)
-    seen = (np.sin(k2 * h) ** 2 + np.sin(k3 * h) ** 2) / h**2
+    observed = (np.sin(k2 * h) ** 2 + np.sin(k3 * h) ** 2) / h**2
     k0 = 2 * math.pi / outer
-    law = np.array([(seen * (one**2 + k2**2 + k3**2 + k0**2) ** (-17 / 6)).sum() for one in k])
+    law = np.array([(observed * (one**2 + k2**2 + k3**2 + k0**2) ** (-17 / 6)).sum() for one in k])
     use = (k > 2 * k0) & (k < math.pi / h / 2)
     slope = np.polyfit(np.log(k[use]), np.log(power[use] / law[use]), 1)[0]
     assert slope == pytest.approx(0, abs=0.15)

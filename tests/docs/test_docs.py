@@ -269,20 +269,20 @@ def run_shell(block, capsys):
         else:
             small = [w for key in SMALLER for w in ("--set", key)] if words[1] == "run" else ()
             with without_figures():
-                code, said = command(line, capsys, small)
-            assert code == 0, f"{block.place}: {line}\n{said}"
+                code, output = command(line, capsys, small)
+            assert code == 0, f"{block.place}: {line}\n{output}"
 
 
 def run_console(block, workplace, capsys):
     """Commands after ``$`` are refused with exactly the line below them."""
     for question, answer in re.findall(r"^\$ (.+)\n(?!\$)(.+)\n", block.text, re.MULTILINE):
-        code, said = command(question, capsys)
-        assert code == 2, f"{block.place}: {question}\n{said}"
-        said = said.splitlines()[-1]
-        said = said.replace(str(files("lidar_mi.scenes")), "<shipped>")
-        said = said.replace(str(ROOT / "scenes"), "<shipped>")
-        said = said.replace(str(workplace.resolve()), "<folder>")
-        assert said == answer, f"{block.place}: {question}"
+        code, output = command(question, capsys)
+        assert code == 2, f"{block.place}: {question}\n{output}"
+        output = output.splitlines()[-1]
+        output = output.replace(str(files("lidar_mi.scenes")), "<shipped>")
+        output = output.replace(str(ROOT / "scenes"), "<shipped>")
+        output = output.replace(str(workplace.resolve()), "<folder>")
+        assert output == answer, f"{block.place}: {question}"
     assert block.text.count("$ ") * 2 == len(block.text.splitlines()), block.place
 
 

@@ -36,8 +36,8 @@ def test_every_page_is_listed_and_there():
 
 def test_images_exist():
     for page in DOCS.rglob("*.md"):
-        for picture in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page.read_text()):
-            assert (page.parent / picture).is_file(), f"{page.name}: {picture}"
+        for image in re.findall(r"!\[[^\]]+\]\(([^)]+)\)", page.read_text()):
+            assert (page.parent / image).is_file(), f"{page.name}: {image}"
 
 
 @with_sphinx

@@ -41,9 +41,9 @@ def test_overlap_by_throwing_darts(fov_half, distance, divergence):
     place = rng.standard_normal((number, 2)) * float(lidar.radius_at(distance)) / 2
     angle, radius = 2 * np.pi * rng.random(number), 0.5 * np.sqrt(rng.random(number))
     point = radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], 1)
-    seen = np.hypot(*(place - point).T) < np.tan(fov_half) * distance
-    error = np.sqrt(max(seen.mean() * (1 - seen.mean()), 1e-6) / number)
-    assert overlap(lidar, distance) == pytest.approx(seen.mean(), abs=4 * error + 1e-3)
+    observed = np.hypot(*(place - point).T) < np.tan(fov_half) * distance
+    error = np.sqrt(max(observed.mean() * (1 - observed.mean()), 1e-6) / number)
+    assert overlap(lidar, distance) == pytest.approx(observed.mean(), abs=4 * error + 1e-3)
 
 
 @pytest.mark.parametrize(

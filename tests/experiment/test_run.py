@@ -27,7 +27,7 @@ def done(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("elsewhere"))
 
-        return lm.run(experiment, notice=lambda text, share: None)
+        return lm.run(experiment, notice=lambda text, fraction: None)
 
 
 def test_a_run_without_a_folder_writes_nothing(done):
@@ -41,11 +41,11 @@ def test_a_run_without_a_folder_writes_nothing(done):
 
 
 def test_it_shows_its_numbers(done):
-    said = repr(done)
-    assert said == str(done)
+    output = repr(done)
+    assert output == str(done)
     for name in ("v", "w"):
-        assert f"{done.metrics[f'backscatter.cc.rmse_{name}']:.2f}" in said
-    assert "windy" in said and "no skill" in said
+        assert f"{done.metrics[f'backscatter.cc.rmse_{name}']:.2f}" in output
+    assert "windy" in output and "no skill" in output
     page = done._repr_html_()
     assert page.startswith('<img alt="" style="max-width: 100%" src="data:image/png;base64,iVBOR')
     assert f"<td>{done.metrics['backscatter.cc.rmse_v']:.2f}</td>" in page
@@ -82,15 +82,15 @@ def test_progress_is_shown_unless_someone_listens(done, monkeypatch, capsys):
     monkeypatch.setattr("lidar_mi.experiment.run.complete", complete)
     lm.run(done.experiment)
     assert "rendering" in capsys.readouterr().err.splitlines()
-    lm.run(done.experiment, notice=lambda text, share: steps.append(text))
+    lm.run(done.experiment, notice=lambda text, fraction: steps.append(text))
     assert capsys.readouterr().err == "" and "rendering" in steps
 
 
 def test_an_experiment_shows_changed_keys():
     experiment = check(small("shown", spacing=0.25) | {"seed": 3})
-    said = repr(experiment).splitlines()
-    assert said[0] == "experiment shown; keys without their default"
-    keys = {line.split()[0]: " ".join(line.split()[1:]) for line in said[1:]}
+    output = repr(experiment).splitlines()
+    assert output[0] == "experiment shown; keys without their default"
+    keys = {line.split()[0]: " ".join(line.split()[1:]) for line in output[1:]}
     assert keys["wake.spacing"] == "0.25 m" and keys["seed"] == "3"
     assert keys["render.samples_per_beam"] == "8"
     assert not any(key.startswith(("scan.", "platform.")) for key in keys)

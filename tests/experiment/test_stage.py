@@ -50,10 +50,10 @@ def test_stages_that_do_not_go_together_are_named(stages, message):
 
 
 def test_a_result_is_computed_from_its_needs_in_order():
-    seen = []
-    stage = Stage("c", lambda experiment, *given, log: seen.append(given), ("b", "a"))
+    observed = []
+    stage = Stage("c", lambda experiment, *given, log: observed.append(given), ("b", "a"))
     result_of(stage, None, {"a": 1, "b": 2, "other": 3}, Log())
-    assert seen == [(2, 1)]
+    assert observed == [(2, 1)]
 
 
 class Drawer:

@@ -41,15 +41,15 @@ def test_published_photon_numbers(distance, published):
     assert float(f"{photons(DopplerLidar(range=distance)):.1e}") == published
 
 
-@pytest.mark.parametrize("distance, share", [(76, 0.0044), (56, 0.0081)])
-def test_photons_of_the_whole_bin(distance, share):
+@pytest.mark.parametrize("distance, fraction", [(76, 0.0044), (56, 0.0081)])
+def test_photons_of_the_whole_bin(distance, fraction):
     """1 / r^2 and the transmittance integrated over the bin: more by (dr / r)^2 / 4."""
 
     def density(r):
         return math.exp(-2 * 2.7e-5 * r) / r**2
 
     whole = integrate.quad(density, distance - 5, distance + 5)[0] / (10 * density(distance))
-    assert whole - 1 == pytest.approx(share, abs=2e-4)
+    assert whole - 1 == pytest.approx(fraction, abs=2e-4)
 
 
 def test_beam_and_gate_of_the_paper():
@@ -81,13 +81,13 @@ def test_solar_background_by_hand():
     assert solar_background(LIDAR, ETALON) == pytest.approx(1313.5, rel=1e-3)
 
 
-@pytest.mark.parametrize("distance, share", [(56, 5.5e-5), (76, 1.01e-4)])
-def test_solar_background_is_negligible(distance, share):
+@pytest.mark.parametrize("distance, fraction", [(56, 5.5e-5), (76, 1.01e-4)])
+def test_solar_background_is_negligible(distance, fraction):
     """A bright cloud adds a ten-thousandth to the variance, half of that to the wind's error; in a
     pixel its variance is 1e-4 of that of a read noise of 5."""
     lidar = DopplerLidar(range=distance)
     background = solar_background(lidar, ETALON)
-    assert background / photons(lidar) == pytest.approx(share, rel=0.01)
+    assert background / photons(lidar) == pytest.approx(fraction, rel=0.01)
     assert background / PIXELS < 1e-4 * 25
 
 

@@ -126,13 +126,15 @@ def test_weights_along_the_line_by_adaptive_quadrature():
     points, weights = sight_volumes([[1.0, 0, 0]], [56.0], lidar)
     sigma = constants.c / 2 * 10e-9 / math.sqrt(8 * math.log(2))
 
-    def seen(r):
+    def observed(r):
         inside = special.ndtr((r - 51) / sigma) - special.ndtr((r - 61) / sigma)
         return inside * math.exp(-2 * 2e-3 * r) / r**2
 
     for power in (1, 2, 3):
-        mean = integrate.quad(lambda r, k=power: (r - 56) ** k * seen(r), 40, 72, epsabs=1e-14)[0]
-        mean /= integrate.quad(seen, 40, 72, epsabs=1e-14)[0]
+        mean = integrate.quad(lambda r, k=power: (r - 56) ** k * observed(r), 40, 72, epsabs=1e-14)[
+            0
+        ]
+        mean /= integrate.quad(observed, 40, 72, epsabs=1e-14)[0]
         found = (weights[0] * (points[0, :, 0] - 56) ** power).sum()
         assert found == pytest.approx(mean, rel=2e-4)
 
@@ -164,16 +166,16 @@ def test_a_vortex_by_random_points():
         r = r + random.standard_normal(len(r)) * constants.c / 2 * 10e-9 / math.sqrt(
             8 * math.log(2)
         )
-        share = np.exp(-2 * 2.7e-5 * r) / r**2
-        share /= share.sum()
+        fraction = np.exp(-2 * 2.7e-5 * r) / r**2
+        fraction /= fraction.sum()
         across = np.cross(line, [0, 0, 1.0])
         across /= np.linalg.norm(across)
         tilt = random.standard_normal((2, len(r))) * (0.5 + 2.5e-4 * r) / 2
         place = r[:, None] * line + tilt[0, :, None] * across
         place += tilt[1, :, None] * np.cross(across, line)
         for sample, expected in ((v(*place.T[1:]), mean[1]), (w(*place.T[1:]), mean[2])):
-            value = (share * sample).sum()
-            sigma = math.sqrt((share**2 * (sample - value) ** 2).sum())
+            value = (fraction * sample).sum()
+            sigma = math.sqrt((fraction**2 * (sample - value) ** 2).sum())
             assert abs(value - expected) < 4 * sigma + 2e-3  # and the grid of the field
 
 

@@ -92,7 +92,7 @@ def slow_pixel(camera, etalon, line, v, column, row):
     nodes, weights = gaussian(41)
     gaps = etalon.tuned_gap(WAVELENGTH) + etalon.surface_rms * nodes
     total = 0.0
-    for share, centre, sigma in zip(line.weights, line.offsets, line.sigmas, strict=True):
+    for fraction, centre, sigma in zip(line.weights, line.offsets, line.sigmas, strict=True):
         for node, weight in zip(*gaussian(101), strict=True):
             nu = constants.c / WAVELENGTH * (1 + 2 * v / constants.c) + centre + sigma * node
             # in long double, for 77 000 orders
@@ -101,7 +101,7 @@ def slow_pixel(camera, etalon, line, v, column, row):
             )
             order = (order - np.round(order)).astype(float)
             fringe = 1 / (1 + 4 * 0.7 / 0.3**2 * np.sin(np.pi * order) ** 2)
-            total += share * weight * float(weights @ fringe @ area)
+            total += fraction * weight * float(weights @ fringe @ area)
     return total
 
 

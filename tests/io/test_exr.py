@@ -202,12 +202,12 @@ class TestErrors:
         path.write_bytes(content)
         assert "not a readable OpenEXR image" in self.fault(path)
 
-    @pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
-    def test_cut_off(self, tmp_path, share):
+    @pytest.mark.parametrize("fraction", [0.1, 0.5, 0.99])
+    def test_cut_off(self, tmp_path, fraction):
         path = tmp_path / "scan.exr"
         write_scan(path, make_scan(rows=60, columns=70))
         content = path.read_bytes()
-        path.write_bytes(content[: int(share * len(content))])
+        path.write_bytes(content[: int(fraction * len(content))])
         assert "not a readable OpenEXR image" in self.fault(path)
 
     def foreign(self, path, header=None, **channels):

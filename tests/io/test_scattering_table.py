@@ -169,6 +169,8 @@ def test_aerosol_in_air():
 )
 def test_shipped_spheroids_have_the_index_of_dust(nm, aerosol):
     """What a table says it was made of is what the aerosol has at that wavelength."""
-    said = re.search(r"m = ([\d.]+) \+ ([\d.]+)i", read_table(shipped("spheroids", nm)).provenance)
+    output = re.search(
+        r"m = ([\d.]+) \+ ([\d.]+)i", read_table(shipped("spheroids", nm)).provenance
+    )
     m = AEROSOLS[aerosol].refractive_index(nm * 1e-9)
-    assert complex(float(said[1]), float(said[2])) == pytest.approx(m, rel=1e-9)
+    assert complex(float(output[1]), float(output[2])) == pytest.approx(m, rel=1e-9)

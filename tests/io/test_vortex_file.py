@@ -43,8 +43,8 @@ def test_what_is_read_is_what_was_written(tmp_path, profile):
     )
     # anyone's JSON reader takes it, and finds numbers with units
     data = json.loads((tmp_path / "vortex.json").read_text(), parse_constant=pytest.fail)
-    said = data["fits"]["images"]["quantities"]["port_circulation"]
-    assert said["value"] == 400.0 and said["units"] == "m2 s-1" and said["stderr"] > 0
+    output = data["fits"]["images"]["quantities"]["port_circulation"]
+    assert output["value"] == 400.0 and output["units"] == "m2 s-1" and output["stderr"] > 0
     assert data["source"] == "a test" and data["parameters"][2] == "port_y"
 
 

@@ -112,8 +112,11 @@ def test_phase_costs_no_velocity_although_float32_does():
 def test_gap_is_tuned_and_index_bends():
     bsdf = etalon(gap=13.7e-3, order_fraction=0.5)
     assert bsdf.gap == pytest.approx(GAP, abs=1e-15)
-    told = bsdf.description()
-    assert (told["order_whole"], told["order_fraction"]) == (77248, pytest.approx(0.5, abs=1e-9))
+    reported = bsdf.description()
+    assert (reported["order_whole"], reported["order_fraction"]) == (
+        77248,
+        pytest.approx(0.5, abs=1e-9),
+    )
     assert bsdf.free_spectral_range == pytest.approx(LIGHT / (2 * GAP), rel=1e-12)
     glass = etalon(index=1.5, gap=10e-3)
     delta = phase(np.sqrt(as_float32(SINE**2)), 1e9, 10e-3, 1.5)
@@ -195,7 +198,7 @@ def test_folded_is_the_mean_of_sampled(kind):
     single = make()
     x, weight = np.polynomial.hermite_e.hermegauss(60)
     weight = weight / weight.sum()
-    bow, share = np.polynomial.legendre.leggauss(12)
+    bow, fraction = np.polynomial.legendre.leggauss(12)
     sine = np.linspace(0, 0.012, 31)
     expected = np.zeros((2, 4, len(sine)))
     for w, o, s in ((0.2, 0, 42e6), (0.5, -1.1e9, 0.9e9), (0.3, 1.6e9, 1.4e9)):
@@ -203,7 +206,7 @@ def test_folded_is_the_mean_of_sampled(kind):
         per_order = LIGHT / (2 * GAP)
         rms = 2 * 5e-9 / WAVELENGTH * per_order
         offset = o + np.hypot(s, rms) * x + 2 * 80 / WAVELENGTH
-        for b, sb in zip(bow, share / 2, strict=True):
+        for b, sb in zip(bow, fraction / 2, strict=True):
             order = 2 * 20e-9 / WAVELENGTH * b / 2
             found = elements(single, sine[:, None], offset, order)
             expected += w * sb * (np.array(found) @ weight)

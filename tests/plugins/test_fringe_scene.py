@@ -141,9 +141,13 @@ def assert_agree(statistics, found, error, expected, paths, least=0.0):
         return values.reshape(rows // 3, 3, columns // 3, 3).sum((1, 3))
 
     expected = blocks(expected)
-    seen = expected > least * expected.max()
+    observed = expected > least * expected.max()
     statistics.assert_agree(
-        blocks(found)[seen], np.sqrt(blocks(error**2))[seen], expected[seen], 9 * paths, skewness=1
+        blocks(found)[observed],
+        np.sqrt(blocks(error**2))[observed],
+        expected[observed],
+        9 * paths,
+        skewness=1,
     )
     total = np.sqrt((error**2).sum())
     assert blocks(found).sum() == pytest.approx(expected.sum(), abs=4 * total)
@@ -211,15 +215,17 @@ def test_velocity_of_an_image_without_noise(estimator, shape, lens, paths, allow
     for v_los in (-210.0, 50.0) if lens is None else (50.0,):
         parameters["line.v_los"] = v_los
         parameters.update()
-        (picture, *_), _ = render(loaded, spp=paths, seed=2)
-        picture = (picture + picture[::-1] + picture[:, ::-1] + picture[::-1, ::-1])[390:, 480:]
+        (rendered, *_), _ = render(loaded, spp=paths, seed=2)
+        rendered = (rendered + rendered[::-1] + rendered[:, ::-1] + rendered[::-1, ::-1])[
+            390:, 480:
+        ]
         guess = v_los + 1.0
         for _ in range(2):
             here, there = (4 * rings(**quarter, v_los=guess + d) for d in (-0.5, 0.5))
             model, slope = (here + there) / 2, there - here
             # the score of a Poisson image; its level is known
             information = (slope**2 / model).sum()
-            guess += (slope / model * (picture - model)).sum() / information
+            guess += (slope / model * (rendered - model)).sum() / information
         # weights of forward paths lie below one: their noise is below that of counts
         sigma = 1 / np.sqrt(information * paths * 960 * 780)
         assert abs(guess - v_los) < (allowed or 4 * sigma)
@@ -285,11 +291,11 @@ def test_two_etalons_see_the_same_frequency(estimator, statistics):
     points = (np.arange(4) + 0.5) / 4 - 0.5
     x, y = ((np.arange(n)[:, None] + points - (n - 1) / 2).ravel() * 74e-6 for n in (96, 78))
     cosine = 1 / np.sqrt(1 + (y[:, None] ** 2 + x**2) / FOCAL**2)
-    node, share = np.polynomial.hermite_e.hermegauss(24)
-    share = share / share.sum()
+    node, fraction = np.polynomial.hermite_e.hermegauss(24)
+    fraction = fraction / fraction.sum()
     expected = np.zeros(cosine.shape)
     for weight, offset, sigma in GAUSSIANS:
-        for z, s in zip(node, share, strict=True):
+        for z, s in zip(node, fraction, strict=True):
             order = ORDER * cosine + (offset + sigma * z) / SPECTRAL_RANGE
             both = np.ones(cosine.shape)
             for reflectivity in (0.7, 0.4):
@@ -396,7 +402,7 @@ def test_plane_waves_are_random_and_pure():
     def draw():
         return mi.Float(np.float32(rng.random(n)))
 
-    direction, share, _ = source.sample_direction_of_light(mi.Point2f(draw(), draw()))
+    direction, fraction, _ = source.sample_direction_of_light(mi.Point2f(draw(), draw()))
     stokes = source.sample_stokes(direction, draw(), mi.Point2f(draw(), draw()))
     stokes = np.array([np.broadcast_to(np.array(s), n) for s in stokes], float)
     np.testing.assert_allclose(np.linalg.norm(stokes[1:], axis=0), 1, atol=1e-5)
@@ -407,7 +413,7 @@ def test_plane_waves_are_random_and_pure():
     # evenly in projected solid angle: uniform in the sine's square and in azimuth
     d = np.array(direction, float)
     sine2 = d[1] ** 2 + d[2] ** 2
-    assert (d[0] < 0).all() and np.all(np.array(share) == 1)
+    assert (d[0] < 0).all() and np.all(np.array(fraction) == 1)
     assert stats.kstest(sine2 / np.sin(0.016) ** 2, "uniform").pvalue > 1e-3
     assert stats.kstest(np.arctan2(d[2], d[1]) / (2 * np.pi) + 0.5, "uniform").pvalue > 1e-3
 
@@ -574,10 +580,12 @@ def test_passes_and_seeds():
         np.testing.assert_allclose(whole, again, rtol=1e-4, atol=1e-4 * whole.max())
         assert not np.allclose(whole[0], other[0], rtol=1e-4)
         loaded.integrator().samples_per_pass = 40_000
-        seen = []
-        loaded.integrator().progress = lambda done, total, seen=seen: seen.append((done, total))
+        observed = []
+        loaded.integrator().progress = lambda done, total, observed=observed: observed.append(
+            (done, total)
+        )
         parts, _ = render(loaded, spp=64, seed=3)
-        assert len(seen) > 10 and seen[-1][0] == seen[-1][1]
+        assert len(observed) > 10 and observed[-1][0] == observed[-1][1]
         noise = np.sqrt(2 * (error**2).sum())
         assert parts[0].sum() == pytest.approx(whole[0].sum(), abs=4 * noise)
         assert np.std(parts[0] - whole[0]) == pytest.approx(np.sqrt(2 * (error**2).mean()), rel=0.1)
@@ -632,7 +640,7 @@ def test_passes_and_seeds():
 def test_wrong_scenes_are_named(build, message):
     with pytest.raises((RuntimeError, ValueError)) as error:
         build()
-    said, cause = "", error.value
+    output, cause = "", error.value
     while cause is not None:
-        said, cause = f"{said} {cause}", cause.__cause__ or cause.__context__
-    assert re.search(message, said), said
+        output, cause = f"{output} {cause}", cause.__cause__ or cause.__context__
+    assert re.search(message, output), output

@@ -50,7 +50,7 @@ class TestAnalogAgreesWithGated:
     """
 
     def compare(self, world, statistics, seed):
-        pictures = {}
+        rendered = {}
         for estimator, samples in (("gated", 60_000), ("analog", 150_000)):
             low, high = (498.0, -65.0, -45.0), (506.0, 65.0, 45.0)
             values = 0.12 * np.random.default_rng(1).uniform(0.5, 1.5, (9, 13, 8))
@@ -67,8 +67,8 @@ class TestAnalogAgreesWithGated:
                 environment=world.homogeneous(1e-4),
                 slab=world.box(low, high, world.grid(values, low, high), world.ENVIRONMENT),
             )
-            pictures[estimator] = world.render(scene, seed=seed, spp=samples)
-        (gated, gated_error), (analog, analog_error) = pictures.values()
+            rendered[estimator] = world.render(scene, seed=seed, spp=samples)
+        (gated, gated_error), (analog, analog_error) = rendered.values()
         both = np.hypot(gated_error, analog_error)
         z = (analog[:, 0] - gated[:, 0]) / both
         assert (np.abs(z) < 4).all()
@@ -199,7 +199,7 @@ class TestPasses:
     def test_samples_per_pass_do_not_change_the_result(self, world, estimator, at_once):
         """Beams in several passes, and the samples of a beam: the same photons, 1e-6 rounding."""
         size, gates, samples = (3, 2), 3, 21
-        pictures = [
+        rendered = [
             world.render(
                 scan(
                     world,
@@ -213,7 +213,7 @@ class TestPasses:
             )
             for n in (1 << 22, at_once)
         ]
-        (whole, whole_error), (parts, parts_error) = pictures
+        (whole, whole_error), (parts, parts_error) = rendered
         assert parts == pytest.approx(whole, rel=2e-6, abs=1e-6 * whole[:, 0].mean())
         assert parts_error == pytest.approx(whole_error, rel=1e-4)
 
@@ -509,13 +509,13 @@ class TestCovariance:
         number = found["S0"].shape[0]
         off = {k: found[k] - found[k].mean(0) for k in ("S0", "S1")}
         product = (off["S0"] * off["S1"]).sum(0) / (number - 1)
-        said = found["S0_S1_correlation"] * found["S0_stderr"] * found["S1_stderr"]
+        output = found["S0_S1_correlation"] * found["S0_stderr"] * found["S1_stderr"]
         beams = product.size
-        for seen, expected in (
+        for observed, expected in (
             ((off["S1"] ** 2).sum(0) / (number - 1), found["S1_stderr"] ** 2),
-            (product, said),
+            (product, output),
         ):
-            ratio = seen.mean() / expected.mean()
+            ratio = observed.mean() / expected.mean()
             # the mean of `beams` sample variances of `number` draws
             sigma = np.sqrt(2 / (beams * (number - 1)))
             assert abs(ratio - 1) < 4 * sigma + 0.01, (ratio, sigma)

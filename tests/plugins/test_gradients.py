@@ -44,7 +44,7 @@ def put(parameters, values, gradient=False):
     parameters.update()
 
 
-def picture_sum(image):
+def image_sum(image):
     """A weighted sum of the beams' S0, of order one."""
     return (np.array(image).astype(float)[..., 0] * WEIGHTS).sum() * 1e7
 
@@ -55,7 +55,7 @@ def by_differences(scene, parameters, seeds, spp):
         ends = []
         for step in (0.5, -0.5):
             put(parameters, BASE + step * DIRECTION)
-            ends.append(picture_sum(mi.render(scene, spp=spp, seed=seed)))
+            ends.append(image_sum(mi.render(scene, spp=spp, seed=seed)))
         values.append(ends[0] - ends[1])
     return np.mean(values), np.std(values, ddof=1) / np.sqrt(len(values))
 
@@ -91,7 +91,7 @@ def test_forward_is_the_transpose_of_backward(slab):
     dr.set_grad(parameters[KEY], mi.TensorXf(DIRECTION[..., None].astype(np.float32)))
     parameters.update()
     image = mi.render(scene, parameters, spp=20_000, seed=4)
-    assert picture_sum(dr.forward_to(image)) == pytest.approx(expected, rel=1e-3)
+    assert image_sum(dr.forward_to(image)) == pytest.approx(expected, rel=1e-3)
 
 
 def test_cells_outside_every_beam_have_no_gradient(slab):

@@ -56,9 +56,9 @@ def test_divergence_is_1_over_e2_at_half_the_full_angle(full_mrad):
     tangent = np.hypot(x, y) / z
     half = full_mrad * 1e-3 / 2
     assert kstest(tangent, lambda t: -np.expm1(-2 * (t / half) ** 2)).pvalue > 1e-3
-    share = np.mean(tangent < half)
+    fraction = np.mean(tangent < half)
     expected = 1 - math.exp(-2)
-    assert abs(share - expected) < 4 * math.sqrt(expected * (1 - expected) / NUMBER)
+    assert abs(fraction - expected) < 4 * math.sqrt(expected * (1 - expected) / NUMBER)
     assert kstest(np.arctan2(y, x), uniform(-np.pi, 2 * np.pi).cdf).pvalue > 1e-3
     assert np.linalg.norm([x, y, z], axis=0) == pytest.approx(1, abs=1e-6)
 

@@ -276,13 +276,13 @@ class TestGates:
 
     def test_every_gate_gets_the_same_number_of_samples(self, world):
         """Samples that do not divide by the gates are rounded up: the same image."""
-        pictures = [
+        images = [
             world.render(
                 slab_scene(world, (5, 4), (500.0, 508.0), gate_count=4), seed=9, spp=samples
             )[0]
             for samples in (13, 16)
         ]
-        assert np.array_equal(*pictures)
+        assert np.array_equal(*images)
 
     @pytest.mark.parametrize("estimator", ["gated", "analog"])
     def test_long_pulse_smears_an_edge_as_an_error_function(self, world, statistics, estimator):
@@ -314,8 +314,8 @@ class TestGates:
         delay = np.linspace(-6, 6, 2401) * sigma
         weight = np.exp(-0.5 * (delay / sigma) ** 2)
         weight /= weight.sum()
-        share = np.linspace(0, 1, 101)
-        ranges = edges[:-1] + share[:, None] * (edges[1:] - edges[:-1])
+        fraction = np.linspace(0, 1, 101)
+        ranges = edges[:-1] + fraction[:, None] * (edges[1:] - edges[:-1])
         place = ranges[..., None] - delay
         signal = AREA * RAYLEIGH_BACKSCATTER * extinction / place**2
         signal *= np.exp(-2 * extinction * np.maximum(place - 500, 0)) * (place >= 500)
@@ -325,10 +325,10 @@ class TestGates:
             middle = (edges[1:] + edges[:-1]) / 2
             shape = 0.5 * (1 + erf((middle - 500) / sigma / math.sqrt(2)))
             assert truth / truth[-1] == pytest.approx(shape, abs=2e-2)
-        seen = spread > 0
-        assert seen.sum() > 25
-        z = (profile - truth)[seen] / spread[seen]
-        enough = truth[seen] > 1e-3 * truth.max()
+        observed = spread > 0
+        assert observed.sum() > 25
+        z = (profile - truth)[observed] / spread[observed]
+        enough = truth[observed] > 1e-3 * truth.max()
         chi2 = (z[enough] ** 2).sum()
         number = enough.sum()
         assert abs(chi2 - number) < 4 * math.sqrt(2 * number)
@@ -336,24 +336,24 @@ class TestGates:
 
 def test_albedo_scales_the_signal_alone(world):
     """Half the light absorbed at the collision; extinction stays. Same random numbers."""
-    pictures = []
+    images = []
     for albedo in (1.0, 0.5):
         scene = slab_scene(world, (5, 4), slab=world.homogeneous(2e-2, albedo=albedo))
-        pictures.append(world.render(scene, seed=11)[0][0, 0])
-    assert pictures[1] / pictures[0] == pytest.approx(0.5, rel=1e-6)
+        images.append(world.render(scene, seed=11)[0][0, 0])
+    assert images[1] / images[0] == pytest.approx(0.5, rel=1e-6)
 
 
 def test_signal_grows_with_the_telescope_area(world):
-    pictures = []
+    images = []
     for radius in (0.5, 0.25):
         scene = slab_scene(world, (5, 4), aperture_radius=radius)
-        pictures.append(world.render(scene, seed=12, spp=1024)[0][0, 0])
-    assert pictures[1].mean() / pictures[0].mean() == pytest.approx(0.25, rel=1e-4)
+        images.append(world.render(scene, seed=12, spp=1024)[0][0, 0])
+    assert images[1].mean() / images[0].mean() == pytest.approx(0.25, rel=1e-4)
 
 
 def test_pulse_energy_and_wavelength_do_not_change_the_relative_signal(world):
-    pictures = []
+    images = []
     for laser in ({}, {"pulse_energy": 1e-3, "wavelength": 354.7e-9}):
         scene = slab_scene(world, (5, 4), laser=laser)
-        pictures.append(world.render(scene, seed=13)[0])
-    assert np.array_equal(*pictures)
+        images.append(world.render(scene, seed=13)[0])
+    assert np.array_equal(*images)

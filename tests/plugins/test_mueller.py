@@ -146,9 +146,9 @@ def test_samples_follow_the_density(optics, table):
     cosine = (middle[:, None] + half[:, None] * point).ravel()
     scattered = np.stack([np.sqrt(1 - cosine**2), 0 * cosine, cosine], -1)
     _, density = optics.evaluate(phase, np.tile([0.0, 0, 1], (len(cosine), 1)), scattered)
-    share = 2 * np.pi * half * (density.reshape(-1, 2) * weight).sum(1)
-    assert share.sum() == pytest.approx(1, abs=5e-6)  # a float32 cosine in the forward peak
-    expected = np.repeat(share[:, None] * number / 8, 8, 1)
+    fraction = 2 * np.pi * half * (density.reshape(-1, 2) * weight).sum(1)
+    assert fraction.sum() == pytest.approx(1, abs=5e-6)  # a float32 cosine in the forward peak
+    expected = np.repeat(fraction[:, None] * number / 8, 8, 1)
     enough = expected > 10
     assert found[~enough].sum() < 1e-3 * number
     statistic = ((found - expected)[enough] ** 2 / expected[enough]).sum()

@@ -120,7 +120,7 @@ def test_environment_and_slab_scatter_together(world):
     """Vertices before the slab count as well: both estimators agree in an environment."""
     environment = world.homogeneous(5e-3, "rayleigh_polarized")
     slab = world.grid(np.full((4, 4, 3), 0.03), (495.0, -40.0, -40.0), (510.0, 40.0, 40.0))
-    pictures = []
+    images = []
     for estimator, samples in (("gated", 300_000), ("analog", 1_500_000)):
         scene = world.scene(
             world.lidar(
@@ -134,8 +134,8 @@ def test_environment_and_slab_scatter_together(world):
             environment=environment,
             slab=world.box((495.0, -40.0, -40.0), (510.0, 40.0, 40.0), slab, world.ENVIRONMENT),
         )
-        pictures.append(gates(scene, spp=samples, seed=3))
-    gated, analog = pictures
+        images.append(gates(scene, spp=samples, seed=3))
+    gated, analog = images
     z = (gated[:, 0] - analog[:, 0]) / np.hypot(gated[:, 4], analog[:, 4])
     assert np.abs(z).max() < 3.5, z
     second = gated[:, 6].sum(), analog[:, 6].sum()

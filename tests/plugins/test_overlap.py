@@ -60,9 +60,9 @@ def reference(case, rounds=3):
 def one_round(case, rng, number):
     """The same from ``number`` photons; the beam goes along x, e_h = y."""
 
-    def disc(radius, share):
+    def disc(radius, fraction):
         azimuth = 2 * np.pi * rng.random(number)
-        return radius(share) * np.cos(azimuth), radius(share) * np.sin(azimuth)
+        return radius(fraction) * np.cos(azimuth), radius(fraction) * np.sin(azimuth)
 
     # the beam, by rejection: uncut Gaussian radii, those beyond the cut drawn again
     y, z = np.empty((2, number))
@@ -75,7 +75,7 @@ def one_round(case, rng, number):
     out = np.stack([np.ones(number), *slope], -1)
     out /= np.linalg.norm(out, axis=1, keepdims=True)
 
-    y, z = disc(lambda share: case.aperture_radius * np.sqrt(share), rng.random(number))
+    y, z = disc(lambda fraction: case.aperture_radius * np.sqrt(fraction), rng.random(number))
     telescope = np.stack([np.zeros(number), y, z], -1)
 
     sigma = 299_792_458.0 / 2 * case.pulse_duration / (2 * math.sqrt(2 * math.log(2)))
@@ -90,10 +90,10 @@ def one_round(case, rng, number):
     back /= length[:, None]
     path = (distance + length) / 2 + delay
 
-    seen = (path >= case.gate[0]) & (path < case.gate[1])
-    seen &= np.arccos(np.clip(-back[:, 0], -1, 1)) <= case.fov_half_mrad * 1e-3
+    observed = (path >= case.gate[0]) & (path < case.gate[1])
+    observed &= np.arccos(np.clip(-back[:, 0], -1, 1)) <= case.fov_half_mrad * 1e-3
     area = math.pi * case.aperture_radius**2
-    weight = seen * case.extinction * np.exp(-case.extinction * (distance + length))
+    weight = observed * case.extinction * np.exp(-case.extinction * (distance + length))
     weight = weight * area * -back[:, 0] / length**2 * (last - first)
 
     # a dipole along the transverse part of e_h; its field where it leaves for the telescope

@@ -177,8 +177,8 @@ class TestTelescope:
         point = np.array(sensor.sample_aperture(frame, sample)).astype(float)
         across, up, along = (np.array(v).ravel() @ point for v in (frame.s, frame.t, frame.n))
         assert np.abs(along).max() < 1e-6
-        share = (across**2 + up**2) / 0.7**2
-        assert kstest(share, uniform.cdf).pvalue > 1e-3
+        fraction = (across**2 + up**2) / 0.7**2
+        assert kstest(fraction, uniform.cdf).pvalue > 1e-3
         assert kstest(np.arctan2(up, across), uniform(-np.pi, 2 * np.pi).cdf).pvalue > 1e-3
         assert np.array(sensor.aperture_area())[0] == pytest.approx(math.pi * 0.49, rel=1e-6)
 
@@ -186,8 +186,8 @@ class TestTelescope:
     def test_field_of_view_ends_at_its_half_angle(self, world, half_mrad):
         sensor = mi.load_dict(world.lidar((1, 1), GATE, fov_half_mrad=half_mrad))
         frame = sensor.beam_frame(mi.UInt32(0))
-        for share, seen in [(0.0, True), (0.999, True), (1.001, False)]:
-            angle = share * half_mrad * 1e-3
+        for fraction, observed in [(0.0, True), (0.999, True), (1.001, False)]:
+            angle = fraction * half_mrad * 1e-3
             for azimuth in np.linspace(0, 2 * np.pi, 5):
                 source = mi.Vector3f(
                     math.cos(angle),
@@ -195,7 +195,7 @@ class TestTelescope:
                     math.sin(angle) * math.sin(azimuth),
                 )
                 # of any length
-                assert np.array(sensor.in_field_of_view(frame, source * 500))[0] == seen
+                assert np.array(sensor.in_field_of_view(frame, source * 500))[0] == observed
         assert not np.array(sensor.in_field_of_view(frame, mi.Vector3f(-1, 0, 0)))[0]
 
 

@@ -112,7 +112,7 @@ def same_scene(world):
 
 def test_xml_and_dictionary_give_the_same_image_in_every_variant(world, scene_file):
     """Back and forth between variants, in one process."""
-    pictures = {}
+    images = {}
     for name in (
         "llvm_ad_mono_polarized",
         "llvm_ad_rgb",
@@ -124,12 +124,12 @@ def test_xml_and_dictionary_give_the_same_image_in_every_variant(world, scene_fi
         from_xml, _ = world.render(mi.load_file(str(scene_file)), seed=1)
         from_dict, _ = world.render(same_scene(world), seed=1)
         assert from_xml == pytest.approx(from_dict, rel=1e-5, abs=1e-6 * from_dict.max())
-        if name in pictures:
-            assert np.array_equal(from_xml, pictures[name])
-        pictures[name] = from_xml
-    polarised = pictures["llvm_ad_mono_polarized"]
-    assert pictures["llvm_ad_rgb"][0, 0] == pytest.approx(polarised[0, 0], rel=1e-5)
-    assert (pictures["llvm_ad_rgb"][0, 1:] == 0).all()
+        if name in images:
+            assert np.array_equal(from_xml, images[name])
+        images[name] = from_xml
+    polarised = images["llvm_ad_mono_polarized"]
+    assert images["llvm_ad_rgb"][0, 0] == pytest.approx(polarised[0, 0], rel=1e-5)
+    assert (images["llvm_ad_rgb"][0, 1:] == 0).all()
     # the slab's table acts, not the environment's phase function
     assert polarised[0, 1] / polarised[0, 0] == pytest.approx(0.8, abs=1e-3)
 
@@ -191,9 +191,9 @@ def test_profile_of_500_gates():
     particles with the table's own a1 at 180 degrees and air, clear air above 1 km. The mixture's
     weight in the file has three digits: 0.3 %. Pulses of 10 ns smear the edge by 1.5 m."""
     table = np.loadtxt(SCENES / "aerosol_spheroids_532nm.txt")
-    picture, _ = shipped("profile.xml", 20_000)
-    single = np.array([picture[f"gate{g:03d}.order1.S0"][0, 0] for g in range(500)])
-    double = np.array([picture[f"gate{g:03d}.order2.S0"][0, 0] for g in range(500)])
+    rendered, _ = shipped("profile.xml", 20_000)
+    single = np.array([rendered[f"gate{g:03d}.order1.S0"][0, 0] for g in range(500)])
+    double = np.array([rendered[f"gate{g:03d}.order2.S0"][0, 0] for g in range(500)])
     r = 60 + 3 * (np.arange(500) + 0.5)
     air = rayleigh_back(0.0284)[0] / (4 * np.pi)
     haze = 1.132e-4 * 0.9484 * (0.877 * table[-1, 1] / (4 * np.pi) + 0.123 * air)
@@ -204,9 +204,9 @@ def test_profile_of_500_gates():
     np.testing.assert_allclose(found[clear] / beta[clear], 1, atol=0.01)
     assert (found[r < 100] < 0.3 * haze).all()  # hardly any overlap
     # multiple scattering grows through the haze and is left behind at its top
-    share = np.divide(double, single, out=np.zeros(500), where=single > 0)
-    inside, above = (share[(r > a) & (r < a + 100)].mean() for a in (890, 1100))
-    assert 1e-4 < share[(r > 400) & (r < 500)].mean() < inside < 5e-3
+    fraction = np.divide(double, single, out=np.zeros(500), where=single > 0)
+    inside, above = (fraction[(r > a) & (r < a + 100)].mean() for a in (890, 1100))
+    assert 1e-4 < fraction[(r > 400) & (r < 500)].mean() < inside < 5e-3
     assert above < 0.5 * inside
 
 
@@ -219,8 +219,8 @@ def test_puff_from_a_grid():
     z, y, x = np.meshgrid(cells, cells, cells, indexing="ij")
     np.testing.assert_allclose(values, 0.02 * np.exp(-(x**2 + y**2 + z**2) / 32), rtol=1e-5)
 
-    picture, sensor = shipped("puff.xml", 256)
-    s0 = picture["gate000.S0"]
+    rendered, sensor = shipped("puff.xml", 256)
+    s0 = rendered["gate000.S0"]
     beams = np.array(sensor.m_directions).reshape(41, 41, 3)
     steps = np.arange(-12, 1.0005, 0.01)
 
@@ -237,7 +237,7 @@ def test_puff_from_a_grid():
         gate = steps > -1
         signal = (along * np.exp(-2 * depth))[gate] * back * np.pi * 0.25**2 / 300**2
         expected = np.trapezoid(signal, steps[gate])
-        error = picture["gate000.S0_stderr"][row, column] / s0[row, column]
+        error = rendered["gate000.S0_stderr"][row, column] / s0[row, column]
         # multiple scattering adds up to a few per cent in a cloud as dense as this
         assert -0.02 - 4 * error < s0[row, column] / expected - 1 < 0.08 + 4 * error
     assert np.unravel_index(s0.argmax(), s0.shape) == pytest.approx((20, 20), abs=2)
@@ -246,19 +246,19 @@ def test_puff_from_a_grid():
 def test_cone_of_beams_from_a_table():
     """36 beams alike, circular light turned round: S3/S0 = a4/a1 at 180 degrees in either order of
     the axes, no linear polarisation; the lidar equation in every gate (overlap complete)."""
-    picture, sensor = shipped("cone.xml", 2_000)
+    rendered, sensor = shipped("cone.xml", 2_000)
     beams = np.array(sensor.m_directions).reshape(36, 3)
     np.testing.assert_allclose(beams[:, 2], np.sin(np.radians(60)), atol=1e-6)
     azimuth = np.degrees(np.arctan2(beams[:, 1], beams[:, 0])) % 360
     np.testing.assert_allclose(azimuth, np.arange(0, 360, 10), atol=1e-3)
     a1, a4 = rayleigh_back(0.0306)
     for gate in range(20):
-        s0, s1, s2, s3 = (picture[f"gate{gate:03d}.S{k}"][0] for k in range(4))
+        s0, s1, s2, s3 = (rendered[f"gate{gate:03d}.S{k}"][0] for k in range(4))
         edges = 1000 + 30 * np.array([gate, gate + 1])
         r = np.linspace(*edges, 101)
         signal = np.exp(-2 * 2.84e-5 * r) / r**2
         expected = 2.84e-5 * a1 / (4 * np.pi) * np.pi * 0.15**2 * np.trapezoid(signal, r)
-        error = picture[f"gate{gate:03d}.S0_stderr"][0]
+        error = rendered[f"gate{gate:03d}.S0_stderr"][0]
         assert s0.mean() == pytest.approx(expected, abs=4 * error.mean() / 6 + 1e-3 * expected)
         np.testing.assert_allclose(s3 / s0, a4 / a1, atol=1e-4)
         assert np.abs(np.stack([s1, s2]) / s0).max() < 1e-4
@@ -279,8 +279,10 @@ def test_blend_with_an_unpolarised_part_is_refused_where_it_would_be_wrong(world
 
     with pytest.raises(RuntimeError) as error:
         render("rayleigh_polarized", scalar)
-    said = f"{error.value} {error.value.__cause__} {error.value.__context__}"
-    assert re.search("blendphase: .*PhaseFunction' is not allowed; expected phase functions", said)
+    output = f"{error.value} {error.value.__cause__} {error.value.__context__}"
+    assert re.search(
+        "blendphase: .*PhaseFunction' is not allowed; expected phase functions", output
+    )
     both = render(scalar, "isotropic")
     assert both[0, 0, 0] > 0 and (both[0, 1:] == 0).all()
     polarised = render("rayleigh_polarized", "rayleigh_polarized")

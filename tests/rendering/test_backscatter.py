@@ -118,9 +118,9 @@ class TestHomogeneousSlab:
         """
         front = float(solid["x"][0]) - solid["x"].attrs["cell_width"] / 2 - plan.position
         oblique = plan.obliquity()
-        share = np.linspace(0, 1, 401)[:, None, None]
+        fraction = np.linspace(0, 1, 401)[:, None, None]
         slant = oblique if plan.gate_kind == "planar" else np.ones_like(oblique)
-        r = (plan.gate_start + share * (plan.gate_stop - plan.gate_start)) * slant
+        r = (plan.gate_start + fraction * (plan.gate_stop - plan.gate_start)) * slant
         middle = plan.centre * slant
         depth = (self.SIGMA - ENVIRONMENT) * (r - front * oblique)
         value = np.exp(-2 * ENVIRONMENT * (r - middle) - 2 * depth) * (middle / r) ** 2

@@ -45,15 +45,15 @@ def render(etalon=None, camera=None, line=LINE, v_los=(0.0,), seed=1, **settings
     )
 
 
-def z_scores(picture, expected):
+def z_scores(rendered, expected):
     """Of the fractions of the light, in blocks of 3 x 3 pixels; 3e-4 are left to the reference."""
 
     def blocks(values):
         rows, columns = values.shape
         return values.reshape(rows // 3, 3, columns // 3, 3).sum((1, 3))
 
-    found = picture["S0"].values.astype(float)
-    error = np.sqrt(blocks(picture["S0_stderr"].values.astype(float) ** 2)) / found.sum()
+    found = rendered["S0"].values.astype(float)
+    error = np.sqrt(blocks(rendered["S0_stderr"].values.astype(float) ** 2)) / found.sum()
     expected = blocks(expected) / expected.sum()
     z = (blocks(found) / found.sum() - expected) / np.hypot(error, 3e-4 * expected)
     return z[expected > 0.02 * expected.max()]
@@ -88,10 +88,10 @@ def fine_image(camera, etalon, line, v_los):
     ids=["camera", "forward"],
 )
 def test_every_description_reaches_the_scene(etalon, camera, settings):
-    (picture,) = render(Etalon(**etalon), camera, v_los=[90.0], samples_per_pixel=256, **settings)
+    (rendered,) = render(Etalon(**etalon), camera, v_los=[90.0], samples_per_pixel=256, **settings)
     described = FringeCamera(**CAMERA | camera)
     expected = fine_image(described, Etalon(**etalon), LINE, 90.0)
-    z = z_scores(picture, expected * cosine_fourth(described))
+    z = z_scores(rendered, expected * cosine_fourth(described))
     assert abs(z.mean()) < 4 / math.sqrt(z.size)
     assert z.var() < 1 + 5 * math.sqrt(2 / z.size)
 
@@ -102,7 +102,7 @@ def test_coatings_reach_the_scene():
     etalon = Etalon(coatings=coatings, plate_index=1.5, surface_rms=0)
     sharp = Line(WAVELENGTH, [1.0], [0.0], [0.0])
     camera = FringeCamera(width=30, height=30, pixel=74e-6)
-    (picture,) = render(etalon, camera.model_dump(), sharp, samples_per_pixel=256)
+    (rendered,) = render(etalon, camera.model_dump(), sharp, samples_per_pixel=256)
     nodes = (np.arange(12) + 0.5) / 12 - 0.5
     expected = np.mean(
         [
@@ -115,38 +115,38 @@ def test_coatings_reach_the_scene():
         ],
         axis=0,
     )
-    z = z_scores(picture, expected * cosine_fourth(camera))
+    z = z_scores(rendered, expected * cosine_fourth(camera))
     assert abs(z.mean()) < 4 / math.sqrt(z.size)
     assert z.var() < 1 + 5 * math.sqrt(2 / z.size)
 
 
 def test_velocities_are_rendered_in_turn_and_reported():
     speeds = [-250.0, 0.0, 33.3]
-    pictures = render(v_los=speeds)
+    images = render(v_los=speeds)
     camera = FringeCamera(**CAMERA)
-    for picture, speed in zip(pictures, speeds, strict=True):
-        assert picture.attrs["v_los"] == speed
+    for rendered, speed in zip(images, speeds, strict=True):
+        assert rendered.attrs["v_los"] == speed
         misfit = {
-            v: np.abs(z_scores(picture, fringe_image(camera, Etalon(), LINE, v).numpy())).mean()
+            v: np.abs(z_scores(rendered, fringe_image(camera, Etalon(), LINE, v).numpy())).mean()
             for v in speeds
         }
         assert min(misfit, key=misfit.get) == speed
     alone = render(v_los=[-250.0])[0]
-    assert np.array_equal(alone["S0"], pictures[0]["S0"])
-    assert pictures[1].attrs["seed"] == 1 + 2**16
-    assert pictures[0].attrs["units"] and pictures[0]["S0"].attrs["units"] == "1"
+    assert np.array_equal(alone["S0"], images[0]["S0"])
+    assert images[1].attrs["seed"] == 1 + 2**16
+    assert images[0].attrs["units"] and images[0]["S0"].attrs["units"] == "1"
 
 
 def test_image_and_header_survive_the_file(tmp_path):
-    (picture,) = render(Etalon(bow=3e-9), v_los=[12.5])
+    (rendered,) = render(Etalon(bow=3e-9), v_los=[12.5])
     path = tmp_path / "fringes.exr"
-    write_fringes(path, picture)
+    write_fringes(path, rendered)
     back = read_fringes(path)
     assert list(tmp_path.iterdir()) == [path]
     for name in ("S0", "S1", "S2", "S3", "S0_stderr"):
-        assert np.array_equal(back[name], picture[name]) and back[name].dims == ("y", "x")
-    assert set(back.attrs) == set(picture.attrs)
-    for key, value in picture.attrs.items():
+        assert np.array_equal(back[name], rendered[name]) and back[name].dims == ("y", "x")
+    assert set(back.attrs) == set(rendered.attrs)
+    for key, value in rendered.attrs.items():
         if isinstance(value, str | int):
             assert back.attrs[key] == value
         else:
@@ -155,7 +155,7 @@ def test_image_and_header_survive_the_file(tmp_path):
     assert back.attrs["order_whole"] == 77248
     assert back.attrs["order_fraction"] == pytest.approx(0.5, abs=1e-6)
     _, layers = read_layers(path)
-    assert np.array_equal(layers["Y"], picture["S0"])
+    assert np.array_equal(layers["Y"], rendered["S0"])
     with pytest.raises(InputError, match="are not an image of a fringe camera; expected S0, S1"):
         write_only = tmp_path / "other.exr"
         OpenEXR.File({}, {"RGB": np.zeros((4, 4, 3), np.float32)}).write(str(write_only))
@@ -166,19 +166,19 @@ def test_image_and_header_survive_the_file(tmp_path):
 def test_scene_file_that_ships_renders(tmp_path, estimator):
     """Whole chain of `lidar-mi render`: four rings and the radii that the description has."""
     out = tmp_path / "fringes.exr"
-    shares = []
-    picture = render_file(
+    fractions = []
+    rendered = render_file(
         SCENE,
         out,
         "llvm_ad_mono",
         4,
         3,
         {"estimator": estimator, "v_los": "40", "lens": "fringes_lens.txt"},
-        shares.append,
+        fractions.append,
     )
-    assert shares[-1] == 1
+    assert fractions[-1] == 1
     back = read_fringes(out)
-    assert back["S0"].shape == (780, 960) and np.array_equal(back["S0"], picture["S0"])
+    assert back["S0"].shape == (780, 960) and np.array_equal(back["S0"], rendered["S0"])
     assert back.attrs["scene"] == "fringes.xml" and back.attrs["lens"] == "surfaces"
     assert back.attrs["v_los"] == 40 and back.attrs["samples_per_pixel"] == 4
     assert read_layers(out)[1]["S0"].shape == (780, 960)
@@ -186,7 +186,7 @@ def test_scene_file_that_ships_renders(tmp_path, estimator):
     y, x = np.mgrid[:780, :960]
     r2 = (x - 479.5) ** 2 + (y - 389.5) ** 2
     ring = np.floor(r2 / 1000).astype(int).ravel()
-    profile = np.bincount(ring, picture["S0"].values.ravel()) / np.bincount(ring)
+    profile = np.bincount(ring, rendered["S0"].values.ravel()) / np.bincount(ring)
     profile = np.convolve(profile[:170], np.ones(9) / 9, "valid")  # radii up to 412 pixels
     peaks = np.flatnonzero((profile[1:-1] > profile[:-2]) & (profile[1:-1] > profile[2:])) + 1
     peaks = peaks[profile[peaks] > 0.5 * profile.max()]

@@ -39,10 +39,10 @@ def test_the_number_is_given_back_after_an_error():
 @pytest.mark.parametrize("call", ["retrieve_wind", "fit_vortices"])
 def test_retrievals_of_images_work_on_one(call, monkeypatch):
     pair = vortex_pair_images(0.0, 1, 40, 32)
-    seen = []
+    observed = []
 
     def watched(image1, *args, **options):
-        seen.append(torch.get_num_threads())
+        observed.append(torch.get_num_threads())
         raise RuntimeError("seen")
 
     method = replace(methods.METHODS["cc"], find=watched)
@@ -50,4 +50,4 @@ def test_retrievals_of_images_work_on_one(call, monkeypatch):
     monkeypatch.setattr("lidar_mi.retrieval.vortices.image_fit.fit_pixels", watched)
     with pytest.raises(RuntimeError, match="seen"):
         getattr(lm, call)(pair.first, pair.second, dt=0.1)
-    assert seen == [1] and torch.get_num_threads() == 2
+    assert observed == [1] and torch.get_num_threads() == 2

@@ -33,7 +33,7 @@ def runs(path: str) -> None:
         return
     with without_figures():
         try:
-            run(experiment, notice=lambda text, share: None)
+            run(experiment, notice=lambda text, fraction: None)
         except InputError as error:
             raise AssertionError(f"check accepts, run refuses: {error}") from None
 

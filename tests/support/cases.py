@@ -144,9 +144,9 @@ def _lines(done: Outcome) -> str | None:
         if hidden:
             return f"prints {hidden[:3]!r}"
     lines = done.err.splitlines()
-    said = [line for line in lines if line.startswith("lidar-mi: ")]
-    if done.code == 2 and (len(said) != 1 or lines[-1] != said[0]):
-        return f"exit code 2 with {len(said)} messages, at the end {lines[-1:]}"
+    output = [line for line in lines if line.startswith("lidar-mi: ")]
+    if done.code == 2 and (len(output) != 1 or lines[-1] != output[0]):
+        return f"exit code 2 with {len(output)} messages, at the end {lines[-1:]}"
     longest = max(map(len, lines), default=0)
     if longest > LONGEST_LINE:
         return f"a line of {longest} characters"

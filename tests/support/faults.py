@@ -160,12 +160,12 @@ def make_fake(seed):
 
 def run_once(folder, seed, real, number=-1, fault=""):
     """A run in a process of its own: exit code, what it said, and the places it came by."""
-    said = Path(f"{folder}.said")
+    output = Path(f"{folder}.said")
     process = os.fork()
     if process == 0:
         code = 99
         try:
-            descriptor = os.open(said, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            descriptor = os.open(output, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(descriptor, 2)
             # samples are kept after every pass
             batches.INTERVAL, batches.time = 0, SimpleNamespace(monotonic=lambda: 0.0)
@@ -184,7 +184,7 @@ def run_once(folder, seed, real, number=-1, fault=""):
         finally:
             os._exit(code)
     _, status = os.waitpid(process, 0)
-    return os.waitstatus_to_exitcode(status), said.read_text()
+    return os.waitstatus_to_exitcode(status), output.read_text()
 
 
 def exit_code(command):
@@ -210,12 +210,12 @@ def tried(folder, start, seed, real, number, fault):
     shutil.rmtree(folder, ignore_errors=True)
     if start:
         shutil.copytree(start, folder)
-    code, said = run_once(folder, seed, real, number, fault)
+    code, output = run_once(folder, seed, real, number, fault)
     left = state(folder) if Path(folder).exists() else {}
     again, said_again = run_once(folder, seed, real)
     return {
         "code": code,
-        "said": said,
+        "said": output,
         "left": left,
         "again": again,
         "said_again": said_again,

@@ -13,7 +13,7 @@ import lidar_mi as lm
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 from tests.support.cases import Case
 from tests.support.hostile_experiments import BASE, as_yaml
-from tests.support.hostile_files import exr_file, picture
+from tests.support.hostile_files import exr_file, image_file
 
 NOT_CALLED = ("run", "doctor", "register_plugins")
 """Public functions that are tried as `accepted.runs`, or that take no input."""
@@ -174,6 +174,6 @@ def calls(draw: st.DrawFn) -> Case:
         for key in draw(st.sets(st.sampled_from(sorted(parameters)), min_size=1, max_size=2)):
             given[key] = draw(st.sampled_from((*candidates(hints.get(key)), *WRONG)))
     text = ", ".join(f"{key}={value}" for key, value in given.items())
-    files = {"a.exr": exr_file(), "a.png": picture(".png", "L"), "a.yaml": as_yaml(BASE)}
+    files = {"a.exr": exr_file(), "a.png": image_file(".png", "L"), "a.yaml": as_yaml(BASE)}
     named = {file: content for file, content in files.items() if file in text}
     return Case("call", ("python", f"lm.{name}({text})"), named)

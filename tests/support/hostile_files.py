@@ -120,7 +120,7 @@ def exr_cases() -> st.SearchStrategy:
 
 
 @cache
-def picture(suffix: str, mode: str) -> bytes:
+def image_file(suffix: str, mode: str) -> bytes:
     """An image of another kind."""
     from astropy.io import fits
     from PIL import Image
@@ -150,7 +150,7 @@ def image_cases() -> st.SearchStrategy:
         ]
     )
     return kinds.flatmap(
-        lambda kind: damaged(picture(*kind)).flatmap(
+        lambda kind: damaged(image_file(*kind)).flatmap(
             lambda content: looked_at("image", f"a{kind[0]}", content, spacing=True)
         )
     )

@@ -35,7 +35,7 @@ def profile(sigma, count=2**14):
     return order, total
 
 
-def picture(
+def ring_image(
     v_los=0.0,
     photons=2.4e7,
     centre=None,
@@ -96,6 +96,6 @@ def information(mean, read_noise, modes):
 
     step = 1e-3 * mean
     p, slope = density(mean), (density(mean + step) - density(mean - step)) / (2 * step)
-    seen = p > 1e-200
-    fisher = np.trapezoid(np.where(seen, slope**2 / np.where(seen, p, 1), 0), x)
+    observed = p > 1e-200
+    fisher = np.trapezoid(np.where(observed, slope**2 / np.where(observed, p, 1), 0), x)
     return fisher * (spread**2 + read_noise**2)

@@ -32,16 +32,18 @@ def demo(tmp_path_factory):
     left = shared / "left.pickle"
     with FileLock(f"{shared}.lock"):
         if not left.is_file():
-            told = []
+            reported = []
             done = experiment.run(
                 loaded,
                 shared / "run",
                 beside=SCENES,
-                notice=lambda text, share: told.append((text, share)),
+                notice=lambda text, fraction: reported.append((text, fraction)),
             )
-            left.write_bytes(pickle.dumps((done.metrics, told)))
-    metrics, told = pickle.loads(left.read_bytes())
-    return SimpleNamespace(folder=shared / "run", experiment=loaded, metrics=metrics, told=told)
+            left.write_bytes(pickle.dumps((done.metrics, reported)))
+    metrics, reported = pickle.loads(left.read_bytes())
+    return SimpleNamespace(
+        folder=shared / "run", experiment=loaded, metrics=metrics, reported=reported
+    )
 
 
 @pytest.fixture(scope="module", autouse=True)

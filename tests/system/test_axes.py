@@ -35,9 +35,9 @@ def test_blob_is_where_it_should_be_in_the_exr(blob_run):
     """Top row = largest z (15 m), left column = largest y (20 m), 0.5 m a pixel; t2 one metre to
     port and half a metre up. 0.05 px allowed; noise moves the centroid by less than 0.01 px."""
     for name, (y, z) in zip(IMAGES, ((8.25, -3.75), (9.25, -3.25)), strict=True):
-        picture = as_seen(blob_run / name)
-        assert picture.shape == (61, 81)
-        bright = picture - np.median(picture)
+        image = as_seen(blob_run / name)
+        assert image.shape == (61, 81)
+        bright = image - np.median(image)
         bright[bright < 0.02 * bright.max()] = 0
         row, column = ndimage.center_of_mass(bright)
         assert 20 - 0.5 * column == pytest.approx(y, abs=0.025)
@@ -98,13 +98,13 @@ def test_volume_shows_the_planes_in_the_gate(tmp_path, quick):
         data["wake"] = {"file": name, "depth": "volume", "x": plane, "texture": {"rms": 0}}
         folder = tmp_path / f"run{plane:g}"
         run(check(data), folder, beside=tmp_path)
-        picture = as_seen(folder / IMAGES[0])
-        dark = np.median(picture)
-        peak = np.unravel_index(picture.argmax(), picture.shape)
+        image = as_seen(folder / IMAGES[0])
+        dark = np.median(image)
+        peak = np.unravel_index(image.argmax(), image.shape)
         assert np.hypot(peak[0] - row, peak[1] - column) < 2
-        assert picture[row, column] > 5 * dark
+        assert image[row, column] > 5 * dark
         # the other blob, mirrored through the middle, is not there
-        assert picture[60 - row, 80 - column] < 1.3 * dark
+        assert image[60 - row, 80 - column] < 1.3 * dark
         with xr.open_dataset(folder / "wind.nc") as wind:
             one = wind.sel(source="extinction", algorithm="cc")
             valid = (one["flag"] == 0).values

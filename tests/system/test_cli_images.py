@@ -85,8 +85,8 @@ def test_retrieve_accepts_any_image_with_a_spacing(there, lidar_mi):
     """A random image moved by 2 px to the left (+y) and 1 px down, 0.25 m a pixel, 0.5 s."""
     noise = np.random.default_rng(5).random((60, 70)).astype(np.float32)
     noise = (noise + np.roll(noise, 1, 0) + np.roll(noise, 1, 1) + 1).astype(np.float32)
-    for name, picture in (("a", noise[5:45, 5:55]), ("b", noise[4:44, 7:57])):
-        OpenEXR.File({}, {"G": np.ascontiguousarray(picture)}).write(f"{name}.exr")
+    for name, image in (("a", noise[5:45, 5:55]), ("b", noise[4:44, 7:57])):
+        OpenEXR.File({}, {"G": np.ascontiguousarray(image)}).write(f"{name}.exr")
     code, *_ = lidar_mi(
         "retrieve",
         "a.exr",
@@ -187,7 +187,7 @@ def test_oiiotool_sees_the_same_values(demo):
         text=True,
         check=True,
     )
-    picture = read_scan(demo.folder / "image_t1.exr")["Y"].values
-    for name, value in (("Max", picture.max()), ("Avg", picture.mean(dtype=float))):
+    image = read_scan(demo.folder / "image_t1.exr")["Y"].values
+    for name, value in (("Max", image.max()), ("Avg", image.mean(dtype=float))):
         shown = float(re.search(rf"Stats {name}: ([\d.e+-]+)", done.stdout)[1])
         assert shown == pytest.approx(float(value), rel=1e-3, abs=5e-7)

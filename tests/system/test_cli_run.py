@@ -52,12 +52,12 @@ def test_check_summarises_a_run(there, lidar_mi):
     before = files_in(there)
     code, out, err = lidar_mi("check", "tiny.yaml", *(w for c in changes for w in ("--set", c)))
     assert code == 0, err
-    said = words_of(out)
-    assert "beams 61 x 41, 0.5 m apart" in said  # 30 m x 20 m
-    assert "gates 1, from 210 to 212.5 m" in said
-    assert "warning time 3 s at 70 m/s" in said
-    assert "fastest wind windows follow 8.75 m/s, here" in said  # (16 - 8)/2 - 1/2 pixels in dt
-    assert "extinction 0.1 to 0.1 1/km" not in said and "texture, rms 10%" in said
+    output = words_of(out)
+    assert "beams 61 x 41, 0.5 m apart" in output  # 30 m x 20 m
+    assert "gates 1, from 210 to 212.5 m" in output
+    assert "warning time 3 s at 70 m/s" in output
+    assert "fastest wind windows follow 8.75 m/s, here" in output  # (16 - 8)/2 - 1/2 pixels in dt
+    assert "extinction 0.1 to 0.1 1/km" not in output and "texture, rms 10%" in output
     assert files_in(there) == before
 
 
@@ -82,13 +82,13 @@ def test_names_are_no_markup(there, lidar_mi):
 
 
 @pytest.mark.parametrize(
-    ("number", "said"),
+    ("number", "output"),
     [
         (signal.SIGINT, "stopped"),
         pytest.param(signal.SIGTERM, "stopped by SIGTERM", marks=pytest.mark.slow),
     ],
 )
-def test_a_signal_stops_cleanly_and_the_run_can_be_resumed(there, number, said):
+def test_a_signal_stops_cleanly_and_the_run_can_be_resumed(there, number, output):
     """In the middle of rendering, where Dr.Jit puts its own exception in the interrupt's place."""
     slow = [
         "run",
@@ -108,14 +108,14 @@ def test_a_signal_stops_cleanly_and_the_run_can_be_resumed(there, number, said):
         # a shell's background job inherits ignored interrupts
         preexec_fn=lambda: signal.signal(number, signal.SIG_DFL),
     ) as process:
-        seen = []
+        observed = []
         for line in process.stderr:
-            seen.append(line)
+            observed.append(line)
             if "rendering scan 1" in line:
                 break
         process.send_signal(number)
         _, err = process.communicate(timeout=60)
-    assert process.returncode == 128 + number, seen
-    assert err.splitlines()[-1] == f"lidar-mi: {said}; start it again to resume the run"
+    assert process.returncode == 128 + number, observed
+    assert err.splitlines()[-1] == f"lidar-mi: {output}; start it again to resume the run"
     assert "Traceback" not in err
     assert sorted(p.name for p in (there / "run").iterdir()) == ["experiment.yaml", "log.txt"]

@@ -49,13 +49,13 @@ def test_a_weak_pulse_is_the_largest_cause(ran):
     """1 mJ from air of 0.1 / km by day: sky and photons drown the structure."""
     _, folder, metrics = ran
     for method in ("multipass", "cc"):
-        share = {
+        fraction = {
             cause: metrics[f"error_budget.{method}.{cause}.fraction"]
             for cause in ("detector_noise", "monte_carlo", "beam_blur", "window", "method")
         }
-        assert max(share, key=share.get) == "detector_noise" and share["detector_noise"] > 0.5, (
-            share
-        )
+        assert (
+            max(fraction, key=fraction.get) == "detector_noise" and fraction["detector_noise"] > 0.5
+        ), fraction
         # the same vectors as everywhere in the run
         count = metrics[f"backscatter_noisy.{method}.valid_fraction"]
         assert 0 < metrics[f"error_budget.{method}.vectors"] <= round(count * 33 * 17)
@@ -101,13 +101,13 @@ def test_blur_is_corrected_only_where_present(tmp_path):
     level = attenuated_backscatter_stderr(scans[0])
     # half of the beam's 1/e^2 radius where the slab's middle is
     width = float(experiment.lidar.radius_at(501.25)) / 2
-    seen = retrieve_wind(*(scan["Y"] for scan in scans), noise=level, blur=width, **settings)
+    observed = retrieve_wind(*(scan["Y"] for scan in scans), noise=level, blur=width, **settings)
     blind = retrieve_wind(*(scan["Y"] for scan in scans), noise=level, **settings)
     air = retrieve_wind(*(truth.image(k) for k in (0, 1)), noise=0.0, **settings)
-    for wind, key in ((seen, "rmse_v"), (air, "beam_blur.rmse_v")):
+    for wind, key in ((observed, "rmse_v"), (air, "beam_blur.rmse_v")):
         error = wind["v"] - truth_at_vectors(wind, truth.wind)["v"]
         assert budget[key] == pytest.approx(float((error**2).mean()) ** 0.5, rel=0.05), key
-    assert abs(seen["v"] - blind["v"]).max() > 0.01
+    assert abs(observed["v"] - blind["v"]).max() > 0.01
 
 
 def test_wind_that_changes_through_the_slab_is_a_cause(tmp_path):

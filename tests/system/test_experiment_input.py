@@ -54,10 +54,12 @@ def test_gates_that_reach_beyond_the_wake(tmp_path):
 def test_beams_wider_than_a_template_are_reported(tmp_path, quick):
     """At 5 km the paper's beam is 10 m wide, a template 4 m: nothing is left to follow, as the
     report states."""
-    told = []
+    reported = []
     data = small() | {"scan": {"range": "5 km"}}
-    metrics = run(check(data), tmp_path / "run", notice=lambda text, _: told.append(text)).metrics
-    warnings = [text for text in told if text.startswith("warning: ")]
+    metrics = run(
+        check(data), tmp_path / "run", notice=lambda text, _: reported.append(text)
+    ).metrics
+    warnings = [text for text in reported if text.startswith("warning: ")]
     assert len(warnings) == 2
     assert "beams are 10 m wide at 5001" in warnings[0] and "template of 4 m" in warnings[0]
     assert "backscatter, cc: no vector is valid; " in warnings[1] and "flag low_" in warnings[1]

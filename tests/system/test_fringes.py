@@ -109,12 +109,12 @@ QUICK = {
 # ---------------------------------------------------------------- images
 
 
-def mean_r2(picture, low, high):
+def mean_r2(rendered, low, high):
     """Mean of r^2 (m^2) over the light above the lowest in a ring's order: its middle."""
     camera = check().doppler.camera
     r2 = camera.radius_squared()
     steps = np.linspace(low, high, 101)
-    light, _ = np.histogram(r2, steps, weights=picture["S0"].values)
+    light, _ = np.histogram(r2, steps, weights=rendered["S0"].values)
     count, _ = np.histogram(r2, steps)
     profile = light / count
     profile -= profile.min()
@@ -139,15 +139,15 @@ def test_rings_lie_where_the_wind_puts_them(small, name, v):
     def r2(m):
         return f**2 * ((order * (1 + 2 * v / speed_of_light) / m) ** 2 - 1)
 
-    picture = read_fringes(small[0] / name)
-    got = mean_r2(picture, r2(77247.5), r2(77246.5))
+    rendered = read_fringes(small[0] / name)
+    got = mean_r2(rendered, r2(77247.5), r2(77246.5))
     per_speed = f**2 * 2 * 2 / speed_of_light
     assert abs(got - r2(77247)) / per_speed < 1.0
 
 
 def test_images_are_described_by_their_headers(small):
     received = [read_fringes(small[0] / f"fringes_received_{k:02d}.exr") for k in (0, 1)]
-    assert [picture.attrs["v_los"] for picture in received] == list(SPEEDS)
+    assert [rendered.attrs["v_los"] for rendered in received] == list(SPEEDS)
     photons = read_fringes(small[0] / "fringes_photons.exr")
     assert (photons.attrs["lens"], photons.attrs["estimator"]) == ("singlet", "analog")
 

@@ -23,7 +23,7 @@ def leftovers(folder):
     return [p for p in folder.rglob("*") if p.name.startswith(".") or p.suffix == ".part"]
 
 
-def pictures_of(folder):
+def images_of(folder):
     return [(folder / name).stat().st_mtime_ns for name in IMAGES]
 
 
@@ -50,10 +50,10 @@ def test_the_wake_is_read_once(tmp_path, monkeypatch):
 def test_a_rerun_uses_the_images(tmp_path, quick):
     folder = tmp_path / "run"
     before = run(check(small()), folder).metrics
-    stamps = pictures_of(folder)
+    stamps = images_of(folder)
     (folder / "wind.nc").unlink()
     after = run(check(small()), folder).metrics
-    assert pictures_of(folder) == stamps
+    assert images_of(folder) == stamps
     assert "using 2 of 2 images" in (folder / "log.txt").read_text()
     assert (folder / "wind.nc").is_file()
     assert without_timing(after) == without_timing(before)
@@ -62,10 +62,10 @@ def test_a_rerun_uses_the_images(tmp_path, quick):
 def test_a_missing_image_is_rendered_again_and_identical(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
-    stamps, before = pictures_of(folder), layers(folder)
+    stamps, before = images_of(folder), layers(folder)
     (folder / IMAGES[1]).unlink()
     run(check(small()), folder)
-    assert pictures_of(folder)[0] == stamps[0] and pictures_of(folder)[1] != stamps[1]
+    assert images_of(folder)[0] == stamps[0] and images_of(folder)[1] != stamps[1]
     for one, other in zip(before, layers(folder), strict=True):
         xr.testing.assert_identical(one, other)
 
@@ -73,13 +73,13 @@ def test_a_missing_image_is_rendered_again_and_identical(tmp_path, quick):
 def test_another_experiment_is_kept_out(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
-    stamps = pictures_of(folder)
+    stamps = images_of(folder)
     other = small() | {"seed": 2}
     with pytest.raises(InputError, match="another experiment"):
         run(check(other), folder)
-    assert pictures_of(folder) == stamps
+    assert images_of(folder) == stamps
     run(check(other), folder, overwrite=True)
-    assert all(new != old for new, old in zip(pictures_of(folder), stamps, strict=True))
+    assert all(new != old for new, old in zip(images_of(folder), stamps, strict=True))
     assert yaml.safe_load((folder / "experiment.yaml").read_text())["experiment"]["seed"] == 2
 
 
@@ -90,12 +90,12 @@ def test_images_of_another_version_are_not_used(tmp_path, quick):
     record = yaml.safe_load((folder / "experiment.yaml").read_text())
     record["versions"]["mitsuba"] = "3.5.0"
     (folder / "experiment.yaml").write_text(yaml.safe_dump(record))
-    stamps = pictures_of(folder)
+    stamps = images_of(folder)
     with pytest.raises(InputError, match=r"a run of mitsuba 3.5.0, this is 3.*; expected"):
         run(check(small()), folder)
-    assert pictures_of(folder) == stamps
+    assert images_of(folder) == stamps
     run(check(small()), folder, overwrite=True)
-    assert pictures_of(folder) != stamps
+    assert images_of(folder) != stamps
     record["versions"]["numpy"] = "1.0"  # which makes no images
     run(check(small()), folder)
 
@@ -116,7 +116,7 @@ def test_overwriting_leaves_nothing_of_the_old_run(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
 
-    def stop(text, share):
+    def stop(text, fraction):
         if "rendering" in text:
             raise KeyboardInterrupt
 
@@ -154,7 +154,7 @@ def test_stopped_anywhere_it_resumes(tmp_path, quick, step):
     happened."""
     folder = tmp_path / "run"
 
-    def stop(text, share):
+    def stop(text, fraction):
         if step in text:
             raise KeyboardInterrupt
 

@@ -44,7 +44,7 @@ def test_a_second_run_is_refused_while_the_first_works(tmp_path, quick):
     """The second has another seed; it comes when the first renders, and changes nothing."""
     folder, refused = tmp_path / "run", []
 
-    def notice(text, share):
+    def notice(text, fraction):
         if "rendering scan 2" in text and not refused:
             for overwrite in (False, True):
                 with pytest.raises(InputError, match="in use by another run") as caught:

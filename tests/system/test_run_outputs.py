@@ -68,7 +68,7 @@ def test_every_variable_of_the_winds_is_in_the_user_guide(demo):
 
 
 def test_progress_names_every_step_and_stays_within_bounds(demo):
-    texts = " | ".join(text for text, _ in demo.told)
+    texts = " | ".join(text for text, _ in demo.reported)
     for step in (
         "reading the wake",
         "rendering scan 1 of 2",
@@ -78,7 +78,7 @@ def test_progress_names_every_step_and_stays_within_bounds(demo):
         "done",
     ):
         assert step in texts
-    assert all(share is None or 0 <= share <= 1 for _, share in demo.told)
+    assert all(fraction is None or 0 <= fraction <= 1 for _, fraction in demo.reported)
 
 
 def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):

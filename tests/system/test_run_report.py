@@ -63,10 +63,10 @@ def test_figures_have_the_pilot_s_view(demo, figure, of):
             ((np.arange(n) + 0.5) * size / n).astype(int)
             for n, size in zip(field.shape, brightness.shape, strict=True)
         )
-        seen = brightness[np.ix_(rows, columns)].ravel()
+        observed = brightness[np.ix_(rows, columns)].ravel()
         values = field.transpose("z", "y").values
         right, *wrong = (
-            np.corrcoef(seen, turned.ravel())[0, 1]
+            np.corrcoef(observed, turned.ravel())[0, 1]
             for turned in (values[::-1, ::-1], values[:, ::-1], values[::-1], values)
         )
         assert right > 0.97 and max(wrong) < 0.92, (right, wrong)

@@ -331,12 +331,12 @@ def test_largest_cause_of_error_of_u_is_reported(amplitude, noise, errors, limit
     found = with_truth(experiment, truth, lines, crossflow)
     metrics = limit_metrics(mean_squares_without(experiment, truth, lines, crossflow, found, []))
     causes = ["line_noise", "range_bin", "crossflow", "sampling", *(["pointing"] if errors else [])]
-    shares = {c: metrics[f"sensor.error_budget.{c}.fraction_u"] for c in causes}
+    fractions = {c: metrics[f"sensor.error_budget.{c}.fraction_u"] for c in causes}
     other = "line_noise" if amplitude else "sampling"
-    assert shares[limit] > 0.9 and shares[other] < 0.1
-    assert abs(shares["range_bin"]) < 0.1
-    said = sensor_report._limit_of_u(metrics | {"sensor.rmse_u": 0.5})
-    assert f"limited by {sensor_report._CAUSES[limit]}" in said[0]
+    assert fractions[limit] > 0.9 and fractions[other] < 0.1
+    assert abs(fractions["range_bin"]) < 0.1
+    output = sensor_report._limit_of_u(metrics | {"sensor.rmse_u": 0.5})
+    assert f"limited by {sensor_report._CAUSES[limit]}" in output[0]
     # standard errors do not hold them
     assert bool(sensor_report._not_stated(experiment.sensor.errors)) == bool(errors)
 
@@ -430,9 +430,11 @@ def test_inconsistent_settings_are_reported_ahead(sections, start):
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize(("columns", "rows", "told"), [(5, 3, False), (5, 1, True), (1, 3, True)])
-def test_a_check_reports_lines_in_one_plane(columns, rows, told):
+@pytest.mark.parametrize(
+    ("columns", "rows", "reported"), [(5, 3, False), (5, 1, True), (1, 3, True)]
+)
+def test_a_check_reports_lines_in_one_plane(columns, rows, reported):
     directions = SMALL["sensor"]["directions"] | {"columns": columns, "rows": rows}
     *_, (_, ((_, lines), *_)) = check.sections(changed(sensor={"directions": directions}))
     assert lines.startswith(f"{columns * rows}, 20 pulses each")
-    assert ("in one plane: no wind" in lines) == told
+    assert ("in one plane: no wind" in lines) == reported

@@ -274,13 +274,13 @@ def test_make_without_a_target_lists_every_target():
 
 
 def test_doctor_reports_an_abort_and_survives_it():
-    ok, said = doctor._attempt("import os; os.abort()")
-    assert (ok, said) == (False, "the process was ended by SIGABRT")
-    ok, said = doctor._attempt("import time; time.sleep(60)", timeout=0.5)
+    ok, output = doctor._attempt("import os; os.abort()")
+    assert (ok, output) == (False, "the process was ended by SIGABRT")
+    ok, output = doctor._attempt("import time; time.sleep(60)", timeout=0.5)
     assert not ok
-    assert "no answer" in said
-    ok, said = doctor._attempt("import sys; sys.exit('reason')")
-    assert (ok, said) == (False, "reason")
+    assert "no answer" in output
+    ok, output = doctor._attempt("import sys; sys.exit('reason')")
+    assert (ok, output) == (False, "reason")
     assert doctor._attempt("print(1); print('last')") == (True, "last")
 
 

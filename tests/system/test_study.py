@@ -109,10 +109,10 @@ def test_faults_name_the_variant(file, variants, message):
 @pytest.mark.usefixtures("variant")
 def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
     leave_out_figures(monkeypatch)
-    folder, told = tmp_path / "out", []
+    folder, reported = tmp_path / "out", []
     variants = config.load_variants(file())
-    found = study.run("two", variants, folder, notice=lambda text, _: told.append(text))
-    assert {text.split(":")[0] for text in told} >= {"near", "far"}
+    found = study.run("two", variants, folder, notice=lambda text, _: reported.append(text))
+    assert {text.split(":")[0] for text in reported} >= {"near", "far"}
     merged = json.loads((folder / "metrics.json").read_text())
     for name in variants:
         alone = json.loads((folder / name / "metrics.json").read_text())
@@ -131,15 +131,15 @@ def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
         found["near"]["safety.hazard_distance"], rel=5e-3
     )
     assert imread(folder / "figures" / "fig00_comparison.png").std() > 0.05
-    told = {title: rows for title, rows in sections(str(folder))}
-    rows = {name: values for name, *values in next(iter(told.values()))}
-    assert f"{folder}: study two" in told and rows["variant"] == ["near", "far"]
+    reported = {title: rows for title, rows in sections(str(folder))}
+    rows = {name: values for name, *values in next(iter(reported.values()))}
+    assert f"{folder}: study two" in reported and rows["variant"] == ["near", "far"]
     assert rows["scan.range"] == ["150 m", "500 m"]
-    results = {name: values for name, *values in told["results"]}
+    results = {name: values for name, *values in reported["results"]}
     assert float(results["hazard distance of a beam, unaided / m"][0]) == pytest.approx(
         found["near"]["safety.hazard_distance"], rel=5e-3
     )
-    names = [name for name, _ in told["files"]]
+    names = [name for name, _ in reported["files"]]
     assert "report.html" in names and "near/report.html" not in names
     # again: nothing is rendered; other things are not overwritten
     before = (folder / "near" / "image_t1.exr").stat().st_mtime_ns
@@ -182,8 +182,8 @@ def test_volumes_are_compared(file, tmp_path, monkeypatch):
     assert imread(tmp_path / "out" / "figures" / "fig00_comparison.png").std() > 0.05
     with xr.open_dataset(tmp_path / "out/volume/wind_volume.nc", engine="h5netcdf") as found:
         nearest = found.isel(source=0, algorithm=0).sel(x=495.0, method="nearest")
-        picture, wind, _ = drawn["volume"]
-        assert picture.dims == wind["w"].dims == ("z", "y")
+        rendered, wind, _ = drawn["volume"]
+        assert rendered.dims == wind["w"].dims == ("z", "y")
         assert float(wind["x"]) == float(nearest["x"]) and wind["w_true"].equals(nearest["w_true"])
     table = {name: values for name, _, values in comparison.results(metrics)}
     u = metrics["volume"]["backscatter.correlation.outside_cores.rmse_u"]

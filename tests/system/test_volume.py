@@ -92,11 +92,13 @@ def test_gates_are_put_where_their_air_is():
     for plan in plans:
         middle = plan.gate_start + 0.5 + np.arange(8)
         reach = middle[:, None, None] / plan.centre
-        seen = pattern(middle[:, None, None] + plan.position, reach * axis[:, None], reach * axis)
+        observed = pattern(
+            middle[:, None, None] + plan.position, reach * axis[:, None], reach * axis
+        )
         # the lidar equation, by hand
         oblique = np.sqrt(1 + (axis[:, None] ** 2 + axis**2) / plan.centre**2)
         r = middle[:, None, None] * oblique
-        s0 = seen * lidar.aperture_area * oblique * np.exp(-2e-4 * r) / r**2
+        s0 = observed * lidar.aperture_area * oblique * np.exp(-2e-4 * r) / r**2
         s0 = xr.DataArray(s0, dims=("gate", "z", "y"))
         found = volume_chain.scan_volume(s0, plan, lidar, 1e-4, nodes)
         expected = pattern(*np.meshgrid(*nodes, indexing="ij"))

@@ -58,8 +58,8 @@ def test_the_readme_states_the_demo_s_numbers(demo):
             rounding = 0.5 * 10.0 ** -len(cell.partition(".")[2])
             assert float(cell) == pytest.approx(demo.metrics[key], abs=0.02 + rounding), key
         if cells[5]:
-            share = float(cells[5].removesuffix("%")) / 100
-            assert share == pytest.approx(demo.metrics[f"{source}.valid_fraction"], abs=0.015)
+            fraction = float(cells[5].removesuffix("%")) / 100
+            assert fraction == pytest.approx(demo.metrics[f"{source}.valid_fraction"], abs=0.015)
     assert found == len(rows)
 
 
@@ -97,12 +97,12 @@ def test_every_step_of_the_instrument_costs(demo):
     same air, so over all vectors each gives worse winds. The noise costs little at 64 photons:
     0.5 % a pixel against a texture of 10 %."""
     for name in ("v", "w"):
-        ideal, blurred, seen = (
+        ideal, blurred, observed = (
             demo.metrics[f"{source}.cc.all.rmse_{name}"]
             for source in ("extinction", "extinction_blurred", "backscatter")
         )
-        assert ideal < blurred < seen < 1.1 * blurred
-        assert demo.metrics[f"extinction_without_texture.cc.all.rmse_{name}"] > 2 * seen
+        assert ideal < blurred < observed < 1.1 * blurred
+        assert demo.metrics[f"extinction_without_texture.cc.all.rmse_{name}"] > 2 * observed
 
 
 def test_noise_of_the_images(demo):
@@ -130,11 +130,11 @@ def test_the_air_between_the_vortices_moves_down(demo):
     """Seen in the images, not in the truth: the port vortex (y > 0) has omega_x > 0, so air
     sinks inboard, rises outboard and drifts to starboard above the core."""
     with xr.open_dataset(demo.folder / "wind.nc") as wind:
-        seen = wind.sel(source="backscatter", algorithm="cc")
-        seen = seen.where(seen["flag"] == 0)
+        observed = wind.sel(source="backscatter", algorithm="cc")
+        observed = observed.where(observed["flag"] == 0)
 
         def mean(name, y, z):
-            return float(seen[name].sel(y=slice(*y), z=slice(*z)).mean())
+            return float(observed[name].sel(y=slice(*y), z=slice(*z)).mean())
 
         assert mean("w", (-10, 10), (-10, 10)) < -4  # -4 w0 = -6.2 m/s midway, at age 0
         assert mean("w", (30, 40), (-5, 5)) > 2

@@ -152,11 +152,11 @@ def test_rings_give_circulation_and_advecting_wind(model):
     flow = flow_of(*pair)
     flow = flow.assign(v=flow["v"] + 3.0, w=flow["w"] - 1.0)
     radius = np.linspace(5, 15, 1001)
-    share = circulation_inside(radius, 458.0, 3.0, model).mean()
+    fraction = circulation_inside(radius, 458.0, 3.0, model).mean()
     cores = [Core(o.y, o.z, o.core_radius, o.circulation) for o in pair]
     for core, other, side in zip(cores, cores[::-1], (1, -1), strict=True):
         rings = ring_averages(flow, core, [other])
-        assert rings.circulation == pytest.approx(side * share, rel=2e-3)
+        assert rings.circulation == pytest.approx(side * fraction, rel=2e-3)
         assert rings.v == pytest.approx(3.0, abs=0.01)
         # Burnham and Hallock's partner still has 0.4 % of its circulation beyond b0
         assert rings.w == pytest.approx(-1.0 - 458 / (2 * np.pi * 47.1), abs=0.02)
@@ -172,6 +172,6 @@ def test_rings_around_another_core_are_undetermined():
     path = files("lidar_mi.scenes").joinpath("wake_slab_40s.nc")
     wake = centre(resample(read_wake(path, 40.0), 0.5), None, None).isel(x=0)
     cores = find_cores(wake)
-    for core, said in zip(cores, (440.0, -438.4), strict=True):
+    for core, output in zip(cores, (440.0, -438.4), strict=True):
         others = [o for o in cores if o is not core]
-        assert ring_averages(wake, core, others).circulation == pytest.approx(said, rel=5e-3)
+        assert ring_averages(wake, core, others).circulation == pytest.approx(output, rel=5e-3)

@@ -57,9 +57,9 @@ def test_each_cause_is_taken_away_and_all_else_stays():
     air, blur, photons, counts, shear = pairs(5)
     blurred = [a + b for a, b in zip(air, blur, strict=True)]
     rendered = [a + b for a, b in zip(blurred, photons, strict=True)]
-    seen = [a + b for a, b in zip(rendered, counts, strict=True)]
-    carried = [a + b for a, b in zip(blurred, shear, strict=True)]
-    found = images_without(seen, blurred, air, rendered, carried)
+    observed = [a + b for a, b in zip(rendered, counts, strict=True)]
+    advected = [a + b for a, b in zip(blurred, shear, strict=True)]
+    found = images_without(observed, blurred, air, rendered, advected)
     for k in (0, 1):
         expected = {
             "detector_noise": air[k] + blur[k] + photons[k],
@@ -73,8 +73,8 @@ def test_each_cause_is_taken_away_and_all_else_stays():
 
 
 def test_without_detector_and_depth_there_are_two_causes():
-    air, blurred, seen = pairs(3)
-    found = images_without(seen, blurred, air)
+    air, blurred, observed = pairs(3)
+    found = images_without(observed, blurred, air)
     assert set(found) == {"monte_carlo", "beam_blur"}
     np.testing.assert_allclose(found["monte_carlo"][1], blurred[1], rtol=1e-12)
 
@@ -205,9 +205,9 @@ def test_fractions_of_independent_errors_are_those_of_their_variances():
     assert budget["vectors"] == 61 * 81 > budget["outside_cores.vectors"] > 0.8 * 61 * 81
     for place in ("", "outside_cores."):
         assert budget[f"{place}rmse_v"] == pytest.approx(5.25**0.5, rel=0.04)
-        for cause, share in (("detector_noise", 4 / 5.25), ("monte_carlo", 1 / 5.25)):
+        for cause, fraction in (("detector_noise", 4 / 5.25), ("monte_carlo", 1 / 5.25)):
             for key in ("fraction_v", "fraction_w", "fraction"):
-                assert budget[f"{place}{cause}.{key}"] == pytest.approx(share, abs=0.06)
+                assert budget[f"{place}{cause}.{key}"] == pytest.approx(fraction, abs=0.06)
 
 
 def test_a_cause_that_reduces_errors_has_a_negative_fraction_and_vectors_are_the_same():
@@ -249,7 +249,7 @@ def test_the_cause_method_is_its_error_on_perfect_images():
 WAVES = plane_waves(7, 3.0, H)
 
 
-def carried(move, columns=81, rows=61):
+def advected(move, columns=81, rows=61):
     """Images at t1 and t2; `move` takes places dt back."""
     grid = np.meshgrid(*axes(columns, rows, H))
     return [field(texture(WAVES, *at)) for at in (grid, move(*grid))]
@@ -259,13 +259,13 @@ def carried(move, columns=81, rows=61):
 def test_noise_alone_has_all_of_it(method):
     """An even wind of a whole pixel, 10 % white noise: without the noise hardly anything is
     left, as correlation sees whole pixels exactly."""
-    sharp = carried(lambda y, z: (y - H, z + H))
+    sharp = advected(lambda y, z: (y - H, z + H))
     rng = np.random.default_rng(11)
-    seen = [i + 0.1 * rng.standard_normal(i.shape) for i in sharp]
-    images = images_without(seen, sharp, sharp, sharp)
+    observed = [i + 0.1 * rng.standard_normal(i.shape) for i in sharp]
+    images = images_without(observed, sharp, sharp, sharp)
     truth = flow(lambda y, z: H / DT + 0 * y, lambda y, z: -H / DT + 0 * y)
     settings = {"dt": DT, "method": method, "stride": 2}
-    found = retrieve_wind(*seen, noise=0.1, **settings)
+    found = retrieve_wind(*observed, noise=0.1, **settings)
     without = {
         cause: retrieve_wind(*pair, noise=0.0 if cause == "detector_noise" else 0.1, **settings)
         for cause, pair in images.items()
@@ -284,7 +284,7 @@ def test_fraction_of_noise_is_the_scatter_of_winds_over_noise_draws(method):
 
     The difference of the two scatters by 0.02 over sets of six draws; four times that is allowed.
     """
-    sharp = carried(lambda y, z: (y - 0.7 * H, z + 0.4 * H))
+    sharp = advected(lambda y, z: (y - 0.7 * H, z + 0.4 * H))
     blurred = [i.copy(data=gaussian_filter(i.values, 1.0, mode="nearest")) for i in sharp]
     rng = np.random.default_rng(29)
     noisy = [[i + 0.04 * rng.standard_normal(i.shape) for i in blurred] for _ in range(6)]
@@ -294,10 +294,10 @@ def test_fraction_of_noise_is_the_scatter_of_winds_over_noise_draws(method):
     found = [retrieve_wind(*pair, **settings) for pair in noisy]
     budgets = [error_budget(one, without, truth, [], flagged=True) for one in found]
     error = np.array([b["rmse_v"] ** 2 + b["rmse_w"] ** 2 for b in budgets])
-    share = np.average([b["detector_noise.fraction"] for b in budgets], weights=error)
+    fraction = np.average([b["detector_noise.fraction"] for b in budgets], weights=error)
     scatter = sum(np.nanmean(np.nanvar([one[n] for one in found], axis=0, ddof=1)) for n in "vw")
-    assert share > 0.3
-    assert share == pytest.approx(scatter / error.mean(), abs=0.08)
+    assert fraction > 0.3
+    assert fraction == pytest.approx(scatter / error.mean(), abs=0.08)
 
 
 @pytest.mark.parametrize("shear", [pytest.param(0.0, marks=pytest.mark.slow), 4.0])
@@ -305,15 +305,15 @@ def test_shear_within_the_window(shear):
     """A simple shear (closed form) of 4 / s deforms a window of 8 px by 1.6 px on either side. With
     windows that move as one, correlation errs as in an even wind, by 0.13 px or
     0.65 m/s."""
-    sharp = carried(lambda y, z: (y - DT * (5 + shear * z), z), 57, 41)
+    sharp = advected(lambda y, z: (y - DT * (5 + shear * z), z), 57, 41)
     rng = np.random.default_rng(4)
-    seen = [i + 0.02 * rng.standard_normal(i.shape) for i in sharp]
+    observed = [i + 0.02 * rng.standard_normal(i.shape) for i in sharp]
     truth = flow(lambda y, z: 5 + shear * z, lambda y, z: 0 * y, 57, 41)
     settings = {"dt": DT, "method": "cc", "search": 24}
-    found = retrieve_wind(*seen, **settings)
+    found = retrieve_wind(*observed, **settings)
     stiff = moved_rigidly(
         found,
-        seen,
+        observed,
         sharp,
         truth,
         lambda pair, stride: retrieve_wind(*pair, stride=stride, **settings),
@@ -326,16 +326,18 @@ def test_shear_within_the_window(shear):
         # the same images but for the interpolation between pixels
         assert budget["shear.fraction"] == pytest.approx(0, abs=0.1)
         assert np.nanmedian(abs(stiff["v"] - found["v"])) < 0.02
-    assert moved_rigidly(found.assign_attrs(method="multipass"), seen, sharp, truth, None) is None
+    assert (
+        moved_rigidly(found.assign_attrs(method="multipass"), observed, sharp, truth, None) is None
+    )
 
 
 # --- the report
 
 
-def described(place="", **shares):
+def described(place="", **fractions):
     keys = {f"{place}rmse_v": 0.3, f"{place}rmse_w": 0.4}
-    keys |= {f"{place}{cause}.{q}": 0.1 for cause in shares for q in ("rmse_v", "rmse_w")}
-    keys |= {f"{place}{cause}.fraction": x for cause, x in shares.items()}
+    keys |= {f"{place}{cause}.{q}": 0.1 for cause in fractions for q in ("rmse_v", "rmse_w")}
+    keys |= {f"{place}{cause}.fraction": x for cause, x in fractions.items()}
     return keys
 
 

@@ -211,8 +211,10 @@ def test_statistics_of_gaussian_errors_are_the_closed_forms():
     found = error_statistics(stated * noise / 0.3, stated)
     assert found["stderr"] == pytest.approx(np.sqrt(np.mean(stated**2)))
     assert found["normalised_error_variance"] == pytest.approx(1, abs=4 * np.sqrt(2 / n))
-    for key, share in (("coverage_68", 0.6827), ("coverage_95", 0.9500)):
-        assert found[key] == pytest.approx(share, abs=4 * np.sqrt(share * (1 - share) / n)), key
+    for key, fraction in (("coverage_68", 0.6827), ("coverage_95", 0.9500)):
+        assert found[key] == pytest.approx(
+            fraction, abs=4 * np.sqrt(fraction * (1 - fraction) / n)
+        ), key
 
 
 def test_statistics_of_a_few_known_errors():

@@ -45,7 +45,7 @@ def test_three_digits(value, text):
 
 
 @pytest.mark.parametrize(
-    ("share", "text"),
+    ("fraction", "text"),
     [
         (0.00432, "0.43"),
         (0.7212, "72"),
@@ -57,8 +57,8 @@ def test_three_digits(value, text):
         (13.2, "1320"),
     ],
 )
-def test_fractions(share, text):
-    assert percent(share) == f"{text} %"
+def test_fractions(fraction, text):
+    assert percent(fraction) == f"{text} %"
 
 
 @pytest.mark.parametrize(

@@ -271,9 +271,9 @@ def test_errors_are_as_stated():
         count = values.size / 2  # nodes of a draw share the lines
         assert abs(values.mean()) < 4 / math.sqrt(count)
         assert values.var() == pytest.approx(1, abs=4 * math.sqrt(2 / count))
-        for sigmas, share in ((1, 0.6827), (2, 0.9545)):
+        for sigmas, fraction in ((1, 0.6827), (2, 0.9545)):
             held = (abs(values) < sigmas).mean()
-            assert abs(held - share) < 4 * math.sqrt(share * (1 - share) / count)
+            assert abs(held - fraction) < 4 * math.sqrt(fraction * (1 - fraction) / count)
 
 
 @pytest.mark.parametrize(

@@ -168,25 +168,25 @@ def measured(winds, distance, random):
     reach = distance * np.tan(
         [float(text.split()[0]) * math.pi / 180 for text in SCANS[distance][:2]]
     )
-    seen = wind.sel(y=slice(-reach[0] - 4, reach[0] + 4), z=slice(-reach[1] - 3, reach[1] + 3))
+    observed = wind.sel(y=slice(-reach[0] - 4, reach[0] + 4), z=slice(-reach[1] - 3, reach[1] + 3))
     roots = [
         np.linalg.cholesky(
             np.clip(1 - abs(a[:, None] - a) / WINDOW, 0, None) + 1e-9 * np.eye(len(a))
         )
-        for a in (seen.z.values, seen.y.values)
+        for a in (observed.z.values, observed.y.values)
     ]
-    flow = xr.Dataset(coords=seen.coords, attrs={"template": WINDOW, "stride": 1})
+    flow = xr.Dataset(coords=observed.coords, attrs={"template": WINDOW, "stride": 1})
     for name in "vw":
-        error = roots[0] @ random.standard_normal(seen.v.shape) @ roots[1].T
-        flow[name] = seen[name] + CROSSFLOW_STD * error
-        flow[f"{name}_stderr"] = xr.full_like(seen.v, CROSSFLOW_STD)
-    flow["vw_correlation"] = xr.zeros_like(seen.v)
-    flow["flag"] = xr.zeros_like(seen.v, dtype=np.uint8)
-    return seen, flow, lines
+        error = roots[0] @ random.standard_normal(observed.v.shape) @ roots[1].T
+        flow[name] = observed[name] + CROSSFLOW_STD * error
+        flow[f"{name}_stderr"] = xr.full_like(observed.v, CROSSFLOW_STD)
+    flow["vw_correlation"] = xr.zeros_like(observed.v)
+    flow["flag"] = xr.zeros_like(observed.v, dtype=np.uint8)
+    return observed, flow, lines
 
 
 @functools.cache
-def shares(name, distance, draws):
+def fractions(name, distance, draws):
     """Within 1 and 1.96 standard errors, and the variance of normalised errors: (draws, 3) of u."""
     rows = []
     for draw in range(draws):
@@ -200,12 +200,12 @@ def shares(name, distance, draws):
 
 
 def check(name, distances, draws):
-    rows = np.concatenate([shares(name, distance, draws) for distance in distances])
+    rows = np.concatenate([fractions(name, distance, draws) for distance in distances])
     mean, slack = rows.mean(0), 0.05 + 2 * rows.std(0) / math.sqrt(len(rows))
-    for index, share in ((0, 0.683), (1, 0.95)):
-        assert mean[index] > share - slack[index], (name, mean)
+    for index, fraction in ((0, 0.683), (1, 0.95)):
+        assert mean[index] > fraction - slack[index], (name, mean)
         if name not in TOO_LARGE:
-            assert mean[index] < share + slack[index], (name, mean)
+            assert mean[index] < fraction + slack[index], (name, mean)
 
 
 @pytest.mark.parametrize("name", ["simulated", "turbulence 30 m"])
@@ -222,8 +222,10 @@ def test_errors_are_as_stated_over_a_class_of_flows(name):
 @pytest.mark.slow
 def test_errors_are_as_stated_over_all_flows():
     """To 5 points, and to a third in variance, of all that lines can tell of."""
-    told = [name for name in FLOWS if name not in TOO_LARGE]
-    mean = np.mean([shares(name, distance, 10) for name in told for distance in SCANS], (0, 1))
+    reported = [name for name in FLOWS if name not in TOO_LARGE]
+    mean = np.mean(
+        [fractions(name, distance, 10) for name in reported for distance in SCANS], (0, 1)
+    )
     assert mean[:2] == pytest.approx([0.683, 0.95], abs=0.05) and mean[2] == pytest.approx(
         1, abs=0.33
     )

@@ -167,9 +167,9 @@ def test_errors_are_as_stated(count):
     assert abs(whitened.mean(0)).max() < 4 / math.sqrt(DRAWS)
     assert abs(np.cov(whitened.T) - np.eye(3)).max() < 4 * math.sqrt(2 / DRAWS)
     reduced = abs(wind - TRUE) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-    for sigmas, share in ((1, 0.6827), (2, 0.9545)):
+    for sigmas, fraction in ((1, 0.6827), (2, 0.9545)):
         held = (reduced < sigmas).mean(0)
-        assert abs(held - share).max() < 4 * math.sqrt(share * (1 - share) / DRAWS)
+        assert abs(held - fraction).max() < 4 * math.sqrt(fraction * (1 - fraction) / DRAWS)
     mean = chi_square.mean()
     assert abs(mean - (count - 3)) < 4 * math.sqrt(2 * max(count - 3, 1e-9) / DRAWS)
 

@@ -35,7 +35,7 @@ def split_rings(shape, centre, spacing, fractions, finesse=60.0, ellipticity=0.0
 
 def test_rings_of_the_emitted_laser():
     """0.02 px: what quarter-pixel sectors and a Gaussian for Airy's peak leave."""
-    found = analyse_rings(reference.picture(0.0, temperature=None))
+    found = analyse_rings(reference.ring_image(0.0, temperature=None))
     np.testing.assert_allclose(found.centre, (479.5, 389.5), atol=0.01)
     np.testing.assert_allclose(found.radius, RADII[: len(found.radius)], atol=0.06)
     assert list(found.order) == list(range(len(found.order))) and not found.line.any()
@@ -46,7 +46,7 @@ def test_rings_of_the_emitted_laser():
 def test_noisy_backscatter_off_centre():
     """2 images of 1.3e7 photons: four coordinates scatter as their error bars say."""
     rng = np.random.default_rng(5)
-    mean = reference.picture(0.0, 1.3e7, (431.7, 402.2))
+    mean = reference.ring_image(0.0, 1.3e7, (431.7, 402.2))
     pulls, fractions = [], []
     for _ in range(2):
         found = analyse_rings(reference.noisy(mean, rng, 5.0))

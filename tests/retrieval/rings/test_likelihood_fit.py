@@ -28,7 +28,7 @@ def coarse(centre):
 @pytest.mark.parametrize("centre", [None, (300.0, 250.0), (485.7, 380.3)])
 def test_no_noise_no_error(v_los, centre):
     """Order, cells and start change the velocity by 0.003 m/s at most; no order is lost."""
-    image = torch.as_tensor(reference.picture(v_los, centre=coarse(centre), **COARSE))
+    image = torch.as_tensor(reference.ring_image(v_los, centre=coarse(centre), **COARSE))
     fit = fit_rings(image, ring_model(**COARSE))
     assert abs(float(fit.v_los) - v_los) < 5e-3
     x, y = coarse(centre) or (119.5, 97.0)
@@ -39,7 +39,7 @@ def test_no_noise_no_error(v_los, centre):
 
 @pytest.mark.slow
 def test_full_size_both_ways():
-    image = torch.as_tensor(reference.picture(-77.0, centre=(470.2, 402.9)))
+    image = torch.as_tensor(reference.ring_image(-77.0, centre=(470.2, 402.9)))
     for method in ("annular", "pixels"):
         fit = fit_rings(image, ring_model(), method=method)
         assert abs(float(fit.v_los) + 77) < 1e-3
@@ -50,7 +50,7 @@ def exposures(case, number, seed, v_los=20.0, **size):
     _, photons, noise, centre = TABLE[case]
     centre = coarse(centre) if size else centre
     rng = np.random.default_rng(seed)
-    mean = reference.picture(v_los, photons, centre, **size)
+    mean = reference.ring_image(v_los, photons, centre, **size)
     drawn = [
         reference.noisy(mean, rng, noise.read_noise, noise.speckle_modes) for _ in range(number)
     ]
@@ -119,7 +119,7 @@ def test_nuisances_do_no_harm():
     """Warmer air, weaker light at the rim, background: found, and not in the velocity."""
     rng = np.random.default_rng(12)
     radius, half2 = 4e-3, (195**2 + 240**2) / 4 * COARSE["pixel"] ** 2
-    mean = reference.picture(
+    mean = reference.ring_image(
         -35.0, 2.4e7, (121.3, 95.1), 250.0, radius=radius, background=40.0, **COARSE
     )
     images = np.array([reference.noisy(mean, rng, 5.0, background=40.0) for _ in range(32)])
@@ -128,9 +128,9 @@ def test_nuisances_do_no_harm():
     values = (fit.v_los, fit.x, fit.y, fit.level, fit.background, fit.temperature, fit.falloff)
     for place, (true, value) in enumerate(zip(truth, values, strict=True)):
         if true is not None:
-            pull = (value - true) / fit.std[:, place]
-            assert abs(pull.mean()) < 4 / np.sqrt(32), place
-            assert abs(pull.std() - 1) < 4 / np.sqrt(64), place
+            score = (value - true) / fit.std[:, place]
+            assert abs(score.mean()) < 4 / np.sqrt(32), place
+            assert abs(score.std() - 1) < 4 / np.sqrt(64), place
 
 
 def test_images_are_independent_of_each_other():
@@ -138,7 +138,9 @@ def test_images_are_independent_of_each_other():
     model = ring_model(**COARSE)
     centres = [(119.5, 97.0), (119.9, 97.4), (131.0, 90.0)]
     images = torch.as_tensor(
-        np.array([reference.picture(10.0 * k, centre=c, **COARSE) for k, c in enumerate(centres)])
+        np.array(
+            [reference.ring_image(10.0 * k, centre=c, **COARSE) for k, c in enumerate(centres)]
+        )
     )
     together = fit_rings(images, model)
     for k, image in enumerate(images):
@@ -149,7 +151,7 @@ def test_images_are_independent_of_each_other():
 
 
 def test_known_centre_stays():
-    image = torch.as_tensor(reference.picture(5.0, centre=(118.0, 95.0), **COARSE))
+    image = torch.as_tensor(reference.ring_image(5.0, centre=(118.0, 95.0), **COARSE))
     free = ("v_los", "level", "background")
     fit = fit_rings(image, ring_model(**COARSE), centre=(118.0, 95.0), free=free)
     assert (float(fit.x), float(fit.y)) == (118.0, 95.0)
@@ -164,11 +166,11 @@ def test_emitted_image_removes_the_instrument():
     laser = ring_model(
         order_at_centre=order, temperatures=(), harmonics=reference.harmonics(None), **COARSE
     )
-    pictures = [
-        torch.as_tensor(reference.picture(v, temperature=t, **COARSE))
+    rendered = [
+        torch.as_tensor(reference.ring_image(v, temperature=t, **COARSE))
         for v, t in ((33.0, reference.TEMPERATURE), (0.0, None))
     ]
-    received, emitted = (fit_rings(p, m) for p, m in zip(pictures, (air, laser), strict=True))
+    received, emitted = (fit_rings(p, m) for p, m in zip(rendered, (air, laser), strict=True))
     assert float(emitted.v_los) == pytest.approx(-0.03 * air.velocity_range, abs=0.05)
     v, std = difference(received, emitted)
     assert abs(float(v) - 33) < 0.05
@@ -206,27 +208,27 @@ def test_one_ring():
     """The first ring on even light, as a stop in the beam would leave it."""
     y, x = np.mgrid[:195, :240]
     r = np.hypot(x - 119.5, y - 97)
-    mean = np.where(r < 50, reference.picture(0.0, **COARSE), 300.0)
+    mean = np.where(r < 50, reference.ring_image(0.0, **COARSE), 300.0)
     rng = np.random.default_rng(2)
     refused(
         rng.poisson(mean).astype(float), "expected (at least 2|two rings)", max_chi_square=np.inf
     )
     # and a camera that is too small for two
     small = {"shape": (70, 70), "pixel": 4 * reference.PIXEL}
-    image = torch.as_tensor(rng.poisson(reference.picture(0.0, 1e6, **small)).astype(float))
+    image = torch.as_tensor(rng.poisson(reference.ring_image(0.0, 1e6, **small)).astype(float))
     with pytest.raises(InputError, match=r"images\[0\]: 1 ring\(s\) detected; expected at least 2"):
         fit_rings(image, ring_model(**small))
 
 
 def test_not_finite():
-    image = reference.picture(0.0, **COARSE)
+    image = reference.ring_image(0.0, **COARSE)
     for value in (np.nan, np.inf):
         image[3, 4] = value
         refused(image, r"images\[0\]: 1 pixel\(s\) of NaN or infinity")
 
 
 def test_saturated():
-    image = reference.picture(0.0, **COARSE)
+    image = reference.ring_image(0.0, **COARSE)
     refused(image, r"saturated, \d+ pixel\(s\) at or above 600", saturation=600.0)
     clipped = np.random.default_rng(3).poisson(image).clip(max=700)
     refused(clipped.astype(float), "saturated, .* share the highest value 700")
@@ -235,8 +237,10 @@ def test_saturated():
 
 
 def test_centre_outside():
-    refused(reference.picture(0.0, centre=(-20.0, 97.0), **COARSE), "centre: .* expected inside")
-    refused(reference.picture(0.0, **COARSE), "centre: .300.0, 0.0. px is not", centre=(300.0, 0.0))
+    refused(reference.ring_image(0.0, centre=(-20.0, 97.0), **COARSE), "centre: .* expected inside")
+    refused(
+        reference.ring_image(0.0, **COARSE), "centre: .300.0, 0.0. px is not", centre=(300.0, 0.0)
+    )
 
 
 def test_another_instrument():
@@ -244,7 +248,7 @@ def test_another_instrument():
     other = {**COARSE, "pixel": 1.2 * COARSE["pixel"]}
     rng = np.random.default_rng(4)
     refused(
-        rng.poisson(reference.picture(0.0, **other)).astype(float),
+        rng.poisson(reference.ring_image(0.0, **other)).astype(float),
         "chi-square|ring.s. seen|converge",
     )
 

@@ -23,7 +23,7 @@ from tests.support.ring_models import TABLE, TEMPERATURES, ring_model
 )
 def test_image_is_airy_convolved_with_the_line(v_los, centre, temperature):
     """To 3e-5 of the mean: what 0.001 m/s is (5e-7 orders, slope up to 60) and interpolation."""
-    truth = reference.picture(v_los, 2.4e7, centre, temperature)
+    truth = reference.ring_image(v_los, 2.4e7, centre, temperature)
     found = expected(ring_model(), v_los, 2.4e7, centre=centre, temperature=temperature)
     np.testing.assert_allclose(found.numpy(), truth, atol=3e-5 * truth.mean())
     assert float(found.sum()) == pytest.approx(2.4e7, rel=1e-9)
@@ -31,7 +31,7 @@ def test_image_is_airy_convolved_with_the_line(v_los, centre, temperature):
 
 def test_light_falls_off_about_the_centre():
     radius = 4e-3
-    truth = reference.picture(10.0, radius=radius, background=3.0)
+    truth = reference.ring_image(10.0, radius=radius, background=3.0)
     half2 = (780**2 + 960**2) / 4 * reference.PIXEL**2
     found = expected(ring_model(falloff=2 * half2 / radius**2), 10.0, background=3.0)
     np.testing.assert_allclose(found.numpy(), truth, atol=5e-5 * truth.mean())
@@ -92,15 +92,15 @@ def test_bound_equals_differences_of_the_reference_images():
     shape, pixel = (195, 240), 4 * reference.PIXEL
     at = {"v_los": 20.0, "x": 110.0, "y": 99.0, "temperature": reference.TEMPERATURE}
 
-    def picture(**changes):
+    def image(**changes):
         p = {**at, **changes}
-        return reference.picture(
+        return reference.ring_image(
             p["v_los"], 2.4e7, (p["x"], p["y"]), p["temperature"], shape, pixel, radius=6e-3
         )
 
-    mean = picture()
+    mean = image()
     slopes = [
-        (picture(**{n: at[n] + s}) - picture(**{n: at[n] - s})) / (2 * s) for n, s in steps.items()
+        (image(**{n: at[n] + s}) - image(**{n: at[n] - s})) / (2 * s) for n, s in steps.items()
     ]
     slopes += [mean, np.ones_like(mean)]  # level and background
     jacobian = np.array([s.ravel() for s in slopes])

@@ -28,12 +28,12 @@ FIRST = 145.9  # px, radius of the innermost ring
 
 
 @pytest.fixture(scope="module")
-def pictures():
+def rendered():
     """Received at 0 and at 50 m/s, and emitted; no noise."""
     return {
-        "still": reference.picture(0.0, centre=CENTRE),
-        "wind": reference.picture(50.0, centre=CENTRE),
-        "emitted": reference.picture(0.0, centre=CENTRE, temperature=None),
+        "still": reference.ring_image(0.0, centre=CENTRE),
+        "wind": reference.ring_image(50.0, centre=CENTRE),
+        "emitted": reference.ring_image(0.0, centre=CENTRE, temperature=None),
     }
 
 
@@ -48,8 +48,8 @@ def paper_velocity(received, emitted, method="ca", coordinate="r", centre=None, 
 
 
 @pytest.mark.parametrize("kind", ["still", "emitted"])
-def test_centres_without_noise(pictures, kind):
-    image = pictures[kind]
+def test_centres_without_noise(rendered, kind):
+    image = rendered[kind]
     assert gradient_centre(image) == pytest.approx(CENTRE, abs=0.7)
     assert circular_centre(image, (473.0, 401.5)) == pytest.approx(CENTRE, abs=0.02)
     assert midpoint_line_centre(image, (472.0, 402.0), FIRST, 40.0) == pytest.approx(
@@ -60,7 +60,7 @@ def test_centres_without_noise(pictures, kind):
 def test_centres_with_noise():
     """1.3e7 photons, read noise 5: 10 % of a pixel, either way."""
     rng = np.random.default_rng(1)
-    image = reference.noisy(reference.picture(0.0, 1.3e7, CENTRE), rng, 5.0)
+    image = reference.noisy(reference.ring_image(0.0, 1.3e7, CENTRE), rng, 5.0)
     assert find_centre(image, "ca") == pytest.approx(CENTRE, abs=0.1)
     assert find_centre(image, "ml") == pytest.approx(CENTRE, abs=0.3)
 
@@ -92,38 +92,38 @@ def test_wind_of_a_radius():
 
 
 @pytest.mark.parametrize("method", ["ca", "sg"])
-def test_gaussian_over_r2_has_no_bias(pictures, method):
+def test_gaussian_over_r2_has_no_bias(rendered, method):
     """The ring is symmetric in r^2. Filtered cuts are smoothed over r: a skew of 1 m/s is left."""
     for kind, v in (("still", 0.0), ("wind", 50.0)):
         found = paper_velocity(
-            pictures[kind], pictures["emitted"], method=method, coordinate="r2", centre=CENTRE
+            rendered[kind], rendered["emitted"], method=method, coordinate="r2", centre=CENTRE
         )
         assert abs(found - v) < (0.3 if method == "ca" else 2.0)
 
 
 @pytest.mark.parametrize("method", ["ca", "ml", "sg"])
-def test_gaussian_over_r_is_biased(pictures, method):
+def test_gaussian_over_r_is_biased(rendered, method):
     for piece in (0.2, 0.35):
         found = paper_velocity(
-            pictures["wind"], pictures["emitted"], method=method, centre=CENTRE, piece=piece
+            rendered["wind"], rendered["emitted"], method=method, centre=CENTRE, piece=piece
         )
         assert -40 < found - 50 < -10
 
 
 @pytest.mark.parametrize(("piece", "bias"), [(0.15, -8.2), (0.35, -29.6)])
-def test_bias_grows_with_the_fitted_piece(pictures, piece, bias):
+def test_bias_grows_with_the_fitted_piece(rendered, piece, bias):
     """Over r by the ring's skew within the piece; 10 % of a m/s over r^2."""
-    pair = pictures["still"], pictures["emitted"]
+    pair = rendered["still"], rendered["emitted"]
     assert paper_velocity(*pair, centre=CENTRE, piece=piece) == pytest.approx(bias, abs=1.0)
     assert abs(paper_velocity(*pair, coordinate="r2", centre=CENTRE, piece=piece)) < 0.3
 
 
-def test_radius_of_the_emitted_ring(pictures):
+def test_radius_of_the_emitted_ring(rendered):
     """Narrow rings hardly care: 0.1 px over r, 0.02 px over r^2."""
     truth = (
         reference.FOCAL_LENGTH / reference.PIXEL * np.sqrt((1 - 0.5 / reference.ORDER) ** -2 - 1)
     )
-    image = pictures["emitted"]
+    image = rendered["emitted"]
     assert innermost(image, CENTRE) == pytest.approx(truth, abs=3)
     assert ring_radius(image, CENTRE, "ca", "r2") == pytest.approx(truth, abs=0.05)
     for method in ("ca", "ml", "sg"):
@@ -138,8 +138,8 @@ def test_twenty_images():
     give 8 m/s. The mean of 20 scatters by less than 2.5 m/s; over r^2 the bias is gone.
     """
     rng = np.random.default_rng(20)
-    mean = reference.picture(0.0, 2.4e7, CENTRE)
-    emitted = reference.picture(0.0, 2.4e7, CENTRE, temperature=None)
+    mean = reference.ring_image(0.0, 2.4e7, CENTRE)
+    emitted = reference.ring_image(0.0, 2.4e7, CENTRE, temperature=None)
     images = [reference.noisy(mean, rng, 5.0, 10.0) for _ in range(20)]
     found = {
         (method, coordinate): np.array(
@@ -166,8 +166,8 @@ def test_twenty_images():
 # --- bad input ------------------------------------------------------------------------------
 
 
-def test_bad_input(pictures):
-    image = pictures["still"]
+def test_bad_input(rendered):
+    image = rendered["still"]
     with pytest.raises(InputError, match="method: 'xx' is not one of ca, ml, sg"):
         ring_radius(image, CENTRE, "xx")
     with pytest.raises(InputError, match="coordinate: 'r3' is not one of r, r2"):

@@ -174,7 +174,7 @@ def test_particle_images(method):
     bright = random.uniform(0.5, 1, len(z0))
     shear = 0.03
 
-    def picture(part):
+    def rendered(part):
         """v = 1.3 px + 0.03 (z - 45), w = -0.6 px: a place moves on a parabola."""
         z = z0 - 0.6 * part
         y = y0 + (1.3 + shear * (z0 - 45)) * part - 0.3 * shear * part**2
@@ -187,7 +187,7 @@ def test_particle_images(method):
         return total + 0.01 * random.standard_normal(total.shape)
 
     axes = np.arange(columns, dtype=float), np.arange(rows, dtype=float)
-    pair = [data_array(picture(part), *axes) for part in (-0.5, 0.5)]
+    pair = [data_array(rendered(part), *axes) for part in (-0.5, 0.5)]
     # a pixel is 1 m and dt 1 s: winds are px. Particles on black have no mean to compare with
     wind = retrieve_wind(*pair, 1.0, method, template=12, search=24, min_texture=0.0)
     good = (wind.flag == 0).values

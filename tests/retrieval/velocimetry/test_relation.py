@@ -51,12 +51,12 @@ def test_unrelated_images_give_no_valid_vector(method, cases, repeats):
 
 def test_rate_of_false_alarms():
     """A rate of 5 % is kept: of 60 images as many look related as the binomial allows (4 sigma)."""
-    number, seen = 60, 0.0
+    number, observed = 60, 0.0
     for seed in range(number):
         pair = [torch.as_tensor(i.values) for i in images(1000 + seed, 61, 50, 2.2)]
         apart = unrelated(pair, Windows((50, 61), 8, 16, 6), False, false_alarm=0.05)
-        seen += 1 - float(apart.double().mean())
-    assert seen < number * 0.05 + 4 * np.sqrt(number * 0.05 * 0.95)
+        observed += 1 - float(apart.double().mean())
+    assert observed < number * 0.05 + 4 * np.sqrt(number * 0.05 * 0.95)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.06])

@@ -267,7 +267,7 @@ def blurred_errors(seed, noise, sigma):
     """Errors in the cores, with and without `blur`, of images blurred after the air has moved."""
     pair = vortex_pair_images(0.0, seed, correlation_length=2.0, columns=160, rows=100)
     random = np.random.default_rng(seed)
-    pictures = [
+    rendered = [
         image.copy(
             data=gaussian_filter(image.values, sigma) + noise * random.standard_normal(image.shape)
         )
@@ -275,7 +275,7 @@ def blurred_errors(seed, noise, sigma):
     ]
     errors = []
     for blur in (0.0, sigma * SPACING):
-        wind = retrieve_wind(*pictures, DT, "variational", noise=noise, blur=blur, stride=2)
+        wind = retrieve_wind(*rendered, DT, "variational", noise=noise, blur=blur, stride=2)
         z, y = np.meshgrid(wind.z, wind.y, indexing="ij")
         true = velocity(pair.vortices, y, z)
         core = np.min([np.hypot(y - o.y, z - o.z) for o in pair.vortices], axis=0) < 6

@@ -29,12 +29,12 @@ def reduced_errors(seed, amount, **changes):
     experiment = load(SCENES / "wake_sensor.yaml", overrides)
     truth = make_truth(experiment, SCENES)
     plans = scan_plans(experiment, truth)
-    pictures = [blur_by_beam(truth.image(k), experiment.lidar, plans[k].centre) for k in (0, 1)]
-    noise = pictures[0].copy(data=np.sqrt(amount * np.polyval(NOISE[::-1], pictures[0].values)))
+    images = [blur_by_beam(truth.image(k), experiment.lidar, plans[k].centre) for k in (0, 1)]
+    noise = images[0].copy(data=np.sqrt(amount * np.polyval(NOISE[::-1], images[0].values)))
     random = np.random.default_rng(seed)
     noisy = [
         p + np.sqrt(amount * np.polyval(NOISE[::-1], p.values)) * random.standard_normal(p.shape)
-        for p in pictures
+        for p in images
     ]
     wind = retrieve_wind(
         *noisy,

@@ -106,8 +106,8 @@ def test_vortex_core_is_retrieved_at_its_position():
     swirl = partial(velocity, [Vortex(200.0, 3.0, 0.0, 0.0)])
     waves = plane_waves(5, 3.0, 0.5)
     first = texture(waves, *grid)
-    carried = grid[0] - mean[0] * DT, grid[1] - mean[1] * DT  # frame that goes with the vortex
-    second = texture(waves, *origin(swirl, *carried, DT))
+    advected = grid[0] - mean[0] * DT, grid[1] - mean[1] * DT  # frame that goes with the vortex
+    second = texture(waves, *origin(swirl, *advected, DT))
     dataset = retrieve_wind(*(data_array(i, y, z) for i in (first, second)), DT)
     good = dataset.flag.values == 0
     v, w = dataset.v.values[good], dataset.w.values[good]
@@ -300,9 +300,9 @@ def burst(number, noise, seed=7):
     random = np.random.default_rng(seed)
     waves = plane_waves(seed, 3.0, 0.5)
     for k in range(number):
-        picture = texture(waves, grid[0] - 3 * k * DT, grid[1] + 2 * k * DT)
-        picture += noise * random.standard_normal(picture.shape)
-        yield data_array(picture, y, z)
+        rendered = texture(waves, grid[0] - 3 * k * DT, grid[1] + 2 * k * DT)
+        rendered += noise * random.standard_normal(rendered.shape)
+        yield data_array(rendered, y, z)
 
 
 def test_more_images_of_a_burst_lower_the_error():

@@ -125,15 +125,15 @@ def test_unravel_gives_shifts_and_the_rim():
 def test_tiles_cover_every_window_once_with_the_pixels_it_needs(room, monkeypatch):
     monkeypatch.setattr("lidar_mi.retrieval.velocimetry.windows.TILE_BYTES", room * 100)
     windows = Windows((37, 41), 5, 11, 3)
-    seen = np.zeros(windows.count, int)
+    observed = np.zeros(windows.count, int)
     for tile in windows.tiles(100):
-        seen[tile.vectors] += 1
-        assert seen[tile.vectors].size <= room
+        observed[tile.vectors] += 1
+        assert observed[tile.vectors].size <= room
         pixels = np.empty(windows.shape)[tile.pixels]
         part = Windows(pixels.shape, 5, 11, 3)
-        assert part.count == seen[tile.vectors].shape
+        assert part.count == observed[tile.vectors].shape
         assert tile.pixels[0].start == windows.starts(0)[tile.vectors[0].start] - windows.lead
-    assert (seen == 1).all()
+    assert (observed == 1).all()
 
 
 @pytest.mark.parametrize(
