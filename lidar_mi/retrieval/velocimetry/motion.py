@@ -12,21 +12,26 @@ from lidar_mi.retrieval.velocimetry.windows import Windows, linear_weights, sepa
 _AROUND = 5
 
 
-def motion_around(image1: torch.Tensor, image2: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """Displacement around every pixel, (2, z, y) px: the median of 5 x 5 coarse vectors.
+def motion_around(
+    image1: torch.Tensor, image2: torch.Tensor, windows: Windows
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Displacement (2, z, y) around every pixel, px, and how far (z, y) vectors there are from it.
 
-    0 where none was found.
+    The median of 5 x 5 coarse vectors, and that of their distances from it; 0 where there is none.
     """
     coarse = coarse_windows(windows)
     found = cross_correlation(image1, image2, coarse.template, coarse.search, coarse.stride)
     usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
     d = pad(torch.where(usable, found.d, torch.nan), (_AROUND // 2,) * 4, value=torch.nan)
-    d = d.unfold(1, _AROUND, 1).unfold(2, _AROUND, 1).flatten(3).nanmedian(-1).values
+    near = d.unfold(1, _AROUND, 1).unfold(2, _AROUND, 1).flatten(3)
+    d = near.nanmedian(-1).values
+    scatter = (near - d[..., None]).norm(dim=0).nanmedian(-1).values
     weights = [
         linear_weights(coarse.centres(axis).to(d), torch.arange(n).to(d))
         for axis, n in enumerate(windows.shape)
     ]
-    return separable(d.nan_to_num(0.0), weights)
+    both = separable(torch.cat([d, scatter[None]]).nan_to_num(0.0), weights)
+    return both[:2], both[2]
 
 
 def moved(image: torch.Tensor, d: torch.Tensor) -> torch.Tensor:

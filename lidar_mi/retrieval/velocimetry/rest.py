@@ -1,6 +1,7 @@
 """What does not move with the air: saturated areas and structure at rest in two images."""
 
 from collections.abc import Sequence
+from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -16,6 +17,8 @@ from lidar_mi.retrieval.velocimetry.windows import Windows, averaged, box_sum, w
 
 # Fraction of a template at the largest value that leaves too little to see.
 _SATURATED = 0.25
+# Px that a spot is moved by along each axis, either way, to see whether it fits better.
+_FARTHEST = 3
 # Px; slower air and structure at rest look alike.
 _SLOWEST = 1.0
 # Sizes of the spots that are looked for, px.
@@ -136,7 +139,8 @@ def at_rest(
     motion d around them is the median of 5 x 5 coarse vectors of the images without these spots,
     averaged over Gaussians of 1.5 px, which hide gains of pixels.
     Spots are at rest where the images differ by 0.7 of the height along d, forward from image 1
-    and back from image 2. Gaussian texture has one pixel beyond 5 standard deviations in two
+    and back from image 2, and differ least without a displacement: where a spot is all that there
+    is, no d is known. Gaussian texture has one pixel beyond 5 standard deviations in two
     millions, in one image alone.
 
     Not found: structure where the air moves by less than a pixel, where it fills most of 5 coarse
@@ -159,13 +163,16 @@ def at_rest(
     spots = [_spots(means[size] - means[3 * size]) for size in _SIZES]
     candidates = torch.stack([_grown(s.alike, z) for s, z in zip(spots, _SIZES, strict=True)])
     candidates = candidates.any(0)
-    d = motion_around(*(_soft(image, ~candidates) for image in (image1, image2)), windows)
+    soft = (_soft(image, ~candidates) for image in (image1, image2))
+    d, scatter = motion_around(*soft, windows)
     if not bool(candidates.any()):
         return candidates, d
     found = torch.zeros_like(candidates)
     for spot, size in zip(spots, _SIZES, strict=True):
-        found |= _grown(spot.alike & spot.apart(d), size)
-    return _grown(found & (d.square().sum(0) >= _SLOWEST**2), 3), d
+        found |= _grown(spot.alike & spot.apart(d) & spot.still(size), size)
+    # without texture around, vectors scatter over the search region
+    speed = d.norm(dim=0)
+    return _grown(found & (speed >= _SLOWEST) & (scatter < speed), 3), d
 
 
 class _Spots(NamedTuple):
@@ -179,6 +186,21 @@ class _Spots(NamedTuple):
         """Where spots neither came along d nor go on."""
         off = (self.two - moved(self.one, -d)).abs(), (self.one - moved(self.two, d)).abs()
         return torch.minimum(*off) > 0.7 * torch.minimum(self.one.abs(), self.two.abs())
+
+    def still(self, size: int) -> torch.Tensor:
+        """Where squares twice as large differ less at rest than moved by up to 3 px."""
+        side = 2 * size + 1
+        steps = range(-_FARTHEST, _FARTHEST + 1)
+        rim = (size,) * 4
+        at_rest, best = None, torch.full_like(self.one, torch.inf)
+        for i, j in product(steps, steps):
+            off = pad((self.one - self.two.roll((i, j), (0, 1))).square(), rim)
+            off = box_sum(box_sum(off, side, -1), side, -2)
+            if i or j:
+                best = torch.minimum(best, off)
+            else:
+                at_rest = off
+        return at_rest < best
 
 
 def _spots(pair: torch.Tensor) -> _Spots:
