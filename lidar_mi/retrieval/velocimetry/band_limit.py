@@ -94,8 +94,9 @@ def best_filter(
     # as if all noise were white and of this variance
     level = floor if mismatch is None else torch.as_tensor(noise**2).to(floor)
     if blur:
-        wave = (torch.arange(len(response)).to(response) + 0.5) / _per_cycle(shape)
-        sharper = torch.exp(2 * (torch.pi * blur * wave).square()).clamp(max=settings.sharpening)
+        sharper = torch.exp((blur * wavenumbers(response, shape)).square() / 2).clamp(
+            max=settings.sharpening
+        )
         response = torch.where(response > 0, (response * sharper).square(), 0.0)
     passed = response[shell]
     # of a real field's transform all but the first column stand for two waves
@@ -142,6 +143,11 @@ def frequencies(sizes: Sequence[int], like: torch.Tensor) -> list[torch.Tensor]:
 def shells(frequency: Sequence[torch.Tensor], shape: Sequence[int]) -> torch.Tensor:
     """Wavenumber in whole cycles per shortest side of the image (at least 16 px)."""
     return (_radius(frequency) * _per_cycle(shape)).long()
+
+
+def wavenumbers(of: torch.Tensor, shape: Sequence[int]) -> torch.Tensor:
+    """Mean wavenumber of each shell, radians per px; `of` holds one value per shell."""
+    return 2 * torch.pi * (torch.arange(len(of)).to(of) + 0.5) / _per_cycle(shape)
 
 
 def _per_cycle(shape: Sequence[int]) -> int:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised, of_one_brightness, rms
+from lidar_mi.retrieval.velocimetry.change import displaced, unexplained
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
 from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
@@ -38,6 +39,10 @@ class Images(NamedTuple):
         Standard deviation of the Gaussian that blurred the images, px.
     noise_updated : bool
         Whether noise and weight contain the local misfit already.
+    through : float
+        Mean square displacement through the plane that the misfit tells of, px^2.
+    white : float
+        Noise before it contained the local misfit.
     """
 
     spline: Spline
@@ -48,6 +53,8 @@ class Images(NamedTuple):
     stack: torch.Tensor
     blur: float
     noise_updated: bool = False
+    through: float = 0.0
+    white: float = 0.0
 
 
 class Linear(NamedTuple):
@@ -108,12 +115,15 @@ def prepared(
     return Images(spline, known_at, time, level, weight, images, blur)
 
 
-def with_local_noise(images: Images, linear: Linear, width: float, coloured: bool) -> Images:
+def with_local_noise(
+    images: Images, linear: Linear, width: float, coloured: bool, knots: float
+) -> Images:
     """The images with the noise estimated from their misfit at each place and wavenumber.
 
     Warped images differ by more than their noise where structure moves through the plane, is
     undersampled, or moves on scales smaller than the splines'. The known noise is the lower
-    limit.
+    limit, and in each wavenumber the motion through the plane that the waves shorter than two
+    `knots` (px) tell of: the flow absorbs part of the misfit of longer ones.
     """
     residual = (linear.warped - linear.warped.mean(0)) * linear.valid
     free = (len(residual) - 1) * max(images.spline.passed, 1e-6)
@@ -124,16 +134,22 @@ def with_local_noise(images: Images, linear: Linear, width: float, coloured: boo
     local = averaged(residual.square().sum(0) * images.weight * steep / free, linear.valid, width)
     local = local / averaged(steep, linear.valid, width)
     mean = float(local[linear.valid].mean()) if linear.valid.any() else 0.0
-    level = max(images.noise**2, mean, 1e-30)
-    least = max(images.noise**2, 0.5 * level)
+    white = images.white if images.noise_updated else images.noise
+    level = max(white**2, mean, 1e-30)
+    least = max(white**2, 0.5 * level)
     weight = images.weight * (level / local.clamp(min=least))
-    density = None
+    density, square = None, 0.0
     if coloured:
         density = mismatch(images.spline, residual * weight.sqrt()).clamp(min=least)
+        through = displaced(images.spline, images.stack, white)
+        square = unexplained(images.spline, mismatch(images.spline, residual), through, knots)
+        density = torch.maximum(density, square * through)
     spline, noise = band_limited(
         images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
     )
-    return images._replace(spline=spline, noise=noise, weight=weight, noise_updated=True)
+    return images._replace(
+        spline=spline, noise=noise, weight=weight, noise_updated=True, through=square, white=white
+    )
 
 
 def linearised(

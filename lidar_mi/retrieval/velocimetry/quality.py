@@ -41,6 +41,8 @@ class Flag(enum.IntFlag):
     """The template holds a saturated area at rest, or is saturated by a quarter (`rest`)."""
     AT_REST = 1024
     """The template holds structure at rest in moving air, or a pattern spoils all (`rest`)."""
+    NO_SKILL = 2048
+    """The standard error approaches the wind's own spread, or noise assumed decides the wind."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:
@@ -52,6 +54,8 @@ def check_between(name: str, value: float, low: float, high: float) -> None:
 # A Sobel derivative, scaled to give the slope of a ramp, passes 3/16 of the variance of white
 # noise: (1/2) from the difference times (1 + 4 + 1) / 16 from the smoothing across it.
 _SOBEL_NOISE = 3 / 16
+# Standard error, px, that is no reason to reject a vector in any wind.
+_SMALL = 0.05
 
 
 class Texture(NamedTuple):
@@ -174,6 +178,22 @@ def uncertain(covariance: torch.Tensor, limit: float = 0.5) -> torch.Tensor:
     `covariance` (components, components, ...) in px^2; also where it is not known (NaN).
     """
     return worst_variance(covariance.nan_to_num(torch.inf, torch.inf)) > limit**2
+
+
+def no_skill(d: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+    """Where a displacement's variance is above a quarter of the variance of all about their mean.
+
+    Means over the components of d (components, ...) and covariance (components, components, ...).
+    Everywhere where that holds of the mean variance of all. An error below 0.05 px is small for any
+    wind: in uniform wind no error is small compared with its spread.
+    """
+    known = covariance.isfinite().all(0).all(0) & d.isfinite().all(0)
+    if not bool(known.any()):
+        return torch.zeros_like(known)
+    variance = covariance.diagonal().mean(-1)
+    spread = working(d)[:, known].var(1, correction=0).mean()
+    limit = (spread / 4).clamp(min=_SMALL**2)
+    return known & ((variance > limit) | (variance[known].mean() > limit))
 
 
 def worst_variance(covariance: torch.Tensor) -> torch.Tensor:

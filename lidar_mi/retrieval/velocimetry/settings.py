@@ -129,6 +129,9 @@ class VariationalSettings:
         Rounds of flow and evidence on each level.
     noise_round : int
         Round of the last level before which noise is estimated from the misfit.
+    rounds_changed : int
+        Further rounds of the last level if structure moves through the plane (`change`), after a
+        second estimate of the noise: the first flow absorbed part of the misfit.
     robust : float
         Standard deviations beyond which residuals enter linearly (Huber 1964, Ann. Math. Stat.
         35, 73-101).
@@ -165,6 +168,7 @@ class VariationalSettings:
     knots: tuple[float, ...] = (1.25, 0.5)
     rounds: tuple[int, ...] = (6, 4)
     noise_round: int = 2
+    rounds_changed: int = 2
     robust: float = 3.0
     path_order: int = 6
     coloured: bool = True

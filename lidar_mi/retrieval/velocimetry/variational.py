@@ -15,7 +15,13 @@ from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import Linear, linearised, prepared, with_local_noise
 from lidar_mi.retrieval.velocimetry.prior import first_prior, refined
-from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, non_finite, worst_variance
+from lidar_mi.retrieval.velocimetry.quality import (
+    Flag,
+    check_between,
+    no_skill,
+    non_finite,
+    worst_variance,
+)
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, window_sums, working
 
@@ -104,9 +110,10 @@ def variational(
     like = images.spline.coefficients[:0]
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
-    last, prior = len(settings.knots) - 1, None
+    last, prior, displaced_only = len(settings.knots) - 1, None, flow
     for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
-        axes = [Axis(n, max(2.0, knots * template)) for n in windows.shape]
+        apart = max(2.0, knots * template)
+        axes = [Axis(n, apart) for n in windows.shape]
         mesh = Mesh(axes, pixels)
         coefficients = mesh.fitted(flow)
         if prior is None:
@@ -115,17 +122,20 @@ def variational(
             prior = first_prior(axes, working(coefficients), width, spacing or unit, settings)
         else:
             prior = refined(prior, axes)
-        for turn in range(rounds):
+        turn = 0
+        while turn < rounds + settings.rounds_changed * (images.through > 0):
             linear = linearised(images, mesh, coefficients, settings)
-            if level == last and turn == settings.noise_round:
+            if level == last and turn in (settings.noise_round, rounds):
+                displaced_only = displaced_only if turn == rounds else mesh.field(coefficients)
                 width = settings.misfit_width * template
-                images = with_local_noise(images, linear, width, settings.coloured)
+                images = with_local_noise(images, linear, width, settings.coloured, apart)
                 linear = linearised(images, mesh, coefficients, settings)
             posterior = solve(linear, mesh, coefficients, prior, settings, turn)
             coefficients = posterior.coefficients.to(like)
             # the first flow on coarse knots is too far off to estimate the prior from
             if turn or level:
                 prior = prior.updated(*posterior.evidence(), settings)
+            turn += 1
         flow = mesh.field(coefficients)
     linear = linearised(images, mesh, coefficients, settings)
     posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
@@ -133,7 +143,12 @@ def variational(
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
     score = agreement(linear, windows)
-    return _flagged(d, covariance, before, score, stack, windows, min_correlation)
+    # a flow that depends on how much is assumed to move through the plane is not in the images
+    spread = (flow - flow.mean(tuple(range(1, flow.ndim)), keepdim=True)).square().mean()
+    undetermined = images.through > 0 and bool((flow - displaced_only).square().mean() > spread)
+    found = _flagged(d, covariance, before, score, stack, windows, min_correlation)
+    unskilled = no_skill(found.d, covariance) | undetermined
+    return found._replace(flag=found.flag | (Flag.NO_SKILL * unskilled).to(torch.int16))
 
 
 def _flagged(
