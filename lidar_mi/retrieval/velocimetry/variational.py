@@ -147,6 +147,8 @@ def variational(
     spread = (flow - flow.mean(tuple(range(1, flow.ndim)), keepdim=True)).square().mean()
     undetermined = images.through > 0 and bool((flow - displaced_only).square().mean() > spread)
     found = _flagged(d, covariance, before, score, stack, windows, min_correlation)
+    if windows.dims > 2:
+        return found
     unskilled = no_skill(found.d, covariance) | undetermined
     return found._replace(flag=found.flag | (Flag.NO_SKILL * unskilled).to(torch.int16))
 
