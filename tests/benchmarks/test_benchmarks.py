@@ -331,6 +331,7 @@ def test_fringes_compare(variant):
     assert len(rates) == 4 and all(line.ours > 0 and line.other > 0 for line in rates)
 
 
+@pytest.mark.slow
 def test_methods_table_has_every_method_and_lists_missing_peers(monkeypatch):
     monkeypatch.setattr(methods, "NOISE", (0.01,))
     monkeypatch.setattr(methods, "find_spec", lambda name: None)

@@ -130,6 +130,7 @@ def test_coherence_is_longest_at_the_peak_of_a_fringe():
     assert np.argmax(times) == 0
 
 
+@pytest.mark.slow
 def test_modes_in_time_by_simulated_speckle():
     """Random fields of the spectrum behind the etalon, their energy in 67 ns: variance 1 / M."""
     # so few pixels that each has one mode in space

@@ -8,7 +8,7 @@ import math
 import os
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidar_mi.errors import InputError
@@ -30,6 +30,7 @@ PLAIN = st.recursive(
 )
 
 
+@settings(max_examples=30)
 @given(PLAIN)
 def test_plain_data_round_trip(data):
     assert parse_yaml(to_yaml(data), "text") == data

@@ -190,6 +190,7 @@ def test_both_directions_give_the_analytic_rings(estimator, shape, lens, statist
         assert photons.max() > 20
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono"], indirect=True)
 @pytest.mark.parametrize(
     ("estimator", "shape", "lens", "paths", "allowed"),

@@ -129,6 +129,7 @@ def test_standard_error_is_correct(world, statistics, case):
         assert abs(means.var() - 1) < 4 * math.sqrt(2 / means.size)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("photons", [64, 400])
 def test_standard_error_is_correct_in_a_thin_textured_slab(world, statistics, photons):
     """The lidar's own case: optical depth 0.008, cells of 20 % variation, few samples per beam.

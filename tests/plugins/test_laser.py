@@ -50,7 +50,9 @@ def test_fluence_over_the_aperture_is_a_truncated_gaussian(radius, cut):
     assert kstest(np.arctan2(y, x), uniform(-np.pi, 2 * np.pi).cdf).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("full_mrad", [2.0, 0.1, 200.0])
+@pytest.mark.parametrize(
+    "full_mrad", [2.0, *(pytest.param(full, marks=pytest.mark.slow) for full in (0.1, 200.0))]
+)
 def test_divergence_is_1_over_e2_at_half_the_full_angle(full_mrad):
     _, (x, y, z) = photons(laser(divergence_full_mrad=full_mrad))
     tangent = np.hypot(x, y) / z

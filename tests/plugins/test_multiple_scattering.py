@@ -45,7 +45,7 @@ def gates(scene, **options):
 
 @pytest.fixture(scope="module")
 def truth():
-    return {case: simulate(case, 500_000, ORDERS, seed=11) for case in (RAYLEIGH, FORWARD)}
+    return {case: simulate(case, 300_000, ORDERS, seed=11) for case in (RAYLEIGH, FORWARD)}
 
 
 def agree(found, mean, error, sigmas=3.5):
@@ -101,6 +101,7 @@ def test_any_majorant_gives_the_same(world, truth, factor):
     agree(found, mean, error)
 
 
+@pytest.mark.slow
 def test_standard_error_is_correct(world):
     """z-scores of 20 seeds against their common mean have unit variance.
 

@@ -46,7 +46,12 @@ CASES = {
     "near, wide, long pulse": Case((20.0, 25.0), 3.0, 120.0, 60.0, 0.5, 0.8, 2e-2, 30e-9),
 }
 # of which each is like one of the others
-RARE = ("telescope beside the beam", "near, wide, long pulse", "nearer than wide")
+RARE = (
+    "near, wide, cut by the view",
+    "telescope beside the beam",
+    "near, wide, long pulse",
+    "nearer than wide",
+)
 
 
 @functools.cache

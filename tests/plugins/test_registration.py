@@ -77,6 +77,7 @@ def test_plugins_serve_mitsuba_3_10(tmp_path):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize(
     "imports",

@@ -278,6 +278,7 @@ def test_bad_input_is_one_line_and_leaves_nothing(there, lidar_mi, arguments, sa
     assert files_in(there) == before
 
 
+@pytest.mark.slow
 def test_bad_input_in_a_fresh_process(there):
     done = shell("run", "tiny.yaml", "--set", "scan.range=-5 m")
     assert done.returncode == 2

@@ -36,6 +36,7 @@ def test_run_writes_into_the_given_folder_and_prints_it(there, lidar_mi, quick):
     assert not (there / "outputs").exists()
 
 
+@pytest.mark.slow
 def test_run_folder_is_named_after_the_experiment(there, lidar_mi, quick):
     assert lidar_mi("run", "tiny.yaml")[0] == 0
     assert (there / "outputs" / "tiny" / "wind.nc").is_file()

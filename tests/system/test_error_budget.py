@@ -20,6 +20,8 @@ from lidar_mi.experiment.truth import blur_by_beam, make_truth
 from lidar_mi.io import exr
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
+pytestmark = pytest.mark.slow
+
 SMALL = """
 name: small
 wake:

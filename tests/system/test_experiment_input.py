@@ -70,6 +70,7 @@ def test_beams_wider_than_a_template_are_reported(tmp_path, quick):
         assert text.removeprefix("warning: ") in page and text in log
 
 
+@pytest.mark.slow
 def test_air_without_vortices_is_reported(tmp_path, quick):
     """Nothing turns: the report says that, and shows the rest."""
     data = small(texture={"rms": 0.3, "outer_scale": "5 m"})

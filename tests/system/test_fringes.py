@@ -282,6 +282,7 @@ def without_times(metrics):
     return {key: value for key, value in metrics.items() if not key.startswith("timing.")}
 
 
+@pytest.mark.slow
 def test_a_stopped_run_resumes_with_its_images(tmp_path, quick):
     settings = check(**QUICK | {"v_los": [0, 20]})
     first = run(settings, tmp_path / "run").metrics
@@ -297,6 +298,7 @@ def test_a_stopped_run_resumes_with_its_images(tmp_path, quick):
     assert "using 2 of 3 ring images" in (tmp_path / "run" / "log.txt").read_text()
 
 
+@pytest.mark.slow
 def test_another_experiment_is_refused_or_replaces(tmp_path, quick):
     run(check(**QUICK), tmp_path)
     other = check(**QUICK | {"v_los": [5]})

@@ -35,6 +35,7 @@ def without_timing(metrics):
     return {key: value for key, value in metrics.items() if not key.startswith("timing.")}
 
 
+@pytest.mark.slow
 def test_the_wake_is_read_once(tmp_path, monkeypatch):
     read = []
     monkeypatch.setattr(
@@ -145,7 +146,7 @@ def test_a_file_in_the_folders_place_is_refused(tmp_path):
     [
         pytest.param("reading the wake", marks=pytest.mark.slow),
         pytest.param("rendering scan 1", marks=pytest.mark.slow),
-        "rendering scan 2",
+        pytest.param("rendering scan 2", marks=pytest.mark.slow),
         "retrieving winds",
     ],
 )

@@ -219,6 +219,7 @@ def test_no_valid_vector_is_reported_and_the_rest_is_shown(whole, tmp_path, monk
     assert "sensor.triples.rmse_u" in metrics and "sensor.rmse_u" not in metrics
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_lines_without_a_velocity_are_reported_and_the_rest_is_shown(whole, tmp_path, monkeypatch):
     report, folder = again(

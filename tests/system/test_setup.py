@@ -284,6 +284,7 @@ def test_doctor_reports_an_abort_and_survives_it():
     assert doctor._attempt("print(1); print('last')") == (True, "last")
 
 
+@pytest.mark.slow
 def test_doctor_examines_what_pyproject_requires():
     checks = {check.name: check for check in doctor.doctor().checks}
     expected = {"Python", "mitsuba", "torch", "LLVM library", "plugins", "NetCDF files"}

@@ -191,6 +191,7 @@ def test_volumes_are_compared(file, tmp_path, monkeypatch):
     assert float(shown) == pytest.approx(u, abs=6e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_doppler_lidars_alone_are_compared(tmp_path, monkeypatch):
     """The paper's two ranges, whose photons it gives: 2.4e7 from 56 m, 1.3e7 from 76 m."""
@@ -279,8 +280,10 @@ def test_shipped_experiments_are_documented():
 @pytest.mark.parametrize(
     ("name", "one"),
     [
-        # carrying the volume on takes 12 s
-        pytest.param(name, one, marks=[pytest.mark.slow] * (name == "wake_3d"), id=name)
+        # carrying air on in three dimensions takes 4 to 12 s
+        pytest.param(
+            name, one, marks=[pytest.mark.slow] * (name in ("wake_3d", "turbine")), id=name
+        )
         for name, one in shipped()
     ],
 )

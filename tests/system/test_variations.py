@@ -72,6 +72,7 @@ def test_images_of_a_second_snapshot_are_those_of_advection(plain, variation):
         assert metrics[key] == pytest.approx(plain[1][key], rel=0.1)
 
 
+@pytest.mark.slow
 def test_detector_adds_a_noisy_image_and_its_winds(variation):
     """Weak pulses by day: noise of the stated size in the images, worse winds."""
     weak = ["detector={}", "lidar.pulse_energy=1 mJ", "render.samples_per_beam=256"]
@@ -104,6 +105,7 @@ def test_strong_pulses_give_the_winds_without_noise(variation):
         )
 
 
+@pytest.mark.slow
 def test_aiming_by_angles_is_as_good(plain, variation):
     """The top row's beams are 0.7 m higher at t2 than at t1 (7 m/s if ignored); resampling must
     make up for it. 5 %: the seed alone moves the rmse by 2 %."""
@@ -122,6 +124,7 @@ def test_aiming_by_angles_is_as_good(plain, variation):
         assert abs(metrics[f"backscatter.cc.bias_{name}"]) < 0.1
 
 
+@pytest.mark.slow
 def test_vortex_pair(tmp_path):
     """No file at all: analytic flow, even air, texture only. With figures, whose sweep meets air
     without any structure and so without any vector."""

@@ -135,6 +135,7 @@ def test_bad_descriptions_are_named(sections, message):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize(
     ("sections", "start"),

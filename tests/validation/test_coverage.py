@@ -43,6 +43,7 @@ def test_replaced_fraction_is_the_uncorrelated_variance(fraction):
     assert 1 - correlation**2 == pytest.approx(fraction, abs=4 * error)
 
 
+@pytest.mark.slow
 def test_gain_gradient_and_pattern():
     plain = coverage.replaced_texture(0.0, 1, noise=0.0)
     gain = coverage.instrument("gain", 1, noise=0.0)

@@ -300,6 +300,7 @@ def test_fraction_of_noise_is_the_scatter_of_winds_over_noise_draws(method):
     assert fraction == pytest.approx(scatter / error.mean(), abs=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shear", [pytest.param(0.0, marks=pytest.mark.slow), 4.0])
 def test_shear_within_the_window(shear):
     """A simple shear (closed form) of 4 / s deforms a window of 8 px by 1.6 px on either side. With

@@ -208,7 +208,9 @@ def check(name, distances, draws):
             assert mean[index] < fraction + slack[index], (name, mean)
 
 
-@pytest.mark.parametrize("name", ["simulated", "turbulence 30 m"])
+@pytest.mark.parametrize(
+    "name", ["simulated", pytest.param("turbulence 30 m", marks=pytest.mark.slow)]
+)
 def test_errors_are_as_stated_in_a_few_flows(name):
     check(name, (150,), 4)
 

@@ -43,6 +43,7 @@ def test_rings_of_the_emitted_laser():
     assert found.misfit < 5e-4
 
 
+@pytest.mark.slow
 def test_noisy_backscatter_off_centre():
     """2 images of 1.3e7 photons: four coordinates scatter as their error bars say."""
     rng = np.random.default_rng(5)

@@ -19,7 +19,11 @@ from tests.support.ring_models import TABLE, TEMPERATURES, ring_model
 
 @pytest.mark.parametrize(
     ("v_los", "centre", "temperature"),
-    [(0.0, None, 232.9), (-300.0, (300.0, 250.0), 232.9), (47.0, (481.3, 391.9), 255.0)],
+    [
+        pytest.param(0.0, None, 232.9, marks=pytest.mark.slow),
+        pytest.param(-300.0, (300.0, 250.0), 232.9, marks=pytest.mark.slow),
+        (47.0, (481.3, 391.9), 255.0),
+    ],
 )
 def test_image_is_airy_convolved_with_the_line(v_los, centre, temperature):
     """To 3e-5 of the mean: what 0.001 m/s is (5e-7 orders, slope up to 60) and interpolation."""

@@ -47,7 +47,7 @@ def paper_velocity(received, emitted, method="ca", coordinate="r", centre=None, 
     return velocity_from_radii(*radii, *OPTICS)
 
 
-@pytest.mark.parametrize("kind", ["still", "emitted"])
+@pytest.mark.parametrize("kind", [pytest.param("still", marks=pytest.mark.slow), "emitted"])
 def test_centres_without_noise(rendered, kind):
     image = rendered[kind]
     assert gradient_centre(image) == pytest.approx(CENTRE, abs=0.7)

@@ -58,7 +58,7 @@ def check_coverage(found):
     assert np.mean(np.abs(reduced) < 1.96) == pytest.approx(0.95, abs=0.05)
 
 
-@pytest.mark.parametrize(("noise", "everywhere", "beyond"), [KNOWN[0], KNOWN[2]])
+@pytest.mark.parametrize(("noise", "everywhere", "beyond"), [KNOWN[2]])
 def test_errors_are_below_the_prototypes(noise, everywhere, beyond):
     check_errors(noise, everywhere, beyond, [1])
 

@@ -59,6 +59,7 @@ def check(reduced, allowed=0.05):
     assert np.mean(reduced**2) == pytest.approx(1, abs=0.3)
 
 
+@pytest.mark.slow
 def test_coverage_on_the_shipped_wake():
     reduced, errors = zip(*(reduced_errors(seed, 1.0) for seed in (1, 2)), strict=True)
     # neighbours share their errors: the fractions of one pair of images scatter by 2.5 points

@@ -290,6 +290,7 @@ def test_bad_input_is_named(change, message):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.slow
 def test_more_volumes_tell_more():
     """Four instead of two tell the same motion from ten times the squares of the times."""
     shape, noise, shift = (12, 16, 16), 0.05, 0.4 * SHIFT[:, None, None, None]

@@ -176,6 +176,7 @@ def test_a_noise_map_that_is_too_low():
     assert np.sqrt(np.mean(np.square(reduced))) < 1.8 and np.abs(reduced).max() < 4
 
 
+@pytest.mark.slow
 def test_noise_that_lies_in_one_place():
     """Around one core four times that of elsewhere, said to be even: residuals tell, and the errors
     of that vortex agree with its error (3.5 times too small from the stated noise alone)."""
@@ -303,6 +304,7 @@ def test_simulated_wake_with_texture():
         assert 0.5 < np.sqrt(np.mean((error / model[f"{name}_stderr"].values) ** 2)) < 1.3
 
 
+@pytest.mark.slow
 def test_simulated_wake_without_texture():
     """Where correlation is off by 4 m/s: 15 % of the circulation, 1 m, as stated."""
     truth, found = simulated(0.0, 0.0)

@@ -34,6 +34,7 @@ def test_quantities_in_closed_form():
     assert float(circulation_5_15(400.0, 0.01)) == pytest.approx(400.0)
 
 
+@pytest.mark.slow
 def test_errors_of_quantities_and_wind_against_drawn_parameters():
     """First order against 1500 draws from the covariance: these scatter by 2 %, 80 by 8 %."""
     random = np.random.default_rng(3)

@@ -15,6 +15,7 @@ from tests.support.flows import data_array
 from tests.support.vortex_pairs import uneven, vector
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("standard_errors", [0.7, 1.5])
 @pytest.mark.parametrize("index", [0, 1, 3, 8])
 def test_a_fit_that_stops_short_is_believed_within_its_errors(monkeypatch, index, standard_errors):
