@@ -282,6 +282,7 @@ def test_energy_that_a_stop_or_another_plate_takes():
         bending.integrator().render(bending, spp=2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_mono"], indirect=True)
 @pytest.mark.parametrize("estimator", ["camera", "forward"])
 def test_two_etalons_see_the_same_frequency(estimator, statistics):

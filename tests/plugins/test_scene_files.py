@@ -186,6 +186,7 @@ def test_every_scene_that_ships_is_tested():
     assert mine == tested
 
 
+@pytest.mark.slow
 def test_profile_of_500_gates():
     """Lidar equation of single scattering where the overlap is complete (above 450 m): haze of
     particles with the table's own a1 at 180 degrees and air, clear air above 1 km. The mixture's

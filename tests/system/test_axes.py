@@ -83,6 +83,7 @@ def test_no_vortex_no_core_metrics(blob_run):
     assert not [key for key in metrics if key.startswith("wake.") or "outside_cores" in key]
 
 
+@pytest.mark.slow
 def test_volume_shows_the_planes_in_the_gate(tmp_path, quick):
     """Planes of 1 m: a port blob for x > 6 m, a starboard one for x < 4 m. A gate of 2.5 m around
     x = 8 m holds only the first, around x = 2 m only the second."""

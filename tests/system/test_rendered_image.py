@@ -113,6 +113,7 @@ def test_image_is_the_blurred_extinction_within_its_standard_errors():
         assert (sums[k] / theory)[inner].mean() == pytest.approx(1, abs=2e-4)
 
 
+@pytest.mark.slow
 def test_volume_image_is_the_mean_over_the_gate(tmp_path, quick):
     """As for the plane, in three dimensions: structure that differs from plane to plane (texture
     of 20 %), gates of 2.5 m across planes of 1 m. Equal weights for the two planes inside the

@@ -71,6 +71,7 @@ def test_a_missing_image_is_rendered_again_and_identical(tmp_path, quick):
         xr.testing.assert_identical(one, other)
 
 
+@pytest.mark.slow
 def test_another_experiment_is_kept_out(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
@@ -101,6 +102,7 @@ def test_images_of_another_version_are_not_used(tmp_path, quick):
     run(check(small()), folder)
 
 
+@pytest.mark.slow
 def test_a_changed_wake_file_is_another_experiment(tmp_path, quick):
     """Same name, other content: the old images must not be taken for it."""
     data = small()

@@ -92,6 +92,7 @@ def test_images_of_another_seed_are_not_used(tmp_path, quick):
     assert read_scan(folder / "image_t2.exr").attrs["seed"] == 1 + (1 << 16)
 
 
+@pytest.mark.slow
 def test_a_damaged_image_is_rendered_again(tmp_path, quick):
     folder = tmp_path / "run"
     run(check(small()), folder)
@@ -113,6 +114,7 @@ def test_results_identify_their_run(tmp_path, quick):
     assert hashes["one"] == hashes["again"] != hashes["other"]
 
 
+@pytest.mark.slow
 def test_metrics_of_another_run_are_not_shown(tmp_path, quick, lidar_mi):
     folder, other = tmp_path / "run", tmp_path / "other"
     run(check(small()), folder)

@@ -235,6 +235,7 @@ def test_lines_without_a_velocity_are_reported_and_the_rest_is_shown(whole, tmp_
     assert "sensor.rmse_v_los" not in metrics
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("variant")
 def test_two_lines_give_no_vector_which_is_reported(whole, tmp_path, monkeypatch):
     report, folder = again(

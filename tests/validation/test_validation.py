@@ -121,6 +121,7 @@ def test_a_wrong_image_is_detected(effort, monkeypatch):
     assert not equation.depolarisation(effort).passed
 
 
+@pytest.mark.slow
 def test_wrong_light_transport_is_detected(effort, monkeypatch):
     """The independent simulation with 3 % more extinction, or 1 % less albedo."""
     scattering = group("multiple_scattering")

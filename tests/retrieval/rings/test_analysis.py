@@ -72,6 +72,7 @@ def test_lines_and_orders_are_distinguished(fractions):
         np.testing.assert_allclose(split[:2], [expected] * 2, atol=5e-3)
 
 
+@pytest.mark.slow
 def test_laboratory_like_image():
     """Split line, 8 bits, tilted camera, ellipses, sloping light: stands in for the real images.
 

@@ -24,6 +24,7 @@ def coarse(centre):
     return None if centre is None else tuple((c - 1.5) / 4 for c in centre)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("v_los", [-300.0, -130.0, 0.0, 51.0, 222.0, 300.0])
 @pytest.mark.parametrize("centre", [None, (300.0, 250.0), (485.7, 380.3)])
 def test_no_noise_no_error(v_los, centre):

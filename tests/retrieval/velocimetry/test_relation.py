@@ -49,6 +49,7 @@ def test_unrelated_images_give_no_valid_vector(method, cases, repeats):
     assert binom.sf(np.count_nonzero(valid) - 1, len(valid), 1e-3) > 1e-3
 
 
+@pytest.mark.slow
 def test_rate_of_false_alarms():
     """A rate of 5 % is kept: of 60 images as many look related as the binomial allows (4 sigma)."""
     number, observed = 60, 0.0
@@ -88,6 +89,7 @@ def test_brightness_and_holes_do_not_matter():
     assert not bool(unrelated([first, second], Windows((83, 101), 8, 16, 4), True).any())
 
 
+@pytest.mark.slow
 def test_volumes():
     random = np.random.default_rng(41)
     shape = 18, 40, 44

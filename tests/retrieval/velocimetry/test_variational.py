@@ -181,6 +181,7 @@ def test_known_noise_of_dark_air_beside_bright_is_used_and_not_misread():
     assert float(errors.square().mean()) < float(other.square().mean())
 
 
+@pytest.mark.slow
 def test_noise_does_not_bias_displacements_to_whole_pixels():
     """Fine texture that is weak in half the image: the other half has the filter let noise pass.
 
@@ -289,6 +290,7 @@ def blurred_errors(seed, noise, sigma):
     return np.reshape(errors, (2, 2, 2))
 
 
+@pytest.mark.slow
 def test_known_blur_is_corrected_in_the_cores():
     """It commutes with shifts, not with what turns and shears; beyond the cores it costs little."""
     plain, undone = blurred_errors(1, 0.01, 1.0)

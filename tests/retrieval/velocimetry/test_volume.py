@@ -110,6 +110,7 @@ def test_standard_errors_know_how_the_components_err_together():
         assert abs(float(found["uv_correlation"].median())) < 0.3, method
 
 
+@pytest.mark.slow
 def test_where_volumes_differ_standard_errors_are_larger():
     """In one half a volume holds fine texture that the other does not; noise is stated as it is."""
     shape = (14, 20, 40)

@@ -68,6 +68,7 @@ def scores(pairs, method):
     return np.mean(rows, axis=0)
 
 
+@pytest.mark.slow
 def test_cc_of_a_vortex_pair(pairs):
     """A plain CC, programmed independently, came to 0.85 m/s, 0.65 beyond two core radii.
 

@@ -46,6 +46,7 @@ def misfit(start, data):
     return float(np.linalg.lstsq(columns, data.value.numpy(), rcond=None)[1][0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("angle", [None, 0.9], ids=["v and w", "one component"])
 @pytest.mark.parametrize("mean", [(0.0, 0.0), (8.0, -3.0)])
 def test_the_pair_is_detected_whatever_wind_advects_it(angle, mean):

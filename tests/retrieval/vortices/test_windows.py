@@ -16,6 +16,7 @@ DT = 0.1
 SMALL = {"columns": 130, "rows": 90}
 
 
+@pytest.mark.slow
 def test_vectors_and_numbers_in_one_data_set(tmp_path):
     pair = vortex_pair_images(0.02, seed=11, vortices=uneven(), **SMALL)
     found = retrieve_wind(pair.first, pair.second, DT, "vortex_fit", stride=2, noise=0.02)
