@@ -37,12 +37,12 @@ class Images(NamedTuple):
         The images, of one brightness.
     blur : float
         Standard deviation of the Gaussian that blurred the images, px.
+    white : float
+        The noise before it contained the local misfit.
     noise_updated : bool
         Whether noise and weight contain the local misfit already.
     through : float
         Mean square displacement through the plane that the misfit tells of, px^2.
-    white : float
-        Noise before it contained the local misfit.
     """
 
     spline: Spline
@@ -52,9 +52,9 @@ class Images(NamedTuple):
     weight: torch.Tensor
     stack: torch.Tensor
     blur: float
+    white: float
     noise_updated: bool = False
     through: float = 0.0
-    white: float = 0.0
 
 
 class Linear(NamedTuple):
@@ -112,7 +112,7 @@ def prepared(
     level = max(level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
     time = time - time.mean()
-    return Images(spline, known_at, time, level, weight, images, blur)
+    return Images(spline, known_at, time, level, weight, images, blur, level)
 
 
 def with_local_noise(
@@ -134,21 +134,20 @@ def with_local_noise(
     local = averaged(residual.square().sum(0) * images.weight * steep / free, linear.valid, width)
     local = local / averaged(steep, linear.valid, width)
     mean = float(local[linear.valid].mean()) if linear.valid.any() else 0.0
-    white = images.white if images.noise_updated else images.noise
-    level = max(white**2, mean, 1e-30)
-    least = max(white**2, 0.5 * level)
+    level = max(images.white**2, mean, 1e-30)
+    least = max(images.white**2, 0.5 * level)
     weight = images.weight * (level / local.clamp(min=least))
     density, square = None, 0.0
     if coloured:
         density = mismatch(images.spline, residual * weight.sqrt()).clamp(min=least)
-        through = displaced(images.spline, images.stack, white)
+        through = displaced(images.spline, images.stack, images.white)
         square = unexplained(images.spline, mismatch(images.spline, residual), through, knots)
         density = torch.maximum(density, square * through)
     spline, noise = band_limited(
         images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
     )
     return images._replace(
-        spline=spline, noise=noise, weight=weight, noise_updated=True, through=square, white=white
+        spline=spline, noise=noise, weight=weight, noise_updated=True, through=square
     )
 
 

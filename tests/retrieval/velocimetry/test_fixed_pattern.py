@@ -3,42 +3,29 @@
 Textures, winds and seeds are none of those that the thresholds were tried on.
 """
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 import xarray as xr
 from scipy.stats import binom
 
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 from lidar_mi.retrieval.velocimetry.fixed_pattern import fixed_pattern
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.rest import all_at_rest
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.velocimetry.windows import Windows
-from tests.support.flows import axes, data_array, origin, plane_waves, texture
-
-DT = 0.1
-COLUMNS, ROWS = 96, 80
+from tests.support.crosswind import DT, crosswind_pair
+from tests.support.flows import axes, data_array
 
 
 def slow(*values):
     return pytest.param(*values, marks=pytest.mark.slow)
 
 
-def pair(seed, length=3.5, noise=0.03, mean=(8.0, -6.0)):
-    """Images (arrays) of two vortices in a crosswind, and v at the pixels."""
-    y, z = axes(COLUMNS, ROWS)
-    grid = np.meshgrid(y, z)
-    vortices = vortex_pair(200.0, 40.0, 3.0)
-
-    def wind(y, z):
-        return [part + more for part, more in zip(velocity(vortices, y, z), mean, strict=True)]
-
-    waves, random = plane_waves(seed, length, 0.5), np.random.default_rng(seed)
-    return [
-        texture(waves, *place) + noise * random.standard_normal((ROWS, COLUMNS))
-        for place in (grid, origin(wind, *grid, DT))
-    ], wind(*grid)[0]
+COLUMNS, ROWS = 96, 80
+pair = partial(crosswind_pair, size=(COLUMNS, ROWS), mean=(8.0, -6.0))
 
 
 def gains(seed, kind, size):
@@ -105,7 +92,7 @@ def test_rate_of_false_alarms(length):
 @pytest.mark.parametrize(("length", "noise"), [slow(1.8, 0.0), (2.6, 0.05), slow(5.0, 0.01)])
 def test_clean_images_have_no_pattern(length, noise):
     for seed, mean in ((171, (8.0, -6.0)), (172, (0.0, 0.0)), (173, (0.0, 12.0))):
-        assert not str(pattern(pair(seed, length, noise, mean)[0]))
+        assert not str(pattern(pair(seed, length, noise, mean=mean)[0]))
 
 
 @pytest.mark.parametrize("kind", ["columns", "rows", "pixels"])

@@ -3,38 +3,24 @@
 Wind, textures, seeds and places are none of those that the thresholds were tried on.
 """
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
 
-from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.rest import all_at_rest, saturated
 from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.velocimetry.windows import Windows
-from tests.support.flows import axes, data_array, origin, plane_waves, texture
+from tests.support.crosswind import DT, crosswind_pair
+from tests.support.flows import axes, data_array, plane_waves, texture
 from tests.support.turning import turning_pair
 from tests.support.volumes import shifted
 
-DT = 0.1
 COLUMNS, ROWS = 104, 84
-
-
-def pair(seed, length=3.5, noise=0.03, mean=(-9.0, 5.0), circulation=200.0):
-    """Images (arrays) of two vortices in a crosswind, and v at the pixels."""
-    y, z = axes(COLUMNS, ROWS)
-    grid = np.meshgrid(y, z)
-    vortices = vortex_pair(circulation, 40.0, 3.0)
-
-    def wind(y, z):
-        return [part + more for part, more in zip(velocity(vortices, y, z), mean, strict=True)]
-
-    waves, random = plane_waves(seed, length, 0.5), np.random.default_rng(seed)
-    return [
-        texture(waves, *place) + noise * random.standard_normal((ROWS, COLUMNS))
-        for place in (grid, origin(wind, *grid, DT))
-    ], wind(*grid)[0]
+pair = partial(crosswind_pair, size=(COLUMNS, ROWS), mean=(-9.0, 5.0))
 
 
 def found_at_rest(images):
@@ -64,7 +50,7 @@ def ratio(wind, off, good):
 )
 def test_nothing_is_at_rest_in_moving_air(length, noise):
     for seed, mean in ((61, (-9.0, 5.0)), (62, (3.0, -12.0)), (63, (0.0, 0.0))):
-        images, _ = pair(seed, length, noise, mean, 350.0)
+        images, _ = pair(seed, length, noise, mean=mean, circulation=350.0)
         found = found_at_rest(images)
         assert not bool(found.structure.any()) and not bool(found.saturated.any())
 
