@@ -112,14 +112,19 @@ def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
     """Saturated areas of images or volumes; structure and a fixed pattern at rest of images."""
     piled = torch.stack([saturated(image) for image in images])
     areas = saturated_areas(piled, windows)
-    none = torch.zeros_like(areas)
     if windows.dims > 2:
-        return AtRest(piled, areas, none, FixedPattern(torch.ones(1)))
+        return nothing_at_rest(images)._replace(piled=piled, saturated=areas)
     pair = [_left_out(image, areas) for image in images[:2]]
     pattern = fixed_pattern(pair, windows)
     pair = pattern.removed(pair)
     structure, d = at_rest(*pair, windows)
     return AtRest(piled, areas, structure & ~areas, pattern.with_pixels(pair, d))
+
+
+def nothing_at_rest(images: Sequence[torch.Tensor]) -> AtRest:
+    """Images or volumes that are known to hold nothing of the kind."""
+    none = torch.zeros_like(images[0], dtype=torch.bool)
+    return AtRest(torch.stack([none] * len(images)), none, none, FixedPattern(torch.ones(1)))
 
 
 def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
@@ -168,11 +173,14 @@ def at_rest(
     if not bool(candidates.any()):
         return candidates, d
     found = torch.zeros_like(candidates)
-    for spot, size in zip(spots, _SIZES, strict=True):
-        found |= _grown(spot.alike & spot.apart(d) & spot.still(size), size)
     # without texture around, vectors scatter over the search region
     speed = d.norm(dim=0)
-    return _grown(found & (speed >= _SLOWEST) & (scatter < speed), 3), d
+    known = (speed >= _SLOWEST) & (scatter < speed)
+    for spot, size in zip(spots, _SIZES, strict=True):
+        apart = _grown(spot.alike & spot.apart(d), size) & known
+        if bool(apart.any()):
+            found |= _grown(spot.alike & spot.apart(d) & spot.still(size), size)
+    return _grown(found & known, 3), d
 
 
 class _Spots(NamedTuple):

@@ -20,7 +20,7 @@ from lidar_mi.retrieval.velocimetry.outliers import (
 )
 from lidar_mi.retrieval.velocimetry.quality import Flag, filled, low_texture, non_finite, uncertain
 from lidar_mi.retrieval.velocimetry.relation import unrelated
-from lidar_mi.retrieval.velocimetry.rest import all_at_rest
+from lidar_mi.retrieval.velocimetry.rest import all_at_rest, nothing_at_rest
 from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
@@ -46,6 +46,7 @@ def retrieve_wind(
     median_threshold: float = MEDIAN_THRESHOLD,
     median_epsilon: float = MEDIAN_EPSILON,
     settings: MultipassSettings | VariationalSettings | None = None,
+    checks: bool = True,
 ) -> xr.Dataset:
     """Wind in the image plane from two images of the same air, dt apart.
 
@@ -86,6 +87,10 @@ def retrieve_wind(
         template apart (or a stride, if that is more): closer ones share their pixels.
     settings : MultipassSettings or VariationalSettings, optional
         Of the method of that name, see `settings`. Left out: its defaults.
+    checks : bool
+        Look for saturated areas, structure at rest, gains of columns and rows, and images of
+        unrelated air. False, for images known to be free of them: faster by a third of the time of
+        "variational", and none of this is removed or flagged.
 
     Returns
     -------
@@ -152,7 +157,7 @@ def retrieve_wind(
     }
     with threads_for(image1.size):
         whole = [pixels1, pixels2, *rest]
-        resting = all_at_rest(whole, windows)
+        resting = all_at_rest(whole, windows) if checks else nothing_at_rest(whole)
         # a correlation of windows would lose all that see a pixel that is left out
         remedy = resting.left_out if chosen.centred else resting.pattern.removed
         first, second, *offered["more"] = remedy(whole)
@@ -168,7 +173,7 @@ def retrieve_wind(
             flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
         if chosen.local:
             flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
-        if chosen.reach:
+        if chosen.reach and checks:
             apart = unrelated([pixels1, pixels2], windows, chosen.reach > 1, noise)
             # a field fitted as a whole is flagged only if the images are unrelated everywhere
             apart = apart if chosen.local else apart.all().expand_as(apart)

@@ -8,6 +8,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
+import xarray as xr
 
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.rest import all_at_rest, saturated
@@ -27,9 +28,9 @@ def found_at_rest(images):
     return all_at_rest([torch.as_tensor(i) for i in images], Windows((ROWS, COLUMNS), 8, 16, 1))
 
 
-def retrieved(images, method):
+def retrieved(images, method, **options):
     y, z = axes(COLUMNS, ROWS)
-    return retrieve_wind(*(data_array(i, y, z) for i in images), DT, method, stride=2)
+    return retrieve_wind(*(data_array(i, y, z) for i in images), DT, method, stride=2, **options)
 
 
 def errors(wind, v):
@@ -61,6 +62,22 @@ def test_dense_particles_are_not_at_rest(seed):
     images = [torch.as_tensor(image.values) for image in turning_pair("particles", seed)]
     found = all_at_rest(images, Windows(tuple(images[0].shape), 16, 32, 4))
     assert not found.structure.any() and not found.saturated.any() and not str(found.pattern)
+
+
+def test_images_known_to_be_good_need_no_checks():
+    images, _ = pair(64)
+    wind = retrieved(images, "multipass")
+    xr.testing.assert_identical(wind, retrieved(images, "multipass", checks=False))
+    spoiled = [image.copy() for image in images]
+    for image in spoiled:
+        image[30:52, 22:47] = 10.0
+    checked, blind = (retrieved(spoiled, "multipass", checks=c) for c in (True, False))
+    assert (checked.flag & Flag.SATURATED.value).any()
+    assert not (blind.flag & Flag.SATURATED.value).any()
+    unrelated = images[0], pair(65)[0][1]
+    checked, blind = (retrieved(unrelated, "multipass", checks=c) for c in (True, False))
+    assert (checked.flag & Flag.UNRELATED.value).any()
+    assert not (blind.flag & Flag.UNRELATED.value).any()
 
 
 @pytest.mark.parametrize(
