@@ -27,7 +27,7 @@ INTRODUCTION = (
 )
 
 SCENES = Path(str(files("lidar_mi.scenes")))
-METHODS = ("variational", "vortex_fit")
+METHODS = ("variational", "vortex_fit", "multipass", "cc")
 """Methods that state standard errors."""
 TOLERANCE = {"coverage_68": 0.05, "coverage_95": 0.05}
 EXPECTED = {"coverage_68": 0.683, "coverage_95": 0.950}

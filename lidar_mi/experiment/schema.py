@@ -274,7 +274,7 @@ class Experiment(Tabular, Section):
                 f"sensor.method: {method!r} is not allowed; expected one of retrieval.methods, "
                 f"{', '.join(self.retrieval.methods)}"
             )
-        if method in (ImageMethod.CC, ImageMethod.WS) and self.sensor.crossflow_std is None:
+        if method == ImageMethod.WS and self.sensor.crossflow_std is None:
             raise ValueError(
                 f"sensor.crossflow_std: missing; expected a speed, as method {method} gives no "
                 "standard errors"

@@ -31,6 +31,9 @@ class Method:
     reach : int
         Range of its first displacements over that of its windows. 0: the method checks by itself
         whether the images are related.
+    repeats : int
+        Retrievals of a known motion that the standard errors are from (`bootstrap`). 0: the method
+        states its errors by itself, or not at all.
     """
 
     find: Callable[..., Displacement]
@@ -39,6 +42,7 @@ class Method:
     centred: bool = False
     local: bool = True
     reach: int = 1
+    repeats: int = 0
 
 
 METHODS: Mapping[str, Method] = {
@@ -46,6 +50,7 @@ METHODS: Mapping[str, Method] = {
         cross_correlation,
         ("correlation", "normalised cross-correlation at the peak"),
         ("min_correlation",),
+        repeats=2,
     ),
     "ws": Method(
         weight_shift, ("mismatch", "misfit of weight and centre of mass over their spread")
@@ -56,6 +61,7 @@ METHODS: Mapping[str, Method] = {
         ("min_correlation", "noise", "settings"),
         centred=True,
         reach=2,
+        repeats=1,
     ),
     "variational": Method(
         variational,

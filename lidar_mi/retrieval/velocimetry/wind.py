@@ -1,6 +1,7 @@
 """From two images to the wind: one call, CF data set out."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
+from lidar_mi.retrieval.velocimetry.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.velocimetry.bound import displacement_bound
 from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.velocimetry.methods import METHODS
@@ -97,7 +99,7 @@ def retrieve_wind(
     xr.Dataset, dims (z, y)
         At the template centres (an even template's lies between pixels): `v`, `w` (m s-1),
         `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
-        their correlation (NaN from methods that give none: "cc", "ws"), `displacement_y`,
+        their correlation ("cc" and "multipass": see `bootstrap`; NaN from "ws"), `displacement_y`,
         `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1), `isotropy`, `flag`
         (bits of `quality.Flag`, 0 = valid; low texture also means a standard error beyond half a
         pixel in some direction). The auxiliary coordinates `y_vector`, `z_vector` are the
@@ -162,13 +164,21 @@ def retrieve_wind(
         remedy = resting.left_out if chosen.centred else resting.pattern.removed
         first, second, *offered["more"] = remedy(whole)
         options = {name: offered[name] for name in chosen.options}
-        found = chosen.find(first, second, template, search, stride, **options)
+        find = partial(chosen.find, template=template, search=search, stride=stride, **options)
+        found = find(first, second)
         level = 0.0 if noise is None else noise
         pixels1, pixels2 = resting.pattern.removed(whole[:2])
         texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
         flag = resting.flags(found, whole, windows, chosen.centred)
+        if chosen.repeats:
+            covariance = bootstrap_covariance(
+                [first, second], found, windows, find, chosen.centred, chosen.repeats
+            )
+            if found.covariance is not None:
+                flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+            found = found._replace(covariance=covariance)
         if found.covariance is not None:
             flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
         if chosen.local:

@@ -1,0 +1,130 @@
+"""Standard errors of windows against errors on images of exactly known motion.
+
+Detects, in the default run, standard errors of "cc" and "multipass" that are wrong by 20 %; slow,
+coverage that is off by more than 5 points in any case where the air is seen by its texture.
+"""
+
+import numpy as np
+import pytest
+import torch
+
+from lidar_mi.retrieval.velocimetry.bootstrap import bootstrap_covariance
+from lidar_mi.retrieval.velocimetry.methods import METHODS
+from lidar_mi.retrieval.velocimetry.quality import Flag
+from lidar_mi.retrieval.velocimetry.weight_shift import weight_shift
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.velocimetry.windows import Windows
+from tests.support.flows import axes, data_array, plane_waves, texture
+from validation.coverage import measured
+
+DT = 0.1
+
+
+def uniform(noise, seed, rows=100, columns=120):
+    """A texture of 3 m in a wind of (4, -3) m/s, with white noise."""
+    y, z = axes(columns, rows)
+    grid = np.meshgrid(y, z)
+    random = np.random.default_rng(seed)
+    waves = plane_waves(seed, 3.0, 0.5)
+    images = texture(waves, *grid), texture(waves, grid[0] - 4 * DT, grid[1] + 3 * DT)
+    return [data_array(i + noise * random.standard_normal(i.shape), y, z) for i in images]
+
+
+@pytest.mark.parametrize("method", ["cc", "multipass"])
+def test_standard_errors_in_a_uniform_wind(method):
+    """Rms error over rms standard error: 1 within 25 %, at 2 % and at 8 % noise.
+
+    Some 200 templates that do not overlap and as many errors of the known motion: each rms is
+    uncertain by 1 / sqrt(2 x 400) = 4 %, less what neighbours share; 25 % is 4 sigma of both.
+    """
+    for noise in (0.02, 0.08):
+        wind = retrieve_wind(*uniform(noise, 5), DT, method, stride=4)
+        valid = wind["flag"] == 0
+        assert valid.mean() > 0.8
+        error = np.stack([(wind["v"] - 4).where(valid), (wind["w"] + 3).where(valid)])
+        stated = np.stack([wind[f"{name}_stderr"].where(valid) for name in "vw"])
+        ratio = np.sqrt(np.nanmean(error**2) / np.nanmean(stated**2))
+        assert ratio == pytest.approx(1, abs=0.25)
+
+
+@pytest.mark.parametrize(
+    ("method", "case"),
+    [("cc", "5 % of the texture replaced"), ("multipass", "10 % of the texture replaced")],
+)
+def test_standard_errors_cover_the_errors_of_air_that_changes(method, case):
+    """Errors of white noise alone would be half of what they are here."""
+    found = measured(case, method, [61])
+    for (value, error), expected in ((found.coverage_68, 0.683), (found.coverage_95, 0.950)):
+        assert abs(value - expected) < 0.05 + 3 * error
+    assert 0.8 - 3 * found.variance[1] < found.variance[0] < 1.25 + 3 * found.variance[1]
+
+
+@pytest.mark.parametrize("method", ["cc", "multipass"])
+def test_displacements_are_those_of_the_method(method):
+    """Errors are added; no vector changes by a bit."""
+    pair = uniform(0.05, 6, 60, 70)
+    first, second = (torch.as_tensor(image.values) for image in pair)
+    alone = METHODS[method].find(first, second, 8, 16, 2)
+    wind = retrieve_wind(*pair, DT, method, stride=2)
+    for part, name in zip(alone.d, "zy", strict=True):
+        np.testing.assert_array_equal(
+            wind[f"displacement_{name}"], (part.numpy() * 0.5).astype(np.float32)
+        )
+
+
+def test_weight_shift_states_no_errors():
+    wind = retrieve_wind(*uniform(0.0, 7, 60, 70), DT, "ws", stride=2)
+    assert np.isnan(wind["v_stderr"]).all() and (wind["flag"] == 0).any()
+
+
+@pytest.mark.parametrize("method", ["cc", "multipass"])
+@pytest.mark.parametrize(("rows", "columns"), [(16, 16), (16, 40), (24, 24)])
+def test_few_windows(method, rows, columns):
+    """A vector has a standard error or a flag."""
+    wind = retrieve_wind(*uniform(0.02, 8, rows, columns), DT, method, stride=8)
+    assert ((wind["flag"] != 0) | (wind["v_stderr"] > 0)).all()
+
+
+def test_pixels_that_are_not_finite_take_part_in_nothing():
+    """Standard errors far from a hole are those without it; near it there is no vector."""
+    first, second = uniform(0.03, 9)
+    whole = retrieve_wind(first, second, DT, stride=4)
+    second = second.copy()
+    second[40:44, 50:54] = np.nan
+    holed = retrieve_wind(first, second, DT, stride=4)
+    hole = (holed["flag"] & Flag.NON_FINITE_INPUT.value) != 0
+    assert hole.any() and np.isnan(holed["v_stderr"]).where(hole, True).all()
+    ratio = (holed["v_stderr"] / whole["v_stderr"]).where(holed["flag"] == 0)
+    assert 0.5 < ratio.min() and ratio.max() < 2 and abs(ratio.median() - 1) < 0.05
+
+
+def test_nothing_valid_means_that_errors_are_not_known():
+    first, second = torch.rand(2, 40, 40, generator=torch.Generator().manual_seed(1))
+    windows = Windows((40, 40), 8, 16, 4)
+    found = weight_shift(first, second, 8, 16, 4)
+
+    def nothing(*images):
+        flag = torch.full_like(found.flag, Flag.NO_MATCH.value)
+        return found._replace(d=torch.full_like(found.d, torch.nan), flag=flag)
+
+    covariance = bootstrap_covariance([first, second], found, windows, nothing, False)
+    assert covariance.shape == (2, 2, *windows.count) and bool(covariance.isnan().all())
+
+
+SEEN = [
+    "advected, texture 5 %",
+    "advected, texture 10 %",
+    "true second state, texture 10 %",
+    "0 % of the texture replaced",
+    "30 % of the texture replaced",
+    "gain of 5 %",
+    "noise of 1 to 10 %, map not given",
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SEEN)
+def test_standard_errors_of_cross_correlation_in_all_cases(case):
+    found = measured(case, "cc", [61, 62, 63])
+    for (value, error), expected in ((found.coverage_68, 0.683), (found.coverage_95, 0.950)):
+        assert abs(value - expected) < 0.05 + 3 * error
