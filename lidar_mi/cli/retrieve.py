@@ -84,6 +84,8 @@ def retrieve(
         _print_vortices(wind)
     if "fixed_pattern" in wind.attrs:
         output.print(f"warning: {wind.attrs['fixed_pattern']} in all images")
+    if "illumination" in wind.attrs:
+        output.print(f"warning: {wind.attrs['illumination']} between the images")
     output.print(f"{wind.sizes['y']} x {wind.sizes['z']} vectors, {valid:.1%} valid")
     output.print(f"winds    {out}")
 

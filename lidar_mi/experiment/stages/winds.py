@@ -73,6 +73,8 @@ def cross_flow_winds(
             )
             if "fixed_pattern" in wind.attrs and not methods:
                 log.remark(f"{source}: {wind.attrs['fixed_pattern']} in all images")
+            if "illumination" in wind.attrs and not methods:
+                log.remark(f"{source}: {wind.attrs['illumination']} between the images")
             wind = wind.assign(
                 {name: (field.dims, field.data, field.attrs) for name, field in bound.items()}
             )

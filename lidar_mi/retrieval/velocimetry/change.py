@@ -26,9 +26,12 @@ _ROUNDS = 30
 def displaced(spline: Spline, stack: torch.Tensor, noise: float) -> torch.Tensor:
     """Spectral density, by shells, of differences made by 1 px of displacement across the plane.
 
-    Structure of spectral density S(k) that is isotropic in space changes by the displacement times
-    its gradient across the plane, of density k^2 S / 2. As in `warping.mismatch`, the density is
-    half that of the difference of two images. 0 where the images hold no structure.
+    Structure changes by the displacement times its gradient across the plane. If it is isotropic
+    in space, its spectral density T gives that of a slice, S(k) = integral T(|(k, q)|) dq, and
+    that of the gradient, F(k) = integral q^2 T(|(k, q)|) dq, over the wavenumbers q across the
+    plane. Then dF/dk = -k S, so that F(k) is the integral of k' S(k') from k on. It holds more in
+    long waves than the gradients in the plane do. As in `warping.mismatch`, the density is half
+    that of the difference of two images. Only structure that stands out of the noise counts.
 
     Parameters
     ----------
@@ -51,7 +54,8 @@ def displaced(spline: Spline, stack: torch.Tensor, noise: float) -> torch.Tensor
     density, uncertainty = shell_means(stack, shell, sizes, settings.smoothing, known)
     wave = wavenumbers(density, spline.shape)
     structure = density > noise**2 * (1 + settings.threshold * uncertainty)
-    return torch.where(structure, wave.square() / 4 * (density - noise**2), 0.0)
+    held = torch.where(structure, wave * (density - noise**2), 0.0)
+    return held.flip(0).cumsum(0).flip(0) * (wave[1] - wave[0]) / 2
 
 
 def unexplained(

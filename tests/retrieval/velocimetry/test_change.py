@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from lidar_mi.retrieval.velocimetry.band_limit import wavenumbers
 from lidar_mi.retrieval.velocimetry.change import displaced, unexplained
 from lidar_mi.retrieval.velocimetry.quality import no_skill
 from lidar_mi.retrieval.velocimetry.warping import band_limited, mismatch
@@ -46,6 +47,28 @@ def test_displacement_across_the_plane_is_recovered(through):
     assert np.mean([found(slices(through, seed)) for seed in range(2)]) == pytest.approx(
         through, rel=0.15
     )
+
+
+def test_gradient_across_a_slice_of_gaussian_structure():
+    """T = exp(-(k^2 + q^2) / 2 s^2): that gradient's density is s^2 S(k), so half of it s^2 S / 2.
+
+    In long waves it is far above k^2 S / 4, which the gradients in the plane would suggest. Noise
+    is so low that all of the spectrum counts.
+    """
+    random = np.random.default_rng(3)
+    s = 0.4
+    z, y = 2 * np.pi * np.fft.fftfreq(256)[:, None], 2 * np.pi * np.fft.rfftfreq(320)
+    wave = np.exp(-(z**2 + y**2) / (4 * s**2))
+    images = [
+        np.fft.irfft2(wave * np.fft.rfft2(random.standard_normal((256, 320)))) for _ in range(4)
+    ]
+    stack = torch.tensor(np.stack(images))
+    spline, _ = band_limited(stack, 1e-9)
+    k = wavenumbers(spline.gain, spline.shape).numpy()
+    expected = s**2 / 2 * np.exp(-(k**2) / (2 * s**2))
+    ratio = displaced(spline, stack, 1e-9).numpy() / expected
+    # a cumulative sum over many waves; tapering blurs a shell into its neighbours
+    assert ratio[(k > 0.05) & (k < 2 * s)] == pytest.approx(1, abs=0.1)
 
 
 def test_noise_is_no_change():
