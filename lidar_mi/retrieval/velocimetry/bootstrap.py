@@ -9,6 +9,7 @@ retrieved wind plus the residual of the given pair.
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from torch.nn.functional import grid_sample
@@ -45,7 +46,7 @@ def bootstrap_covariance(
     images: Sequence[torch.Tensor],
     found: Displacement,
     windows: Windows,
-    retrieve: Callable[[torch.Tensor, torch.Tensor], Displacement],
+    retrieve: Callable[..., Displacement],
     centred: bool,
     repeats: int = 1,
 ) -> torch.Tensor:
@@ -86,7 +87,7 @@ def bootstrap_covariance(
         Retrieved from them.
     windows : Windows
     retrieve : callable
-        (image1, image2) -> Displacement, the method with its options.
+        (image1, image2, stride=...) -> Displacement, the method with its options.
     centred : bool
         Vectors belong to the windows' centres, not half their displacement further on.
     repeats : int
@@ -97,18 +98,21 @@ def bootstrap_covariance(
     torch.Tensor, shape (2, 2, *windows.count)
         px^2; NaN if no vector of the known motion is valid.
     """
-    d = working(found.d)
-    per_template = windows.template / windows.stride
+    # vectors of windows that overlap by more than half would cost more and tell little
+    every = max(1, windows.template // 2 // windows.stride)
+    coarse = replace(windows, stride=every * windows.stride)
+    d = working(found.d)[:, ::every, ::every]
+    per_template = windows.template / coarse.stride
     flow, _ = validated(d, max(1, round(per_template / 2)))
     window = per_template / math.sqrt(12)
     everywhere = torch.ones_like(flow[0], dtype=torch.bool)
-    shear = averaged(_squared_gradient(flow) / windows.stride**2, everywhere, _SHEAR * per_template)
+    shear = averaged(_squared_gradient(flow) / coarse.stride**2, everywhere, _SHEAR * per_template)
     lost = flow
     for _ in range(_SHARPENINGS):
         lost = lost - torch.stack([averaged(part, everywhere, window) for part in lost])
         flow = flow + lost
 
-    wind = _at_mid_time(flow, windows, centred)
+    wind = _at_mid_time(flow, coarse, centred)
     first, second = normalised(images)
     carried = _carried(filled(first), wind)
     rest = torch.where(second.isfinite(), second - carried, 0.0)
@@ -119,17 +123,21 @@ def bootstrap_covariance(
     for apart in _APART[:repeats]:
         moved = (rest / level).roll([windows.template * part for part in apart], (0, 1))
         moved = torch.where(second.isfinite(), level * moved, torch.nan)
-        again = retrieve(first, carried + moved)
+        again = retrieve(first, carried + moved, stride=coarse.stride)
         outlier = median_outliers(again.d, 3, max(1, round(per_template / 2)))
         use = (again.flag == 0) & ~outlier
         if not bool(use.any()):
             continue
-        error = again.d - _read(wind, _places(again.d, windows, centred))
+        error = again.d - _read(wind, _places(again.d, coarse, centred))
         products = torch.einsum("i...,j...->ij...", error, error).flatten(0, 1) / scale
         means += [torch.stack([averaged(p, use, _REGION * per_template) for p in products])]
     if not means:
-        return torch.full_like(d[None].expand(2, -1, -1, -1), torch.nan)
-    covariance = (torch.stack(means).mean(0) * scale).unflatten(0, (2, 2))
+        return torch.full_like(found.d[None].expand(2, -1, -1, -1), torch.nan)
+    weights = [
+        linear_weights(*(frame.centres(axis).to(d) for frame in (coarse, windows)))
+        for axis in (0, 1)
+    ]
+    covariance = separable(torch.stack(means).mean(0) * scale, weights).unflatten(0, (2, 2))
     return covariance + _LEAST**2 * torch.eye(2).to(d)[:, :, None, None]
 
 

@@ -167,8 +167,8 @@ def retrieve_wind(
         remedy = resting.left_out if chosen.centred else resting.pattern.removed
         first, second, *offered["more"] = _of_one_light(remedy(whole), light)
         options = {name: offered[name] for name in chosen.options}
-        find = partial(chosen.find, template=template, search=search, stride=stride, **options)
-        found = find(first, second)
+        find = partial(chosen.find, template=template, search=search, **options)
+        found = find(first, second, stride=stride)
         level = 0.0 if noise is None else noise
         pixels1, pixels2 = _of_one_light(resting.pattern.removed(whole[:2]), light)
         texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)

@@ -103,7 +103,7 @@ def test_nothing_valid_means_that_errors_are_not_known():
     windows = Windows((40, 40), 8, 16, 4)
     found = weight_shift(first, second, 8, 16, 4)
 
-    def nothing(*images):
+    def nothing(*images, stride):
         flag = torch.full_like(found.flag, Flag.NO_MATCH.value)
         return found._replace(d=torch.full_like(found.d, torch.nan), flag=flag)
 
