@@ -3,13 +3,19 @@
 import numpy as np
 import torch
 
-from lidar_mi.retrieval.vortices.model_error import ModelError, model_error, spread_of
+from lidar_mi.retrieval.vortices.model_error import ModelError, model_error, of_change, spread_of
 from lidar_mi.retrieval.vortices.robust_fit import Solution
 
 
-def model_error_of(found: Solution, shortest: float) -> ModelError:
-    """Departure of the flow from the model, from the residuals of a fit; see `model_error`."""
+def model_error_of(found: Solution, shortest: float, *, changes: bool = False) -> ModelError:
+    """Departure of the flow from the model, from the residuals of a fit; see `model_error`.
+
+    With `changes`, residuals (z, y) may correlate for another reason, see `of_change`.
+    """
     misfit = found.misfit
+    change = (
+        of_change(misfit.residual, found.weight * misfit.slope, misfit.valid) if changes else None
+    )
     residual, slope, weight = misfit.residual, misfit.slope, found.weight
     if residual.ndim == 2:
         residual, slope, weight = residual[None], slope[:, None], weight[None]
@@ -17,7 +23,7 @@ def model_error_of(found: Solution, shortest: float) -> ModelError:
     stiffness = torch.stack(
         [(weight * slope[a] * slope[b]).sum(0) for a, b in ((0, 0), (0, 1), (1, 1))]
     )
-    return model_error(force, stiffness, shortest)
+    return model_error(force, stiffness, shortest, change)
 
 
 def parameter_covariance(found: Solution, error: ModelError, excess: float) -> np.ndarray:
@@ -33,7 +39,7 @@ def parameter_covariance(found: Solution, error: ModelError, excess: float) -> n
     inverse = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
     inverse = inverse / scale / scale[:, None]
     covariance = (inverse @ spread @ inverse)[:10, :10]
-    attenuation = _attenuation(found)
+    attenuation = _attenuation(found, error)
     covariance = covariance + torch.outer(attenuation, attenuation)
     if not found.converged:
         left = _remaining_step(found)
@@ -51,13 +57,7 @@ def _noise_spread(found: Solution, error: ModelError) -> torch.Tensor:
     columns = misfit.jacobian.flatten(1)
     moved = error.variance * misfit.slope.square().sum(0)
     ratio = (misfit.residual.square() / (misfit.scatter + moved)).where(misfit.valid, 0.0)
-    stated, observed = (
-        (columns * (weight**2 * part).flatten()) @ columns.T
-        for part in (misfit.variance, misfit.variance * ratio)
-    )
-    scale = found.normal.diagonal()
-    excess = float((observed.diagonal() / scale).sum() / (stated.diagonal() / scale).sum())
-    return observed if excess > 1 else stated
+    return (columns * (weight**2 * misfit.variance * ratio).flatten()) @ columns.T
 
 
 def _remaining_step(found: Solution) -> torch.Tensor:
@@ -75,7 +75,7 @@ def far_from_minimum(found: Solution, covariance: np.ndarray) -> bool:
     return not (left < np.diagonal(covariance) - left).all()
 
 
-def _attenuation(found: Solution) -> torch.Tensor:
+def _attenuation(found: Solution, error: ModelError) -> torch.Tensor:
     """Possible bias of the circulations towards zero, as an error of all parameters (10,).
 
     Structure that has been wound up for long is aligned with the flow: the images change little,
@@ -85,9 +85,9 @@ def _attenuation(found: Solution) -> torch.Tensor:
     """
     misfit, theta = found.misfit, found.parameters
     explained = theta[0] * misfit.jacobian[0] + theta[4] * misfit.jacobian[4]
-    left = float((found.weight * (misfit.residual.square() - misfit.scatter))[misfit.valid].sum())
+    left = error.variance * float((found.weight * misfit.slope.square().sum(0))[misfit.valid].sum())
     power = float((found.weight * explained.square())[misfit.valid].sum())
-    fraction = max(0.0, left / power) if power > 0 else 0.0
+    fraction = left / power if power > 0 else 0.0
     attenuation = torch.zeros_like(theta[:10])
     attenuation[0], attenuation[4] = fraction * theta[0], fraction * theta[4]
     return attenuation

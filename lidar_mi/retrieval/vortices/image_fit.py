@@ -4,20 +4,16 @@ No wind vectors are needed in between: the whole image informs the ten parameter
 works where the texture is too weak for any local method, and elsewhere as well as the noise allows.
 """
 
-from dataclasses import dataclass
-from functools import cached_property
-
 import numpy as np
 import torch
 import xarray as xr
-from kornia.filters import gaussian_blur2d
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.quality import filled
-from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited
+from lidar_mi.retrieval.velocimetry.warping import band_limited
 from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
     TOLERANCE,
@@ -27,85 +23,21 @@ from lidar_mi.retrieval.vortices.acceptance import (
     step_limits,
 )
 from lidar_mi.retrieval.vortices.covariance import model_error_of, parameter_covariance
-from lidar_mi.retrieval.vortices.model import Profile, advected, drift, path_sensitivity
+from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder
+from lidar_mi.retrieval.vortices.model import Profile
 from lidar_mi.retrieval.vortices.model_error import mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
-from lidar_mi.retrieval.vortices.robust_fit import Misfit, fit
-from lidar_mi.retrieval.vortices.search import Observations, starting_points
+from lidar_mi.retrieval.vortices.robust_fit import fit, without_step
+from lidar_mi.retrieval.vortices.search import starting_points
 
 # Coarse to fine: standard deviation of the blur and step between the pixels used, px.
 _LEVELS = ((3.0, 4), (1.5, 2), (0.0, 1))
-# Interpolation error of a cubic spline over an image's rms structure.
-_INTERPOLATION = 1e-4
 # Model error assumed at first (px); later it is estimated.
 _FIRST_MODEL_ERROR = 0.1
+# Fraction of the images' difference that may be change, for the search.
+_CHANGE = 0.25
 # Lags (px) over which the noise of band-limited images correlates.
 _NOISE_LAGS = 4.0
-
-
-@dataclass(frozen=True)
-class _Images:
-    """The two images of a fit; call with parameters for the misfit.
-
-    Parameters are those of the pair and two more, gain and offset of image 2 over image 1. The
-    unfiltered images are compared, and their difference is filtered: filtering them before would
-    remove another part of texture that the vortices have sheared, which makes cores 1 % too wide.
-    The derivatives are those of the filtered images.
-    """
-
-    spline: Spline
-    whole: Spline
-    y: torch.Tensor
-    z: torch.Tensor
-    first: tuple[float, float]
-    spacing: tuple[float, float]
-    bad: torch.Tensor
-    variance: torch.Tensor
-    scatter: torch.Tensor
-    dt: float
-    profile: Profile
-    frozen: bool
-
-    def __call__(self, parameters: torch.Tensor) -> Misfit:
-        theta, gain, offset = parameters[:10], parameters[10], parameters[11]
-        half = self.dt / 2
-        moving = torch.zeros_like(theta[:2]) if self.frozen else drift(theta, self.profile)
-        # the flow is steady in the frame that moves with the pair
-        steady = torch.cat([theta[:8], theta[8:] - moving])
-        middle, place = zip(
-            *(advected(steady, self.y, self.z, time, self.profile) for time in (-half, half)),
-            strict=True,
-        )
-        shift = moving[:, None, None] * half
-        place = [place[0] - shift, place[1] + shift]
-        columns, rows = (
-            (torch.stack([p[axis] for p in place]) - self.first[axis]) / self.spacing[axis]
-            for axis in (0, 1)
-        )
-        value, slope_z, slope_y = self.spline.sample(rows, columns)
-        valid = self.spline.holds(rows, columns).all(0)
-        if bool(self.bad.any()):
-            nearest = [
-                p.round().long().clamp(0, n - 1)
-                for p, n in zip((rows, columns), self.bad.shape, strict=True)
-            ]
-            valid &= ~self.bad[nearest[0], nearest[1]].any(0)
-        slope = torch.stack([slope_y / self.spacing[0], slope_z / self.spacing[1]], 1)
-        slope[0] *= gain
-        jacobian = value.new_empty(12, *valid.shape)
-        torch.sub(
-            path_sensitivity(steady, middle[1], slope[1], half, self.profile),
-            path_sensitivity(steady, middle[0], slope[0], -half, self.profile),
-            out=jacobian[:10],
-        )
-        jacobian[8:10] = half * (slope[0] + slope[1])
-        jacobian[10], jacobian[11] = -value[0], -1
-        if self.whole is not self.spline:
-            value, _, _ = self.whole.sample(rows, columns)
-        residual = valid * (value[1] - gain * value[0] - offset)
-        if self.whole is not self.spline:
-            residual = self.spline.filtered(residual)
-        return Misfit(residual, jacobian, slope.mean(0), valid, self.variance, self.scatter)
 
 
 @checked_arguments
@@ -216,32 +148,44 @@ def fit_pixels(
     if level is not None:
         level /= float(contrast)
     bad = torch.nn.functional.max_pool2d((~finite)[None].double(), 5, 1, 2)[0] > 0
-    make = _Builder(pair, bad, z, y, dt, level, noise, float(contrast), profile, frozen)
+    given = noise if isinstance(noise, torch.Tensor) else None
+    make = Builder(pair, bad, z, y, dt, level, given, float(contrast), profile, frozen)
     spacing = (make.spacing[0] * make.spacing[1]) ** 0.5
     limits = step_limits(y, z, profile, dt)
 
     best = None
-    level_images = make(*_LEVELS[0])
-    for start in starting_points(_differences(level_images), STARTS, profile):
-        parameters = torch.cat([start, start.new_tensor([1.0, 0.0])])
-        found = fit(level_images, parameters, limits, spacing**2, 12, TOLERANCE)
+    images = make(*_LEVELS[0])
+    images = images.at_least(_CHANGE * float(images.differences().value.var()))
+    for start in starting_points(images.differences(), STARTS, profile):
+        parameters = torch.cat([start, start.new_tensor(SAME_BRIGHTNESS)])
+        found = fit(images, parameters, limits, spacing**2, 12, TOLERANCE)
         if best is None or found.cost < best.cost:
             best = found
     if best is None:
         return no_fit(profile, "no vortex signature")
     variance = (_FIRST_MODEL_ERROR * spacing) ** 2
     for blur, step in _LEVELS[1:]:
-        level_images = make(blur, step)
-        best = fit(level_images, best.parameters, limits, variance, 12, TOLERANCE)
+        white = make(blur, step)
+        # weights from what the parameters so far would leave: with those of the noise alone, air
+        # that changes gives a sum of squares with many minima
+        misfit = white(best.parameters)
+        left = without_step(misfit, variance)[misfit.valid].square().mean()
+        images = white.at_least(float(left))
+        best = fit(images, best.parameters, limits, variance, 12, TOLERANCE)
+        variance = 0.0
     for _ in range(2):
-        error = model_error_of(best, _NOISE_LAGS)
-        best = fit(level_images, best.parameters, limits, error.variance, 10, TOLERANCE)
-    error = model_error_of(best, _NOISE_LAGS)
-    covariance = parameter_covariance(best, error, level_images.spline.excess)
-    misfit, valid = best.misfit, best.misfit.valid
+        error = model_error_of(best, _NOISE_LAGS, changes=True)
+        images = make.with_change(white, images, best.misfit, error.variance)
+        if not images.whitening.passed > 0:
+            return no_fit(profile, "the images have no structure in common")
+        best = fit(images, best.parameters, limits, error.variance, 10, TOLERANCE)
+    error = model_error_of(best, _NOISE_LAGS, changes=True)
+    covariance = parameter_covariance(best, error, images.whitening.excess)
+    misfit = white(best.parameters)
+    valid = misfit.valid
     # image 1 at its places, and image 2 at its own: the residual with image 1 added
     first = -misfit.jacobian[10]
-    second = misfit.residual + best.parameters[10] * first
+    second = misfit.residual + first
     match = float(torch.corrcoef(torch.stack([first[valid], second[valid]]))[0, 1])
     known = make.noise > 0
     chi2 = float((misfit.residual.square() / misfit.scatter)[valid].mean()) if known else np.nan
@@ -282,89 +226,3 @@ def _typical(noise: float | torch.Tensor | None, contrast: torch.Tensor) -> floa
     known = torch.isfinite(noise)
     variance = noise[known].double().square()
     return float(((variance * contrast[known]).sum() / contrast[known].sum()).sqrt())
-
-
-@dataclass(frozen=True)
-class _Builder:
-    """Builds the images of the levels, from coarse to fine."""
-
-    pair: torch.Tensor
-    bad: torch.Tensor
-    z: np.ndarray
-    y: np.ndarray
-    dt: float
-    level: float | None
-    map: float | torch.Tensor | None
-    contrast: float
-    profile: Profile
-    frozen: bool
-
-    @property
-    def spacing(self) -> tuple[float, float]:
-        return tuple(float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (self.y, self.z))
-
-    @cached_property
-    def sharp(self) -> tuple[Spline, float]:
-        return band_limited(self.pair, self.level)
-
-    @cached_property
-    def unfiltered(self) -> Spline:
-        return band_limited(self.pair, 0.0)[0]
-
-    @property
-    def noise(self) -> float:
-        return self.sharp[1]
-
-    def __call__(self, blur: float, step: int) -> _Images:
-        spline, noise = self.sharp
-        passed = spline.passed
-        if blur:
-            size = 2 * int(np.ceil(4 * blur)) + 1
-            size = tuple(min(size, 2 * n - 1) for n in self.pair.shape[1:])
-            soft = gaussian_blur2d(self.pair[None], size, (blur, blur), "replicate")[0]
-            spline, _ = band_limited(soft, 0.0)
-            passed = 1 / (4 * np.pi * blur**2)
-        places = [
-            torch.as_tensor(axis[step // 2 :: step], device=self.pair.device)
-            for axis in (self.z, self.y)
-        ]
-        vertical, lateral = torch.meshgrid(*places, indexing="ij")
-        variance = torch.full_like(lateral, 2 * noise**2)
-        if isinstance(self.map, torch.Tensor):
-            # the filter spreads noise over a few pixels, and with few samples one pixel's estimate
-            # is unreliable
-            known = torch.nn.functional.avg_pool2d(
-                filled(self.map.double())[None].square(), 9, 1, 4, count_include_pad=False
-            )[0]
-            variance = 2 * known[step // 2 :: step, step // 2 :: step] / self.contrast**2
-        floor = 2 * _INTERPOLATION**2
-        whole = spline if blur or noise == 0 else self.unfiltered
-        return _Images(
-            spline,
-            whole,
-            lateral,
-            vertical,
-            (float(self.y[0]), float(self.z[0])),
-            self.spacing,
-            self.bad,
-            variance + floor,
-            passed * variance + floor,
-            self.dt,
-            self.profile,
-            self.frozen,
-        )
-
-
-def _differences(images: _Images) -> Observations:
-    """Observations of the wind in blurred images: I2 - I1 = -dt u . slope."""
-    rows = (images.z - images.first[1]) / images.spacing[1]
-    columns = (images.y - images.first[0]) / images.spacing[0]
-    value, slope_z, slope_y = images.spline.sample(*(torch.stack([p, p]) for p in (rows, columns)))
-    slope = torch.stack([slope_y.mean(0) / images.spacing[0], slope_z.mean(0) / images.spacing[1]])
-    clean = ~images.bad[rows.round().long(), columns.round().long()]
-    strength = slope.square().sum(0)
-    # model error of one pixel everywhere
-    weight = 1 / (images.scatter + strength * images.spacing[0] * images.spacing[1])
-    parts = (images.y, images.z, *slope, value[1] - value[0], weight)
-    y, z, slope_y, slope_z, change, weight = (part[clean] for part in parts)
-    return Observations(y, z, -images.dt * torch.stack([slope_y, slope_z]), change, weight)

@@ -15,6 +15,8 @@ import torch
 from scipy.optimize import nnls
 
 # Lengths L_j in steps of the grid; those up to 1/5 of its shorter side are used.
+# Standard errors by which a departure must exceed what change and noise explain.
+_SIGNIFICANT = 4.0
 _LENGTHS = (3.0, 6.0, 12.0, 24.0, 48.0)
 
 
@@ -102,7 +104,12 @@ class Lags:
         return total
 
 
-def model_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) -> ModelError:
+def model_error(
+    force: torch.Tensor,
+    stiffness: torch.Tensor,
+    shortest: float,
+    change: torch.Tensor | None = None,
+) -> ModelError:
     """The departure from a model that explains the correlation of the residuals of its fit.
 
     With the residual r, its slope g and its weight w, the force is q = w g r and the stiffness
@@ -118,6 +125,8 @@ def model_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) -
         A: yy, yz, zz.
     shortest : float
         Lags below this (steps of the grid) are left out, as noise may correlate over them.
+    change : torch.Tensor, optional
+        Correlation by another cause, by lags, of unknown amplitude; see `of_change`.
     """
     lags = Lags(tuple(force.shape[1:]), force)
     observed = lags.autocorrelation(force, (1.0, 1.0))
@@ -130,6 +139,8 @@ def model_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) -
     if not float(scale) > 0 or not bool(used.any()):
         return ModelError()
     columns = [unit[used] / scale * torch.exp(-(distance[used] ** 2) / (2 * n**2)) for n in lengths]
+    if change is not None:
+        columns.append(change[used] / change.abs().max().clamp(min=1e-300))
     # normalised in both directions: least squares needs numbers near one
     size = float((observed[used] / scale).abs().max())
     if not size > 0:
@@ -137,9 +148,37 @@ def model_error(force: torch.Tensor, stiffness: torch.Tensor, shortest: float) -
     amplitudes, _ = nnls(
         torch.stack(columns, 1).cpu().numpy(), (observed[used] / scale / size).cpu().numpy()
     )
-    variances = amplitudes * size
+    variances = amplitudes[: len(lengths)] * size
+    if change is not None:
+        explained = scale * sum(
+            a * column for a, column in zip(variances, columns[:-1], strict=True)
+        )
+        # of white noise the sum at a lag has the variance of that at lag 0 squared, over pixels
+        noise = observed[distance < shortest].sum() / (force != 0).any(0).sum().sqrt()
+        if not explained.square().sum().sqrt() > _SIGNIFICANT * noise:
+            return ModelError()
     kept = [(float(a), n) for a, n in zip(variances, lengths, strict=True) if a > 0]
     return ModelError(tuple(a for a, _ in kept), tuple(n for _, n in kept))
+
+
+def of_change(residual: torch.Tensor, slope: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Correlation of the force by residuals that do not depend on the slopes, by lags.
+
+    Where air changes, the residuals correlate between neighbours for another reason than flow. Over
+    the lag h they add R(h) sum s(x) . s(x + h) with the residuals' autocorrelation R and the
+    weighted slopes s. Texture without long correlation has next to none of this at large lags.
+
+    Parameters
+    ----------
+    residual : torch.Tensor, shape (z, y)
+    slope : torch.Tensor, shape (2, z, y)
+        Weighted.
+    valid : torch.Tensor of bool, shape (z, y)
+    """
+    lags = Lags(tuple(residual.shape), residual)
+    number = lags.autocorrelation([valid.to(residual)], (1.0,)).clamp(min=1)
+    alike = lags.autocorrelation([valid * residual], (1.0,)) / number
+    return alike * lags.autocorrelation(slope, (1.0, 1.0))
 
 
 def spread_of(responses: torch.Tensor, error: ModelError) -> torch.Tensor:

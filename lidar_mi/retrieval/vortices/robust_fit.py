@@ -57,6 +57,15 @@ def weights(misfit: Misfit, flow_variance: float) -> torch.Tensor:
     return misfit.valid * (_HUBER / size.clamp(min=_HUBER)) / (misfit.variance + moved)
 
 
+def without_step(misfit: Misfit, flow_variance: float) -> torch.Tensor:
+    """The residuals that a linear step to the minimum would leave."""
+    normal, force = _normal(misfit, weights(misfit, flow_variance))
+    step = _step(normal, force, 1e-6)
+    if step is None:
+        return misfit.residual
+    return misfit.residual + torch.tensordot(step, misfit.jacobian, 1)
+
+
 def fit(
     evaluate: Callable[[torch.Tensor], Misfit],
     parameters: torch.Tensor,

@@ -27,6 +27,8 @@ class Observations(NamedTuple):
     value : torch.Tensor
     weight : torch.Tensor
         1 / variance, up to a factor.
+    brightness : torch.Tensor, shape (m, n), optional
+        Changes of the values that are no wind, of unknown amplitudes.
     """
 
     y: torch.Tensor
@@ -34,6 +36,13 @@ class Observations(NamedTuple):
     along: torch.Tensor
     value: torch.Tensor
     weight: torch.Tensor
+    brightness: torch.Tensor | None = None
+
+    @property
+    def everywhere(self) -> torch.Tensor:
+        """Columns (n, 2 + m) of the mean wind and of the brightness."""
+        parts = [self.along] if self.brightness is None else [self.along, self.brightness]
+        return torch.cat(parts).T
 
 
 def starting_points(observed: Observations, count: int, profile: Profile) -> torch.Tensor:
@@ -52,16 +61,16 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
     place = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).flatten(0, 1)
     apart = torch.cdist(place, place)
     root = observed.weight.sqrt()
-    uniform = torch.linalg.qr((observed.along * root).T)[0]
+    uniform = torch.linalg.qr(observed.everywhere * root[:, None])[0]
 
-    def without_mean_wind(values):
+    def without_uniform(values):
         return values - uniform @ (uniform.T @ values)
 
-    value = without_mean_wind(observed.value * root)
+    value = without_uniform(observed.value * root)
     found = []
     for fraction in _RADII:
         radius = fraction * min(sides)
-        columns = without_mean_wind(_swirls(observed, root, place, radius, profile))
+        columns = without_uniform(_swirls(observed, root, place, radius, profile))
         normal, wanted = columns.T @ columns, columns.T @ value
         gain, first, second = _explained(normal, wanted)
         gain = torch.where((first > 0) & (second < 0) & (apart > 3 * radius), gain, 0.0)
@@ -113,5 +122,5 @@ def _peaks(gain, apart, count: int, distance: float):
 def _with_mean_wind(theta, observed: Observations, root, profile: Profile) -> torch.Tensor:
     """The parameters with the mean wind that fits the residual best."""
     left = observed.value - (observed.along * wind(theta, observed.y, observed.z, profile)).sum(0)
-    mean = torch.linalg.lstsq((observed.along * root).T, (left * root)[:, None]).solution[:, 0]
-    return torch.cat([theta[:8], mean])
+    free = torch.linalg.lstsq(observed.everywhere * root[:, None], (left * root)[:, None])
+    return torch.cat([theta[:8], free.solution[:2, 0]])
