@@ -1,24 +1,49 @@
 """Number of threads for an image: one, unless it is large.
 
 A step of a retrieval takes some 0.1 ms on an image of the paper's size. The synchronisation of
-threads then takes longer than their work, the more so on a machine with other load.
+threads then takes longer than their work, the more so on a machine with other load. Parts of a
+large image that do not depend on each other are worked on by one thread each (`mapped`): threads
+that wait for nothing but the last part lose nothing on a busy machine.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TypeVar
 
 import torch
 
 SMALL = 1 << 18
 """Pixels up to which one thread is as fast as two on a quiet machine (`benchmarks threads`)."""
 
+_Part = TypeVar("_Part")
+_Result = TypeVar("_Result")
+_AVAILABLE: ContextVar[int | None] = ContextVar("available", default=None)
+
 
 @contextmanager
 def threads_for(pixels: int) -> Iterator[None]:
     """Work with one thread on so few pixels, with torch's own number on more."""
     before = torch.get_num_threads()
+    available = _AVAILABLE.set(before)
     torch.set_num_threads(1 if pixels <= SMALL else before)
     try:
         yield
+    finally:
+        torch.set_num_threads(before)
+        _AVAILABLE.reset(available)
+
+
+def mapped(function: Callable[[_Part], _Result], parts: Iterable[_Part]) -> list[_Result]:
+    """The function of every part, each computed by one of as many threads as torch was given."""
+    parts = list(parts)
+    before = torch.get_num_threads()
+    number = min(len(parts), _AVAILABLE.get() or before)
+    if number < 2:
+        return [function(part) for part in parts]
+    try:
+        with ThreadPoolExecutor(number, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            return list(pool.map(function, parts))
     finally:
         torch.set_num_threads(before)

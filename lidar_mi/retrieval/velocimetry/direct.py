@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import torch
 
-from lidar_mi.retrieval.velocimetry.band import Band
-from lidar_mi.retrieval.velocimetry.block_tridiagonal import Factor
-from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
+from lidar_mi.retrieval.velocimetry.band import Band, form, spread
+from lidar_mi.retrieval.velocimetry.block_banded import Factor
+from lidar_mi.retrieval.velocimetry.flow_spline import REACH, Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import Linear
 from lidar_mi.retrieval.velocimetry.prior import Prior
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
@@ -32,22 +32,14 @@ class Posterior(NamedTuple):
         """By kind of motion: the variance removed by the images, and its square in the flow."""
         before = self.band.covariance(self.band.factor(self.stiff))
         removed = before - self.band.covariance(self.root)
-        informed = [
-            sum(
-                one * other * self.band.spread(removed[a, b], self.prior.mesh, first, second)
-                for a, first, one in terms
-                for b, second, other in terms
-            )
-            for terms in _kinds(self.prior)
-        ]
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
-        return torch.stack(informed), energy
+        return variances(removed, self.prior), energy
 
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before."""
         mesh = Mesh(self.prior.mesh.axes, places)
         after, before = (
-            self.band.spread(self.band.covariance(root), mesh)
+            spread(self.band.covariance(root), mesh)
             for root in (self.root, self.band.factor(self.stiff))
         )
         return after, before
@@ -62,39 +54,61 @@ def solved(
     turn: int,
 ) -> Posterior:
     """One Gauss-Newton step; `turn` is for `iterative` only."""
-    band = Band(*mesh.axes)
-    data = band.form(linear.weight * linear.slope[:, None] * linear.slope, mesh)
-    stiff = _prior_form(band, prior, settings.ridge)
+    band = Band(*(axis.knots for axis in mesh.axes))
+    data = data_form(linear, mesh)
+    stiff = prior_form(prior)
+    with_diagonal(stiff, settings.ridge)
     gradient = mesh.transposed(linear.gradient) - band.apply(stiff, coefficients)
-    stiff = _damped(stiff)
+    with_diagonal(stiff, rounding(stiff))
     root = band.factor(data + stiff)
     return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
 
 
-def _prior_form(band: Band, prior: Prior, ridge: float) -> torch.Tensor:
-    """The prior's quadratic form; the ridge keeps the variance of rigid motion finite."""
-    form = prior.local.new_zeros(2, 2, 7, band.z.knots, 4, band.y.knots)
+def data_form(linear: Linear, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
+    """The log-likelihood's quadratic form, of all cells along z or of some (`band.form`)."""
+    return form(linear.weight * linear.slope[:, None] * linear.slope, mesh, cells=cells)
+
+
+def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
+    """The prior's quadratic form without its ridge, of all cells along z or of some."""
+    mesh = prior.mesh
+    rows = mesh.axes[0].knots if cells is None else cells.stop - cells.start + REACH
+    total = prior.local.new_zeros(2, 2, 2 * REACH + 1, rows, REACH + 1, mesh.axes[1].knots)
     for terms, strength in zip(_kinds(prior), prior.strength, strict=True):
         for a, first, one in terms:
             for b, second, other in terms:
-                part = band.form(prior.cell * strength, prior.mesh, first, second)
-                form[a, b] += one * other * part
+                part = form(prior.cell * strength, mesh, first, second, cells)
+                total[a, b] += one * other * part
+    return total
+
+
+def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None) -> torch.Tensor:
+    """Variance of each kind of motion (kinds, ...) on the prior's mesh, from a band's."""
+    return torch.stack(
+        [
+            sum(
+                one * other * spread(covariance[a, b], prior.mesh, first, second, cells)
+                for a, first, one in terms
+                for b, second, other in terms
+            )
+            for terms in _kinds(prior)
+        ]
+    )
+
+
+def with_diagonal(form: torch.Tensor, value: float) -> None:
+    """Add a number to the diagonal, as the ridge that keeps the variance of rigid motion finite."""
     for a in (0, 1):
-        form[a, a, 3, :, 0] += ridge
-    return form
+        form[a, a, REACH, :, 0] += value
 
 
-def _damped(stiff: torch.Tensor) -> torch.Tensor:
-    """A quadratic form that stays positive in spite of rounding; this only shortens the steps.
+def rounding(form: torch.Tensor) -> float:
+    """What keeps a quadratic form positive in spite of rounding; this only shortens the steps.
 
     Noise-free images of a flow without any vorticity make the prior stronger than the ridge by
     more than the floating-point precision.
     """
-    stiff = stiff.clone()
-    least = _ROUNDING * float(stiff.amax())
-    for a in (0, 1):
-        stiff[a, a, 3, :, 0] += least
-    return stiff
+    return _ROUNDING * float(form.amax())
 
 
 def _kinds(prior: Prior) -> list[list[tuple[int, tuple[int, int], float]]]:

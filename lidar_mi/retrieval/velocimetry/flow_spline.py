@@ -11,6 +11,8 @@ from lidar_mi.retrieval.velocimetry.windows import linear_weights, separable
 
 REACH = 3
 """Knots further apart than this have no common support."""
+# Cells along an axis that are multiplied at once: a spline is zero beyond four of them.
+_CELLS = 24
 
 
 @dataclass(frozen=True)
@@ -38,14 +40,18 @@ class Axis:
         """Number of splines."""
         return self.cells + REACH
 
+    def cell(self, place: torch.Tensor) -> torch.Tensor:
+        """Number of the cell that each place (px) is in; the outermost ones hold what is beyond."""
+        width = (self.size - 1) / self.cells
+        return (place / width).floor().clamp(0, self.cells - 1).long()
+
     def basis(self, place: torch.Tensor, order: int = 0) -> torch.Tensor:
         """Matrix (place, knot) of derivatives of the splines, order 0 to 3, at places (px)."""
         width = (self.size - 1) / self.cells
-        scaled = place / width
-        cell = scaled.floor().clamp(0, self.cells - 1)
-        pieces = _pieces(scaled - cell, order) / width**order
+        cell = self.cell(place)
+        pieces = _pieces(place / width - cell, order) / width**order
         matrix = pieces.new_zeros(len(place), self.knots)
-        columns = cell.long()[:, None] + torch.arange(4, device=place.device)
+        columns = cell[:, None] + torch.arange(4, device=place.device)
         return matrix.scatter_(1, columns, pieces)
 
 
@@ -82,7 +88,7 @@ class Mesh:
         self.axes, self.places = tuple(axes), tuple(places)
         self.shape = tuple(len(place) for place in places)
         self.dims = len(self.axes)
-        self._bases, self._products = {}, {}
+        self._bases, self._products, self._groups = {}, {}, {}
 
     def basis(self, axis: int, order: int = 0) -> torch.Tensor:
         """Matrix (place, knot) of a derivative of the splines along an axis."""
@@ -103,6 +109,25 @@ class Mesh:
                 [one * padded[shift : shift + len(one)] for shift in range(2 * REACH + 1)]
             )
         return self._products[key]
+
+    def within(self, axis: int, cells: slice) -> tuple[slice, slice]:
+        """The knots whose splines reach into these cells, and the nodes in them, which ascend."""
+        along = self.axes[axis]
+        of_nodes = along.cell(self.places[axis])
+        bounds = torch.tensor([cells.start, cells.stop]).to(of_nodes)
+        start, stop = torch.searchsorted(of_nodes, bounds).tolist()
+        return slice(cells.start, cells.stop + REACH), slice(start, stop)
+
+    def groups(self, axis: int, cells: slice | None = None) -> list[tuple[slice, slice]]:
+        """Knots and nodes of groups of cells, of all or of these; see `within`."""
+        cells = cells or slice(0, self.axes[axis].cells)
+        key = axis, cells.start, cells.stop
+        if key not in self._groups:
+            self._groups[key] = [
+                self.within(axis, slice(start, min(start + _CELLS, cells.stop)))
+                for start in range(cells.start, cells.stop, _CELLS)
+            ]
+        return self._groups[key]
 
     def field(self, coefficients: torch.Tensor, order: Sequence[int] | None = None) -> torch.Tensor:
         """Derivatives of these orders, (..., *shape), from coefficients (..., knots)."""

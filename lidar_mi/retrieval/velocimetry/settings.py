@@ -118,6 +118,43 @@ class IterativeSettings:
 
 
 @dataclass(frozen=True)
+class StripSettings:
+    """Strips of large images (`strips`); lengths in cells between knots.
+
+    Attributes
+    ----------
+    largest : int
+        Knots along z up to which images are solved at once.
+    core, overlap : int
+        Width of a strip and its overlap with each neighbour, for the prior's strength. The
+        variance of vorticity and divergence that the images remove is 2 % too large.
+    final_overlap : int
+        The same for the standard errors, which are too large by less than 5 %.
+    solved_core, solved_overlap : int
+        The same for the preconditioner.
+    at_once : int
+        Strips of the preconditioner that one thread works on.
+    tolerance : float
+        Residual over the first one at which conjugate gradients end.
+    steps : int
+        Largest number of them.
+    coarse_cells : int
+        Largest number along each axis for the covariance before the images.
+    """
+
+    largest: int = 48
+    core: int = 10
+    overlap: int = 6
+    final_overlap: int = 12
+    solved_core: int = 9
+    solved_overlap: int = 4
+    at_once: int = 4
+    tolerance: float = 1e-5
+    steps: int = 200
+    coarse_cells: int = 24
+
+
+@dataclass(frozen=True)
 class VariationalSettings:
     """Variational retrieval (`variational.variational`).
 
@@ -162,7 +199,9 @@ class VariationalSettings:
         Factor by which a strength may change per round.
     filter : FilterSettings
     solver : IterativeSettings
-        Of volumes; images are solved directly.
+        Of volumes.
+    strips : StripSettings
+        Of large images; smaller ones are solved directly.
     """
 
     knots: tuple[float, ...] = (1.25, 0.5)
@@ -183,6 +222,7 @@ class VariationalSettings:
     largest_change_divergence: float = 16.0
     filter: FilterSettings = FilterSettings()
     solver: IterativeSettings = IterativeSettings()
+    strips: StripSettings = StripSettings()
 
 
 VOLUME_VARIATIONAL = VariationalSettings(

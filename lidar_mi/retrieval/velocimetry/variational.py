@@ -5,11 +5,11 @@ probable ones given the images and a prior of concentrated vorticity and small d
 prior's strength, which varies over the image, is itself estimated from the images (evidence).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 
-from lidar_mi.retrieval.velocimetry import direct, iterative
+from lidar_mi.retrieval.velocimetry import direct, iterative, strips
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
@@ -54,7 +54,8 @@ def variational(
     expects, of what the images inform (MacKay 1992, Neural Comput. 4, 415-447). So the flow is
     smoothed little in cores and strongly around them. In volumes vorticity along x, across x and
     divergence each have a strength L(x) (`prior.KINDS`). Solved by Gauss-Newton steps from a coarse
-    correlation, level by level of `settings.knots`: images directly (`direct`), volumes by
+    correlation, level by level of `settings.knots`: images directly (`direct`; large
+    ones in strips, `strips`), volumes by
     conjugate gradients (`iterative`).
 
     Parameters
@@ -105,7 +106,6 @@ def variational(
     windows = Windows(tuple(image1.shape), template, search, stride)
     if settings is None:
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
-    solve = direct.solved if windows.dims == 2 else iterative.solved
     images = prepared(stack, noise, blur, settings)
     like = images.spline.coefficients[:0]
     pixels = [torch.arange(n).to(like) for n in windows.shape]
@@ -115,6 +115,7 @@ def variational(
         apart = max(2.0, knots * template)
         axes = [Axis(n, apart) for n in windows.shape]
         mesh = Mesh(axes, pixels)
+        solve = _solver(axes, settings)
         coefficients = mesh.fitted(flow)
         if prior is None:
             unit = (1.0,) * windows.dims
@@ -151,6 +152,14 @@ def variational(
         return found
     unskilled = no_skill(found.d, covariance) | undetermined
     return found._replace(flag=found.flag | (Flag.NO_SKILL * unskilled).to(torch.int16))
+
+
+def _solver(
+    axes: Sequence[Axis], settings: VariationalSettings
+) -> Callable[..., direct.Posterior | strips.Posterior | iterative.Posterior]:
+    if len(axes) > 2:
+        return iterative.solved
+    return direct.solved if axes[0].knots <= settings.strips.largest else strips.solved
 
 
 def _flagged(

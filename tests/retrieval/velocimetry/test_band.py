@@ -5,8 +5,8 @@ Detects a wrong block, shift or derivative.
 
 import torch
 
-from lidar_mi.retrieval.velocimetry.band import Band
-from lidar_mi.retrieval.velocimetry.block_tridiagonal import factor
+from lidar_mi.retrieval.velocimetry.band import Band, form, spread
+from lidar_mi.retrieval.velocimetry.block_banded import factor
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
 
 AXES = Axis(23, 4.0), Axis(38, 5.0)
@@ -16,35 +16,39 @@ def pixels():
     return [torch.arange(axis.size, dtype=torch.float64) for axis in AXES]
 
 
-def test_block_tridiagonal_is_its_dense_matrix():
+def test_block_banded_is_its_dense_matrix():
     random = torch.Generator().manual_seed(1)
-    parts = torch.randn(4, 5, 5, generator=random, dtype=torch.float64)
-    below = torch.randn(3, 5, 5, generator=random, dtype=torch.float64)
-    diagonal = parts @ parts.mT + 20 * torch.eye(5, dtype=torch.float64)
-    dense = torch.block_diag(*diagonal)
-    for k in range(3):
-        dense[5 * k + 5 : 5 * k + 10, 5 * k : 5 * k + 5] = below[k]
-        dense[5 * k : 5 * k + 5, 5 * k + 5 : 5 * k + 10] = below[k].T
-    root = factor(diagonal, below)
-    right = torch.randn(4, 5, 2, generator=random, dtype=torch.float64)
-    solution = torch.linalg.solve(dense, right.reshape(20, 2))
-    torch.testing.assert_close(root.solve(right).reshape(20, 2), solution)
-    inverse = torch.linalg.inv(dense)
-    own, under = root.inverse()
-    for k in range(4):
-        torch.testing.assert_close(own[k], inverse[5 * k : 5 * k + 5, 5 * k : 5 * k + 5])
-    for k in range(3):
-        torch.testing.assert_close(under[k], inverse[5 * k + 5 : 5 * k + 10, 5 * k : 5 * k + 5])
+    blocks, matrices, n = 6, 2, 5
+    dense = torch.zeros(matrices, blocks, n, blocks, n, dtype=torch.float64)
+    columns = torch.zeros(blocks, matrices, 3, n, n, dtype=torch.float64)
+    for k in range(blocks):
+        for j in range(min(3, blocks - k)):
+            part = torch.randn(matrices, n, n, generator=random, dtype=torch.float64)
+            part = part + part.mT + 30 * torch.eye(n) if j == 0 else part
+            columns[k, :, j] = part
+            dense[:, k + j, :, k] = part
+            dense[:, k, :, k + j] = part.mT
+    dense = dense.reshape(matrices, blocks * n, blocks * n)
+    root = factor(columns.flatten(2, 3))
+    right = torch.randn(blocks, matrices, n, generator=random, dtype=torch.float64)
+    flat = right.movedim(0, 1).flatten(1)
+    found = root.solve(right).movedim(0, 1).flatten(1)
+    torch.testing.assert_close(found, torch.linalg.solve(dense, flat))
+    inverse = torch.linalg.inv(dense).unflatten(1, (blocks, n)).unflatten(3, (blocks, n))
+    found = root.inverse().unflatten(2, (3, n))
+    for k in range(blocks):
+        for j in range(min(3, blocks - k)):
+            torch.testing.assert_close(found[k, :, j], inverse[:, k + j, :, k])
 
 
 def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
-    knots = Band(*AXES)
+    knots = Band(*(axis.knots for axis in AXES))
     mesh = Mesh(AXES, pixels())
     random = torch.Generator().manual_seed(2)
     slope = torch.randn(2, 23, 38, generator=random, dtype=torch.float64)
     weight = torch.rand(23, 38, generator=random, dtype=torch.float64)
-    band = knots.form(slope[:, None] * slope, mesh)
-    bend = knots.form(weight, mesh, (1, 1), (1, 1))
+    band = form(slope[:, None] * slope, mesh)
+    bend = form(weight, mesh, (1, 1), (1, 1))
     for a in (0, 1):
         band[a, a] += bend
     plain, twist = (torch.kron(mesh.basis(0, k), mesh.basis(1, k)) for k in (0, 1))
@@ -64,8 +68,8 @@ def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
     places = torch.tensor([0.0, 3.3, 21.5]), torch.tensor([2.0, 17.7, 36.9, 37.0])
     few = Mesh(AXES, [place.double() for place in places])
     at = torch.kron(few.basis(0), few.basis(1))
-    spread = knots.spread(knots.covariance(root), few)
+    found = spread(knots.covariance(root), few)
     for a in (0, 1):
         for b in (0, 1):
             expected = (at @ inverse[a, :, b] @ at.T).diagonal().reshape(3, 4)
-            torch.testing.assert_close(spread[a, b], expected)
+            torch.testing.assert_close(found[a, b], expected)
