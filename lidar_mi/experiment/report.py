@@ -24,7 +24,6 @@ from lidar_mi.assessment.report.vortices import vortex_chapter
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import Results, judged
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.vortices import vectors_method
 from lidar_mi.experiment.stages.winds import rendered_pairs
 
 Metrics = Mapping[str, float]
@@ -110,7 +109,7 @@ def _vortices(experiment, results, metrics, folder, log) -> Chapter:
     drawn = vortex_figures.draw_all(
         folder, image, results["vectors"], truth, fits.pairs, results["cores"], log
     )
-    return vortex_chapter(metrics, fits.pairs, fits.refused, drawn, vectors_method(experiment))
+    return vortex_chapter(metrics, fits.pairs, fits.refused, drawn, fits.method)
 
 
 # result of a chapter, step to which the time of its figures is added

@@ -224,6 +224,8 @@ class RunFolder:
             path.unlink(missing_ok=True)
         elif name == "vortices":
             about = {"experiment": self._experiment.name, "source": f"lidar-mi {__version__}"}
+            if value.method:
+                about["vectors_method"] = str(value.method)
             write_vortices(path, value.pairs, **about, **{MADE_BY: self.made_by})
         else:
             write_netcdf(self._signed(value), path)

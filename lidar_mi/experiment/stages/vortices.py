@@ -31,10 +31,13 @@ class VortexFits:
         The accepted ones, by `Origin`.
     refused : dict of str to str
         Reasons for which there is no other.
+    method : str, optional
+        Method of the wind vectors; None if no pair was fitted to vectors.
     """
 
     pairs: dict[str, VortexPairFit]
     refused: dict[str, str]
+    method: str | None = None
 
 
 def combined_vectors(experiment: Experiment, wind3d: xr.Dataset | None) -> xr.Dataset | None:
@@ -65,10 +68,12 @@ def fit_pairs(
     experiment: Experiment, scans: Sequence[xr.Dataset], vectors: xr.Dataset | None, *, log: Log
 ) -> VortexFits:
     """Vortex pairs from the images and from the vectors, where there are or should be some."""
-    log("fitting vortex pairs")
+    with_vectors = bool(experiment.sensor) or vectors is not None
+    method = vectors_method(experiment) if with_vectors else None
+    log(f"fitting vortex pairs to the images{f' and to the vectors by {method}' if method else ''}")
     pair, noise = list(rendered_pairs(experiment, scans).values())[-1]
     ways = {Origin.IMAGES: lambda: fit_vortices(*pair, experiment.platform.dt, noise)}
-    if experiment.sensor or vectors is not None:
+    if with_vectors:
         ways[Origin.VECTORS] = lambda: _from_vectors(vectors)
     fits, refused = {}, {}
     for origin, way in ways.items():
@@ -84,7 +89,7 @@ def fit_pairs(
 
     for origin, reason in refused.items():
         log.remark(f"no vortex pair from the {ORIGIN_NAMES[Origin(origin)]}: {reason}")
-    return VortexFits(fits, refused)
+    return VortexFits(fits, refused, method)
 
 
 def _from_vectors(vectors: xr.Dataset | None) -> VortexPairFit:

@@ -6,6 +6,10 @@ import torch
 from lidar_mi.retrieval.vortices.model_error import ModelError, model_error, of_change, spread_of
 from lidar_mi.retrieval.vortices.robust_fit import Solution
 
+# Side of the blocks (px) whose means are independent, fewer than which say too little, and standard
+# errors by which an increase between them is significant.
+_BLOCK, _FEW_BLOCKS, _SIGNIFICANT = 12, 12, 4.0
+
 
 def model_error_of(found: Solution, shortest: float, *, changes: bool = False) -> ModelError:
     """Departure of the flow from the model, from the residuals of a fit; see `model_error`.
@@ -39,7 +43,7 @@ def parameter_covariance(found: Solution, error: ModelError, excess: float) -> n
     inverse = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
     inverse = inverse / scale / scale[:, None]
     covariance = (inverse @ spread @ inverse)[:10, :10]
-    attenuation = _attenuation(found, error)
+    attenuation = _attenuation(found)
     covariance = covariance + torch.outer(attenuation, attenuation)
     if not found.converged:
         left = _remaining_step(found)
@@ -75,19 +79,43 @@ def far_from_minimum(found: Solution, covariance: np.ndarray) -> bool:
     return not (left < np.diagonal(covariance) - left).all()
 
 
-def _attenuation(found: Solution, error: ModelError) -> torch.Tensor:
+def _attenuation(found: Solution) -> torch.Tensor:
     """Possible bias of the circulations towards zero, as an error of all parameters (10,).
 
     Structure that has been wound up for long is aligned with the flow: the images change little,
-    and the residual may as well be model error. The inverse regression (errors in the model, not
-    in the change) would make both circulations larger by the unexplained fraction of the change:
-    this is the error stated.
+    and the residual may as well be model error. A pattern that does not move with the air changes
+    less than the air does. The inverse regression (errors in the model, not in the change) would
+    make both circulations larger by the unexplained fraction of the change: this is the error
+    stated. Of images only what grows with the change counts, as air is replaced anywhere.
     """
     misfit, theta = found.misfit, found.parameters
-    explained = theta[0] * misfit.jacobian[0] + theta[4] * misfit.jacobian[4]
-    left = error.variance * float((found.weight * misfit.slope.square().sum(0))[misfit.valid].sum())
-    power = float((found.weight * explained.square())[misfit.valid].sum())
-    fraction = left / power if power > 0 else 0.0
+    explained = (theta[0] * misfit.jacobian[0] + theta[4] * misfit.jacobian[4]).square()
+    left = misfit.residual.square()
+    if left.ndim == 2:
+        fraction = _increase(left, explained, misfit.valid)
+    else:
+        excess = float((found.weight * (left - misfit.scatter))[misfit.valid].sum())
+        power = float((found.weight * explained)[misfit.valid].sum())
+        fraction = max(0.0, excess / power) if power > 0 else 0.0
     attenuation = torch.zeros_like(theta[:10])
     attenuation[0], attenuation[4] = fraction * theta[0], fraction * theta[4]
     return attenuation
+
+
+def _increase(left: torch.Tensor, explained: torch.Tensor, valid: torch.Tensor) -> float:
+    """Increase of the misfit per explained change, of means over blocks; 0 if not significant."""
+    whole = valid.to(left)
+    sums = torch.nn.functional.avg_pool2d(
+        torch.stack([whole, whole * left, whole * explained])[:, None], min(_BLOCK, *left.shape)
+    ).flatten(1)
+    full = sums[0] > 0.5
+    if int(full.sum()) < _FEW_BLOCKS:
+        return 0.0
+    misfit, change = sums[1:, full] / sums[0, full]
+    change = change - change.mean()
+    power = change.square().sum()
+    if not float(power) > 0:
+        return 0.0
+    slope = float((change * misfit).sum() / power)
+    scatter = (misfit - misfit.mean() - slope * change).square().sum() / (len(change) - 2)
+    return slope if slope > _SIGNIFICANT * float((scatter / power).sqrt()) else 0.0

@@ -7,12 +7,14 @@ variance of the missed flow, and noise of pixels taken for it.
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from lidar_mi.retrieval.vortices.model_error import (
     Lags,
     ModelError,
     mean_length,
     model_error,
+    of_change,
     spread_of,
 )
 
@@ -117,3 +119,33 @@ def test_noise_of_pixels_is_no_flow():
 def test_without_residuals_there_is_no_model_error():
     nothing = torch.zeros(3, 20, 20, dtype=torch.float64)
     assert model_error(nothing[:2], nothing, 1.0) == ModelError()
+
+
+def smooth(random, shape, length):
+    """A field of unit variance with the correlation exp(-h^2 / (4 length^2))."""
+    return gaussian_filter(random.standard_normal(shape), length, mode="wrap") * length * 3.545
+
+
+def test_change_of_the_air_is_no_flow():
+    """Residuals that correlate, independent of the slopes: as a flow, they would be 0.002 m^2.
+
+    With a flow of 0.02 m^2 over 6 steps besides, that flow is left (seeds 0 to 7, whose values
+    scatter by 0.009 m^2: three standard errors of the mean).
+    """
+    shape = (90, 110)
+    alone, uninformed, moved = [], [], []
+    for seed in range(8):
+        random = np.random.default_rng(seed)
+        slope = np.stack([smooth(random, shape, 2.0) for _ in "yz"])
+        new = smooth(random, shape, 1.5) * 0.2
+        flow = np.stack([smooth(random, shape, 6.0 / np.sqrt(2)) for _ in "yz"]) * np.sqrt(0.02)
+        for found, residual in ((alone, new), (moved, new + (slope * flow).sum(0))):
+            weight = 1 / np.mean(residual**2)
+            g, r = torch.as_tensor(slope), torch.as_tensor(residual)
+            products = weight * torch.stack([g[0] ** 2, g[0] * g[1], g[1] ** 2])
+            change = of_change(r, weight * g, torch.ones(shape, dtype=torch.bool))
+            found.append(model_error(weight * g * r, products, 4.0, change).variance)
+            if found is alone:
+                uninformed.append(model_error(weight * g * r, products, 4.0).variance)
+    assert max(alone) == 0.0 and np.mean(uninformed) > 0.001
+    assert np.mean(moved) == pytest.approx(0.02, abs=0.0095)

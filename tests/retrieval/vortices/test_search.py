@@ -99,3 +99,13 @@ def test_vortices_of_one_sense_are_no_pair():
 
 def test_still_air_has_no_pair():
     assert starting_points(observed(()), 3, "lamb_oseen").shape == (0, 10)
+
+
+def test_brightness_is_no_wind():
+    """A change of the values across the region, four times the swirl's, is fitted beside it."""
+    data = observed(PAIR, noise=0.3)
+    columns = torch.stack([torch.ones_like(data.y), data.y / data.y.max()])
+    changed = data._replace(value=data.value + 20 * columns[1] - 5, brightness=columns)
+    start = starting_points(changed, 1, "lamb_oseen")[0].numpy()
+    np.testing.assert_allclose(start[[2, 3, 6, 7]], [14.0, 3.0, -15.0, -4.0], atol=1.9)
+    np.testing.assert_allclose(start[[0, 4]], [320, -280], rtol=0.15)
