@@ -1,13 +1,14 @@
 """Verdict on the cross-flow winds of a run: errors, efficiencies, strength of the true wind."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import error_statistics, wind_metrics
-from lidar_mi.assessment.metrics.names import sweep_key, wind_key
+from lidar_mi.assessment.metrics.names import Source, sweep_key, wind_key
+from lidar_mi.retrieval.velocimetry.quality import Flag
 
 
 def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:
@@ -26,7 +27,7 @@ def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, fl
         for method in found["algorithm"].values:
             wind = found.sel(source=source, algorithm=method)
             true = wind[["v_true", "w_true"]].rename(v_true="v", w_true="w")
-            numbers = wind_metrics(wind, true, list(cores)) | efficiency(wind)
+            numbers = wind_metrics(wind, true, list(cores)) | efficiency(wind) | skill(wind)
             metrics |= {wind_key(source, method, key): value for key, value in numbers.items()}
     return metrics
 
@@ -45,8 +46,39 @@ def efficiency(wind: xr.Dataset) -> dict[str, float]:
         if used.any() and (bound[used] > 0).all():
             least = float(np.sqrt(np.mean(bound[used].astype(float) ** 2)))
             metrics[f"bound_{name}"] = least
-            metrics[f"efficiency_{name}"] = least / error_statistics(error, where=used)["rmse"]
+            rmse = error_statistics(error, where=used)["rmse"]
+            # without errors there is nothing to divide by
+            metrics |= {f"efficiency_{name}": least / rmse} if rmse > 0 else {}
     return metrics
+
+
+def skill(wind: xr.Dataset) -> dict[str, float]:
+    """What a method states of its own errors; empty for methods that state none.
+
+    ``stderr_*``: rms standard error, m/s, of vectors that are valid or have the flag `no_skill`
+    alone. ``no_skill_fraction``: 1 where they are as large as the true wind, else the fraction of
+    all vectors with that flag.
+    """
+    flag = wind["flag"].values
+    used = (flag | Flag.NO_SKILL.value) == Flag.NO_SKILL.value
+    metrics: dict[str, float] = {}
+    for name in ("v", "w"):
+        stated = wind[f"{name}_stderr"].values if f"{name}_stderr" in wind else np.nan
+        stated = np.broadcast_to(stated, flag.shape)
+        known = used & np.isfinite(stated)
+        if known.any():
+            metrics[f"stderr_{name}"] = float(np.sqrt(np.mean(stated[known].astype(float) ** 2)))
+    if len(metrics) == 2:
+        true = [np.sqrt(np.mean(wind[f"{name}_true"].values ** 2)) for name in ("v", "w")]
+        none = np.hypot(*metrics.values()) >= np.hypot(*true)
+        marked = float(((flag & Flag.NO_SKILL.value) > 0).mean())
+        metrics["no_skill_fraction"] = 1.0 if none else marked
+    return metrics
+
+
+def has_no_skill(metrics: Mapping[str, float], source: Source, method: str) -> bool:
+    """Whether a method says that most of its vectors are no better than zero wind."""
+    return metrics.get(wind_key(source, method, "no_skill_fraction"), 0.0) > 0.5
 
 
 def true_wind_metrics(

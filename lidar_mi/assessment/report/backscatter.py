@@ -6,6 +6,7 @@ from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.names import Source, wind_key
+from lidar_mi.assessment.metrics.winds import has_no_skill
 from lidar_mi.assessment.report.digits import in_row, percent, three
 from lidar_mi.assessment.report.page import Chapter, Tables
 
@@ -21,6 +22,8 @@ _ROWS = (
     ("outside_cores.rmse_w", "rms error of w beyond two core radii", "m/s"),
     ("all.rmse_v", "rms error of v, including flagged vectors", "m/s"),
     ("all.rmse_w", "rms error of w, including flagged vectors", "m/s"),
+    ("stderr_v", "rms standard error of v, as stated", "m/s"),
+    ("stderr_w", "rms standard error of w, as stated", "m/s"),
     ("valid_fraction", "fraction of valid vectors", "%"),
 )
 
@@ -86,7 +89,11 @@ def _tables(experiment, metrics):
             # the error of zero wind
             nothing = key.replace("rmse_", "rms_").removeprefix("all.")
             values.append(metrics.get(f"true_wind.{nothing}"))
-            rows.append((label, unit, in_row(values, unit)))
+            if any(value is not None for value in values):
+                rows.append((label, unit, in_row(values, unit)))
+        unskilled = [has_no_skill(metrics, source, method) for source in sources]
+        if any(unskilled):
+            rows.append(("verdict", "", ["no skill" if none else "-" for none in [*unskilled, 0]]))
         heads = [SOURCE_NAMES[source] for source in sources]
         yield METHOD_NAMES[method], [*heads, "true wind, rms"], rows
 

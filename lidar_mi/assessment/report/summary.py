@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from itertools import product
 
 from lidar_mi.assessment.metrics.names import Source, bound_key, ring_key, wind_key
+from lidar_mi.assessment.metrics.winds import has_no_skill
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table
 
@@ -67,7 +68,8 @@ def _winds(metrics: Mapping[str, float]) -> Table:
             keys = [wind_key(source, method, f"{place}rmse_{name}") for place, name in wanted]
             label = source.replace("_", " ").replace("extinction ", "")
             errors = (_shown(metrics.get(key)) for key in keys)
-            rows.append((label, str(method), *errors, f"{valid:.0%}"))
+            shown = "no skill" if has_no_skill(metrics, source, method) else f"{valid:.0%}"
+            rows.append((label, str(method), *errors, shown))
     strength = [_shown(metrics.get(f"true_wind.{place}rms_{name}")) for place, name in wanted]
     return Table(
         "rms error of the wind in m/s, valid vectors (far: beyond two core radii)",
