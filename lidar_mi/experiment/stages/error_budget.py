@@ -81,9 +81,9 @@ def budgets(
             else:
                 corrected = 0.0 if cause in _SHARP else blur
                 # the flags that count are those of the images as measured
-                checks = cause == "measured"
+                flags = dict.fromkeys(("checks", "standard_errors"), cause == "measured")
                 winds[cause] = retrieve_wind(
-                    *pair, method=method, noise=noise, blur=corrected, checks=checks, **settings
+                    *pair, method=method, noise=noise, blur=corrected, **flags, **settings
                 )
         measured, perfect = winds.pop("measured"), winds.pop("perfect")
         stiff = moved_rigidly(
@@ -92,7 +92,11 @@ def budgets(
             blurred,
             truth.wind,
             lambda pair, stride, method=method: retrieve_wind(
-                *pair, method=method, checks=False, **settings | {"stride": stride}
+                *pair,
+                method=method,
+                checks=False,
+                standard_errors=False,
+                **settings | {"stride": stride},
             ),
         )
         winds |= {} if stiff is None else {"shear": stiff}

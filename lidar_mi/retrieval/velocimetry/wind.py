@@ -50,6 +50,7 @@ def retrieve_wind(
     median_epsilon: float = MEDIAN_EPSILON,
     settings: MultipassSettings | VariationalSettings | None = None,
     checks: bool = True,
+    standard_errors: bool = True,
 ) -> xr.Dataset:
     """Wind in the image plane from two images of the same air, dt apart.
 
@@ -94,6 +95,9 @@ def retrieve_wind(
         Look for saturated areas, structure at rest, gains of columns and rows, a change of
         illumination, and images of unrelated air. False, for images known to be free of them:
         faster by 0.15 of the time of "variational", and none of this is removed or flagged.
+    standard_errors : bool
+        False: "cc" and "multipass" state none, which halves their time. The others have theirs
+        from the fit.
 
     Returns
     -------
@@ -176,11 +180,14 @@ def retrieve_wind(
         outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
         flag = resting.flags(found, whole, windows, chosen.centred)
         if chosen.repeats:
-            covariance = bootstrap_covariance(
-                [first, second], found, windows, find, chosen.centred, chosen.repeats
-            )
             if found.covariance is not None:
                 flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+            pair = [first, second]
+            covariance = (
+                bootstrap_covariance(pair, found, windows, find, chosen.centred, chosen.repeats)
+                if standard_errors
+                else None
+            )
             found = found._replace(covariance=covariance)
         if found.covariance is not None:
             flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)

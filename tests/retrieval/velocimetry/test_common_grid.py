@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.velocimetry.common_grid import resample, resample_pair
+from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid, resample, resample_pair
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from tests.support.flows import plane_waves, texture
 
@@ -94,3 +94,11 @@ def test_bad_input_is_named():
         with pytest.raises(InputError) as error:
             call()
         assert str(error.value).startswith(start) and "\n" not in str(error.value)
+
+
+def test_axes_of_another_order_are_the_same_image():
+    y, z = np.arange(30.0), np.arange(24.0)
+    image = xr.DataArray(np.random.default_rng(3).random((24, 30)), {"z": z, "y": y}, ("z", "y"))
+    first, second = on_one_grid(image, image.T)
+    xr.testing.assert_identical(first, image)
+    xr.testing.assert_identical(second, image)

@@ -67,6 +67,9 @@ def test_dense_particles_are_not_at_rest(seed):
 def test_images_known_to_be_good_need_no_checks():
     images, _ = pair(64)
     wind = retrieved(images, "multipass")
+    none = retrieved(images, "multipass", standard_errors=False)
+    xr.testing.assert_identical(none["v"], wind["v"])
+    assert none["v_stderr"].isnull().all() and wind["v_stderr"].notnull().any()
     xr.testing.assert_identical(wind, retrieved(images, "multipass", checks=False))
     spoiled = [image.copy() for image in images]
     for image in spoiled:
