@@ -62,8 +62,11 @@ def read_table(path: str | Path) -> ScatteringTable:
         No such file, a missing or wrong header line, or a matrix that fails `check`.
     """
     text = read_text(path, "a scattering-matrix table")
+    rows = [line for line in text.splitlines() if line.partition("#")[0].strip()]
+    if not rows:
+        raise InputError(f"{path}: no row of numbers; expected seven a line: angle and a1 ... b2")
     try:
-        numbers = np.loadtxt(text.splitlines(), ndmin=2)
+        numbers = np.loadtxt(rows, ndmin=2)
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{path}: not a table of seven numbers a line ({reason})") from None

@@ -63,6 +63,7 @@ def test_unreadable_files(tmp_path):
         text.replace("albedo: 0.9", "albedo: 1.9"): "albedo: 1.9",
         "# nothing\n1 2 3\n4 5 6\n": "3 columns",
         text + "words\n": "not a table",
+        "# name: soot\n": "no row",
     }
     for content, words in cases.items():
         path.write_text(content)
