@@ -70,7 +70,7 @@ def skill(wind: xr.Dataset) -> dict[str, float]:
             metrics[f"stderr_{name}"] = float(np.sqrt(np.mean(stated[known].astype(float) ** 2)))
     if len(metrics) == 2:
         true = [np.sqrt(np.mean(wind[f"{name}_true"].values ** 2)) for name in ("v", "w")]
-        none = np.hypot(*metrics.values()) >= np.hypot(*true)
+        none = np.hypot(metrics["stderr_v"], metrics["stderr_w"]) >= np.hypot(*true)
         marked = float(((flag & Flag.NO_SKILL.value) > 0).mean())
         metrics["no_skill_fraction"] = 1.0 if none else marked
     return metrics

@@ -137,7 +137,9 @@ def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArra
                 f"{name}: dims {tuple(image.dims)} of {image.shape} px; expected z and y with "
                 "coordinates, two pixels or more each"
             )
-    image1, image2 = (i if i.dims == ("z", "y") else i.transpose("z", "y") for i in (image1, image2))
+    image1, image2 = (
+        i if i.dims == ("z", "y") else i.transpose("z", "y") for i in (image1, image2)
+    )
     if image1.shape != image2.shape:
         sizes = " and ".join(f"{i.sizes['y']} x {i.sizes['z']}" for i in (image1, image2))
         raise InputError(f"image2: sizes {sizes} px (y x z) differ; expected two of one size")
