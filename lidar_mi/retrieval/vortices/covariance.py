@@ -3,9 +3,12 @@
 import numpy as np
 import torch
 
+from lidar_mi.retrieval.velocimetry.windows import averaged
 from lidar_mi.retrieval.vortices.model_error import ModelError, model_error, of_change, spread_of
 from lidar_mi.retrieval.vortices.robust_fit import Solution
 
+# Width (px) of the Gaussian over which squared residuals are averaged.
+_NEAR = 12.0
 # Side of the blocks (px) whose means are independent, fewer than which say too little, and standard
 # errors by which an increase between them is significant.
 _BLOCK, _FEW_BLOCKS, _SIGNIFICANT = 12, 12, 4.0
@@ -52,16 +55,25 @@ def parameter_covariance(found: Solution, error: ModelError, excess: float) -> n
 
 
 def _noise_spread(found: Solution, error: ModelError) -> torch.Tensor:
-    """Covariance of the force by noise: from the stated noise or, if larger, from the residuals.
+    """Covariance of the force by noise: from the residuals, of vectors if it exceeds that stated.
 
     By the residuals, each stands for its own variance (White 1980, Econometrica 48, 817), whatever
-    pixels are noisier than stated.
+    pixels are noisier than stated. Of images it is their mean about each pixel: ten parameters
+    absorb part of the few residuals in a core.
     """
     misfit, weight = found.misfit, found.weight
     columns = misfit.jacobian.flatten(1)
     moved = error.variance * misfit.slope.square().sum(0)
     ratio = (misfit.residual.square() / (misfit.scatter + moved)).where(misfit.valid, 0.0)
-    return (columns * (weight**2 * misfit.variance * ratio).flatten()) @ columns.T
+    if ratio.ndim == 2:
+        ratio = averaged(ratio, misfit.valid, _NEAR)
+    stated, observed = (
+        (columns * (weight**2 * part).flatten()) @ columns.T
+        for part in (misfit.variance, misfit.variance * ratio)
+    )
+    scale = found.normal.diagonal()
+    excess = float((observed.diagonal() / scale).sum() / (stated.diagonal() / scale).sum())
+    return observed if excess > 1 or ratio.ndim == 2 else stated
 
 
 def _remaining_step(found: Solution) -> torch.Tensor:

@@ -228,10 +228,10 @@ class Builder:
 
         Air that changes adds differences that are correlated from pixel to pixel. Their power
         spectrum is that of the misfit, and a filter whitens it, except for the fraction that
-        the flow's error moves: it differs from place to place as the slopes do. Noise that was
-        given is the lower limit. The filter passes nothing where all structure may be change.
+        the flow's error moves: it differs from place to place as the slopes do. The white noise is
+        the lower limit. The filter passes nothing where all structure may be change.
         """
-        valid, known = misfit.valid, self._known(white)
+        valid, known = misfit.valid, white.variance
         shape = white.variance / white.variance[valid].mean()
         passed = max((images.whitening or images.spline).passed, 1e-6)
         power = (misfit.residual.square() / shape)[valid].mean()
@@ -253,7 +253,3 @@ class Builder:
             variance=level * shape + floor,
             scatter=spline.passed * level * shape + floor,
         )
-
-    def _known(self, white: Images) -> torch.Tensor:
-        floor = torch.full_like(white.variance, 2 * _INTERPOLATION**2)
-        return white.variance if self.level else floor
