@@ -8,7 +8,7 @@ import numpy as np
 from lidar_mi.assessment.metrics.requirements import look_ahead
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.describe import Section
-from lidar_mi.experiment.forecast import forecast
+from lidar_mi.experiment.forecast import forecast, lines_seconds
 from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import Truth
@@ -124,6 +124,7 @@ def _sensor(asked: Experiment, tables: Mapping) -> Section:
     return "both as one sensor", [
         ("lines of sight", f"{count}, {sensor.pulses} pulses each{flat}"),
         ("pulses per second", f"{count * sensor.pulses * sensor.slabs_per_second:g}"),
+        ("time of the lines on one core", f"about {duration(lines_seconds(asked))}"),
         ("v and w from", sensor.method),
         ("compliance with", ", ".join(" ".join(key) for key in tables) or "no requirements"),
     ]

@@ -32,6 +32,8 @@ SAMPLES_PER_SECOND = 8e6
 """Times scattering orders, on one core (wake_backscatter on a core of 2024)."""
 VECTORS_PER_SECOND = 15e3
 """On one core, by correlation of windows of 8 in 16 pixels; other methods are within a factor 3."""
+RING_PIXELS_PER_SECOND = 3e6
+"""On one core: noise drawn for a pixel of the rings, and fitted (wake_sensor)."""
 SINGLE = 1e-17
 """S0 whose squared error is the smallest number of single precision."""
 CONTRIBUTIONS = 5
@@ -54,6 +56,16 @@ def forecast(experiment: Experiment, beams: int) -> Forecast:
     vectors = _vectors_per_beam(experiment) * beams
     seconds = 2 * samples * render.max_order / SAMPLES_PER_SECOND + vectors / VECTORS_PER_SECOND
     return Forecast(memory, seconds)
+
+
+def lines_seconds(experiment: Experiment) -> float:
+    """Time on one core, s, to measure all lines of sight, to a factor of two.
+
+    The pulses of a line are summed before they are evaluated, however many they are.
+    """
+    directions, camera = experiment.sensor.directions, experiment.doppler.camera
+    pixels = camera.width * camera.height
+    return directions.columns * directions.rows * pixels / RING_PIXELS_PER_SECOND
 
 
 def _per_beam(experiment: Experiment, gates: int) -> float:

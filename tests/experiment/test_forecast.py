@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import lidar_mi as lm
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.check import duration, sections
-from lidar_mi.experiment.forecast import check_brightness, check_size, forecast, overlap
+from lidar_mi.experiment.forecast import (
+    check_brightness,
+    check_size,
+    forecast,
+    lines_seconds,
+    overlap,
+)
 from lidar_mi.experiment.truth import read_flows
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import plan_scans
@@ -158,3 +165,13 @@ def test_the_machine_has_memory():
 )
 def test_durations(seconds, text):
     assert duration(seconds).startswith(text)
+
+
+def test_time_of_the_lines_of_sight():
+    """63 lines of 960 x 780 pixels took 14 to 19 s in runs of wake_sensor; no more with pulses."""
+    shipped = lm.load_experiment("wake_sensor")
+    more = lm.load_experiment("wake_sensor", sensor={"directions": {"columns": 90, "rows": 70}})
+    pulses = lm.load_experiment("wake_sensor", sensor={"pulses": 200})
+    assert 16 / 2 < lines_seconds(shipped) < 16 * 2
+    assert lines_seconds(more) == pytest.approx(100 * lines_seconds(shipped))
+    assert lines_seconds(pulses) == lines_seconds(shipped)
