@@ -188,7 +188,7 @@ def band_limited(
     mismatch : torch.Tensor, shape (shells,), optional
         Spectral density N of the differences of warped images, see `mismatch`. The filter is then
         sqrt(noise^2 / N) of that for white noise (Hannan & Thomson 1973, Biometrika 60,
-        117-130), so that the mismatch is whitened.
+        241-253), so that the mismatch is whitened.
     weight : torch.Tensor, shape of an image, optional
         Of the pixels, for the texture's spectrum.
     blur : float, optional
