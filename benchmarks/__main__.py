@@ -18,6 +18,7 @@ COMPARISONS = (
     "methods",
     "settings",
     "threads",
+    "growth",
     "rendered",
     "renderer",
     "fringes",

@@ -32,6 +32,7 @@ from benchmarks import (
     cases,
     estimators,
     fringes,
+    growth,
     measure,
     methods,
     rendered,
@@ -381,6 +382,23 @@ def test_threads_are_compared_quiet_and_busy():
     ]
     assert len(found.rows) == 6 and all(row.ours > 0 and row.ratio > 0 for row in found.rows)
     assert (torch.get_num_threads(), thread_choice.SMALL) == before
+
+
+def test_power_of_growth_is_the_slope_of_the_logarithms():
+    sizes = (20, 10), (40, 20), (100, 60)
+    costs = [[growth.Cost(1.0, (a * b) ** 1.25, 1.0)] * 3 for a, b in sizes]
+    assert growth.power(sizes, costs) == pytest.approx(1.25)
+
+
+@pytest.mark.slow
+def test_growth_has_a_row_for_every_size_and_a_power(monkeypatch):
+    monkeypatch.setattr(growth, "PEER_OF", {"multipass": "OpenCV DIS"})
+    found = growth.compare(1, ((48, 40), (64, 48)))
+    assert [line.quantity for line in found.rows] == [
+        *("wall time", "time of all cores", "peak memory") * 2,
+        "p",
+    ]
+    assert all(line.ours > 0 for line in found.rows[:-1])
 
 
 def test_settings_are_halved_and_doubled_in_turn():
