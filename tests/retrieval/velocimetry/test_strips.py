@@ -101,8 +101,7 @@ def test_evidence_is_that_of_the_whole_system(systems):
 def test_retrieval_is_that_of_the_whole_system():
     images, level = changing_images(columns=90, rows=240, seed=4)
     found, exact = (
-        variational(*images, noise=level, settings=settings)
-        for settings in (IN_STRIPS, AT_ONCE)
+        variational(*images, noise=level, settings=settings) for settings in (IN_STRIPS, AT_ONCE)
     )
     deviation = exact.covariance.diagonal().sqrt().movedim(-1, 0)
     assert float(((found.d - exact.d) / deviation).abs().max()) < 0.05
