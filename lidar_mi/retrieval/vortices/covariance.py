@@ -98,36 +98,56 @@ def _attenuation(found: Solution) -> torch.Tensor:
     and the residual may as well be model error. A pattern that does not move with the air changes
     less than the air does. The inverse regression (errors in the model, not in the change) would
     make both circulations larger by the unexplained fraction of the change: this is the error
-    stated. Of images only what grows with the change counts, as air is replaced anywhere.
+    stated. What model error leaves unexplained of images counts only as far as it grows with the
+    change, as air is replaced anywhere.
     """
     misfit, theta = found.misfit, found.parameters
     explained = (theta[0] * misfit.jacobian[0] + theta[4] * misfit.jacobian[4]).square()
     left = misfit.residual.square()
+    power = float((found.weight * explained)[misfit.valid].sum())
     if left.ndim == 2:
-        fraction = _increase(left, explained, misfit.valid)
+        steep = misfit.slope.square().sum(0)
+        fraction = _increase(left - misfit.scatter, explained, steep, misfit.valid)
     else:
         excess = float((found.weight * (left - misfit.scatter))[misfit.valid].sum())
-        power = float((found.weight * explained)[misfit.valid].sum())
         fraction = max(0.0, excess / power) if power > 0 else 0.0
     attenuation = torch.zeros_like(theta[:10])
     attenuation[0], attenuation[4] = fraction * theta[0], fraction * theta[4]
     return attenuation
 
 
-def _increase(left: torch.Tensor, explained: torch.Tensor, valid: torch.Tensor) -> float:
-    """Increase of the misfit per explained change, of means over blocks; 0 if not significant."""
+def _increase(
+    left: torch.Tensor, explained: torch.Tensor, steep: torch.Tensor, valid: torch.Tensor
+) -> float:
+    """Increase of the misfit per explained change, of means over blocks; 0 if not significant.
+
+    The smaller one of that of the means and of that of the means over their squared slopes. Bright
+    air has more of misfit, change and slopes, and so increases the first; where the model fits
+    worse in fast air of little texture, the second is increased.
+    """
     whole = valid.to(left)
     sums = torch.nn.functional.avg_pool2d(
-        torch.stack([whole, whole * left, whole * explained])[:, None], min(_BLOCK, *left.shape)
+        torch.stack([whole, whole * left, whole * explained, whole * steep])[:, None],
+        min(_BLOCK, *left.shape),
     ).flatten(1)
-    full = sums[0] > 0.5
+    full = (sums[0] > 0.5) & (sums[3] > 0)
     if int(full.sum()) < _FEW_BLOCKS:
         return 0.0
-    misfit, change = sums[1:, full] / sums[0, full]
-    change = change - change.mean()
-    power = change.square().sum()
-    if not float(power) > 0:
+    part, misfit, change, power = sums[:, full]
+    return min(
+        _slope(misfit / part, change / part, torch.ones_like(part)),
+        _slope(misfit / power, change / power, power),
+    )
+
+
+def _slope(misfit: torch.Tensor, change: torch.Tensor, weight: torch.Tensor) -> float:
+    """Of a weighted straight line; 0 if not significant by residuals of any size (White 1980)."""
+    weight = weight / weight.sum()
+    misfit, change = (part - (weight * part).sum() for part in (misfit, change))
+    square = (weight * change.square()).sum()
+    if not float(square) > 0:
         return 0.0
-    slope = float((change * misfit).sum() / power)
-    scatter = (misfit - misfit.mean() - slope * change).square().sum() / (len(change) - 2)
-    return slope if slope > _SIGNIFICANT * float((scatter / power).sqrt()) else 0.0
+    slope = float((weight * change * misfit).sum() / square)
+    rest = misfit - slope * change
+    error = float((weight * change * rest).square().sum().sqrt() / square)
+    return slope if slope > _SIGNIFICANT * error else 0.0
