@@ -98,6 +98,11 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
             *(f"{part}{s}" for part in ("", "outside_cores.", "all.") for s in STATISTICS),
         )
     }
+    # weight shift states no standard errors
+    expected |= {
+        f"{source}.cc.{key}"
+        for source, key in product(SOURCES, ("stderr_v", "stderr_w", "no_skill_fraction"))
+    }
     # the noise of an image that was rendered is known, and so how well a wind can be found in it
     expected |= {
         f"backscatter.{method}.{q}_{name}"

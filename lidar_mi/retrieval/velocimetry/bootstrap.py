@@ -49,6 +49,7 @@ def bootstrap_covariance(
     retrieve: Callable[..., Displacement],
     centred: bool,
     repeats: int = 1,
+    textured: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Covariance of the displacements' errors, from further retrievals of a known motion.
 
@@ -92,6 +93,9 @@ def bootstrap_covariance(
         Vectors belong to the windows' centres, not half their displacement further on.
     repeats : int
         1 or 2 retrievals: the residual is moved to opposite sides.
+    textured : torch.Tensor of bool, shape windows.count, optional
+        Windows whose errors count; left out: all. Errors of windows that hold nothing say nothing
+        of their neighbours.
 
     Returns
     -------
@@ -126,6 +130,8 @@ def bootstrap_covariance(
         again = retrieve(first, carried + moved, stride=coarse.stride)
         outlier = median_outliers(again.d, 3, max(1, round(per_template / 2)))
         use = (again.flag == 0) & ~outlier
+        if textured is not None:
+            use &= textured[::every, ::every]
         if not bool(use.any()):
             continue
         error = again.d - _read(wind, _places(again.d, coarse, centred))

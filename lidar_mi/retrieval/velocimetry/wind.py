@@ -184,7 +184,9 @@ def retrieve_wind(
                 flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
             pair = [first, second]
             covariance = (
-                bootstrap_covariance(pair, found, windows, find, chosen.centred, chosen.repeats)
+                bootstrap_covariance(
+                    pair, found, windows, find, chosen.centred, chosen.repeats, ~low
+                )
                 if standard_errors
                 else None
             )

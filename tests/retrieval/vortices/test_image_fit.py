@@ -305,11 +305,11 @@ def test_noise_alone_keeps_no_fit_busy(monkeypatch):
 
 
 def test_a_map_without_noise_says_nothing():
-    """As files have it whose pixels have no standard error."""
+    """As files have it whose pixels have no standard error. Sums of one kind round differently."""
     pair = vortex_pair_images(0.05, seed=6, vortices=uneven(), columns=40, rows=30)
     alone = fit_vortices(pair.first, pair.second, DT)
     stated = fit_vortices(pair.first, pair.second, DT, noise=0 * pair.first)
-    np.testing.assert_array_equal(stated.parameters, alone.parameters)
+    np.testing.assert_allclose(stated.parameters, alone.parameters, rtol=1e-6)
 
 
 def simulated(texture_rms, noise):
