@@ -100,7 +100,9 @@ def evaluate(expression: str) -> str | None:
     except TypeError as error:
         return None if _names_argument(error, expression) else _where(error)
     except Exception as error:
-        return _where(error)
+        place = _where(error)
+        # an argument that cannot even be made is no call of ours
+        return None if place.startswith("? ") else place
     return None
 
 
