@@ -56,7 +56,9 @@ def _message(error: BaseException) -> str | None:
     if isinstance(error, OSError):
         names = [str(name) for name in (error.filename, error.filename2) if name is not None]
         return ": ".join([*names, error.strerror or str(error)])
-    if isinstance(error, MemoryError):
+    # torch has no type of its own for it
+    no_memory = isinstance(error, RuntimeError) and "allocate memory" in str(error)
+    if isinstance(error, MemoryError) or no_memory:
         return (
             f"not enough memory ({one_line(error, 100) or 'in all'}); expected fewer beams, gates "
             "or samples, or a larger machine"

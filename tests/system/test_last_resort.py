@@ -38,6 +38,11 @@ def said_by(error, capsys):
             "samples, or a larger machine",
         ),
         (
+            RuntimeError("DefaultCPUAllocator: can't allocate memory: 2 GB"),
+            "not enough memory (DefaultCPUAllocator: can't allocate memory: 2 GB); expected fewer "
+            "beams, gates or samples, or a larger machine",
+        ),
+        (
             np.linalg.LinAlgError("Singular matrix"),
             "equations without a solution (Singular matrix); expected data that determine it",
         ),
