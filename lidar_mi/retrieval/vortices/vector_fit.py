@@ -91,6 +91,8 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     for name in ("v", "w"):
         if name not in vectors:
             raise InputError(f"vectors.{name}: missing; expected v and w on (z, y)")
+    if set(vectors.sizes) != {"z", "y"}:
+        raise InputError(f"vectors: dims {tuple(vectors.sizes)} are not allowed; expected z and y")
     vectors = vectors.transpose("z", "y")
 
     def field(name, default=None):
