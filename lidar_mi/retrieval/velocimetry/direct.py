@@ -55,13 +55,21 @@ def solved(
 ) -> Posterior:
     """One Gauss-Newton step; `turn` is for `iterative` only."""
     band = Band(*(axis.knots for axis in mesh.axes))
-    data = data_form(linear, mesh)
+    stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
+    root = band.factor(data_form(linear, mesh) + stiff)
+    return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
+
+
+def prior_and_gradient(
+    linear: Linear, mesh: Mesh, coefficients: torch.Tensor, prior: Prior, ridge: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The prior's quadratic form with its ridge, and the gradient of the log-posterior."""
     stiff = prior_form(prior)
-    with_diagonal(stiff, settings.ridge)
+    with_diagonal(stiff, ridge)
+    band = Band(*(axis.knots for axis in mesh.axes))
     gradient = mesh.transposed(linear.gradient) - band.apply(stiff, coefficients)
     with_diagonal(stiff, rounding(stiff))
-    root = band.factor(data + stiff)
-    return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
+    return stiff, gradient
 
 
 def data_form(linear: Linear, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:

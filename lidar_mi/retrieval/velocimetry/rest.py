@@ -177,9 +177,9 @@ def at_rest(
     speed = d.norm(dim=0)
     known = (speed >= _SLOWEST) & (scatter < speed)
     for spot, size in zip(spots, _SIZES, strict=True):
-        apart = _grown(spot.alike & spot.apart(d), size) & known
-        if bool(apart.any()):
-            found |= _grown(spot.alike & spot.apart(d) & spot.still(size), size)
+        apart = spot.alike & spot.apart(d)
+        if bool((_grown(apart, size) & known).any()):
+            found |= _grown(apart & spot.still(size), size)
     return _grown(found & known, 3), d
 
 

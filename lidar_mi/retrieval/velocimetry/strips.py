@@ -14,6 +14,7 @@ from lidar_mi.retrieval.velocimetry.band import Band, spread
 from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.direct import (
     data_form,
+    prior_and_gradient,
     prior_form,
     rounding,
     variances,
@@ -148,10 +149,7 @@ def solved(
     """
     solver = settings.strips
     whole = Band(*(axis.knots for axis in mesh.axes))
-    stiff = prior_form(prior)
-    with_diagonal(stiff, settings.ridge)
-    gradient = mesh.transposed(linear.gradient) - whole.apply(stiff, coefficients)
-    with_diagonal(stiff, rounding(stiff))
+    stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     both = Matrix(data_form(linear, mesh) + stiff, prior, (linear, mesh))
     cut = strips(mesh.axes[0].cells, solver.solved_core, solver.solved_overlap)
     # those that one thread solves at once

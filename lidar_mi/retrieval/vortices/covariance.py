@@ -104,11 +104,11 @@ def _attenuation(found: Solution) -> torch.Tensor:
     misfit, theta = found.misfit, found.parameters
     explained = (theta[0] * misfit.jacobian[0] + theta[4] * misfit.jacobian[4]).square()
     left = misfit.residual.square()
-    power = float((found.weight * explained)[misfit.valid].sum())
     if left.ndim == 2:
         steep = misfit.slope.square().sum(0)
         fraction = _increase(left - misfit.scatter, explained, steep, misfit.valid)
     else:
+        power = float((found.weight * explained)[misfit.valid].sum())
         excess = float((found.weight * (left - misfit.scatter))[misfit.valid].sum())
         fraction = max(0.0, excess / power) if power > 0 else 0.0
     attenuation = torch.zeros_like(theta[:10])
