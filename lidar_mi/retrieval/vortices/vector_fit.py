@@ -95,12 +95,18 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         raise InputError(f"vectors: dims {tuple(vectors.sizes)} are not allowed; expected z and y")
     vectors = vectors.transpose("z", "y")
 
+    def numbers(name):
+        kind = vectors[name].dtype
+        if kind.kind not in "biuf":
+            raise InputError(f"vectors.{name}: {kind} is not allowed; expected real numbers")
+        return vectors[name].values.astype(float)
+
     def field(name, default=None):
         if name not in vectors and name not in vectors.coords:
             return default
-        return np.broadcast_to(vectors[name].values.astype(float), vectors["v"].shape)
+        return np.broadcast_to(numbers(name), vectors["v"].shape)
 
-    z, y = (vectors[name].values.astype(float) for name in ("z", "y"))
+    z, y = numbers("z"), numbers("y")
     vertical, lateral = np.meshgrid(z, y, indexing="ij")
     value = np.stack([field("v"), field("w")])
     place = np.stack([field("y_vector", lateral), field("z_vector", vertical)])
