@@ -55,6 +55,8 @@ def main(arguments: list[str] | None = None) -> int:
         found.append(future.result())
         for check in found[-1][-1]:
             report.show(check, console)
+            if name in OPEN:  # on no page
+                console.print(check.text, highlight=False, soft_wrap=True)
             failed += [
                 f"{check.title}, {row.name}: expected {row.expected:.6g}, got {row.got:.6g}"
                 for row in check.rows

@@ -82,7 +82,16 @@ def air_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> Ring
     return ring_model(etalon, camera, line, temperature * np.array(TEMPERATURE_NODES))
 
 
-def pixel_noise(ccd: CCD, modes: float = math.inf) -> PixelNoise:
-    """The CCD's noise; a digitiser's step adds 1/12 of its square to the variance."""
-    step = 0.0 if ccd.bits is None else ccd.gain
-    return PixelNoise(math.hypot(ccd.read_noise, step / math.sqrt(12)), modes)
+def pixel_noise(ccd: CCD, modes: float = math.inf, images: int = 1) -> PixelNoise:
+    """The CCD's noise in the sum of so many images, referred to photoelectrons.
+
+    ``modes`` are those of the speckle in one image. Responses of the pixels that are not known
+    have, like speckle, a variance that grows with the square of the signal; they are the same in
+    every image.
+    """
+    spread = 1 / (images * modes) + ccd.pixel_response_rms**2
+    return PixelNoise(
+        math.sqrt(images) * ccd.output_noise / ccd.multiplication_gain,
+        1 / spread if spread else math.inf,
+        ccd.excess,
+    )

@@ -1,22 +1,35 @@
-"""The CCD behind the etalon: detection of photons, and its noise."""
+"""The CCD behind the etalon, with or without gain: detection of photons, and its noise."""
 
 import math
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.multiplication import intensified, register_excess, register_output
 from lidar_mi.units import Frequency, Number, Time, Within, quantity
 
 
 class CCD(BaseModel):
-    """A CCD; numbers of photoelectrons unless stated otherwise.
+    """A CCD, an EMCCD or an intensified CCD; numbers of electrons unless stated otherwise.
 
     ``quantum_efficiency`` is 1 by default because the paper's photon numbers count the photons
     that the CCD detects. The other defaults are those of a scientific camera, not the paper's.
+
+    A pixel of the image, ``camera.pixel`` wide, is read once. It consists of ``binning`` x
+    ``binning`` pixels of the chip, to which dark current, full well and response refer.
+
+    An ``emccd`` multiplies the electrons of a pixel in a register of ``stages`` on the chip
+    (CCD97: 536). An ``iccd`` multiplies those of a photocathode in front of the chip, whose wells
+    then hold the multiplied ones; ``intensifier_excess`` is F^2 = <g^2> / <g>^2 of its pulse
+    heights g (F of 1.6 or more: Dussault and Hoess 2004, Proc. SPIE 5563, 195). Read noise and the
+    digitiser's steps are numbers behind the gain.
+
+    ``nonlinearity`` a records q (1 - a q / q_full) of q electrons: positive where the response
+    falls. q_full is ``register_well``, or without one what full wells of the chip become.
     """
 
     model_config = ConfigDict(
@@ -36,17 +49,100 @@ class CCD(BaseModel):
         quantity("10 ms"), description="from one read-out to the next; a laser of 100 Hz"
     )
     full_well: Annotated[Number, Within(1, 1e12, "from a single photon to whole rows added")] = (
-        Field(20e3, description="most a pixel holds; no blooming")
+        Field(20e3, description="most a pixel of the chip holds; no blooming")
+    )
+    register_well: (
+        Annotated[Number, Within(1, 1e12, "from a single photon to whole rows added")] | None
+    ) = Field(
+        None, description="most a cell of the output register holds, multiplied; null: no limit"
+    )
+    binning: Annotated[int, Within(1, 10000, "one pixel from a whole chip")] = Field(
+        1, description="pixels of the chip along each side of a pixel of the image"
+    )
+    multiplication: Literal["none", "emccd", "iccd"] = Field(
+        "none", description="gain before the read-out"
+    )
+    multiplication_gain: Annotated[
+        Number, Within(1, 1e7, "from no gain to two channel plates in a row")
+    ] = Field(1.0, description="mean electrons of one photoelectron")
+    stages: Annotated[int, Within(16, 10000, "registers have 468 to 604")] = Field(
+        536, description="of the register of an emccd"
+    )
+    intensifier_excess: Annotated[
+        Number, Within(1, 100, "the noisiest channel plates have about 12")
+    ] = Field(2.6, description="excess noise factor F^2 of an iccd")
+    response_rms: Annotated[Number, Within(0, 0.3, "chips are uniform to a few per cent")] = Field(
+        0.0, description="standard deviation of the pixels' responses over their mean"
+    )
+    response_seed: Annotated[int, Within(0, 2**31 - 1, "what 32 bits hold")] = Field(
+        0, description="selects the chip: its responses are the same in every image"
+    )
+    nonlinearity: Annotated[Number, Within(-0.5, 0.5, "the response has to rise")] = Field(
+        0.0, description="fraction of the electrons lost in the output at full well"
     )
     gain: Annotated[
         Number, Within(1e-6, 1e9, "from a fraction of an electron to the largest well")
-    ] = Field(1.0, description="photoelectrons per step of the digitiser")
+    ] = Field(1.0, description="electrons per step of the digitiser")
     bits: Annotated[int, Within(1, 32, "digitisers have 32 at most")] | None = Field(
         16, description="of the digitiser; null: no rounding"
     )
     bias: Annotated[int, Within(0, 2**31 - 1, "what 32 bits hold")] = Field(
         100, description="steps of the digitiser without a signal"
     )
+
+    @model_validator(mode="after")
+    def _gain_has_its_kind(self):
+        if self.multiplication == "none" and self.multiplication_gain != 1:
+            raise ValueError(
+                f"multiplication_gain: {self.multiplication_gain:g} is not allowed with "
+                "multiplication none; expected emccd or iccd"
+            )
+        return self
+
+    @property
+    def excess(self) -> float:
+        """F^2, the variance of a multiplied photoelectron number over Poisson's."""
+        if self.multiplication == "emccd":
+            return register_excess(self.multiplication_gain, self.stages)
+        return self.intensifier_excess if self.multiplication == "iccd" else 1.0
+
+    @property
+    def pixel_response_rms(self) -> float:
+        """Of the pixels of the image: means over those of the chip."""
+        return self.response_rms / self.binning
+
+    @property
+    def output_noise(self) -> float:
+        """Rms of what does not depend on the light, electrons behind the gain.
+
+        Read noise and 1 / sqrt(12) of a step of the digitiser.
+        """
+        step = 0.0 if self.bits is None else self.gain
+        return math.hypot(self.read_noise, step / math.sqrt(12))
+
+    @property
+    def chip_well(self) -> float:
+        """Electrons that fill the chip's pixels of one pixel of the image."""
+        return self.full_well * self.binning**2
+
+    @property
+    def output_well(self) -> float:
+        """Most electrons of a pixel behind the gain."""
+        if self.register_well is not None:
+            return self.register_well
+        return self.chip_well * (self.multiplication_gain if self.multiplication == "emccd" else 1)
+
+    @property
+    def saturation(self) -> float:
+        """Photoelectrons of a pixel of the image at which a well or the digitiser is full.
+
+        The chip's pixels are taken as evenly filled.
+        """
+        digits = math.inf if self.bits is None else (2**self.bits - 1 - self.bias) * self.gain
+        behind = min(self.output_well, digits)
+        if self.multiplication == "emccd":
+            return min(self.chip_well, behind / self.multiplication_gain)
+        return min(self.chip_well, behind) / self.multiplication_gain
 
 
 def expose(
@@ -59,11 +155,13 @@ def expose(
 ) -> torch.Tensor:
     """Read the CCD: noisy images, in photoelectrons.
 
-    The mean of a pixel is drawn from a Gamma distribution of shape ``modes`` (speckle), the number
-    of photoelectrons from a Poisson one and clipped at the full well; Gaussian read noise is added,
-    the sum rounded to the digitiser's steps and clipped to its range, and bias and gain are
-    corrected. The means of background and dark current are not subtracted. Pixels are independent
-    of each other: speckles are assumed to be smaller than a pixel.
+    The mean of a pixel is drawn from a Gamma distribution of shape ``modes`` (speckle) and
+    multiplied by the pixel's response, the number of photoelectrons from a Poisson one. They are
+    multiplied (`lidar_mi.instrument.multiplication`) and clipped at the wells, in the order of the
+    camera; Gaussian read noise is added, the sum rounded to the digitiser's steps and clipped to
+    its range, and bias and gains are corrected. The means of background and dark current are not
+    subtracted, response and nonlinearity not corrected. Pixels are independent of each other:
+    speckles are assumed to be smaller than a pixel.
 
     Parameters
     ----------
@@ -94,7 +192,12 @@ def expose(
         raise InputError("modes: expected numbers above 0, or inf for no speckle")
     numbers = _image_numbers(images, expected)
     means = expected * ccd.quantum_efficiency
-    floor = background * ccd.quantum_efficiency + ccd.dark_current * ccd.integration_time
+    light = background * ccd.quantum_efficiency
+    dark = ccd.dark_current * ccd.integration_time * ccd.binning**2
+    if ccd.response_rms > 0:
+        response = _response(ccd, expected)
+        means, light = means * response, light * response
+    floor = light + dark
     frames = expected.new_empty((len(numbers), *expected.shape[-2:]), dtype=torch.float32)
     # one image at a time, so that its noise depends only on its own number
     for i, (frame, number) in enumerate(zip(frames, numbers, strict=True)):
@@ -110,14 +213,36 @@ def _read(mean, floor, modes, ccd, generator):
         # the sampler of torch.distributions.Gamma, which accepts no generator
         drawn = torch._standard_gamma(torch.nan_to_num(shape, posinf=1.0), generator=generator)
         mean = torch.where(torch.isinf(shape), mean, mean * drawn / shape)
-    electrons = torch.poisson(mean + floor, generator=generator).clamp(max=ccd.full_well)
+    electrons = _output(torch.poisson(mean + floor, generator=generator), ccd, generator)
     if ccd.read_noise > 0:
         noise = torch.randn(mean.shape, generator=generator, dtype=mean.dtype, device=mean.device)
         electrons = electrons + ccd.read_noise * noise
-    if ccd.bits is None:
-        return electrons
-    steps = torch.round(electrons / ccd.gain + ccd.bias).clamp(0, 2**ccd.bits - 1)
-    return (steps - ccd.bias) * ccd.gain
+    if ccd.bits is not None:
+        steps = torch.round(electrons / ccd.gain + ccd.bias).clamp(0, 2**ccd.bits - 1)
+        electrons = (steps - ccd.bias) * ccd.gain
+    return electrons / ccd.multiplication_gain
+
+
+def _output(photoelectrons, ccd, generator):
+    """Electrons that reach the output: multiplied, within the wells, the response bent."""
+    electrons, gain = photoelectrons, ccd.multiplication_gain
+    if ccd.multiplication == "iccd":
+        electrons = intensified(electrons, gain, ccd.intensifier_excess, generator)
+    electrons = electrons.clamp(max=ccd.chip_well)
+    if ccd.multiplication == "emccd":
+        electrons = register_output(electrons, gain, ccd.stages, generator)
+    if ccd.register_well is not None:
+        electrons = electrons.clamp(max=ccd.register_well)
+    if ccd.nonlinearity:
+        electrons = electrons * (1 - ccd.nonlinearity * electrons / ccd.output_well)
+    return electrons
+
+
+def _response(ccd, expected):
+    """Responses of the pixels: those of the chip, whatever is drawn on it."""
+    generator = torch.Generator().manual_seed(ccd.response_seed)
+    drawn = torch.randn(expected.shape[-2:], generator=generator, dtype=torch.float64)
+    return (1 + ccd.pixel_response_rms * drawn).clamp(min=0).to(expected.device)
 
 
 def _generator(seed, number, device):

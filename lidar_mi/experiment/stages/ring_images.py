@@ -109,13 +109,13 @@ def ring_instrument(doppler: Doppler) -> Rings:
     )
     background = solar_background(lidar, etalon) / (camera.width * camera.height)
     crest = ccd.quantum_efficiency * (float(image.max()) + background)
-    digits = math.inf if ccd.bits is None else (2**ccd.bits - 1 - ccd.bias) * ccd.gain
-    full = min(ccd.full_well, digits)
+    noise = pixel_noise(ccd, modes)
     # crests of the noisiest pixels stay below
-    if not crest + 6 * math.sqrt(crest + crest**2 / modes + ccd.read_noise**2) < full:
+    spread = math.sqrt(noise.variance(crest, crest))
+    if not crest + 6 * spread < ccd.saturation:
         raise InputError(
-            f"doppler.ccd: a pixel that holds {full:.3g} photoelectrons is not allowed; expected "
-            f"more, as the rings' crests have {crest:.3g}"
+            f"doppler.ccd: a pixel that holds {ccd.saturation:.3g} photoelectrons is not allowed; "
+            f"expected more, as the rings' crests have {crest:.3g}"
         )
     return Rings(line, model, float(image.sum()), background, modes)
 
@@ -254,9 +254,10 @@ def summed(ccd: CCD, images: int) -> CCD:
         return ccd
     return ccd.model_copy(
         update={
-            "read_noise": math.sqrt(images) * pixel_noise(ccd).read_noise,
+            "read_noise": math.sqrt(images) * ccd.output_noise,
             "integration_time": images * ccd.integration_time,
             "full_well": images * ccd.full_well,
+            "register_well": ccd.register_well and images * ccd.register_well,
             "bits": None,
         }
     )
@@ -264,4 +265,4 @@ def summed(ccd: CCD, images: int) -> CCD:
 
 def summed_noise(ccd: CCD, modes: float, images: int) -> PixelNoise:
     """The noise of the sum of so many images by the CCD."""
-    return PixelNoise(math.sqrt(images) * pixel_noise(ccd).read_noise, images * modes)
+    return pixel_noise(ccd, modes, images)

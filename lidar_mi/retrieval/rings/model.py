@@ -147,15 +147,18 @@ class RingModel:
 
 @dataclass(frozen=True)
 class PixelNoise:
-    """Noise of a pixel, electrons.
+    """Noise of a pixel, photoelectrons.
 
     Parameters
     ----------
     read_noise : float
         Standard deviation of the noise that does not depend on the light: root sum of squares of
-        the read-out's and of 1 / sqrt(12) of a digitisation step.
+        the read-out's and of 1 / sqrt(12) of a digitisation step, over the gain before them.
     speckle_modes : float
         M of the Gamma distribution that the laser light of a pixel follows; infinite without.
+    excess : float
+        Variance of a photoelectron number over Poisson's: the excess noise factor F^2 of a
+        multiplication before the read-out, 1 without.
 
     Raises
     ------
@@ -164,6 +167,7 @@ class PixelNoise:
 
     read_noise: float = 0.0
     speckle_modes: float = math.inf
+    excess: float = 1.0
 
     def __post_init__(self):
         if not (math.isfinite(self.read_noise) and self.read_noise >= 0):
@@ -172,6 +176,8 @@ class PixelNoise:
             raise InputError(
                 f"speckle_modes: {self.speckle_modes!r} is not allowed; expected above 0"
             )
+        if not (math.isfinite(self.excess) and self.excess >= 1):
+            raise InputError(f"excess: {self.excess!r} is not allowed; expected 1 or more")
 
     def variance(self, mean: torch.Tensor, signal: torch.Tensor) -> torch.Tensor:
         """Electrons^2, of pixels with ``mean`` electrons, ``signal`` of them laser light.
@@ -181,9 +187,10 @@ class PixelNoise:
         d mean, so that weighting by the variance of the fitted mean *is* maximum likelihood.
         With read noise the exact density is a convolution; the same score then loses less than
         1 % of the information for a mean of 20 electrons or more and 4 % at worst (5 electrons
-        rms, M = 10 or more).
+        rms, M = 10 or more). A multiplied number has the variance ``excess`` times Poisson's; the
+        score is then that of its first two moments.
         """
-        return mean + signal**2 / self.speckle_modes + self.read_noise**2
+        return self.excess * mean + signal**2 / self.speckle_modes + self.read_noise**2
 
 
 def squared_radius(cells: Cells, dx: torch.Tensor, dy: torch.Tensor) -> torch.Tensor:
