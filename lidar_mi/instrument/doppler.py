@@ -1,6 +1,7 @@
 """The fringe-imaging Doppler lidar: signal photons, sunlight and speckle."""
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 import numpy as np
@@ -154,10 +155,7 @@ def solar_background(lidar: DopplerLidar, etalon: Etalon) -> float:
 
 
 def coherence_time(etalon: Etalon, line: Line, order: float = 0.0) -> float:
-    """Coherence time of the light of a line behind the etalon, s.
-
-    int |g|^2 dt over all times, which by Parseval's theorem is int p^2 dnu, with p the spectrum
-    behind the etalon, of integral 1 (Goodman 1985, Statistical Optics, section 5.1).
+    """Coherence time of the light of a line in one place behind the etalon, s.
 
     Parameters
     ----------
@@ -172,29 +170,74 @@ def coherence_time(etalon: Etalon, line: Line, order: float = 0.0) -> float:
     InputError
         A line with a monochromatic part.
     """
+    return filtered_coherence_time(line, _behind_etalon(etalon, line, order))
+
+
+def filtered_coherence_time(line: Line, transmission: Callable[[np.ndarray], np.ndarray]) -> float:
+    """Coherence time of the light of a line behind a filter, s.
+
+    int |g|^2 dt over all times, which by Parseval's theorem is int p^2 dnu, with p the spectrum
+    behind the filter, of integral 1 (Goodman 1985, Statistical Optics, section 5.1).
+
+    Parameters
+    ----------
+    line : lidar_mi.atmosphere.line.Line
+        Of air at rest, every Gaussian with a width.
+    transmission : function
+        Of the frequency less that of the laser (array, Hz).
+
+    Raises
+    ------
+    InputError
+        A line with a monochromatic part.
+    """
     if not line.sigmas.all():
         raise InputError("line.sigmas: 0 Hz is not allowed; expected a line with a width")
     extent = 8 * line.sigmas.max() + abs(line.offsets).max()
     # steps of sigma / 8 of the narrowest Gaussian: sums of its square are exact to rounding
     nu = np.arange(-extent, extent, line.sigmas.min() / 8)
-    orders = order + nu / etalon.free_spectral_range(line.wavelength)
-    passed = series(harmonics(etalon, line.wavelength), torch.from_numpy(orders)).numpy()
-    transmitted = line.pdf(nu) * passed
+    transmitted = line.pdf(nu) * transmission(nu)
     return float((transmitted**2).sum() / transmitted.sum() ** 2 / (nu[1] - nu[0]))
 
 
-def speckle_modes(lidar: DopplerLidar, camera: FringeCamera, etalon: Etalon, line: Line) -> float:
-    """Degrees of freedom M of the speckle in one pixel: its relative variance is 1 / M.
+def _behind_etalon(etalon, line, order):
+    """Transmission as a function of the frequency, in the place of a fractional order."""
+    amplitudes = harmonics(etalon, line.wavelength)
+    spectral_range = etalon.free_spectral_range(line.wavelength)
+    return lambda nu: series(amplitudes, torch.from_numpy(order + nu / spectral_range)).numpy()
 
-    Modes in time, for a Gaussian line of the `coherence_time` at the peak of a fringe, times modes
-    in space: those of the telescope, A Omega / lambda^2, spread evenly over the pixels, and one at
-    least. Polarised light is taken, the least that molecules leave; the polarisations of
-    depolarised light would add modes.
+
+def speckle_modes(lidar: DopplerLidar, camera: FringeCamera, etalon: Etalon, line: Line) -> float:
+    """Degrees of freedom M of the speckle in one pixel of a ring image.
+
+    `channel_modes` of as many channels as pixels, with the light at the peak of a fringe, which has
+    the fewest modes.
+    """
+    return channel_modes(
+        lidar, line, _behind_etalon(etalon, line, 0.0), camera.width * camera.height
+    )
+
+
+def channel_modes(
+    lidar: DopplerLidar, line: Line, transmission: Callable[[np.ndarray], np.ndarray], channels: int
+) -> float:
+    """Degrees of freedom M of the speckle in a channel of a receiver: its relative variance is 1/M.
+
+    Modes in time, for a Gaussian line of the `filtered_coherence_time`, times modes in space: those
+    of the telescope, A Omega / lambda^2, spread evenly over the channels, and one at least.
+    Polarised light is taken, the least that molecules leave; the polarisations of depolarised light
+    would add modes.
+
+    Parameters
+    ----------
+    transmission : function
+        Of the channel, of the frequency less that of the laser (array, Hz).
+    channels : int
+        That the light is spread over: pixels of a camera, elements of a line detector.
     """
     # FWHM of the Gaussian line with that coherence time
-    width = math.sqrt(2 * math.log(2) / math.pi) / coherence_time(etalon, line)
+    width = math.sqrt(2 * math.log(2) / math.pi) / filtered_coherence_time(line, transmission)
     footprint = min(lidar.beam_width / 2, lidar.fov_half * lidar.range)
     radius = math.sqrt(lidar.telescope_area / math.pi)
     space = spatial_modes(radius, lidar.wavelength, footprint, lidar.range)
-    pixel_fraction = float(space) / (camera.width * camera.height)
-    return float(temporal_modes(width, lidar.gate_duration)) * max(1.0, pixel_fraction)
+    return float(temporal_modes(width, lidar.gate_duration)) * max(1.0, float(space) / channels)

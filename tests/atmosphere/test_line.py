@@ -7,6 +7,7 @@ own error), the Fourier transform with quadrature (1e-9), samples with their dis
 (Kolmogorov-Smirnov).
 """
 
+import itertools
 import math
 
 import numpy as np
@@ -208,3 +209,26 @@ def test_samples_follow_the_density():
 def test_bad_input(call, words):
     with pytest.raises(InputError, match=words):
         call()
+
+
+def test_information_of_a_line():
+    """1 / sigma^2 of a Gaussian; of others by adaptive quadrature of the definition."""
+    assert rayleigh(WAVELENGTH, TEMPERATURE).information == pytest.approx(THERMAL**-2, rel=1e-9)
+    line = backscatter_line(WAVELENGTH, TEMPERATURE, PRESSURE, aerosol_fraction=0.1)
+
+    def density(x):  # in GHz
+        return float(line.pdf(1e9 * x)) * 1e9
+
+    def information(x):
+        slope = (density(x + 1e-5) - density(x - 1e-5)) / 2e-5
+        return slope**2 / density(x)
+
+    parts = [-9, -3, -0.5, -0.25, -0.1, -0.05, 0, 0.05, 0.1, 0.25, 0.5, 3, 9]
+    expected = sum(
+        integrate.quad(information, low, high, epsrel=1e-8)[0]
+        for low, high in itertools.pairwise(parts)
+    )
+    assert line.information * 1e18 == pytest.approx(expected, rel=1e-6)
+    assert line.shifted(3e9).information == pytest.approx(line.information, rel=1e-9)
+    with pytest.raises(InputError, match=r"line.sigmas: 0 Hz"):
+        _ = laser_line(WAVELENGTH, 0.0).information
