@@ -231,12 +231,13 @@ def _receiver(lidar, detector, harmonics, delay, modes, pixels=1.0, ratio=False)
     # in front of the receiver, so without an etalon
     sun = solar_background(lidar.model_copy(update={"counted": "detected"}), Etalon())
     electrons = sun * detector.quantum_efficiency * harmonics[:, 0].real
+    dark = detector.dark_current * detector.integration_time * detector.binning**2
     channels = ChannelModel(
         molecules=harmonics * np.array(lines)[:, None],
         aerosol=harmonics * laser,
         period=lidar.wavelength / (2 * delay),
         temperatures=temperatures,
-        background=electrons + pixels * detector.dark_current * detector.integration_time,
+        background=electrons + pixels * dark,
         pixels=pixels,
     )
     if ratio:

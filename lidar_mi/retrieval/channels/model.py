@@ -83,8 +83,8 @@ class ChannelModel:
         if aerosol.ndim != 2 or min(aerosol.shape) < 2 or molecules.shape != expected:
             raise InputError(
                 f"harmonics: shapes {molecules.shape} and {aerosol.shape} are not allowed; "
-                f"expected ({len(temperatures)}, channels, K) and (channels, K), two channels and K = 2 or "
-                "more"
+                f"expected ({len(temperatures)}, channels, K) and (channels, K), two channels and "
+                "K = 2 or more"
             )
         for name, value in (("molecules", molecules), ("aerosol", aerosol)):
             if not (np.isfinite(value).all() and (value[..., 0].real > 0).all()):
@@ -96,8 +96,8 @@ class ChannelModel:
             "molecules": torch.from_numpy(molecules),
             "aerosol": torch.from_numpy(aerosol),
             "temperatures": temperatures,
-            "background": torch.from_numpy(channels * self.background),
-            "pixels": torch.from_numpy(channels * self.pixels),
+            "background": torch.from_numpy(channels * np.asarray(self.background)),
+            "pixels": torch.from_numpy(channels * np.asarray(self.pixels)),
             "limits": limits,
         }
         if not (torch.isfinite(values["background"]) & (values["background"] >= 0)).all():
