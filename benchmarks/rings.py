@@ -15,9 +15,9 @@ from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.retrieval.rings.bound import cramer_rao
-from lidar_mi.retrieval.rings.cells import pixels
 from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
-from lidar_mi.retrieval.rings.model import RingModel, expected, mean_and_jacobian
+from lidar_mi.retrieval.rings.mean_image import expected, mean_and_jacobian, pixel_waves
+from lidar_mi.retrieval.rings.model import PARAMETERS, RingModel
 
 from .measure import in_turns
 from .report import Comparison, row
@@ -101,18 +101,24 @@ def compare(repeats: int = 5, width: int = 960, height: int = 780) -> Comparison
 
 def scipy_fit(image: torch.Tensor, model: RingModel, noise) -> float:
     """v_LOS of one image, by scipy's Levenberg-Marquardt over all pixels."""
-    cells = pixels(model.shape, model.centre)
+    blocks = list(pixel_waves(model))
+    names = model.parameters
+    places = [PARAMETERS.index(name) for name in names]
     values = image.double().flatten()
     level = float(values.mean())
-    start = [SPEED + 5, 1.0, -1.0, 0.9 * level, 0.1 * level, model.middle_temperature, 0.0]
+    begin = {"v_los": SPEED + 5, "x": 1.0, "y": -1.0, "level": 0.9 * level}
+    begin |= {"background": 0.1 * level, "temperature": model.middle_temperature}
+    start = [begin.get(name, 0.0) for name in names]
 
     def evaluate(parameters):
-        vector = torch.as_tensor(np.asarray(parameters))[None]
-        mean, jacobian = mean_and_jacobian(model, cells, vector)
-        return mean[0], jacobian[0]
+        vector = model.start()
+        vector[0, places] = torch.as_tensor(np.asarray(parameters))
+        parts = [mean_and_jacobian(model, waves, vector, names) for waves in blocks]
+        mean, jacobian = (torch.cat(both, -1)[0] for both in zip(*parts, strict=True))
+        return mean, jacobian
 
     guess = evaluate(start)[0]
-    sigma = noise.variance(guess, guess - start[4]).sqrt()
+    sigma = noise.variance(guess, guess - begin["background"]).sqrt()
     found = least_squares(
         lambda p: ((evaluate(p)[0] - values) / sigma).numpy(),
         start,

@@ -5,22 +5,19 @@ from collections.abc import Sequence
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.cells import pixels
-from lidar_mi.retrieval.rings.model import (
-    PARAMETERS,
-    PixelNoise,
-    RingModel,
-    mean_and_jacobian,
-    parameter_vector,
-)
+from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, parameter_vector, pixel_waves
+from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
 
 
-def fisher_matrix(
-    jacobian: torch.Tensor, weight: torch.Tensor, free: Sequence[int]
-) -> torch.Tensor:
-    """sum_i w_i J_i J_i^T over the free parameters, shape (images, free, free)."""
-    part = jacobian[:, list(free)]
-    return (part * weight[:, None]) @ part.transpose(1, 2)
+def fisher_matrix(jacobian: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
+    """sum_i w_i J_i J_i^T, shape (images, parameters, parameters)."""
+    return (jacobian * weight[:, None]) @ jacobian.transpose(1, 2)
+
+
+def prior_information(model: RingModel, names: Sequence[str], device="cpu") -> torch.Tensor:
+    """1 / variance of the model's priors on these parameters; 0 where it has none."""
+    variances = [model.priors[name][1] ** -2 if name in model.priors else 0.0 for name in names]
+    return torch.tensor(variances, dtype=torch.float64, device=device)
 
 
 def standard_deviations(fisher: torch.Tensor) -> torch.Tensor:
@@ -31,8 +28,8 @@ def standard_deviations(fisher: torch.Tensor) -> torch.Tensor:
     return torch.where(info[:, None] == 0, found, torch.nan)
 
 
-def free_indices(model: RingModel, free: Sequence[str] | None) -> list[int]:
-    """Places of the named parameters in `PARAMETERS`; of all that the model has if None.
+def free_names(model: RingModel, free: Sequence[str] | None) -> list[str]:
+    """The named parameters in the order of `PARAMETERS`; all that the model has if None.
 
     Raises
     ------
@@ -45,7 +42,7 @@ def free_indices(model: RingModel, free: Sequence[str] | None) -> list[int]:
             raise InputError(f"free: {name!r} is not one of {', '.join(model.parameters)}")
     if "v_los" not in names:
         raise InputError(f"free: {', '.join(names)} is not allowed; expected v_los among them")
-    return [i for i, name in enumerate(PARAMETERS) if name in names]
+    return [name for name in PARAMETERS if name in names]
 
 
 def cramer_rao(
@@ -62,7 +59,8 @@ def cramer_rao(
     """Smallest standard deviation that an unbiased estimate from one image can have.
 
     The inverse of the Fisher matrix F = sum over pixels of J J^T / variance, J the derivatives
-    of the mean by all free parameters, none of which is known. Exact for Poisson noise
+    of the mean by all free parameters, of which no more is known than the model's priors say (van
+    Trees 1968, Detection, Estimation, and Modulation Theory, section 2.4). Exact for Poisson noise
     and Poisson with speckle; with read noise up to 2 % above the exact bound, see
     `PixelNoise.variance`.
 
@@ -87,13 +85,14 @@ def cramer_rao(
     InputError
         Numbers out of range, or an image that does not determine the free parameters.
     """
-    indices = free_indices(model, free)
-    cells = pixels(model.shape, centre or model.centre)
-    vector = parameter_vector(model, cells, v_los, photons, background, temperature)
-    mean, jacobian = mean_and_jacobian(model, cells, vector)
-    variance = (noise or PixelNoise()).variance(mean, mean - background)
-    found = standard_deviations(fisher_matrix(jacobian, 1 / variance, indices))[0]
+    names = free_names(model, free)
+    vector = parameter_vector(model, v_los, photons, background, centre, temperature)
+    fisher = torch.diag(prior_information(model, names))[None]
+    for waves in pixel_waves(model, centre):
+        mean, jacobian = mean_and_jacobian(model, waves, vector, names)
+        variance = (noise or PixelNoise()).variance(mean, mean - background)
+        fisher = fisher + fisher_matrix(jacobian, 1 / variance)
+    found = standard_deviations(fisher)[0]
     if not torch.isfinite(found).all():
-        names = ", ".join(PARAMETERS[i] for i in indices)
-        raise InputError(f"free: the image does not determine {names} all together")
-    return {PARAMETERS[i]: float(value) for i, value in zip(indices, found, strict=True)}
+        raise InputError(f"free: the image does not determine {', '.join(names)} all together")
+    return {name: float(value) for name, value in zip(names, found, strict=True)}

@@ -6,6 +6,9 @@ which the centre follows. A cell stores first and second moments of its pixels' 
 centre it was made with. About any other centre its mean r^2 is then exact, and the spread of r^2
 exact up to third moments. So an image is binned only once, although a fit moves the centre, as long
 as it moves by a few pixels.
+
+Positions are those in the ideal image (`lidar_mi.retrieval.rings.geometry`), pixels count with
+their response to light, and those of response 0 (hot, dead, covered) do not count at all.
 """
 
 import math
@@ -14,6 +17,8 @@ from typing import NamedTuple
 import torch
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.geometry import Geometry, straightened
+from lidar_mi.retrieval.rings.smooth import term_values
 
 
 class Cells(NamedTuple):
@@ -24,13 +29,15 @@ class Cells(NamedTuple):
     index : torch.Tensor or None
         Cell of every pixel, row by row; None where every pixel is a cell of its own.
     count : torch.Tensor
-        Pixels in the cell.
+        Sum of the responses of the cell's pixels: their number where all are 1.
     centre : (float, float)
         Origin of x, y and r2: (x, y) from the top left pixel's centre.
     x, y, r2 : torch.Tensor
         Means over the cell's pixels.
     spread : torch.Tensor, shape (cells, 3, 3), or None
         Covariance of (x, y, r2) over the cell's pixels.
+    terms : torch.Tensor, shape (cells, names)
+        Means of the smooth terms that were asked for.
     """
 
     index: torch.Tensor | None
@@ -40,25 +47,48 @@ class Cells(NamedTuple):
     y: torch.Tensor
     r2: torch.Tensor
     spread: torch.Tensor | None
+    terms: torch.Tensor
+
+    def part(self, which: slice) -> "Cells":
+        """Some of the cells, without their pixels."""
+        spread = None if self.spread is None else self.spread[which]
+        return Cells(
+            None,
+            self.count[which],
+            self.centre,
+            self.x[which],
+            self.y[which],
+            self.r2[which],
+            spread,
+            self.terms[which],
+        )
 
     def means(self, images: torch.Tensor) -> torch.Tensor:
         """Mean of every cell: images (..., height, width) to (..., cells)."""
         flat = images.flatten(-2)
         if self.index is None:
             return flat.double()
-        sums = flat.new_zeros((*flat.shape[:-1], len(self.count)))
+        # pixels that do not count have the index after the last cell
+        sums = flat.new_zeros((*flat.shape[:-1], len(self.count) + 1))
         # one image at a time: four times faster than a sum along the last axis of all
         for total, image in zip(
             sums.view(-1, sums.shape[-1]), flat.view(-1, flat.shape[-1]), strict=True
         ):
             total.index_add_(0, self.index, image)
-        return sums.double() / self.count
+        return sums[..., :-1].double() / self.count
 
 
-def pixels(shape: tuple[int, int], centre: tuple[float, float], device="cpu") -> Cells:
+def pixels(
+    shape: tuple[int, int],
+    centre: tuple[float, float],
+    device="cpu",
+    *,
+    geometry: Geometry | None = None,
+    names: tuple[str, ...] = (),
+) -> Cells:
     """Every pixel of an image of (height, width) as a cell of its own."""
-    x, y = (values.flatten() for values in _positions(shape, centre, device))
-    return Cells(None, torch.ones_like(x), centre, x, y, x**2 + y**2, None)
+    x, y, terms = _positions(shape, centre, device, geometry, names)
+    return Cells(None, torch.ones_like(x), centre, x, y, x**2 + y**2, None, terms)
 
 
 def annular_sectors(
@@ -67,6 +97,10 @@ def annular_sectors(
     step: float,
     sectors: int = 16,
     device="cpu",
+    *,
+    geometry: Geometry | None = None,
+    response: torch.Tensor | None = None,
+    names: tuple[str, ...] = (),
 ) -> Cells:
     """Sectors of annuli about ``centre``, ``step`` px^2 wide in r^2.
 
@@ -81,30 +115,51 @@ def annular_sectors(
         the ring profile, with `order` the step of r^2 from ring to ring.
     sectors : int
         Per turn; 1 for whole annuli.
+    geometry : Geometry, optional
+        Of the camera; ideal if not given.
+    response : torch.Tensor, shape (height, width), optional
+        Of every pixel to light, 1 on average; 0 leaves a pixel out.
+    names : tuple of str
+        Smooth terms to average, see `lidar_mi.retrieval.rings.smooth.term_names`.
 
     Raises
     ------
     InputError
-        A step or number of sectors that is not above 0.
+        A step or number of sectors that is not above 0, a response that is negative or 0 all over.
     """
     if not (math.isfinite(step) and step > 0):
         raise InputError(f"step: {step!r} px^2 is not allowed; expected above 0")
     if sectors < 1:
         raise InputError(f"sectors: {sectors!r} is not allowed; expected 1 or more")
-    x, y = (values.flatten() for values in _positions(shape, centre, device))
+    x, y, terms = _positions(shape, centre, device, geometry, names)
+    weight = torch.ones_like(x) if response is None else response.to(x).flatten()
+    if len(weight) != len(x) or not ((weight >= 0).all() and weight.any()):
+        raise InputError(
+            f"response: shape {tuple(response.shape)}, {float(weight.min()):g} to "
+            f"{float(weight.max()):g} is not allowed; expected {shape[0]} x {shape[1]} px of 0 or "
+            "more"
+        )
     r2 = x**2 + y**2
     turn = (torch.atan2(y, x) / (2 * torch.pi) + 0.5) * sectors
     label = (r2 / step).long() * sectors + turn.long().clamp(max=sectors - 1)
-    index, count = torch.unique(label, return_inverse=True, return_counts=True)[1:]
+    # numbered in the order of the labels; pixels that do not count come last
+    used = torch.zeros(int(label.max()) + 1, dtype=torch.long, device=label.device)
+    used[label[weight > 0]] = 1
+    size = int(used.sum())
+    index = torch.where(weight > 0, (used.cumsum(0) - 1)[label], size)
+    count = _sums(index, weight, size)
 
     def mean(values):
-        total = torch.zeros(len(count), dtype=torch.float64, device=device)
-        return total.index_add_(0, index, values) / count
+        return _sums(index, weight * values, size) / count
 
     means = [mean(values) for values in (x, y, r2)]
-    off = [values - middle[index] for values, middle in zip((x, y, r2), means, strict=True)]
+    inner = index.clamp(max=size - 1)
+    off = [values - middle[inner] for values, middle in zip((x, y, r2), means, strict=True)]
     spread = torch.stack([torch.stack([mean(a * b) for a in off], -1) for b in off], -1)
-    return Cells(index, count.double(), centre, *means, spread)
+    smooth = (
+        torch.stack([mean(values) for values in terms.T], 1) if names else count[:, None][:, :0]
+    )
+    return Cells(index, count, centre, *means, spread, smooth)
 
 
 def annular_average(
@@ -122,9 +177,19 @@ def annular_average(
     return cells.r2, cells.means(images), cells.count
 
 
-def _positions(shape, centre, device):
-    y, x = (
-        torch.arange(size, dtype=torch.float64, device=device) - middle
-        for size, middle in zip(shape, reversed(centre), strict=True)
-    )
-    return torch.broadcast_tensors(x[None, :], y[:, None])
+def _sums(index: torch.Tensor, values: torch.Tensor, size: int) -> torch.Tensor:
+    """Sum of the values of each cell, without those that do not count."""
+    total = torch.zeros(size + 1, dtype=torch.float64, device=values.device)
+    return total.index_add_(0, index, values)[:size]
+
+
+def _positions(shape, centre, device, geometry, names):
+    """Positions of all pixels from the centre in the ideal image, and their smooth terms."""
+    rows, columns = (torch.arange(size, dtype=torch.float64, device=device) for size in shape)
+    x, y = (part.flatten() for part in torch.broadcast_tensors(columns[None, :], rows[:, None]))
+    half = math.hypot(*shape) / 2
+    middle = [(size - 1) / 2 for size in shape]
+    terms = term_values(names, (x - middle[1]) / half, (y - middle[0]) / half)
+    if geometry is not None:
+        x, y = straightened(geometry, x, y)
+    return x - centre[0], y - centre[1], terms

@@ -13,8 +13,12 @@ PLATEAU = 1e-3
 EXCESS = 4.0
 
 
-def checked(images: torch.Tensor, saturation: float | None = None) -> torch.Tensor:
+def checked(
+    images: torch.Tensor, saturation: float | None = None, used: torch.Tensor | None = None
+) -> torch.Tensor:
     """The images as a batch (images, height, width) of floats.
+
+    Pixels that are not ``used`` (height, width) may have any value; they become the least one.
 
     Raises
     ------
@@ -35,6 +39,8 @@ def checked(images: torch.Tensor, saturation: float | None = None) -> torch.Tens
         images = images[None]
     if not images.is_floating_point():
         images = images.float()
+    if used is not None and used.shape == images.shape[-2:]:
+        images = torch.where(used, images, images[:, used].nan_to_num().min())
     for number, image in enumerate(images):
         total = image.sum()
         if not torch.isfinite(total) and not torch.isfinite(image).all():

@@ -1,11 +1,11 @@
 """Line-of-sight wind from all rings of an image at once: maximum likelihood, many images per call.
 
 Every parameter of `lidar_mi.retrieval.rings.model` that is not known is fitted along: the rings'
-centre, the level of the light, its fall-off, the background and the air's temperature. Two ways,
-one fit:
+centre, the level of the light, its fall-off and slopes, the background, the air's temperature and
+the fraction of aerosol. Two ways, one fit:
 
 annular  images are first averaged over sectors of annuli of equal steps in r^2: a hundred
-         times fewer numbers, 0.3 % of the information lost
+         times fewer numbers, 1 % of the information lost
 pixels   every pixel takes part (2-D fit), from where the annular fit ended
 
 Images are in electrons, so that their noise follows from their mean.
@@ -13,72 +13,127 @@ Images are in electrons, so that their noise follows from their mean.
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.bound import fisher_matrix, free_indices, standard_deviations
-from lidar_mi.retrieval.rings.cells import annular_sectors, pixels
+from lidar_mi.retrieval.rings.bound import (
+    fisher_matrix,
+    free_names,
+    prior_information,
+    standard_deviations,
+)
+from lidar_mi.retrieval.rings.cells import annular_sectors
 from lidar_mi.retrieval.rings.centre import gradient_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
-from lidar_mi.retrieval.rings.model import (
-    PARAMETERS,
-    PixelNoise,
-    RingModel,
-    illumination,
+from lidar_mi.retrieval.rings.mean_image import (
+    Waves,
+    light_on,
     mean_and_jacobian,
     orders,
+    pixel_waves,
+    reach,
+    ring_waves,
     squared_radius,
+    strongest,
 )
+from lidar_mi.retrieval.rings.model import INSTRUMENT, PARAMETERS, PixelNoise, RingModel
 
 METHODS = ("annular", "pixels")
 
-# Annuli per order of interference, for each significant harmonic: pi^2 / 3 / 16^2 = 1.3 % of the
-# information of the highest is lost.
-STEPS_PER_HARMONIC = 16
-SECTORS = 16
-REACH = 0.025  # of the first ring's size, largest distance of a centre from the sectors' own
+# Annuli per order of interference, for each significant harmonic: pi^2 / 3 / 10^2 = 3 % of the
+# information of the highest is lost, 0.8 % and less of the others.
+STEPS_PER_HARMONIC = 10
+SECTORS = 12
 ITERATIONS = 40
+MOVES = 12  # of the cells toward the rings' centre
 CLOSE = 1e-3  # standard deviations, largest last step of a fit that has converged
 CHUNK_BYTES = 256e6
 SIGNIFICANT = 5.0  # standard deviations, the least amplitude of rings
+# Cells beyond so many standard deviations hold hot pixels or dust and are left out, unless more
+# than this fraction is: then the model is wrong, and chi-square shall say so.
+OUTLIER, MOST_OUTLIERS = 5.0, 0.03
+# standard deviations of chi-square above 1 from which stated errors grow with its root
+MISFIT = 4.0
 
 
-class RingFit(NamedTuple):
-    """Retrieved values, tensors of shape (images,), float64.
+@dataclass(frozen=True, eq=False)
+class RingFit:
+    """Retrieved values, tensors of shape (images,) unless stated, float64.
 
     Attributes
     ----------
-    v_los, v_los_std : torch.Tensor
-        m/s, positive toward the instrument; the standard deviation from the Fisher matrix, with
-        all other free parameters unknown.
-    x, y : torch.Tensor
-        Centre of the rings, pixels to the right and down from the top left pixel's centre.
-    level, background : torch.Tensor
-        Electrons per pixel.
-    temperature : torch.Tensor
-        K; NaN where the model has none.
-    falloff : torch.Tensor
-    std : torch.Tensor, shape (images, 7)
-        Standard deviations of all `PARAMETERS`; 0 where one was not free.
+    values : torch.Tensor, shape (images, parameters)
+        All of `lidar_mi.retrieval.rings.model.PARAMETERS`; those that were not free have the
+        model's value. x and y are pixels from the top left pixel's centre.
+    std : torch.Tensor, shape (images, parameters)
+        Their random standard deviations, from the Fisher matrix with all other free parameters
+        unknown, times the root of chi_square where that is significantly above 1; 0 where one was
+        not free.
     chi_square : torch.Tensor
         Squared misfit over its expectation: 1 where model and noise are right.
     rings : torch.Tensor
         Rings that were detected.
+    outliers : torch.Tensor
+        Fraction of the cells that was left out.
+    sensitivity : torch.Tensor, shape (images, 8)
+        Change of v_los with what the model's calibration left uncertain (`RingModel.systematic`).
+    systematic : torch.Tensor, shape (8, 8)
+        The covariance of that.
     """
 
-    v_los: torch.Tensor
-    v_los_std: torch.Tensor
-    x: torch.Tensor
-    y: torch.Tensor
-    level: torch.Tensor
-    background: torch.Tensor
-    temperature: torch.Tensor
-    falloff: torch.Tensor
+    values: torch.Tensor
     std: torch.Tensor
     chi_square: torch.Tensor
     rings: torch.Tensor
+    outliers: torch.Tensor
+    sensitivity: torch.Tensor
+    systematic: torch.Tensor
+
+    def of(self, name: str) -> torch.Tensor:
+        """Retrieved values of a parameter."""
+        return self.values[:, PARAMETERS.index(name)]
+
+    def std_of(self, name: str) -> torch.Tensor:
+        """Random standard deviations of a parameter."""
+        return self.std[:, PARAMETERS.index(name)]
+
+    @property
+    def v_los(self) -> torch.Tensor:
+        """Speed along the line of sight, m/s, positive toward the instrument."""
+        return self.of("v_los")
+
+    @property
+    def v_los_std(self) -> torch.Tensor:
+        """Random standard deviation of v_los, m/s."""
+        return self.std_of("v_los")
+
+    @property
+    def v_los_systematic(self) -> torch.Tensor:
+        """Standard deviation of v_los by the calibration, common to all images, m/s."""
+        return _systematic(self.sensitivity, self.systematic)
+
+
+def difference(
+    received: RingFit, emitted: RingFit
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """v_LOS of received images less that of images of the laser itself, with standard deviations.
+
+    An error of the order at the centre, by a drift of etalon or laser, cancels. So does what the
+    calibration left uncertain, as far as both images respond alike.
+
+    Returns
+    -------
+    v_los, v_los_std, v_los_systematic : torch.Tensor, shape (images,)
+        m/s; random, and by the calibration.
+    """
+    std = torch.hypot(received.v_los_std, emitted.v_los_std)
+    uncommon = received.sensitivity - emitted.sensitivity
+    return received.v_los - emitted.v_los, std, _systematic(uncommon, received.systematic)
 
 
 def fit_rings(
@@ -89,6 +144,7 @@ def fit_rings(
     method: str = "annular",
     centre: tuple[float, float] | None = None,
     free: Sequence[str] | None = None,
+    response: torch.Tensor | None = None,
     saturation: float | None = None,
     max_chi_square: float = 2.0,
 ) -> RingFit:
@@ -111,6 +167,8 @@ def fit_rings(
     free : names out of `lidar_mi.retrieval.rings.model.PARAMETERS`, optional
         Fitted parameters; all that the model has if not given. The others stay at the model's
         values, the background at 0.
+    response : torch.Tensor, shape (height, width), optional
+        Of the pixels to light, 1 on average; pixels of response 0 are left out. For ``annular``.
     saturation : float, optional
         Electrons from which a pixel is saturated. Images that end in a plateau are refused even
         if it is not given.
@@ -133,42 +191,68 @@ def fit_rings(
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
     if not max_chi_square > 0:
         raise InputError(f"max_chi_square: {max_chi_square!r} is not allowed; expected above 0")
-    images = checked(images, saturation)
+    if response is not None and method != "annular":
+        raise InputError(f"response: not allowed with method {method}; expected annular")
+    images = checked(images, saturation, None if response is None else response > 0)
     if tuple(images.shape[-2:]) != tuple(model.shape):
         sizes = " and ".join(f"{h} x {w}" for h, w in (images.shape[-2:], model.shape))
         raise InputError(f"images: sizes {sizes} px (height x width) of image and model differ")
-    indices = free_indices(model, free)
+    names = free_names(model, free)
     if centre is not None:
         inside(*centre, model.shape, "centre")
-    elif not {"x", "y"} <= {PARAMETERS[i] for i in indices}:
+    elif not {"x", "y"} <= set(names):
         centre = model.centre
-    task = _Task(model, noise or PixelNoise(), indices, max_chi_square, centre)
+    task = _Task(model, noise or PixelNoise(), names, max_chi_square, centre, response)
     size = _chunk(model, method)
     parts = [_fit(images[k : k + size], task, k, method) for k in range(0, len(images), size)]
-    return RingFit(*(torch.cat(values) for values in zip(*parts, strict=True)))
+    return _joined(parts)
 
 
-def difference(received: RingFit, emitted: RingFit) -> tuple[torch.Tensor, torch.Tensor]:
-    """v_LOS and its standard deviation between received images and those of the laser itself.
+def annular_waves(
+    model: RingModel,
+    centre: tuple[float, float],
+    response: torch.Tensor | None = None,
+    device="cpu",
+    derivatives: bool = False,
+) -> Waves:
+    """The annular fit's cells about a centre, and the waves of rings over them."""
+    step = model.order_spacing / (STEPS_PER_HARMONIC * strongest(model))
+    cells = annular_sectors(
+        model.shape,
+        centre,
+        step,
+        SECTORS,
+        device,
+        geometry=model.geometry,
+        response=response,
+        names=model.smooth,
+    )
+    return ring_waves(model, cells, derivatives)
 
-    An error of the order at the centre, by a drift of etalon or laser, cancels.
-    """
-    std = torch.hypot(received.v_los_std, emitted.v_los_std)
-    return received.v_los - emitted.v_los, std
+
+# images of one camera share their cells from call to call
+_waves = lru_cache(maxsize=4)(annular_waves)
+
+
+def _joined(parts: Sequence[RingFit]) -> RingFit:
+    def all_of(name):
+        return torch.cat([getattr(part, name) for part in parts])
+
+    each = ("values", "std", "chi_square", "rings", "outliers", "sensitivity")
+    return RingFit(**{name: all_of(name) for name in each}, systematic=parts[0].systematic)
+
+
+def _systematic(sensitivity: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+    return torch.einsum("bi,ij,bj->b", sensitivity, covariance, sensitivity).clamp(min=0).sqrt()
 
 
 def _chunk(model: RingModel, method: str) -> int:
-    """Images at once: about 250 bytes per cell for Jacobian and waves."""
+    """Images at once: about 300 bytes per cell for Jacobian and products."""
     cells = math.prod(model.shape)
     if method == "annular":
-        cells = min(cells, _steps(model) * SECTORS * (1 + cells // model.order_spacing))
-    return max(1, int(CHUNK_BYTES // (250 * cells + 12 * math.prod(model.shape))))
-
-
-def _steps(model: RingModel) -> int:
-    """Annuli per order of interference."""
-    strong = (abs(model.harmonics) > 0.01).any(0).nonzero()[0]
-    return STEPS_PER_HARMONIC * int(strong[-1])
+        steps = STEPS_PER_HARMONIC * strongest(model)
+        cells = min(cells, steps * SECTORS * int(1 + cells // model.order_spacing))
+    return max(1, int(CHUNK_BYTES // (300 * cells + 12 * math.prod(model.shape))))
 
 
 class _Task(NamedTuple):
@@ -176,92 +260,108 @@ class _Task(NamedTuple):
 
     model: RingModel
     noise: PixelNoise
-    free: list[int]
+    free: list[str]
     max_chi_square: float
     centre: tuple[float, float] | None
+    response: torch.Tensor | None
+
+    @property
+    def moves(self) -> bool:
+        """Whether the centre is fitted."""
+        return "x" in self.free or "y" in self.free
 
 
 def _fit(images, task: _Task, number: int, method: str) -> RingFit:
     """`fit_rings` for some of the images, from the ``number``-th on.
 
-    They have common cells, about the centre of their mean. An image without rings about that
+    They have common cells, about the middle of their centres. An image without rings about that
     centre, or with its own centre too far from it, gets cells of its own.
     """
     centre = task.centre or gradient_centre(images.mean(0, dtype=torch.float32))
+    inside(*centre, task.model.shape, f"images[{number}]: centre")
+    near = reach(task.model)
     try:
-        fit = _fit_about(centre, images, task, number, method)
+        for _ in range(MOVES):
+            fit = _fit_about(centre, images, task, number, method)
+            away = (fit.of("x") - centre[0], fit.of("y") - centre[1])
+            middle = [float(part.median()) for part in away]
+            if not task.moves or math.hypot(*middle) <= near:
+                break
+            centre = (centre[0] + middle[0], centre[1] + middle[1])
+            inside(*centre, task.model.shape, f"images[{number}]: centre")
     except InputError:
         if len(images) == 1:
             raise
-        alone = [_fit(one[None], task, number + k, method) for k, one in enumerate(images)]
-        return RingFit(*(torch.cat(values) for values in zip(*alone, strict=True)))
-    if method == "annular":
-        far = torch.hypot(fit.x - centre[0], fit.y - centre[1])
-        for k in (far > REACH * math.sqrt(task.model.order_spacing)).nonzero()[:, 0].tolist():
-            own = float(fit.x[k]), float(fit.y[k])
-            again = _fit_about(own, images[k, None], task, number + k, method)
-            for values, value in zip(fit, again, strict=True):
-                values[k] = value[0]
+        return _joined([_fit(one[None], task, number + k, method) for k, one in enumerate(images)])
+    if task.moves and len(images) > 1:
+        far = torch.hypot(*(part - shift for part, shift in zip(away, middle, strict=True))) > near
+        for k in far.nonzero()[:, 0].tolist():
+            start = float(fit.of("x")[k]), float(fit.of("y")[k])
+            alone = _fit(images[k, None], task._replace(centre=start), number + k, method)
+            fit = _joined([_part(fit, slice(0, k)), alone, _part(fit, slice(k + 1, None))])
+    _check(fit, task, number)
     return fit
 
 
-def _fit_about(centre, images, task: _Task, number: int, method: str) -> RingFit:
-    """`_fit` with cells about the one centre."""
-    model, noise, free = task.model, task.noise, task.free
-    if method == "annular":
-        step = model.order_spacing / _steps(model)
-        cells = annular_sectors(model.shape, centre, step, SECTORS, images.device)
-        means = cells.means(images)
-        parameters = _start(model, cells, means, noise, number)
-    else:
-        near = _fit(images, task, number, "annular")
-        parameters = torch.stack(
-            [
-                near.v_los,
-                near.x - centre[0],
-                near.y - centre[1],
-                near.level,
-                near.background,
-                near.temperature,
-                near.falloff,
-            ],
-            1,
-        )
-        cells = pixels(model.shape, centre, images.device)
-        means = cells.means(images)
-    parameters, mean, jacobian, variance = _scoring(
-        model, cells, means, parameters, noise, free, number
-    )
-    weight = cells.count / variance
-    std = torch.zeros_like(parameters)
-    std[:, free] = standard_deviations(fisher_matrix(jacobian, weight, free))
-    chi_square = (weight * (means - mean) ** 2).sum(1) / (len(cells.count) - len(free))
-    rings = _rings(model, cells, means, parameters, mean, variance)
-    v, dx, dy, level, background, temperature, falloff = parameters.unbind(1)
-    x, y = dx + centre[0], dy + centre[1]
-    found = (values.tolist() for values in (x, y, rings, chi_square))
-    for name, *place, detected, misfit in zip(
-        (f"images[{number + k}]" for k in range(len(x))), *found, strict=True
-    ):
-        inside(*place, model.shape, f"{name}: centre")
-        if detected < 2:
+def _part(fit: RingFit, which: slice) -> RingFit:
+    each = ("values", "std", "chi_square", "rings", "outliers", "sensitivity")
+    return replace(fit, **{name: getattr(fit, name)[which] for name in each})
+
+
+def _check(fit: RingFit, task: _Task, number: int) -> None:
+    """Raise InputError unless all images have their centre inside, two rings and a good fit."""
+    found = (values.tolist() for values in (fit.of("x"), fit.of("y"), fit.rings, fit.chi_square))
+    for k, (x, y, rings, misfit) in enumerate(zip(*found, strict=True)):
+        name = f"images[{number + k}]"
+        inside(x, y, task.model.shape, f"{name}: centre")
+        if rings < 2:
             raise InputError(
-                f"{name}: {detected} ring(s) detected; expected at least 2 that follow the model"
+                f"{name}: {rings} ring(s) detected; expected at least 2 that follow the model"
             )
         if not misfit <= task.max_chi_square:
             raise InputError(
                 f"{name}: chi-square {misfit:.3g} is not allowed; expected at most "
                 f"{task.max_chi_square:g}: line, etalon or noise are not the model's"
             )
-    return RingFit(
-        v, std[:, 0], x, y, level, background, temperature, falloff, std, chi_square, rings
+
+
+def _fit_about(centre, images, task: _Task, number: int, method: str) -> RingFit:
+    """`_fit` with cells about the one centre, unchecked."""
+    model, noise = task.model, task.noise
+    annular = _waves(model, centre, task.response, images.device)
+    means = annular.cells.means(images)
+    parameters = _start(model, annular, means, noise, number)
+    end = _robust([annular], [means], parameters, task, number)
+    rings = _rings(model, annular, means, end, noise)
+    if method == "pixels":
+        blocks = list(pixel_waves(model, centre, images.device))
+        split = [len(block.cells.count) for block in blocks]
+        every = images.flatten(-2).double().split(split, -1)
+        end = _robust(blocks, every, end.parameters, task, number)
+    names, chi_square = task.free, end.chi_square
+    std = torch.zeros_like(end.parameters)
+    grown = torch.where(
+        chi_square > 1 + MISFIT * math.sqrt(2 / end.freedom), chi_square.sqrt(), 1.0
     )
+    columns = [PARAMETERS.index(name) for name in names]
+    std[:, columns] = standard_deviations(end.fisher) * grown[:, None]
+    values = end.parameters.clone()
+    for name, shift in zip(("x", "y"), centre, strict=True):
+        values[:, PARAMETERS.index(name)] += shift
+    size = 1 + len(INSTRUMENT)
+    covariance = np.zeros((size, size)) if model.systematic is None else model.systematic
+    sensitivity = end.parameters.new_zeros((len(images), size))
+    if model.systematic is not None:
+        sensitivity = _sensitivity(annular, end, task)
+    systematic = torch.as_tensor(covariance, dtype=torch.float64, device=images.device)
+    return RingFit(values, std, chi_square, rings, end.outliers, sensitivity, systematic)
 
 
-def _start(model, cells, means, noise, number) -> torch.Tensor:
+def _start(model, waves, means, noise, number) -> torch.Tensor:
     """Parameters from the first harmonic over the order: a linear fit, no guess needed."""
-    fraction = orders(model, cells.r2, means.new_zeros(()))[1]
-    waves = torch.stack(
+    cells = waves.cells
+    fraction = orders(model, cells.r2)[1]
+    turns = torch.stack(
         [
             torch.ones_like(fraction),
             torch.cos(2 * torch.pi * fraction),
@@ -269,8 +369,8 @@ def _start(model, cells, means, noise, number) -> torch.Tensor:
         ]
     )
     weight = cells.count
-    inverse = torch.linalg.pinv((waves * weight) @ waves.T, hermitian=True)
-    found = (means * weight) @ waves.T @ inverse
+    inverse = torch.linalg.pinv((turns * weight) @ turns.T, hermitian=True)
+    found = (means * weight) @ turns.T @ inverse
     # the noise at the image's mean
     spread = noise.variance(found[:, :1].clamp(min=0), found[:, :1].clamp(min=0))
     size = found[:, 1:].norm(dim=1)
@@ -281,40 +381,101 @@ def _start(model, cells, means, noise, number) -> torch.Tensor:
                 f"images[{number + k}]: no rings detected (contrast {float(size[k]):.3g} electrons "
                 f"with {float(error[k]):.2g} of noise); expected rings"
             )
-    blank = means.new_tensor([[0, 0, 0, 1, 0, model.middle_temperature, model.falloff]])
-    first = model.at_temperature(blank[:, 5])[0][0, 1]
+    parameters = model.start(means.device).repeat(len(means), 1)
+    first = model.amplitudes(parameters[:1])[0][0, 0]
     # level Re(2 A_1 exp(2 pi i (m + s v))) = a cos + b sin: A_1 exp(2 pi i s v) ~ a - i b
     wave = torch.complex(found[:, 1], -found[:, 2])
     v = torch.angle(wave / first) / (2 * torch.pi) * model.velocity_range
-    level = size / (2 * abs(first))
-    parameters = blank.repeat(len(means), 1)
-    parameters[:, 0] = v
-    parameters[:, 3] = torch.minimum(level, found[:, 0])
-    parameters[:, 4] = found[:, 0] - parameters[:, 3]
+    level = torch.minimum(size / (2 * abs(first)), found[:, 0])
+    for name, value in (("v_los", v), ("level", level), ("background", found[:, 0] - level)):
+        parameters[:, PARAMETERS.index(name)] = value
     return parameters
 
 
-def _scoring(model, cells, means, parameters, noise, indices, number):
-    """Fisher scoring: weighted least squares, its weights from the mean of the step before."""
-    fixed = [i for i in range(len(PARAMETERS)) if i not in indices]
-    if PARAMETERS.index("background") in fixed:
-        parameters[:, 3] += parameters[:, 4]
-        parameters[:, 4] = 0
-    # a step longer than the rings are wide leaves the linear range
-    limit = torch.full_like(parameters[0], math.inf)
-    limit[0], limit[1:3] = model.velocity_range / 16, 0.04 * math.sqrt(model.order_spacing)
-    limit[5], limit[6] = 20.0, 0.3
-    floor = 1e-3 * means.mean(1, keepdim=True)
-    converged = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+class _End(NamedTuple):
+    """Where the scoring ended."""
+
+    parameters: torch.Tensor
+    fisher: torch.Tensor
+    chi_square: torch.Tensor
+    freedom: int
+    outliers: torch.Tensor
+    kept: list[torch.Tensor]
+
+
+def _robust(blocks, means, parameters, task: _Task, number: int) -> _End:
+    """Fisher scoring, again without cells that are far outside the noise."""
+    kept = [torch.ones_like(part, dtype=torch.bool) for part in means]
+    for _ in range(4):
+        end = _scoring(blocks, means, kept, parameters, task, number)
+        left = [
+            _residual(waves, part, end.parameters, task).abs() <= OUTLIER
+            for waves, part in zip(blocks, means, strict=True)
+        ]
+        number_of = sum(part.shape[1] for part in left)
+        fraction = sum((~part).sum(1) for part in left) / number_of
+        # an image with too many keeps them all
+        few = (fraction <= MOST_OUTLIERS)[:, None]
+        left = [part | ~few for part in left]
+        if all(torch.equal(a, b) for a, b in zip(left, kept, strict=True)):
+            break
+        kept, parameters = left, end.parameters
+    return end
+
+
+def _variance(mean, parameters, noise, floor=0.0) -> torch.Tensor:
+    """Variance of a pixel in every cell."""
+    background = parameters[:, PARAMETERS.index("background"), None]
+    mean = mean.clamp(min=floor) if isinstance(floor, float) else torch.maximum(mean, floor)
+    return noise.variance(mean, (mean - background).clamp(min=0))
+
+
+def _residual(waves, means, parameters, task: _Task) -> torch.Tensor:
+    """Misfit of every cell in standard deviations."""
+    mean = mean_and_jacobian(task.model, waves, parameters)[0]
+    variance = _variance(mean, parameters, task.noise, 1e-3 * means.mean(1, keepdim=True))
+    return (means - mean) * (waves.cells.count / variance).sqrt()
+
+
+def _scoring(blocks, means, kept, parameters, task: _Task, number: int) -> _End:
+    """Weighted least squares, the weights from the mean of the step before.
+
+    The fit that has converged is the maximum of the likelihood times the priors.
+    """
+    model, noise, names = task.model, task.noise, task.free
+    columns = [PARAMETERS.index(name) for name in names]
+    parameters = parameters.clone()
+    if "background" not in names:
+        place, level = PARAMETERS.index("background"), PARAMETERS.index("level")
+        parameters[:, level] += parameters[:, place]
+        parameters[:, place] = 0
+    limit = _step_limits(model, names, parameters.device)
+    information = prior_information(model, names, parameters.device)
+    middle = model.start(parameters.device)[:, columns]
+    floor = 1e-3 * means[0].mean(1, keepdim=True)
+    freedom = sum(part.shape[1] for part in means) - len(names)
+    converged = torch.zeros(len(parameters), dtype=torch.bool, device=parameters.device)
     for _ in range(ITERATIONS):
-        mean, jacobian = mean_and_jacobian(model, cells, parameters)
-        signal = (mean - parameters[:, 4, None]).clamp(min=0)
-        variance = noise.variance(torch.maximum(mean, floor), signal)
+        fisher = torch.diag(information).repeat(len(parameters), 1, 1)
+        score = information * (middle - parameters[:, columns])
+        chi_square = torch.zeros_like(score[:, 0])
+        for waves, part, use in zip(blocks, means, kept, strict=True):
+            mean, jacobian = mean_and_jacobian(model, waves, parameters, names)
+            variance = _variance(mean, parameters, noise, floor)
+            weight = use * waves.cells.count / variance
+            fisher = fisher + fisher_matrix(jacobian, weight)
+            score = score + (jacobian @ (weight * (part - mean))[:, :, None])[:, :, 0]
+            chi_square = chi_square + (weight * (part - mean) ** 2).sum(1)
         if converged.all():
-            return parameters, mean, jacobian, variance
-        weight = cells.count / variance
-        fisher = fisher_matrix(jacobian, weight, indices)
-        score = (jacobian[:, indices] @ (weight * (means - mean))[:, :, None])[:, :, 0]
+            lost = sum((~use).sum(1) for use in kept)
+            return _End(
+                parameters,
+                fisher,
+                chi_square / (freedom - lost),
+                freedom,
+                lost / (freedom + len(names)),
+                kept,
+            )
         std = standard_deviations(fisher)
         unit = fisher.diagonal(dim1=1, dim2=2).rsqrt()
         normal = fisher * unit[:, :, None] * unit[:, None, :]
@@ -324,27 +485,67 @@ def _scoring(model, cells, means, parameters, noise, indices, number):
             raise InputError(
                 f"images[{bad}]: the fit fails; expected rings that the model describes"
             )
-        parameters = parameters.clone()
-        bound = limit[indices]
-        parameters[:, indices] += step.clamp(-bound, bound)
-        if len(model.temperatures) > 1:
-            first, last = model.temperatures[[0, -1]]
-            parameters[:, 5] = parameters[:, 5].clamp(first, last)
         converged = (step.abs() <= CLOSE * std).all(1)
+        parameters[:, columns] += step.clamp(-limit, limit)
+        if "temperature" in names:
+            place = PARAMETERS.index("temperature")
+            parameters[:, place] = parameters[:, place].clamp(*model.temperatures[[0, -1]])
+        # beyond, the waves are not exact: the cells move first
+        for name in ("x", "y"):
+            place = PARAMETERS.index(name)
+            far = parameters[:, place].abs() > 3 * reach(model)
+            parameters[:, place] = parameters[:, place].clamp(-3 * reach(model), 3 * reach(model))
+            converged |= far & (step.abs() <= 0.1 * limit).all(1)
     bad = number + int((~converged).nonzero()[0])
     raise InputError(
         f"images[{bad}]: the fit does not converge; expected two rings or more as in the model"
     )
 
 
-def _rings(model, cells, means, parameters, mean, variance) -> torch.Tensor:
+def _step_limits(model: RingModel, names, device) -> torch.Tensor:
+    """Longest steps: one longer than the rings are wide would leave the linear range."""
+    widths = {
+        "v_los": model.velocity_range / 16,
+        "x": 0.04 * math.sqrt(model.order_spacing),
+        "y": 0.04 * math.sqrt(model.order_spacing),
+        "temperature": 20.0,
+        "falloff": 0.3,
+        "aerosol": 0.1,
+    }
+    return torch.tensor([widths.get(name, math.inf) for name in names], device=device).double()
+
+
+def _sensitivity(waves, end: _End, task: _Task) -> torch.Tensor:
+    """Change of the fitted speed with what was taken as known, (images, 8).
+
+    A change d of the instrument moves the fit by -F^-1 J^T W (dmu/dd) d.
+    """
+    model = task.model
+    exact = ring_waves(model, waves.cells, derivatives=True)
+    mean, jacobian = mean_and_jacobian(model, exact, end.parameters, [*task.free, *INSTRUMENT])
+    weight = end.kept[0] * waves.cells.count / _variance(mean, end.parameters, task.noise, 1e-9)
+    free, known = jacobian.split([len(task.free), len(INSTRUMENT)], 1)
+    information = prior_information(model, task.free, mean.device)
+    fisher = torch.diag(information) + fisher_matrix(free, weight)
+    moved = torch.linalg.solve(fisher, (free * weight[:, None]) @ known.transpose(1, 2))
+    first = moved[:, task.free.index("v_los")]
+    # the zero of the speeds itself moves all of them
+    return -torch.cat([torch.ones_like(first[:, :1]), first], 1)
+
+
+def _rings(model, waves, means, end: _End, noise) -> torch.Tensor:
     """Orders whose rings are significant and at least half as strong as fitted."""
-    v, dx, dy, level, background, _, falloff = parameters.T[..., None]
-    r2 = squared_radius(cells, dx, dy)
-    order = orders(model, r2, v)[1].round().long()
+    cells, parameters = waves.cells, end.parameters
+    v, dx, dy, level, background = (
+        parameters[:, PARAMETERS.index(name), None]
+        for name in ("v_los", "x", "y", "level", "background")
+    )
+    mean = mean_and_jacobian(model, waves, parameters)[0]
+    order = orders(model, squared_radius(cells, dx, dy))[1] + v / model.velocity_range
+    order = order.round().long()
     order -= order.min()
-    ring = mean - background - level * illumination(model, r2, falloff)
-    weight = cells.count / variance
+    ring = mean - background - level * light_on(model, cells, parameters)
+    weight = cells.count / _variance(mean, parameters, noise, 1e-9)
     sums = mean.new_zeros(2, len(mean), int(order.max()) + 1)
     strength = sums[0].scatter_add_(1, order, weight * ring**2)
     misfit = sums[1].scatter_add_(1, order, weight * ring * (means - mean))

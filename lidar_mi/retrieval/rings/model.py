@@ -1,35 +1,42 @@
-"""Mean image of the rings of an etalon, and the smallest possible errors of its parameters.
+"""The instrument and the light on which an image of rings depends, and the noise of its pixels.
 
-The mean image is, in electrons per pixel,
-
-    level exp(-falloff r^2 / R^2) g(m) / A_0 + background,
-    g(m) = A_0 + 2 sum_n Re(A_n exp(2 pi i n m)),   m = m_0 (1 + 2 v_LOS / c) cos(theta),
-
-with r the distance from the rings' centre, R half the image's diagonal, tan(theta) = r / f and
-m the order of interference; the A_n are the etalon's harmonics times the line's characteristic
-function (Airy function convolved with the line). Only the part of m_0 beyond its integer enters:
-m = m_0 (cos(theta) - 1) + ..., in float64 throughout. Averages over a pixel, and over all pixels
-of a cell, are taken to second order in the cell's spread of r^2: A_n falls by
-exp(-(2 pi n)^2 var(m) / 2).
+The mean image itself is in `lidar_mi.retrieval.rings.mean_image`.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
 from scipy.constants import speed_of_light
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.cells import Cells, pixels
+from lidar_mi.retrieval.rings.geometry import Geometry
+from lidar_mi.retrieval.rings.smooth import MOST_DEGREE, term_names
 
-PARAMETERS = ("v_los", "x", "y", "level", "background", "temperature", "falloff")
-"""Parameters of an image: m/s, px, px, electrons per pixel (mean over an order, at the centre),
-electrons per pixel, K, and the exponent of the illumination's fall-off from centre to corner."""
+FRAME = ("v_los", "x", "y", "level", "background", "temperature", "falloff", "aerosol")
+"""Parameters of every image: m/s, px, px, electrons per pixel (mean over an order, at the centre),
+electrons per pixel, K, the exponent of the illumination's fall-off from centre to corner, and the
+fraction of the light that aerosol scatters."""
 
-PIXEL_R2 = 1 / 6  # px^2, mean squared distance of a pixel's points from its centre
+LIGHT = term_names("light", MOST_DEGREE)
+"""Logarithm of uneven illumination, see `lidar_mi.retrieval.rings.smooth`."""
+
+BACKGROUND = term_names("background", MOST_DEGREE)
+"""Uneven background, electrons per pixel."""
+
+INSTRUMENT = ("focal_length", "tilt_x", "tilt_y", "distortion", "blur", "damping", "roughness")
+"""Departures of the instrument from the model: relative change of the focal length, rad, rad,
+distortion at the corner, px^2 (squared radius of the disc of a defocused point), and a and b of the
+factor exp(-a n - b n^2) of the n-th harmonic: the mirrors' reflectivity and the plates' defects."""
+
+PARAMETERS = (*FRAME, *LIGHT, *BACKGROUND, *INSTRUMENT)
+
 NEGLIGIBLE = 1e-7  # harmonics below this fraction of A_0 change velocities by less than 1e-4 m/s
+# Of the aerosol's narrow line; the harmonics left out are nearly orthogonal to a change of speed.
+_NEGLIGIBLE_AEROSOL = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +60,21 @@ class RingModel:
         K, ascending, a few nodes: harmonics between them follow the polynomial through all. One
         node, or none given: the temperature is not a parameter.
     falloff : float
-        Of the illumination, see the module.
+        Of the illumination: exp(-falloff r^2 / R^2), R half the image's diagonal.
+    aerosol_harmonics : array (K,), complex, optional
+        Of the light that aerosol scatters: the laser's own line. With them the fraction of that
+        light is a parameter; ``harmonics`` are those of the other light.
+    tilt, distortion, blur
+        Of the camera and its lens, see `Geometry` and `INSTRUMENT`.
+    light : mapping
+        Values of terms of `LIGHT`; 0 where one is not given.
+    light_degree, background_degree : int
+        Terms of `LIGHT` and `BACKGROUND` up to this degree are unknown, 0 to 4.
+    priors : mapping of (mean, standard deviation)
+        Normal distributions of parameters, from what is known beside the image.
+    systematic : array (8, 8), optional
+        Covariance of what a calibration left uncertain, the same in all images: of the speed at
+        which the rings are those of order_at_centre (m/s), then of `INSTRUMENT`.
 
     Raises
     ------
@@ -70,6 +91,15 @@ class RingModel:
     harmonics: np.ndarray
     temperatures: Sequence[float] = ()
     falloff: float = 0.0
+    aerosol_harmonics: np.ndarray | None = None
+    tilt: tuple[float, float] = (0.0, 0.0)
+    distortion: float = 0.0
+    blur: float = 0.0
+    light: Mapping[str, float] = field(default_factory=dict)
+    light_degree: int = 0
+    background_degree: int = 0
+    priors: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    systematic: np.ndarray | None = None
 
     def __post_init__(self):
         for name in ("pixel", "focal_length", "wavelength", "order_at_centre"):
@@ -94,19 +124,25 @@ class RingModel:
                 f"harmonics: shape {harmonics.shape} is not allowed; expected a row of two or "
                 f"more for each of {len(temperatures)} temperatures"
             )
-        if not (np.isfinite(harmonics).all() and (harmonics[:, 0].real > 0).all()):
-            raise InputError(
-                f"harmonics: mean transmission {harmonics[0, 0]:g} is not allowed; expected "
-                "above 0: the etalon must transmit"
-            )
-        harmonics = harmonics / harmonics[:, :1].real
-        strong = np.flatnonzero(np.abs(harmonics).max(0) > NEGLIGIBLE)[-1]
-        if strong < 1:
-            raise InputError(
-                "harmonics: all but the mean are 0; expected an etalon that leaves rings"
-            )
-        object.__setattr__(self, "harmonics", harmonics[:, : strong + 1])
+        object.__setattr__(self, "harmonics", _relative(harmonics, NEGLIGIBLE))
         object.__setattr__(self, "temperatures", temperatures)
+        if self.aerosol_harmonics is not None:
+            aerosol = np.atleast_2d(np.asarray(self.aerosol_harmonics, complex))
+            object.__setattr__(
+                self, "aerosol_harmonics", _relative(aerosol, _NEGLIGIBLE_AEROSOL)[0]
+            )
+        for name in self.light:
+            if name not in LIGHT:
+                raise InputError(f"light: {name!r} is not one of {', '.join(LIGHT)}")
+        for name, (mean, std) in self.priors.items():
+            if name not in PARAMETERS or not (math.isfinite(mean) and std > 0):
+                raise InputError(
+                    f"priors: {name}: {mean!r} +- {std!r} is not allowed; expected a parameter, a "
+                    "finite mean and a standard deviation above 0"
+                )
+        # degrees that cannot be
+        term_names("light", self.light_degree)
+        term_names("background", self.background_degree)
 
     @property
     def order_spacing(self) -> float:
@@ -120,29 +156,131 @@ class RingModel:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Those of `PARAMETERS` that this model has."""
-        known = len(self.temperatures) > 1
-        return tuple(name for name in PARAMETERS if known or name != "temperature")
+        """Those of `PARAMETERS` that are unknown in an image, without the instrument's own."""
+        absent = set()
+        if len(self.temperatures) < 2:
+            absent.add("temperature")
+        if self.aerosol_harmonics is None:
+            absent.add("aerosol")
+        return (
+            *(name for name in FRAME if name not in absent),
+            *term_names("light", self.light_degree),
+            *term_names("background", self.background_degree),
+        )
+
+    @property
+    def smooth(self) -> tuple[str, ...]:
+        """Smooth terms of the model: those of the light, then those of the background."""
+        degree = max([self.light_degree, *(int(name.split("_")[1]) for name in self.light)])
+        return (*term_names("light", degree), *term_names("background", self.background_degree))
+
+    @property
+    def count(self) -> int:
+        """The highest harmonic."""
+        narrow = 0 if self.aerosol_harmonics is None else len(self.aerosol_harmonics)
+        return max(self.harmonics.shape[1], narrow) - 1
 
     @property
     def middle_temperature(self) -> float:
         """The middle one of the model's temperatures, K."""
         return float(self.temperatures[len(self.temperatures) // 2])
 
-    def at_temperature(self, temperature: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Harmonics (images, K) and their derivatives by temperature, of temperatures (images,)."""
-        nodes = torch.as_tensor(self.temperatures, device=temperature.device)
-        table = torch.as_tensor(self.harmonics, device=temperature.device)
+    @property
+    def half_diagonal(self) -> float:
+        """Half of the image's diagonal, px."""
+        return math.hypot(*self.shape) / 2
+
+    @property
+    def geometry(self) -> Geometry:
+        """Of camera and lens, whose axis meets the camera in the rings' nominal centre."""
+        return Geometry(
+            self.focal_length / self.pixel,
+            self.centre,
+            self.half_diagonal,
+            self.tilt,
+            self.distortion,
+        )
+
+    def start(self, device="cpu") -> torch.Tensor:
+        """Parameters (1, `PARAMETERS`) that are known before an image is seen; level 1."""
+        values = {
+            "level": 1.0,
+            "temperature": self.middle_temperature,
+            "falloff": self.falloff,
+            **self.light,
+            **{name: mean for name, (mean, _) in self.priors.items()},
+        }
+        vector = [values.get(name, 0.0) for name in PARAMETERS]
+        return torch.tensor([vector], dtype=torch.float64, device=device)
+
+    @cached_property
+    def _polynomials(self) -> np.ndarray:
+        """Coefficients (T, K) of the harmonics' polynomials over the scaled temperature."""
+        nodes = self.temperatures
         if len(nodes) == 1:
-            value = table.expand(len(temperature), -1)
-            return value, torch.zeros_like(value)
-        width = nodes[-1] - nodes[0]
-        power = torch.arange(len(nodes), device=nodes.device)
-        scaled = (nodes - nodes[0]) / width
-        coefficients = torch.linalg.solve((scaled[:, None] ** power).to(table), table)
-        place = ((temperature - nodes[0]) / width)[:, None]
-        slope = power * place ** (power - 1).clamp(min=0) / width
-        return (place**power).to(table) @ coefficients, slope.to(table) @ coefficients
+            return self.harmonics
+        scaled = (nodes - nodes[0]) / (nodes[-1] - nodes[0])
+        return np.linalg.solve(np.vander(scaled, increasing=True), self.harmonics)
+
+    def amplitudes(self, parameters: torch.Tensor) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+        """Harmonics A_1 ... of images with these parameters, and their derivatives.
+
+        Parameters
+        ----------
+        parameters : torch.Tensor, shape (images, `PARAMETERS`)
+
+        Returns
+        -------
+        amplitudes : torch.Tensor, shape (images, K), complex
+            Relative to A_0, of light of no speed.
+        derivatives : dict
+            By temperature and aerosol (where the model has them), damping and roughness.
+        """
+        device = parameters.device
+        temperature, aerosol, damping, roughness = (
+            parameters[:, PARAMETERS.index(name), None]
+            for name in ("temperature", "aerosol", "damping", "roughness")
+        )
+        table = torch.as_tensor(self._polynomials, device=device)
+        by = {}
+        if len(table) == 1:
+            value = table.expand(len(parameters), -1)
+        else:
+            first, last = self.temperatures[[0, -1]]
+            power = torch.arange(len(table), device=device)
+            place = (temperature - first) / (last - first)
+            slope = power * place ** (power - 1).clamp(min=0) / (last - first)
+            value, by["temperature"] = (part.to(table) @ table for part in (place**power, slope))
+        if self.aerosol_harmonics is not None:
+            narrow = torch.as_tensor(self.aerosol_harmonics, device=device)[None]
+            count = max(value.shape[1], narrow.shape[1])
+            value, narrow, *warming = (
+                torch.nn.functional.pad(part, (0, count - part.shape[1]))
+                for part in (value, narrow, *by.values())
+            )
+            by = {name: part * (1 - aerosol) for name, part in zip(by, warming, strict=True)}
+            by["aerosol"] = narrow - value
+            value = value * (1 - aerosol) + narrow * aerosol
+        n = torch.arange(value.shape[1], device=device)
+        factor = torch.exp(-n * damping - n**2 * roughness)
+        value = value * factor
+        by = {name: (part * factor)[:, 1:] for name, part in by.items()}
+        by |= {"damping": (-n * value)[:, 1:], "roughness": (-(n**2) * value)[:, 1:]}
+        return value[:, 1:], by
+
+
+def _relative(harmonics: np.ndarray, negligible: float) -> np.ndarray:
+    """Harmonics over their mean A_0, without those that are negligible."""
+    if not (np.isfinite(harmonics).all() and (harmonics[:, 0].real > 0).all()):
+        raise InputError(
+            f"harmonics: mean transmission {harmonics[0, 0]:g} is not allowed; expected "
+            "above 0: the etalon must transmit"
+        )
+    harmonics = harmonics / harmonics[:, :1].real
+    strong = np.flatnonzero(np.abs(harmonics).max(0) > negligible)[-1]
+    if strong < 1:
+        raise InputError("harmonics: all but the mean are 0; expected an etalon that leaves rings")
+    return harmonics[:, : strong + 1]
 
 
 @dataclass(frozen=True)
@@ -191,156 +329,3 @@ class PixelNoise:
         score is then that of its first two moments.
         """
         return self.excess * mean + signal**2 / self.speckle_modes + self.read_noise**2
-
-
-def squared_radius(cells: Cells, dx: torch.Tensor, dy: torch.Tensor) -> torch.Tensor:
-    """Mean of r^2 about (dx, dy) from the cells' centre, over the pixels' areas, px^2."""
-    return cells.r2 - 2 * (cells.x * dx + cells.y * dy) + dx**2 + dy**2 + PIXEL_R2
-
-
-def orders(
-    model: RingModel, r2: torch.Tensor, v_los: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Cosine of the angle, and the order of interference less the integer part at the centre."""
-    scale, centre = (model.pixel / model.focal_length) ** 2, model.order_at_centre
-    cosine = (1 + scale * r2).rsqrt()
-    # cos - 1 = -tan^2 cos^2 / (1 + cos), without the difference of numbers next to one
-    order = centre % 1 - centre * scale * r2 * cosine**2 / (1 + cosine)
-    return cosine, order + v_los * cosine / model.velocity_range
-
-
-def illumination(model: RingModel, r2: torch.Tensor, falloff: torch.Tensor) -> torch.Tensor:
-    """Light relative to the rings' centre."""
-    return torch.exp(-falloff * r2 / _corner(model))
-
-
-def _corner(model: RingModel) -> float:
-    """Squared half of the image's diagonal, px^2."""
-    return (model.shape[0] ** 2 + model.shape[1] ** 2) / 4
-
-
-def mean_and_jacobian(
-    model: RingModel, cells: Cells, parameters: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean electrons per pixel in every cell, and their derivatives.
-
-    Parameters
-    ----------
-    cells : Cells
-    parameters : torch.Tensor, shape (images, 7)
-        In the order of `PARAMETERS`; x and y from the cells' centre.
-
-    Returns
-    -------
-    mean : torch.Tensor, shape (images, cells)
-    jacobian : torch.Tensor, shape (images, 7, cells)
-        By each parameter. The change of a cell's spread of r^2 with the centre is neglected.
-    """
-    v, dx, dy, level, background, temperature, falloff = parameters.T[..., None]
-    r2 = squared_radius(cells, dx, dy)
-    variance = (r2 - PIXEL_R2) / 3  # of r2 over a pixel: (2 x)^2 / 12 + (2 y)^2 / 12
-    if cells.spread is not None:
-        by = torch.cat([-2 * dx, -2 * dy, torch.ones_like(dx)], -1)  # of r2 by (x, y, r2)
-        variance = variance + torch.einsum("bi,cij,bj->bc", by, cells.spread, by)
-    light = illumination(model, r2, falloff)
-    # more light at the inner end of a cell
-    cosine, fraction = orders(model, r2 - falloff / _corner(model) * variance, v)
-    turn = torch.polar(torch.ones_like(fraction), 2 * torch.pi * fraction)
-    per_velocity = cosine / model.velocity_range
-    by_r2 = -model.order_at_centre / 2 * (model.pixel / model.focal_length) ** 2 * cosine**3
-    damping = torch.exp(-2 * torch.pi**2 * variance * by_r2**2)
-    amplitudes, warming = model.at_temperature(temperature[:, 0])
-    profile, slope, warmer = (torch.zeros_like(fraction) for _ in range(3))
-    wave, blur = torch.ones_like(turn), torch.ones_like(fraction)
-    for n in range(1, amplitudes.shape[1]):
-        wave = wave * turn
-        blur = blur * damping ** (2 * n - 1)  # damping^(n^2) in all
-        term = 2 * amplitudes[:, n, None] * wave
-        profile += blur * term.real
-        slope -= 2 * torch.pi * n * blur * term.imag
-        if len(model.temperatures) > 1:
-            warmer += blur * 2 * (warming[:, n, None] * wave).real
-    profile += 1
-    lit = light * profile
-    by_r2 = level * light * (slope * by_r2 - profile * falloff / _corner(model))
-    return level * lit + background, torch.stack(
-        [
-            level * light * slope * per_velocity,
-            by_r2 * 2 * (dx - cells.x),
-            by_r2 * 2 * (dy - cells.y),
-            lit,
-            torch.ones_like(lit),
-            level * light * warmer,
-            -level * lit * r2 / _corner(model),
-        ],
-        1,
-    )
-
-
-def parameter_vector(
-    model: RingModel,
-    cells: Cells,
-    v_los: float = 0.0,
-    photons: float = 2.4e7,
-    background: float = 0.0,
-    temperature: float | None = None,
-) -> torch.Tensor:
-    """Parameters (1, 7) of an image about the cells' centre with this number of signal electrons.
-
-    Raises
-    ------
-    InputError
-        Photons not above 0, a temperature outside the model's.
-    """
-    if not (math.isfinite(photons) and photons > 0):
-        raise InputError(f"photons: {photons!r} is not allowed; expected above 0")
-    if not (math.isfinite(background) and background >= 0):
-        raise InputError(f"background: {background!r} is not allowed; expected 0 or more")
-    if not math.isfinite(v_los):
-        raise InputError(f"v_los: {v_los!r} m/s is not allowed; expected a finite speed")
-    warm = model.middle_temperature if temperature is None else temperature
-    if temperature is not None:
-        first, last = model.temperatures[[0, -1]]
-        if not first <= temperature <= last:
-            raise InputError(
-                f"temperature: {temperature!r} K is not allowed; the model is valid from "
-                f"{first:g} to {last:g} K"
-            )
-    vector = torch.tensor(
-        [[v_los, 0.0, 0.0, 1.0, 0.0, warm, model.falloff]],
-        dtype=torch.float64,
-        device=cells.x.device,
-    )
-    level_one = mean_and_jacobian(model, cells, vector)[0]
-    vector[0, 3] = photons / (level_one * cells.count).sum()
-    vector[0, 4] = background
-    return vector
-
-
-def expected(
-    model: RingModel,
-    v_los: float = 0.0,
-    photons: float = 2.4e7,
-    background: float = 0.0,
-    centre: tuple[float, float] | None = None,
-    temperature: float | None = None,
-    device="cpu",
-) -> torch.Tensor:
-    """Mean image, electrons, shape (height, width), float64.
-
-    Parameters
-    ----------
-    v_los : float
-        m/s, positive toward the instrument.
-    photons : float
-        Signal electrons in the whole image (photons detected).
-    background : float
-        Electrons per pixel that have no rings: sky, dark current.
-    centre : (float, float), optional
-        (x, y), pixels; the model's if not given.
-    temperature : float, optional
-        K; the middle one of the model's if not given.
-    """
-    cells = pixels(model.shape, centre or model.centre, device)
-    vector = parameter_vector(model, cells, v_los, photons, background, temperature)
-    return mean_and_jacobian(model, cells, vector)[0].reshape(model.shape)

@@ -1,0 +1,43 @@
+"""Smooth variations over an image: polynomials r^n cos(m phi), r^n sin(m phi).
+
+The radius is in half diagonals of the image, from its middle. They describe light that is not even
+(its logarithm, so that it stays above 0) and a background that is not. The term r^2 of the light is
+the `falloff` about the rings' centre, so it is not among the light's terms.
+"""
+
+import torch
+
+from lidar_mi.errors import InputError
+
+MOST_DEGREE = 4
+
+
+def term_names(kind: str, degree: int) -> tuple[str, ...]:
+    """Names of the terms of ``light`` or ``background`` up to a degree: kind_n_m, m < 0 the sine.
+
+    Raises
+    ------
+    InputError
+        A degree that is not 0 to 4.
+    """
+    if degree not in range(MOST_DEGREE + 1):
+        raise InputError(f"{kind} degree: {degree!r} is not allowed; expected 0 to {MOST_DEGREE}")
+    return tuple(
+        f"{kind}_{n}_{m}" for n, m in _indices(degree) if kind != "light" or (n, m) != (2, 0)
+    )
+
+
+def term_values(names: tuple[str, ...], u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """Values at places (u, v), half diagonals from the middle; shape (places, names)."""
+    wave = torch.complex(u, v)
+    columns = []
+    for name in names:
+        n, m = map(int, name.split("_")[1:])
+        angular = wave ** abs(m)
+        columns.append((wave.abs() ** (n - abs(m))) * (angular.imag if m < 0 else angular.real))
+    return torch.stack(columns, 1) if columns else u.new_zeros((len(u), 0))
+
+
+def _indices(degree: int) -> list[tuple[int, int]]:
+    """n and m of all terms but the constant."""
+    return [(n, m) for n in range(1, degree + 1) for m in range(n, -n - 1, -2)]
