@@ -106,7 +106,7 @@ def to_laser_shot(laser: torch.Tensor, air: torch.Tensor) -> Retrieved:
         fit_rings(frames, model, noise, max_chi_square=math.inf)
         for frames, model in zip((air, laser), models, strict=True)
     )
-    v, std = difference(received, emitted)
+    v, std, _ = difference(received, emitted)
     worst = torch.maximum(received.chi_square, emitted.chi_square)
     return Retrieved(v.numpy(), std.numpy(), worst.numpy())
 

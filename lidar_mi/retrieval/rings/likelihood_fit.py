@@ -42,6 +42,7 @@ from lidar_mi.retrieval.rings.mean_image import (
     strongest,
 )
 from lidar_mi.retrieval.rings.model import INSTRUMENT, PARAMETERS, PixelNoise, RingModel
+from lidar_mi.retrieval.rings.scoring import Scored, cell_variance, robust_scoring
 
 METHODS = ("annular", "pixels")
 
@@ -49,14 +50,9 @@ METHODS = ("annular", "pixels")
 # information of the highest is lost, 0.8 % and less of the others.
 STEPS_PER_HARMONIC = 10
 SECTORS = 12
-ITERATIONS = 40
 MOVES = 12  # of the cells toward the rings' centre
-CLOSE = 1e-3  # standard deviations, largest last step of a fit that has converged
 CHUNK_BYTES = 256e6
 SIGNIFICANT = 5.0  # standard deviations, the least amplitude of rings
-# Cells beyond so many standard deviations hold hot pixels or dust and are left out, unless more
-# than this fraction is: then the model is wrong, and chi-square shall say so.
-OUTLIER, MOST_OUTLIERS = 5.0, 0.03
 # standard deviations of chi-square above 1 from which stated errors grow with its root
 MISFIT = 4.0
 
@@ -331,13 +327,13 @@ def _fit_about(centre, images, task: _Task, number: int, method: str) -> RingFit
     annular = _waves(model, centre, task.response, images.device)
     means = annular.cells.means(images)
     parameters = _start(model, annular, means, noise, number)
-    end = _robust([annular], [means], parameters, task, number)
+    end = robust_scoring([annular], [means], parameters, model, noise, task.free, number)
     rings = _rings(model, annular, means, end, noise)
     if method == "pixels":
         blocks = list(pixel_waves(model, centre, images.device))
         split = [len(block.cells.count) for block in blocks]
         every = images.flatten(-2).double().split(split, -1)
-        end = _robust(blocks, every, end.parameters, task, number)
+        end = robust_scoring(blocks, every, end.parameters, model, noise, task.free, number)
     names, chi_square = task.free, end.chi_square
     std = torch.zeros_like(end.parameters)
     grown = torch.where(
@@ -392,130 +388,7 @@ def _start(model, waves, means, noise, number) -> torch.Tensor:
     return parameters
 
 
-class _End(NamedTuple):
-    """Where the scoring ended."""
-
-    parameters: torch.Tensor
-    fisher: torch.Tensor
-    chi_square: torch.Tensor
-    freedom: int
-    outliers: torch.Tensor
-    kept: list[torch.Tensor]
-
-
-def _robust(blocks, means, parameters, task: _Task, number: int) -> _End:
-    """Fisher scoring, again without cells that are far outside the noise."""
-    kept = [torch.ones_like(part, dtype=torch.bool) for part in means]
-    for _ in range(4):
-        end = _scoring(blocks, means, kept, parameters, task, number)
-        left = [
-            _residual(waves, part, end.parameters, task).abs() <= OUTLIER
-            for waves, part in zip(blocks, means, strict=True)
-        ]
-        number_of = sum(part.shape[1] for part in left)
-        fraction = sum((~part).sum(1) for part in left) / number_of
-        # an image with too many keeps them all
-        few = (fraction <= MOST_OUTLIERS)[:, None]
-        left = [part | ~few for part in left]
-        if all(torch.equal(a, b) for a, b in zip(left, kept, strict=True)):
-            break
-        kept, parameters = left, end.parameters
-    return end
-
-
-def _variance(mean, parameters, noise, floor=0.0) -> torch.Tensor:
-    """Variance of a pixel in every cell."""
-    background = parameters[:, PARAMETERS.index("background"), None]
-    mean = mean.clamp(min=floor) if isinstance(floor, float) else torch.maximum(mean, floor)
-    return noise.variance(mean, (mean - background).clamp(min=0))
-
-
-def _residual(waves, means, parameters, task: _Task) -> torch.Tensor:
-    """Misfit of every cell in standard deviations."""
-    mean = mean_and_jacobian(task.model, waves, parameters)[0]
-    variance = _variance(mean, parameters, task.noise, 1e-3 * means.mean(1, keepdim=True))
-    return (means - mean) * (waves.cells.count / variance).sqrt()
-
-
-def _scoring(blocks, means, kept, parameters, task: _Task, number: int) -> _End:
-    """Weighted least squares, the weights from the mean of the step before.
-
-    The fit that has converged is the maximum of the likelihood times the priors.
-    """
-    model, noise, names = task.model, task.noise, task.free
-    columns = [PARAMETERS.index(name) for name in names]
-    parameters = parameters.clone()
-    if "background" not in names:
-        place, level = PARAMETERS.index("background"), PARAMETERS.index("level")
-        parameters[:, level] += parameters[:, place]
-        parameters[:, place] = 0
-    limit = _step_limits(model, names, parameters.device)
-    information = prior_information(model, names, parameters.device)
-    middle = model.start(parameters.device)[:, columns]
-    floor = 1e-3 * means[0].mean(1, keepdim=True)
-    freedom = sum(part.shape[1] for part in means) - len(names)
-    converged = torch.zeros(len(parameters), dtype=torch.bool, device=parameters.device)
-    for _ in range(ITERATIONS):
-        fisher = torch.diag(information).repeat(len(parameters), 1, 1)
-        score = information * (middle - parameters[:, columns])
-        chi_square = torch.zeros_like(score[:, 0])
-        for waves, part, use in zip(blocks, means, kept, strict=True):
-            mean, jacobian = mean_and_jacobian(model, waves, parameters, names)
-            variance = _variance(mean, parameters, noise, floor)
-            weight = use * waves.cells.count / variance
-            fisher = fisher + fisher_matrix(jacobian, weight)
-            score = score + (jacobian @ (weight * (part - mean))[:, :, None])[:, :, 0]
-            chi_square = chi_square + (weight * (part - mean) ** 2).sum(1)
-        if converged.all():
-            lost = sum((~use).sum(1) for use in kept)
-            return _End(
-                parameters,
-                fisher,
-                chi_square / (freedom - lost),
-                freedom,
-                lost / (freedom + len(names)),
-                kept,
-            )
-        std = standard_deviations(fisher)
-        unit = fisher.diagonal(dim1=1, dim2=2).rsqrt()
-        normal = fisher * unit[:, :, None] * unit[:, None, :]
-        step = torch.linalg.solve_ex(normal, score * unit)[0] * unit
-        if not torch.isfinite(step).all():
-            bad = number + int((~torch.isfinite(step)).any(1).nonzero()[0])
-            raise InputError(
-                f"images[{bad}]: the fit fails; expected rings that the model describes"
-            )
-        converged = (step.abs() <= CLOSE * std).all(1)
-        parameters[:, columns] += step.clamp(-limit, limit)
-        if "temperature" in names:
-            place = PARAMETERS.index("temperature")
-            parameters[:, place] = parameters[:, place].clamp(*model.temperatures[[0, -1]])
-        # beyond, the waves are not exact: the cells move first
-        for name in ("x", "y"):
-            place = PARAMETERS.index(name)
-            far = parameters[:, place].abs() > 3 * reach(model)
-            parameters[:, place] = parameters[:, place].clamp(-3 * reach(model), 3 * reach(model))
-            converged |= far & (step.abs() <= 0.1 * limit).all(1)
-    bad = number + int((~converged).nonzero()[0])
-    raise InputError(
-        f"images[{bad}]: the fit does not converge; expected two rings or more as in the model"
-    )
-
-
-def _step_limits(model: RingModel, names, device) -> torch.Tensor:
-    """Longest steps: one longer than the rings are wide would leave the linear range."""
-    widths = {
-        "v_los": model.velocity_range / 16,
-        "x": 0.04 * math.sqrt(model.order_spacing),
-        "y": 0.04 * math.sqrt(model.order_spacing),
-        "temperature": 20.0,
-        "falloff": 0.3,
-        "aerosol": 0.1,
-    }
-    return torch.tensor([widths.get(name, math.inf) for name in names], device=device).double()
-
-
-def _sensitivity(waves, end: _End, task: _Task) -> torch.Tensor:
+def _sensitivity(waves, end: Scored, task: _Task) -> torch.Tensor:
     """Change of the fitted speed with what was taken as known, (images, 8).
 
     A change d of the instrument moves the fit by -F^-1 J^T W (dmu/dd) d.
@@ -523,7 +396,7 @@ def _sensitivity(waves, end: _End, task: _Task) -> torch.Tensor:
     model = task.model
     exact = ring_waves(model, waves.cells, derivatives=True)
     mean, jacobian = mean_and_jacobian(model, exact, end.parameters, [*task.free, *INSTRUMENT])
-    weight = end.kept[0] * waves.cells.count / _variance(mean, end.parameters, task.noise, 1e-9)
+    weight = end.kept[0] * waves.cells.count / cell_variance(mean, end.parameters, task.noise)
     free, known = jacobian.split([len(task.free), len(INSTRUMENT)], 1)
     information = prior_information(model, task.free, mean.device)
     fisher = torch.diag(information) + fisher_matrix(free, weight)
@@ -533,7 +406,7 @@ def _sensitivity(waves, end: _End, task: _Task) -> torch.Tensor:
     return -torch.cat([torch.ones_like(first[:, :1]), first], 1)
 
 
-def _rings(model, waves, means, end: _End, noise) -> torch.Tensor:
+def _rings(model, waves, means, end: Scored, noise) -> torch.Tensor:
     """Orders whose rings are significant and at least half as strong as fitted."""
     cells, parameters = waves.cells, end.parameters
     v, dx, dy, level, background = (
@@ -545,7 +418,7 @@ def _rings(model, waves, means, end: _End, noise) -> torch.Tensor:
     order = order.round().long()
     order -= order.min()
     ring = mean - background - level * light_on(model, cells, parameters)
-    weight = cells.count / _variance(mean, parameters, noise, 1e-9)
+    weight = cells.count / cell_variance(mean, parameters, noise)
     sums = mean.new_zeros(2, len(mean), int(order.max()) + 1)
     strength = sums[0].scatter_add_(1, order, weight * ring**2)
     misfit = sums[1].scatter_add_(1, order, weight * ring * (means - mean))

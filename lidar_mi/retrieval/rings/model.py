@@ -113,7 +113,7 @@ class RingModel:
             )
         harmonics = np.atleast_2d(np.asarray(self.harmonics, complex))
         temperatures = np.atleast_1d(np.asarray(self.temperatures, float))
-        if not temperatures.size:
+        if not temperatures.size or (temperatures.size == 1 and np.isnan(temperatures[0])):
             temperatures = np.array([np.nan])
         elif not (np.all(temperatures > 0) and np.all(np.diff(temperatures) > 0)):
             raise InputError(

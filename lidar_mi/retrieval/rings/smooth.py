@@ -9,7 +9,7 @@ import torch
 
 from lidar_mi.errors import InputError
 
-MOST_DEGREE = 4
+MOST_DEGREE = 8
 
 
 def term_names(kind: str, degree: int) -> tuple[str, ...]:

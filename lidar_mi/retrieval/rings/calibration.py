@@ -1,0 +1,206 @@
+"""What frames of a known line say of an instrument: kept in a file, given to the ring fit."""
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.model import INSTRUMENT, RingModel
+from lidar_mi.tables import Table, Tabular, with_error
+
+_ARRAYS = {
+    "systematic": (("systematic", "systematic_2"), "1", "covariance of the instrument"),
+    "frame_speed": (("frame",), "m s-1", "drift of the frame, as a speed"),
+    "frame_speed_std": (("frame",), "m s-1", "standard error of frame_speed"),
+    "response": (("row", "column"), "1", "response to light, 0 for pixels left out"),
+    "misfit": (("block_row", "block_column"), "1", "mean misfit over its standard deviation"),
+}
+"""Dimensions, units and names of the arrays in a file."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Calibration(Tabular):
+    """What the frames of a line say of an instrument.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        Height and width of the camera, pixels.
+    pixel, wavelength, focal_length : float
+        m. The focal length is that for the nominal gap.
+    order_at_centre : float
+        Of the line, its fraction as the mean of the frames has it.
+    finesse : float
+        Free spectral range over the full width at half maximum of the line's rings.
+    centre : (float, float)
+        (x, y) of the rings, pixels.
+    tilt, distortion, blur, damping, roughness
+        As in `lidar_mi.retrieval.rings.model`.
+    falloff : float
+    light : mapping
+        Uneven illumination, terms of `LIGHT`.
+    std : mapping
+        Standard errors by name, of `INSTRUMENT` (focal_length relative), x, y and falloff.
+    systematic : array (8, 8)
+        Covariance that all later speeds share, see `RingModel.systematic`.
+    frame_speed, frame_speed_std : array (frames,)
+        Fractional order of every frame as a speed about their mean, m/s: the drift.
+    drift : float
+        Standard deviation of that beyond its noise, m/s.
+    chi_square : float
+        Squared misfit over its expectation.
+    response : array (height, width)
+        Of the pixels to light; 0 for pixels that are not to be used.
+    misfit : array (height, width)
+        Mean of the frames less the model, in standard deviations, in blocks of ``block`` pixels.
+    block : int
+    undetermined : tuple of str
+        Of `INSTRUMENT`, what the frames do not tell beyond the tolerances.
+    """
+
+    shape: tuple[int, int]
+    pixel: float
+    wavelength: float
+    focal_length: float
+    order_at_centre: float
+    finesse: float
+    centre: tuple[float, float]
+    tilt: tuple[float, float]
+    distortion: float
+    blur: float
+    damping: float
+    roughness: float
+    falloff: float
+    light: Mapping[str, float]
+    std: Mapping[str, float]
+    systematic: np.ndarray
+    frame_speed: np.ndarray
+    frame_speed_std: np.ndarray
+    drift: float
+    chi_square: float
+    response: np.ndarray
+    misfit: np.ndarray
+    block: int
+    undetermined: tuple[str, ...]
+
+    def tables(self) -> list[Table]:
+        """The instrument, with standard errors, and how well the frames fit."""
+        std, bad = self.std, int((self.response == 0).sum())
+        x, y = self.centre
+        tilt_x, tilt_y = (math.degrees(t) for t in self.tilt)
+        focal = with_error(self.focal_length * 1e3, std["focal_length"] * self.focal_length * 1e3)
+        rows = [
+            ("frames", str(len(self.frame_speed))),
+            ("focal length, for the nominal gap", f"{focal} mm"),
+            ("fractional order at the centre", f"{self.order_at_centre % 1:.5f}"),
+            ("finesse of the line's rings", f"{self.finesse:.3g}"),
+            ("centre x, y", f"{with_error(x, std['x'])}, {with_error(y, std['y'])} px"),
+            (
+                "camera tilt along x, y",
+                f"{with_error(tilt_x, math.degrees(std['tilt_x']))}, "
+                f"{with_error(tilt_y, math.degrees(std['tilt_y']))} deg",
+            ),
+            (
+                "distortion at the corner",
+                with_error(100 * self.distortion, 100 * std["distortion"], "%"),
+            ),
+            ("squared radius of the blur", with_error(self.blur, std["blur"], "px^2")),
+            ("change of -ln R of the mirrors", with_error(self.damping, std["damping"])),
+            ("change of the roughness term", with_error(self.roughness, std["roughness"])),
+            ("fall-off of the light to the corner", with_error(self.falloff, std["falloff"])),
+            ("pixels left out", str(bad)),
+            ("drift between frames", f"{self.drift:.3g} m/s"),
+            ("chi-square", f"{self.chi_square:.4f}"),
+        ]
+        note = ""
+        if self.undetermined:
+            note = f"Not determined by the frames: {', '.join(self.undetermined)}."
+        return [Table("calibration", rows, note=note)]
+
+    def to_dataset(self) -> xr.Dataset:
+        """All of it, for a NetCDF file; numbers that are no arrays as JSON in ``calibration``."""
+        single = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _ARRAYS}
+        arrays = {
+            name: (dims, getattr(self, name), {"units": units, "long_name": text})
+            for name, (dims, units, text) in _ARRAYS.items()
+        }
+        attributes = {"title": "Calibration of a fringe-imaging lidar", "Conventions": "CF-1.11"}
+        return xr.Dataset(arrays, attrs={**attributes, "calibration": json.dumps(single)})
+
+
+def calibration_of(data: xr.Dataset) -> Calibration:
+    """The calibration in a data set of `Calibration.to_dataset`.
+
+    Raises
+    ------
+    InputError
+        A data set that is none, or not whole.
+    """
+    try:
+        single = json.loads(data.attrs["calibration"])
+        arrays = {name: data[name].transpose(*dims).values for name, (dims, *_) in _ARRAYS.items()}
+        for name in ("shape", "centre", "tilt", "undetermined"):
+            single[name] = tuple(single[name])
+        found = Calibration(**single, **arrays)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"calibration: {error} is missing or wrong; expected the file of a calibration"
+        ) from None
+    numbers = (found.pixel, found.wavelength, found.focal_length, found.order_at_centre)
+    size = (1 + len(INSTRUMENT),) * 2
+    whole = found.response.shape == found.shape and found.systematic.shape == size
+    finite = all(np.isfinite(getattr(found, name)).all() for name in _ARRAYS)
+    if not (whole and finite and all(isinstance(v, float) and v > 0 for v in numbers)):
+        raise InputError(
+            "calibration: sizes or numbers that cannot be; expected the file of a calibration"
+        )
+    return found
+
+
+def calibrated(model: RingModel, calibration: Calibration) -> RingModel:
+    """The model of another line with the instrument as calibrated.
+
+    Raises
+    ------
+    InputError
+        A calibration of another camera or wavelength.
+    """
+    if tuple(model.shape) != tuple(calibration.shape):
+        sizes = " and ".join(f"{h} x {w}" for h, w in (calibration.shape, model.shape))
+        raise InputError(f"calibration: sizes {sizes} px (height x width) of cameras differ")
+    for name in ("pixel", "wavelength"):
+        own, other = getattr(calibration, name), getattr(model, name)
+        if not math.isclose(own, other, rel_tol=1e-3):
+            raise InputError(f"calibration: {name} {own:g} m is not that of the model, {other:g} m")
+    order = calibration.order_at_centre
+    # the nominal gap may be given to another fraction of an order
+    if abs(order - model.order_at_centre) > 2:
+        raise InputError(
+            f"calibration: order {order:.1f} at the centre is not that of the model, "
+            f"{model.order_at_centre:.1f}: another gap"
+        )
+
+    def changed(harmonics):
+        n = np.arange(np.shape(harmonics)[-1])
+        factor = np.exp(-calibration.damping * n - calibration.roughness * n**2)
+        return np.asarray(harmonics) * factor
+
+    aerosol = model.aerosol_harmonics
+    return replace(
+        model,
+        centre=calibration.centre,
+        focal_length=calibration.focal_length,
+        order_at_centre=order,
+        harmonics=changed(model.harmonics),
+        aerosol_harmonics=None if aerosol is None else changed(aerosol),
+        tilt=calibration.tilt,
+        distortion=calibration.distortion,
+        blur=calibration.blur,
+        falloff=calibration.falloff,
+        light=calibration.light,
+        systematic=calibration.systematic,
+    )

@@ -1,0 +1,170 @@
+"""Fisher scoring of images of rings: the maximum of their likelihood, many images at once.
+
+Weighted least squares whose weights come from the mean of the step before. Where it has converged
+the score is 0, so that it *is* the maximum of the likelihood times the priors.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.bound import fisher_matrix, prior_information, standard_deviations
+from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, reach
+from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
+
+ITERATIONS = 40
+CLOSE = 1e-3  # standard deviations, largest last step of a fit that has converged
+# Cells beyond so many standard deviations hold hot pixels or dust and are left out, unless more
+# than this fraction is: then the model is wrong, and chi-square shall say so.
+OUTLIER, MOST_OUTLIERS = 5.0, 0.03
+
+
+class Scored(NamedTuple):
+    """Where the scoring ended."""
+
+    parameters: torch.Tensor
+    fisher: torch.Tensor
+    chi_square: torch.Tensor
+    freedom: int
+    outliers: torch.Tensor
+    kept: list[torch.Tensor]
+
+
+def robust_scoring(
+    blocks,
+    means,
+    parameters,
+    model: RingModel,
+    noise: PixelNoise,
+    names: Sequence[str],
+    number: int,
+) -> Scored:
+    """Fisher scoring, again without cells that are far outside the noise."""
+    kept = [torch.ones_like(part, dtype=torch.bool) for part in means]
+    for _ in range(4):
+        end = _scoring(blocks, means, kept, parameters, model, noise, names, number)
+        left = [
+            _residual(waves, part, end.parameters, model, noise).abs() <= OUTLIER
+            for waves, part in zip(blocks, means, strict=True)
+        ]
+        number_of = sum(part.shape[1] for part in left)
+        fraction = sum((~part).sum(1) for part in left) / number_of
+        # an image with too many keeps them all
+        few = (fraction <= MOST_OUTLIERS)[:, None]
+        left = [part | ~few for part in left]
+        if all(torch.equal(a, b) for a, b in zip(left, kept, strict=True)):
+            break
+        kept, parameters = left, end.parameters
+    return end
+
+
+def cell_variance(
+    mean: torch.Tensor,
+    parameters: torch.Tensor,
+    noise: PixelNoise,
+    floor: torch.Tensor | None = None,
+) -> torch.Tensor:
+    """Variance of a pixel in every cell, (images, cells), from its mean, not below ``floor``.
+
+    The floor is 0.001 of an image's mean if not given.
+    """
+    background = parameters[:, PARAMETERS.index("background"), None]
+    floor = 1e-3 * mean.mean(1, keepdim=True) if floor is None else floor
+    mean = torch.maximum(mean, floor)
+    return noise.variance(mean, (mean - background).clamp(min=0))
+
+
+def _residual(waves, means, parameters, model, noise) -> torch.Tensor:
+    """Misfit of every cell in standard deviations."""
+    mean = mean_and_jacobian(model, waves, parameters)[0]
+    variance = cell_variance(mean, parameters, noise, 1e-3 * means.mean(1, keepdim=True))
+    return (means - mean) * (waves.cells.count / variance).sqrt()
+
+
+def _scoring(
+    blocks,
+    means,
+    kept,
+    parameters,
+    model: RingModel,
+    noise: PixelNoise,
+    names: Sequence[str],
+    number: int,
+) -> Scored:
+    """Weighted least squares, the weights from the mean of the step before.
+
+    The fit that has converged is the maximum of the likelihood times the priors.
+    """
+    columns = [PARAMETERS.index(name) for name in names]
+    parameters = parameters.clone()
+    if "background" not in names:
+        place, level = PARAMETERS.index("background"), PARAMETERS.index("level")
+        parameters[:, level] += parameters[:, place]
+        parameters[:, place] = 0
+    limit = _step_limits(model, names, parameters.device)
+    information = prior_information(model, names, parameters.device)
+    middle = model.start(parameters.device)[:, columns]
+    floor = 1e-3 * means[0].mean(1, keepdim=True)
+    freedom = sum(part.shape[1] for part in means) - len(names)
+    converged = torch.zeros(len(parameters), dtype=torch.bool, device=parameters.device)
+    for _ in range(ITERATIONS):
+        fisher = torch.diag(information).repeat(len(parameters), 1, 1)
+        score = information * (middle - parameters[:, columns])
+        chi_square = torch.zeros_like(score[:, 0])
+        for waves, part, use in zip(blocks, means, kept, strict=True):
+            mean, jacobian = mean_and_jacobian(model, waves, parameters, names)
+            variance = cell_variance(mean, parameters, noise, floor)
+            weight = use * waves.cells.count / variance
+            fisher = fisher + fisher_matrix(jacobian, weight)
+            score = score + (jacobian @ (weight * (part - mean))[:, :, None])[:, :, 0]
+            chi_square = chi_square + (weight * (part - mean) ** 2).sum(1)
+        if converged.all():
+            lost = sum((~use).sum(1) for use in kept)
+            return Scored(
+                parameters,
+                fisher,
+                chi_square / (freedom - lost),
+                freedom,
+                lost / (freedom + len(names)),
+                kept,
+            )
+        std = standard_deviations(fisher)
+        unit = fisher.diagonal(dim1=1, dim2=2).rsqrt()
+        normal = fisher * unit[:, :, None] * unit[:, None, :]
+        step = torch.linalg.solve_ex(normal, score * unit)[0] * unit
+        if not torch.isfinite(step).all():
+            bad = number + int((~torch.isfinite(step)).any(1).nonzero()[0])
+            raise InputError(
+                f"images[{bad}]: the fit fails; expected rings that the model describes"
+            )
+        converged = (step.abs() <= CLOSE * std).all(1)
+        parameters[:, columns] += step.clamp(-limit, limit)
+        if "temperature" in names:
+            place = PARAMETERS.index("temperature")
+            parameters[:, place] = parameters[:, place].clamp(*model.temperatures[[0, -1]])
+        # beyond, the waves are not exact: the cells move first
+        for name in ("x", "y"):
+            place = PARAMETERS.index(name)
+            far = parameters[:, place].abs() > 3 * reach(model)
+            parameters[:, place] = parameters[:, place].clamp(-3 * reach(model), 3 * reach(model))
+            converged |= far & (step.abs() <= 0.1 * limit).all(1)
+    bad = number + int((~converged).nonzero()[0])
+    raise InputError(
+        f"images[{bad}]: the fit does not converge; expected two rings or more as in the model"
+    )
+
+
+def _step_limits(model: RingModel, names, device) -> torch.Tensor:
+    """Longest steps: one longer than the rings are wide would leave the linear range."""
+    widths = {
+        "v_los": model.velocity_range / 16,
+        "x": 0.04 * math.sqrt(model.order_spacing),
+        "y": 0.04 * math.sqrt(model.order_spacing),
+        "temperature": 20.0,
+        "falloff": 0.3,
+        "aerosol": 0.1,
+    }
+    return torch.tensor([widths.get(name, math.inf) for name in names], device=device).double()
