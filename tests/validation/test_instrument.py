@@ -28,7 +28,7 @@ def test_bias_is_the_closed_form(case):
         # a wedge makes the profile skew: 0.03 m/s more
         assert outcome.bias == pytest.approx(bias, abs=4 * sigma + 0.1)
         # plates times pupil: 50 m/s that chi-square does not show
-        assert outcome.chi_square < 1.1 or case == instrument.WEDGE
+        assert outcome.chi_square < 1.2 or case == instrument.WEDGE
 
 
 def test_retrievals_get_the_frames_of_a_pulse_and_their_errors_are_compared():

@@ -9,9 +9,12 @@ from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, parameter_vec
 from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
 
 
-def fisher_matrix(jacobian: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-    """sum_i w_i J_i J_i^T, shape (images, parameters, parameters)."""
-    return (jacobian * weight[:, None]) @ jacobian.transpose(1, 2)
+def fisher_matrix(
+    jacobian: torch.Tensor, weight: torch.Tensor, free: Sequence[int] | None = None
+) -> torch.Tensor:
+    """sum_i w_i J_i J_i^T over the free parameters (all if None), (images, free, free)."""
+    part = jacobian if free is None else jacobian[:, list(free)]
+    return (part * weight[:, None]) @ part.transpose(1, 2)
 
 
 def prior_information(model: RingModel, names: Sequence[str], device="cpu") -> torch.Tensor:
