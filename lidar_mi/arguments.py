@@ -3,6 +3,7 @@
 import functools
 import inspect
 import operator
+import os
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +21,7 @@ _WORDS = {
     str: "text",
     bool: "True or False",
     types.NoneType: "None",
+    Path: "a path (names of 255 bytes at most, no NUL)",
 }
 
 
@@ -54,8 +56,7 @@ def _is(value: Any, annotation: Any) -> bool:
         return True
     if origin in (typing.Union, types.UnionType):
         named = Path in inner and isinstance(value, str | Path)
-        # no file has a name with a NUL in it
-        return any(_is(value, part) for part in inner) and not (named and "\0" in str(value))
+        return any(_is(value, part) for part in inner) and not (named and not _nameable(value))
     if origin is Literal:
         return isinstance(value, tuple(map(type, inner)))
     if origin is tuple:
@@ -72,6 +73,12 @@ def _is(value: Any, annotation: Any) -> bool:
     if annotation is int:
         return not isinstance(value, bool) and _becomes(operator.index, value)
     return isinstance(value, annotation)
+
+
+def _nameable(path: str | Path) -> bool:
+    """Whether a file may have that path: no NUL, names within what file systems allow."""
+    name = os.fsencode(path) if isinstance(path, Path) else path.encode(errors="replace")
+    return b"\0" not in name and len(name) < 4096 and max(map(len, name.split(b"/"))) <= 255
 
 
 def _becomes(kind: Callable, value: Any) -> bool:

@@ -62,12 +62,12 @@ def reach(model: RingModel) -> float:
 
 
 def strongest(model: RingModel) -> int:
-    """The highest harmonic above 0.01 of the mean."""
+    """The highest harmonic above 0.01 of the mean, 1 at least."""
     rows = [abs(model.harmonics).max(0)]
     if model.aerosol_harmonics is not None:
         # aerosol scatters a part of the light
         rows.append(0.1 * abs(model.aerosol_harmonics))
-    return max(int((row > 0.01).nonzero()[0][-1]) for row in rows)
+    return max(1, *(int((row > 0.01).nonzero()[0][-1]) for row in rows))
 
 
 def ring_waves(model: RingModel, cells: Cells, derivatives: bool = False) -> Waves:
