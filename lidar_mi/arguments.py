@@ -21,7 +21,7 @@ _WORDS = {
     str: "text",
     bool: "True or False",
     types.NoneType: "None",
-    Path: "a path (names of 255 bytes at most, no NUL)",
+    Path: "a path (names to 255 bytes)",
 }
 
 
