@@ -14,6 +14,7 @@ from lidar_mi.io.exr import axis_of, read_layers
 from lidar_mi.io.size import check_size
 
 FITS = (".fits", ".fit", ".fts")
+TIFF = (".tif", ".tiff")
 
 
 def read_pixels(path: str | Path, layer: str | None = None) -> np.ndarray:
@@ -44,6 +45,29 @@ def read_pixels(path: str | Path, layer: str | None = None) -> np.ndarray:
     else:
         image = _fits(path) if path.suffix.lower() in FITS else _image(path)
     return np.array(image, dtype=float)
+
+
+def read_frames(path: str | Path, layer: str | None = None) -> np.ndarray:
+    """All images of a file as stored, (frames, height, width), top row first.
+
+    The pages of a TIFF file, the planes of a FITS cube; one for any other. Colours are averaged.
+
+    Parameters
+    ----------
+    layer : str, optional
+        As of `read_pixels`.
+
+    Raises
+    ------
+    InputError
+        As `read_pixels`; pages of different size.
+    """
+    path = Path(path)
+    if path.is_file() and layer is None and path.suffix.lower() in FITS:
+        return _fits_cube(path)
+    if path.is_file() and layer is None and path.suffix.lower() in TIFF:
+        return _pages(path)
+    return read_pixels(path, layer)[None]
 
 
 @checked_arguments
@@ -195,6 +219,16 @@ def _exr(path, layer):
 
 
 def _fits(path):
+    cube = _fits_cube(path)
+    if len(cube) != 1:
+        raise InputError(
+            f"{path}: its first image is {' x '.join(map(str, cube.shape))}; expected one of two "
+            "dimensions"
+        )
+    return cube[0]
+
+
+def _fits_cube(path):
     try:
         from astropy.io import fits
     except ImportError:
@@ -213,10 +247,11 @@ def _fits(path):
         raise
     except Exception as error:  # any exception of the library in a damaged file
         raise InputError(f"{path}: no readable FITS file ({_short(error)})") from None
-    if not found or found[0].squeeze().ndim != 2:
+    image = found[0].squeeze() if found else np.zeros(())
+    if image.ndim not in (2, 3):
         shape = " x ".join(map(str, found[0].shape)) if found else "none"
-        raise InputError(f"{path}: its first image is {shape}; expected one of two dimensions")
-    return found[0].squeeze()
+        raise InputError(f"{path}: its first image is {shape}; expected two or three dimensions")
+    return image.reshape(-1, *image.shape[-2:])
 
 
 def _opened(path):
@@ -233,17 +268,42 @@ def _image(path):
     try:
         with _opened(path) as file:
             check_size(path, 8 * file.width * file.height * len(file.getbands()))
-            indirect = file.mode in ("P", "CMYK", "YCbCr", "HSV", "LAB")
-            image = file.convert("RGB") if indirect else file
-            bands, pixels = image.getbands(), np.asarray(image)
+            return _grey(file)
     except InputError:
         raise
     except Exception as error:  # any exception of the library in a damaged file
         raise InputError(f"{path}: no readable image ({_short(error)})") from None
+
+
+def _pages(path):
+    try:
+        with _opened(path) as file:
+            number = getattr(file, "n_frames", 1)
+            check_size(path, 8 * number * file.width * file.height * len(file.getbands()))
+            first, found = file.size, []
+            for page in range(number):
+                file.seek(page)
+                if file.size != first:
+                    raise InputError(
+                        f"{path}: page {page} is {file.width} x {file.height} px; expected "
+                        f"{first[0]} x {first[1]} px as of the first"
+                    )
+                found.append(_grey(file))
+            return np.stack(found)
+    except InputError:
+        raise
+    except Exception as error:  # any exception of the library in a damaged file
+        raise InputError(f"{path}: no readable image ({_short(error)})") from None
+
+
+def _grey(file):
+    """Pixels of an image of the library, colours averaged, transparency left out."""
+    indirect = file.mode in ("P", "CMYK", "YCbCr", "HSV", "LAB")
+    image = file.convert("RGB") if indirect else file
+    bands, pixels = image.getbands(), np.asarray(image)
     if pixels.ndim == 2:
         return pixels
-    colours = [k for k, band in enumerate(bands) if band != "A"]
-    return pixels[..., colours].mean(-1)
+    return pixels[..., [k for k, band in enumerate(bands) if band != "A"]].mean(-1)
 
 
 def _short(error: Exception) -> str:

@@ -1,0 +1,392 @@
+"""The periodic pattern of an etalon's rings in their mean over circles: spacing and lines.
+
+The transmission is Airy's, of a gap that scatters by a Gaussian, periodic in order (Born & Wolf
+1999, section 7.6; Vaughan 1989, The Fabry-Perot interferometer, chapter 3):
+
+    P(m) = 1 + 2 sum_n exp(-n loss - n^2 spread) cos(2 pi n m),  loss = -ln R
+
+and over the squared radius q a line of fractional order f at the centre gives P(q / spacing - f).
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import least_squares
+
+LINES = 3  # largest number of lines
+MULTIPLES = 6  # the strongest period may be this harmonic of the order
+FAINT = 0.02  # of the strongest line, the least height of a line
+SIGNIFICANT = 5.0  # standard errors, likewise
+DISTINCT = 0.8  # full widths, the least distance of lines
+MATERIAL = 2e-3  # of the pattern's power, the least that a longer spacing must explain in addition
+DOUBTFUL = 4.0  # factor from MATERIAL within which the choice of the spacing is doubtful
+HARMONICS = 15  # of the strongest wave, that a period may have
+ORDERS = 1.6  # least number of orders in the image
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Lines of an etalon over the squared radius.
+
+    Attributes
+    ----------
+    spacing : float
+        px^2 per order.
+    fraction : array (lines,)
+        Fractional order at the centre, 0 to 1, ascending.
+    height : array (lines,)
+        Relative to the highest.
+    loss, spread : float
+        Of Airy's formula, see above.
+    unexplained : float
+        Weighted sum of squared residuals.
+    power : float
+        Weighted sum of squares of the pattern, less its background.
+    freedom : int
+        Annuli less parameters.
+    """
+
+    spacing: float
+    fraction: np.ndarray
+    height: np.ndarray
+    loss: float
+    spread: float
+    unexplained: float = math.inf
+    power: float = 0.0
+    freedom: int = 1
+
+    @property
+    def width(self) -> float:
+        """Full width of a line at half of its height over its lowest value, orders."""
+        phase = np.linspace(0, 0.5, 513)
+        shape = _shape(phase, self.loss, np.array(self.spread))
+        middle = (shape[0] + shape[-1]) / 2
+        return 2 * float(np.interp(-middle, -shape, phase))
+
+    def phase(self, r2: np.ndarray) -> np.ndarray:
+        """Order from each line's ring of order 0, (lines, annuli)."""
+        return r2 / self.spacing - self.fraction[:, None]
+
+
+def airy(phase: np.ndarray, loss: float, spread) -> tuple[np.ndarray, ...]:
+    """P of the module's formula and its derivatives by phase, loss and spread.
+
+    ``spread`` may have the phase's shape.
+    """
+    turn = np.exp(2j * np.pi * np.asarray(phase))
+    spread = np.broadcast_to(spread, turn.shape)
+    weight, step, fall = np.ones(turn.shape), np.exp(-loss - spread), np.exp(-2 * spread)
+    wave = np.ones_like(turn)
+    total, slope, by_loss, by_spread = np.ones(turn.shape), *np.zeros((3, *turn.shape))
+    for n in range(1, 400):
+        weight, wave, step = weight * step, wave * turn, step * fall
+        total += 2 * weight * wave.real
+        slope -= 4 * np.pi * n * weight * wave.imag
+        by_loss -= 2 * n * weight * wave.real
+        by_spread -= 2 * n**2 * weight * wave.real
+        if n * weight.max() < 1e-4:
+            break
+    return total, slope, by_loss, by_spread
+
+
+def _shape(phase: np.ndarray, loss: float, spread: np.ndarray) -> np.ndarray:
+    """P alone."""
+    double = 2 * np.cos(2 * np.pi * phase)
+    weight, step, fall = 1.0, np.exp(-loss - spread), np.exp(-2 * spread)
+    last, now, total = 1.0, double / 2, np.ones(phase.shape)
+    for _ in range(1, 400):
+        weight, step = weight * step, step * fall
+        total += 2 * weight * now
+        last, now = now, double * now - last
+        if weight.max() < 1e-5:
+            break
+    return total
+
+
+def blur(r2: np.ndarray, step: float, spacing: float) -> np.ndarray:
+    """What averaging over a pixel and an annulus adds to the spread: their variances in order."""
+    return 2 * np.pi**2 * (r2 / 3 + step**2 / 12) / spacing**2
+
+
+class Profile:
+    """A mean over circles that patterns are fitted to."""
+
+    def __init__(self, r2: np.ndarray, value: np.ndarray, count: np.ndarray, step: float):
+        known = count > 0
+        self.r2, self.value, self.step = r2[known], value[known], step
+        self.root = np.sqrt(count[known] / count.mean())
+        self.last = float(self.r2[-1])
+        q = self.r2 / self.last
+        self.background = np.column_stack([np.ones_like(q), np.sqrt(q), q])
+
+    def columns(self, pattern: Pattern) -> np.ndarray:
+        """Weighted columns of the linear parameters: background, then each line's envelope."""
+        q = self.r2 / self.last
+        orders = self.last / pattern.spacing
+        degree = 0 if orders < 2.2 else 1 if orders < 4 else 2
+        spread = pattern.spread + blur(self.r2, self.step, pattern.spacing)
+        waves = _shape(pattern.phase(self.r2), pattern.loss, spread)
+        lines = [wave * q**k for wave in waves for k in range(degree + 1)]
+        return np.column_stack([self.background, *lines]) * self.root[:, None]
+
+    def residual(self, pattern: Pattern) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Weighted residual, columns and linear parameters of least squares."""
+        columns = self.columns(pattern)
+        found = np.linalg.solve(_squares(columns), columns.T @ (self.value * self.root))
+        return self.value * self.root - columns @ found, columns, found
+
+    def matched(self, pattern: Pattern, bins: int = 64) -> tuple[np.ndarray, np.ndarray]:
+        """Fractions, and the height that a further line at each of them would have."""
+        left, columns, _ = self.residual(pattern)
+        fraction = np.arange(bins) / bins
+        spread = pattern.spread + blur(self.r2, self.step, pattern.spacing)
+        phase = self.r2 / pattern.spacing - fraction[:, None]
+        shape = _shape(phase, pattern.loss, spread) * self.root
+        shape = shape - np.linalg.solve(_squares(columns), columns.T @ shape.T).T @ columns.T
+        return fraction, shape @ left / np.maximum((shape**2).sum(1), 1e-9)
+
+    def fitted(self, pattern: Pattern, free_spacing: bool = True) -> Pattern:
+        """The pattern by nonlinear least squares from a start; heights may come out negative."""
+        start = np.array([1.0, *pattern.fraction, pattern.loss, pattern.spread])
+        lines = len(pattern.fraction)
+        reach = 0.06 if free_spacing else 0.02
+        low = np.array([1 - reach, *pattern.fraction - 0.3, 0.01, 0.0])
+        high = np.array([1 + reach, *pattern.fraction + 0.3, 6.0, 4.0])
+
+        def made(x):
+            return replace(
+                pattern,
+                spacing=pattern.spacing * x[0],
+                fraction=x[1 : 1 + lines],
+                loss=x[-2],
+                spread=x[-1],
+            )
+
+        found = least_squares(
+            lambda x: self.residual(made(x))[0],
+            start.clip(low + 1e-9, high - 1e-9),
+            jac=lambda x: self._slopes(made(x), pattern.spacing),
+            bounds=(low, high),
+            x_scale=np.array([0.01, *[0.03] * lines, 0.3, 0.1]),
+            max_nfev=40,
+            ftol=1e-7,
+            xtol=1e-6,
+        )
+        best = made(found.x)
+        left, columns, linear = self.residual(best)
+        wave = columns[:, 3:] @ linear[3:]
+        basis = np.linalg.qr(columns[:, :3])[0]
+        wave = wave - basis @ (basis.T @ wave)
+        per_line = linear[3:].reshape(lines, -1)
+        middle = 0.3 ** np.arange(per_line.shape[1])
+        height = per_line @ middle
+        top = np.abs(height).max() or 1.0
+        return replace(
+            best,
+            height=height / top,
+            unexplained=float(left @ left),
+            power=float(wave @ wave),
+            freedom=max(len(left) - len(linear) - len(found.x), 1),
+        )
+
+    def _slopes(self, pattern: Pattern, unit: float) -> np.ndarray:
+        """Derivatives of the residual by spacing / unit, fractions, loss and spread.
+
+        Linear parameters follow along (Kaufman 1975, BIT 15, 49).
+        """
+        _, columns, linear = self.residual(pattern)
+        spread = pattern.spread + blur(self.r2, self.step, pattern.spacing)
+        phase = pattern.phase(self.r2)
+        _, slope, by_loss, by_spread = airy(phase, pattern.loss, spread)
+        per_line = linear[3:].reshape(len(phase), -1)
+        q = self.r2 / self.last
+        height = per_line @ np.stack([q**k for k in range(per_line.shape[1])]) * self.root
+        whole = phase + pattern.fraction[:, None]
+        rows = [
+            (height * slope * whole).sum(0) * unit / pattern.spacing,
+            *(height * slope),
+            -(height * by_loss).sum(0),
+            -(height * by_spread).sum(0),
+        ]
+        found = np.stack(rows, 1)
+        return found - columns @ np.linalg.solve(_squares(columns), columns.T @ found)
+
+    def top(self, pattern: Pattern) -> float:
+        """Height of the highest line, in the profile's unit."""
+        linear = self.residual(pattern)[2][3:].reshape(len(pattern.fraction), -1)
+        return float(np.abs(linear @ 0.3 ** np.arange(linear.shape[1])).max())
+
+    def height_std(self, pattern: Pattern, noise: float) -> np.ndarray:
+        """Standard errors of the relative heights for weighted noise of that variance."""
+        _, columns, linear = self.residual(pattern)
+        lines = len(pattern.fraction)
+        middle = 0.3 ** np.arange((columns.shape[1] - 3) // lines)
+        pick = np.kron(np.eye(lines), middle)
+        height = pick @ linear[3:]
+        covariance = noise * np.linalg.inv(_squares(columns))[3:, 3:]
+        return np.sqrt(np.diag(pick @ covariance @ pick.T)) / (np.abs(height).max() or 1.0)
+
+
+def _squares(columns: np.ndarray) -> np.ndarray:
+    """Normal matrix, regular also where lines coincide."""
+    matrix = columns.T @ columns
+    matrix[np.diag_indices(len(matrix))] *= 1 + 1e-10
+    return matrix
+
+
+def strongest_period(profile: Profile) -> float:
+    """Period of the wave that, added to a smooth background, explains most."""
+    q = profile.r2 / profile.last
+    columns = np.column_stack([profile.background, q**2]) * profile.root[:, None]
+    basis = np.linalg.qr(columns)[0]
+    value = profile.value * profile.root
+    value = value - basis @ (basis.T @ value)
+    number = min(len(q) // 6, 150)
+
+    def strongest(frequencies):
+        wave = np.exp(2j * np.pi * frequencies[:, None] * q) * profile.root
+        wave = wave - (wave @ basis) @ basis.T
+        along, length, mixed = wave @ value, (np.abs(wave) ** 2).sum(1), (wave**2).sum(1)
+        # squared projection onto the plane of a wave's real and imaginary part
+        power = 2 * (length * np.abs(along) ** 2 - (mixed.conj() * along**2).real)
+        return frequencies[np.argmax(power / (length**2 - np.abs(mixed) ** 2))]
+
+    rough = strongest(np.arange(1.2, number, 1 / 8))
+    return profile.last / strongest(rough + np.arange(-32, 33) / 256)
+
+
+def _folded(profile: Profile, period: float, highest: float) -> float:
+    """What waves of a period, up to a frequency in 1/px^2, leave of a profile unexplained."""
+    q = profile.r2 / profile.last
+    wave = np.exp(2j * np.pi * profile.r2[:, None] / period * np.arange(1, 1 + highest * period))
+    columns = np.hstack([profile.background, wave.real, wave.imag])
+    columns = np.hstack([columns, q[:, None] * columns[:, 3:]]) * profile.root[:, None]
+    value = profile.value * profile.root
+    along = columns.T @ value
+    return float(value @ value - along @ np.linalg.solve(_squares(columns), along))
+
+
+def lines_at(profile: Profile, spacing: float, noise: float, most: int = LINES) -> Pattern | None:
+    """The fewest lines at about one spacing that explain a profile; None if there are none.
+
+    A further line must be higher than its standard error allows, and twice as high as anything
+    that is left unexplained at other orders, which is what a shape that is not Airy's leaves.
+    """
+    starts = [_first(profile, spacing, loss) for loss in (0.12, 0.35, 0.9)]
+    best = profile.fitted(min(starts, key=lambda p: float((profile.residual(p)[0] ** 2).sum())))
+    if best.height[0] <= 0:
+        return None
+    chosen, left = best, profile.matched(best)
+    while len(best.fraction) < most:
+        std = profile.height_std(best, noise).min()
+        if np.abs(left[1]).max() < profile.top(best) * max(FAINT / 2, SIGNIFICANT * std):
+            break
+        # two further lines may be needed before either helps
+        best = min(map(profile.fitted, _starts(best, left)), key=lambda p: p.unexplained)
+        left = profile.matched(best)
+        if best.height.min() <= 0:
+            break
+        if _plausible(best, profile, noise, left):
+            chosen = best
+    return _sorted(chosen)
+
+
+def _first(profile: Profile, spacing: float, loss: float) -> Pattern:
+    """One line of that width where it explains most."""
+    none, one = np.zeros(0), np.ones(1)
+    fraction, height = profile.matched(Pattern(spacing, none, none, loss, 0.0))
+    return Pattern(spacing, fraction[[height.argmax()]], one, loss, 0.0)
+
+
+def _starts(pattern: Pattern, left) -> list[Pattern]:
+    """A line more: where most is left, or the highest line split into two."""
+    more = np.ones(len(pattern.fraction) + 1)
+    fraction, height = left
+    added = replace(pattern, fraction=np.append(pattern.fraction, fraction[height.argmax()]))
+    split = pattern.fraction.copy()
+    top = int(pattern.height.argmax())
+    half = max(0.35 * pattern.width, 0.02)
+    split[top] -= half
+    apart = replace(
+        pattern,
+        fraction=np.append(split, pattern.fraction[top] + half),
+        loss=max(pattern.loss / 2, 0.05),
+        spread=pattern.spread / 4,
+    )
+    return [replace(one, height=more) for one in (added, apart)]
+
+
+def _plausible(pattern: Pattern, profile: Profile, noise: float, left) -> bool:
+    fraction = np.sort(pattern.fraction % 1)
+    distance = np.diff(np.append(fraction, fraction[0] + 1))
+    std = profile.height_std(pattern, noise)
+    floor = np.abs(left[1]).max()
+    least = np.maximum(SIGNIFICANT * std, max(FAINT, 2 * floor / profile.top(pattern)))
+    return bool((pattern.height > least).all() and distance.min() > DISTINCT * pattern.width)
+
+
+def _sorted(pattern: Pattern) -> Pattern:
+    fraction = pattern.fraction % 1
+    order = np.argsort(fraction)
+    return replace(pattern, fraction=fraction[order], height=pattern.height[order])
+
+
+def find_pattern(
+    profile: Profile, noise: float, spacing: float | None = None
+) -> tuple[Pattern, str] | None:
+    """Spacing and lines, and in words how the spacing could be another; None without a pattern.
+
+    The strongest wave of the profile is a harmonic of the order. Of its multiples the shortest
+    wins, unless a longer one explains a fraction MATERIAL more of the pattern's power: lines at
+    equal distances are one line of a shorter spacing, for all that an image can tell.
+    """
+    if spacing is not None:
+        found = lines_at(profile, spacing, noise)
+        return None if found is None else (found, "")
+    base = strongest_period(profile)
+    tried: dict[int, Pattern] = {}
+    multiples = [m for m in range(1, MULTIPLES + 1) if profile.last >= ORDERS * m * base]
+    rest = [_folded(profile, m * base, HARMONICS / base) for m in multiples]
+    for multiple, left in zip(multiples, rest, strict=True):
+        power = max((p.power for p in tried.values()), default=math.inf)
+        first = min(tried.values(), key=lambda p: p.unexplained, default=None)
+        # no shape of this period explains materially more than what has been tried
+        less = (min(rest[: multiples.index(multiple)], default=math.inf)) - left
+        if first is not None and less < MATERIAL / DOUBTFUL * power:
+            continue
+        found = lines_at(profile, multiple * base, noise)
+        if found is not None:
+            tried[multiple] = found
+    if not tried:
+        return None
+    power = max(p.power for p in tried.values())
+
+    def gain(short, long):
+        """Of the pattern's power, what the longer spacing explains in addition; 0 for noise."""
+        more = tried[short].unexplained - tried[long].unexplained
+        if more < 40 * noise or _repeats(tried[long]):
+            return 0.0
+        return more / power
+
+    for chosen in tried:
+        rest = {m: gain(chosen, m) for m in tried if m > chosen}
+        if max(rest.values(), default=0.0) < MATERIAL:
+            break
+    doubt = [m for m, g in rest.items() if g > MATERIAL / DOUBTFUL]
+    said = ""
+    if doubt:
+        said = f"the spacing may be {doubt[0] / chosen:.3g} times as large, with further lines"
+    shorter = [m for m in tried if m < chosen and chosen % m == 0]
+    if not said and shorter and gain(shorter[-1], chosen) < DOUBTFUL * MATERIAL:
+        said = f"the spacing may be {chosen // shorter[-1]} times smaller, with fewer lines"
+    return tried[chosen], said
+
+
+def _repeats(pattern: Pattern) -> bool:
+    """Whether two or three lines are at equal distances and of one height."""
+    lines = len(pattern.fraction)
+    if lines < 2:
+        return False
+    steps = np.diff(np.append(pattern.fraction, pattern.fraction[0] + 1))
+    return bool(np.ptp(steps) < 0.02 and pattern.height.min() > 0.9)

@@ -1,0 +1,283 @@
+"""All rings of a pattern at once: their radii, centre and shape, with standard errors that hold.
+
+Least squares over the cells of `sectors.Sectors`. Every sector has a background and a height of
+its own, both smooth in r: illumination, vignetting and sloping light do not enter. The standard
+errors come from the residuals alone, sector by sector, so that nothing needs to be known of the
+camera: the sectors' scores are summed with their neighbours' in a window as wide as their
+correlation (Newey and West 1987, Econometrica 55, 703; Andrews 1991, Econometrica 59, 817), and
+scaled to be exact for white noise.
+"""
+
+import warnings
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.alignment import ALL_AROUND, LEAST, shape_columns
+from lidar_mi.retrieval.rings.frames import inside
+from lidar_mi.retrieval.rings.pattern import Pattern, airy, blur
+from lidar_mi.retrieval.rings.sectors import SECTORS, Geometry, Sectors
+
+OUTLIER = 6.0  # standard deviations of an annulus's cells
+ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class RingFit:
+    """Rings, with the covariance of everything fitted.
+
+    Attributes
+    ----------
+    geometry : Geometry
+    pattern : Pattern
+    sectors : Sectors
+    order, line : arrays (rings,) of int
+    square : array (rings,)
+        Squared mean radius, px^2.
+    square_covariance : array (rings, rings)
+    geometry_covariance : array (6, 6)
+        Of centre, ellipticity and tilt; 0 for what is not fitted.
+    model_covariance : array (rings, rings)
+        For white noise of variance 1, which gives the weights of the rings.
+    roundness : float
+        Rms deviation of the crests from the curves, px.
+    """
+
+    geometry: Geometry
+    pattern: Pattern
+    sectors: Sectors
+    order: np.ndarray
+    line: np.ndarray
+    square: np.ndarray
+    square_covariance: np.ndarray
+    geometry_covariance: np.ndarray
+    model_covariance: np.ndarray
+    roundness: float
+
+
+def fit_all(image: np.ndarray, geometry: Geometry, pattern: Pattern, free: bool) -> RingFit:
+    """Gauss-Newton from a geometry and a pattern that are nearly right.
+
+    Ellipticity and tilt are fitted if two rings are in half of the sectors.
+
+    Raises
+    ------
+    InputError
+        Fewer than two rings, or a centre outside the image.
+    """
+    deviation: dict[tuple[int, int], float] = {}
+    for number in range(ROUNDS):
+        sectors = Sectors(image, geometry)
+        system = _System(sectors, pattern, deviation, free)
+        step, std = system.solved()
+        change, ring_change, heights, shape = system.parts(step)
+        change_std = system.parts(std)[0]
+        geometry = geometry.moved(change)
+        inside(*geometry.centre, image.shape)
+        if number == ROUNDS - 1 or (number and (np.abs(change) <= 0.05 * change_std + 1e-9).all()):
+            break
+        # a ring that its noise would carry off its line stays where the pattern has it
+        firm = system.parts(std)[1] < 0.1 * pattern.width
+        deviation = {
+            key: float(deviation.get(key, 0.0) + moved) if held else 0.0
+            for key, moved, held in zip(system.keys, ring_change, firm, strict=True)
+        }
+        top = np.maximum(pattern.height + heights, 0.2 * pattern.height)
+        pattern = replace(
+            pattern,
+            height=top / top.max(),
+            loss=float(np.clip(pattern.loss + shape[0], 0.5 * pattern.loss, 2 * pattern.loss)),
+            spread=float(np.clip(pattern.spread + shape[1], 0.0, 2 * pattern.spread + 0.05)),
+        )
+    covariance = system.covariance()
+    rings = system.ring_slots
+    moved = ring_change + np.array([deviation.get(key, 0.0) for key in system.keys])
+    slots = np.ix_(rings, rings)
+    whole = np.zeros((6, 6))
+    place = np.flatnonzero(system.fitted)
+    whole[np.ix_(place, place)] = covariance[: len(place), : len(place)]
+    return RingFit(
+        geometry=geometry,
+        pattern=pattern,
+        sectors=sectors,
+        order=system.order,
+        line=system.line,
+        square=(system.order + pattern.fraction[system.line] + moved) * pattern.spacing,
+        square_covariance=covariance[slots] * pattern.spacing**2,
+        geometry_covariance=whole,
+        model_covariance=system.inverse[slots] * pattern.spacing**2,
+        roundness=system.roundness(),
+    )
+
+
+class _System:
+    """Normal equations of one round, sector by sector."""
+
+    def __init__(self, sectors: Sectors, pattern: Pattern, deviation, free: bool):
+        self.sectors, self.pattern = sectors, pattern
+        self.order, self.line, shared = _visible(sectors, pattern)
+        shaped = bool((shared >= ALL_AROUND * SECTORS).sum() >= 2)
+        self.fitted = np.repeat([free, shaped], [2, 4])
+        self.keys = list(zip(self.order.tolist(), self.line.tolist(), strict=True))
+        self.geometry_slots = int(self.fitted.sum())
+        lines = len(pattern.fraction)
+        q = sectors.r2
+        bend = self._bends(q)
+        known = np.array([deviation.get(key, 0.0) for key in self.keys])
+        phase = pattern.phase(q)
+        for j in range(lines):
+            phase[j] -= known[self.line == j] @ bend[self.line == j]
+        spread = pattern.spread + blur(q, sectors.step, pattern.spacing)
+        wave, slope, by_loss, by_spread = airy(phase, pattern.loss, spread)
+        height = pattern.height[:, None]
+        along_q = (height * slope / pattern.spacing).sum(0)
+        total = (height * wave).sum(0)
+        # shared by all sectors: rings, further lines' heights, shape
+        low = int(pattern.height.argmax())
+        others = [j for j in range(lines) if j != low]
+        shared = np.vstack(
+            [
+                -(height * slope)[self.line] * bend,
+                wave[others],
+                (height * by_loss).sum(0)[None],
+                (height * by_spread).sum(0)[None],
+            ]
+        )
+        self.others = others
+        moved = -shape_columns(q, sectors.angle[:, None])[..., self.fitted] * along_q[:, None]
+        q1 = q / q[-1]
+        smooth = np.stack([np.ones_like(q), np.sqrt(q1), q1, total, q1 * total], -1)
+        root = np.sqrt(sectors.count)
+        keep = np.ones_like(root)
+        for _ in range(2):
+            weight = root * keep
+            nuisance = smooth * weight[..., None]
+            basis, triangle = np.linalg.qr(nuisance)
+            # where a sector has too few cells, its columns are dependent
+            firm = np.abs(np.diagonal(triangle, axis1=1, axis2=2))
+            basis = basis * (firm > 1e-6 * firm.max(1, keepdims=True))[:, None, :]
+            value = sectors.value * weight
+            linear = np.stack(
+                [np.linalg.lstsq(a, b, rcond=1e-8)[0] for a, b in zip(nuisance, value, strict=True)]
+            )
+            local = linear[:, 3, None] + linear[:, 4, None] * q1
+            left = sectors.value - np.einsum("qk,sk->sq", smooth, linear)
+            left = left - local * along_q * sectors.offset
+            keep = keep * _usual(left, weight)
+        columns = np.concatenate([moved, np.broadcast_to(shared.T, (SECTORS, *shared.T.shape))], -1)
+        columns = columns * (local * root * keep)[..., None]
+        left = left * root * keep
+        self.columns = columns - basis @ (basis.transpose(0, 2, 1) @ columns)
+        self.left = left - (basis @ (basis.transpose(0, 2, 1) @ left[..., None]))[..., 0]
+        self.ring_slots = self.geometry_slots + np.arange(len(self.order))
+        self.matrix = np.einsum("sqa,sqb->sab", self.columns, self.columns)
+        self.score = np.einsum("sqa,sq->sa", self.columns, self.left)
+        whole = self.matrix.sum(0)
+        size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+        self.inverse = np.linalg.pinv(whole / np.outer(size, size), 1e-10, hermitian=True)
+        self.inverse /= np.outer(size, size)
+        cells = (keep * root > 0).sum() - 5 * SECTORS - len(size)
+        self.variance = float((self.left**2).sum() / max(cells, 1))
+
+    def _bends(self, q):
+        """What each ring's deviation adds to its line's order at every annulus: linear between."""
+        bend = np.zeros((len(self.order), len(q)))
+        for j in range(len(self.pattern.fraction)):
+            of_line = np.flatnonzero(self.line == j)
+            if not len(of_line):
+                continue
+            place = (self.order[of_line] + self.pattern.fraction[j]) * self.pattern.spacing
+            for k, ring in enumerate(of_line):
+                bend[ring] = np.interp(q, place, np.eye(len(of_line))[k])
+        return bend
+
+    def solved(self):
+        """Step of Gauss and Newton, and its standard errors for white noise."""
+        return self.inverse @ self.score.sum(0), np.sqrt(self.variance * np.diag(self.inverse))
+
+    def parts(self, vector):
+        """Six of the geometry, one of each ring, of each line's height, two of the shape."""
+        first, rings = self.geometry_slots, len(self.order)
+        geometry = np.zeros(6)
+        geometry[self.fitted] = vector[:first]
+        heights = np.zeros(len(self.pattern.fraction))
+        heights[self.others] = vector[first + rings : len(vector) - 2]
+        return geometry, vector[first : first + rings], heights, vector[-2:]
+
+    def covariance(self):
+        """Of all parameters, from the sectors' scores and their neighbours'."""
+        lag = np.abs(np.arange(SECTORS)[:, None] - np.arange(SECTORS))
+        lag = np.minimum(lag, SECTORS - lag)
+        window = np.maximum(1 - lag / (1 + self._width()), 0.0)
+        meat = self.score.T @ window @ self.score
+        # what white noise of variance 1 would give, less what the fit takes from its residuals
+        leverage = self.matrix @ self.inverse
+        white = np.einsum("ss,sab->ab", window, self.matrix)
+        white = white - np.einsum("st,sab,tcb->ac", window, leverage, self.matrix)
+        expected = np.diag(self.inverse @ white @ self.inverse)
+        scale = np.sqrt(np.diag(self.inverse) / np.maximum(expected, 1e-3 * np.diag(self.inverse)))
+        return self.inverse @ meat @ self.inverse * np.outer(scale, scale)
+
+    def _shifts(self):
+        """Shift of every ring in every sector, orders, NaN where it has none; its information."""
+        slots = self.ring_slots
+        information = self.matrix[:, slots, slots].T
+        least = 1e-2 * np.median(information[information > 0])
+        shift = np.where(information > least, self.score[:, slots].T, np.nan)
+        return shift / np.maximum(information, least), information
+
+    def _width(self) -> float:
+        """Sectors over which errors are correlated: Andrews' rule for an autoregression."""
+        shift, information = self._shifts()
+        reduced = np.nan_to_num(shift * np.sqrt(information))
+        both = (reduced != 0) & (np.roll(reduced, 1, 1) != 0)
+        product = (reduced * np.roll(reduced, 1, 1))[both].sum()
+        power = (reduced**2)[both].sum()
+        if not power > 0:
+            return 0.0
+        # the harmonics that the geometry takes make neighbours of white noise anticorrelated
+        correlation = product / power + (1 + self.geometry_slots) / SECTORS
+        if correlation < 2.5 / np.sqrt(both.sum()):
+            return 0.0
+        rho = min(correlation, 0.9)
+        return min(1.1447 * (4 * rho**2 / (1 - rho**2) ** 2 * SECTORS) ** (1 / 3), SECTORS / 5)
+
+    def roundness(self) -> float:
+        """Rms deviation of the highest line's crests from the curves, px."""
+        shift = self._shifts()[0]
+        radius = np.sqrt((self.order + self.pattern.fraction[self.line]) * self.pattern.spacing)
+        high = self.line == int(self.pattern.height.argmax())
+        pixels = (shift * self.pattern.spacing / (2 * radius[:, None]))[high]
+        return float(np.sqrt(np.nanmean(pixels**2)))
+
+
+def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
+    """Order, line and number of sectors of the rings in enough of them, by their radius."""
+    found = []
+    present = (sectors.count > 0).sum(0)
+    half = 0.5 * pattern.width * pattern.spacing
+    for line, fraction in enumerate(pattern.fraction):
+        for order in range(int(sectors.r2[-1] / pattern.spacing) + 1):
+            place = (order + fraction) * pattern.spacing
+            last = int((place + half) / sectors.step)
+            if place > 2 * half and last < len(present) and present[last] >= LEAST:
+                found.append((place, order, line, present[last]))
+    if len(found) < 2:
+        raise InputError(f"rings: {len(found)} detected; expected at least 2")
+    found.sort()
+    return np.array([f[1:] for f in found]).T
+
+
+def _usual(left: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Cells that are no dust and no reflection: near the median of their annulus."""
+    reduced = np.where(weight > 0, left * weight, np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # an annulus without cells
+        off = reduced - np.nanmedian(reduced, 0)
+        scale = 1.4826 * np.nanmedian(np.abs(off), 0)
+    scale = np.nan_to_num(scale)
+    kernel = np.ones(25) / 25
+    smooth = np.convolve(np.pad(scale, 12, mode="edge"), kernel, "valid")
+    limit = OUTLIER * np.maximum(smooth, scale)
+    return np.where(np.isfinite(off), np.abs(off) <= limit + 1e-12, 0.0)

@@ -1,0 +1,108 @@
+"""Averages over sectors of annuli about rings that a camera distorts.
+
+Coordinates are pixels, x to the right and y down. A ring of mean radius a is seen at
+
+    r = a (1 + ellipticity . u2) + a^2 tilt . u,  u = (cos, sin) of the angle, u2 of twice the angle
+
+about the centre: circles distorted by a tilted camera, to first order in the tilt (each ring's
+shift is proportional to its area), and by anamorphic pixels or lenses.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+STEPS = 1200  # annuli out to the farthest corner, at most
+PIXELS = 2  # least mean number of pixels of a sector of an annulus
+SECTORS = 48
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Where rings lie: centre (x, y) in px, ellipticity, tilt in 1/px; (cosine, sine) parts."""
+
+    centre: tuple[float, float]
+    ellipticity: tuple[float, float] = (0.0, 0.0)
+    tilt: tuple[float, float] = (0.0, 0.0)
+
+    def moved(self, by: np.ndarray) -> "Geometry":
+        """With six changes added: of centre, ellipticity and tilt."""
+        whole = np.array([*self.centre, *self.ellipticity, *self.tilt]) + by
+        pairs = (tuple(map(float, whole[k : k + 2])) for k in (0, 2, 4))
+        return Geometry(*pairs)
+
+    def curve(self, radius, angle) -> tuple[np.ndarray, np.ndarray]:
+        """Points (x, y) of rings of these mean radii, at angles from x toward y."""
+        cosine, sine = np.cos(angle), np.sin(angle)
+        r = radius * (
+            1 + self.ellipticity[0] * np.cos(2 * angle) + self.ellipticity[1] * np.sin(2 * angle)
+        )
+        r = r + radius**2 * (self.tilt[0] * cosine + self.tilt[1] * sine)
+        return self.centre[0] + r * cosine, self.centre[1] + r * sine
+
+    def squared_radius(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Squared mean radius of the ring through each point; x, y from the centre."""
+        r2 = x**2 + y**2
+        if not (any(self.ellipticity) or any(self.tilt)):
+            return r2
+        r = np.sqrt(r2)
+        safe = np.maximum(r2, 1e-12)
+        linear = 1 + (self.ellipticity[0] * (x**2 - y**2) + self.ellipticity[1] * 2 * x * y) / safe
+        # root of tilt . u a^2 + linear a = r, the one that stays without a tilt
+        along = self.tilt[0] * x + self.tilt[1] * y
+        return (2 * r / (linear + np.sqrt(np.maximum(linear**2 + 4 * along, 0)))) ** 2
+
+
+class Sectors:
+    """Averages over sectors of annuli of equal steps in squared mean radius.
+
+    Out to where the last sector leaves the image. A sector cut by the edge has no pixels: it would
+    average another part of the image.
+
+    Attributes
+    ----------
+    angle : array (SECTORS,)
+    step : float
+        px^2.
+    r2 : array (annuli,)
+        The annuli's middles.
+    count, value, offset : arrays (SECTORS, annuli)
+        Number of pixels; their mean; mean of their squared radius less the annulus's middle.
+    profile, profile_count, profile_r2 : arrays (annuli,)
+        Mean over circles, of the value and of the squared radius; interpolated where no pixel is.
+    """
+
+    def __init__(self, image: np.ndarray, geometry: Geometry):
+        height, width = image.shape
+        centre = geometry.centre
+        x, y = np.arange(width) - centre[0], np.arange(height)[:, None] - centre[1]
+        r2 = geometry.squared_radius(x, y)
+        steps = min(STEPS, height * width // (SECTORS * PIXELS))
+        self.step = float(r2.max()) / steps
+        sector = np.arctan2(y, x) * (SECTORS / (2 * np.pi)) % SECTORS
+        label = np.minimum(sector, SECTORS - 1).astype(int) * steps
+        label += np.minimum(r2 / self.step, steps - 1).astype(int)
+        count, total, total_r2 = (
+            np.bincount(label.ravel(), weight, steps * SECTORS).reshape(SECTORS, steps)
+            for weight in (None, image.ravel(), r2.ravel())
+        )
+        self.angle = (np.arange(SECTORS) + 0.5) * (2 * np.pi / SECTORS)
+        outer = np.sqrt((np.arange(steps) + 1) * self.step)[None, :, None]
+        around = (np.arange(SECTORS)[:, None] + np.linspace(0, 1, 5)) * (2 * np.pi / SECTORS)
+        x, y = geometry.curve(outer, around[:, None, :])
+        full = ((x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)).all(2)
+        last = int(np.flatnonzero((full & (count > 0)).any(0))[-1]) + 1
+        full = full[:, :last]
+        self.r2 = (np.arange(last) + 0.5) * self.step
+        self.count = np.where(full, count[:, :last], 0).astype(float)
+        some = np.maximum(self.count, 1)
+        self.value = np.where(full, total[:, :last], 0) / some
+        self.offset = np.where(self.count > 0, total_r2[:, :last] / some - self.r2, 0.0)
+        self.profile_count = self.count.sum(0)
+        known = np.flatnonzero(self.profile_count)
+        mean, mean_r2 = (
+            (self.count * part).sum(0)[known] / self.profile_count[known]
+            for part in (self.value, self.r2 + self.offset)
+        )
+        self.profile = np.interp(self.r2, self.r2[known], mean)
+        self.profile_r2 = np.interp(self.r2, self.r2[known], mean_r2)

@@ -1,0 +1,128 @@
+"""Frames of one instrument in a row: a spacing that all of them share."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.analysis import Rings, analyse_rings
+from lidar_mi.tables import Table, Tabular, with_error
+
+SAME = 0.02  # relative difference of spacings that are one
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RingSeries(Tabular):
+    """Rings of every frame, None where a frame is refused, and why it is.
+
+    Attributes
+    ----------
+    rings : tuple of Rings or None
+    refused : tuple of str
+        Reason for each frame without rings; else empty.
+    """
+
+    rings: tuple[Rings | None, ...]
+    refused: tuple[str, ...]
+
+    def tables(self) -> list[Table]:
+        """One row for each frame."""
+        rows = []
+        for number, (rings, reason) in enumerate(zip(self.rings, self.refused, strict=True)):
+            if rings is None:
+                rows.append((str(number), "-", "-", "-", reason))
+                continue
+            (x, y), (x_std, y_std) = rings.centre, rings.centre_std
+            fractions = ", ".join(map(with_error, rings.fraction, rings.fraction_std))
+            rows.append(
+                (
+                    str(number),
+                    f"{with_error(x, x_std)}, {with_error(y, y_std)}",
+                    with_error(rings.spacing, rings.spacing_std),
+                    fractions,
+                    rings.doubt,
+                )
+            )
+        heads = ("frame", "centre x, y / px", "spacing / px^2", "fractional orders", "note")
+        return [Table("frames", rows, heads)]
+
+    def columns(self) -> dict[str, list]:
+        """The same as numbers, one value for each frame; NaN where there is none."""
+        found: dict[str, list] = {"frame": list(range(len(self.rings)))}
+
+        def column(name, value):
+            found[name] = [np.nan if one is None else value(one) for one in self.rings]
+
+        for k, axis in enumerate("xy"):
+            column(f"centre_{axis}", lambda r, k=k: r.centre[k])
+            column(f"centre_{axis}_std", lambda r, k=k: r.centre_std[k])
+        column("spacing", lambda r: r.spacing)
+        column("spacing_std", lambda r: r.spacing_std)
+        lines = max((len(r.fraction) for r in self.rings if r is not None), default=0)
+        for k in range(lines):
+            for name in ("fraction", "fraction_std", "height"):
+                column(
+                    f"{name}_{k}",
+                    lambda r, k=k, name=name: (*getattr(r, name), *[np.nan] * lines)[k],
+                )
+        column("misfit", lambda r: r.misfit)
+        found["note"] = [
+            reason if rings is None else rings.doubt
+            for rings, reason in zip(self.rings, self.refused, strict=True)
+        ]
+        return found
+
+
+def analyse_series(
+    frames: Iterable[np.ndarray],
+    centre: tuple[float, float] | None = None,
+    saturation: float | None = None,
+    spacing: float | None = None,
+) -> RingSeries:
+    """Rings of all frames of one instrument, at one spacing of the orders.
+
+    Lines at equal distances look like one line of a shorter spacing, so that a frame in which a
+    moving line crosses the middle between two orders cannot tell. The others can: the spacing of
+    most of the frames, or the given one, is that of all.
+
+    Parameters
+    ----------
+    frames : iterable of arrays (height, width)
+    centre, saturation, spacing
+        As of `analyse_rings`.
+
+    Returns
+    -------
+    RingSeries
+    """
+    kept = list(frames)
+    rings: list[Rings | None] = []
+    refused: list[str] = []
+    for frame in kept:
+        one, reason = _tried(frame, centre, saturation, spacing)
+        rings.append(one)
+        refused.append(reason)
+    known = np.array([one.spacing for one in rings if one is not None])
+    if spacing is not None or not len(known):
+        return RingSeries(tuple(rings), tuple(refused))
+    alike = np.abs(known[:, None] / known - 1) < SAME
+    common = float(np.median(known[alike[alike.sum(1).argmax()]]))
+    for number, one in enumerate(rings):
+        if one is not None and abs(one.spacing / common - 1) < SAME:
+            rings[number] = replace(one, doubt="")
+            continue
+        again, reason = _tried(kept[number], centre, saturation, common)
+        if again is not None:
+            rings[number], refused[number] = replace(again, doubt=""), ""
+        elif one is not None:
+            said = f"{one.spacing / common:.3g} times the spacing of the other frames"
+            rings[number] = replace(one, doubt=said)
+    return RingSeries(tuple(rings), tuple(refused))
+
+
+def _tried(frame, centre, saturation, spacing):
+    try:
+        return analyse_rings(frame, centre, saturation, spacing), ""
+    except InputError as error:
+        return None, str(error)
