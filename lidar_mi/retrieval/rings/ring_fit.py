@@ -21,6 +21,7 @@ from lidar_mi.retrieval.rings.sectors import SECTORS, Geometry, Sectors
 
 OUTLIER = 6.0  # standard deviations of an annulus's cells
 ROUNDS = 6
+TWO_RINGS = 2.2  # orders, least extent of a sector whose height may change with r
 
 
 @dataclass(frozen=True)
@@ -148,6 +149,10 @@ class _System:
         moved = -shape_columns(q, sectors.angle[:, None])[..., self.fitted] * along_q[:, None]
         q1 = q / q[-1]
         smooth = np.stack([np.ones_like(q), np.sqrt(q1), q1, total, q1 * total], -1)
+        smooth = np.repeat(smooth[None], SECTORS, 0)
+        # about a single ring, a height that changes is hardly another than a shift
+        extent = np.where(sectors.count > 0, q, 0).max(1)
+        smooth[extent < TWO_RINGS * pattern.spacing, :, 4] = 0
         root = np.sqrt(sectors.count)
         keep = np.ones_like(root)
         for _ in range(2):
@@ -162,7 +167,7 @@ class _System:
                 [np.linalg.lstsq(a, b, rcond=1e-8)[0] for a, b in zip(nuisance, value, strict=True)]
             )
             local = linear[:, 3, None] + linear[:, 4, None] * q1
-            left = sectors.value - np.einsum("qk,sk->sq", smooth, linear)
+            left = sectors.value - np.einsum("sqk,sk->sq", smooth, linear)
             left = left - local * along_q * sectors.offset
             keep = keep * _usual(left, weight)
         columns = np.concatenate([moved, np.broadcast_to(shared.T, (SECTORS, *shared.T.shape))], -1)

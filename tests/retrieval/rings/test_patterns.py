@@ -77,7 +77,7 @@ def test_the_shorter_spacing_wins():
 
 
 def test_a_series_has_one_spacing():
-    """The frame in the middle of its neighbours' splitting takes their spacing; noise is refused."""
+    """A frame between its neighbours takes their spacing; noise is refused."""
     frames = [zeeman("two", splitting)[0] for splitting in (0.46, 0.5, 0.54)]
     frames.append(np.random.default_rng(1).normal(100, 5, SMALL["shape"]))
     series = analyse_series(frames)
