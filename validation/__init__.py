@@ -10,6 +10,7 @@ scattering_matrices  particles: published tables, other solvers, inequalities of
 molecules            air: published numbers
 standard_errors      standard errors against the scatter over seeds
 gradients            derivatives of an image against those of the lidar equation
+receivers            analysers of the Doppler shift: published efficiencies, cost of 0.5 m/s
 coverage             standard errors of winds where air changes; only by name, as some rows fail
 instrument           winds by an etalon with defects; only by name
 """
@@ -24,6 +25,7 @@ GROUPS = (
     "molecules",
     "standard_errors",
     "gradients",
+    "receivers",
 )
 OPEN = ("coverage", "instrument")
 """Run only by name. Some rows of ``coverage`` fail as long as the retrievals assume air that does

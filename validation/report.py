@@ -68,6 +68,14 @@ class Row:
 
 
 @dataclass(frozen=True)
+class Comparison:
+    """A table of results that have no reference: heads of the columns, cells line by line."""
+
+    heads: tuple[str, ...]
+    lines: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
 class Check:
     """Rows of one topic, with the information needed to read them.
 
@@ -80,6 +88,7 @@ class Check:
     rows: tuple[Row, ...]
     figures: tuple[tuple[str, str], ...] = ()
     name: str = ""
+    comparison: Comparison | None = None
 
     @property
     def passed(self) -> bool:
@@ -133,6 +142,9 @@ def show(check: Check, console: Console) -> None:
         verdict = "ok" if row.passed else "[bold red]FAILS[/bold red]"
         table.add_row(*_cells(row), verdict)
     console.print(table)
+    if check.comparison:
+        # lines that the terminal is too narrow for would lose cells in a drawn table
+        console.print("\n".join(_markdown(check.comparison)), soft_wrap=True, highlight=False)
 
 
 def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes=()) -> str:
@@ -156,9 +168,9 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
         "<!-- Written by `python -m validation`; edit validation/ instead. -->",
         "",
         "Comparisons of lidar-mi with independent numbers: closed forms, published",
-        "values, conservation laws and other programs. They concern the light transport; errors "
-        "of the",
-        "retrievals are under [accuracy](accuracy.md). Every row of this page is computed again by",
+        "values, conservation laws and other programs. They concern the light transport and the "
+        "receivers of",
+        "the Doppler shift; errors of the retrievals are under [accuracy](accuracy.md). Every row of this page is computed again by",
         "",
         "```sh",
         command,
@@ -201,9 +213,16 @@ def _section(check: Check) -> list[str]:
         cells = [cell.replace("|", "\\|") for cell in (*_cells(row), verdict, row.reference)]
         lines.append(f"| {' | '.join(cells)} |")
     lines.append("")
+    if check.comparison:
+        lines += [*_markdown(check.comparison), ""]
     for name, caption in check.figures:
         lines += [f"![{caption}](validation/{name})", "", f"*{caption}*", ""]
     return lines
+
+
+def _markdown(table: Comparison) -> list[str]:
+    rules = ("---",) * len(table.heads)
+    return [f"| {' | '.join(cells)} |" for cells in (table.heads, rules, *table.lines)]
 
 
 def _cells(row: Row) -> list[str]:
