@@ -311,7 +311,7 @@ def _draw(place):
         "double edge, etalons of 0.1 m": ("C2", ":"),
         "double edge, in sequence": ("C2", "--"),
     }
-    with figures.figure(place, (8.0, 3.8), columns=2, sharey=True) as axes:
+    with figures.figure(place, (9.5, 3.8), columns=2, sharey=True) as axes:
         for axis, aerosol in zip(axes, AEROSOL[:2], strict=True):
             lidars = [DopplerLidar(range=r, aerosol_fraction=aerosol) for r in ranges]
             found = [_compared(lidar) for lidar in lidars]
@@ -330,7 +330,7 @@ def _draw(place):
             )
             axis.minorticks_off()
         axes[0].set(ylabel="standard error of one pulse, m/s")
-        axes[0].legend(frameon=False, fontsize=7, loc="lower right")
+        axes[1].legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1, 0.5))
 
 
 def cost(effort):
@@ -375,13 +375,13 @@ def cost(effort):
         "Cramér-Rao bounds at 56 / 76 / 150 m for the default lidar (70 mJ, 8500 m) and CCD (5 "
         "electrons rms per pixel or element), v_LOS = 50 m/s. N = 2.4e7 / 1.3e7 / 3.3e6 photons "
         "reach every receiver; *aerosol* is a fraction of them. *Rings, all photons detected*: N "
-        "reach the CCD, as the paper's numbers are taken elsewhere in this documentation; 5.6 times as many "
-        "then reach the etalon. *Times the ideal error*: photon noise alone, of N photons; the "
-        "ideal analyser resolves the narrow line of the aerosol, which no other here does. "
-        "*Pulses* are averaged, or their energies added in one pulse of that *energy*. *Error by*: "
-        "of a fit of speed and level that assumes 5 K, or 5 % of the photons as aerosol, too "
-        "much. *Both unknown*: temperature and aerosol are fitted, known before to 5 K and 0.05; "
-        "two filters determine neither. The double edge is collimated to 1 mrad, which takes "
+        "reach the CCD, as the paper's numbers are taken elsewhere in this documentation; 5.6 "
+        "times as many then reach the etalon. *Times the ideal error*: photon noise alone, of N "
+        "photons; the ideal analyser resolves the narrow line of the aerosol, which no other here "
+        "does. *Pulses* are averaged, or their energies added in one pulse of that *energy*. "
+        "*Error by*: of a fit of speed and level that assumes 5 K, or 5 % of the photons as "
+        "aerosol, too much. *Both unknown*: temperature and aerosol are fitted, known before to 5 K and "
+        "0.05; two filters determine neither. The double edge is collimated to 1 mrad, which takes "
         "etalons of 0.28 m behind this telescope (0.41 m, 0.7 mrad at 56 m); etalons of 0.1 m "
         "have 2.8 mrad. Rings and the fringes of a field-widened Michelson take such light. "
         "Saturation is left out: 1e6 photons in one channel are beyond a pixel of the CCD.",

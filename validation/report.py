@@ -170,7 +170,8 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
         "Comparisons of lidar-mi with independent numbers: closed forms, published",
         "values, conservation laws and other programs. They concern the light transport and the "
         "receivers of",
-        "the Doppler shift; errors of the retrievals are under [accuracy](accuracy.md). Every row of this page is computed again by",
+        "the Doppler shift; errors of the retrievals are under [accuracy](accuracy.md). Every row "
+        "of this page is computed again by",
         "",
         "```sh",
         command,

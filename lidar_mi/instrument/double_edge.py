@@ -2,8 +2,8 @@
 
 Two etalons alike but for their gaps transmit peaks ``spacing`` apart, the laser's frequency in the
 middle. A Doppler shift moves the line toward one peak and away from the other; the ratio of the
-two signals is the measurement (Chanin et al. 1989; Flesia & Korb 1999, Appl. Opt. 38, 432). The
-light falls through the etalons as a collimated beam onto one detector each.
+two signals is the measurement (Flesia & Korb 1999, Appl. Opt. 38, 432). The light falls
+through the etalons as a collimated beam onto one detector each.
 """
 
 import math

@@ -251,6 +251,20 @@ def test_page_lists_failures(quick, monkeypatch):
     assert "| one \\| of | 1 | 2 | \\|1.0e-01\\| | +10.0 | **FAIL** | two |" in text
 
 
+def test_comparison_is_printed_and_on_the_page(quick, monkeypatch, capsys):
+    table = report.Comparison(("receiver", "m/s"), (("rings", "0.1"),))
+
+    def with_table(name, effort):
+        title, text, (check,) = fake_run(name, effort)
+        return title, text, [replace(check, comparison=table)]
+
+    monkeypatch.setattr(command, "run", with_table)
+    monkeypatch.setattr(command, "GROUPS", ("lidar_equation",))
+    assert command.main(["-o", str(quick)]) == 0
+    lines = "| receiver | m/s |\n| --- | --- |\n| rings | 0.1 |\n"
+    assert lines in capsys.readouterr().out and f"\n\n{lines}\n" in quick.read_text()
+
+
 def test_command_names_unknown_arguments(capsys):
     with pytest.raises(SystemExit) as stop:
         command.main(["speed"])
@@ -300,7 +314,13 @@ def test_every_row_of_the_page_passes(page):
 
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize(
-    "name", ["molecules.cross_sections", "molecules.depolarisation", "scattering_matrices.laws"]
+    "name",
+    [
+        "molecules.cross_sections",
+        "molecules.depolarisation",
+        "scattering_matrices.laws",
+        pytest.param("receivers.published", marks=pytest.mark.slow),
+    ],
 )
 def test_page_is_in_date(page, effort, name):
     """Quick checks without chance: the same rows again."""
