@@ -28,6 +28,7 @@ INTRODUCTION = (
 )
 
 SPEED = 20.0
+FREE = ("v_los", "x", "y", "level", "background", "temperature", "falloff")
 FACTORS = (1, 2, 4, 6, 10, 15, 20, 30)
 RESOLVED = 10
 """Pixels of at most a third of the distance of the outermost rings (34 pixels of the fine camera).
@@ -125,7 +126,7 @@ def fitted(factor: int, ccd: CCD, frames: int, seed: int) -> Errors:
     model, noise = nominal(INSTRUMENT.binned(factor))[0], pixel_noise(ccd)
     drawn = expose(torch.from_numpy(mean_frame(factor)), ccd, seed, frames)
     try:
-        fit = fit_rings(drawn, model, noise, max_chi_square=math.inf)
+        fit = fit_rings(drawn, model, noise, free=FREE, max_chi_square=math.inf)
     except InputError:
         return Errors.of([])
     return Errors.of(fit.v_los.numpy(), fit.v_los_std.numpy())
@@ -192,7 +193,8 @@ def _rows(camera, bounds, fits, noise) -> list[Row]:
         one, least = fits[camera, factor], bounds[camera, factor]
         name = f"{camera}, {_size(factor)} px"
         sigma = least / math.sqrt(one.number)
-        own = cramer_rao(nominal(INSTRUMENT.binned(factor))[0], PHOTONS, noise, v_los=SPEED)
+        model = nominal(INSTRUMENT.binned(factor))[0]
+        own = cramer_rao(model, PHOTONS, noise, v_los=SPEED, free=FREE)
         rows += [
             Row(
                 f"{name}: bound", "without the program", least, own["v_los"], 0, 0.02 * least, "m/s"
@@ -239,14 +241,19 @@ def draw(place, bounds, fits, paper) -> None:
             left.plot(widths, least, color=colour, label=f"{camera}: bound")
             error = [one.std / math.sqrt(2 * max(one.number, 1)) for one in some]
             std = [one.std for one in some]
-            left.errorbar(widths, std, error, fmt="o", ms=4, color=colour, label="fit, std")
+            left.errorbar(widths, std, error, fmt="o", ms=3, color=colour, label=f"{camera}: fit")
             right.plot(
-                widths, [rms(one) for one in some], "o-", ms=4, color=colour, label=f"fit, {camera}"
+                widths,
+                [rms(one) for one in some],
+                "o-",
+                ms=4,
+                color=colour,
+                label=f"fit, {camera.split(',')[0]}",
             )
         for number, name in enumerate(METHODS):
             values = [rms(paper[factor][name]) for factor in FACTORS]
             right.plot(widths, values, ".--", color=f"C{number + 2}", label=f"{name}, CCD")
-        left.set(xscale="log", yscale="log", xlabel="pixels of a row", ylabel="std of v_LOS, m/s")
+        left.set(xscale="log", ylim=(0, None), xlabel="pixels of a row", ylabel="std of v_LOS, m/s")
         right.set(yscale="log", xlabel="pixels of a row", ylabel="rms error of v_LOS, m/s")
         ticks = [30, 60, 120, 240, 480, 960]
         left.set_xticks(ticks, [str(n) for n in ticks])
