@@ -1,4 +1,4 @@
-"""Cramer-Rao bound of what the signals of a receiver's channels tell."""
+"""Cramer-Rao bound of the speed from the signals of a receiver's channels."""
 
 import math
 from collections.abc import Mapping, Sequence
