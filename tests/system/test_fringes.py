@@ -343,6 +343,16 @@ def test_both_lidars_in_one_experiment(tmp_path, quick, monkeypatch):
     [
         ({"v_los": [1000]}, "doppler.v_los: 1000 m/s is not allowed; expected less than 970 m/s"),
         ({"ccd": {"full_well": 100}}, "doppler.ccd: a pixel that holds 100 photoelectrons is not"),
+        (
+            {
+                "ccd": {
+                    "multiplication": "emccd",
+                    "multiplication_gain": 300,
+                    "register_well": "30e3",
+                }
+            },
+            "doppler.ccd: a pixel that holds 100 photoelectrons is not",
+        ),
         ({"ccd": {"bits": 8}}, "doppler.ccd: a pixel that holds 155 photoelectrons is not"),
         ({"camera": {"width": 100, "height": 80}}, "doppler.camera: 0 ring(s) at 0 m/s are not"),
         ({"camera": {"width": 300, "height": 240}}, "doppler.camera: 1 ring(s) at 0 m/s are not"),
