@@ -27,7 +27,7 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
     light = (
         f"A pulse gives {three(metrics['doppler.photons'])} photons from {doppler.lidar.range:g} m "
         f"and {three(metrics['doppler.background_photons'])} of sunlight; {speckle}, read-out "
-        f"{doppler.ccd.read_noise:g} photoelectrons of noise."
+        f"{doppler.ccd.read_noise / doppler.ccd.multiplication_gain:.3g} photoelectrons of noise."
     )
     rings = (
         f"The line is {metrics['doppler.line_width'] / 1e9:.2f} GHz wide, the etalon's free "
