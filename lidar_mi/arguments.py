@@ -21,7 +21,7 @@ _WORDS = {
     str: "text",
     bool: "True or False",
     types.NoneType: "None",
-    Path: "a path (names to 255 bytes)",
+    Path: "a path (255 bytes a name)",
 }
 
 
