@@ -161,6 +161,7 @@ Area = Annotated[float, Unit("m^2", "0.13 m^2")]
 Frequency = Annotated[float, Unit("Hz", "1 kHz")]
 SpectralRadiance = Annotated[float, Unit("W/m^3/sr", "0.3 W/m^2/sr/nm")]
 Circulation = Annotated[float, Unit("m^2/s", "458 m^2/s")]
+Temperature = Annotated[float, Unit("K", "10 K")]
 Memory = Annotated[float, Unit("byte", "8 GB")]
 Number = Annotated[float, Unit("", "0.5")]
 

@@ -5,10 +5,11 @@ The only module that imports both `lidar_mi.instrument` and `lidar_mi.retrieval`
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from lidar_mi.atmosphere.line import Line, backscatter_line
+from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.ccd import CCD
@@ -65,21 +66,52 @@ def ring_model(
     )
 
 
-def air_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> RingModel:
-    """Rings of the backscatter at the lidar's altitude, for its temperature within 25 %."""
+def laser_rings(lidar: DopplerLidar, etalon: Etalon, camera: FringeCamera) -> RingModel:
+    """Rings of the laser's own light."""
+    return ring_model(etalon, camera, laser_line(lidar.wavelength, lidar.laser_width))
+
+
+def air_rings(
+    lidar: DopplerLidar,
+    etalon: Etalon,
+    camera: FringeCamera,
+    *,
+    aerosol_std: float = 0.0,
+    temperature_std: float = math.inf,
+    light_degree: int = 0,
+    background_degree: int = 0,
+) -> RingModel:
+    """Rings of the backscatter at the lidar's altitude, for its temperature within 25 %.
+
+    Parameters
+    ----------
+    aerosol_std, temperature_std : float
+        Standard deviations of what is known of the fraction of aerosol (0: all) and of the
+        temperature (K), about those of the lidar's air.
+    light_degree, background_degree : int
+        Of the smooth variations of light and background that are fitted along.
+    """
     pressure, temperature = standard_atmosphere(lidar.altitude)
+    known = lidar.aerosol_fraction if aerosol_std == 0 else 0.0
 
     def line(kelvin: float) -> Line:
         return backscatter_line(
-            lidar.wavelength,
-            kelvin,
-            pressure,
-            lidar.laser_width,
-            lidar.aerosol_fraction,
-            lidar.line_shape,
+            lidar.wavelength, kelvin, pressure, lidar.laser_width, known, lidar.line_shape
         )
 
-    return ring_model(etalon, camera, line, temperature * np.array(TEMPERATURE_NODES))
+    model = ring_model(etalon, camera, line, temperature * np.array(TEMPERATURE_NODES))
+    priors = {}
+    if math.isfinite(temperature_std):
+        priors["temperature"] = (temperature, temperature_std)
+    if aerosol_std > 0:
+        priors["aerosol"] = (lidar.aerosol_fraction, aerosol_std)
+    return replace(
+        model,
+        aerosol_harmonics=laser_rings(lidar, etalon, camera).harmonics[0] if aerosol_std else None,
+        light_degree=light_degree,
+        background_degree=background_degree,
+        priors=priors,
+    )
 
 
 def pixel_noise(ccd: CCD, modes: float = math.inf, images: int = 1) -> PixelNoise:

@@ -22,7 +22,7 @@ from lidar_mi.instrument.scan import Scan
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table, Tabular
-from lidar_mi.units import Frequency, Length, Number, Speed, Time, Within, to_si
+from lidar_mi.units import Frequency, Length, Number, Speed, Temperature, Time, Within, to_si
 
 
 def _once(key: str, values: tuple) -> None:
@@ -87,6 +87,21 @@ class RingRetrieval(Section):
     slow_images: Annotated[int, Within(0, 100000, "no more than images")] = Field(
         3, description="of these, for methods other than annular, which are slow"
     )
+    aerosol_std: Annotated[Number, Within(0, 10, "a fraction that is not known at all")] = Field(
+        0.5, description="uncertainty of lidar.aerosol_fraction; 0: known, not fitted"
+    )
+    temperature_std: Annotated[
+        Temperature, Within(1e-3, 1000, "a temperature that is not known at all")
+    ] = Field(10.0, description="uncertainty of the air's temperature")
+    light_degree: Annotated[int, Within(0, 8, "finer light has the size of rings")] = Field(
+        1, description="of the illumination's polynomial that is fitted along; 1: slopes"
+    )
+    background_degree: Annotated[int, Within(0, 8, "finer light has the size of rings")] = Field(
+        4, description="of the background's polynomial that is fitted along; 0: even"
+    )
+    max_chi_square: Annotated[
+        Number, Within(1, 1e9, "the expected value to any image", or_infinite=True)
+    ] = Field(2.0, allow_inf_nan=True, description="images that fit worse are refused")
 
     @model_validator(mode="after")
     def _each_once(self):
@@ -98,6 +113,17 @@ class RingRetrieval(Section):
                 f"{self.images}"
             )
         return self
+
+
+class Reference(Section):
+    """The frame of the laser's own light that every pulse has: the zero of its speed."""
+
+    photons: Annotated[Number, Within(1, 1e15, "a photon to the whole pulse")] | None = Field(
+        None, description="detected; default: as many as of the echo"
+    )
+    laser_drift: Annotated[Frequency, Within(0, 1e12, "hundreds of orders of an etalon")] = Field(
+        0.0, description="rms change of the laser's frequency from its frame to the echo"
+    )
 
 
 _MODES = Within(0.1, 1e15, "from a pixel that sees part of a mode to white light", or_infinite=True)
@@ -125,6 +151,7 @@ class Doppler(Section):
         description="light paths per pixel, each traced through a real lens",
         validation_alias=AliasChoices("path_samples", "photon_samples"),  # its former name
     )
+    reference: Reference = Reference()
     retrieval: RingRetrieval = RingRetrieval()
 
     @field_validator("speckle_modes", mode="before")

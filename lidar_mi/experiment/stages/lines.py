@@ -7,11 +7,18 @@ import torch
 import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable, read_requirements
+from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames, summed_noise
-from lidar_mi.experiment.stages.ring_velocities import FRAMES, fitted_speeds
+from lidar_mi.experiment.stages.ring_velocities import (
+    FRAMES,
+    REFERENCES,
+    drift_speed,
+    reference_photons,
+    speeds_to_laser,
+)
 from lidar_mi.experiment.truth import Truth, find_file
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_at
@@ -118,13 +125,15 @@ def measure_lines(
             for speed in middle + half * nodes
         ]
     )
+    line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
+    own = fringe_image(doppler.camera, doppler.etalon, line, 0.0, reference_photons(doppler, rings))
     noise = summed_noise(doppler.ccd, rings.modes, sensor.pulses)
     weights = torch.from_numpy(_lagrange(nodes, (true - middle) / half)).to(images.dtype)
     retrieved = np.empty((2, len(true)))
     for start in range(0, len(true), FRAMES):
         log.bar(f"retrieving line of sight {start + 1} of {len(true)}", start / len(true))
         chunk = range(start, min(start + FRAMES, len(true)))
-        frames = []
+        frames, laser = [], []
         for index in chunk:
             farther = doppler.lidar.model_copy(update={"range": float(lines["range"][index])})
             image = torch.tensordot(weights[index], images, 1) * (photons(farther) / light)
@@ -134,10 +143,29 @@ def measure_lines(
                     doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
                 )
             )
-        retrieved[:, start : chunk.stop] = fitted_speeds(
-            torch.cat(frames), doppler, rings.model, noise, RingMethod.ANNULAR, RingCentre.FREE
+            laser.append(
+                exposed_frames(
+                    doppler,
+                    rings,
+                    own,
+                    sensor.pulses,
+                    experiment.seed,
+                    [REFERENCES + _STREAMS + index],
+                )
+            )
+        retrieved[:, start : chunk.stop] = speeds_to_laser(
+            torch.cat(frames),
+            torch.cat(laser),
+            doppler,
+            rings,
+            noise,
+            RingMethod.ANNULAR,
+            RingCentre.FREE,
         )
     v_los, std = retrieved
+    drift = drift_speed(doppler, sensor.pulses)
+    v_los += drift * np.random.default_rng([experiment.seed, 2]).standard_normal(len(true))
+    std = np.hypot(std, drift)
     return lines.assign(
         v_los=("line", v_los, lines["v_los"].attrs),
         v_los_std=("line", std, lines["v_los_std"].attrs),

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.ring_instrument import air_rings, pixel_noise
+from lidar_mi.experiment.ring_instrument import air_rings, laser_rings, pixel_noise
 from lidar_mi.experiment.schema import Doppler, Experiment
 from lidar_mi.experiment.stage import Keeper
 from lidar_mi.experiment.stages.rendering import batches_of
@@ -34,6 +34,7 @@ class Rings(NamedTuple):
 
     line: Line
     model: RingModel
+    laser: RingModel
     photons: float
     background: float
     modes: float
@@ -88,7 +89,7 @@ def ring_instrument(doppler: Doppler) -> Rings:
         lidar.aerosol_fraction,
         lidar.line_shape,
     )
-    model = air_rings(lidar, etalon, camera)
+    model, laser = ring_models(doppler)
     for speed in doppler.v_los:
         if not abs(speed) < model.velocity_range / 2:
             raise InputError(
@@ -117,7 +118,17 @@ def ring_instrument(doppler: Doppler) -> Rings:
             f"doppler.ccd: a pixel that holds {ccd.saturation:.3g} photoelectrons is not allowed; "
             f"expected more, as the rings' crests have {crest:.3g}"
         )
-    return Rings(line, model, float(image.sum()), background, modes)
+    return Rings(line, model, laser, float(image.sum()), background, modes)
+
+
+def ring_models(doppler: Doppler) -> tuple[RingModel, RingModel]:
+    """What the ring fit assumes of images of air and of the laser."""
+    told, instrument = doppler.retrieval, (doppler.lidar, doppler.etalon, doppler.camera)
+    smooth = {"light_degree": told.light_degree, "background_degree": told.background_degree}
+    air = air_rings(
+        *instrument, aerosol_std=told.aerosol_std, temperature_std=told.temperature_std, **smooth
+    )
+    return air, replace(laser_rings(*instrument), **smooth)
 
 
 def check_rings(experiment: Experiment, rings: Rings) -> None:

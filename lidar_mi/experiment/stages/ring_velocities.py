@@ -9,10 +9,9 @@ import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.assessment.metrics.rings import RingBudget
-from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.ring_instrument import pixel_noise, ring_model
+from lidar_mi.experiment.ring_instrument import pixel_noise
 from lidar_mi.experiment.schema import Doppler, Experiment
 from lidar_mi.experiment.stages.ring_images import (
     RingImages,
@@ -26,6 +25,7 @@ from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 from lidar_mi.retrieval.rings import peaks as ring_peaks
 from lidar_mi.retrieval.rings.bound import cramer_rao
 from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
+from lidar_mi.retrieval.rings.model import RingModel
 
 FITS = (RingMethod.ANNULAR, RingMethod.PIXELS)
 # method and coordinate of the radius, see `lidar_mi.retrieval.rings.peaks.ring_radius`
@@ -40,6 +40,8 @@ PEAKS = {
 PIECES = tuple(np.linspace(0.1, 0.5, 9).round(3).tolist())
 
 FRAMES = 16  # noisy images in memory at a time
+# First number of the laser's own frames, which selects their random streams.
+REFERENCES = 1 << 25
 
 
 def line_of_sight_winds(
@@ -65,7 +67,9 @@ def ring_budget(
     expected = [expected_image(image, rings.photons) for image in images.received]
     # few samples leave more than the noise of photons: that shows as an error, not as no image
     v = fit_rings(torch.stack(expected), rings.model, max_chi_square=math.inf).v_los.numpy()
-    errors = v - [image.attrs["v_los"] for image in images.received]
+    light = expected_image(images.emitted, reference_photons(doppler, rings))
+    zero = fit_rings(light, rings.laser, max_chi_square=math.inf).v_los.numpy()
+    errors = v - zero - [image.attrs["v_los"] for image in images.received]
     first = images.received[0]
     relative = (first["S0_stderr"] / first["S0"].where(first["S0"] > 0)).median()
     return RingBudget(
@@ -84,22 +88,45 @@ def ring_budget(
 
 
 def _bound(doppler: Doppler, rings: Rings, centre: str) -> float:
-    """Cramer-Rao bound of one image at the first speed, m/s."""
+    """Cramer-Rao bound of one image at the first speed less its reference, m/s."""
     efficiency = doppler.ccd.quantum_efficiency
     floor = efficiency * rings.background + doppler.ccd.dark_current * doppler.ccd.integration_time
-    unknown = [
-        name
-        for name in rings.model.parameters
-        if centre == RingCentre.FREE or name not in ("x", "y")
-    ]
-    return cramer_rao(
-        rings.model,
-        efficiency * rings.photons,
-        pixel_noise(doppler.ccd, rings.modes),
-        v_los=doppler.v_los[0],
-        background=floor,
-        free=unknown,
-    )["v_los"]
+    both = (
+        (rings.model, rings.photons, doppler.v_los[0]),
+        (rings.laser, reference_photons(doppler, rings), 0.0),
+    )
+    return math.hypot(
+        *(
+            cramer_rao(
+                model,
+                efficiency * photons,
+                pixel_noise(doppler.ccd, rings.modes),
+                v_los=speed,
+                background=floor,
+                free=_unknown(model, centre),
+            )["v_los"]
+            for model, photons, speed in both
+        )
+    )
+
+
+def _unknown(model: RingModel, centre: str) -> list[str]:
+    return [n for n in model.parameters if centre == RingCentre.FREE or n not in ("x", "y")]
+
+
+def reference_photons(doppler: Doppler, rings: Rings) -> float:
+    """Photons of a frame of the laser's own light."""
+    return doppler.reference.photons or rings.photons
+
+
+def drift_speed(doppler: Doppler, averaged: int) -> float:
+    """Standard deviation of a speed by the laser's drift after its frame, m/s.
+
+    A change of frequency is a change of speed: lambda / 2 times it. Drifts of averaged pulses are
+    independent.
+    """
+    lidar = doppler.lidar
+    return lidar.wavelength / 2 * doppler.reference.laser_drift / math.sqrt(averaged)
 
 
 def velocities(
@@ -129,9 +156,7 @@ def velocities(
         settings.images,
     )
     v, v_std = np.full((2, *shape), np.nan)
-    emitted = rendered.emitted["S0"].values.astype(float)
-    reference = _emitted_velocity(doppler, rendered.emitted, rings.photons)
-    radii = {centre: _peak_radii(emitted, doppler, centre) for centre in settings.centre}
+    emitted = expected_image(rendered.emitted, reference_photons(doppler, rings))
     fits = [m for m in settings.methods if m in FITS]
     peaks = [m for m in settings.methods if m in PEAKS]
     places = {name: settings.methods.index(name) for name in settings.methods}
@@ -142,33 +167,44 @@ def velocities(
     done, total = 0, math.prod(shape[2:])
     for j, n in enumerate(settings.averaged):
         noise = summed_noise(doppler.ccd, rings.modes, n)
-        for k, speed in enumerate(speeds):
+        for k, true in enumerate(speeds):
             for first in range(0, settings.images, FRAMES):
-                text = f"retrieving winds from averages of {n} images at {speed:g} m/s"
+                text = f"retrieving winds from averages of {n} images at {true:g} m/s"
                 log.bar(text, done / total)
                 images = range(first, min(first + FRAMES, settings.images))
                 numbers = [(j * len(speeds) + k) * settings.images + i for i in images]
                 frames = exposed_frames(doppler, rings, expected[k], n, seed, numbers)
+                # every pulse has its own frame of the laser
+                laser = exposed_frames(
+                    doppler, rings, emitted, n, seed, [REFERENCES + i for i in numbers]
+                )
+                # as a change of the laser's frequency is one of the speed
+                drifted = drift_speed(doppler, n) * np.array(
+                    [np.random.default_rng([seed, 2, i]).standard_normal() for i in numbers]
+                )
                 few = max(0, min(settings.slow_images - first, len(images)))
                 for c, centre in enumerate(settings.centre):
                     for name in fits:
                         count = len(images) if name == RingMethod.ANNULAR else few
                         if count:
                             place = places[name], c, j, k, slice(first, first + count)
-                            read = fitted_speeds(
-                                frames[:count], doppler, rings.model, noise, name, centre
+                            v[place], v_std[place] = speeds_to_laser(
+                                frames[:count], laser[:count], doppler, rings, noise, name, centre
                             )
-                            v[place], v_std[place] = read
-                            v[place] -= reference
+                            v[place] += drifted[:count]
+                            v_std[place] = np.hypot(v_std[place], drift_speed(doppler, n))
                     for i in range(few if peaks else 0):
-                        found = _peak_radii(frames[i].numpy(), doppler, centre)
+                        found, zero = (
+                            _peak_radii(one[i].numpy(), doppler, centre) for one in (frames, laser)
+                        )
                         for name in peaks:
-                            v[places[name], c, j, k, first + i] = ring_peaks.velocity_from_radii(
+                            speed = ring_peaks.velocity_from_radii(
                                 found[name],
-                                radii[centre][name],
+                                zero[name],
                                 doppler.camera.focal_length,
                                 doppler.camera.pixel,
                             )
+                            v[places[name], c, j, k, first + i] = speed + drifted[i]
                 done += len(images)
     dims = ("algorithm", "centre", "averaged", "v_los", "image")
     return xr.Dataset(
@@ -210,18 +246,34 @@ def velocities(
     )
 
 
-def fitted_speeds(frames, doppler, model, noise, method, centre) -> tuple[np.ndarray, np.ndarray]:
+def speeds_to_laser(
+    frames, laser, doppler, rings, noise, method, centre
+) -> tuple[np.ndarray, np.ndarray]:
+    """v_LOS of frames less that of the laser's own frames, and its standard deviation."""
+    both = (frames, rings.model), (laser, rings.laser)
+    (v, std), (zero, zero_std) = (
+        _fitted_speeds(images, doppler, model, noise, method, centre) for images, model in both
+    )
+    return v - zero, np.hypot(std, zero_std)
+
+
+def _fitted_speeds(frames, doppler, model, noise, method, centre):
     """v_LOS and its standard deviation by `fit_rings`; NaN for images that it refuses."""
-    known = {}
-    if centre == RingCentre.KNOWN:
-        free = [name for name in model.parameters if name not in ("x", "y")]
-        known = {"centre": doppler.camera.centre_pixel, "free": free}
+    start = doppler.camera.centre_pixel if centre == RingCentre.KNOWN else None
     try:
-        fit = fit_rings(frames, model, noise, method=method, **known)
+        fit = fit_rings(
+            frames,
+            model,
+            noise,
+            method=method,
+            centre=start,
+            free=_unknown(model, centre),
+            max_chi_square=doppler.retrieval.max_chi_square,
+        )
     except InputError:
         if len(frames) == 1:
             return np.array([np.nan]), np.array([np.nan])
-        alone = [fitted_speeds(f[None], doppler, model, noise, method, centre) for f in frames]
+        alone = [_fitted_speeds(f[None], doppler, model, noise, method, centre) for f in frames]
         v, std = zip(*alone, strict=True)
         return np.concatenate(v), np.concatenate(std)
     return fit.v_los.numpy(), fit.v_los_std.numpy()
@@ -269,17 +321,6 @@ def _peak_bias(doppler: Doppler, rendered: RingImages) -> np.ndarray:
         return v - doppler.v_los[0]
 
     return np.array([[error(c, p) for p in PIECES] for c in ring_peaks.COORDINATES])
-
-
-def _emitted_velocity(doppler: Doppler, emitted: xr.Dataset, total: float) -> float:
-    """Fit of the laser's own image: the zero of all speeds.
-
-    Without noise, as any number of its images can be averaged.
-    """
-    line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
-    model = ring_model(doppler.etalon, doppler.camera, line)
-    image = expected_image(emitted, total)[None]
-    return float(fit_rings(image, model, max_chi_square=math.inf).v_los)
 
 
 def _warn_of_failures(found: xr.Dataset, log: Log) -> None:
