@@ -1,6 +1,7 @@
 """The public names: what ``import lidar_mi as lm`` offers, and where each is made."""
 
 from .errors import InputError
+from .experiment.own_frames import calibrate_etalon, retrieve_v_los
 from .experiment.reading import load_experiment
 from .experiment.results import Run
 from .experiment.run import run
@@ -12,6 +13,7 @@ from .io.images import read_image, read_noise
 from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
 from .retrieval.rings.analysis import Rings, analyse_rings
+from .retrieval.rings.calibration import Calibration
 from .retrieval.velocimetry.common_grid import on_one_grid
 from .retrieval.velocimetry.quality import Flag
 from .retrieval.velocimetry.volume import retrieve_wind_volume
@@ -24,6 +26,7 @@ from .system.doctor import doctor
 __version__: str
 
 __all__ = [
+    "Calibration",
     "Experiment",
     "Flag",
     "InputError",
@@ -32,6 +35,7 @@ __all__ = [
     "VortexPairFit",
     "__version__",
     "analyse_rings",
+    "calibrate_etalon",
     "doctor",
     "experiments",
     "fit_vortices",
@@ -44,6 +48,7 @@ __all__ = [
     "read_scan",
     "read_vortices",
     "register_plugins",
+    "retrieve_v_los",
     "retrieve_wind",
     "retrieve_wind_volume",
     "run",

@@ -4,7 +4,18 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli import aerosol, check, doctor, info, render, retrieve, rings, run
+from lidar_mi.cli import (
+    aerosol,
+    calibrate,
+    check,
+    doctor,
+    info,
+    render,
+    retrieve,
+    rings,
+    run,
+    v_los,
+)
 from lidar_mi.cli.exit_codes import exit_by
 
 app = typer.Typer(
@@ -35,6 +46,8 @@ app.command(epilog=retrieve.EXAMPLES)(retrieve.retrieve)
 app.command(epilog=info.EXAMPLES)(info.info)
 app.command(epilog=aerosol.EXAMPLES)(aerosol.aerosol)
 app.command(epilog=rings.EXAMPLES)(rings.rings)
+app.command(epilog=calibrate.EXAMPLES)(calibrate.calibrate)
+app.command("v_los", epilog=v_los.EXAMPLES)(v_los.v_los)
 app.command(epilog=doctor.EXAMPLES)(doctor.doctor)
 
 

@@ -1,0 +1,105 @@
+"""``lidar-mi v_los``: line-of-sight speeds from frames of rings."""
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidar_mi.cli.options import Changes, Overwrite
+from lidar_mi.cli.terminal import output, print_table
+from lidar_mi.errors import InputError
+
+EXAMPLES = (
+    "Examples: `lidar-mi v_los air_*.tif --reference laser.tif --calibration etalon.nc "
+    "--instrument my_lidar.yaml` - `lidar-mi v_los air.fits --calibration etalon.nc -o v.nc`"
+)
+
+
+def v_los(
+    frames: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Frames of the echo of air: EXR, PNG, TIFF (also of several pages) or FITS (also "
+            "cubes)."
+        ),
+    ],
+    reference: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Frames of the laser itself, once per file: one for all, or one for each frame."
+        ),
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="File of `lidar-mi calibrate`. Default: the nominal one.")
+    ] = None,
+    instrument: Annotated[
+        str,
+        typer.Option(
+            help="The nominal instrument: an experiment file with the section doppler, or the "
+            "name of a shipped one."
+        ),
+    ] = "fringes",
+    changes: Changes = None,
+    electrons: Annotated[
+        bool,
+        typer.Option(
+            "--electrons",
+            help="The files hold photoelectrons. Default: counts, of doppler.ccd's bias and gain.",
+        ),
+    ] = False,
+    max_chi_square: Annotated[
+        float | None,
+        typer.Option(help="Frames that fit worse are refused. Default: doppler.retrieval's."),
+    ] = None,
+    layer: Annotated[str | None, typer.Option(help="Layer of EXR files.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="NetCDF file. Default: none.")
+    ] = None,
+    overwrite: Overwrite = False,
+) -> None:
+    """Retrieve the speed along the line of sight from every frame of an etalon's rings."""
+    from lidar_mi.experiment.own_frames import read_electrons, retrieve_v_los
+    from lidar_mi.experiment.reading import load
+    from lidar_mi.experiment.shipped import experiment_file
+    from lidar_mi.io.netcdf import read_netcdf, write_netcdf
+    from lidar_mi.io.target import check_target
+    from lidar_mi.retrieval.rings.calibration import calibration_of
+    from lidar_mi.tables import Table, with_error
+
+    given = [*frames, *(reference or []), *([calibration] if calibration else [])]
+    if out is not None:
+        check_target(out, given, overwrite=overwrite)
+    experiment = load(experiment_file(instrument), list(changes or []))
+    if experiment.doppler is None:
+        raise InputError(f"--instrument: {instrument} has no section doppler; expected one")
+    ccd, counts = experiment.doppler.ccd, not electrons
+    known = None
+    if calibration is not None:
+        try:
+            known = calibration_of(read_netcdf(calibration))
+        except InputError as error:
+            raise InputError(f"{calibration}: {error}") from None
+    air = read_electrons(frames, ccd, counts=counts, layer=layer)
+    laser = read_electrons(reference, ccd, counts=counts, layer=layer) if reference else None
+    found = retrieve_v_los(air, laser, experiment, calibration=known, max_chi_square=max_chi_square)
+    rows = [
+        (
+            str(k),
+            with_error(float(one["v_los"]), float(one["v_los_std"])),
+            "" if math.isnan(one["v_los"]) else f"{float(one['v_los_systematic']):.2g}",
+            f"{float(one['chi_square']):.3f}",
+            str(one["status"].values),
+        )
+        for k, one in ((k, found.isel(frame=k)) for k in range(found.sizes["frame"]))
+    ]
+    heads = ("frame", "v_los, m/s", "systematic", "chi-square", "refused")
+    if not any(row[-1] for row in rows):
+        rows, heads = [row[:-1] for row in rows], heads[:-1]
+    note = "" if known else "No calibration: the nominal instrument is taken as true."
+    print_table(Table("line-of-sight speeds", rows, heads, note))
+    if out is not None:
+        write_netcdf(found, out)
+        output.print(f"speeds   {out}")
+    if all(row[-1] for row in rows) and len(heads) == 5:
+        raise InputError("no frame has a speed; the reasons are in the table")

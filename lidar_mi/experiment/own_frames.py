@@ -1,0 +1,278 @@
+"""Frames of a real instrument: calibration of the etalon, and speeds along the line of sight.
+
+The nominal instrument, its air and its camera are those of an experiment's section ``doppler``.
+"""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi import __version__
+from lidar_mi.arguments import checked_arguments
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.reading import load_experiment
+from lidar_mi.experiment.ring_instrument import pixel_noise
+from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.experiment.stages.ring_images import ring_models
+from lidar_mi.instrument.ccd import CCD
+from lidar_mi.io.images import read_frames
+from lidar_mi.retrieval.rings.calibration import Calibration, calibrated
+from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
+from lidar_mi.retrieval.rings.likelihood_fit import RingFit, difference, fit_rings
+
+
+def electrons(counts: np.ndarray, ccd: CCD) -> np.ndarray:
+    """Photoelectrons of a digitiser's counts: bias off, times the gain of digitiser and CCD."""
+    return (np.asarray(counts, float) - ccd.bias) * ccd.gain / ccd.multiplication_gain
+
+
+def read_electrons(
+    paths: Sequence[str | Path], ccd: CCD, *, counts: bool, layer: str | None = None
+) -> np.ndarray:
+    """All frames of some files as photoelectrons, (frames, height, width).
+
+    Parameters
+    ----------
+    counts : bool
+        Whether the files hold a digitiser's counts; electrons otherwise.
+
+    Raises
+    ------
+    InputError
+        A file that is no image, frames of different sizes.
+    """
+    found: list[np.ndarray] = []
+    for path in paths:
+        for frame in read_frames(path, layer):
+            if found and frame.shape != found[0].shape:
+                raise InputError(
+                    f"{path}: {frame.shape[1]} x {frame.shape[0]} px are not allowed; expected "
+                    f"{found[0].shape[1]} x {found[0].shape[0]} px as in {paths[0]}"
+                )
+            found.append(electrons(frame, ccd) if counts else np.asarray(frame, float))
+    return np.stack(found)
+
+
+@checked_arguments
+def calibrate_etalon(
+    frames: Any,
+    instrument: str | Path | Experiment = "fringes",
+    *,
+    flat: Any = None,
+    light_degree: int = 2,
+    background_degree: int = 4,
+    max_chi_square: float = 2.0,
+) -> Calibration:
+    """Calibrate a fringe-imaging etalon from frames of its laser.
+
+    Parameters
+    ----------
+    frames : array, shape (frames, height, width)
+        Photoelectrons, two frames or more.
+    instrument : path, str or Experiment
+        The nominal instrument: an experiment with a section ``doppler``, its file or the name of a
+        shipped one. Laser, etalon, camera and CCD are taken from it.
+    flat : array, shape (height, width), optional
+        Mean of frames of even white light, any scale; pixels of 0 are left out.
+    light_degree, background_degree : int
+        Of the polynomials of the illumination and of each frame's background, 0 to 8.
+    max_chi_square : float
+        Frames that fit worse are refused.
+
+    Returns
+    -------
+    Calibration
+        To be given to `retrieve_v_los`.
+
+    Raises
+    ------
+    InputError
+        Frames that are none of the nominal instrument: another size, no rings, a bad fit.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> lm.calibrate_etalon(np.ones((1, 780, 960)))
+    Traceback (most recent call last):
+        ...
+    lidar_mi.errors.InputError: frames: 1 is not allowed; expected 2 or more, from which the drift \
+is determined
+    """
+    doppler = _doppler(instrument)
+    _, laser = ring_models(doppler)
+    return calibrate_rings(
+        _batch("frames", frames, doppler),
+        laser,
+        pixel_noise(doppler.ccd),
+        response=None if flat is None else _response(flat, doppler),
+        light_degree=light_degree,
+        background_degree=background_degree,
+        max_chi_square=max_chi_square,
+    )
+
+
+@checked_arguments
+def retrieve_v_los(
+    frames: Any,
+    reference: Any = None,
+    instrument: str | Path | Experiment = "fringes",
+    *,
+    calibration: Calibration | None = None,
+    max_chi_square: float | None = None,
+) -> xr.Dataset:
+    """Speeds along the line of sight from frames of the echo of air.
+
+    Parameters
+    ----------
+    frames : array, shape (frames, height, width)
+        Photoelectrons.
+    reference : array, shape (n, height, width), optional
+        Frames of the laser itself: one for each frame, one for all, or one for each of equal
+        numbers of frames in turn. Without them speeds are from the calibration's order.
+    instrument : path, str or Experiment
+        As of `calibrate_etalon`.
+    calibration : Calibration, optional
+        The nominal instrument is taken as true without one.
+    max_chi_square : float, optional
+        Default: that of the experiment's ``doppler.retrieval``.
+
+    Returns
+    -------
+    xr.Dataset, dim frame
+        ``v_los`` (m s-1, positive toward the instrument), ``v_los_std`` its random standard error,
+        ``v_los_systematic`` that which the calibration leaves to all frames alike, ``chi_square``,
+        ``rings``, and ``status``: empty, or why a frame has no speed (NaN).
+
+    Raises
+    ------
+    InputError
+        Frames of another size than the instrument's, a number of references that does not fit.
+    """
+    doppler = _doppler(instrument)
+    models = ring_models(doppler)
+    response = None
+    if calibration is not None:
+        models = tuple(calibrated(model, calibration) for model in models)
+        response = torch.from_numpy(np.asarray(calibration.response, float))
+    limit = doppler.retrieval.max_chi_square if max_chi_square is None else max_chi_square
+    noise = pixel_noise(doppler.ccd)
+
+    def fitted(name, images, model):
+        return _each(images, name, model, noise, response, limit, calibration is not None)
+
+    batch = _batch("frames", frames, doppler)
+    received, status = fitted("frames", batch, models[0])
+    if reference is None:
+        parts = [
+            None if fit is None else (fit.v_los, fit.v_los_std, fit.v_los_systematic)
+            for fit in received
+        ]
+    else:
+        own = _batch("reference", reference, doppler)
+        if len(batch) % len(own):
+            raise InputError(
+                f"reference: {len(own)} frames are not allowed; expected as many as frames, "
+                f"{len(batch)}, or a divisor of that"
+            )
+        emitted, faults = fitted("reference", own, models[1])
+        each = len(batch) // len(own)
+        parts = []
+        for k, fit in enumerate(received):
+            laser = emitted[k // each]
+            status[k] = status[k] or faults[k // each]
+            parts.append(None if fit is None or laser is None else difference(fit, laser))
+    columns = np.full((5, len(batch)), np.nan)
+    for k, (part, fit) in enumerate(zip(parts, received, strict=True)):
+        if part is not None:
+            columns[:3, k] = [float(value) for value in part]
+        if fit is not None:
+            columns[3:, k] = float(fit.chi_square), float(fit.rings)
+    return xr.Dataset(
+        {
+            name: ("frame", values, {"units": units, "long_name": text})
+            for (name, units, text), values in zip(_VARIABLES, columns, strict=True)
+        }
+        | {"status": ("frame", status, {"long_name": "why a frame has no speed"})},
+        attrs={
+            "Conventions": "CF-1.11",
+            "title": "Line-of-sight speeds from ring images",
+            "source": f"lidar-mi {__version__}",
+        },
+    )
+
+
+_VARIABLES = (
+    ("v_los", "m s-1", "speed toward the instrument along the line of sight"),
+    ("v_los_std", "m s-1", "random standard error of v_los"),
+    ("v_los_systematic", "m s-1", "standard error of v_los by the calibration, common to frames"),
+    ("chi_square", "1", "squared misfit over its expectation"),
+    ("rings", "1", "rings detected"),
+)
+
+
+def _each(
+    images, name, model, noise, response, limit, known
+) -> tuple[list[RingFit | None], list[str]]:
+    """The fit of every image, or None and why not."""
+    found: list[RingFit | None] = []
+    status = []
+    for k, image in enumerate(images):
+        try:
+            fit = fit_rings(
+                image[None],
+                model,
+                noise,
+                response=response,
+                centre=model.centre if known else None,
+                max_chi_square=limit,
+            )
+        except InputError as error:
+            found.append(None)
+            status.append(str(error).replace("images[0]", f"{name}[{k}]"))
+        else:
+            found.append(fit)
+            status.append("")
+    return found, status
+
+
+def _doppler(instrument: str | Path | Experiment) -> Doppler:
+    experiment = instrument if isinstance(instrument, Experiment) else load_experiment(instrument)
+    if experiment.doppler is None:
+        raise InputError(
+            f"instrument: experiment {experiment.name!r} has no Doppler lidar; expected one with "
+            "the section doppler"
+        )
+    return experiment.doppler
+
+
+def _batch(name: str, frames: Any, doppler: Doppler) -> torch.Tensor:
+    """Frames (n, height, width) of the camera's size."""
+    values = np.asarray(frames)
+    if values.dtype.kind not in "fiub" or values.ndim not in (2, 3):
+        raise InputError(
+            f"{name}: {values.dtype} of shape {values.shape} is not allowed; expected numbers "
+            "(frames, height, width)"
+        )
+    camera = doppler.camera
+    if values.shape[-2:] != (camera.height, camera.width):
+        raise InputError(
+            f"{name}: {values.shape[-1]} x {values.shape[-2]} px are not allowed; expected "
+            f"{camera.width} x {camera.height} px, doppler.camera's width and height"
+        )
+    # writable, and in the byte order of the machine
+    return torch.from_numpy(np.array(values, np.float32).reshape(-1, *values.shape[-2:]))
+
+
+def _response(flat: Any, doppler: Doppler) -> torch.Tensor:
+    """Responses of the pixels, 1 on average."""
+    values = _batch("flat", flat, doppler).double().mean(0)
+    mean = float(values[values > 0].mean()) if (values > 0).any() else math.nan
+    if not (torch.isfinite(values).all() and math.isfinite(mean)):
+        raise InputError("flat: expected finite values, some of them above 0")
+    return values.clamp(min=0) / mean
