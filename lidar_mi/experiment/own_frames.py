@@ -153,6 +153,16 @@ def retrieve_v_los(
     ------
     InputError
         Frames of another size than the instrument's, a number of references that does not fit.
+
+    Examples
+    --------
+    A frame without rings has no speed, and says why:
+
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> found = lm.retrieve_v_los(np.full((1, 780, 960), 30.0))
+    >>> float(found.v_los[0]), str(found.status[0].values)
+    (nan, 'image: its gradients have no common centre; expected rings')
     """
     doppler = _doppler(instrument)
     models = ring_models(doppler)

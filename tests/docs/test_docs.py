@@ -116,6 +116,7 @@ def _unit(field):
             (units.Backscatter, "1/m/sr"),
             (units.Area, "m²"),
             (units.Memory, "byte"),
+            (units.Temperature, "K"),
             (units.Number, None),
         )
     }

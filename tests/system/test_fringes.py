@@ -168,7 +168,8 @@ def test_winds_scatter_as_the_bound_says(small, found, centre, averaged):
     own = small[1]["doppler.render.largest_error"]
     assert own < 0.05
     assert low * bound**2 < (error**2).sum() < high * (bound**2 + own**2)
-    np.testing.assert_allclose(case["v_std"], bound, rtol=0.1)
+    # of averages, it is seen as a misfit, by which stated errors grow
+    np.testing.assert_allclose(case["v_std"], bound, rtol=0.15)
 
 
 def test_bound_falls_with_the_root_of_the_number(small):
