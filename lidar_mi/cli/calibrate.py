@@ -54,6 +54,7 @@ def calibrate(
 
     Writes the calibration (NetCDF) and, beside it, a figure of the misfit (PNG).
     """
+    from lidar_mi import __version__
     from lidar_mi.assessment.figures.calibration import draw_calibration
     from lidar_mi.experiment.own_frames import calibrate_etalon, read_electrons
     from lidar_mi.experiment.reading import load
@@ -82,7 +83,7 @@ def calibrate(
         background_degree=background_degree,
         max_chi_square=max_chi_square,
     )
-    write_netcdf(found.to_dataset(), out)
+    write_netcdf(found.to_dataset().assign_attrs(software=f"lidar-mi {__version__}"), out)
     write_png(draw_calibration(found), figure)
     for table in found.tables():
         print_table(table)

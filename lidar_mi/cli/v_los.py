@@ -83,23 +83,27 @@ def v_los(
     air = read_electrons(frames, ccd, counts=counts, layer=layer)
     laser = read_electrons(reference, ccd, counts=counts, layer=layer) if reference else None
     found = retrieve_v_los(air, laser, experiment, calibration=known, max_chi_square=max_chi_square)
-    rows = [
-        (
-            str(k),
-            with_error(float(one["v_los"]), float(one["v_los_std"])),
-            "" if math.isnan(one["v_los"]) else f"{float(one['v_los_systematic']):.2g}",
-            f"{float(one['chi_square']):.3f}",
-            str(one["status"].values),
+    rows: list[tuple[str, ...]] = []
+    for k in range(found.sizes["frame"]):
+        one = found.isel(frame=k)
+        speed, systematic = float(one["v_los"]), float(one["v_los_systematic"])
+        rows.append(
+            (
+                str(k),
+                with_error(speed, float(one["v_los_std"])),
+                "" if math.isnan(speed) else f"{systematic:.2g}",
+                f"{float(one['chi_square']):.3f}",
+                str(one["status"].values),
+            )
         )
-        for k, one in ((k, found.isel(frame=k)) for k in range(found.sizes["frame"]))
-    ]
-    heads = ("frame", "v_los, m/s", "systematic", "chi-square", "refused")
-    if not any(row[-1] for row in rows):
+    refused = [row for row in rows if row[-1]]
+    heads: tuple[str, ...] = ("frame", "v_los, m/s", "systematic", "chi-square", "refused")
+    if not refused:
         rows, heads = [row[:-1] for row in rows], heads[:-1]
     note = "" if known else "No calibration: the nominal instrument is taken as true."
     print_table(Table("line-of-sight speeds", rows, heads, note))
     if out is not None:
         write_netcdf(found, out)
         output.print(f"speeds   {out}")
-    if all(row[-1] for row in rows) and len(heads) == 5:
+    if len(refused) == len(rows):
         raise InputError("no frame has a speed; the reasons are in the table")

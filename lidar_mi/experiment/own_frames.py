@@ -212,7 +212,7 @@ def retrieve_v_los(
         attrs={
             "Conventions": "CF-1.11",
             "title": "Line-of-sight speeds from ring images",
-            "source": f"lidar-mi {__version__}",
+            "software": f"lidar-mi {__version__}",
         },
     )
 

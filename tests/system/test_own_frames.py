@@ -1,0 +1,115 @@
+"""Calibration and speeds from frames of one's own, by command. System tier.
+
+The frames are made without the program (`validation.fringe_reference`): 16-bit TIFF, a camera that
+is tilted, out of focus and distorting, hot pixels, other mirrors and another focal length than the
+nominal ones, light that differs between laser and air. Detects a speed that is wrong by more than
+its error, a calibration that does not survive its file, and bad input that ends in a traceback.
+"""
+
+import numpy as np
+import pytest
+import xarray as xr
+from PIL import Image
+
+from tests.support.command_line import shell, words_of
+from validation.fringe_reference import (
+    Defects,
+    Instrument,
+    Light,
+    air_frame,
+    exposures,
+    laser_frame,
+)
+
+SPEED = 50.0
+NOMINAL = """
+name: mine
+doppler:
+  camera: {width: 240, height: 195, pixel: 29.6 um}
+  ccd: {full_well: 1e6}
+  lidar: {line_shape: rayleigh}
+"""
+"""Few large pixels: as many photons and the same rings as on the whole camera."""
+
+DEFECTS = Defects(
+    tilt=(0.008, -0.004),
+    distortion=1e-3,
+    defocus=1.0,
+    focal_length=1.001,
+    finesse=0.95,
+    warming=0.3,
+    laser=Light(slope=(0.03, 0.0)),
+    air=Light(slope=(0.0, 0.05)),
+    hot_pixels=20,
+)
+
+
+def printed(*arguments):
+    done = shell(*arguments)
+    assert done.returncode == 0, done.stderr
+    return words_of(done.stdout)
+
+
+def failed(*arguments):
+    done = shell(*arguments)
+    assert done.returncode == 2
+    return words_of(done.stdout + done.stderr)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frames")
+    (folder / "mine.yaml").write_text(NOMINAL)
+    instrument = Instrument().binned(4)
+    laser = laser_frame(instrument, DEFECTS, 2.4e7)
+    air = air_frame(instrument, DEFECTS, SPEED, 2.4e7)
+    for name, mean, count in (("laser", laser, 8), ("reference", laser, 4), ("air", air, 4)):
+        frames = exposures(mean, count, [3, len(name)], 5.0)
+        pages = [Image.fromarray((f + 100.5).clip(0, 65535).astype(np.uint16)) for f in frames]
+        pages[0].save(folder / f"{name}.tif", save_all=True, append_images=pages[1:])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def calibration(folder):
+    path = folder / "etalon.nc"
+    said = printed(
+        "calibrate", folder / "laser.tif", "--instrument", folder / "mine.yaml", "-o", path
+    )
+    assert "camera tilt" in said and path.with_suffix(".png").is_file()
+    return path
+
+
+def test_speeds_agree_within_their_errors(folder, calibration):
+    """Four frames each way: chi-square of the normalised errors to 1e-4 (23.5 for 4)."""
+    for more in (["--reference", folder / "reference.tif"], []):
+        out = folder / "v.nc"
+        printed(
+            *("v_los", folder / "air.tif", "--calibration", calibration, *more),
+            *("--instrument", folder / "mine.yaml", "-o", out),
+        )
+        with xr.open_dataset(out) as found:
+            error = np.hypot(found["v_los_std"], found["v_los_systematic"])
+            assert float(error.max()) < 0.2
+            assert float((((found["v_los"] - SPEED) / error) ** 2).sum()) < 23.5
+            assert (found["status"] == "").all()
+
+
+def test_without_calibration_the_frames_are_refused(folder):
+    said = failed("v_los", folder / "air.tif", "--instrument", folder / "mine.yaml")
+    assert "no frame has a speed" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["calibrate", "air.tif", "--set", "doppler.camera.width=200"], "200 x 195 px"),
+        (["calibrate", "mine.yaml"], "mine.yaml"),
+        (["v_los", "air.tif", "--calibration", "v.tif"], "v.tif"),
+        (["v_los", "air.tif", "--reference", "laser.tif", "--reference", "air.tif"], "reference"),
+    ],
+)
+def test_wrong_input_is_one_line(folder, calibration, arguments, message):
+    paths = [folder / a if a.endswith((".tif", ".yaml")) else a for a in arguments]
+    said = failed(*paths, "--instrument", folder / "mine.yaml")
+    assert message in said and "Traceback" not in said
