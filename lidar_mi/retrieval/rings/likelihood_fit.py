@@ -43,15 +43,17 @@ from lidar_mi.retrieval.rings.mean_image import (
 )
 from lidar_mi.retrieval.rings.model import INSTRUMENT, PARAMETERS, PixelNoise, RingModel
 from lidar_mi.retrieval.rings.scoring import Scored, cell_variance, robust_scoring
+from lidar_mi.retrieval.threads import mapped
 
 METHODS = ("annular", "pixels")
 
-# Annuli per order of interference, for each significant harmonic: pi^2 / 3 / 10^2 = 3 % of the
-# information of the highest is lost, 0.8 % and less of the others.
-STEPS_PER_HARMONIC = 10
-SECTORS = 12
+# Annuli per order of interference, for each significant harmonic: pi^2 / 3 / 8^2 = 5 % of the
+# information of the highest is lost, 1.3 % and less of the others.
+STEPS_PER_HARMONIC = 8
+SECTORS = 8
 MOVES = 12  # of the cells toward the rings' centre
 CHUNK_BYTES = 256e6
+AT_ONCE = 16  # images: what they need fits into the cache
 SIGNIFICANT = 5.0  # standard deviations, the least amplitude of rings
 # standard deviations of chi-square above 1 from which stated errors grow with its root
 MISFIT = 4.0
@@ -200,7 +202,9 @@ def fit_rings(
         centre = model.centre
     task = _Task(model, noise or PixelNoise(), names, max_chi_square, centre, response)
     size = _chunk(model, method)
-    parts = [_fit(images[k : k + size], task, k, method) for k in range(0, len(images), size)]
+    # each thread has images of its own
+    starts = range(0, len(images), size)
+    parts = mapped(lambda k: _fit(images[k : k + size], task, k, method), starts)
     return _joined(parts)
 
 
@@ -248,7 +252,7 @@ def _chunk(model: RingModel, method: str) -> int:
     if method == "annular":
         steps = STEPS_PER_HARMONIC * strongest(model)
         cells = min(cells, steps * SECTORS * int(1 + cells // model.order_spacing))
-    return max(1, int(CHUNK_BYTES // (300 * cells + 12 * math.prod(model.shape))))
+    return max(1, min(AT_ONCE, int(CHUNK_BYTES // (300 * cells + 12 * math.prod(model.shape)))))
 
 
 class _Task(NamedTuple):
