@@ -271,13 +271,6 @@ def _residual(mean: torch.Tensor, state: _State, noise, count: int, response) ->
     return torch.where(response > 0, (mean / used - expected) * (used * count / variance).sqrt(), 0)
 
 
-def _spots(mean: torch.Tensor, noise, count: int) -> torch.Tensor:
-    """Pixels whose mean is far from the median of their neighbours: the hottest, and dead ones."""
-    near = torch.from_numpy(median_filter(mean.numpy(), 5)).clamp(min=0)
-    std = (noise.variance(near, near) / count).sqrt()
-    return (mean - near).abs() > _BAD * std + 0.5 * near
-
-
 def _bad_pixels(mean, state: _State, noise, count: int, response) -> torch.Tensor:
     """Further ones that are far from the model and from their neighbours: dust, warm pixels."""
     residual = _residual(mean, state, noise, count, response).numpy()

@@ -2,8 +2,10 @@
 
 import numpy as np
 import torch
+from scipy.ndimage import median_filter
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.model import PixelNoise
 from lidar_mi.retrieval.threads import mapped
 
 # The highest value is the end of the scale if it has more than this fraction of the pixels, and
@@ -12,6 +14,7 @@ from lidar_mi.retrieval.threads import mapped
 # square root of the depth.
 PLATEAU = 1e-3
 EXCESS = 4.0
+SPOT = 6.0  # standard deviations
 STRIDE = 7  # of the pixels that are looked at first; prime, so that it follows no column
 
 
@@ -73,6 +76,24 @@ def _check(image: torch.Tensor, number: int, saturation: float | None) -> None:
                 f"images[{number}]: saturated, {count} pixels share the highest value "
                 f"{float(top):g}; expected an exposure within the camera's range"
             )
+
+
+def spots(image: torch.Tensor, noise: PixelNoise, count: int = 1) -> torch.Tensor:
+    """Pixels that are far from the median of their neighbours: hot and dead ones, dust, cosmics.
+
+    Parameters
+    ----------
+    image : torch.Tensor, shape (height, width)
+        Electrons, the mean of ``count`` images.
+
+    Returns
+    -------
+    torch.Tensor of bool, shape (height, width)
+    """
+    near = torch.from_numpy(median_filter(image.cpu().numpy(), 5)).to(image).clamp(min=0)
+    std = (noise.variance(near, near) / count).sqrt()
+    # crests are sharper than the median of 5 px, but not by half
+    return (image - near).abs() > SPOT * std + 0.5 * near
 
 
 def inside(x: float, y: float, shape: tuple[int, int], name: str = "centre") -> None:

@@ -29,7 +29,7 @@ from lidar_mi.retrieval.rings.bound import (
 )
 from lidar_mi.retrieval.rings.cells import annular_sectors
 from lidar_mi.retrieval.rings.centre import gradient_centre
-from lidar_mi.retrieval.rings.frames import checked, inside
+from lidar_mi.retrieval.rings.frames import checked, inside, spots
 from lidar_mi.retrieval.rings.mean_image import (
     Waves,
     light_on,
@@ -42,7 +42,7 @@ from lidar_mi.retrieval.rings.mean_image import (
     strongest,
 )
 from lidar_mi.retrieval.rings.model import INSTRUMENT, PARAMETERS, PixelNoise, RingModel
-from lidar_mi.retrieval.rings.scoring import Scored, cell_variance, robust_scoring
+from lidar_mi.retrieval.rings.scoring import POOR, Scored, cell_variance, robust_scoring
 from lidar_mi.retrieval.threads import mapped
 
 METHODS = ("annular", "pixels")
@@ -54,6 +54,7 @@ SECTORS = 8
 MOVES = 12  # of the cells toward the rings' centre
 CHUNK_BYTES = 256e6
 AT_ONCE = 16  # images: what they need fits into the cache
+MOST_SPOTS = 0.02  # of the pixels may be hot or dead
 SIGNIFICANT = 5.0  # standard deviations, the least amplitude of rings
 # standard deviations of chi-square above 1 from which stated errors grow with its root
 MISFIT = 4.0
@@ -264,6 +265,7 @@ class _Task(NamedTuple):
     max_chi_square: float
     centre: tuple[float, float] | None
     response: torch.Tensor | None
+    spotless: bool = False
 
     @property
     def moves(self) -> bool:
@@ -299,7 +301,24 @@ def _fit(images, task: _Task, number: int, method: str) -> RingFit:
             start = float(fit.of("x")[k]), float(fit.of("y")[k])
             alone = _fit(images[k, None], task._replace(centre=start), number + k, method)
             fit = _joined([_part(fit, slice(0, k)), alone, _part(fit, slice(k + 1, None))])
+    if method == "annular" and not task.spotless:
+        fit = _without_spots(fit, images, task, number)
     _check(fit, task, number)
+    return fit
+
+
+def _without_spots(fit: RingFit, images, task: _Task, number: int) -> RingFit:
+    """Images that fit poorly again, without their hot and dead pixels, if they have any."""
+    for k in (fit.chi_square > POOR).nonzero()[:, 0].tolist():
+        bad = spots(images[k].double(), task.noise)
+        if 0 < bad.sum() < MOST_SPOTS * bad.numel():
+            given = torch.ones_like(bad).double() if task.response is None else task.response
+            place = float(fit.of("x")[k]), float(fit.of("y")[k])
+            clean = task._replace(
+                response=torch.where(bad, 0.0, given), spotless=True, centre=place
+            )
+            alone = _fit(images[k, None], clean, number + k, "annular")
+            fit = _joined([_part(fit, slice(0, k)), alone, _part(fit, slice(k + 1, None))])
     return fit
 
 

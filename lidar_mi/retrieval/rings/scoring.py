@@ -20,6 +20,7 @@ CLOSE = 1e-3  # standard deviations, largest last step of a fit that has converg
 # Cells beyond so many standard deviations hold hot pixels or dust and are left out, unless more
 # than this fraction is: then the model is wrong, and chi-square shall say so.
 OUTLIER, MOST_OUTLIERS = 5.0, 0.03
+POOR = 1.2  # chi-square of a fit that something is wrong with
 
 
 class Scored(NamedTuple):
@@ -58,6 +59,11 @@ def robust_scoring(
         if all(torch.equal(a, b) for a, b in zip(left, kept, strict=True)):
             break
         kept, parameters = left, end.parameters
+    # where the rest does not fit either, it is the model that is wrong: no cell is to blame
+    wrong = (end.chi_square > POOR) & (end.outliers > 0)
+    if wrong.any():
+        kept = [part | wrong[:, None] for part in end.kept]
+        end = _scoring(blocks, means, kept, end.parameters, model, noise, names, number)
     return end
 
 
