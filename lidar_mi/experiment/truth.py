@@ -65,7 +65,7 @@ def make_truth(
     Raises
     ------
     InputError
-        A file that is missing or inconsistent with the experiment.
+        A file that is missing or inconsistent with the experiment; an experiment without a wake.
 
     Examples
     --------
@@ -75,6 +75,8 @@ def make_truth(
     >>> truth.wind["v"].dims, len(truth.extinction)
     (('z', 'y'), 2)
     """
+    if experiment.wake is None:
+        raise InputError(f"wake: missing in {experiment.name}; expected the section of a wake")
     beside = experiment.folder if beside is None else beside
     first, second = flows or read_flows(experiment, beside)
     mapping = experiment.wake.extinction

@@ -295,7 +295,8 @@ def check_yaml(block):
     elif block.file:
         Path(block.file).write_text(block.text)
         for experiment in reading.load_variants(block.file).values() or [reading.load(block.file)]:
-            truth.make_truth(experiment)
+            if experiment.wake:
+                truth.make_truth(experiment)
     else:
         loaded = reading.check({**BASE, **data}, block.place)
         scatterer(loaded.scattering, wavelength=loaded.lidar.wavelength)  # finds the tables

@@ -7,6 +7,7 @@ import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import norm, qmc
 
+import lidar_mi as lm
 from lidar_mi.experiment.truth import blur_by_beam
 from lidar_mi.instrument.lidar import BackscatterLidar
 
@@ -44,3 +45,8 @@ def test_oblique_beams_smear_the_plane_over_the_gate(duration):
     for other in (0.0, 1.05 * depth):
         wrong = blur_by_beam(rough, lidar, distance, other).values[6:-6, 6:-6]
         assert np.std(wrong - expected) > 3e-4
+
+
+def test_experiment_without_a_wake_has_no_truth():
+    with pytest.raises(lm.InputError, match="wake: missing in fringes"):
+        lm.make_truth(lm.load_experiment("fringes"))
