@@ -14,6 +14,7 @@ from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
 from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.rings.calibration import Calibration
+from .retrieval.rings.gap import Gap, gap_from_fractions, gap_from_lines
 from .retrieval.velocimetry.common_grid import on_one_grid
 from .retrieval.velocimetry.quality import Flag
 from .retrieval.velocimetry.volume import retrieve_wind_volume
@@ -29,6 +30,7 @@ __all__ = [
     "Calibration",
     "Experiment",
     "Flag",
+    "Gap",
     "InputError",
     "Rings",
     "Run",
@@ -40,6 +42,8 @@ __all__ = [
     "experiments",
     "fit_vortices",
     "fit_vortices_to_wind",
+    "gap_from_fractions",
+    "gap_from_lines",
     "load_experiment",
     "make_truth",
     "on_one_grid",

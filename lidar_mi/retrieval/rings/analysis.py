@@ -128,6 +128,8 @@ class Rings(Tabular):
                     )
                 )
         steps = "too few rings to test" if math.isnan(self.misfit) else f"{self.misfit:.2g} orders"
+        if self.doubt:
+            whole.append(("doubtful", self.doubt))
         whole += [
             ("rms deviation from equal steps", steps),
             ("rms deviation of crests from the rings", f"{self.roundness:.2g} px"),
@@ -189,6 +191,8 @@ def analyse_rings(
     >>> print("{:.1f} {:.1f}".format(*rings.centre), f"{rings.spacing:.0f}")
     150.5 99.0 4000
     """
+    if spacing is not None and not 0 < spacing < math.inf:
+        raise InputError(f"spacing: {spacing:g} px^2 is not allowed; expected above 0")
     image = checked(image, saturation)
     if len(image) != 1:
         raise InputError(f"image: {len(image)} images are not allowed; expected one")
@@ -235,8 +239,7 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     high = sectors.profile[places] - sectors.profile.min()
     places = sectors.r2[places[high > CREST * high.max()]]
     profile = Profile(sectors.profile_r2, sectors.profile, sectors.profile_count, sectors.step)
-    # differences of second order are noise alone: of variance 6 for white noise of 1
-    noise = float(np.median(np.diff(profile.value * profile.root, 2) ** 2) / 0.4549 / 6)
+    noise = sectors.noise() / sectors.profile_count[sectors.profile_count > 0].mean()
     found = find_pattern(profile, noise, spacing)
     radii = ", ".join(f"{math.sqrt(place):.0f}" for place in places)
     wrong = InputError(

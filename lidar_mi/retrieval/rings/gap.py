@@ -121,10 +121,10 @@ def gap_from_fractions(
     --------
     A gap of 0.885 mm, and lines 0.113 nm apart measured to 0.001 orders:
 
-    >>> from lidar_mi.retrieval.rings.gap import gap_from_fractions
+    >>> import lidar_mi as lm
     >>> lines = 487.986e-9, 487.873e-9
     >>> fraction = [2 * 0.885e-3 / line % 1 for line in lines]
-    >>> found = gap_from_fractions(fraction, [1e-3, 1e-3], lines, 0.9e-3, 0.1e-3)
+    >>> found = lm.gap_from_fractions(fraction, [1e-3, 1e-3], lines, 0.9e-3, 0.1e-3)
     >>> f"{1e3 * found.gap:.3f} +- {1e3 * found.gap_std:.3f} mm"
     '0.885 +- 0.001 mm'
     """
@@ -243,6 +243,21 @@ def gap_from_lines(
     InputError
         Another number of lines than of wavelengths, lines of about one height that would give gaps
         in either order of the wavelengths, and as `gap_from_fractions`.
+
+    Examples
+    --------
+    Rings of two lines, the second a third as high as the first:
+
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> y, x = np.mgrid[:200, :300]
+    >>> r2 = (x - 150.5) ** 2 + (y - 99.0) ** 2
+    >>> lines = np.array([487.986e-9, 487.873e-9])
+    >>> order = r2[..., None] / (5000 * lines / lines[0]) - 2 * 0.885e-3 / lines
+    >>> image = 1 / (1 + 60 * np.sin(np.pi * order) ** 2) @ [3, 1]
+    >>> found = lm.gap_from_lines(lm.analyse_rings(image), lines, 0.9e-3, 0.1e-3)
+    >>> f"{1e3 * found.gap:.3f} mm"
+    '0.885 mm'
     """
     lines = len(rings.fraction)
     if len(wavelength) != lines:

@@ -18,6 +18,7 @@ LINES = 3  # largest number of lines
 MULTIPLES = 6  # the strongest period may be this harmonic of the order
 FAINT = 0.02  # of the strongest line, the least height of a line
 SIGNIFICANT = 5.0  # standard errors, likewise
+FLANK = 0.2  # likewise, of a line within 1.2 widths of another
 DISTINCT = 0.8  # full widths, the least distance of lines
 MATERIAL = 2e-3  # of the pattern's power, the least that a longer spacing must explain in addition
 DOUBTFUL = 4.0  # factor from MATERIAL within which the choice of the spacing is doubtful
@@ -217,6 +218,19 @@ class Profile:
         linear = self.residual(pattern)[2][3:].reshape(len(pattern.fraction), -1)
         return float(np.abs(linear @ 0.3 ** np.arange(linear.shape[1])).max())
 
+    def crest(self, pattern: Pattern) -> np.ndarray:
+        """Value at each line less that one width beside it, mean over the orders."""
+        found = []
+        for fraction in pattern.fraction:
+            orders = np.arange(1, self.last / pattern.spacing - 1)
+            place = (orders + fraction) * pattern.spacing
+            beside = pattern.width * pattern.spacing
+            middle, low, high = (
+                np.interp(place + by, self.r2, self.value) for by in (0.0, -beside, beside)
+            )
+            found.append((middle - (low + high) / 2).mean() if len(place) else np.inf)
+        return np.array(found)
+
     def height_std(self, pattern: Pattern, noise: float) -> np.ndarray:
         """Standard errors of the relative heights for weighted noise of that variance."""
         _, columns, linear = self.residual(pattern)
@@ -279,16 +293,19 @@ def lines_at(profile: Profile, spacing: float, noise: float, most: int = LINES) 
         return None
     chosen, left = best, profile.matched(best)
     while len(best.fraction) < most:
-        std = profile.height_std(best, noise).min()
-        if np.abs(left[1]).max() < profile.top(best) * max(FAINT / 2, SIGNIFICANT * std):
+        expected = noise * (best.freedom + SIGNIFICANT * math.sqrt(2 * best.freedom))
+        if best.unexplained < max(expected, FAINT**2 / 4 * best.power):
             break
         # two further lines may be needed before either helps
-        best = min(map(profile.fitted, _starts(best, left)), key=lambda p: p.unexplained)
+        tried = sorted(map(profile.fitted, _starts(best, left, most)), key=lambda p: p.unexplained)
+        for one in tried:
+            if _plausible(one, profile, noise):
+                chosen = one
+                break
+        best = next((one for one in tried if len(one.fraction) < most), tried[0])
         left = profile.matched(best)
         if best.height.min() <= 0:
             break
-        if _plausible(best, profile, noise, left):
-            chosen = best
     return _sorted(chosen)
 
 
@@ -299,31 +316,42 @@ def _first(profile: Profile, spacing: float, loss: float) -> Pattern:
     return Pattern(spacing, fraction[[height.argmax()]], one, loss, 0.0)
 
 
-def _starts(pattern: Pattern, left) -> list[Pattern]:
-    """A line more: where most is left, or the highest line split into two."""
-    more = np.ones(len(pattern.fraction) + 1)
+def _starts(pattern: Pattern, left, most: int) -> list[Pattern]:
+    """Further lines: where most is left, or the highest line split into two or three."""
     fraction, height = left
-    added = replace(pattern, fraction=np.append(pattern.fraction, fraction[height.argmax()]))
-    split = pattern.fraction.copy()
     top = int(pattern.height.argmax())
+    others = np.delete(pattern.fraction, top)
     half = max(0.35 * pattern.width, 0.02)
-    split[top] -= half
-    apart = replace(
-        pattern,
-        fraction=np.append(split, pattern.fraction[top] + half),
-        loss=max(pattern.loss / 2, 0.05),
-        spread=pattern.spread / 4,
-    )
-    return [replace(one, height=more) for one in (added, apart)]
+    added = replace(pattern, fraction=np.append(pattern.fraction, fraction[height.argmax()]))
+    narrow = replace(pattern, loss=max(pattern.loss / 2, 0.05), spread=pattern.spread / 4)
+    three = np.array([-1, 0, 1])
+    parts = [half * three[::2], 1.4 * half * three, 2.2 * half * three]
+    split = [
+        replace(narrow, fraction=np.append(others, pattern.fraction[top] + part))
+        for part in parts
+        if len(others) + len(part) <= most
+    ]
+    return [replace(one, height=np.ones(len(one.fraction))) for one in (added, *split)]
 
 
-def _plausible(pattern: Pattern, profile: Profile, noise: float, left) -> bool:
-    fraction = np.sort(pattern.fraction % 1)
+def _plausible(pattern: Pattern, profile: Profile, noise: float) -> bool:
+    if pattern.height.min() <= 0:
+        return False
+    fractions = pattern.fraction % 1
+    fraction = np.sort(fractions)
     distance = np.diff(np.append(fraction, fraction[0] + 1))
     std = profile.height_std(pattern, noise)
-    floor = np.abs(left[1]).max()
-    least = np.maximum(SIGNIFICANT * std, max(FAINT, 2 * floor / profile.top(pattern)))
-    return bool((pattern.height > least).all() and distance.min() > DISTINCT * pattern.width)
+    top = profile.top(pattern)
+    floor = np.abs(profile.matched(pattern)[1]).max() / top
+    least = np.maximum(SIGNIFICANT * std, max(FAINT, 2 * floor))
+    if (pattern.height < least).any() or distance.min() < DISTINCT * pattern.width:
+        return False
+    # a line away from the others has a crest of its own, which their wings have not; one in a
+    # flank must be high, or it mends a shape that is not Airy's
+    nearest = np.minimum(distance, np.roll(distance, 1))[np.argsort(np.argsort(fractions))]
+    crest = profile.crest(pattern) / top > 0.2 * pattern.height
+    apart = nearest > 1.2 * pattern.width
+    return bool(np.where(apart, crest, pattern.height > FLANK).all())
 
 
 def _sorted(pattern: Pattern) -> Pattern:

@@ -106,3 +106,11 @@ class Sectors:
         )
         self.profile = np.interp(self.r2, self.r2[known], mean)
         self.profile_r2 = np.interp(self.r2, self.r2[known], mean_r2)
+
+    def noise(self) -> float:
+        """Variance of a pixel: neighbouring sectors of an annulus differ by little else."""
+        ahead, number = np.roll(self.value, -1, 0), np.roll(self.count, -1, 0)
+        both = (self.count > 0) & (number > 0)
+        share = 1 / self.count[both] + 1 / number[both]
+        # the median of squares of Gaussian numbers is 0.4549 of their mean
+        return float(np.median((self.value - ahead)[both] ** 2 / share)) / 0.4549
