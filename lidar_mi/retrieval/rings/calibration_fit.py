@@ -108,7 +108,7 @@ def calibrate_rings(
             raise InputError(
                 f"tolerances.{name}: {tolerances.get(name)!r} is not allowed; expected above 0"
             )
-    frames = checked(frames, None, None if response is None else response > 0)
+    frames = checked(frames, None, None if response is None else response > 0, "frames")
     if tuple(frames.shape[-2:]) != tuple(model.shape):
         sizes = " and ".join(f"{h} x {w}" for h, w in (frames.shape[-2:], model.shape))
         raise InputError(f"frames: sizes {sizes} px (height x width) of frames and model differ")
@@ -119,13 +119,17 @@ def calibrate_rings(
         )
     noise = noise or PixelNoise()
     mean = frames.mean(0, dtype=torch.float64)
-    centre = gradient_centre(mean)
+    # those that would lead the start astray; the others once there is a fit
+    hot = spots(mean, noise, len(frames))
+    whole = torch.where(hot, torch.from_numpy(median_filter(mean.numpy(), 3)), mean)
+    centre = gradient_centre(whole)
     inside(*centre, model.shape, "frames: centre")
     model = replace(
         model, light_degree=light_degree, background_degree=background_degree, centre=centre
     )
-    model = _near(model, mean, tolerances["focal_length"])
+    model = _near(model, whole, tolerances["focal_length"])
     given = torch.ones(model.shape, dtype=torch.float64) if response is None else response.double()
+    given = torch.where(hot, 0.0, given)
     start = fit_rings(frames, model, noise, centre=centre, response=given, max_chi_square=math.inf)
     first = start.values.clone()
     first[:, PARAMETERS.index("x")] = first[:, PARAMETERS.index("y")] = 0.0

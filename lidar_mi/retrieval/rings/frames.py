@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from scipy.ndimage import median_filter
+from scipy.ndimage import rank_filter
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.model import PixelNoise
@@ -19,11 +19,15 @@ STRIDE = 7  # of the pixels that are looked at first; prime, so that it follows 
 
 
 def checked(
-    images: torch.Tensor, saturation: float | None = None, used: torch.Tensor | None = None
+    images: torch.Tensor,
+    saturation: float | None = None,
+    used: torch.Tensor | None = None,
+    what: str = "images",
 ) -> torch.Tensor:
     """The images as a batch (images, height, width) of floats.
 
     Pixels that are not ``used`` (height, width) may have any value; they become the least one.
+    ``what`` names them in messages.
 
     Raises
     ------
@@ -33,11 +37,11 @@ def checked(
     if not isinstance(images, torch.Tensor):
         images = np.array(images)
         if images.dtype.kind not in "fiub":
-            raise InputError(f"images: {images.dtype} is not allowed; expected real numbers")
+            raise InputError(f"{what}: {images.dtype} is not allowed; expected real numbers")
         images = torch.as_tensor(images)
     if images.ndim not in (2, 3) or min(images.shape) < 1 or min(images.shape[-2:]) < 16:
         raise InputError(
-            f"images: shape {tuple(images.shape)} is not allowed; expected (height, width) or "
+            f"{what}: shape {tuple(images.shape)} is not allowed; expected (height, width) or "
             "(images, height, width) of 16 px or more each way"
         )
     if images.ndim == 2:
@@ -46,21 +50,23 @@ def checked(
         images = images.float()
     if used is not None and used.shape == images.shape[-2:]:
         images = torch.where(used, images, images[:, used].nan_to_num().min())
-    mapped(lambda number: _check(images[number], number, saturation), range(len(images)))
+    mapped(
+        lambda number: _check(images[number], f"{what}[{number}]", saturation), range(len(images))
+    )
     return images
 
 
-def _check(image: torch.Tensor, number: int, saturation: float | None) -> None:
+def _check(image: torch.Tensor, name: str, saturation: float | None) -> None:
     low, top = torch.aminmax(image)  # NaN where there is one
     if not torch.isfinite(top - low):
         number_bad = int((~torch.isfinite(image)).sum())
         raise InputError(
-            f"images[{number}]: {number_bad} pixel(s) of NaN or infinity; expected finite values"
+            f"{name}: {number_bad} pixel(s) of NaN or infinity; expected finite values"
         )
     if saturation is not None and top >= saturation:
         number_full = int((image >= saturation).sum())
         raise InputError(
-            f"images[{number}]: saturated, {number_full} pixel(s) at or above {saturation:g}; "
+            f"{name}: saturated, {number_full} pixel(s) at or above {saturation:g}; "
             "expected all below"
         )
     # most images have their highest value once: every seventh pixel would hold 100 of a plateau
@@ -73,13 +79,13 @@ def _check(image: torch.Tensor, number: int, saturation: float | None) -> None:
         below = int((image == image[~full].max()).sum())
         if count > EXCESS * below:
             raise InputError(
-                f"images[{number}]: saturated, {count} pixels share the highest value "
+                f"{name}: saturated, {count} pixels share the highest value "
                 f"{float(top):g}; expected an exposure within the camera's range"
             )
 
 
 def spots(image: torch.Tensor, noise: PixelNoise, count: int = 1) -> torch.Tensor:
-    """Pixels that are far from the median of their neighbours: hot and dead ones, dust, cosmics.
+    """Pixels far above or below all but two of their neighbours: hot and dead ones, dust.
 
     Parameters
     ----------
@@ -90,10 +96,16 @@ def spots(image: torch.Tensor, noise: PixelNoise, count: int = 1) -> torch.Tenso
     -------
     torch.Tensor of bool, shape (height, width)
     """
-    near = torch.from_numpy(median_filter(image.cpu().numpy(), 5)).to(image).clamp(min=0)
-    std = (noise.variance(near, near) / count).sqrt()
-    # crests are sharper than the median of 5 px, but not by half
-    return (image - near).abs() > SPOT * std + 0.5 * near
+    around = np.ones((5, 5), bool)
+    around[2, 2] = False
+    # all but two of the neighbours: a ring as narrow as a pixel has four more of its pixels there
+    high, low = (
+        torch.from_numpy(rank_filter(image.cpu().numpy(), rank, footprint=around)).to(image)
+        for rank in (-3, 2)
+    )
+    high, low = high.clamp(min=0), low.clamp(min=0)
+    std = [SPOT * (noise.variance(near, near) / count).sqrt() for near in (high, low)]
+    return (image > 1.5 * high + std[0]) | (image < 0.5 * low - std[1])
 
 
 def inside(x: float, y: float, shape: tuple[int, int], name: str = "centre") -> None:

@@ -5,6 +5,8 @@ The radius is in half diagonals of the image, from its middle. They describe lig
 the `falloff` about the rings' centre, so it is not among the light's terms.
 """
 
+import math
+
 import torch
 
 from lidar_mi.errors import InputError
@@ -18,7 +20,7 @@ def term_names(kind: str, degree: int) -> tuple[str, ...]:
     Raises
     ------
     InputError
-        A degree that is not 0 to 4.
+        A degree that is not 0 to `MOST_DEGREE`.
     """
     if degree not in range(MOST_DEGREE + 1):
         raise InputError(f"{kind} degree: {degree!r} is not allowed; expected 0 to {MOST_DEGREE}")
@@ -29,13 +31,24 @@ def term_names(kind: str, degree: int) -> tuple[str, ...]:
 
 def term_values(names: tuple[str, ...], u: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
     """Values at places (u, v), half diagonals from the middle; shape (places, names)."""
-    wave = torch.complex(u, v)
+    indices = [tuple(map(int, name.split("_")[1:])) for name in names]
+    # n - |m| is even: products of r e^(i phi) and r^2, no roots or powers of all pixels
+    highest = max((n for n, _ in indices), default=0)
+    waves, squares = [torch.complex(u, v)], [u**2 + v**2]
+    for _ in range(1, highest):
+        waves.append(waves[-1] * waves[0])
+    for _ in range(1, highest // 2):
+        squares.append(squares[-1] * squares[0])
     columns = []
-    for name in names:
-        n, m = map(int, name.split("_")[1:])
-        angular = wave ** abs(m)
-        columns.append((wave.abs() ** (n - abs(m))) * (angular.imag if m < 0 else angular.real))
-    return torch.stack(columns, 1) if columns else u.new_zeros((len(u), 0))
+    for n, m in indices:
+        factors = []
+        if m:
+            factors.append(waves[abs(m) - 1].imag if m < 0 else waves[m - 1].real)
+        if n > abs(m):
+            factors.append(squares[(n - abs(m)) // 2 - 1])
+        columns.append(math.prod(factors))
+    # every term's values lie side by side in memory
+    return torch.stack(columns).T if columns else u.new_zeros((len(u), 0))
 
 
 def _indices(degree: int) -> list[tuple[int, int]]:
