@@ -317,8 +317,9 @@ def before_calibration(effort) -> Check:
     height, width = INSTRUMENT.binned(binning).shape
     text = (
         f"{pairs} pulses at {SPEED:g} m/s, {PHOTONS:.1e} photons in every frame of {width} x "
-        f"{height} pixels, {READ_NOISE:g} electrons of read noise. *Random*: standard error stated. *Within 1*, *within 1.96*: "
-        "fraction of the errors below so many standard errors stated (expected 68 and 95 %)."
+        f"{height} pixels, {READ_NOISE:g} electrons of read noise. *Random*: standard error "
+        "stated. *Within 1*, *within 1.96*: fraction of the errors "
+        "below so many standard errors stated (expected 68 and 95 %)."
     )
     return Check("Before calibration", "\n".join([text, "", *table(found)]), tuple(rows))
 

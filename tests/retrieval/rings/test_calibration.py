@@ -1,4 +1,4 @@
-"""Calibration from laser frames of an instrument with all defects at once, made without the program.
+"""Calibration from laser frames, made without the program, of an instrument with all defects.
 
 Detects: a tilt, distortion, blur, focal length, centre or finesse that is off by 5 standard errors,
 covariances of half or twice their size (slow: over independent calibrations), a file that loses a

@@ -90,7 +90,7 @@ def test_numbers_that_cannot_be(change, message):
 
 
 def test_limits_and_fillings_that_cannot_be():
-    with pytest.raises(InputError, match="limit: 0.5 m/s .* at least 1.77 m/s"):
+    with pytest.raises(InputError, match=r"limit: 0.5 m/s .* at least 1.77 m/s"):
         ReferenceError(**KNOWN, laser_drift=10e6).scrambling_for(0.5)
     with pytest.raises(InputError, match="filling: radius 0"):
         Filling(0.0)
