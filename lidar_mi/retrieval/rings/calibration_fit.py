@@ -24,7 +24,7 @@ from lidar_mi.retrieval.rings.analysis import analyse_rings
 from lidar_mi.retrieval.rings.bound import fisher_matrix
 from lidar_mi.retrieval.rings.calibration import Calibration
 from lidar_mi.retrieval.rings.centre import gradient_centre
-from lidar_mi.retrieval.rings.frames import checked, inside
+from lidar_mi.retrieval.rings.frames import checked, inside, spots
 from lidar_mi.retrieval.rings.likelihood_fit import annular_waves, fit_rings
 from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, pixel_waves
 from lidar_mi.retrieval.rings.model import INSTRUMENT, LIGHT, PARAMETERS, PixelNoise, RingModel
