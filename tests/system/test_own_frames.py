@@ -6,12 +6,17 @@ nominal ones, light that differs between laser and air. Detects a speed that is 
 its error, a calibration that does not survive its file, and bad input that ends in a traceback.
 """
 
+import io
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+
 import numpy as np
 import pytest
 import xarray as xr
 from PIL import Image
 
-from tests.support.command_line import shell, words_of
+from lidar_mi.cli.app import main
+from tests.support.command_line import words_of
 from validation.fringe_reference import (
     Defects,
     Instrument,
@@ -44,16 +49,26 @@ DEFECTS = Defects(
 )
 
 
+def called(*arguments):
+    """Exit code of a command in this process, and all that it printed."""
+    said = io.StringIO()
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(said), redirect_stderr(said):
+        patch.setattr(sys, "argv", ["lidar-mi", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+    return stop.value.code or 0, words_of(said.getvalue())
+
+
 def printed(*arguments):
-    done = shell(*arguments)
-    assert done.returncode == 0, done.stderr
-    return words_of(done.stdout)
+    code, said = called(*arguments)
+    assert code == 0, said
+    return said
 
 
 def failed(*arguments):
-    done = shell(*arguments)
-    assert done.returncode == 2
-    return words_of(done.stdout + done.stderr)
+    code, said = called(*arguments)
+    assert code == 2, said
+    return said
 
 
 @pytest.fixture(scope="module")
