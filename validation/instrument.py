@@ -24,7 +24,7 @@ from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.retrieval.rings.calibration import calibrated
 from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
 from lidar_mi.retrieval.rings.likelihood_fit import RingFit, difference, fit_rings
-from lidar_mi.retrieval.rings.reference_error import Filling, ReferenceError
+from lidar_mi.retrieval.rings.reference_error import Filling, ReferenceUncertainty
 
 from .fringe_reference import LIGHT, Defects, Instrument, Light, air_frame, exposures, laser_frame
 from .report import Check, Row
@@ -79,10 +79,10 @@ CASES: dict[str, Defects] = {
 }
 
 _ETALON = {"wavelength": INSTRUMENT.wavelength, "gap": INSTRUMENT.gap}
-KNOWN: dict[str, ReferenceError] = {
-    DRIFT: ReferenceError(**_ETALON, laser_drift=10e6),
-    BOW: ReferenceError(**_ETALON, bow=_HUNDREDTH, laser=Filling(radius=0.5)),
-    WEDGE: ReferenceError(**_ETALON, wedge=_HUNDREDTH, air=Filling(shift=0.05)),
+KNOWN: dict[str, ReferenceUncertainty] = {
+    DRIFT: ReferenceUncertainty(**_ETALON, laser_drift=10e6),
+    BOW: ReferenceUncertainty(**_ETALON, bow=_HUNDREDTH, laser=Filling(radius=0.5)),
+    WEDGE: ReferenceUncertainty(**_ETALON, wedge=_HUNDREDTH, air=Filling(shift=0.05)),
 }
 """What frames of the laser cannot show, as it is known beside them."""
 MENDED = tuple(case for case in CASES if case not in KNOWN)
@@ -219,7 +219,7 @@ def measured(
     seed: int,
     retrieval: Retrieval,
     instrument: Instrument = INSTRUMENT,
-    known: ReferenceError | None = None,
+    known: ReferenceUncertainty | None = None,
 ) -> dict[str, Outcome]:
     """The retrieval's errors over ``pairs`` pulses of an instrument with the defects.
 

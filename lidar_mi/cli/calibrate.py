@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, Overwrite
+from lidar_mi.cli.options import Changes, Electrons, NominalInstrument, Overwrite
 from lidar_mi.cli.terminal import output, print_table
 from lidar_mi.errors import InputError
 
@@ -23,24 +23,12 @@ def calibrate(
             "(also cubes); two at least, twenty are good."
         ),
     ],
-    instrument: Annotated[
-        str,
-        typer.Option(
-            help="The nominal instrument: an experiment file with the section doppler, or the "
-            "name of a shipped one."
-        ),
-    ] = "fringes",
+    instrument: NominalInstrument = "fringes",
     changes: Changes = None,
     flat: Annotated[
         list[Path] | None, typer.Option(help="Frames of even white light, once per file.")
     ] = None,
-    electrons: Annotated[
-        bool,
-        typer.Option(
-            "--electrons",
-            help="The files hold photoelectrons. Default: counts, of doppler.ccd's bias and gain.",
-        ),
-    ] = False,
+    electrons: Electrons = False,
     light_degree: Annotated[int, typer.Option(help="Degree of the illumination's polynomial.")] = 2,
     background_degree: Annotated[
         int, typer.Option(help="Degree of the background's polynomial; 8 for stray light.")

@@ -24,6 +24,21 @@ Variant = Annotated[
     ),
 ]
 
+NominalInstrument = Annotated[
+    str,
+    typer.Option(
+        "--instrument",
+        help="The nominal instrument: an experiment file with the section doppler, or the name of "
+        "a shipped one.",
+    ),
+]
+Electrons = Annotated[
+    bool,
+    typer.Option(
+        "--electrons",
+        help="The files hold photoelectrons. Default: counts, of doppler.ccd's bias and gain.",
+    ),
+]
 Overwrite = Annotated[
     bool, typer.Option("--overwrite", help="Replace a file even if it is no result of lidar-mi.")
 ]

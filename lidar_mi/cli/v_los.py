@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, Overwrite
+from lidar_mi.cli.options import Changes, Electrons, NominalInstrument, Overwrite
 from lidar_mi.cli.terminal import output, print_table
 from lidar_mi.errors import InputError
 
@@ -33,21 +33,9 @@ def v_los(
     calibration: Annotated[
         Path | None, typer.Option(help="File of `lidar-mi calibrate`. Default: the nominal one.")
     ] = None,
-    instrument: Annotated[
-        str,
-        typer.Option(
-            help="The nominal instrument: an experiment file with the section doppler, or the "
-            "name of a shipped one."
-        ),
-    ] = "fringes",
+    instrument: NominalInstrument = "fringes",
     changes: Changes = None,
-    electrons: Annotated[
-        bool,
-        typer.Option(
-            "--electrons",
-            help="The files hold photoelectrons. Default: counts, of doppler.ccd's bias and gain.",
-        ),
-    ] = False,
+    electrons: Electrons = False,
     max_chi_square: Annotated[
         float | None,
         typer.Option(help="Frames that fit worse are refused. Default: doppler.retrieval's."),

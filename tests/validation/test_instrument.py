@@ -8,7 +8,7 @@ a calibration that leaves a defect (slow), a stated systematic error that is not
 import numpy as np
 import pytest
 
-from lidar_mi.retrieval.rings.reference_error import ReferenceError
+from lidar_mi.retrieval.rings.reference_error import ReferenceUncertainty
 from validation import instrument
 from validation.instrument import CASES, INSTRUMENT, Outcome, Retrieved
 
@@ -67,7 +67,7 @@ def test_retrievals_get_the_frames_of_a_pulse_and_their_errors_are_compared():
     assert found["guess"].coverage(1.96) == 0.75
     lines = instrument.table({"none": found}, systematic=True)
     assert "| none | +0.75 ± 1.13 | 1.00 | 0.75 | 75 % | 75 % | 1.00 |" in lines
-    beside = ReferenceError(wavelength=1e-6, gap=1e-2, laser_drift=2e6)
+    beside = ReferenceUncertainty(wavelength=1e-6, gap=1e-2, laser_drift=2e6)
     found = instrument.measured(CASES["none"], 4, 3, guess, SMALL, beside)
     assert found["guess"].systematic == pytest.approx(1.25)
 

@@ -10,7 +10,7 @@ from scipy.signal import find_peaks, peak_widths, savgol_coeffs, savgol_filter
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.frames import inside
-from lidar_mi.retrieval.rings.sectors import SECTORS, Geometry, Sectors
+from lidar_mi.retrieval.rings.sectors import SECTORS, RingCurves, Sectors
 
 SIGNIFICANT = 8.0  # standard deviations of the smoothed average, the least height of a ring
 PROMINENT = 0.1  # of the tallest ring's height, likewise
@@ -19,13 +19,13 @@ ALL_AROUND = 0.5  # of the sectors, in which a ring must be detected to determin
 ALIKE = 0.5  # least correlation of a sector with the mean
 
 
-def aligned(image: np.ndarray, start: Geometry, free: bool) -> Geometry:
+def aligned(image: np.ndarray, start: RingCurves, free: bool) -> RingCurves:
     """The rings' geometry, to a fraction of their width.
 
     Parameters
     ----------
     image : array, shape (height, width)
-    start : Geometry
+    start : RingCurves
         With a centre within about a third of a ring's width.
     free : bool
         Whether the centre is fitted.

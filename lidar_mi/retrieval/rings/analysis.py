@@ -18,8 +18,8 @@ from lidar_mi.retrieval.rings.alignment import aligned, crests
 from lidar_mi.retrieval.rings.centre import gradient_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
 from lidar_mi.retrieval.rings.pattern import Pattern, Profile, find_pattern
-from lidar_mi.retrieval.rings.ring_fit import RingFit, fit_all
-from lidar_mi.retrieval.rings.sectors import Geometry, Sectors
+from lidar_mi.retrieval.rings.ring_fit import CurveFit, fit_all
+from lidar_mi.retrieval.rings.sectors import RingCurves, Sectors
 from lidar_mi.tables import Table, Tabular, with_error
 
 LAW = 0.02  # orders, largest rms deviation from equal steps of an etalon's pattern
@@ -106,7 +106,7 @@ class Rings(Tabular):
 
     def curve(self, radius: float, angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Points (x, y) of a ring of that mean radius, at angles from x toward y."""
-        return Geometry(self.centre, self.ellipticity, self.tilt).curve(radius, angle)
+        return RingCurves(self.centre, self.ellipticity, self.tilt).curve(radius, angle)
 
     def tables(self) -> list[Table]:
         """Pattern and rings, with standard errors."""
@@ -200,7 +200,7 @@ def analyse_rings(
     free = centre is None
     centre = gradient_centre(image) if free else tuple(map(float, centre))
     inside(*centre, image.shape)
-    geometry = aligned(image, Geometry(centre), free)
+    geometry = aligned(image, RingCurves(centre), free)
     sectors = Sectors(image, geometry)
     pattern, doubt = _pattern(sectors, spacing)
     fit = fit_all(image, geometry, pattern, free)
@@ -270,7 +270,7 @@ class _Law:
     misfit: float
 
 
-def _law(fit: RingFit) -> _Law:
+def _law(fit: CurveFit) -> _Law:
     """Least squares of square = (order + fraction) spacing, weighted as for white noise.
 
     The standard errors are those of the rings; where the rings deviate more than these allow, at

@@ -62,7 +62,7 @@ class Filling:
 
 
 @dataclass(frozen=True)
-class ReferenceError:
+class ReferenceUncertainty:
     """What is known of the differences between the reference shot and the echo.
 
     Parameters

@@ -17,7 +17,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.alignment import ALL_AROUND, LEAST, shape_columns
 from lidar_mi.retrieval.rings.frames import inside
 from lidar_mi.retrieval.rings.pattern import Pattern, airy, blur
-from lidar_mi.retrieval.rings.sectors import SECTORS, Geometry, Sectors
+from lidar_mi.retrieval.rings.sectors import SECTORS, RingCurves, Sectors
 
 OUTLIER = 6.0  # standard deviations of an annulus's cells
 ROUNDS = 6
@@ -25,12 +25,12 @@ TWO_RINGS = 2.2  # orders, least extent of a sector whose height may change with
 
 
 @dataclass(frozen=True)
-class RingFit:
+class CurveFit:
     """Rings, with the covariance of everything fitted.
 
     Attributes
     ----------
-    geometry : Geometry
+    geometry : RingCurves
     pattern : Pattern
     sectors : Sectors
     order, line : arrays (rings,) of int
@@ -45,7 +45,7 @@ class RingFit:
         Rms deviation of the crests from the curves, px.
     """
 
-    geometry: Geometry
+    geometry: RingCurves
     pattern: Pattern
     sectors: Sectors
     order: np.ndarray
@@ -57,7 +57,7 @@ class RingFit:
     roundness: float
 
 
-def fit_all(image: np.ndarray, geometry: Geometry, pattern: Pattern, free: bool) -> RingFit:
+def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: bool) -> CurveFit:
     """Gauss-Newton from a geometry and a pattern that are nearly right.
 
     Ellipticity and tilt are fitted if two rings are in half of the sectors.
@@ -98,7 +98,7 @@ def fit_all(image: np.ndarray, geometry: Geometry, pattern: Pattern, free: bool)
     whole = np.zeros((6, 6))
     place = np.flatnonzero(system.fitted)
     whole[np.ix_(place, place)] = covariance[: len(place), : len(place)]
-    return RingFit(
+    return CurveFit(
         geometry=geometry,
         pattern=pattern,
         sectors=sectors,

@@ -18,18 +18,18 @@ SECTORS = 48
 
 
 @dataclass(frozen=True)
-class Geometry:
+class RingCurves:
     """Where rings lie: centre (x, y) in px, ellipticity, tilt in 1/px; (cosine, sine) parts."""
 
     centre: tuple[float, float]
     ellipticity: tuple[float, float] = (0.0, 0.0)
     tilt: tuple[float, float] = (0.0, 0.0)
 
-    def moved(self, by: np.ndarray) -> "Geometry":
+    def moved(self, by: np.ndarray) -> "RingCurves":
         """With six changes added: of centre, ellipticity and tilt."""
         whole = np.array([*self.centre, *self.ellipticity, *self.tilt]) + by
         pairs = (tuple(map(float, whole[k : k + 2])) for k in (0, 2, 4))
-        return Geometry(*pairs)
+        return RingCurves(*pairs)
 
     def curve(self, radius, angle) -> tuple[np.ndarray, np.ndarray]:
         """Points (x, y) of rings of these mean radii, at angles from x toward y."""
@@ -72,7 +72,7 @@ class Sectors:
         Mean over circles, of the value and of the squared radius; interpolated where no pixel is.
     """
 
-    def __init__(self, image: np.ndarray, geometry: Geometry):
+    def __init__(self, image: np.ndarray, geometry: RingCurves):
         height, width = image.shape
         centre = geometry.centre
         x, y = np.arange(width) - centre[0], np.arange(height)[:, None] - centre[1]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.rings.reference_error import Filling, ReferenceError
+from lidar_mi.retrieval.rings.reference_error import Filling, ReferenceUncertainty
 from validation.fringe_reference import LIGHT, Defects, Instrument, Light, pupil_orders
 
 NOMINAL = Instrument()
@@ -31,21 +31,21 @@ def test_plates_times_pupil_is_the_mean_gap(kind, radius, shift):
     defects = Defects(**{kind: RMS})
     light = Light(pupil=radius, pupil_shift=shift)
     expected = abs(mean_speed(defects, Light()) - mean_speed(defects, light))
-    known = ReferenceError(**KNOWN, **{kind: RMS}, laser=Filling(radius, shift))
+    known = ReferenceUncertainty(**KNOWN, **{kind: RMS}, laser=Filling(radius, shift))
     assert known.terms()[f"{kind} and pupil"] == pytest.approx(expected, rel=1e-9, abs=1e-9)
     assert known.total == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_sizes_of_a_real_instrument():
     """Half the radius of plates bowed by lambda/100 rms: 50 m/s; 10 MHz: 1.77 m/s; 1 K: 75 m/s."""
-    half = ReferenceError(**KNOWN, bow=RMS, laser=Filling(0.5))
+    half = ReferenceUncertainty(**KNOWN, bow=RMS, laser=Filling(0.5))
     assert half.total == pytest.approx(50.4, abs=0.1)
-    assert ReferenceError(**KNOWN, laser_drift=10e6).total == pytest.approx(1.7735, abs=1e-4)
-    assert ReferenceError(**KNOWN, etalon_drift=1.0).total == pytest.approx(74.95, abs=0.01)
+    assert ReferenceUncertainty(**KNOWN, laser_drift=10e6).total == pytest.approx(1.7735, abs=1e-4)
+    assert ReferenceUncertainty(**KNOWN, etalon_drift=1.0).total == pytest.approx(74.95, abs=0.01)
 
 
 def test_terms_are_independent():
-    known = ReferenceError(
+    known = ReferenceUncertainty(
         **KNOWN, laser_drift=1e6, etalon_drift=1e-3, bow=1e-11, wedge=2e-11, laser=Filling(0.8, 0.1)
     )
     terms = known.terms()
@@ -57,22 +57,24 @@ def test_scrambled_light_is_a_mixture_with_an_even_pupil():
     defects, light = Defects(bow=RMS, wedge=RMS), Light(pupil=0.6, pupil_shift=0.1)
     uneven, even = mean_speed(defects, light), mean_speed(defects, Light())
     mixed = 0.3 * even + 0.7 * uneven
-    known = ReferenceError(**KNOWN, bow=RMS, wedge=RMS, laser=Filling(0.6, 0.1), scrambling=0.3)
+    known = ReferenceUncertainty(
+        **KNOWN, bow=RMS, wedge=RMS, laser=Filling(0.6, 0.1), scrambling=0.3
+    )
     bow, wedge = (known.terms()[f"{kind} and pupil"] for kind in ("bow", "wedge"))
     # here their signs are opposite
     assert abs(bow - wedge) == pytest.approx(abs(mixed - even), rel=1e-9)
 
 
 def test_how_well_light_must_be_scrambled():
-    known = ReferenceError(**KNOWN, laser_drift=1e6, bow=RMS, laser=Filling(0.5))
+    known = ReferenceUncertainty(**KNOWN, laser_drift=1e6, bow=RMS, laser=Filling(0.5))
     factor = known.scrambling_for(0.5)
     # of 50.4 m/s remain (0.5^2 - 0.177^2)^(1/2)
     assert factor == pytest.approx(1 - math.sqrt(0.25 - 0.17735**2) / 50.4, abs=1e-4)
-    assert ReferenceError(
+    assert ReferenceUncertainty(
         **KNOWN, laser_drift=1e6, bow=RMS, laser=Filling(0.5), scrambling=factor
     ).total == pytest.approx(0.5, rel=1e-9)
     assert known.scrambling_for(100.0) == 0
-    assert ReferenceError(**KNOWN).scrambling_for(0.0) == 0
+    assert ReferenceUncertainty(**KNOWN).scrambling_for(0.0) == 0
 
 
 @pytest.mark.parametrize(
@@ -86,11 +88,11 @@ def test_how_well_light_must_be_scrambled():
 )
 def test_numbers_that_cannot_be(change, message):
     with pytest.raises(InputError, match=message):
-        ReferenceError(**{**KNOWN, **change})
+        ReferenceUncertainty(**{**KNOWN, **change})
 
 
 def test_limits_and_fillings_that_cannot_be():
     with pytest.raises(InputError, match=r"limit: 0.5 m/s .* at least 1.77 m/s"):
-        ReferenceError(**KNOWN, laser_drift=10e6).scrambling_for(0.5)
+        ReferenceUncertainty(**KNOWN, laser_drift=10e6).scrambling_for(0.5)
     with pytest.raises(InputError, match="filling: radius 0"):
         Filling(0.0)
