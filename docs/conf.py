@@ -19,6 +19,8 @@ release = metadata.version("lidar-mi")
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 
 # as docstrings are written: numpydoc, shapes and units in words
+# attributes as fields: two classes may have one of the same name
+napoleon_use_ivar = True
 napoleon_google_docstring = False
 napoleon_use_rtype = False
 autodoc_typehints = "none"
