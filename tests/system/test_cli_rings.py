@@ -81,6 +81,7 @@ def test_the_gap_of_a_lamp(call):
     assert err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_a_series_as_a_table(call):
     """Two frames and one without rings: a row for each, in the table and in the file."""
     noise = np.random.default_rng(5).normal(100, 5, LAMP.shape).round()

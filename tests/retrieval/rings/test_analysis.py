@@ -155,7 +155,9 @@ def images():
     }
 
 
-@pytest.mark.parametrize("kind", images())
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, marks=[pytest.mark.slow] * (k == "unequal")) for k in images()]
+)
 def test_refused(kind):
     image, message = images()[kind]
     with pytest.raises(InputError, match=message) as stop:

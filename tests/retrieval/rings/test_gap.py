@@ -92,6 +92,7 @@ def two_lines(faint=0.1, seed=2):
     return frame.exposure(np.random.default_rng(seed), photons=300.0)
 
 
+@pytest.mark.slow
 def test_gap_from_a_frame():
     """The faint thorium line a tenth as high as argon's: 0.885 mm within 4 standard errors."""
     rings = analyse_rings(two_lines())

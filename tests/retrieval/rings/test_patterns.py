@@ -89,7 +89,7 @@ def test_a_series_has_one_spacing():
     assert "fractional orders" in repr(series)
 
 
-@pytest.mark.parametrize("height", [0.05, 0.1])
+@pytest.mark.parametrize("height", [0.05, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_faint_line(height):
     """Down to 5 % of the other line, crests of 400 photons: found, with its standard error."""
     frame = Frame(**SMALL, fraction=(0.3, 0.62), height=(height, 1.0))
@@ -100,7 +100,10 @@ def test_faint_line(height):
     assert found.fraction_std.max() < 0.01
 
 
-@pytest.mark.parametrize("frame", [Frame(**SMALL), Frame(**SMALL, plates=0.03, patch=25.0)])
+@pytest.mark.parametrize(
+    "frame",
+    [Frame(**SMALL), pytest.param(Frame(**SMALL, plates=0.03, patch=25.0), marks=pytest.mark.slow)],
+)
 def test_one_line_stays_one(frame):
     """Neither noise nor uneven plates, which widen the line, make a second one."""
     for seed in range(2):
