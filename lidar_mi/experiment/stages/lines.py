@@ -10,8 +10,9 @@ from lidar_mi.assessment.metrics.requirements import RequirementTable, read_requ
 from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.ring_instrument import pixel_noise
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames, summed_noise
+from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames
 from lidar_mi.experiment.stages.ring_velocities import (
     FRAMES,
     REFERENCES,
@@ -127,7 +128,7 @@ def measure_lines(
     )
     line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
     own = fringe_image(doppler.camera, doppler.etalon, line, 0.0, reference_photons(doppler, rings))
-    noise = summed_noise(doppler.ccd, rings.modes, sensor.pulses)
+    noise = pixel_noise(doppler.ccd, rings.modes, sensor.pulses)
     weights = torch.from_numpy(_lagrange(nodes, (true - middle) / half)).to(images.dtype)
     retrieved = np.empty((2, len(true)))
     for start in range(0, len(true), FRAMES):

@@ -24,7 +24,7 @@ from lidar_mi.instrument.fringe_camera import fringe_image, ring_radii
 from lidar_mi.rendering.fringes import render_fringes, scene_dict
 from lidar_mi.rendering.memory import PER_PIXEL, PER_SAMPLE, PROGRAM, check_memory
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.rings.model import PixelNoise, RingModel
+from lidar_mi.retrieval.rings.model import RingModel
 
 EMITTED, PHOTONS = "fringes_emitted", "fringes_photons"
 
@@ -272,8 +272,3 @@ def summed(ccd: CCD, images: int) -> CCD:
             "bits": None,
         }
     )
-
-
-def summed_noise(ccd: CCD, modes: float, images: int) -> PixelNoise:
-    """The noise of the sum of so many images by the CCD."""
-    return pixel_noise(ccd, modes, images)

@@ -13,13 +13,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.ring_instrument import pixel_noise
 from lidar_mi.experiment.schema import Doppler, Experiment
-from lidar_mi.experiment.stages.ring_images import (
-    RingImages,
-    Rings,
-    expected_image,
-    exposed_frames,
-    summed_noise,
-)
+from lidar_mi.experiment.stages.ring_images import RingImages, Rings, expected_image, exposed_frames
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 from lidar_mi.retrieval.rings import peaks as ring_peaks
@@ -166,7 +160,7 @@ def velocities(
     ]
     done, total = 0, math.prod(shape[2:])
     for j, n in enumerate(settings.averaged):
-        noise = summed_noise(doppler.ccd, rings.modes, n)
+        noise = pixel_noise(doppler.ccd, rings.modes, n)
         for k, true in enumerate(speeds):
             for first in range(0, settings.images, FRAMES):
                 text = f"retrieving winds from averages of {n} images at {true:g} m/s"
