@@ -71,7 +71,7 @@ def _images(results: Results) -> dict[str, float]:
         | light_metrics(results["scans"][0])
         | core_metrics(cores)
         | true_wind_metrics(results["truth"].wind.sel(place), cores)
-        | sweep_metrics(results["texture_sweep"])
+        | (sweep_metrics(results["texture_sweep"]) if "texture_sweep" in results else {})
         | {f"detector.{key}": value for key, value in noise.items()}
         | safety_metrics(results["eye_safety"])
     )

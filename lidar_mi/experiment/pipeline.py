@@ -99,12 +99,72 @@ def _quiet(function: Callable[..., Any]) -> Callable[..., Any]:
     return lambda *needed, log: function(*needed)
 
 
+BEHIND_IMAGES = ("name", "lidar.pulse_energy", "detector", "retrieval", "doppler", "sensor")
+"""What is used only after the backscatter lidar's images, which are per emitted energy."""
+
+BEHIND_RING_IMAGES = (
+    "name",
+    "wake",
+    "platform",
+    "lidar",
+    "detector",
+    "scan",
+    "scattering",
+    "render",
+    "retrieval",
+    "sensor",
+    "volume",
+    "doppler.lidar.pulse_energy",
+    "doppler.lidar.pulse_duration",
+    "doppler.lidar.beam_radius",
+    "doppler.lidar.divergence_full",
+    "doppler.lidar.telescope_area",
+    "doppler.lidar.fov_half",
+    "doppler.lidar.instrument_constant",
+    "doppler.lidar.counted",
+    "doppler.lidar.range",
+    "doppler.lidar.range_bin",
+    "doppler.lidar.backscatter",
+    "doppler.lidar.extinction",
+    "doppler.lidar.sky_radiance",
+    "doppler.lidar.filter_bandwidth",
+    "doppler.ccd",
+    "doppler.speckle_modes",
+    "doppler.reference",
+    "doppler.retrieval",
+)
+"""What is used beside or after the Doppler lidar's images, which are in relative units."""
+
 STAGES = (
     # the truth, the scans, the air
-    Stage("flows", read_truth, ("beside",), has_wake, ahead=True, timing="truth"),
-    Stage("truth", _quiet(make_truth), ("beside", "flows"), has_wake, ahead=True, timing="truth"),
-    Stage("plans", _quiet(scan_plans), ("truth",), has_wake, ahead=True, timing="truth"),
-    Stage("air", scattering_air, ("beside",), has_wake, ahead=True),
+    Stage(
+        "flows",
+        read_truth,
+        ("beside",),
+        has_wake,
+        ahead=True,
+        timing="truth",
+        indifferent_to=BEHIND_IMAGES,
+    ),
+    Stage(
+        "truth",
+        _quiet(make_truth),
+        ("beside", "flows"),
+        has_wake,
+        ahead=True,
+        timing="truth",
+        indifferent_to=BEHIND_IMAGES,
+    ),
+    Stage(
+        "plans",
+        _quiet(scan_plans),
+        ("truth",),
+        has_wake,
+        ahead=True,
+        timing="truth",
+        indifferent_to=BEHIND_IMAGES,
+    ),
+    Stage("air", scattering_air, ("beside",), has_wake, ahead=True, indifferent_to=BEHIND_IMAGES),
     Stage("cores", _quiet(true_cores), ("truth",), has_wake, timing="retrieve"),
     # the backscatter lidar
     Stage(
@@ -114,6 +174,7 @@ STAGES = (
         has_wake,
         check=check_light,
         parts=lambda experiment: IMAGES,
+        indifferent_to=BEHIND_IMAGES,
     ),
     Stage("scans", _quiet(detect_images), ("images", "plans"), has_wake),
     Stage(
@@ -124,7 +185,9 @@ STAGES = (
         check=check_windows,
         timing="retrieve",
     ),
-    Stage("texture_sweep", texture_sweep, ("flows",), has_images, timing="retrieve"),
+    Stage(
+        "texture_sweep", texture_sweep, ("flows",), has_images, timing="retrieve", illustrates=True
+    ),
     Stage("detector_noise", _quiet(detector_noise), ("scans",), has_detector),
     Stage("eye_safety", _quiet(scan_safety), ("plans",), has_images),
     Stage(
@@ -153,11 +216,12 @@ STAGES = (
         check=check_rings,
         parts=ring_image_names,
         timing="doppler_render",
+        indifferent_to=BEHIND_RING_IMAGES,
     ),
     Stage("lit_rings", _quiet(ring_images), ("ring_images",), has_rings),
     Stage("v_los", line_of_sight_winds, ("rings", "lit_rings"), has_rings, timing=RING_RETRIEVAL),
     Stage("ring_budget", ring_budget, ("rings", "lit_rings"), has_rings, timing=RING_RETRIEVAL),
-    Stage("exposure", _quiet(exposure), ("rings", "lit_rings"), has_rings),
+    Stage("exposure", _quiet(exposure), ("rings", "lit_rings"), has_rings, illustrates=True),
     # both as one sensor
     Stage("requirements", _quiet(requirement_tables), ("beside",), has_sensor, ahead=True),
     Stage("slab_wind", _quiet(slab_wind), ("truth",), has_sensor, ahead=True),
@@ -190,3 +254,13 @@ STAGES = (
 def stages_of(experiment: Experiment) -> list[Stage]:
     """The stages of an experiment, each behind those it needs."""
     return in_order([stage for stage in STAGES if stage.wanted(experiment)], GIVEN)
+
+
+def stored_parts(experiment: Experiment) -> dict[str, Stage]:
+    """The stage of every part of a result that takes long: rendered images of both lidars."""
+    return {
+        part: stage
+        for stage in stages_of(experiment)
+        if stage.parts
+        for part in stage.parts(experiment)
+    }

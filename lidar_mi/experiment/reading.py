@@ -67,11 +67,11 @@ def load_experiment(name: str | Path, *, variant: str | None = None, **changes: 
         raise InputError(f"variant: {variant!r} is not allowed; expected {wanted}")
     found = variants[str(variant)] if variants else load(path)
     if changes:
-        data = parse_yaml(dump(found), str(name))
+        data = settings(found)
         for key, value in changes.items():
             for part in reversed(key.split(".")):
                 value = {part: value}
-            data = _merged(data, value)
+            data = merged(data, value)
         found = check(data, str(name))
     return found.read_from(path.parent)
 
@@ -131,27 +131,27 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
             raise InputError(f"{place}: {changes!r} is not allowed; expected keys to change")
         if "name" in changes:
             raise InputError(f"{place}.name: not allowed; the variant is its name")
-        merged = _merged(data, changes)
+        changed = merged(data, changes)
         for override in overrides or []:
             if override not in own:
-                _override(merged, override)
-        if isinstance(merged.get("name"), str):
-            merged["name"] += f".{name}"
-        found[str(name)] = check(merged, place)
+                _override(changed, override)
+        if isinstance(changed.get("name"), str):
+            changed["name"] += f".{name}"
+        found[str(name)] = check(changed, place)
     return found
 
 
-def _merged(data: Any, changes: dict) -> dict:
+def merged(data: Any, changes: dict) -> dict:
     """``data`` with ``changes``, section by section; null removes. Both remain unchanged."""
-    merged = copy.deepcopy(data)
+    found = copy.deepcopy(data)
     for key, value in changes.items():
-        inner = merged.get(key)
+        inner = found.get(key)
         if value is None and isinstance(inner, dict):
-            del merged[key]
+            del found[key]
             continue
         both = isinstance(inner, dict) and isinstance(value, dict)
-        merged[key] = _merged(inner, value) if both else copy.deepcopy(value)
-    return merged
+        found[key] = merged(inner, value) if both else copy.deepcopy(value)
+    return found
 
 
 def _read(path: str | Path) -> dict:
@@ -183,7 +183,12 @@ def check(data: dict, origin: str) -> Experiment:
 
 
 def dump(experiment: Experiment) -> str:
-    """The resolved experiment as YAML, quantities with their SI units; `load` reads it again.
+    """The resolved experiment as YAML; see `settings`. `load` reads it again."""
+    return to_yaml(settings(experiment))
+
+
+def settings(experiment: Experiment) -> dict[str, Any]:
+    """The resolved experiment as nested sections, quantities as text with their SI units.
 
     Without the sections of a lidar that it does not have.
     """
@@ -191,8 +196,7 @@ def dump(experiment: Experiment) -> str:
     unused |= {
         name for name in ("doppler", "sensor", "volume") if getattr(experiment, name) is None
     }
-    data = experiment.model_dump(mode="json", exclude=unused)
-    return to_yaml(data)
+    return experiment.model_dump(mode="json", exclude=unused)
 
 
 def _override(data: dict, text: str) -> None:

@@ -1,9 +1,10 @@
 """The folder of a run: its experiment, the file of each result, its progress."""
 
+import functools
 import hashlib
 import json
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -15,19 +16,18 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.names import current_name
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import log, reading
+from lidar_mi.experiment.image_store import BATCHES, MADE_BY, ImageStore
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.truth import find_file
-from lidar_mi.instrument.detector_noise import without_noise
 from lidar_mi.io import exr
-from lidar_mi.io.arrays import read_arrays, write_arrays
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.folder import is_free, locked, make_folder
 from lidar_mi.io.json import read_json, to_json
 from lidar_mi.io.netcdf import write_netcdf
 from lidar_mi.io.text import encoded, write_text
 from lidar_mi.io.vortex_file import write_vortices
-from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
+from lidar_mi.io.yaml import read_yaml, to_yaml
 from lidar_mi.rendering.phase import table_files
 
 RECORD, LOG, METRICS, REPORT = "experiment.yaml", "log.txt", "metrics.json", "report.html"
@@ -35,8 +35,6 @@ FIGURES = "figures"
 IMAGES = tuple(f"{name}.exr" for name in rendering.IMAGES)
 RENDERED = (*IMAGES, "fringes_*.exr")
 """Images of an earlier run of the same experiment that a resumed run reuses."""
-BATCHES = "_batches.npz"
-"""Suffix to the name of an unfinished image: its samples so far."""
 RESULTS = {
     "wind": "wind.nc",
     "wind_volume": "wind_volume.nc",
@@ -49,8 +47,6 @@ RESULTS = {
 
 # images may depend on the versions of these
 _RENDERED_BY = ("lidar-mi", "mitsuba", "drjit")
-MADE_BY = "run_sha256"
-"""Attribute of every result: the hash `RunFolder.made_by`."""
 _LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "torch", "kornia", "OpenEXR", "xarray")
 
 
@@ -66,6 +62,8 @@ class RunFolder:
     experiment : Experiment
     beside : path
         Folder in which files named by the experiment are looked for first.
+    shared : ImageStore, optional
+        Images that are shared with other runs: used if they are there, else added.
 
     Attributes
     ----------
@@ -76,23 +74,22 @@ class RunFolder:
         attribute; a result with another hash is not of this run.
     """
 
-    def __init__(self, path: str | Path, experiment: Experiment, beside: str | Path):
+    def __init__(
+        self,
+        path: str | Path,
+        experiment: Experiment,
+        beside: str | Path,
+        shared: ImageStore | None = None,
+    ):
         self.path = Path(path)
         self.figures = self.path / FIGURES
         self.log = self.path / LOG
         self._experiment, self._beside = experiment, Path(beside)
         self._inputs = _inputs(experiment, beside)
-        self.record: dict[str, Any] = {
-            "experiment": parse_yaml(reading.dump(experiment), experiment.name),
-            "files": {field: _checksum(path) for field, path in self._inputs.items()},
-            "versions": {
-                "lidar-mi": __version__,
-                "python": platform.python_version(),
-                **{name: version(name) for name in _LIBRARIES},
-            },
-            "metrics": None,
-        }
-        self.made_by = _made_by(self.record)
+        self.record = new_record(experiment, beside)
+        self.made_by = made_by(self.record)
+        self._shared = shared
+        self._images = ImageStore(lambda part: self.path, lambda part: self.made_by)
 
     @contextmanager
     def claimed(self, overwrite: bool) -> Iterator[None]:
@@ -158,50 +155,27 @@ class RunFolder:
             )
 
     def kept(self, part: str) -> xr.Dataset | None:
-        """A rendered image, without a detector's noise; None: it is not there.
-
-        Raises
-        ------
-        InputError
-            It was made by another experiment or version.
-        """
-        path = self._image(part)
-        if not path.is_file():
-            return None
-        try:
-            image = exr.read_scan(path) if part in rendering.IMAGES else exr.read_fringes(path)
-        except InputError:  # damaged: the image is rendered again
-            return None
-        if image.attrs.pop(MADE_BY, None) != self.made_by:
-            raise InputError(
-                f"{path}: was made by another experiment; expected the image of this one"
-            )
-        # a killed process may have left samples beside the finished image
-        self._batches(part).unlink(missing_ok=True)
-        return without_noise(image) if part in rendering.IMAGES else image
+        """As of `ImageStore`; an image shared with other runs is copied here."""
+        image = self._images.kept(part)
+        if image is None and self._shared:
+            image = self._shared.kept(part)
+            if image is not None:
+                self._images.write(part, image)
+        return image
 
     def unfinished(self, part: str) -> dict[str, Any] | None:
-        """Samples of an image unfinished by an earlier run; None: there are none."""
-        path = self._batches(part)
-        if not path.is_file():
-            return None
-        try:
-            arrays = read_arrays(path)
-        except InputError:  # damaged: the image is rendered from the start
-            return None
-        return arrays if str(arrays.pop(MADE_BY, "")) == self.made_by else None
+        """As of `ImageStore`."""
+        return self._images.unfinished(part)
 
     def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
-        """Save samples of an image until the image itself is saved."""
-        write_arrays(self._batches(part), arrays | {MADE_BY: self.made_by})
+        """As of `ImageStore`."""
+        self._images.keep_unfinished(part, arrays)
 
     def keep_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
-        """Write a rendered image; returns it as it is read."""
-        write = exr.write_scan if part in rendering.IMAGES else exr.write_fringes
-        write(self._image(part), self._signed(value))
-        kept = self.kept(part)
-        assert kept is not None
-        return kept
+        """As of `ImageStore`; an image that may be shared with other runs is also written there."""
+        if self._shared:
+            self._shared.keep_part(part, value)
+        return self._images.keep_part(part, value)
 
     def _signed(self, value: xr.Dataset) -> xr.Dataset:
         return value.assign_attrs({MADE_BY: self.made_by})
@@ -239,17 +213,11 @@ class RunFolder:
         write_text(self.path / REPORT, page)
         write_text(self.path / METRICS, text)
 
-    def _image(self, part: str) -> Path:
-        return self.path / f"{part}.exr"
-
-    def _batches(self, part: str) -> Path:
-        return self.path / f"{part}{BATCHES}"
-
     def _keep_noise(self, scans: list[xr.Dataset]) -> None:
         """Add noisy images to the files of those without noise."""
         for part, scan in zip(rendering.IMAGES, scans, strict=True):
-            if "Y_noisy" in scan and "Y_noisy" not in exr.read_scan(self._image(part)):
-                exr.write_scan(self._image(part), self._signed(scan))
+            if "Y_noisy" in scan and "Y_noisy" not in exr.read_scan(self._images.path(part)):
+                self._images.write(part, scan)
 
 
 def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
@@ -264,14 +232,52 @@ def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
         raise InputError(f"{folder}: is no {kind}; expected an empty or a new one (-o DIR)")
 
 
-def _made_by(record: dict) -> str:
-    """Hash of the parts of a record that determine the rendered images."""
+def new_record(experiment: Experiment, beside: str | Path) -> dict[str, Any]:
+    """Record of a run to be: ``experiment`` (resolved), ``files`` (checksums), ``versions``."""
+    return {
+        "experiment": reading.settings(experiment),
+        "files": {field: _checksum(path) for field, path in _inputs(experiment, beside).items()},
+        "versions": _versions(),
+        "metrics": None,
+    }
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    return {
+        "lidar-mi": __version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in _LIBRARIES},
+    }
+
+
+def made_by(record: dict, indifferent_to: Sequence[str] = ()) -> str:
+    """Hash of what a record says of settings, files and versions that rendered images depend on.
+
+    Parameters
+    ----------
+    record : dict
+        From `new_record`.
+    indifferent_to : sequence of str
+        Dotted keys of settings that have no influence; files that they name have none either.
+    """
     decisive = {
-        "experiment": record["experiment"],
-        "files": record["files"],
+        "experiment": _without(record["experiment"], indifferent_to),
+        "files": _without(record["files"], indifferent_to),
         "versions": {name: record["versions"][name] for name in _RENDERED_BY},
     }
     return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
+
+
+def _without(settings: dict, keys: Sequence[str], above: str = "") -> dict:
+    """Settings without some dotted keys and what is below them."""
+    found = {}
+    for key, value in settings.items():
+        name = f"{above}{key}"
+        if not any(name == one or name.startswith(f"{one}.") for one in keys):
+            nested = isinstance(value, dict)
+            found[key] = _without(value, keys, f"{name}.") if nested else value
+    return found
 
 
 def _difference(before: dict, now: dict) -> str | None:
@@ -296,6 +302,13 @@ def _inputs(experiment: Experiment, beside: str | Path) -> dict[str, Path]:
 
 
 def _checksum(path: Path) -> str:
+    found = path.stat()
+    return _checksum_of(path, found.st_size, found.st_mtime_ns)
+
+
+@functools.lru_cache(64)
+def _checksum_of(path: Path, size: int, changed: int) -> str:
+    """Of a file as it was then: many runs of one process read the same file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -6,13 +6,16 @@ files are saved and reused, `rendering.batches` stores the samples of unfinished
 """
 
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.names import timing_key
 from lidar_mi.assessment.report.page import page
 from lidar_mi.errors import InputError, is_interrupt
+from lidar_mi.experiment.image_store import ImageStore
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.measure import measure
 from lidar_mi.experiment.pipeline import stages_of
@@ -21,7 +24,7 @@ from lidar_mi.experiment.report import chapters
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.resumable_folder import RunFolder
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stage import Stage, result_of
+from lidar_mi.experiment.stage import Keeper, Stage, result_of
 from lidar_mi.progress import Notice, progress
 
 RESUMED = "start it again to resume the run"
@@ -84,9 +87,20 @@ def run(
 
 
 def prepare(
-    experiment: Experiment, beside: str | Path | None = None, notice: Notice = silent
+    experiment: Experiment,
+    beside: str | Path | None = None,
+    notice: Notice = silent,
+    known: Mapping[str, Any] | None = None,
 ) -> Run:
     """Run all checks that are possible before anything is rendered or written.
+
+    Parameters
+    ----------
+    experiment, beside, notice
+        As of `run`.
+    known : mapping, optional
+        Results of stages, by name, of an experiment that differs only in what these are
+        indifferent to: they are not computed again.
 
     Returns
     -------
@@ -99,10 +113,10 @@ def prepare(
         Bad input.
     """
     beside = experiment.folder if beside is None else beside
-    prepared = Run(experiment, {"beside": beside}, Log(notice))
+    prepared = Run(experiment, {"beside": beside, **(known or {})}, Log(notice))
     stages = stages_of(experiment)
     for stage in stages:
-        if stage.ahead:
+        if stage.ahead and stage.name not in prepared.results:
             _carry_out(stage, prepared)
     for stage in stages:
         if stage.check:
@@ -111,12 +125,30 @@ def prepare(
     return prepared
 
 
-def complete(prepared: Run, folder: str | Path | None = None, *, overwrite: bool = False) -> Run:
-    """Run the rest of a prepared experiment; parameters and errors as of `run`."""
+def complete(
+    prepared: Run,
+    folder: str | Path | None = None,
+    *,
+    overwrite: bool = False,
+    shared: ImageStore | None = None,
+) -> Run:
+    """Run the rest of a prepared experiment.
+
+    Parameters
+    ----------
+    prepared : Run
+        From `prepare`.
+    folder, overwrite
+        As of `run`; errors, too.
+    shared : ImageStore, optional
+        Images that are shared with other runs.
+    """
     if folder is None:
-        return _complete(prepared, None)
+        finish(prepared)
+        prepared.log("done")
+        return prepared
     prepared.folder = Path(folder)
-    kept = RunFolder(folder, prepared.experiment, prepared.results["beside"])
+    kept = RunFolder(folder, prepared.experiment, prepared.results["beside"], shared)
     with kept.claimed(overwrite):
         log = prepared.log
         log.path = kept.log
@@ -125,7 +157,10 @@ def complete(prepared: Run, folder: str | Path | None = None, *, overwrite: bool
             f"seed {prepared.experiment.seed}"
         )
         try:
-            return _complete(prepared, kept)
+            finish(prepared, kept)
+            _report(prepared, kept)
+            log("done")
+            return prepared
         except BaseException as error:
             if is_interrupt(error):
                 error.add_note(RESUMED)
@@ -136,21 +171,29 @@ def complete(prepared: Run, folder: str | Path | None = None, *, overwrite: bool
             raise
 
 
-def _complete(run: Run, kept: RunFolder | None) -> Run:
-    for stage in stages_of(run.experiment):
-        if stage.name not in run.results:
-            _carry_out(stage, run, kept)
-    if run.scans:
+def finish(prepared: Run, kept: Keeper | None = None, *, illustrated: bool = True) -> None:
+    """Compute the stages that a prepared experiment lacks, and its metrics.
+
+    Parameters
+    ----------
+    prepared : Run
+        From `prepare`; complete afterwards.
+    kept : Keeper, optional
+        Stores the results, and has those of an earlier run.
+    illustrated : bool
+        With what only the report needs.
+    """
+    for stage in stages_of(prepared.experiment):
+        if stage.name not in prepared.results and (illustrated or not stage.illustrates):
+            _carry_out(stage, prepared, kept)
+    if prepared.scans:
         # of images from an earlier run the time that they took then
-        run.seconds["render"] = sum(scan.attrs["render_seconds"] for scan in run.scans)
-    run.metrics = measure(run.experiment, run.results, run.seconds)
-    if kept is not None:
-        _report(run, kept)
-    run.log("done")
-    return run
+        seconds = sum(scan.attrs["render_seconds"] for scan in prepared.scans)
+        prepared.seconds["render"] = seconds
+    prepared.metrics = measure(prepared.experiment, prepared.results, prepared.seconds)
 
 
-def _carry_out(stage: Stage, run: Run, kept: RunFolder | None = None) -> None:
+def _carry_out(stage: Stage, run: Run, kept: Keeper | None = None) -> None:
     start = time.perf_counter()
     run.results[stage.name] = result_of(stage, run.experiment, run.results, run.log, kept)
     if stage.timing:

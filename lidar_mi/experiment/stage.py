@@ -40,6 +40,11 @@ class Stage:
         complete. The result is a dictionary of all parts.
     timing : str, optional
         Step to which its duration is added.
+    indifferent_to : tuple of str, optional
+        Dotted keys of the experiment, sections or values, that have no influence on the result.
+        Runs that differ in these alone share it. None: it is not shared.
+    illustrates : bool
+        Only the report needs it.
     """
 
     name: str
@@ -50,6 +55,8 @@ class Stage:
     check: Callable[..., None] | None = None
     parts: Callable[[Experiment], Sequence[str]] | None = None
     timing: str | None = None
+    indifferent_to: tuple[str, ...] | None = None
+    illustrates: bool = False
 
 
 class Keeper(Protocol):

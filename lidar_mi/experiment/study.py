@@ -15,7 +15,7 @@ from lidar_mi.assessment.report.comparison import page
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.log import Log, Notice, silent
-from lidar_mi.experiment.reading import dump
+from lidar_mi.experiment.reading import settings as settings_of
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.resumable_folder import (
     FIGURES,
@@ -31,7 +31,7 @@ from lidar_mi.experiment.schema import NAME, Experiment
 from lidar_mi.io.folder import locked, make_folder
 from lidar_mi.io.json import write_json
 from lidar_mi.io.text import write_text
-from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
+from lidar_mi.io.yaml import read_yaml, to_yaml
 
 RECORD = "study.yaml"
 
@@ -66,7 +66,7 @@ def run(
     ready = {
         key: experiment.prepare(one, beside, _of(key, notice)) for key, one in variants.items()
     }
-    settings = {key: parse_yaml(dump(one), key) for key, one in variants.items()}
+    settings = {key: settings_of(one) for key, one in variants.items()}
     make_folder(folder)
     with locked(folder):
         refuse_strangers(folder, RECORD, "study's folder")

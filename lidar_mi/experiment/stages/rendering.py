@@ -174,7 +174,9 @@ def detect_images(
     experiment: Experiment, images: Mapping[str, xr.Dataset], plans: Sequence[ScanPlan]
 ) -> list[xr.Dataset]:
     """The scans with noisy images in addition, if there is a detector."""
-    scans = [images[name] for name in IMAGES]
+    # images are per emitted energy: those of another pulse energy are the same
+    energy = experiment.lidar.pulse_energy
+    scans = [images[name].assign_attrs(pulse_energy=energy) for name in IMAGES]
     if experiment.detector is None:
         return scans
     lidar, detector, seed = experiment.lidar, experiment.detector, experiment.seed
