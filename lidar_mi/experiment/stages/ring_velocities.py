@@ -16,10 +16,16 @@ from lidar_mi.experiment.schema import Doppler, Experiment
 from lidar_mi.experiment.stages.ring_images import RingImages, Rings, expected_image, exposed_frames
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
-from lidar_mi.retrieval.rings import peaks as ring_peaks
-from lidar_mi.retrieval.rings.bound import cramer_rao
+from lidar_mi.retrieval.rings.bound import cramer_rao_of
+from lidar_mi.retrieval.rings.centre import circular_average
 from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
 from lidar_mi.retrieval.rings.model import RingModel
+from lidar_mi.retrieval.rings.peaks import (
+    COORDINATES,
+    find_centre,
+    ring_radius,
+    velocity_from_radii,
+)
 
 FITS = (RingMethod.ANNULAR, RingMethod.PIXELS)
 # method and coordinate of the radius, see `lidar_mi.retrieval.rings.peaks.ring_radius`
@@ -75,33 +81,35 @@ def ring_budget(
         finesse=finesse(doppler.etalon, doppler.lidar.wavelength),
         velocity_range=rings.model.velocity_range,
         speckle_modes=rings.modes,
-        bound={centre: _bound(doppler, rings, centre) for centre in doppler.retrieval.centre},
+        bound=_bounds(doppler, rings),
         relative_error=float(relative),
         largest_error=float(abs(errors).max()),
     )
 
 
-def _bound(doppler: Doppler, rings: Rings, centre: str) -> float:
-    """Cramer-Rao bound of one image at the first speed less its reference, m/s."""
-    efficiency = doppler.ccd.quantum_efficiency
+def _bounds(doppler: Doppler, rings: Rings) -> dict[RingCentre, float]:
+    """Cramer-Rao bound of one image at the first speed less its reference, m/s, by centre."""
+    efficiency, centres = doppler.ccd.quantum_efficiency, doppler.retrieval.centre
     floor = efficiency * rings.background + doppler.ccd.dark_current * doppler.ccd.integration_time
     both = (
         (rings.model, rings.photons, doppler.v_los[0]),
         (rings.laser, reference_photons(doppler, rings), 0.0),
     )
-    return math.hypot(
-        *(
-            cramer_rao(
-                model,
-                efficiency * photons,
-                pixel_noise(doppler.ccd, rings.modes),
-                v_los=speed,
-                background=floor,
-                free=_unknown(model, centre),
-            )["v_los"]
-            for model, photons, speed in both
+    found = [
+        cramer_rao_of(
+            model,
+            efficiency * photons,
+            pixel_noise(doppler.ccd, rings.modes),
+            [_unknown(model, centre) for centre in centres],
+            v_los=speed,
+            background=floor,
         )
-    )
+        for model, photons, speed in both
+    ]
+    return {
+        centre: math.hypot(*(bound["v_los"] for bound in pair))
+        for centre, *pair in zip(centres, *found, strict=True)
+    }
 
 
 def _unknown(model: RingModel, centre: str) -> list[str]:
@@ -192,7 +200,7 @@ def velocities(
                             _peak_radii(one[i].numpy(), doppler, centre) for one in (frames, laser)
                         )
                         for name in peaks:
-                            speed = ring_peaks.velocity_from_radii(
+                            speed = velocity_from_radii(
                                 found[name],
                                 zero[name],
                                 doppler.camera.focal_length,
@@ -229,7 +237,7 @@ def velocities(
                 {"units": "1", "long_name": "images of an average"},
             ),
             "v_los": ("v_los", list(speeds), {"units": "m s-1", "long_name": "true wind"}),
-            "coordinate": list(ring_peaks.COORDINATES),
+            "coordinate": list(COORDINATES),
             "piece": (
                 "piece",
                 list(PIECES),
@@ -275,20 +283,20 @@ def _fitted_speeds(frames, doppler, model, noise, method, centre):
 def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, float]:
     """Innermost ring's radius (px) by the given peak methods; NaN where one fails."""
     methods = [name for name in doppler.retrieval.methods if name in PEAKS]
-    centres, radii, near = {}, {}, None
+    places, averages, radii, near = {}, {}, {}, None
     for name in methods:
         way, coordinate = PEAKS[name]
-        finder = "ml" if way == "ml" else "ca"
+        finder = "known" if centre == RingCentre.KNOWN else "ml" if way == "ml" else "ca"
         try:
-            if finder not in centres:
-                known = centre == RingCentre.KNOWN
-                centres[finder] = (
-                    doppler.camera.centre_pixel if known else ring_peaks.find_centre(image, finder)
-                )
-            place = centres[finder]
+            if finder not in places:
+                known = finder == "known"
+                place = doppler.camera.centre_pixel if known else find_centre(image, finder)
+                averages[finder] = circular_average(image, place)
+                places[finder] = place
+            place, average = places[finder], averages[finder]
             # the crest to a pixel: the bias of a fit in r depends on the piece about it
-            near = near or ring_peaks.ring_radius(image, place, "ca", "r2")
-            radii[name] = ring_peaks.ring_radius(image, place, way, coordinate, near)
+            near = near or ring_radius(image, place, "ca", "r2", average=average)
+            radii[name] = ring_radius(image, place, way, coordinate, near, average=average)
         except InputError:
             radii[name] = math.nan
     return radii
@@ -301,19 +309,22 @@ def _peak_bias(doppler: Doppler, rendered: RingImages) -> np.ndarray:
     """
     camera = doppler.camera
     images = [p["S0"].values.astype(float) for p in (rendered.received[0], rendered.emitted)]
+    averages = [circular_average(image, camera.centre_pixel) for image in images]
 
     def error(coordinate, piece):
         try:
             radii = [
-                ring_peaks.ring_radius(i, camera.centre_pixel, "ca", coordinate, piece=piece)
-                for i in images
+                ring_radius(
+                    image, camera.centre_pixel, "ca", coordinate, piece=piece, average=average
+                )
+                for image, average in zip(images, averages, strict=True)
             ]
         except InputError:
             return math.nan
-        v = ring_peaks.velocity_from_radii(*radii, camera.focal_length, camera.pixel)
+        v = velocity_from_radii(*radii, camera.focal_length, camera.pixel)
         return v - doppler.v_los[0]
 
-    return np.array([[error(c, p) for p in PIECES] for c in ring_peaks.COORDINATES])
+    return np.array([[error(c, p) for p in PIECES] for c in COORDINATES])
 
 
 def _warn_of_failures(found: xr.Dataset, log: Log) -> None:

@@ -88,14 +88,43 @@ def cramer_rao(
     InputError
         Numbers out of range, or an image that does not determine the free parameters.
     """
-    names = free_names(model, free)
+    return cramer_rao_of(
+        model,
+        photons,
+        noise,
+        [free],
+        v_los=v_los,
+        background=background,
+        centre=centre,
+        temperature=temperature,
+    )[0]
+
+
+def cramer_rao_of(
+    model: RingModel,
+    photons: float,
+    noise: PixelNoise | None,
+    choices: Sequence[Sequence[str] | None],
+    *,
+    v_los: float = 0.0,
+    background: float = 0.0,
+    centre: tuple[float, float] | None = None,
+    temperature: float | None = None,
+) -> list[dict[str, float]]:
+    """`cramer_rao` for several choices of the free parameters, in the time of one."""
+    chosen = [free_names(model, free) for free in choices]
+    names = [name for name in PARAMETERS if any(name in free for free in chosen)]
     vector = parameter_vector(model, v_los, photons, background, centre, temperature)
     fisher = torch.diag(prior_information(model, names))[None]
     for waves in pixel_waves(model, centre):
         mean, jacobian = mean_and_jacobian(model, waves, vector, names)
         variance = (noise or PixelNoise()).variance(mean, mean - background)
         fisher = fisher + fisher_matrix(jacobian, 1 / variance)
-    found = standard_deviations(fisher)[0]
-    if not torch.isfinite(found).all():
-        raise InputError(f"free: the image does not determine {', '.join(names)} all together")
-    return {name: float(value) for name, value in zip(names, found, strict=True)}
+    bounds = []
+    for free in chosen:
+        places = torch.tensor([names.index(name) for name in free])
+        found = standard_deviations(fisher[:, places][:, :, places])[0]
+        if not torch.isfinite(found).all():
+            raise InputError(f"free: the image does not determine {', '.join(free)} all together")
+        bounds.append({name: float(value) for name, value in zip(free, found, strict=True)})
+    return bounds

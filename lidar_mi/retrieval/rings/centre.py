@@ -10,6 +10,8 @@ from scipy.ndimage import gaussian_filter
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.peak_fit import peak
 
+ROWS = 64  # of an image at once: what they need stays in the cache
+
 
 def gradient_centre(image) -> tuple[float, float]:
     """Point that the lines along all gradients pass closest by, to about a pixel.
@@ -66,15 +68,23 @@ def circular_average(image: np.ndarray, centre: tuple[float, float]) -> tuple:
         px; the value's unit; sum of the pixels' weights. Radii of weight 0 are left out.
     """
     height, width = image.shape
-    x, y = np.arange(width) - centre[0], np.arange(height) - centre[1]
-    r = np.hypot(x[None, :], y[:, None]).ravel()
-    low = r.astype(np.intp)
-    upper = r - low
-    value = np.asarray(image, float).ravel()
-    weight, total = np.zeros((2, low.max() + 2))
-    for index, part in ((low, 1 - upper), (low + 1, upper)):
-        weight += np.bincount(index, part, len(weight))
-        total += np.bincount(index, part * value, len(weight))
+    x2 = (np.arange(width) - centre[0]) ** 2
+    y2 = (np.arange(height) - centre[1]) ** 2
+    size = int(np.sqrt(x2.max() + y2.max())) + 2
+    # number, value, and both times the distance beyond the circle below
+    sums = np.zeros((4, size))
+    for first in range(0, height, ROWS):
+        rows = slice(first, first + ROWS)
+        r = np.sqrt(y2[rows, None] + x2).ravel()
+        low = r.astype(np.intp)
+        upper = r - low
+        value = np.asarray(image[rows], float).ravel()
+        for total, part in zip(sums, (None, value, upper, upper * value), strict=True):
+            total += np.bincount(low, part, size)
+    whole, above = sums[:2], sums[2:]
+    weight, total = whole - above
+    weight[1:] += above[0, :-1]
+    total[1:] += above[1, :-1]
     known = weight > 0
     return np.flatnonzero(known).astype(float), total[known] / weight[known], weight[known]
 

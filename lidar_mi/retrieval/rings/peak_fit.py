@@ -1,10 +1,9 @@
 """Positions of peaks: Gaussians on a level or a slope, fitted by Levenberg-Marquardt."""
 
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.optimize import OptimizeWarning, curve_fit
+from scipy.optimize import leastsq
 
 from lidar_mi.errors import InputError
 
@@ -44,19 +43,36 @@ def peaks(
         raise failed
     x, values = x[near], values[near]
     low, high = values.min(), values.max()
+    slopes = np.empty((2 + 2 * number + slope, len(x)))  # of the model, parameter by parameter
+    slopes[1] = 1.0
+    if slope:
+        slopes[-1] = (x - starts[0]) / reach
+    by_place, bells = slopes[2 : 2 + number], slopes[2 + number : 2 + 2 * number]
 
-    def gaussians(x, width, level, *rest):
-        place, height = np.array(rest[:number]), np.array(rest[number : 2 * number])
-        tilt = rest[-1] * (x - starts[0]) / reach if slope else 0.0
-        return level + tilt + np.exp(-(((x[:, None] - place) / width) ** 2) / 2) @ height
+    def shapes(parameters):
+        """Distances from the peaks in widths; the Gaussians go to ``bells``."""
+        away = (x - parameters[2 : 2 + number, None]) / parameters[0]
+        np.exp(-0.5 * away * away, out=bells)
+        return away
+
+    def misfit(parameters):
+        shapes(parameters)
+        # linear in all but width and places
+        return parameters[1] + parameters[2 + number :] @ slopes[2 + number :] - values
+
+    def jacobian(parameters):
+        away = shapes(parameters)
+        heights = parameters[2 + number : 2 + 2 * number, None]
+        np.multiply(away * bells, heights / parameters[0], out=by_place)
+        slopes[0] = (away * by_place).sum(0)
+        return slopes
 
     guess = (reach / 2, low, *starts, *[high - low] * number, *[0.0] * slope)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", OptimizeWarning)
-            found = curve_fit(gaussians, x, values, guess, method="lm", maxfev=3000)[0]
-    except (RuntimeError, OptimizeWarning):
-        raise failed from None
+    found, covariance, *_, end = leastsq(
+        misfit, guess, Dfun=jacobian, col_deriv=True, full_output=True, maxfev=3000
+    )
+    if end not in (1, 2, 3, 4) or covariance is None:
+        raise failed
     places, heights = found[2 : 2 + number], found[2 + number : 2 + 2 * number]
     if not (np.all(np.abs(places - starts) < 0.7 * reach) and np.all(heights > 0)):
         raise failed

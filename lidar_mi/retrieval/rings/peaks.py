@@ -70,14 +70,17 @@ def find_centre(
     if method == "ca":
         return circular_centre(image, start)
     if method == "ml":
-        radius = radius or innermost(image, start)
+        radius = radius or innermost(circular_average(image, start))
         return midpoint_line_centre(image, start, radius, PIECE * radius)
     raise InputError(f"centre: {method!r} is not one of ca, ml")
 
 
-def innermost(image: np.ndarray, centre: tuple[float, float]) -> float:
-    """Radius of the innermost ring, px, to a few pixels: first crest of the smoothed average."""
-    r, mean, weight = circular_average(image, centre)
+def innermost(average: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
+    """Radius of the innermost ring, px, to a few pixels: first crest of the smoothed average.
+
+    ``average`` is what `lidar_mi.retrieval.rings.centre.circular_average` returns.
+    """
+    r, mean, weight = average
     # circles next to the centre average too few pixels
     mean, r = mean[weight > 30], r[weight > 30]
     smooth = savgol_filter(mean, max(5, len(mean) // 20 * 2 + 1), 2)
@@ -95,6 +98,7 @@ def ring_radius(
     coordinate: str = "r",
     radius: float | None = None,
     piece: float = PIECE,
+    average: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
 ) -> float:
     """Radius of the innermost ring, px.
 
@@ -113,6 +117,9 @@ def ring_radius(
     piece : float
         Half width of the fitted piece of the profile, in radii; for r2, of nearly the same piece,
         symmetric in r^2.
+    average : tuple of arrays, optional
+        The image's `lidar_mi.retrieval.rings.centre.circular_average` about the centre, where it
+        is known already.
 
     Raises
     ------
@@ -126,7 +133,9 @@ def ring_radius(
     if method == "ml" and coordinate != "r":
         raise InputError(f"coordinate: {coordinate!r} is not allowed with ml; expected r")
     inside(*centre, image.shape)
-    radius = radius or innermost(image, centre)
+    if average is None and (method == "ca" or not radius):
+        average = circular_average(image, centre)
+    radius = radius or innermost(average)
     if method == "ml":
         points = midpoint_points(image, centre, radius, piece * radius).reshape(-1, 2)
         distance = np.hypot(*(points - centre).T)
@@ -134,7 +143,7 @@ def ring_radius(
             raise InputError("rings: no crest on any midpoint line; expected a ring")
         return float(np.nanmean(distance))
     if method == "ca":
-        r, mean, _ = circular_average(image, centre)
+        r, mean, _ = average
     else:
         cuts = savitzky_golay(radial_cuts(image, centre))
         reached = np.isfinite(cuts).any(0)
