@@ -20,6 +20,7 @@ from lidar_mi.retrieval.rings.frames import checked, inside
 from lidar_mi.retrieval.rings.pattern import Pattern, Profile, find_pattern
 from lidar_mi.retrieval.rings.ring_fit import CurveFit, fit_all
 from lidar_mi.retrieval.rings.sectors import RingCurves, Sectors
+from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.tables import Table, Tabular, with_error
 
 LAW = 0.02  # orders, largest rms deviation from equal steps of an etalon's pattern
@@ -242,7 +243,8 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     places = sectors.r2[places[high > CREST * high.max()]]
     profile = Profile(sectors.profile_r2, sectors.profile, sectors.profile_count, sectors.step)
     noise = sectors.noise() / sectors.profile_count[sectors.profile_count > 0].mean()
-    found = find_pattern(profile, noise, spacing)
+    with threads_for(len(profile.r2)):
+        found = find_pattern(profile, noise, spacing)
     radii = ", ".join(f"{math.sqrt(place):.0f}" for place in places)
     wrong = InputError(
         f"rings: radii of {radii} px are not allowed; expected squares that rise by equal "

@@ -12,6 +12,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from scipy.optimize import least_squares
 
 LINES = 3  # largest number of lines
@@ -24,6 +25,7 @@ MATERIAL = 2e-3  # of the pattern's power, the least that a longer spacing must 
 DOUBTFUL = 4.0  # factor from MATERIAL within which the choice of the spacing is doubtful
 HARMONICS = 15  # of the strongest wave, that a period may have
 ORDERS = 1.6  # least number of orders in the image
+MOST_HARMONICS = 400  # of a line's shape
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,7 @@ class Pattern:
     def width(self) -> float:
         """Full width of a line at half of its height over its lowest value, orders."""
         phase = np.linspace(0, 0.5, 513)
-        shape = _shape(phase, self.loss, np.array(self.spread))
+        shape = _sums(_harmonics(phase, self.loss, np.full(513, self.spread)), np.zeros(1))[0]
         middle = (shape[0] + shape[-1]) / 2
         return 2 * float(np.interp(-middle, -shape, phase))
 
@@ -70,39 +72,48 @@ class Pattern:
         return r2 / self.spacing - self.fraction[:, None]
 
 
-def airy(phase: np.ndarray, loss: float, spread) -> tuple[np.ndarray, ...]:
-    """P of the module's formula and its derivatives by phase, loss and spread.
-
-    ``spread`` may have the phase's shape.
-    """
-    turn = np.exp(2j * np.pi * np.asarray(phase))
-    spread = np.broadcast_to(spread, turn.shape)
-    weight, step, fall = np.ones(turn.shape), np.exp(-loss - spread), np.exp(-2 * spread)
-    wave = np.ones_like(turn)
-    total, slope, by_loss, by_spread = np.ones(turn.shape), *np.zeros((3, *turn.shape))
-    for n in range(1, 400):
-        weight, wave, step = weight * step, wave * turn, step * fall
-        total += 2 * weight * wave.real
-        slope -= 4 * np.pi * n * weight * wave.imag
-        by_loss -= 2 * n * weight * wave.real
-        by_spread -= 2 * n**2 * weight * wave.real
-        if n * weight.max() < 1e-4:
-            break
-    return total, slope, by_loss, by_spread
+def airy(phase: np.ndarray, loss: float, spread: np.ndarray) -> np.ndarray:
+    """P of the module's formula and its derivatives by phase, loss and spread, (4, annuli)."""
+    return _derivatives(_harmonics(phase, loss, spread), np.zeros(1))[:, 0]
 
 
-def _shape(phase: np.ndarray, loss: float, spread: np.ndarray) -> np.ndarray:
-    """P alone."""
-    double = 2 * np.cos(2 * np.pi * phase)
-    weight, step, fall = 1.0, np.exp(-loss - spread), np.exp(-2 * spread)
-    last, now, total = 1.0, double / 2, np.ones(phase.shape)
-    for _ in range(1, 400):
-        weight, step = weight * step, step * fall
-        total += 2 * weight * now
-        last, now = now, double * now - last
-        if weight.max() < 1e-5:
-            break
-    return total
+def _harmonics(phase: np.ndarray, loss: float, spread: np.ndarray) -> np.ndarray:
+    """exp(-n loss - n^2 spread + 2 pi i n phase) from n = 1 on, complex, (n, annuli)."""
+    n = np.arange(1, MOST_HARMONICS + 1)
+    weight = np.exp(-n * loss - n**2 * spread.min())
+    # those after the last that counts, in P or in a derivative
+    small = np.flatnonzero((weight < 1e-5) & (n * weight < 1e-4))
+    waves = np.empty((small[0] + 1 if small.size else len(n), len(phase)), complex)
+    # from one to the next: exp(-n^2 spread) falls by exp(-(2 n - 1) spread)
+    factor = np.exp(2j * np.pi * phase - loss - spread)
+    fall = np.exp(-2 * spread)
+    before = np.ones(1)
+    for wave in waves:
+        np.multiply(before, factor, out=wave)
+        factor *= fall
+        before = wave
+    return waves
+
+
+def _sums(waves: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """P of lines at these fractional orders, (lines, annuli)."""
+    n = np.arange(1, len(waves) + 1)
+    return 1 + 2 * _product(np.exp(-2j * np.pi * n * fraction[:, None]), waves).real
+
+
+def _derivatives(waves: np.ndarray, fraction: np.ndarray) -> np.ndarray:
+    """P, its derivatives by phase, loss and spread, (4, lines, annuli)."""
+    n = np.arange(1, len(waves) + 1)
+    by = 2 * np.stack([np.ones(len(n)), 2j * np.pi * n, -n, -(n**2)])
+    turned = by[:, None] * np.exp(-2j * np.pi * n * fraction[:, None])
+    found = _product(turned.reshape(-1, len(n)), waves).real.reshape(4, len(fraction), -1)
+    found[0] += 1
+    return found
+
+
+def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    # by torch, on its number of threads: those of numpy wait for each other on a busy machine
+    return (torch.from_numpy(left) @ torch.from_numpy(right)).numpy()
 
 
 def blur(r2: np.ndarray, step: float, spacing: float) -> np.ndarray:
@@ -120,15 +131,28 @@ class Profile:
         self.last = float(self.r2[-1])
         q = self.r2 / self.last
         self.background = np.column_stack([np.ones_like(q), np.sqrt(q), q])
+        self._kept: tuple[float, float, float] | None = None
+        self._waves = np.empty((0, len(q)), complex)
+
+    def waves(self, pattern: Pattern) -> np.ndarray:
+        """Harmonics of a line at order 0; those of the last pattern are kept."""
+        shape = pattern.spacing, pattern.loss, pattern.spread
+        if shape != self._kept:
+            spread = pattern.spread + blur(self.r2, self.step, pattern.spacing)
+            self._waves = _harmonics(self.r2 / pattern.spacing, pattern.loss, spread)
+            self._kept = shape
+        return self._waves
 
     def columns(self, pattern: Pattern) -> np.ndarray:
         """Weighted columns of the linear parameters: background, then each line's envelope."""
         q = self.r2 / self.last
         orders = self.last / pattern.spacing
         degree = 0 if orders < 2.2 else 1 if orders < 4 else 2
-        spread = pattern.spread + blur(self.r2, self.step, pattern.spacing)
-        waves = _shape(pattern.phase(self.r2), pattern.loss, spread)
-        lines = [wave * q**k for wave in waves for k in range(degree + 1)]
+        lines = [
+            wave * q**k
+            for wave in _sums(self.waves(pattern), pattern.fraction)
+            for k in range(degree + 1)
+        ]
         return np.column_stack([self.background, *lines]) * self.root[:, None]
 
     def residual(self, pattern: Pattern) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -141,9 +165,7 @@ class Profile:
         """Fractions, and the height that a further line at each of them would have."""
         left, columns, _ = self.residual(pattern)
         fraction = np.arange(bins) / bins
-        spread = pattern.spread + blur(self.r2, self.step, pattern.spacing)
-        phase = self.r2 / pattern.spacing - fraction[:, None]
-        shape = _shape(phase, pattern.loss, spread) * self.root
+        shape = _sums(self.waves(pattern), fraction) * self.root
         shape = shape - np.linalg.solve(_squares(columns), columns.T @ shape.T).T @ columns.T
         return fraction, shape @ left / np.maximum((shape**2).sum(1), 1e-9)
 
@@ -197,15 +219,12 @@ class Profile:
         Linear parameters follow along (Kaufman 1975, BIT 15, 49).
         """
         _, columns, linear = self.residual(pattern)
-        spread = pattern.spread + blur(self.r2, self.step, pattern.spacing)
-        phase = pattern.phase(self.r2)
-        _, slope, by_loss, by_spread = airy(phase, pattern.loss, spread)
-        per_line = linear[3:].reshape(len(phase), -1)
+        _, slope, by_loss, by_spread = _derivatives(self.waves(pattern), pattern.fraction)
+        per_line = linear[3:].reshape(len(pattern.fraction), -1)
         q = self.r2 / self.last
         height = per_line @ np.stack([q**k for k in range(per_line.shape[1])]) * self.root
-        whole = phase + pattern.fraction[:, None]
         rows = [
-            (height * slope * whole).sum(0) * unit / pattern.spacing,
+            (height * slope).sum(0) * self.r2 * unit / pattern.spacing**2,
             *(height * slope),
             -(height * by_loss).sum(0),
             -(height * by_spread).sum(0),

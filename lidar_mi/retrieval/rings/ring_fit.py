@@ -130,7 +130,9 @@ class _System:
         for j in range(lines):
             phase[j] -= known[self.line == j] @ bend[self.line == j]
         spread = pattern.spread + blur(q, sectors.step, pattern.spacing)
-        wave, slope, by_loss, by_spread = airy(phase, pattern.loss, spread)
+        wave, slope, by_loss, by_spread = np.stack(
+            [airy(of_line, pattern.loss, spread) for of_line in phase], 1
+        )
         height = pattern.height[:, None]
         along_q = (height * slope / pattern.spacing).sum(0)
         total = (height * wave).sum(0)
@@ -176,8 +178,8 @@ class _System:
         self.columns = columns - basis @ (basis.transpose(0, 2, 1) @ columns)
         self.left = left - (basis @ (basis.transpose(0, 2, 1) @ left[..., None]))[..., 0]
         self.ring_slots = self.geometry_slots + np.arange(len(self.order))
-        self.matrix = np.einsum("sqa,sqb->sab", self.columns, self.columns)
-        self.score = np.einsum("sqa,sq->sa", self.columns, self.left)
+        turned = self.columns.transpose(0, 2, 1)
+        self.matrix, self.score = turned @ self.columns, (turned @ self.left[..., None])[..., 0]
         whole = self.matrix.sum(0)
         size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
         self.inverse = np.linalg.pinv(whole / np.outer(size, size), 1e-10, hermitian=True)
