@@ -1,5 +1,8 @@
 """The public names: what ``import lidar_mi as lm`` offers, and where each is made."""
 
+from .campaign.collect import open_campaign
+from .campaign.engine import run_campaign
+from .campaign.shipped import campaigns
 from .errors import InputError
 from .experiment.own_frames import calibrate_etalon, retrieve_v_los
 from .experiment.reading import load_experiment
@@ -38,6 +41,7 @@ __all__ = [
     "__version__",
     "analyse_rings",
     "calibrate_etalon",
+    "campaigns",
     "doctor",
     "experiments",
     "fit_vortices",
@@ -47,6 +51,7 @@ __all__ = [
     "load_experiment",
     "make_truth",
     "on_one_grid",
+    "open_campaign",
     "read_image",
     "read_noise",
     "read_scan",
@@ -56,5 +61,6 @@ __all__ = [
     "retrieve_wind",
     "retrieve_wind_volume",
     "run",
+    "run_campaign",
     "write_vortices",
 ]

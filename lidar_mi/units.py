@@ -71,6 +71,23 @@ def to_si(value: object, unit: str, example: str) -> float:
         raise wrong from None
 
 
+def split_quantity(value: object) -> tuple[float, str]:
+    """A number and the text of its unit, "150 m" as (150.0, "m"); a plain number has none.
+
+    Raises
+    ------
+    ValueError
+        It is neither a number nor text that begins with one.
+    """
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value), ""
+    text = value.strip() if isinstance(value, str) and len(value) <= 2 * _LONGEST else ""
+    match = _TEXT.fullmatch(text)
+    if not match:
+        raise ValueError(f"{value!r} is not allowed; expected a quantity such as '150 m'")
+    return float(match[1]), match[2].strip()
+
+
 def _bounded(text: str) -> str:
     """Text of a unit, if it is names and small numbers, with powers of two digits."""
     if len(text) > _LONGEST or not _PARTS.fullmatch(text):

@@ -38,8 +38,10 @@ ARROWS = {
         "assessment",
         "io",
         "experiment",
+        "campaign",
         "system",
     },
+    "campaign": {"assessment", "io", "experiment", "system"},
 }
 """What a room may import beside `errors` and `units`: a room, or modules of one. `atmosphere`,
 `instrument` and `retrieval` share descriptions alone: a vortex, a spectral line; `io` builds those

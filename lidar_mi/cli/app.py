@@ -7,6 +7,7 @@ import typer
 from lidar_mi.cli import (
     aerosol,
     calibrate,
+    campaign,
     check,
     doctor,
     info,
@@ -47,6 +48,7 @@ app.command(epilog=info.EXAMPLES)(info.info)
 app.command(epilog=aerosol.EXAMPLES)(aerosol.aerosol)
 app.command(epilog=rings.EXAMPLES)(rings.rings)
 app.command(epilog=calibrate.EXAMPLES)(calibrate.calibrate)
+app.add_typer(campaign.app, name="campaign")
 app.command("v_los", epilog=v_los.EXAMPLES)(v_los.v_los)
 app.command(epilog=doctor.EXAMPLES)(doctor.doctor)
 

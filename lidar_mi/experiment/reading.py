@@ -1,19 +1,18 @@
 """Reading experiments: from a YAML file and its variants to a checked description."""
 
 import copy
-import difflib
 import re
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.faults import first_fault
 from lidar_mi.experiment.schema import BACKSCATTER, NAME, Experiment
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
-from lidar_mi.units import Unit, Within, to_si
 
 BESIDE_VARIANTS = (
     "study.yaml",
@@ -85,7 +84,7 @@ def load(path: str | Path, overrides: list[str] | None = None) -> Experiment:
         Unreadable file, unknown key, wrong unit, value out of range: the first fault is named. A
         file of several variants: `load_variants` reads it.
     """
-    data = _read(path)
+    data = read_keys(path)
     for override in overrides or []:
         _override(data, override)
     if "variants" in data:
@@ -107,7 +106,7 @@ def load_variants(path: str | Path, overrides: list[str] | None = None) -> dict[
     InputError
         As `load`, with the variant's name; no variants, or one that is no section.
     """
-    data = _read(path)
+    data = read_keys(path)
     own = [text for text in overrides or [] if text.strip().startswith("variants.")]
     if "variants" not in data and not own:
         return {}
@@ -154,7 +153,7 @@ def merged(data: Any, changes: dict) -> dict:
     return found
 
 
-def _read(path: str | Path) -> dict:
+def read_keys(path: str | Path) -> dict:
     """The keys of an experiment file, as they stand."""
     path = Path(path)
     if path.suffix == ".xml":
@@ -179,7 +178,7 @@ def check(data: dict, origin: str) -> Experiment:
     try:
         return Experiment.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{origin}: {_first_fault(error)}") from None
+        raise InputError(f"{origin}: {first_fault(error, Experiment)}") from None
 
 
 def dump(experiment: Experiment) -> str:
@@ -212,83 +211,3 @@ def _override(data: dict, text: str) -> None:
         data[last] = parse_yaml(value, key)
     except InputError:
         raise InputError(f"--set {text}: {value!r} is not a YAML value") from None
-
-
-def _first_fault(error: ValidationError) -> str:
-    faults = error.errors()
-    # a misspelt key also leaves one missing: report the misspelt one
-    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
-    where, word = _key(fault["loc"]), ""
-    if len(where) < len(fault["loc"]) and fault["type"] == "literal_error":
-        # a word or a number: report the number's fault
-        word = fault["ctx"]["expected"] + " or "
-        fault = next(f for f in faults if f is not fault and _key(f["loc"]) == where)
-    field = ".".join(where)
-    message = fault["msg"].removeprefix("Value error, ")
-    if fault["type"] == "extra_forbidden":
-        allowed = _keys_at(fault["loc"][:-1])
-        close = difflib.get_close_matches(where[-1], allowed, 1)
-        hint = f"; did you mean {close[0]}?" if close else ""
-        return f"{field}: unknown key{hint} (allowed: {', '.join(allowed)})"
-    if fault["type"] == "missing":
-        return f"{field}: missing"
-    if fault["type"] == "value_error":
-        return f"{field}: {message}" if field else message
-    value = fault["input"]
-    unit, within = _metadata_at(fault["loc"], Unit), _metadata_at(fault["loc"], Within)
-    symbol = unit.symbol if unit else ""
-    shown = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
-    if fault["type"] in ("out_of_range", "finite_number", "int_parsing_size") and within:
-        if unit and not isinstance(value, float):
-            # as it was understood, with its unit
-            shown = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
-        expected = word + within.words(symbol)
-    elif fault["type"].startswith("model_"):
-        expected = f"a section with keys out of {', '.join(_keys_at(fault['loc']))}"
-    elif fault["type"] == "string_pattern_mismatch":
-        expected = "at most 100 letters, digits, _, . and -, a letter or digit first"
-    elif fault["type"] in ("tuple_type", "list_type"):
-        expected = "a list in brackets"
-    elif fault["type"] == "too_short":
-        expected = f"{fault['ctx']['min_length']} or more"
-    else:
-        expected = message.removeprefix("Input should be ")
-    return f"{field}: {shown} is not allowed; expected {expected}"
-
-
-def _key(location: tuple) -> list[str]:
-    """A fault's location without the kinds of value that pydantic tried there."""
-    kinds = ("literal[", "function-")
-    return [str(p) for p in location if p != "float" and not str(p).startswith(kinds)]
-
-
-def _metadata_at(location: tuple, kind: type) -> Any:
-    """The part of a kind in the annotation of the key at a location; None if there is none."""
-    model: Any = Experiment
-    field: Any = None
-    for part in location:
-        if model and part in model.model_fields:
-            field = model.model_fields[part]
-            model = _section(field.annotation)
-    pending = [field.annotation, *field.metadata] if field else []
-    while pending:
-        part = pending.pop()
-        if isinstance(part, kind):
-            return part
-        pending += (*get_args(part), *getattr(part, "__metadata__", ()))
-    return None
-
-
-def _keys_at(location: tuple) -> list[str]:
-    model: Any = Experiment
-    for part in location:
-        if isinstance(part, str):
-            model = _section(model.model_fields[part].annotation)
-    return list(model.model_fields)
-
-
-def _section(annotation) -> type[BaseModel] | None:
-    """The model in an annotation such as ``tuple[Model, ...] | None``."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next(filter(None, map(_section, get_args(annotation))), None)

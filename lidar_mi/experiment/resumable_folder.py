@@ -18,6 +18,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment import log, reading
 from lidar_mi.experiment.image_store import BATCHES, MADE_BY, ImageStore
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stage import Keeper
 from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.truth import find_file
 from lidar_mi.io import exr
@@ -62,7 +63,7 @@ class RunFolder:
     experiment : Experiment
     beside : path
         Folder in which files named by the experiment are looked for first.
-    shared : ImageStore, optional
+    shared : Keeper, optional
         Images that are shared with other runs: used if they are there, else added.
 
     Attributes
@@ -79,7 +80,7 @@ class RunFolder:
         path: str | Path,
         experiment: Experiment,
         beside: str | Path,
-        shared: ImageStore | None = None,
+        shared: Keeper | None = None,
     ):
         self.path = Path(path)
         self.figures = self.path / FIGURES
@@ -177,9 +178,6 @@ class RunFolder:
             self._shared.keep_part(part, value)
         return self._images.keep_part(part, value)
 
-    def _signed(self, value: xr.Dataset) -> xr.Dataset:
-        return value.assign_attrs({MADE_BY: self.made_by})
-
     def _is_foreign(self, image: Path) -> bool:
         """Whether an image is of another experiment or version, or cannot be read."""
         try:
@@ -191,18 +189,7 @@ class RunFolder:
         """Write a result into its file, if it has one; None: there is no such result."""
         if name == "scans":
             self._keep_noise(value)
-        if name not in RESULTS:
-            return
-        path = self.path / RESULTS[name]
-        if value is None:
-            path.unlink(missing_ok=True)
-        elif name == "vortices":
-            about = {"experiment": self._experiment.name, "source": f"lidar-mi {__version__}"}
-            if value.method:
-                about["vectors_method"] = str(value.method)
-            write_vortices(path, value.pairs, **about, **{MADE_BY: self.made_by})
-        else:
-            write_netcdf(self._signed(value), path)
+        write_result(self.path, name, value, self._experiment.name, self.made_by)
 
     def keep_verdict(self, metrics: Mapping[str, float], page: str) -> None:
         """Write report and metrics: the run is complete. The record has the metrics' checksum."""
@@ -218,6 +205,33 @@ class RunFolder:
         for part, scan in zip(rendering.IMAGES, scans, strict=True):
             if "Y_noisy" in scan and "Y_noisy" not in exr.read_scan(self._images.path(part)):
                 self._images.write(part, scan)
+
+
+def write_result(folder: Path, name: str, value: Any, experiment: str, signature: str) -> None:
+    """Write the result of a stage into its file, if it has one.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        Of the stage.
+    value : Dataset or VortexFits or None
+        None: there is no such result.
+    experiment, signature : str
+        Name of the experiment and hash of its record, see `made_by`.
+    """
+    if name not in RESULTS:
+        return
+    path = folder / RESULTS[name]
+    if value is None:
+        path.unlink(missing_ok=True)
+    elif name == "vortices":
+        about = {"experiment": experiment, "source": f"lidar-mi {__version__}"}
+        if value.method:
+            about["vectors_method"] = str(value.method)
+        write_vortices(path, value.pairs, **about, **{MADE_BY: signature})
+    else:
+        write_netcdf(value.assign_attrs({MADE_BY: signature}), path)
 
 
 def refuse_strangers(folder: Path, marker: str, kind: str) -> None:

@@ -15,7 +15,6 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.names import timing_key
 from lidar_mi.assessment.report.page import page
 from lidar_mi.errors import InputError, is_interrupt
-from lidar_mi.experiment.image_store import ImageStore
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.measure import measure
 from lidar_mi.experiment.pipeline import stages_of
@@ -130,7 +129,7 @@ def complete(
     folder: str | Path | None = None,
     *,
     overwrite: bool = False,
-    shared: ImageStore | None = None,
+    shared: Keeper | None = None,
 ) -> Run:
     """Run the rest of a prepared experiment.
 
@@ -140,7 +139,7 @@ def complete(
         From `prepare`.
     folder, overwrite
         As of `run`; errors, too.
-    shared : ImageStore, optional
+    shared : Keeper, optional
         Images that are shared with other runs.
     """
     if folder is None:

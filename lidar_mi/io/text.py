@@ -48,6 +48,23 @@ def write_text(path: str | Path, text: str) -> None:
     write_atomically(path, encoded(text))
 
 
+def append_line(path: str | Path, line: str) -> None:
+    """Append a line to a text file, which is created if it is missing.
+
+    Raises
+    ------
+    InputError
+        It cannot be written.
+    """
+    try:
+        with open(path, "ab") as file:
+            file.write(encoded(f"{line}\n"))
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}); expected a folder to write in"
+        ) from None
+
+
 def encoded(text: str) -> bytes:
     """Text as UTF-8; of names of files, bytes that are not UTF-8 are spelled out."""
     return text.encode("utf-8", "backslashreplace")

@@ -1,0 +1,1 @@
+"""Many experiments: their points, the engine, the collected data set."""

@@ -1,0 +1,136 @@
+"""The points of a campaign as one data set."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi import __version__
+from lidar_mi.arguments import checked_arguments
+from lidar_mi.assessment.metrics.units import unit_of
+from lidar_mi.campaign.folder import DATA, CampaignFolder, open_folder
+from lidar_mi.campaign.points import MEMBER, tied
+from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.resumable_folder import METRICS
+from lidar_mi.io.json import read_json
+from lidar_mi.io.netcdf import read_netcdf, write_netcdf
+from lidar_mi.progress import Notice
+
+STATUS = ("done", "failed", "missing")
+
+_EVERY = 200
+
+
+@checked_arguments
+def open_campaign(folder: str | Path) -> xr.Dataset:
+    """The data set of a campaign's folder, collected if that was not done.
+
+    Parameters
+    ----------
+    folder : path
+
+    Returns
+    -------
+    xr.Dataset
+        As of `run_campaign`; ``folder`` is relative to the campaign's folder.
+
+    Raises
+    ------
+    InputError
+        No campaign in the folder.
+    """
+    opened = open_folder(folder)
+    path = opened.path / DATA
+    return read_netcdf(path) if path.is_file() else collect(opened)
+
+
+def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
+    """Collect the metrics of all points, and write ``campaign.nc``.
+
+    The same points give the same file, whoever computed them and in whichever order. Durations are
+    left out: they are never the same.
+
+    Returns
+    -------
+    xr.Dataset
+        Dimensions in the order of the description, then ``member`` if there are several. A point
+        without metrics has NaN, and its ``status`` and ``message`` say why.
+    """
+    points = folder.points
+    total = len(points)
+    values: dict[str, np.ndarray] = {}
+    status = np.full(total, STATUS.index("missing"), np.int8)
+    messages, places = np.full(total, "", object), np.full(total, "", object)
+    for number in range(total):
+        if number % _EVERY == 0:
+            notice("collecting points", number / total)
+        place = folder.place(number)
+        places[number] = str(place.relative_to(folder.path))
+        if folder.is_done(number):
+            status[number] = STATUS.index("done")
+            metrics = read_json(place / METRICS, "metrics of a point")
+            for key, value in metrics.items():
+                if not key.startswith("timing."):
+                    values.setdefault(key, np.full(total, np.nan))[number] = value
+        elif (outcome := folder.outcome(number)) is not None:
+            status[number] = STATUS.index("failed")
+            messages[number] = outcome.message
+    data = _data_set(folder, values, status, messages, places)
+    write_netcdf(data, folder.path / DATA)
+    return data
+
+
+def _data_set(folder, values, status, messages, places) -> xr.Dataset:
+    points, campaign = folder.points, folder.campaign
+    dims = [one.name for one in points.dimensions]
+    shape = points.shape
+    if campaign.members > 1:
+        dims.append(MEMBER)
+    else:
+        shape = shape[:-1]
+    units = points.units()
+    coords: dict[str, Any] = {}
+    scales = {one.name: one.scale for one in points.dimensions}
+    if campaign.sample:
+        scales |= {tied(keys)[0]: span.scale for keys, span in campaign.sample.over.items()}
+    for name, (dim, found) in points.coordinates().items():
+        about = {"long_name": name.replace(".", " ").replace("_", " ")}
+        if name in units:
+            about["units"] = units[name]
+        if scales.get(name):
+            about["scale"] = scales[name]
+        coords[name] = (dim, np.array(found, object if isinstance(found[0], str) else None), about)
+    if MEMBER in dims:
+        coords[MEMBER] = (MEMBER, np.arange(campaign.members), {"long_name": "member"})
+    variables: dict[str, Any] = {
+        key: (dims, values[key].reshape(shape), _about(key)) for key in sorted(values)
+    }
+    variables["status"] = (
+        dims,
+        status.reshape(shape),
+        {
+            "long_name": "what became of the point",
+            "flag_values": np.arange(len(STATUS), dtype=np.int8),
+            "flag_meanings": " ".join(STATUS),
+        },
+    )
+    variables["message"] = (dims, messages.reshape(shape), {"long_name": "why it failed"})
+    variables["folder"] = (dims, places.reshape(shape), {"long_name": "folder of the point"})
+    attributes = {
+        "Conventions": "CF-1.11",
+        "name": campaign.name,
+        "base": campaign.base,
+        "seed": points.seed,
+        "kind": "sample" if campaign.sample else "sweep",
+        "keep": campaign.keep,
+        "version": __version__,
+    }
+    return xr.Dataset(variables, coords, attributes)
+
+
+def _about(key: str) -> dict[str, str]:
+    """Attributes of a metric."""
+    unit = unit_of(key)
+    name = ", ".join(key.replace("_", " ").split("."))
+    return {"long_name": name, **({"units": unit} if unit else {})}

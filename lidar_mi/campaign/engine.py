@@ -1,0 +1,387 @@
+"""A campaign on `dask.distributed`: points are handed out, results are files."""
+
+import os
+import time
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import dask
+import xarray as xr
+from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
+
+from lidar_mi.arguments import checked_arguments
+from lidar_mi.campaign.collect import collect
+from lidar_mi.campaign.description import Campaign, checked_campaign, read_campaign
+from lidar_mi.campaign.folder import CampaignFolder, check_version, create, read_base, signatures
+from lidar_mi.campaign.points import Points
+from lidar_mi.campaign.status import Status, count
+from lidar_mi.campaign.worker import Prepare, carry_out, render_shared
+from lidar_mi.errors import InputError, one_line
+from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.pipeline import stored_parts
+from lidar_mi.progress import Notice
+
+MOST_UNASKED = 100_000
+"""Points of a campaign that is run without being confirmed."""
+
+PATIENCE = 15.0
+"""Seconds for a scheduler to answer."""
+
+_AT_ONCE = 4
+"""Tasks per thread that the scheduler holds: enough that no worker waits."""
+
+
+@dataclass(repr=False)
+class State(Status):
+    """How far a campaign is that is being computed.
+
+    Attributes
+    ----------
+    started : float
+        Clock at the start.
+    before : int
+        Points that were finished before this start.
+    workers : int
+    dashboard : str
+        Address; empty: there is none.
+    """
+
+    started: float = field(default_factory=time.monotonic)
+    before: int = 0
+    workers: int = 0
+    dashboard: str = ""
+
+    def rate(self) -> float:
+        """Points a second since the start; 0: none yet."""
+        return (self.finished - self.before) / max(time.monotonic() - self.started, 1e-9)
+
+    def left(self) -> float:
+        """Seconds until the end at this rate."""
+        rate = self.rate()
+        return (self.total - self.finished) / rate if rate else float("nan")
+
+
+Watcher = Callable[[State], None]
+"""Called whenever a point has ended."""
+
+
+@checked_arguments
+def run_campaign(
+    campaign: str | Path | dict,
+    folder: str | Path | None = None,
+    *,
+    client: Any = None,
+    workers: int | None = None,
+    threads: int = 1,
+    quick: bool = False,
+    confirmed: bool = False,
+    lifetime: float | None = None,
+    notice: Notice | None = None,
+    watch: Any = None,
+) -> xr.Dataset:
+    """Run all points of a campaign that are not done, and collect them.
+
+    Parameters
+    ----------
+    campaign : path or dict
+        A campaign file, the name of a shipped one, an experiment with variants, or the keys of a
+        description.
+    folder : path, optional
+        Default: ``outputs/NAME``. A folder with a part of this campaign is completed.
+    client : distributed.Client, optional
+        Of any scheduler whose workers see this folder under the same path. Default: processes on
+        this machine.
+    workers : int, optional
+        Processes on this machine. Default: one per core.
+    threads : int
+        Of each worker.
+    quick : bool
+        The coarse version that the file describes.
+    confirmed : bool
+        Also with more than 100 000 points.
+    lifetime : float, optional
+        Seconds after which no further point is begun that would not end in time.
+    notice : callable, optional
+        Called with what is done before the first point, and how far it is (0 to 1, or None).
+    watch : callable, optional
+        Called with a `State` whenever a point has ended.
+
+    Returns
+    -------
+    xr.Dataset
+        Metrics over the campaign's dimensions and members, with ``status``, ``message`` and
+        ``folder`` of every point; as in the file ``campaign.nc``.
+
+    Raises
+    ------
+    InputError
+        A description that is none, too many points, the folder of another campaign, a scheduler
+        without workers or with workers of another version.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> table = lm.run_campaign("design_map", quick=True)         # doctest: +SKIP
+    >>> table["sensor.rmse_u"].sel(case="day").mean("member")     # doctest: +SKIP
+    """
+    notice, watch = notice or silent, watch or (lambda state: None)
+    ready = prepare_campaign(campaign, folder, quick=quick, confirmed=confirmed, notice=notice)
+    with ready.claimed(), connected(client, workers, threads, notice) as connection:
+        execute(ready, connection, watch=watch, lifetime=lifetime)
+    return collect(ready, notice)
+
+
+def prepare_campaign(
+    campaign: str | Path | dict | Campaign,
+    folder: str | Path | None = None,
+    *,
+    quick: bool = False,
+    confirmed: bool = False,
+    overrides: list[str] | None = None,
+    notice: Notice = silent,
+) -> CampaignFolder:
+    """The folder of a campaign whose points were all checked; parameters of `run_campaign`."""
+    from lidar_mi.campaign.shipped import campaign_file
+
+    origin: str | Path = "campaign"
+    if isinstance(campaign, dict):
+        campaign = checked_campaign(campaign, str(origin))
+    elif not isinstance(campaign, Campaign):
+        origin = campaign_file(campaign)
+        campaign = read_campaign(origin, overrides, quick=quick)
+    points = Points(campaign, *read_base(campaign, origin))
+    if len(points) > MOST_UNASKED and not confirmed:
+        raise InputError(
+            f"{origin}: {len(points)} points are not allowed unasked; expected at most "
+            f"{MOST_UNASKED}, or --yes (confirmed=True)"
+        )
+    ready = create(points, folder or Path("outputs") / campaign.name, notice)
+    check_version(ready)
+    return ready
+
+
+@contextmanager
+def connected(
+    client: Client | str | None, workers: int | None, threads: int, notice: Notice
+) -> Iterator[Client]:
+    """A client whose workers are ready.
+
+    Parameters
+    ----------
+    client : Client or str, optional
+        Of a scheduler, its address, or the file that it wrote. Default: processes here.
+
+    Raises
+    ------
+    InputError
+        A scheduler that does not answer, workers of another version.
+    """
+    if isinstance(client, Client):
+        _make_ready(client, threads, own_cache=True)
+        yield client
+        return
+    if client is not None:
+        with _client_of(client) as found:
+            _make_ready(found, threads, own_cache=True)
+            yield found
+        return
+    count = workers or os.cpu_count() or 1
+    if count < 1:
+        raise InputError(f"workers: {workers} is not allowed; expected 1 or more")
+    notice(f"starting {count} workers", None)
+    # a point is given up by its own count of killed workers, not by that of the scheduler
+    settings: dict[str, Any] = {
+        "distributed.scheduler.allowed-failures": 10**6,
+        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.worker.multiprocessing-method": "spawn",
+        "distributed.logging.distributed": "critical",
+    }
+    with dask.config.set(settings):
+        cluster = LocalCluster(
+            n_workers=count,
+            threads_per_worker=1,
+            processes=True,
+            dashboard_address=":0" if _has_dashboard() else None,
+            silence_logs=50,
+        )
+        with cluster, Client(cluster) as found:
+            _make_ready(found, threads, own_cache=False)
+            yield found
+
+
+def execute(
+    folder: CampaignFolder, client: Client, *, watch: Watcher, lifetime: float | None = None
+) -> State:
+    """Hand out the points that are not done, and wait for them.
+
+    Returns
+    -------
+    State
+        At the end; `State.finished` is below its total if the lifetime was too short.
+    """
+    name, total = folder.campaign.name, len(folder.points)
+    state = State(name, total, dashboard=client.dashboard_link if _has_dashboard() else "")
+    waiting = []
+    for number in range(state.total):
+        if folder.is_done(number):
+            count(folder, number, state)
+        else:
+            waiting.append(number)
+    state.before = state.finished
+    state.seconds.clear()
+    watch(state)
+    _Dispatch(folder, client, state, watch, lifetime).run(waiting)
+    return state
+
+
+class _Dispatch:
+    """The points in flight, and what has to be there first."""
+
+    def __init__(self, folder, client, state, watch, lifetime):
+        self.folder, self.client, self.state, self.watch = folder, client, state, watch
+        self.path, self.session = str(folder.path.resolve()), uuid.uuid4().hex[:12]
+        self.end = None if lifetime is None else state.started + lifetime
+        self.longest = 0.0
+        self.numbers: dict[Future, int] = {}
+        self.shared: dict[str, Future] = {}
+
+    def run(self, waiting: list[int]) -> None:
+        """All of some points, in their order."""
+        self.needed = signatures(self.folder.index, waiting)
+        self.rest = iter(waiting)
+        self.flying = as_completed()
+        self._fill()
+        for future in self.flying:
+            self._land(future)
+            self._fill()
+
+    def _fill(self) -> None:
+        """Keep the scheduler busy, but let it hold only a few tasks."""
+        threads = max(sum(self.client.nthreads().values()), 1)
+        self.state.workers = len(self.client.nthreads())
+        while len(self.numbers) < _AT_ONCE * threads:
+            if self.end is not None and time.monotonic() + self.longest > self.end:
+                break
+            number = next(self.rest, None)
+            if number is None:
+                break
+            self._launch(number)
+        self.state.running = min(len(self.numbers), threads)
+
+    def _launch(self, number: int) -> None:
+        first, ready = self._renderings(number)
+        future = self.client.submit(
+            carry_out,
+            self.path,
+            number,
+            self.session,
+            ready,
+            first,
+            key=f"point-{number}-{uuid.uuid4().hex[:8]}",
+            pure=False,
+        )
+        self.numbers[future] = number
+        self.flying.add(future)
+
+    def _renderings(self, number: int) -> tuple[list[int], list[Future]]:
+        """Tasks that render what this point shares with others, each submitted once.
+
+        Returns
+        -------
+        first : list of int
+            Which of them were submitted for this point.
+        tasks : list of Future
+        """
+        signatures_ = self.folder.index[number].images
+        if all(self.needed[one] < 2 for one in signatures_):
+            return [], []
+        parts: dict[str, str] = {}
+        for part, stage in stored_parts(self.folder.points.experiment(number)).items():
+            parts.setdefault(stage.name, part)
+        first: list[int] = []
+        tasks: list[Future] = []
+        for signature, part in zip(signatures_, parts.values(), strict=True):
+            if self.needed[signature] > 1 and signature not in self.shared:
+                first.append(len(tasks))
+                self.shared[signature] = self.client.submit(
+                    render_shared,
+                    self.path,
+                    number,
+                    part,
+                    self.session,
+                    key=f"render-{part}-{signature[:8]}-{uuid.uuid4().hex[:8]}",
+                    pure=False,
+                )
+            if signature in self.shared:
+                tasks.append(self.shared[signature])
+        return first, tasks
+
+    def _land(self, future: Future) -> None:
+        number = self.numbers.pop(future)
+        try:
+            outcome = future.result()
+        except KilledWorker:
+            # of a scheduler that gives up before the point's own count does
+            self._launch(number)
+            return
+        except InputError:  # the folder, not the point
+            raise
+        except Exception as error:  # a point's own failure is an outcome
+            raise InputError(
+                f"the scheduler or its workers are lost ({one_line(error)[:100]}); start the "
+                "campaign again to complete it"
+            ) from error
+        finally:
+            future.release()
+        self.longest = max(self.longest, outcome.seconds.get("total", 0.0))
+        self.state.add(outcome)
+        self.watch(self.state)
+        for signature in self.folder.index[number].images:
+            self.needed[signature] -= 1
+            if not self.needed[signature]:
+                self.shared.pop(signature, None)
+                self.folder.drop_images(signature)
+
+
+def _client_of(address: str) -> Client:
+    """A client of a scheduler by its address or by the file that it wrote."""
+    file = Path(address).is_file()
+    try:
+        return Client(timeout=PATIENCE, **{"scheduler_file" if file else "address": str(address)})
+    except (OSError, ValueError) as error:
+        reason = one_line(error).split(";")[0][:80]
+        raise InputError(
+            f"--scheduler: {address} does not answer within {PATIENCE:g} s ({reason}); expected "
+            "the address of a running dask scheduler, tcp://HOST:8786, or its scheduler file"
+        ) from None
+
+
+def _make_ready(client: Client, threads: int, *, own_cache: bool) -> None:
+    """Threads, kernel cache and version of all workers, those that come later included."""
+    try:
+        client.wait_for_workers(1, timeout=60)
+    except TimeoutError:
+        raise InputError(
+            "--scheduler: no worker within 60 s; expected dask workers of this scheduler"
+        ) from None
+    try:
+        client.register_plugin(Prepare(threads, own_cache))
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(
+            f"--scheduler: its workers cannot load lidar-mi ({one_line(error)[:100]}); expected "
+            "workers with the same version of it"
+        ) from None
+
+
+def _has_dashboard() -> bool:
+    try:
+        import bokeh  # noqa: F401
+    except ImportError:
+        return False
+    return True

@@ -1,0 +1,324 @@
+"""The folder of a campaign: its description, its points, images that points share.
+
+Files are the truth: a point is done when its folder has `metrics.json`. Whatever was killed while
+writing left no such file, and is done again.
+"""
+
+import shutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from lidar_mi import __version__
+from lidar_mi.campaign.description import Campaign, checked_campaign
+from lidar_mi.campaign.points import Points
+from lidar_mi.errors import InputError
+from lidar_mi.experiment import reading
+from lidar_mi.experiment.pipeline import stored_parts
+from lidar_mi.experiment.resumable_folder import METRICS, made_by, new_record, refuse_strangers
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.shipped import experiment_file
+from lidar_mi.io.folder import locked, make_folder
+from lidar_mi.io.json import read_json, to_json
+from lidar_mi.io.text import read_text, write_text
+from lidar_mi.io.yaml import read_yaml, to_yaml
+from lidar_mi.progress import Notice
+
+RECORD, INDEX, OUTCOME = "campaign.yaml", "points.txt", "outcome.json"
+DATA, REPORT, LOG = "campaign.nc", "report.html", "log.txt"
+POINTS, IMAGES = "points", "images"
+ATTEMPTS = "attempts.txt"
+RUN = "run"
+"""Run folder in that of a point, if everything is kept."""
+
+_SHORT = 20
+"""Characters of a hash that name a folder: 80 bits, for which 10^7 points collide never."""
+
+
+class Row(NamedTuple):
+    """One point in the index: the hash of its settings, inputs and version; those of its images."""
+
+    point: str
+    images: tuple[str, ...]
+
+
+class Outcome(NamedTuple):
+    """What became of a point.
+
+    Attributes
+    ----------
+    status : str
+        "done" or "failed".
+    message : str
+        Why it failed.
+    seconds : dict of str to float
+        Duration by step.
+    rendered, reused : int
+        Images.
+    """
+
+    status: str
+    message: str
+    seconds: dict[str, float]
+    rendered: int
+    reused: int
+
+
+@dataclass(frozen=True)
+class CampaignFolder:
+    """A campaign's folder, with the points that its record describes.
+
+    Attributes
+    ----------
+    path : Path
+    points : Points
+    """
+
+    path: Path
+    points: Points
+
+    @property
+    def campaign(self) -> Campaign:
+        """The description."""
+        return self.points.campaign
+
+    @cached_property
+    def index(self) -> list[Row]:
+        """A row for each point, by its number.
+
+        Raises
+        ------
+        InputError
+            The file is damaged.
+        """
+        path = self.path / INDEX
+        rows = []
+        for line in read_text(path, "the index of a campaign").splitlines():
+            point, *images = line.split()
+            rows.append(Row(point, tuple(images)))
+        if len(rows) != len(self.points):
+            raise InputError(
+                f"{path}: {len(rows)} points; expected {len(self.points)}, as {RECORD} describes"
+            )
+        return rows
+
+    def place(self, number: int) -> Path:
+        """Folder of a point."""
+        name = self.index[number].point
+        return self.path / POINTS / name[:2] / name
+
+    def images(self, signature: str) -> Path:
+        """Folder of images of one signature."""
+        return self.path / IMAGES / signature[:_SHORT]
+
+    def is_done(self, number: int) -> bool:
+        """Whether a point's metrics are there."""
+        return (self.place(number) / METRICS).is_file()
+
+    def outcome(self, number: int) -> Outcome | None:
+        """What became of a point; None: nothing yet."""
+        return read_outcome(self.place(number))
+
+    def drop_images(self, signature: str) -> None:
+        """Remove images that no point needs any more."""
+        shutil.rmtree(self.images(signature), ignore_errors=True)
+        with suppress(OSError):  # others are left in it
+            (self.path / IMAGES).rmdir()
+
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Lock the folder for the one process that hands out its points.
+
+        Raises
+        ------
+        InputError
+            Another process does.
+        """
+        with locked(self.path):
+            yield
+
+
+def read_outcome(place: Path) -> Outcome | None:
+    """What became of the point in a folder; None: nothing yet."""
+    path = place / OUTCOME
+    if not path.is_file():
+        return None
+    found = read_json(path, "outcome of a point")
+    try:
+        return Outcome(**found)
+    except TypeError:
+        raise InputError(f"{path}: was not written by a campaign; expected its outcome") from None
+
+
+def write_outcome(place: Path, outcome: Outcome) -> None:
+    """Write what became of a point."""
+    write_text(place / OUTCOME, to_json(outcome._asdict()))
+
+
+def read_base(campaign: Campaign, origin: str | Path) -> tuple[dict[str, Any], Path]:
+    """Keys of the base experiment and the folder of its file.
+
+    Raises
+    ------
+    InputError
+        No such experiment; one with variants.
+    """
+    beside = Path(origin).parent / campaign.base
+    path = beside if beside.is_file() else experiment_file(campaign.base)
+    base = dict(reading.read_keys(path))
+    variants = base.pop("variants", None)
+    if variants and "variant" not in campaign.sweep:
+        raise InputError(
+            f"{origin}: base: {campaign.base} has variants; expected an experiment without, or the "
+            "campaign of its variants: lidar-mi campaign run " + str(campaign.base)
+        )
+    # a name in the base would only name its own run
+    return base, path.parent.resolve()
+
+
+def create(points: Points, folder: str | Path, notice: Notice) -> CampaignFolder:
+    """The folder of a campaign, with its record and index; an existing one of the same campaign.
+
+    Every point's settings are checked before anything is written.
+
+    Raises
+    ------
+    InputError
+        A point that is no experiment, two that are equal, the folder of another campaign.
+    """
+    folder = Path(folder)
+    record = _record(points)
+    refuse_strangers(folder, RECORD, "campaign's folder")
+    if (folder / RECORD).is_file():
+        found = open_folder(folder)
+        old = read_yaml(folder / RECORD, "the record of a campaign")
+        other = next((key for key, value in record.items() if old.get(key) != value), None)
+        if other:
+            what = f"version {old.get(other)}" if other == "version" else f"another {other}"
+            raise InputError(
+                f"{folder}: holds a campaign with {what}; expected another folder (-o DIR)"
+            )
+        return found
+    rows = _checked(points, notice)
+    make_folder(folder)
+    lines = [" ".join((row.point, *row.images)) for row in rows]
+    write_text(folder / INDEX, "\n".join(lines) + "\n")
+    write_text(folder / RECORD, to_yaml(record))
+    return CampaignFolder(folder, points)
+
+
+def open_folder(folder: str | Path) -> CampaignFolder:
+    """The folder of an existing campaign.
+
+    Raises
+    ------
+    InputError
+        There is no campaign in it.
+    """
+    folder = Path(folder)
+    path = folder / RECORD
+    if not path.is_file():
+        raise InputError(f"{folder}: no {RECORD} in it; expected the folder of a campaign")
+    record = read_yaml(path, "the record of a campaign")
+    try:
+        campaign = checked_campaign(record["campaign"], str(path))
+        points = Points(campaign, dict(record["base"]), record["beside"])
+    except (TypeError, KeyError):
+        raise InputError(f"{path}: not written by a campaign; expected its record") from None
+    return CampaignFolder(folder, points)
+
+
+def check_version(folder: CampaignFolder) -> None:
+    """Refuse to compute points of another version's campaign.
+
+    Raises
+    ------
+    InputError
+        Results of two versions must not be mixed.
+    """
+    version = read_yaml(folder.path / RECORD, "the record of a campaign")["version"]
+    if version != __version__:
+        raise InputError(
+            f"{folder.path}: a campaign of lidar-mi {version}; expected that version, this is "
+            f"{__version__}"
+        )
+
+
+def _record(points: Points) -> dict[str, Any]:
+    return {
+        "campaign": points.campaign.model_dump(mode="json", exclude_defaults=True),
+        "base": points.base,
+        "beside": str(points.beside),
+        "version": __version__,
+    }
+
+
+def _checked(points: Points, notice: Notice) -> list[Row]:
+    """The index of all points; each is a valid experiment, and no two are equal."""
+    _check_keys(points)
+    seen: dict[str, int] = {}
+    rows = []
+    for number in range(len(points)):
+        if number % 100 == 0:
+            notice(f"checking {len(points)} points", number / len(points))
+        experiment = points.experiment(number)
+        row = _row(experiment, points.beside)
+        if row.point in seen:
+            raise InputError(
+                f"{_differing(points, seen[row.point], number)}: changes nothing between "
+                f"{points.title(seen[row.point])} and {points.title(number)}; expected points that "
+                "differ"
+            )
+        seen[row.point] = number
+        rows.append(row)
+    return rows
+
+
+def _row(experiment: Experiment, beside: Path) -> Row:
+    record = new_record(experiment, beside)
+    # equal stages have equal signatures: of each one part is enough
+    stages = {stage.name: stage for stage in stored_parts(experiment).values()}
+    images = [made_by(record, stage.indifferent_to or ()) for stage in stages.values()]
+    return Row(made_by(record)[:_SHORT], tuple(images))
+
+
+def _check_keys(points: Points) -> None:
+    """Keys that vary must be keys of the base experiment."""
+    settings = reading.settings(reading.check(points.base, points.campaign.base))
+    for dimension in points.dimensions:
+        for key in dimension.changes[0] if not dimension.named else ():
+            section = key.rpartition(".")[0]
+            inside = _section(settings, section)
+            if inside is None:
+                raise InputError(
+                    f"sweep.{key}: not allowed, as {points.campaign.base} has no section "
+                    f"{section}; expected a key of it, or the section under set"
+                )
+
+
+def _section(settings: Mapping[str, Any], key: str) -> Mapping[str, Any] | None:
+    for part in key.split(".") if key else ():
+        found = settings.get(part)
+        if not isinstance(found, Mapping):
+            return None
+        settings = found
+    return settings
+
+
+def _differing(points: Points, one: int, other: int) -> str:
+    """The first dimension in which two points differ, as a key of the description."""
+    pairs = zip(points.index(one), points.index(other), strict=True)
+    names = [f"sweep.{dimension.name}" for dimension in points.dimensions] + ["members"]
+    return next(name for name, (a, b) in zip(names, pairs, strict=True) if a != b)
+
+
+def signatures(rows: Sequence[Row], numbers: Iterable[int]) -> dict[str, int]:
+    """How many of some points need the images of each signature."""
+    found: dict[str, int] = {}
+    for number in numbers:
+        for signature in rows[number].images:
+            found[signature] = found.get(signature, 0) + 1
+    return found

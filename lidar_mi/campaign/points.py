@@ -1,0 +1,273 @@
+"""The points of a campaign: from a number to an experiment, without a list of all."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from lidar_mi.campaign.description import Campaign, Range
+from lidar_mi.errors import InputError
+from lidar_mi.experiment import reading
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.units import UNITS, split_quantity
+
+MEMBER, SAMPLE = "member", "sample"
+"""Names of dimensions that are no key."""
+
+
+@dataclass(frozen=True)
+class Dimension:
+    """One dimension of a campaign's points.
+
+    Attributes
+    ----------
+    name : str
+        A dotted key, a name of its own, or `SAMPLE`.
+    labels : tuple
+        Values as an experiment file has them, or names.
+    changes : tuple of dict
+        Keys that each label changes, dotted.
+    named : bool
+        Whether it has sets of changes by name; else its changes are those of keys.
+    scale : str
+        Either linear or log, of a range; empty where the description does not say.
+    """
+
+    name: str
+    labels: tuple
+    changes: tuple[dict[str, Any], ...]
+    named: bool
+    scale: str = ""
+
+
+class Points:
+    """All points of a campaign, in the order of the file, members last and fastest.
+
+    Parameters
+    ----------
+    campaign : Campaign
+    base : dict
+        Keys of the base experiment.
+    beside : path
+        Folder in which files named by the experiments are searched first.
+
+    Raises
+    ------
+    InputError
+        Two dimensions that change one key.
+    """
+
+    def __init__(self, campaign: Campaign, base: dict[str, Any], beside: str | Path):
+        self.campaign, self.beside = campaign, Path(beside)
+        self.dimensions = tuple(_dimensions(campaign))
+        # a name of a point is no part of what it is
+        self.base = reading.merged(base, _nested(campaign.set))
+        self.seed = campaign.seed if campaign.seed is not None else self.base.get("seed", 1)
+        _refuse_overlaps(self.dimensions)
+
+    @cached_property
+    def shape(self) -> tuple[int, ...]:
+        """Number of values in each dimension; the last one is that of members."""
+        return (*(len(one.labels) for one in self.dimensions), self.campaign.members)
+
+    def __len__(self) -> int:
+        return math.prod(self.shape)
+
+    def index(self, number: int) -> tuple[int, ...]:
+        """Indices of a point in all dimensions."""
+        return tuple(int(k) for k in np.unravel_index(number, self.shape))
+
+    def title(self, number: int) -> str:
+        """A point by its values: "scan.range 150 m, case day, member 3"."""
+        *index, member = self.index(number)
+        words = [
+            f"{one.name} {one.labels[k]}" for one, k in zip(self.dimensions, index, strict=True)
+        ]
+        return ", ".join(words + ([f"member {member}"] if self.campaign.members > 1 else []))
+
+    def experiment(self, number: int) -> Experiment:
+        """The experiment of a point.
+
+        Raises
+        ------
+        InputError
+            An unknown key, a wrong unit, a value out of range.
+        """
+        *index, member = self.index(number)
+        data = self.base
+        for dimension, k in zip(self.dimensions, index, strict=True):
+            data = reading.merged(data, _nested(dimension.changes[k]))
+        data = data | {"seed": member_seed(self.seed, member)}
+        found = reading.check(data, self.title(number))
+        return found.read_from(self.beside)
+
+    def coordinates(self) -> dict[str, tuple[str, list]]:
+        """Values of every key and name by the dimension along which they vary.
+
+        Returns
+        -------
+        dict
+            By name: the dimension, and numbers in SI units, text or numbers from 0 on. Units are
+            those of `units`.
+        """
+        found: dict[str, tuple[str, list]] = {}
+        for axis, dimension in enumerate(self.dimensions):
+            if dimension.name == SAMPLE:
+                found[SAMPLE] = (SAMPLE, list(dimension.labels))
+                for keys in self.campaign.sample.over if self.campaign.sample else ():
+                    key = tied(keys)[0]
+                    found[key] = (SAMPLE, self._values(axis, key))
+            else:
+                if dimension.named:
+                    values, _ = _quantities(dimension.labels)
+                else:
+                    values = self._values(axis, dimension.name)
+                found[dimension.name] = (dimension.name, values)
+        return found
+
+    def units(self) -> dict[str, str]:
+        """SI units of the keys that vary, as far as they have one."""
+        found = {}
+        for dimension in self.dimensions:
+            if dimension.named:
+                _, unit = _quantities(dimension.labels)
+                found |= {dimension.name: unit} if unit else {}
+                continue
+            for key in dimension.changes[0]:
+                value = _at(reading.settings(self.experiment(0)), key)
+                if isinstance(value, str) and _number(value) is not None:
+                    found[key] = value.partition(" ")[2]
+        return found
+
+    def _values(self, axis: int, key: str) -> list:
+        """Values of a key along a dimension, as the experiments have them."""
+        stride = math.prod(self.shape[axis + 1 :])
+        found = [
+            _at(reading.settings(self.experiment(k * stride)), key) for k in range(self.shape[axis])
+        ]
+        numbers = [_number(value) for value in found]
+        if all(number is not None for number in numbers):
+            return numbers
+        return [str(value) for value in self.dimensions[axis].labels]
+
+
+def member_seed(seed: int, member: int) -> int:
+    """Seed of a member: the same at every point, so that differences between points are sharp."""
+    state = np.random.SeedSequence((seed, member)).generate_state(1)
+    return int(state[0]) % 2**31
+
+
+def _dimensions(campaign: Campaign) -> Iterator[Dimension]:
+    for key, values in campaign.sweep.items():
+        if isinstance(values, dict):
+            yield Dimension(key, tuple(values), tuple(map(_flat, values.values())), True)
+        else:
+            labels = tuple(values.values() if isinstance(values, Range) else values)
+            keys = tied(key)
+            changes = tuple(dict.fromkeys(keys, value) for value in labels)
+            scale = values.scale if isinstance(values, Range) else ""
+            yield Dimension(keys[0], labels, changes, False, scale)
+    if campaign.sample:
+        yield _sampled(campaign)
+
+
+def _sampled(campaign: Campaign) -> Dimension:
+    """The points of a space-filling sample, scrambled by the campaign's seed."""
+    sample = campaign.sample
+    assert sample is not None
+    kinds = {"sobol": qmc.Sobol, "latin_hypercube": qmc.LatinHypercube}
+    random = np.random.default_rng(campaign.seed or 0)
+    unit = kinds[sample.method](len(sample.over), rng=random).random(sample.n)
+    columns = [
+        span.quantities(column.tolist())
+        for span, column in zip(sample.over.values(), unit.T, strict=True)
+    ]
+    changes = [
+        {key: value for keys, value in zip(sample.over, row, strict=True) for key in tied(keys)}
+        for row in zip(*columns, strict=True)
+    ]
+    return Dimension(SAMPLE, tuple(range(sample.n)), tuple(changes), False)
+
+
+def tied(keys: str) -> list[str]:
+    """Keys that share their values, as the description joins them: "scan.range, doppler.range"."""
+    return [key.strip() for key in keys.split(",")]
+
+
+def _quantities(labels: Sequence[str]) -> tuple[list, str]:
+    """Names of sets of changes; those that are all quantities of one kind as numbers in SI."""
+    try:
+        found = [UNITS.Quantity(*split_quantity(_plain(label))).to_base_units() for label in labels]
+    except Exception:  # words; pint raises whatever its parser does
+        return list(labels), ""
+    if len({one.units for one in found}) > 1:
+        return list(labels), ""
+    return [float(one.magnitude) for one in found], f"{found[0].units:~C}"
+
+
+def _plain(label: str) -> str | float:
+    """A label as a number, if it is one."""
+    try:
+        return float(label)
+    except ValueError:
+        return label
+
+
+def _refuse_overlaps(dimensions: Sequence[Dimension]) -> None:
+    owner: dict[str, str] = {}
+    for dimension in dimensions:
+        for key in dict.fromkeys(key for changes in dimension.changes for key in changes):
+            clash = next((k for k in owner if _overlap(k, key)), None)
+            if clash:
+                raise InputError(
+                    f"sweep.{dimension.name}: {key} is not allowed; expected no key that "
+                    f"{owner[clash]} changes, too"
+                )
+        owner |= {key: dimension.name for changes in dimension.changes for key in changes}
+
+
+def _overlap(one: str, other: str) -> bool:
+    return f"{one}.".startswith(f"{other}.") or f"{other}.".startswith(f"{one}.")
+
+
+def _flat(changes: Mapping[str, Any], above: str = "") -> dict[str, Any]:
+    """Nested sections as dotted keys; an empty section is a value."""
+    found: dict[str, Any] = {}
+    for key, value in changes.items():
+        name = f"{above}{key}"
+        nested = isinstance(value, Mapping) and value
+        found |= _flat(value, f"{name}.") if nested else {name: value}
+    return found
+
+
+def _nested(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Dotted keys as nested sections."""
+    found: dict[str, Any] = {}
+    for key, value in changes.items():
+        for part in reversed(key.split(".")):
+            value = {part: value}
+        found = reading.merged(found, value) if found else dict(value)
+    return found
+
+
+def _at(settings: Mapping[str, Any], key: str) -> Any:
+    """The value at a dotted key; None: there is none."""
+    value: Any = settings
+    for part in key.split("."):
+        value = value.get(part) if isinstance(value, Mapping) else None
+    return value
+
+
+def _number(value: object) -> float | None:
+    """A number, with or without its SI unit; None: it is none."""
+    if isinstance(value, bool) or value is None:
+        return None
+    try:
+        return float(str(value).partition(" ")[0])
+    except ValueError:
+        return None

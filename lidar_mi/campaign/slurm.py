@@ -1,0 +1,73 @@
+"""Workers of a campaign as jobs of SLURM, by dask-jobqueue."""
+
+from typing import Any
+
+from lidar_mi.errors import InputError
+
+
+def slurm_cluster(
+    workers: int,
+    *,
+    memory: str = "4 GB",
+    walltime: str = "01:00:00",
+    queue: str | None = None,
+    account: str | None = None,
+) -> Any:
+    """A cluster whose workers are jobs of SLURM, each with one core.
+
+    Workers end two minutes before their walltime, and their points go to others.
+
+    Parameters
+    ----------
+    workers : int
+        Jobs that are asked for.
+    memory : str
+        Of each.
+    walltime : str
+        Of each job, HH:MM:SS.
+    queue, account : str, optional
+        Partition and account.
+
+    Returns
+    -------
+    dask_jobqueue.SLURMCluster
+        ``job_script()`` is its job as text.
+
+    Raises
+    ------
+    InputError
+        dask-jobqueue is missing; a walltime that is none.
+    """
+    try:
+        from dask_jobqueue import SLURMCluster
+    except ImportError:
+        raise InputError(
+            "--slurm: dask-jobqueue is not installed; expected pip install 'lidar-mi[slurm]'"
+        ) from None
+    lifetime = _seconds(walltime) - 120
+    if lifetime <= 0:
+        raise InputError(f"--walltime: {walltime} is not allowed; expected more than 2 minutes")
+    cluster = SLURMCluster(
+        cores=1,
+        processes=1,
+        memory=memory,
+        walltime=walltime,
+        queue=queue,
+        account=account,
+        worker_extra_args=["--lifetime", f"{lifetime}s", "--lifetime-stagger", "60s"],
+        death_timeout=300,
+        scheduler_options={"dashboard_address": None},
+    )
+    cluster.scale(jobs=workers)
+    return cluster
+
+
+def _seconds(walltime: str) -> int:
+    """HH:MM:SS in seconds."""
+    try:
+        hours, minutes, seconds = map(int, walltime.split(":"))
+    except ValueError:
+        raise InputError(
+            f"--walltime: {walltime!r} is not allowed; expected HH:MM:SS such as 01:00:00"
+        ) from None
+    return 3600 * hours + 60 * minutes + seconds

@@ -1,0 +1,97 @@
+"""Faults that pydantic finds in a description, in words of who wrote it."""
+
+import difflib
+from typing import Any, get_args
+
+from pydantic import BaseModel, ValidationError
+
+from lidar_mi.units import Unit, Within, to_si
+
+
+def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
+    """The key of the first fault in a description, its value and what is allowed, as one line.
+
+    Parameters
+    ----------
+    error : ValidationError
+    model : type of BaseModel
+        Of the description: it says units, limits and the keys of every section.
+    """
+    faults = error.errors()
+    # a misspelt key also leaves one missing: report the misspelt one
+    fault = next((f for f in faults if f["type"] == "extra_forbidden"), faults[0])
+    where, word = _key(fault["loc"]), ""
+    if len(where) < len(fault["loc"]) and fault["type"] == "literal_error":
+        # a word or a number: report the number's fault
+        word = fault["ctx"]["expected"] + " or "
+        fault = next(f for f in faults if f is not fault and _key(f["loc"]) == where)
+    field = ".".join(where)
+    message = fault["msg"].removeprefix("Value error, ")
+    if fault["type"] == "extra_forbidden":
+        allowed = _keys_at(model, fault["loc"][:-1])
+        close = difflib.get_close_matches(where[-1], allowed, 1)
+        hint = f"; did you mean {close[0]}?" if close else ""
+        return f"{field}: unknown key{hint} (allowed: {', '.join(allowed)})"
+    if fault["type"] == "missing":
+        return f"{field}: missing"
+    if fault["type"] == "value_error":
+        return f"{field}: {message}" if field else message
+    value = fault["input"]
+    unit, within = (
+        _metadata_at(model, fault["loc"], Unit),
+        _metadata_at(model, fault["loc"], Within),
+    )
+    symbol = unit.symbol if unit else ""
+    shown = f"{value:g} {symbol}".strip() if isinstance(value, float) else repr(value)
+    if fault["type"] in ("out_of_range", "finite_number", "int_parsing_size") and within:
+        if unit and not isinstance(value, float):
+            # as it was understood, with its unit
+            shown = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
+        expected = word + within.words(symbol)
+    elif fault["type"].startswith("model_"):
+        expected = f"a section with keys out of {', '.join(_keys_at(model, fault['loc']))}"
+    elif fault["type"] == "string_pattern_mismatch":
+        expected = "at most 100 letters, digits, _, . and -, a letter or digit first"
+    elif fault["type"] in ("tuple_type", "list_type"):
+        expected = "a list in brackets"
+    elif fault["type"] == "too_short":
+        expected = f"{fault['ctx']['min_length']} or more"
+    else:
+        expected = message.removeprefix("Input should be ")
+    return f"{field}: {shown} is not allowed; expected {expected}"
+
+
+def _key(location: tuple) -> list[str]:
+    """A fault's location without the kinds of value that pydantic tried there."""
+    kinds = ("literal[", "function-")
+    return [str(p) for p in location if p != "float" and not str(p).startswith(kinds)]
+
+
+def _metadata_at(model: Any, location: tuple, kind: type) -> Any:
+    """The part of a kind in the annotation of the key at a location; None if there is none."""
+    field: Any = None
+    for part in location:
+        if model and part in model.model_fields:
+            field = model.model_fields[part]
+            model = _section(field.annotation)
+    pending = [field.annotation, *field.metadata] if field else []
+    while pending:
+        part = pending.pop()
+        if isinstance(part, kind):
+            return part
+        pending += (*get_args(part), *getattr(part, "__metadata__", ()))
+    return None
+
+
+def _keys_at(model: Any, location: tuple) -> list[str]:
+    for part in location:
+        if model and part in model.model_fields:
+            model = _section(model.model_fields[part].annotation)
+    return list(model.model_fields)
+
+
+def _section(annotation) -> type[BaseModel] | None:
+    """The model in an annotation such as ``tuple[Model, ...] | None``."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next(filter(None, map(_section, get_args(annotation))), None)

@@ -1,0 +1,1 @@
+"""Experiments, Mitsuba scenes and the sample wake that ship with the package."""
