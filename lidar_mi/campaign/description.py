@@ -168,9 +168,10 @@ class Campaign(_Section):
 
     @model_validator(mode="after")
     def _one_kind(self):
-        if bool(self.sweep) == bool(self.sample):
-            both = "sweep and sample together are" if self.sweep else "no sweep or sample is"
-            raise ValueError(f"{both} not allowed; expected one of the two")
+        if self.sweep and self.sample:
+            raise ValueError("sweep and sample: not allowed together; expected one of the two")
+        if not self.sweep and not self.sample and self.members == 1:
+            raise ValueError("sweep: missing; expected sweep, sample or several members")
         reserved = {"seed": "members", "member": "members", "sample": "sample", "name": "name"}
         for key in (*self.sweep, *(self.sample.over if self.sample else ())):
             if key in reserved:
@@ -267,11 +268,23 @@ def read_campaign(
         coarse = data.get("quick")
         if not isinstance(coarse, dict) or not coarse:
             raise InputError(f"{path}: quick: missing; expected the keys of a coarse version")
-        for key, value in coarse.items():
-            both = isinstance(value, dict) and isinstance(data.get(key), dict)
-            data[key] = {**data[key], **value} if both else value
+        data = _coarser(data, coarse)
         data["name"] = f"{data.get('name')}.quick"
     return checked_campaign(data, str(path))
+
+
+def _coarser(data: dict, coarse: dict) -> dict:
+    """A description with other values in some places; a list of names picks out of named sets."""
+    found, scales = dict(data), {"linear", "log"}
+    for key, value in coarse.items():
+        before = data.get(key)
+        if isinstance(value, dict) and isinstance(before, dict) and not scales & set(value):
+            found[key] = _coarser(before, value)
+        elif isinstance(value, list) and isinstance(before, dict) and set(value) <= set(before):
+            found[key] = {name: before[name] for name in value}
+        else:
+            found[key] = value
+    return found
 
 
 def checked_campaign(data: dict, origin: str) -> Campaign:

@@ -132,7 +132,7 @@ class Points:
 
     def units(self) -> dict[str, str]:
         """SI units of the keys that vary, as far as they have one."""
-        found = {}
+        found: dict[str, str] = {}
         for dimension in self.dimensions:
             if dimension.named:
                 _, unit = _quantities(dimension.labels)

@@ -54,6 +54,17 @@ class Retrieval(Section):
         0.0, description="standard deviation of the beam's blur, corrected by variational"
     )
     error_budget: bool = Field(False, description="also retrieve winds without each cause of error")
+    sources: Literal["all", "measured"] = Field(
+        "all",
+        description="also from ideal images of the truth, for comparison, or from measured ones "
+        "alone",
+    )
+
+    @model_validator(mode="after")
+    def _budget_compares(self):
+        if self.error_budget and self.sources != "all":
+            raise ValueError("sources: 'measured' is not allowed with error_budget; expected all")
+        return self
 
     @model_validator(mode="after")
     def _each_once(self):

@@ -71,11 +71,16 @@ def error_by_texture(found: xr.Dataset, sweep: xr.Dataset) -> tuple[Figure, str]
         ylabel="rms error / m s$^{-1}$",
         title="cross-correlation from extinction, all vectors",
     )
+    several = found.sizes["source"] > 1
     for source, marker in (
         (Source.EXTINCTION, "o"),
         (Source.BACKSCATTER, "s"),
         (Source.WITHOUT_TEXTURE, "^"),
+        (Source.NOISY, "d"),
     ):
+        # noisy images are shown where there are no others
+        if source not in found["source"].values or (source == Source.NOISY and several):
+            continue
         for method in found["algorithm"].values:
             wind = found.sel(source=source, algorithm=method)
             groups = error_by_quality(wind, truth_vectors(wind), "isotropy")

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from lidar_mi.assessment.figures.accuracy import error_and_bound, error_by_texture, truth_vectors
 from lidar_mi.assessment.figures.plates import Drawn, frame, image_panel, save_all, sheet
-from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES
+from lidar_mi.assessment.labels import BACKSCATTER, METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.errors import deviations
 from lidar_mi.assessment.metrics.names import Source
@@ -65,19 +65,22 @@ def draw_all(
     sweep : xr.Dataset
         Errors by texture, from `lidar_mi.experiment.stages.texture.texture_sweep`.
     """
-    scale = _scale(truth)
-    plates = (
+    scale, sources = _scale(truth), [str(name) for name in found["source"].values]
+    # with measured images alone there are no winds from extinction to compare with
+    compared = Source.EXTINCTION in sources
+    ideal, lidar = (Source.EXTINCTION, Source.BACKSCATTER) if compared else (sources[-1],) * 2
+    plates: tuple = (
         ("fig00_overview", "Image and retrieved wind", overview(truth, scans, found, cores)),
         ("fig05_extinction", "Extinction", _extinction(truth)),
         (
-            "fig06_wind_from_extinction",
-            "Wind: truth and from the extinction pair",
-            _wind_and_truth(truth, found, cores, scale),
+            "fig06_wind_from_extinction" if compared else "fig06_wind",
+            f"Wind: truth and from the {SOURCE_NAMES[ideal]} pair",
+            _wind_and_truth(truth, found, ideal, cores, scale),
         ),
         (
             "fig07_deviation_from_truth",
-            "Winds from extinction against the truth",
-            _deviation_maps(found, "extinction", None),
+            f"Winds from {SOURCE_NAMES[ideal]} against the truth",
+            _deviation_maps(found, ideal, None),
         ),
         ("fig08_backscatter", "Backscatter images", _backscatter(scans)),
         (
@@ -88,15 +91,18 @@ def draw_all(
         (
             "fig10_wind_from_backscatter",
             "Wind from the backscatter pair",
-            _retrieved(found, "backscatter", cores, scale),
+            _retrieved(found, lidar, cores, scale),
         ),
-        (
-            "fig11_deviation_from_extinction_winds",
-            "Change of the winds by the instrument",
-            _deviation_maps(found, "backscatter", "extinction"),
-        ),
-        ("fig12_error_by_texture", "Error and texture", error_by_texture(found, sweep)),
     )
+    if compared:
+        plates += (
+            (
+                "fig11_deviation_from_extinction_winds",
+                "Change of the winds by the instrument",
+                _deviation_maps(found, lidar, ideal),
+            ),
+        )
+    plates += (("fig12_error_by_texture", "Error and texture", error_by_texture(found, sweep)),)
     if (drawn := error_and_bound(found)) is not None:
         plates += (("fig12b_error_and_bound", "Errors and Cramer-Rao bound", drawn),)
     if "depolarization" in scans[0]:
@@ -209,9 +215,9 @@ def _extinction(truth):
     )
 
 
-def _wind_and_truth(truth, found, cores, scale):
+def _wind_and_truth(truth, found, source, cores, scale):
     figure, axes = sheet(2, max(2, found.sizes["algorithm"]))
-    first = found.sel(source="extinction").isel(algorithm=0)
+    first = found.sel(source=source).isel(algorithm=0)
     _arrows(axes[0, 0], truth_vectors(first), cores, "true wind", scale)
     speed = np.hypot(truth.wind["v"], truth.wind["w"])
     image_panel(
@@ -225,10 +231,10 @@ def _wind_and_truth(truth, found, cores, scale):
     )
     for axis in axes[0, 2:]:
         axis.set_axis_off()
-    _retrieved_into(axes[1], found, "extinction", cores, scale)
+    _retrieved_into(axes[1], found, source, cores, scale)
     return figure, (
         "Above: the true cross-flow wind and its speed. Below: winds retrieved from the "
-        "extinction pair. Grey vectors are flagged; red crosses mark the true cores."
+        f"{SOURCE_NAMES[source]} pair. Grey vectors are flagged; red crosses mark the true cores."
     )
 
 

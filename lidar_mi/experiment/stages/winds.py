@@ -43,7 +43,7 @@ def cross_flow_winds(
 
     Sources are the extinction itself, the same without sub-grid texture, the extinction blurred by
     the beam's width (the image of a noise-free lidar), the rendered backscatter and, with a
-    detector, the same with its noise.
+    detector, the same with its noise; of measured sources only the last one.
 
     Returns
     -------
@@ -98,6 +98,8 @@ def cross_flow_winds(
 def _image_pairs(experiment, truth, plans, scans) -> dict[str, tuple[list[xr.DataArray], Any]]:
     """Both images and their noise by source: of the truth, then of the lidar."""
     lidar = experiment.lidar
+    if experiment.retrieval.sources == "measured":
+        return dict([rendered_pairs(experiment, scans).popitem()])
     exact = {
         Source.EXTINCTION: [truth.image(k) for k in (0, 1)],
         Source.WITHOUT_TEXTURE: [truth.image(k, smooth=True) for k in (0, 1)],
@@ -150,7 +152,7 @@ def known_blur(experiment: Experiment, plan: ScanPlan) -> float:
 
 def window_settings(settings: Retrieval) -> dict[str, Any]:
     """Window sizes and thresholds, as `retrieve_wind` takes them."""
-    return settings.model_dump(exclude={"methods", "error_budget", "blur"})
+    return settings.model_dump(exclude={"methods", "error_budget", "blur", "sources"})
 
 
 def _warn_of_wide_beams(experiment, truth, plans, log) -> None:
