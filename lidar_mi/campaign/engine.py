@@ -205,10 +205,10 @@ def connected(
             n_workers=count,
             threads_per_worker=1,
             processes=True,
-            dashboard_address=":0" if _has_dashboard() else None,
+            dashboard_address=":0",
             silence_logs=50,
         )
-        with cluster, Client(cluster) as found:
+        with cluster, Client(cluster, set_as_default=False) as found:
             _make_ready(found, threads, own_cache=False)
             yield found
 
@@ -253,7 +253,7 @@ class _Dispatch:
         """All of some points, in their order."""
         self.needed = signatures(self.folder.index, waiting)
         self.rest = iter(waiting)
-        self.flying = as_completed()
+        self.flying = as_completed(loop=self.client.loop)
         self._fill()
         for future in self.flying:
             self._land(future)
@@ -351,7 +351,11 @@ def _client_of(address: str) -> Client:
     """A client of a scheduler by its address or by the file that it wrote."""
     file = Path(address).is_file()
     try:
-        return Client(timeout=PATIENCE, **{"scheduler_file" if file else "address": str(address)})
+        return Client(
+            timeout=PATIENCE,
+            set_as_default=False,
+            **{"scheduler_file" if file else "address": str(address)},
+        )
     except (OSError, ValueError) as error:
         reason = one_line(error).split(";")[0][:80]
         raise InputError(

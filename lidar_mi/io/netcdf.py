@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import dask
 import h5py
 import xarray as xr
 
@@ -108,4 +109,7 @@ def write_netcdf(data: xr.Dataset, path: str | Path) -> None:
     packed = {n: {"zlib": True, "complevel": 4} for n, v in data.data_vars.items() if v.ndim}
     # CF 2.5.1: no missing values in coordinate variables
     packed |= {name: {"_FillValue": None} for name in data.coords if name in data.dims}
-    write_atomically(path, data.to_netcdf(engine="h5netcdf", encoding=packed))
+    # in a campaign xarray would ask the scheduler for a lock on what is in memory here
+    with dask.config.set(scheduler="synchronous"):
+        content = data.to_netcdf(engine="h5netcdf", encoding=packed)
+    write_atomically(path, content)

@@ -1,0 +1,149 @@
+"""What results are indifferent to, and so may be shared by experiments that differ in it.
+
+Detects: a setting that changes an image and is said not to, with which a campaign would take the
+image of another experiment.
+"""
+
+import numpy as np
+import pytest
+
+from lidar_mi.experiment import reading
+from lidar_mi.experiment.pipeline import (
+    BEHIND_IMAGES,
+    BEHIND_RING_IMAGES,
+    STAGES,
+    stages_of,
+    stored_parts,
+)
+from lidar_mi.experiment.resumable_folder import made_by, new_record
+from lidar_mi.experiment.run import prepare
+from lidar_mi.experiment.stage import result_of
+from tests.support.experiments import small
+
+DOPPLER = {
+    "camera": {"width": 64, "height": 52, "pixel": "111 um"},
+    "render": {"samples_per_pixel": 4},
+    "v_los": ["70 m/s"],
+    "path_samples": 0,
+}
+
+# other values of every key, or of one in every section, that images are said to be indifferent to
+BEHIND = {
+    "name": "another",
+    "lidar.pulse_energy": "7.3 mJ",
+    "detector": {"sky_radiance": "0.1 W/m^2/sr/nm", "quantum_efficiency": 0.3},
+    "retrieval": {"methods": ["variational"], "stride": 4},
+    "doppler": {"lidar": {"pulse_energy": "1 mJ"}, "retrieval": {"images": 3}},
+    "sensor": {"pulses": 3, "method": "cc"},
+}
+BEHIND_RINGS = {
+    "name": "another",
+    "wake": small()["wake"],
+    "platform": {"speed": "70 m/s"},
+    "lidar": {"pulse_energy": "2 mJ"},
+    "detector": {},
+    "scan": {"range": "400 m"},
+    "scattering": {"phase": "isotropic"},
+    "render": {"samples_per_beam": 16},
+    "retrieval": {"methods": ["cc"], "stride": 2},
+    "sensor": {"method": "cc"},
+    "volume": None,
+    "doppler.lidar.pulse_energy": "1 mJ",
+    "doppler.lidar.pulse_duration": "20 ns",
+    "doppler.lidar.beam_radius": "5 cm",
+    "doppler.lidar.divergence_full": "1 mrad",
+    "doppler.lidar.telescope_area": "0.1 m^2",
+    "doppler.lidar.fov_half": "3 mrad",
+    "doppler.lidar.instrument_constant": 0.2,
+    "doppler.lidar.counted": "before_etalon",
+    "doppler.lidar.range": "76 m",
+    "doppler.lidar.range_bin": "5 m",
+    "doppler.lidar.backscatter": "1e-6 / m / sr",
+    "doppler.lidar.extinction": "0.2 / km",
+    "doppler.lidar.sky_radiance": "0.01 W/m^2/sr/nm",
+    "doppler.lidar.filter_bandwidth": "0.2 nm",
+    "doppler.ccd": {"read_noise": 9},
+    "doppler.speckle_modes": 300,
+    "doppler.reference": {"laser_drift": "3 MHz"},
+    "doppler.retrieval": {"images": 2, "slow_images": 1},
+}
+
+
+def changed(data, key, value):
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return reading.check(reading.merged(data, value), "changed")
+
+
+def images(experiment):
+    prepared = prepare(experiment)
+    found = {}
+    for stage in stages_of(experiment):
+        if stage.parts:
+            found |= result_of(stage, experiment, prepared.results, prepared.log)
+    return found
+
+
+def signatures(experiment):
+    record = new_record(experiment, ".")
+    return {
+        part: made_by(record, stage.indifferent_to)
+        for part, stage in stored_parts(experiment).items()
+    }
+
+
+def equal(one, other):
+    return all(np.array_equal(one[n].values, other[n].values, equal_nan=True) for n in one)
+
+
+def test_every_key_that_images_are_indifferent_to_is_tried():
+    assert set(BEHIND) == set(BEHIND_IMAGES) and set(BEHIND_RINGS) == set(BEHIND_RING_IMAGES)
+    shared = {stage.indifferent_to for stage in STAGES if stage.indifferent_to}
+    assert shared == {BEHIND_IMAGES, BEHIND_RING_IMAGES}
+
+
+def test_images_do_not_depend_on_what_follows_them():
+    base = small()
+    before, signed = images(reading.check(base, "base")), signatures(reading.check(base, "base"))
+    other = base
+    for key in BEHIND_IMAGES:
+        if key == "sensor":  # which needs both lidars and their methods
+            continue
+        after = changed(other, key, BEHIND[key])
+        other = reading.settings(after)
+    found = images(after)
+    for name in ("image_t1", "image_t2"):
+        assert equal(before[name], found[name]) and signatures(after)[name] == signed[name]
+
+
+def test_ring_images_do_not_depend_on_what_is_beside_them():
+    base = {"name": "rings", "doppler": DOPPLER}
+    before, signed = images(reading.check(base, "base")), signatures(reading.check(base, "base"))
+    other = base
+    for key in (k for k in BEHIND_RING_IMAGES if k not in ("volume", "sensor")):
+        other = reading.settings(changed(other, key, BEHIND_RINGS[key]))
+    after = reading.check(other, "after")
+    found = images(after)
+    for name in before:
+        assert equal(before[name], found[name]) and signatures(after)[name] == signed[name]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("lidar.divergence_full", "1 mrad"),
+        ("lidar.pulse_duration", "10 ns"),
+        ("scan.range", "400 m"),
+        ("platform.dt", "0.2 s"),
+        ("wake.texture.rms", 0.3),
+        ("seed", 2),
+        ("render.samples_per_beam", 9),
+    ],
+)
+def test_what_changes_an_image_changes_its_signature(key, value):
+    one, other = reading.check(small(), "base"), changed(small(), key, value)
+    assert signatures(one)["image_t1"] != signatures(other)["image_t1"]
+    two, four = images(one), images(other)
+    assert not (
+        equal(two["image_t1"], four["image_t1"]) and equal(two["image_t2"], four["image_t2"])
+    )
