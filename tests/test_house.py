@@ -264,7 +264,7 @@ def test_rule_is_kept(rule):
 def test_every_room_has_its_rule():
     found = {room(name) for name in MODULES if "." in name}
     assert found == set(ARROWS)
-    assert len(found) < 10  # campaign and encounter are still to come
+    assert len(found) <= 11  # encounter is still to come
 
 
 def test_fixed_exceptions_leave_the_list():

@@ -39,6 +39,12 @@ def open_campaign(folder: str | Path) -> xr.Dataset:
     ------
     InputError
         No campaign in the folder.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> table = lm.open_campaign("outputs/design_map")            # doctest: +SKIP
+    >>> table["sensor.rmse_u"].sel(sky="day").mean("member")      # doctest: +SKIP
     """
     opened = open_folder(folder)
     path = opened.path / DATA

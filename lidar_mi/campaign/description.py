@@ -251,6 +251,11 @@ def read_campaign(
         raise InputError(f"{path}: holds no keys; expected name, base, sweep, ...")
     if "variants" in data and not set(KEYS) & set(data):
         data = {"name": data.get("name"), "base": str(path), "sweep": {"variant": data["variants"]}}
+    if not set(KEYS) & set(data) and {"wake", "doppler"} & set(data):
+        raise InputError(
+            f"{path}: one experiment, not a campaign; expected lidar-mi run, or a file with base "
+            "and sweep"
+        )
     for override in overrides or []:
         key, equals, value = override.partition("=")
         if not equals or not key.strip():
@@ -292,4 +297,5 @@ def checked_campaign(data: dict, origin: str) -> Campaign:
     try:
         return Campaign.model_validate(data)
     except ValidationError as error:
-        raise InputError(f"{origin}: {first_fault(error, Campaign)}") from None
+        fault = first_fault(error, Campaign).replace("sweep: sweep.", "sweep.", 1)
+        raise InputError(f"{origin}: {fault}") from None

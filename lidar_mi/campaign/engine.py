@@ -126,7 +126,7 @@ def run_campaign(
     --------
     >>> import lidar_mi as lm
     >>> table = lm.run_campaign("design_map", quick=True)         # doctest: +SKIP
-    >>> table["sensor.rmse_u"].sel(case="day").mean("member")     # doctest: +SKIP
+    >>> table["sensor.rmse_u"].sel(sky="day").mean("member")     # doctest: +SKIP
     """
     notice, watch = notice or silent, watch or (lambda state: None)
     ready = prepare_campaign(campaign, folder, quick=quick, confirmed=confirmed, notice=notice)

@@ -6,21 +6,18 @@ from lidar_mi.errors import InputError
 
 
 def slurm_cluster(
-    workers: int,
     *,
     memory: str = "4 GB",
     walltime: str = "01:00:00",
     queue: str | None = None,
     account: str | None = None,
 ) -> Any:
-    """A cluster whose workers are jobs of SLURM, each with one core.
+    """A cluster whose workers are jobs of SLURM, each with one core; `scale` submits them.
 
     Workers end two minutes before their walltime, and their points go to others.
 
     Parameters
     ----------
-    workers : int
-        Jobs that are asked for.
     memory : str
         Of each.
     walltime : str
@@ -31,7 +28,7 @@ def slurm_cluster(
     Returns
     -------
     dask_jobqueue.SLURMCluster
-        ``job_script()`` is its job as text.
+        ``scale(jobs=40)`` submits 40 of them, ``job_script()`` is one as text.
 
     Raises
     ------
@@ -47,7 +44,7 @@ def slurm_cluster(
     lifetime = _seconds(walltime) - 120
     if lifetime <= 0:
         raise InputError(f"--walltime: {walltime} is not allowed; expected more than 2 minutes")
-    cluster = SLURMCluster(
+    return SLURMCluster(
         cores=1,
         processes=1,
         memory=memory,
@@ -56,10 +53,8 @@ def slurm_cluster(
         account=account,
         worker_extra_args=["--lifetime", f"{lifetime}s", "--lifetime-stagger", "60s"],
         death_timeout=300,
-        scheduler_options={"dashboard_address": None},
+        scheduler_options={"dashboard_address": ":0"},
     )
-    cluster.scale(jobs=workers)
-    return cluster
 
 
 def _seconds(walltime: str) -> int:

@@ -1,6 +1,7 @@
 """``lidar-mi campaign``: many experiments, on this machine or on many."""
 
 import math
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -93,12 +94,16 @@ def run(
     fails does not stop the others.
     """
     from lidar_mi.campaign.engine import connected, execute, prepare_campaign
+    from lidar_mi.campaign.slurm import slurm_cluster
 
     seconds = quantity("--lifetime", lifetime, "s", "50 min")
+    if slurm and not job_script and shutil.which("sbatch") is None:
+        raise InputError("--slurm: there is no sbatch here; expected a login node of SLURM")
     if scheduler and slurm:
         raise InputError("--slurm: not allowed with --scheduler; expected one of the two")
     if job_script:
-        output.print(_cluster(slurm or 1, memory, walltime, queue).job_script(), highlight=False)
+        with slurm_cluster(memory=memory, walltime=walltime, queue=queue) as cluster:
+            output.print(cluster.job_script(), highlight=False, soft_wrap=True)
         return
     with progress() as notice:
         folder = prepare_campaign(
@@ -107,9 +112,14 @@ def run(
     if point is not None:
         _run_point(folder, point)
         return
-    client: Any = _cluster(slurm, memory, walltime, queue).get_client() if slurm else scheduler
+    client: Any = scheduler
     with ExitStack() as stack:
         stack.enter_context(folder.claimed())
+        if slurm:
+            jobs = slurm_cluster(memory=memory, walltime=walltime, queue=queue)
+            cluster = stack.enter_context(jobs)
+            cluster.scale(jobs=slurm)
+            client = stack.enter_context(cluster.get_client())
         with progress() as notice:
             connection = stack.enter_context(connected(client, workers, threads, notice))
         with _watched() as watch:
@@ -179,12 +189,6 @@ def _run_point(folder: "CampaignFolder", number: int) -> None:
     output.print(f"{folder.points.title(number)}: {outcome.status}")
     if outcome.status == "failed":
         raise InputError(f"point {number}: {outcome.message}")
-
-
-def _cluster(jobs: int, memory: str, walltime: str, queue: str | None) -> Any:
-    from lidar_mi.campaign.slurm import slurm_cluster
-
-    return slurm_cluster(jobs, memory=memory, walltime=walltime, queue=queue)
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import pytest
 import yaml
 
 from lidar_mi.campaign.description import Campaign, read_campaign
+from lidar_mi.campaign.shipped import campaign_file
 from lidar_mi.errors import InputError
 
 SWEEP = {"scan.range": ["300 m", "500 m"]}
@@ -85,6 +86,11 @@ def test_variants_are_a_campaign_of_one_dimension(tmp_path):
     path.write_text(yaml.safe_dump({"name": "e", "wake": {}, "variants": variants}))
     found = read_campaign(path)
     assert found.sweep == {"variant": variants} and found.base == str(path)
+
+
+def test_an_experiment_is_no_campaign():
+    with pytest.raises(InputError, match="one experiment, not a campaign; expected lidar-mi run"):
+        read_campaign(campaign_file("wake_sensor"))
 
 
 def test_the_command_line_changes_keys(tmp_path):
