@@ -23,6 +23,7 @@ COMPARISONS = (
     "renderer",
     "fringes",
     "rings",
+    "campaign",
     "imports",
 )
 

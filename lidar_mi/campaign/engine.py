@@ -15,9 +15,10 @@ from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.campaign.collect import collect
-from lidar_mi.campaign.description import Campaign, checked_campaign, read_campaign
+from lidar_mi.campaign.description import checked_campaign, read_campaign
 from lidar_mi.campaign.folder import CampaignFolder, check_version, create, read_base, signatures
 from lidar_mi.campaign.points import Points
+from lidar_mi.campaign.shipped import campaign_file
 from lidar_mi.campaign.status import Status, count
 from lidar_mi.campaign.worker import Prepare, carry_out, render_shared
 from lidar_mi.errors import InputError, one_line
@@ -136,7 +137,7 @@ def run_campaign(
 
 
 def prepare_campaign(
-    campaign: str | Path | dict | Campaign,
+    campaign: str | Path | dict | Points,
     folder: str | Path | None = None,
     *,
     quick: bool = False,
@@ -145,21 +146,22 @@ def prepare_campaign(
     notice: Notice = silent,
 ) -> CampaignFolder:
     """The folder of a campaign whose points were all checked; parameters of `run_campaign`."""
-    from lidar_mi.campaign.shipped import campaign_file
-
-    origin: str | Path = "campaign"
-    if isinstance(campaign, dict):
-        campaign = checked_campaign(campaign, str(origin))
-    elif not isinstance(campaign, Campaign):
-        origin = campaign_file(campaign)
-        campaign = read_campaign(origin, overrides, quick=quick)
-    points = Points(campaign, *read_base(campaign, origin))
+    if isinstance(campaign, Points):
+        origin, points = campaign.campaign.name, campaign
+    elif isinstance(campaign, dict):
+        origin = "campaign"
+        described = checked_campaign(campaign, origin)
+        points = Points(described, *read_base(described, origin))
+    else:
+        origin = str(campaign_file(campaign))
+        described = read_campaign(origin, overrides, quick=quick)
+        points = Points(described, *read_base(described, origin))
     if len(points) > MOST_UNASKED and not confirmed:
         raise InputError(
             f"{origin}: {len(points)} points are not allowed unasked; expected at most "
             f"{MOST_UNASKED}, or --yes (confirmed=True)"
         )
-    ready = create(points, folder or Path("outputs") / campaign.name, notice)
+    ready = create(points, folder or Path("outputs") / points.campaign.name, notice)
     check_version(ready)
     return ready
 

@@ -1,0 +1,116 @@
+"""A campaign against a plain loop over its points and against the same loop with multiprocessing.
+
+Points are computed without figures by all sides, and each in a folder of its own by the campaign.
+"""
+
+import multiprocessing
+import shutil
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+from lidar_mi.campaign.collect import collect
+from lidar_mi.campaign.description import Campaign
+from lidar_mi.campaign.engine import connected, execute, prepare_campaign
+from lidar_mi.campaign.points import Points
+from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.run import finish, prepare
+from lidar_mi.io.json import to_json
+from lidar_mi.io.text import write_text
+from lidar_mi.system.threads import use_threads
+
+from .measure import in_turns
+from .report import Comparison, Row, row
+
+BASE = {
+    "name": "point",
+    "wake": {"vortex_pair": {"width": 30, "height": 20, "circulation": 150, "separation": 16}},
+    "render": {"max_order": 1},
+    "retrieval": {"methods": ["variational"], "stride": 4, "sources": "measured"},
+}
+SMALL, LARGE = 4, 2000
+"""Samples per beam: points of tenths of a second, and of some seconds."""
+
+
+def compare(repeats: int = 3, points: int = 24) -> Comparison:
+    """Wall time of a point."""
+    lines = []
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        clients = {
+            count: stack.enter_context(connected(None, count, 1, silent)) for count in (1, 2)
+        }
+        context = multiprocessing.get_context("spawn")
+        pool = stack.enter_context(context.Pool(2, use_threads, (1,)))
+        use_threads(1)
+        for samples, count in ((SMALL, points), (LARGE, max(points // 4, 2))):
+            lines += _rows(folder, clients, pool, samples, count, repeats)
+    notes = (
+        "Loop: prepare and finish of every point in one process, metrics written to a file. Pool: "
+        "the same in two processes. Workers and pool are started before.",
+    )
+    return Comparison("Campaigns", "campaign", "loop or pool", tuple(lines), notes)
+
+
+def _rows(folder: Path, clients: dict, pool: Any, samples: int, count: int, repeats: int):
+    def campaign(workers: int) -> Callable[[int], None]:
+        return lambda turn: _campaign(folder, clients[workers], samples, count, turn)
+
+    tasks: dict[str, Callable[[int], Any]] = {
+        "one": campaign(1),
+        "two": campaign(2),
+        "loop": lambda turn: [_point(*case) for case in _cases(folder, samples, count, turn)],
+        "pool": lambda turn: pool.starmap(
+            _point, _cases(folder, samples, count, turn), chunksize=1
+        ),
+    }
+    timed = in_turns(tasks, repeats)
+    seconds = {name: [one.seconds / count for one in found] for name, found in timed.items()}
+    about = f"{count} points, {samples} samples a beam"
+    added = [a - b for a, b in zip(seconds["one"], seconds["loop"], strict=True)]
+    yield row(
+        f"{about}: one worker", "time of a point", "s", seconds["one"], seconds["loop"], "lower"
+    )
+    yield row(
+        f"{about}: two workers", "time of a point", "s", seconds["two"], seconds["pool"], "lower"
+    )
+    yield row(
+        f"{about}: two workers, one",
+        "time of a point",
+        "s",
+        seconds["two"],
+        seconds["one"],
+        "lower",
+    )
+    yield Row(f"{about}: one worker", "added to a point", "s", sorted(added)[len(added) // 2])
+
+
+def _described(samples: int, count: int, turn: int) -> tuple[Campaign, dict]:
+    base = BASE | {"render": BASE["render"] | {"samples_per_beam": samples}}
+    return Campaign(name="bench", base="point", seed=turn, members=count), base
+
+
+def _campaign(folder: Path, client: Any, samples: int, count: int, turn: int) -> None:
+    out = folder / "campaign"
+    shutil.rmtree(out, ignore_errors=True)
+    campaign, base = _described(samples, count, turn)
+    ready = prepare_campaign(Points(campaign, base, folder), out)
+    with ready.claimed():
+        state = execute(ready, client, watch=lambda state: None)
+    assert state.done == count
+    collect(ready)
+
+
+def _cases(folder: Path, samples: int, count: int, turn: int) -> list[tuple]:
+    campaign, base = _described(samples, count, turn)
+    points = Points(campaign, base, folder)
+    (folder / "loop").mkdir(exist_ok=True)
+    return [(points.experiment(n), folder / "loop" / f"{n}.json") for n in range(count)]
+
+
+def _point(experiment: Any, path: Path) -> None:
+    run = prepare(experiment)
+    finish(run, illustrated=False)
+    write_text(path, to_json(run.metrics))
