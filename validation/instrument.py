@@ -14,9 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.ring_instrument import air_rings, pixel_noise, ring_model
+from lidar_mi.experiment.ring_instrument import air_rings, laser_rings, pixel_noise
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.etalon import Etalon
@@ -116,14 +115,16 @@ Retrieval = Callable[[Frames], dict[str, Retrieved]]
 
 
 @cache
-def nominal(instrument: Instrument):
-    """Models of air and laser, and the noise, as a user of the nominal instrument has them."""
+def nominal(instrument: Instrument, **told):
+    """Models of air and laser, and the noise, as a user of the nominal instrument has them.
+
+    ``told`` is what `air_rings` takes along.
+    """
     lidar = DopplerLidar(line_shape="rayleigh")
     height, width = instrument.shape
     camera = FringeCamera(width=width, height=height, pixel=instrument.pixel)
-    line = laser_line(lidar.wavelength, lidar.laser_width)
     noise = pixel_noise(CCD(read_noise=READ_NOISE, bits=None))
-    return air_rings(lidar, Etalon(), camera), ring_model(Etalon(), camera, line), noise
+    return air_rings(lidar, Etalon(), camera, **told), laser_rings(lidar, Etalon(), camera), noise
 
 
 def _of(frames: torch.Tensor) -> Instrument:
@@ -145,16 +146,12 @@ def calibrated_first(frames: Frames) -> dict[str, Retrieved]:
     Unknown in each echo are the fraction of aerosol, the temperature (known to 10 K), and slopes of
     illumination and background.
     """
-    air_model, laser_model, noise = nominal(_of(frames.air))
+    smooth = {"light_degree": 1, "background_degree": BACKGROUND_DEGREE}
+    air_model, laser_model, noise = nominal(
+        _of(frames.air), aerosol_std=0.5, temperature_std=10.0, **smooth
+    )
     found = calibrate_rings(
         frames.calibration, laser_model, noise, background_degree=BACKGROUND_DEGREE
-    )
-    smooth = {"light_degree": 1, "background_degree": BACKGROUND_DEGREE}
-    air_model = replace(
-        air_model,
-        aerosol_harmonics=laser_model.harmonics[0],
-        priors={"aerosol": (0.0, 0.5), "temperature": (air_model.middle_temperature, 10.0)},
-        **smooth,
     )
     models = (calibrated(model, found) for model in (air_model, replace(laser_model, **smooth)))
     return _both(

@@ -68,7 +68,7 @@ def _first_harmonic(path):
     return float(error) / receivers.ideal_error(GAUSSIAN)
 
 
-def _edges(width, spacing):
+def edges(width, spacing, **changes):
     """Filters without defects of a full width and a spacing, GHz; 12 GHz from order to order."""
     sine = math.sin(math.pi * width / 12 / 2)
     b = 1 + 2 * sine**2
@@ -78,7 +78,7 @@ def _edges(width, spacing):
         order_fraction=None,
         surface_rms=0,
     )
-    filters = DoubleEdge(etalon=etalon, spacing=spacing * 1e9, field_half_angle=0)
+    filters = DoubleEdge(etalon=etalon, spacing=spacing * 1e9, field_half_angle=0, **changes)
     return receivers.double_edge_receiver(GAUSSIAN, filters)
 
 
@@ -97,8 +97,8 @@ def published(effort):
     time = likelihood.x / constants.c
     visibility = math.exp(-2 * (math.pi * time * sigma) ** 2)
     fringe = 1 / (2 * math.pi * time * sigma * math.sqrt(1 - math.sqrt(1 - visibility**2)))
-    edges = minimize(
-        lambda x: _relative(_edges(*x), GAUSSIAN), (1.5, 4.4), method="Nelder-Mead", tol=1e-3
+    filters = minimize(
+        lambda x: _relative(edges(*x), GAUSSIAN), (1.5, 4.4), method="Nelder-Mead", tol=1e-3
     )
     lidar = DopplerLidar()
     rings = receivers.ring_receiver(lidar, Etalon(), BINNED)
@@ -141,7 +141,7 @@ def published(effort):
             "double edge, best width and spacing: times the ideal error",
             mckay,
             2.5,
-            edges.fun,
+            filters.fun,
             tolerance=0.05,
         ),
         Row(

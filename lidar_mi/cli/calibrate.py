@@ -7,7 +7,6 @@ import typer
 
 from lidar_mi.cli.options import Changes, Electrons, NominalInstrument, Overwrite
 from lidar_mi.cli.terminal import output, print_table
-from lidar_mi.errors import InputError
 
 EXAMPLES = (
     "Examples: `lidar-mi calibrate laser_*.tif --instrument my_lidar.yaml -o etalon.nc` - "
@@ -44,7 +43,7 @@ def calibrate(
     """
     from lidar_mi import __version__
     from lidar_mi.assessment.figures.calibration import draw_calibration
-    from lidar_mi.experiment.own_frames import calibrate_etalon, read_electrons
+    from lidar_mi.experiment.own_frames import calibrate_etalon, doppler_of, read_electrons
     from lidar_mi.experiment.reading import load
     from lidar_mi.experiment.shipped import experiment_file
     from lidar_mi.io.netcdf import write_netcdf
@@ -56,9 +55,7 @@ def calibrate(
     for path in (out, figure):
         check_target(path, given, overwrite=overwrite)
     experiment = load(experiment_file(instrument), list(changes or []))
-    if experiment.doppler is None:
-        raise InputError(f"--instrument: {instrument} has no section doppler; expected one")
-    ccd, counts = experiment.doppler.ccd, not electrons
+    ccd, counts = doppler_of(experiment, "--instrument").ccd, not electrons
     values = read_electrons(frames, ccd, counts=counts, layer=layer)
     white = None
     if flat:

@@ -47,7 +47,7 @@ def v_los(
     overwrite: Overwrite = False,
 ) -> None:
     """Retrieve the speed along the line of sight from every frame of an etalon's rings."""
-    from lidar_mi.experiment.own_frames import read_electrons, retrieve_v_los
+    from lidar_mi.experiment.own_frames import doppler_of, read_electrons, retrieve_v_los
     from lidar_mi.experiment.reading import load
     from lidar_mi.experiment.shipped import experiment_file
     from lidar_mi.io.netcdf import read_netcdf, write_netcdf
@@ -59,9 +59,7 @@ def v_los(
     if out is not None:
         check_target(out, given, overwrite=overwrite)
     experiment = load(experiment_file(instrument), list(changes or []))
-    if experiment.doppler is None:
-        raise InputError(f"--instrument: {instrument} has no section doppler; expected one")
-    ccd, counts = experiment.doppler.ccd, not electrons
+    ccd, counts = doppler_of(experiment, "--instrument").ccd, not electrons
     known = None
     if calibration is not None:
         try:

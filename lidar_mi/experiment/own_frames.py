@@ -26,6 +26,22 @@ from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
 from lidar_mi.retrieval.rings.likelihood_fit import RingFit, difference, fit_rings
 
 
+def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") -> Doppler:
+    """The Doppler lidar of an experiment, which messages call ``name``.
+
+    Raises
+    ------
+    InputError
+        An experiment without one.
+    """
+    experiment = instrument if isinstance(instrument, Experiment) else load_experiment(instrument)
+    if experiment.doppler is None:
+        raise InputError(
+            f"{name}: experiment {experiment.name!r} has no section doppler; expected one"
+        )
+    return experiment.doppler
+
+
 def electrons(counts: np.ndarray, ccd: CCD) -> np.ndarray:
     """Photoelectrons of a digitiser's counts: bias off, times the gain of digitiser and CCD."""
     return (np.asarray(counts, float) - ccd.bias) * ccd.gain / ccd.multiplication_gain
@@ -104,7 +120,7 @@ def calibrate_etalon(
     lidar_mi.errors.InputError: frames: 1 is not allowed; expected 2 or more, from which the drift \
 is determined
     """
-    doppler = _doppler(instrument)
+    doppler = doppler_of(instrument)
     _, laser = ring_models(doppler)
     return calibrate_rings(
         _batch("frames", frames, doppler),
@@ -164,7 +180,7 @@ def retrieve_v_los(
     >>> float(found.v_los[0]), str(found.status[0].values)
     (nan, 'image: its gradients have no common centre; expected rings')
     """
-    doppler = _doppler(instrument)
+    doppler = doppler_of(instrument)
     models = ring_models(doppler)
     response = None
     if calibration is not None:
@@ -249,16 +265,6 @@ def _each(
             found.append(fit)
             status.append("")
     return found, status
-
-
-def _doppler(instrument: str | Path | Experiment) -> Doppler:
-    experiment = instrument if isinstance(instrument, Experiment) else load_experiment(instrument)
-    if experiment.doppler is None:
-        raise InputError(
-            f"instrument: experiment {experiment.name!r} has no Doppler lidar; expected one with "
-            "the section doppler"
-        )
-    return experiment.doppler
 
 
 def _batch(name: str, frames: Any, doppler: Doppler) -> torch.Tensor:

@@ -25,6 +25,7 @@ from lidar_mi.instrument.michelson import Michelson
 from lidar_mi.retrieval.channels.assumption import assumption_error
 from lidar_mi.retrieval.rings.bound import cramer_rao
 from lidar_mi.retrieval.rings.model import PixelNoise
+from validation.receivers import edges
 
 # molecules without collisions, and next to nothing of the laser's width: one Gaussian
 GAUSSIAN = DopplerLidar(line_shape="rayleigh", laser_width="45 MHz", pulse_duration="10 ns")
@@ -47,20 +48,6 @@ def ratio(receiver, v_los=0.0):
 def fringes(**changes):
     values = {"contrast": 1.0, "elements": 64, **changes}
     return receivers.michelson_receiver(GAUSSIAN, Michelson(**values))
-
-
-def edges(width, spacing, **changes):
-    """Filters of a full width and a spacing (GHz), 12 GHz from order to order, no defects."""
-    sine = math.sin(math.pi * width / 12 / 2)
-    b = 1 + 2 * sine**2
-    etalon = Etalon(
-        gap=constants.c / 24e9,
-        reflectivity=b - math.sqrt(b**2 - 1),
-        order_fraction=None,
-        surface_rms=0,
-    )
-    filters = DoubleEdge(etalon=etalon, spacing=spacing * 1e9, field_half_angle=0, **changes)
-    return receivers.double_edge_receiver(GAUSSIAN, filters)
 
 
 def test_ideal_analyser():

@@ -16,6 +16,8 @@ import xarray as xr
 from PIL import Image
 
 from lidar_mi.cli.app import main
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.own_frames import doppler_of
 from tests.support.command_line import words_of
 from validation.fringe_reference import (
     Defects,
@@ -128,3 +130,10 @@ def test_wrong_input_is_one_line(folder, calibration, arguments, message):
     paths = [folder / a if a.endswith((".tif", ".yaml")) else a for a in arguments]
     said = failed(*paths, "--instrument", folder / "mine.yaml")
     assert message in said and "Traceback" not in said
+
+
+def test_an_instrument_without_a_doppler_lidar():
+    with pytest.raises(InputError) as error:
+        doppler_of("wake_backscatter", "--instrument")
+    expected = "--instrument: experiment 'wake_backscatter' has no section doppler; expected one"
+    assert str(error.value) == expected

@@ -25,8 +25,8 @@ from lidar_mi.retrieval.rings.bound import fisher_matrix
 from lidar_mi.retrieval.rings.calibration import Calibration
 from lidar_mi.retrieval.rings.centre import gradient_centre
 from lidar_mi.retrieval.rings.frames import checked, inside, spots
-from lidar_mi.retrieval.rings.likelihood_fit import annular_waves, fit_rings
-from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, pixel_waves
+from lidar_mi.retrieval.rings.likelihood_fit import MISFIT, annular_waves, fit_rings
+from lidar_mi.retrieval.rings.mean_image import mean_and_jacobian, mean_image
 from lidar_mi.retrieval.rings.model import INSTRUMENT, LIGHT, PARAMETERS, PixelNoise, RingModel
 from lidar_mi.retrieval.rings.scoring import OUTLIER, cell_variance
 from lidar_mi.retrieval.rings.smooth import term_names
@@ -89,7 +89,7 @@ def calibrate_rings(
     tolerances : mapping
         Standard deviations of `INSTRUMENT` about the nominal one, see `TOLERANCES`.
     light_degree, background_degree : int
-        Of the illumination, the same in all frames, and of the background of each frame, 0 to 4.
+        Of the illumination, the same in all frames, and of the background of each frame, 0 to 8.
     max_chi_square : float
         Frames that fit worse are refused.
 
@@ -108,10 +108,8 @@ def calibrate_rings(
             raise InputError(
                 f"tolerances.{name}: {tolerances.get(name)!r} is not allowed; expected above 0"
             )
-    frames = checked(frames, None, None if response is None else response > 0, "frames")
-    if tuple(frames.shape[-2:]) != tuple(model.shape):
-        sizes = " and ".join(f"{h} x {w}" for h, w in (frames.shape[-2:], model.shape))
-        raise InputError(f"frames: sizes {sizes} px (height x width) of frames and model differ")
+    used = None if response is None else response > 0
+    frames = checked(frames, None, used, "frames", model.shape)
     if len(frames) < 2:
         raise InputError(
             f"frames: {len(frames)} is not allowed; expected 2 or more, from which the drift is "
@@ -155,7 +153,8 @@ class _State:
     """The instrument so far: its model, the frames' parameters, departures from the nominal one.
 
     ``model`` has focal length, tilt, distortion and blur in it; damping and roughness are in the
-    frames' parameters. After a fit: covariance of what is shared, parts of the local solution.
+    frames' parameters. After a fit: covariance of what is shared, parts of the local
+    solution, chi-square and its degrees of freedom.
     """
 
     model: RingModel
@@ -166,6 +165,7 @@ class _State:
     speed_by_shared: torch.Tensor | None = None
     speed_variance: torch.Tensor | None = None
     chi_square: float = math.nan
+    freedom: int = 1
 
 
 def _near(model: RingModel, mean: torch.Tensor, tolerance: float) -> RingModel:
@@ -228,6 +228,7 @@ def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
             if name in ("falloff", "damping", "roughness", *LIGHT):
                 parameters[:, PARAMETERS.index(name)] += change[name]
         used = int((weight > 0).sum())
+        freedom = max(used - len(shared) - few * len(frames), 1)
         state = _State(
             _moved(state.model, change),
             parameters,
@@ -236,7 +237,8 @@ def _fitted(frames, state: _State, noise, response, tolerances) -> _State:
             covariance,
             by_shared[:, 0],
             torch.linalg.inv(own)[:, 0, 0],
-            float((weight * residual**2).sum()) / max(used - len(shared) - few * len(frames), 1),
+            float((weight * residual**2).sum()) / freedom,
+            freedom,
         )
         if close:
             return state
@@ -265,11 +267,7 @@ def _residual(mean: torch.Tensor, state: _State, noise, count: int, response) ->
     The model is taken with the mean of the frames' own parameters.
     """
     parameters = state.parameters.mean(0, keepdim=True)
-    parts = [
-        mean_and_jacobian(state.model, waves, parameters)[0][0]
-        for waves in pixel_waves(state.model, state.model.centre)
-    ]
-    expected = torch.cat(parts).reshape(state.model.shape)
+    expected = mean_image(state.model, parameters)
     variance = cell_variance(expected.reshape(1, -1), parameters, noise).reshape(expected.shape)
     used = torch.where(response > 0, response, 1.0)
     return torch.where(response > 0, (mean / used - expected) * (used * count / variance).sqrt(), 0)
@@ -285,8 +283,8 @@ def _bad_pixels(mean, state: _State, noise, count: int, response) -> torch.Tenso
 def _calibration(frames, state: _State, noise, response, tolerances) -> Calibration:
     model, names = state.model, state.names
     count = len(frames)
-    cells = frames.shape[0] * 1000
-    grown = max(1.0, state.chi_square) if state.chi_square > 1 + 4 * math.sqrt(2 / cells) else 1.0
+    poor = state.chi_square > 1 + MISFIT * math.sqrt(2 / state.freedom)
+    grown = state.chi_square if poor else 1.0
     covariance = (grown * state.covariance).numpy()
     std = dict(zip(names, np.sqrt(np.diag(covariance)), strict=True))
     speed = state.parameters[:, 0].numpy()

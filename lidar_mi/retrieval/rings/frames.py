@@ -23,16 +23,18 @@ def checked(
     saturation: float | None = None,
     used: torch.Tensor | None = None,
     what: str = "images",
+    shape: tuple[int, int] | None = None,
 ) -> torch.Tensor:
     """The images as a batch (images, height, width) of floats.
 
     Pixels that are not ``used`` (height, width) may have any value; they become the least one.
-    ``what`` names them in messages.
+    ``what`` names them in messages, ``shape`` (height, width) is that of their model.
 
     Raises
     ------
     InputError
-        Other shapes, images below 16 px, NaN or infinity, saturated pixels.
+        Other shapes, images below 16 px or not as large as the model, NaN or infinity, saturated
+        pixels.
     """
     if not isinstance(images, torch.Tensor):
         images = np.array(images)
@@ -50,6 +52,9 @@ def checked(
         images = images.float()
     if used is not None and used.shape == images.shape[-2:]:
         images = torch.where(used, images, images[:, used].nan_to_num().min())
+    if shape is not None and tuple(images.shape[-2:]) != tuple(shape):
+        sizes = " and ".join(f"{h} x {w}" for h, w in (images.shape[-2:], shape))
+        raise InputError(f"{what}: sizes {sizes} px (height x width) of {what} and model differ")
     mapped(
         lambda number: _check(images[number], f"{what}[{number}]", saturation), range(len(images))
     )

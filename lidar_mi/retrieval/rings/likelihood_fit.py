@@ -192,10 +192,8 @@ def fit_rings(
         raise InputError(f"max_chi_square: {max_chi_square!r} is not allowed; expected above 0")
     if response is not None and method != "annular":
         raise InputError(f"response: not allowed with method {method}; expected annular")
-    images = checked(images, saturation, None if response is None else response > 0)
-    if tuple(images.shape[-2:]) != tuple(model.shape):
-        sizes = " and ".join(f"{h} x {w}" for h, w in (images.shape[-2:], model.shape))
-        raise InputError(f"images: sizes {sizes} px (height x width) of image and model differ")
+    used = None if response is None else response > 0
+    images = checked(images, saturation, used, shape=model.shape)
     names = free_names(model, free)
     if centre is not None:
         inside(*centre, model.shape, "centre")

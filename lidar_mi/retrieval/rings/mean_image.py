@@ -226,11 +226,7 @@ def parameter_vector(
                 f"{first:g} to {last:g} K"
             )
         vector[0, PARAMETERS.index("temperature")] = temperature
-    total = sum(
-        float(mean_and_jacobian(model, waves, vector)[0].sum())
-        for waves in pixel_waves(model, centre, device)
-    )
-    vector[0, PARAMETERS.index("level")] = photons / total
+    vector[0, PARAMETERS.index("level")] = photons / float(mean_image(model, vector, centre).sum())
     vector[0, PARAMETERS.index("background")] = background
     return vector
 
@@ -274,9 +270,19 @@ def expected(
         K; the middle one of the model's if not given.
     """
     vector = parameter_vector(model, v_los, photons, background, centre, temperature, device)
+    return mean_image(model, vector, centre)
+
+
+def mean_image(
+    model: RingModel, parameters: torch.Tensor, centre: tuple[float, float] | None = None
+) -> torch.Tensor:
+    """Mean electrons of every pixel, (height, width), for parameters (1, `PARAMETERS`).
+
+    x and y are from ``centre``, or the model's.
+    """
     parts = [
-        mean_and_jacobian(model, waves, vector)[0][0]
-        for waves in pixel_waves(model, centre, device)
+        mean_and_jacobian(model, waves, parameters)[0][0]
+        for waves in pixel_waves(model, centre, parameters.device)
     ]
     return torch.cat(parts).reshape(model.shape)
 

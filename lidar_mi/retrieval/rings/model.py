@@ -69,7 +69,7 @@ class RingModel:
     light : mapping
         Values of terms of `LIGHT`; 0 where one is not given.
     light_degree, background_degree : int
-        Terms of `LIGHT` and `BACKGROUND` up to this degree are unknown, 0 to 4.
+        Terms of `LIGHT` and `BACKGROUND` up to this degree are unknown, 0 to 8.
     priors : mapping of (mean, standard deviation)
         Normal distributions of parameters, from what is known beside the image.
     systematic : array (8, 8), optional
