@@ -27,7 +27,7 @@ from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.ring_images import summed
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.io.exr import read_fringes
-from tests.support.experiments import leave_out_figures
+from tests.support.experiments import leave_out_figures, sketched_figures
 
 # 25 % of the default camera's pixels see the same four rings
 CAMERA = {"width": 480, "height": 390, "pixel": "14.8 um"}
@@ -77,7 +77,8 @@ def check(**changes):
 def small(tmp_path_factory):
     """Folder and metrics of the small experiment."""
     folder = tmp_path_factory.mktemp("fringes") / "run"
-    return folder, run(check(), folder).metrics
+    with sketched_figures():
+        return folder, run(check(), folder).metrics
 
 
 @pytest.fixture(scope="module")
