@@ -123,7 +123,11 @@ def run(
         with progress() as notice:
             connection = stack.enter_context(connected(client, workers, threads, notice))
         with _watched() as watch:
-            state = execute(folder, connection, watch=watch, lifetime=seconds)
+            try:
+                state = execute(folder, connection, watch=watch, lifetime=seconds)
+            except BaseException as error:
+                error.add_note("start it again to do the points that are left")
+                raise
     _conclude(folder)
     for table in state.tables():
         print_table(table)
