@@ -6,7 +6,8 @@ Points are computed without figures by all sides, and each in a folder of its ow
 import multiprocessing
 import shutil
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,10 @@ from typing import Any
 from lidar_mi.campaign.collect import collect
 from lidar_mi.campaign.description import Campaign
 from lidar_mi.campaign.engine import connected, execute, prepare_campaign
+from lidar_mi.campaign.folder import Outcome, write_outcome
 from lidar_mi.campaign.points import Points
 from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.resumable_folder import METRICS
 from lidar_mi.experiment.run import finish, prepare
 from lidar_mi.io.json import to_json
 from lidar_mi.io.text import write_text
@@ -47,6 +50,7 @@ def compare(repeats: int = 3, points: int = 24) -> Comparison:
         use_threads(1)
         for samples, count in ((SMALL, points), (LARGE, max(points // 4, 2))):
             lines += _rows(folder, clients, pool, samples, count, repeats)
+        lines += _costs(folder, clients[2])
     notes = (
         "Loop: prepare and finish of every point in one process, metrics written to a file. Pool: "
         "the same in two processes. Workers and pool are started before.",
@@ -85,6 +89,34 @@ def _rows(folder: Path, clients: dict, pool: Any, samples: int, count: int, repe
         "lower",
     )
     yield Row(f"{about}: one worker", "added to a point", "s", sorted(added)[len(added) // 2])
+
+
+def _costs(folder: Path, client: Any, count: int = 1000) -> Iterator[Row]:
+    """What a point costs beside its own computation: once each, of many points without work."""
+    campaign, base = _described(SMALL, count, 0)
+    out = folder / "costs"
+    start = time.perf_counter()
+    ready = prepare_campaign(Points(campaign, base, folder), out)
+    checked = time.perf_counter()
+    for number in range(count):
+        place = ready.place(number)
+        place.mkdir(parents=True)
+        write_outcome(place, Outcome("done", "", {}, 0, 0))
+        write_text(place / METRICS, to_json({f"metric_{k}": float(k) for k in range(200)}))
+    written = time.perf_counter()
+    collect(ready)
+    collected = time.perf_counter()
+    futures = client.map(abs, range(count), pure=False)
+    client.gather(futures)
+    scheduled = time.perf_counter()
+    steps = {
+        "checking its settings": checked - start,
+        "writing its metrics": written - checked,
+        "collecting 200 metrics": collected - written,
+        "scheduling its task": scheduled - collected,
+    }
+    for name, seconds in steps.items():
+        yield Row(f"{count} points without work", name, "s", seconds / count)
 
 
 def _described(samples: int, count: int, turn: int) -> tuple[Campaign, dict]:
