@@ -1,0 +1,296 @@
+"""Figures of a campaign: maps, lines with bands over members, knobs of a sample, compromises."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm, Normalize, to_hex
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from lidar_mi.assessment.figures.linked import Mark, as_svg, panel
+from lidar_mi.assessment.metrics.campaign import MEMBER, Interval, over_members
+from lidar_mi.assessment.metrics.sensitivity import SobolIndices
+from lidar_mi.assessment.report.digits import three
+
+FAILED, ABSENT, DOT = "#a4161a", "#e4e4e4", "#3b6ea5"
+COLOURS = ("#1f5fa8", "#c2571a", "#2c7a3f", "#8a3a8f", "#7a6200", "#4a4a4a", "#b0306a", "#0d7f86")
+
+
+class Points(NamedTuple):
+    """What every point is, over the dimensions of the sweep or the sample.
+
+    Attributes
+    ----------
+    number : xr.DataArray
+        0, 1, ...
+    failed : xr.DataArray
+        Whether no member of it is done.
+    link : xr.DataArray
+    """
+
+    number: xr.DataArray
+    failed: xr.DataArray
+    link: xr.DataArray
+
+
+class Axis(NamedTuple):
+    """A knob as an axis; labels are at 0, 1, ..."""
+
+    name: str
+    label: str
+    logarithmic: bool
+    labels: tuple[str, ...] = ()
+
+    def places(self, values: np.ndarray) -> np.ndarray:
+        """Where values are along the axis."""
+        if self.labels:
+            return np.array([self.labels.index(str(value)) for value in values], dtype=float)
+        return np.asarray(values, dtype=float)
+
+
+def colour_scale(values: xr.DataArray) -> Normalize:
+    """From the smallest to the largest of all panels, by factors beyond a ratio of 20."""
+    known = values.values[np.isfinite(values.values)]
+    low, high = (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
+    if low > 0 and high > 20 * low:
+        return LogNorm(low, high)
+    return Normalize(low, high if high > low else low + (abs(low) or 1.0))
+
+
+def draw_map(
+    title: str, values: xr.DataArray, x: Axis, y: Axis, points: Points, label: str, norm: Normalize
+) -> str:
+    """A metric over two knobs; failed points are crossed out, those without a value grey."""
+    figure, axes = panel(title)
+    values = values.transpose(y.name, x.name)
+    cmap = colormaps["viridis"]
+    marks = _cells(
+        axes,
+        values,
+        x,
+        y,
+        points,
+        lambda v: to_hex(cmap(norm(v))),
+        lambda v: f"{label}: {three(v)}",
+    )
+    bar = figure.colorbar(ScalarMappable(norm, cmap), ax=axes, label=label)
+    if isinstance(norm, LogNorm):
+        _plain_decades(bar.ax.yaxis)
+    return as_svg(axes, marks, f"{label}, {title}")
+
+
+def draw_requirements(
+    title: str, margins: Mapping[str, Interval], x: Axis, y: Axis, points: Points
+) -> str:
+    """Where all requirements are met (green), and the boundary of each with its uncertainty."""
+    _, axes = panel(title)
+    order = (y.name, x.name)
+    means = {name: one.mean.transpose(*order) for name, one in margins.items()}
+    worst = xr.concat(list(means.values()), "row", coords="minimal", compat="override").min(
+        "row", skipna=False
+    )
+    marks = _cells(
+        axes,
+        worst.transpose(*order),
+        x,
+        y,
+        points,
+        lambda v: "#cfe8d3" if v >= 0 else "#f3d5cf",
+        lambda v: f"smallest margin {100 * v:+.0f} %",
+    )
+    across, up = (axis.places(worst[axis.name].values) for axis in (x, y))
+    handles = []
+    for (name, one), colour in zip(margins.items(), COLOURS * 3, strict=False):
+        mean = means[name].values
+        if not (np.nanmin(mean) < 0 <= np.nanmax(mean)) or min(mean.shape) < 2:
+            continue
+        axes.contour(across, up, mean, [0.0], colors=colour, linewidths=1.8)
+        for bound in (one.low, one.high):
+            edge = bound.transpose(*order).values
+            if np.isfinite(edge).all() and edge.min() < 0 <= edge.max():
+                axes.contour(
+                    across, up, edge, [0.0], colors=colour, linewidths=0.8, linestyles="--"
+                )
+        handles.append(Line2D([], [], color=colour, label=name))
+    if handles:
+        axes.legend(handles=handles, fontsize=8, loc="best", framealpha=0.85)
+    return as_svg(axes, marks, title)
+
+
+def draw_lines(
+    title: str, groups: Mapping[str, tuple[xr.DataArray, Points]], x: Axis, label: str
+) -> str:
+    """A metric along one knob, a line per group: mean of the members, band of 68 % of them."""
+    _, axes = panel(title)
+    marks, known = [], []
+    for (name, (values, points)), colour in zip(groups.items(), COLOURS * 3, strict=False):
+        mean = over_members(values).mean
+        place = x.places(mean[x.name].values)
+        style = {"color": colour, "label": name or None}
+        axes.plot(place, mean.values, "--" if x.labels else "-", lw=1.3, **style)
+        if MEMBER in values.dims and x.name != MEMBER:
+            low, high = values.quantile([0.16, 0.84], MEMBER).transpose("quantile", x.name).values
+            axes.fill_between(place, low, high, color=colour, alpha=0.18, lw=0)
+        known.append(mean.values)
+        marks += [
+            _dot(p, v, f"{label}: {three(v)}", colour, points, {x.name: k})
+            for k, (p, v) in enumerate(zip(place, mean.values, strict=True))
+            if np.isfinite(v)
+        ]
+    low = _lowest(known)
+    for _, points in groups.values():
+        for k in np.flatnonzero(points.failed.values):
+            p = x.places(points.failed[x.name].values)[k]
+            axes.plot(p, low, "x", color=FAILED, ms=7, mew=2, clip_on=False)
+            marks.append(_dot(p, low, "failed", FAILED, points, {x.name: k}))
+    _scale(axes, x, None)
+    axes.set_ylabel(label)
+    _by_factors(axes, known)
+    if len(groups) > 1:
+        axes.legend(fontsize=8)
+    axes.grid(alpha=0.3)
+    return as_svg(axes, marks, f"{label}, {title}")
+
+
+def draw_scatter(
+    title: str,
+    x: Axis,
+    across: np.ndarray,
+    y: Axis,
+    up: np.ndarray,
+    points: Points,
+    front: np.ndarray | None = None,
+    line: np.ndarray | None = None,
+) -> str:
+    """Two numbers of every point of a sample; failed points are at the lower edge.
+
+    Points of a front (bool per point) are coloured, those of a line joined.
+    """
+    _, axes = panel(title)
+    across, up = np.asarray(across, dtype=float), np.asarray(up, dtype=float)
+    known = np.isfinite(across) & np.isfinite(up)
+    axes.plot(across[known], up[known], ",", alpha=0)
+    _by_factors(axes, [up])
+    low = _lowest([up[known]])
+    marks = []
+    for k in range(len(up)):
+        if known[k]:
+            colour = COLOURS[1] if front is not None and front[k] else DOT
+            marks.append(_dot(across[k], up[k], f"{y.label}: {three(up[k])}", colour, points, k))
+        elif np.isfinite(across[k]):
+            lost = bool(points.failed.values[k])
+            text = "failed" if lost else f"{y.label}: no value"
+            if lost:
+                axes.plot(across[k], low, "x", color=FAILED, ms=6, clip_on=False)
+            marks.append(_dot(across[k], low, text, FAILED if lost else ABSENT, points, k))
+    if line is not None:
+        chosen = np.flatnonzero(line)
+        order = chosen[np.argsort(across[chosen])]
+        axes.plot(across[order], up[order], color=COLOURS[1], lw=1)
+    _scale(axes, x, None)
+    axes.set_ylabel(y.label)
+    axes.grid(alpha=0.3)
+    return as_svg(axes, marks, f"{y.label} against {x.label}")
+
+
+def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str]) -> str:
+    """First-order and total indices of every knob with their intervals."""
+    _, axes = panel(title)
+    rows = np.arange(len(found.knobs), dtype=float)[::-1]
+    for shift, name, values, interval, colour in (
+        (0.17, "first order", found.first, found.first_interval, COLOURS[0]),
+        (-0.17, "total", found.total, found.total_interval, COLOURS[1]),
+    ):
+        axes.barh(rows + shift, values, 0.3, color=colour, label=name, alpha=0.8)
+        axes.hlines(rows + shift, *interval.T, color="k", lw=1)
+    axes.set_yticks(rows, [labels[name] for name in found.knobs])
+    axes.set(xlim=(0, 1), xlabel="fraction of the variance")
+    axes.legend(fontsize=8)
+    return as_svg(axes, [], title)
+
+
+def _cells(
+    axes, values: xr.DataArray, x: Axis, y: Axis, points: Points, colour, text
+) -> list[Mark]:
+    """Cells of a map around its points, (y, x)."""
+    across, up = (axis.places(values[axis.name].values) for axis in (x, y))
+    edges = _edges(across, x.logarithmic), _edges(up, y.logarithmic)
+    marks = []
+    failed = points.failed.transpose(y.name, x.name).values
+    for i, j in np.ndindex(*values.shape):
+        value = float(values.values[i, j])
+        shown = ABSENT if not np.isfinite(value) else colour(value)
+        words = text(value) if np.isfinite(value) else "failed" if failed[i, j] else "no value"
+        at = {y.name: i, x.name: j}
+        marks.append(
+            Mark(
+                int(points.number.isel(at)),
+                (edges[0][j], edges[0][j + 1]),
+                (edges[1][i], edges[1][i + 1]),
+                words,
+                shown,
+                str(points.link.isel(at).values),
+            )
+        )
+        if failed[i, j]:
+            axes.plot(across[j], up[i], "x", color=FAILED, ms=9, mew=2)
+    _scale(axes, x, y)
+    axes.set_xlim(edges[0].min(), edges[0].max())
+    axes.set_ylim(edges[1].min(), edges[1].max())
+    return marks
+
+
+def _dot(x: float, y: float, text: str, colour: str, points: Points, at) -> Mark:
+    at = at if isinstance(at, dict) else dict.fromkeys(points.number.dims, at)
+    number, link = int(points.number.isel(at)), str(points.link.isel(at).values)
+    return Mark(number, (x, x), (y, y), text, colour, link)
+
+
+def _edges(places: np.ndarray, logarithmic: bool) -> np.ndarray:
+    at = np.log(places) if logarithmic else places
+    if len(at) == 1:
+        inner = np.array([at[0] - 0.5, at[0] + 0.5])
+    else:
+        middle = (at[1:] + at[:-1]) / 2
+        inner = np.concatenate([[2 * at[0] - middle[0]], middle, [2 * at[-1] - middle[-1]]])
+    return np.exp(inner) if logarithmic else inner
+
+
+def _lowest(values: Sequence[np.ndarray]) -> float:
+    known = np.concatenate([one[np.isfinite(one)] for one in values]) if values else np.zeros(0)
+    return float(known.min()) if known.size else 0.0
+
+
+def _scale(axes: Axes, x: Axis, y: Axis | None) -> None:
+    for knob, side, set_scale, set_label in (
+        (x, axes.xaxis, axes.set_xscale, axes.set_xlabel),
+        (y, axes.yaxis, axes.set_yscale, axes.set_ylabel),
+    ):
+        if knob is None:
+            continue
+        set_label(knob.label)
+        if knob.logarithmic:
+            set_scale("log")
+            _plain_decades(side)
+        if knob.labels:
+            side.set_ticks(range(len(knob.labels)), knob.labels)
+
+
+def _by_factors(axes: Axes, values: Sequence[np.ndarray]) -> None:
+    known = np.concatenate([one[np.isfinite(one)] for one in values])
+    if known.size and known.min() > 0 and known.max() > 20 * known.min():
+        axes.set_yscale("log")
+        _plain_decades(axes.yaxis)
+
+
+def _plain_decades(side) -> None:
+    low, high = side.get_view_interval()
+    few = high > 50 * low > 0
+    side.set_major_locator(LogLocator(subs=(1.0,) if few else (1.0, 2.0, 5.0)))
+    side.set_major_formatter(FuncFormatter(lambda value, _: three(value)))
+    side.set_minor_formatter(NullFormatter())

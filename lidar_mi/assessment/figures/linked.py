@@ -1,0 +1,80 @@
+"""Figures whose points are links: SVG for a page, drawn by matplotlib, with one link per point."""
+
+import io
+import re
+from collections.abc import Sequence
+from html import escape
+from typing import NamedTuple
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure
+
+
+class Mark(NamedTuple):
+    """A point of a figure: a dot at the middle, or a cell.
+
+    Attributes
+    ----------
+    point : int
+        Number of the point, for what the page says of it.
+    x, y : tuple of float
+        Ends of the cell, in data; equal ends: a dot.
+    text : str
+        What it shows, as text.
+    colour : str
+    link : str
+    """
+
+    point: int
+    x: tuple[float, float]
+    y: tuple[float, float]
+    text: str
+    colour: str
+    link: str
+
+
+def panel(title: str) -> tuple[Figure, Axes]:
+    """A figure of one panel, as wide as a phone; pages put several side by side."""
+    figure = Figure(figsize=(5.2, 3.7), dpi=72, layout="constrained")
+    axes = figure.subplots()
+    axes.set_title(title, fontsize=10)
+    return figure, axes
+
+
+def as_svg(axes: Axes, marks: Sequence[Mark], label: str) -> str:
+    """The axes' figure as an SVG element with marks below its lines; all text is escaped."""
+    figure = axes.figure
+    # cells and dots are behind the frame
+    figure.patch.set_visible(False)
+    axes.patch.set_visible(False)
+    text = io.StringIO()
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": label}):
+        FigureCanvasSVG(figure).print_svg(text, metadata={"Date": None})
+    svg = text.getvalue()
+    height = float(figure.get_figheight() * 72)
+    # names of groups are the same in every figure
+    body = re.sub(r'<g id="[^"]*"', "<g", svg[svg.index("<svg") :])
+    body = re.sub(r"<metadata>.*?</metadata>", "", body, flags=re.DOTALL)
+    size = re.search(r'viewBox="([^"]*)"', body)
+    start = f'<svg viewBox="{size[1] if size else ""}" role="img" aria-label="{escape(label)}">'
+    drawn = "".join(_element(axes, mark, height) for mark in marks)
+    return f"{start}<g>{drawn}</g>{body[body.index('>') + 1 :]}"
+
+
+def _element(axes: Axes, mark: Mark, height: float) -> str:
+    (x0, y0), (x1, y1) = axes.transData.transform(list(zip(mark.x, mark.y, strict=True)))
+    if mark.x[0] == mark.x[1]:
+        shape = f'<circle cx="{x0:.1f}" cy="{height - y0:.1f}" r="3.2"'
+    else:
+        left, top = min(x0, x1), height - max(y0, y1)
+        shape = (
+            f'<rect x="{left:.1f}" y="{top:.1f}" width="{abs(x1 - x0):.1f}" '
+            f'height="{abs(y1 - y0):.1f}"'
+        )
+    text = f"<title>{escape(mark.text)}</title>"
+    return (
+        f'<a href="{escape(mark.link)}" data-point="{mark.point}">'
+        f'{shape} fill="{mark.colour}">{text}{"</circle>" if "circle" in shape else "</rect>"}</a>'
+    )

@@ -1,0 +1,440 @@
+"""The report of a campaign: one self-contained HTML file, from its data set alone."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.resources import files
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+from markupsafe import Markup
+
+from lidar_mi.assessment.figures import campaign as figures
+from lidar_mi.assessment.figures.campaign import Axis, Points
+from lidar_mi.assessment.metrics import campaign as numbers
+from lidar_mi.assessment.metrics.campaign import MEMBER, SAMPLE, Interval
+from lidar_mi.assessment.metrics.pareto import pareto_front
+from lidar_mi.assessment.metrics.requirements import QUANTITIES
+from lidar_mi.assessment.metrics.sensitivity import SobolIndices, sobol_indices
+from lidar_mi.assessment.metrics.units import unit_of
+from lidar_mi.assessment.report.digits import percent, three, with_error
+from lidar_mi.assessment.report.page import template
+
+_PANELS = 16
+_DONE, _FAILED = 0, 1
+# Objectives of a Pareto front beside the error: key, whether larger is better.
+_OBJECTIVES = (
+    ("lidar.pulse_energy", False),
+    ("scan.range", True),
+    ("render.samples_per_beam", False),
+)
+
+
+class Block(NamedTuple):
+    """Panels under one heading, SVG."""
+
+    title: str
+    text: str
+    panels: Sequence[str]
+
+
+def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = None) -> str:
+    """The report as HTML; all text of the user is escaped.
+
+    Parameters
+    ----------
+    dataset : xr.Dataset
+        The campaign's data set, as `lidar_mi.assessment.metrics.campaign` describes it, with
+        ``status``, ``message`` and ``folder`` of every point. Links are relative to the folder of
+        the campaign, where the page belongs.
+    resolved : str
+        The campaign with all defaults, as YAML.
+    metrics : sequence of str, optional
+        Names of metrics to show. Default: errors, coverage, vortices, pulses needed.
+
+    Raises
+    ------
+    InputError
+        A metric that the campaign does not have.
+    """
+    known = numbers.metrics_of(dataset)
+    shown = numbers.chosen(known, metrics)
+    axes = {name: _axis(dataset, name) for name in numbers.knobs(dataset)}
+    points = _points(dataset)
+    margins = {
+        group: {
+            QUANTITIES.get(q, (q, ""))[0]: numbers.over_members(known[k]) for q, k in rows.items()
+        }
+        for group, rows in numbers.requirements(known).items()
+    }
+    if SAMPLE in dataset.dims:
+        blocks = list(_sample_blocks(dataset, known, shown, axes, points))
+        required = []
+    else:
+        blocks = [_sweep_block(dataset, key, known[key], axes, points) for key in shown]
+        required = list(_requirement_maps(dataset, margins, axes, points))
+    return template("campaign.html").render(
+        name=dataset.attrs.get("name", "campaign"),
+        lead=_lead(dataset, axes, margins),
+        rows=_requirement_rows(margins, axes),
+        required=_marked(required),
+        blocks=_marked(blocks),
+        coverages=_coverage_rows(known),
+        failures=_failures(dataset),
+        resolved=resolved,
+        points=_descriptions(dataset),
+        script=Markup(files("lidar_mi.assessment.report").joinpath("campaign.js").read_text()),
+    )
+
+
+def _marked(blocks: Sequence[Block]) -> list[Block]:
+    return [block._replace(panels=[Markup(panel) for panel in block.panels]) for block in blocks]
+
+
+def _label(array: xr.DataArray, key: str) -> str:
+    unit = array.attrs.get("units") or unit_of(key)
+    return f"{array.attrs.get('long_name') or key}{f' / {unit}' if unit not in ('', '1') else ''}"
+
+
+def _axis(dataset: xr.Dataset, name: str) -> Axis:
+    at = dataset[name]
+    if not numbers.is_numeric(dataset, name):
+        return Axis(name, _label(at, name), False, tuple(str(value) for value in at.values))
+    values = at.values
+    # without a word of it, by factors where values differ by some
+    guess = "log" if values.min() > 0 and values.max() > 20 * values.min() else "linear"
+    return Axis(name, _label(at, name), at.attrs.get("scale", guess) == "log")
+
+
+def _points(dataset: xr.Dataset) -> Points:
+    status, folder = dataset["status"], dataset["folder"].astype(str)
+    failed, link = status != _DONE, _links(dataset, folder)
+    if MEMBER in status.dims:
+        failed, link = failed.all(MEMBER), link.isel({MEMBER: 0})
+    number = xr.DataArray(np.arange(failed.size).reshape(failed.shape), failed.coords, failed.dims)
+    return Points(number, failed, link)
+
+
+def _links(dataset: xr.Dataset, folder: xr.DataArray) -> xr.DataArray:
+    """The report of a point, where reports are kept; else its folder."""
+    kept = (dataset["status"] == _DONE) & (dataset.attrs.get("keep") == "everything")
+    ends = [
+        f"{one}/report.html" if keep else f"{one}/"
+        for one, keep in zip(folder.values.ravel(), kept.values.ravel(), strict=True)
+    ]
+    return folder.copy(data=np.array(ends, dtype=object).reshape(folder.shape))
+
+
+def _place(dataset: xr.Dataset, at: Mapping) -> str:
+    """A point's coordinates as text."""
+    names = (
+        [name for name in dataset.coords if dataset[name].dims == (SAMPLE,)]
+        if SAMPLE in dataset.dims
+        else list(at)
+    )
+    words = []
+    for name in names:
+        here = dataset[name].isel({dim: k for dim, k in at.items() if dim in dataset[name].dims})
+        value = here.item()
+        number = f"{value:.4g}" if isinstance(value, float) else str(value)
+        words.append(f"{name} = {number} {here.attrs.get('units', '')}".strip())
+    return ", ".join(words)
+
+
+def _each(array: xr.DataArray) -> Iterator[dict]:
+    for index in np.ndindex(*array.shape):
+        yield dict(zip(array.dims, index, strict=True))
+
+
+def _descriptions(dataset: xr.Dataset) -> list[str]:
+    status = dataset["status"]
+    if MEMBER in status.dims:
+        status = status.isel({MEMBER: 0})
+    return [_place(dataset, at) for at in _each(status)]
+
+
+def _failures(dataset: xr.Dataset) -> list[tuple[str, str, str, str]]:
+    rows = []
+    for at in _each(dataset["status"]):
+        here = dataset[["status", "message", "folder"]].isel(at)
+        code = int(here["status"])
+        if code != _DONE:
+            word = "failed" if code == _FAILED else "missing"
+            message = str(here["message"].item())
+            rows.append((_place(dataset, at), word, message, f"{here['folder'].item()}/"))
+    return rows
+
+
+def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Mapping) -> str:
+    status = dataset["status"]
+    runs, done = status.size, int((status == _DONE).sum())
+    failed = int((status == _FAILED).sum())
+    members = dataset.sizes.get(MEMBER, 1)
+    points = runs // (status.sizes.get(MEMBER, 1))
+    text = f"{points} point{'s' * (points != 1)} of {dataset.attrs.get('base', 'an experiment')}"
+    if members > 1:
+        text += f" with {members} members each"
+    text += f": {done} of {runs} runs done, {failed} failed"
+    missing = runs - done - failed
+    text += f", {missing} missing." if missing else "."
+    if axes:
+        sizes = [
+            f"{axis.label.partition(' / ')[0]} ({_range(dataset, name)})"
+            for name, axis in axes.items()
+        ]
+        kind = "Sampled" if SAMPLE in dataset.dims else "Varied"
+        text += f" {kind}: {', '.join(sizes)}."
+    if not margins:
+        return text + " No requirement was judged: that needs both lidars as one sensor."
+    found = []
+    for (application, phase), rows in margins.items():
+        each = [numbers.met(one) for one in rows.values()]
+        every = xr.concat(each, "row", coords="minimal", compat="override").min("row", skipna=False)
+        known = int(np.isfinite(every).sum())
+        found.append(
+            f"{application.replace('_', ' ')}, {phase}: at {int(every.sum())} of {known} points"
+        )
+    return f"{text} All rows of the requirements are met for {'; '.join(found)}."
+
+
+def _range(dataset: xr.Dataset, name: str) -> str:
+    values = dataset[name]
+    if not numbers.is_numeric(dataset, name):
+        return ", ".join(str(value) for value in values.values)
+    unit = values.attrs.get("units", "")
+    ends = f"{three(float(values.min()))} to {three(float(values.max()))} {unit}".strip()
+    return ends if SAMPLE in dataset.dims else f"{values.size} values, {ends}"
+
+
+def _requirement_rows(
+    margins: Mapping, axes: Mapping[str, Axis]
+) -> list[tuple[str, str, list[str]]]:
+    rows = []
+    for (application, phase), quantities in margins.items():
+        for name, margin in quantities.items():
+            met = numbers.met(margin)
+            known, many = int(np.isfinite(met).sum()), int(met.sum())
+            open_ = (
+                str(int(numbers.undecided(margin).sum()))
+                if np.isfinite(margin.low).any()
+                else "not known"
+            )
+            where = _boundary_text(margin, axes)
+            label = f"{application.replace('_', ' ')}, {phase}: {name}"
+            rows.append((label, "", [f"{many} of {known}", open_, where]))
+    return rows
+
+
+def _boundary_text(margin: Interval, axes: Mapping[str, Axis]) -> str:
+    met = numbers.met(margin)
+    if not (met == 0).any():
+        return "met everywhere"
+    if not (met == 1).any():
+        return "met nowhere"
+    numeric = [axis for axis in axes.values() if not axis.labels and axis.name in margin.mean.dims]
+    if len(numeric) != 1 or SAMPLE in margin.mean.dims:
+        return "see the figures" if SAMPLE not in margin.mean.dims else "see the lead"
+    axis, texts = numeric[0], []
+    unit = margin.mean[axis.name].attrs.get("units", "")
+    others = [dim for dim in margin.mean.dims if dim != axis.name]
+    for labels in product(*(margin.mean[dim].values for dim in others)):
+        at = dict(zip(others, labels, strict=True))
+        line = Interval(*(each.sel(at) for each in (margin.mean, margin.low, margin.high)))
+        for one in numbers.boundaries(line, axis.logarithmic):
+            side = "from" if one.above else "up to"
+            words = f"{side} {three(one.value)} {unit}".strip()
+            if np.isnan(one.low):
+                words += " (uncertainty not known)"
+            else:
+                low = three(one.low) if np.isfinite(one.low) else "beyond the sweep"
+                high = three(one.high) if np.isfinite(one.high) else "beyond the sweep"
+                words += f" (95 %: {low} to {high})"
+            texts.append(": ".join([*map(str, labels), words]))
+    return "; ".join(texts)
+
+
+def _layout(axes: Mapping[str, Axis], dims) -> tuple[list[Axis], Axis | None, list[str]]:
+    """Axes of a panel (one or two), the axis whose labels are lines, dims of the panels."""
+    numeric = [axis for name, axis in axes.items() if name in dims and not axis.labels]
+    labelled = [axis for name, axis in axes.items() if name in dims and axis.labels]
+    if len(numeric) >= 2:
+        # the finest two are the axes
+        numeric.sort(key=lambda axis: -dims[axis.name])
+        return numeric[:2], None, [axis.name for axis in (*numeric[2:], *labelled)]
+    if numeric:
+        lines = labelled[0] if labelled else None
+        return numeric, lines, [axis.name for axis in labelled[1:]]
+    return labelled[:1], labelled[1] if len(labelled) > 1 else None, [a.name for a in labelled[2:]]
+
+
+def _panels(dataset: xr.Dataset, names: Sequence[str]) -> list[tuple[str, dict]]:
+    """Title and selection of every panel."""
+    found = []
+    for index in product(*(range(dataset.sizes[name]) for name in names)):
+        at = dict(zip(names, index, strict=True))
+        found.append((_place(dataset, at), at))
+    return found
+
+
+def _sweep_block(dataset, key, values, axes, points) -> Block:
+    label = _label(values, key)
+    values = values.squeeze([d for d in values.dims if d not in axes and d != MEMBER], drop=True)
+    flat = Points(*(p.squeeze([d for d in p.dims if d not in axes], drop=True) for p in points))
+    title = f"{label.partition(' / ')[0]}"
+    if not axes:
+        return Block(title, _by_member(values), [])
+    at, lines, rest = _layout(axes, values.sizes)
+    selections = _panels(dataset, rest)
+    text = "Mean over members. " if MEMBER in values.dims else ""
+    if len(selections) > _PANELS:
+        text += f"The first {_PANELS} of {len(selections)} panels. "
+    drawn, mean = [], numbers.over_members(values).mean
+    norm = figures.colour_scale(mean)
+    for name, where in selections[:_PANELS]:
+        here = Points(*(p.isel(where) for p in flat))
+        if len(at) == 2:
+            drawn.append(figures.draw_map(name, mean.isel(where), *at, here, label, norm))
+            continue
+        groups = {"": (values.isel(where), here)}
+        if lines:
+            groups = {
+                one: (
+                    values.isel(where).isel({lines.name: k}),
+                    Points(*(p.isel({lines.name: k}) for p in here)),
+                )
+                for k, one in enumerate(lines.labels)
+            }
+        drawn.append(figures.draw_lines(name, groups, at[0], label))
+    if len(at) == 1 and MEMBER in values.dims:
+        text += "Bands: 16 to 84 % of the members. "
+    return Block(title, f"{text}Key: {key}.", drawn)
+
+
+def _by_member(values: xr.DataArray) -> str:
+    known = values.values[np.isfinite(values.values)]
+    if not known.size:
+        return "No value."
+    if known.size == 1:
+        return f"{three(float(known[0]))}."
+    mean, spread = float(known.mean()), float(known.std(ddof=1))
+    return (
+        f"Mean {with_error(mean, spread / np.sqrt(known.size))}, standard deviation "
+        f"{three(spread)}, from {three(float(known.min()))} to {three(float(known.max()))} over "
+        f"{known.size} members."
+    )
+
+
+def _requirement_maps(dataset, margins, axes, points) -> Iterator[Block]:
+    for (application, phase), rows in margins.items():
+        dims = next(iter(rows.values())).mean.sizes
+        at, _, rest = _layout(axes, dims) if axes else ([], None, [])
+        if len(at) != 2:
+            continue
+        flat = Points(*(p.squeeze([d for d in p.dims if d not in axes], drop=True) for p in points))
+        drawn = []
+        for name, where in _panels(dataset, rest)[:_PANELS]:
+            here = {
+                row: Interval(
+                    *(
+                        part.squeeze([d for d in part.dims if d not in axes], drop=True).isel(where)
+                        for part in (one.mean, one.low, one.high)
+                    )
+                )
+                for row, one in rows.items()
+            }
+            spots = Points(*(p.isel(where) for p in flat))
+            drawn.append(figures.draw_requirements(name, here, *at, spots))
+        known = any(np.isfinite(one.low).any() for one in rows.values())
+        text = "Green: all rows are met. Lines: where the margin of a row is 0"
+        text += (
+            "; dashed: 95 % interval of that, from the members."
+            if known
+            else ". Their uncertainty is not known: there is one member."
+        )
+        yield Block(f"{application.replace('_', ' ')}, {phase}", text, drawn)
+
+
+def _sample_blocks(dataset, known, shown, axes, points) -> Iterator[Block]:
+    logarithmic = [name for name, axis in axes.items() if axis.logarithmic]
+    labels = {name: axis.label.partition(" / ")[0] for name, axis in axes.items()}
+    places = {name: dataset[name].values for name in axes}
+    for key in shown:
+        values = known[key].transpose(SAMPLE, ...)
+        label, mean = _label(values, key), numbers.over_members(values).mean.values
+        title, text, drawn = label.partition(" / ")[0], "", []
+        y = Axis(key, label, False)
+        if places:
+            found = sobol_indices(places, values.values, logarithmic)
+            text = _sensitivity_text(found)
+            if found.determined:
+                drawn.append(figures.draw_indices(f"Sobol' indices: {title}", found, labels))
+        for name, axis in axes.items():
+            drawn.append(figures.draw_scatter("", axis, places[name], y, mean, points))
+        yield Block(title, f"{text} Key: {key}.", drawn)
+    errors = [key for key in shown if "rmse_" in key][:1]
+    for key in errors:
+        yield from _fronts(key, known, axes, places, points)
+
+
+def _fronts(key, known, axes, places, points) -> Iterator[Block]:
+    varied = [(name, larger) for name, larger in _OBJECTIVES if name in axes]
+    if not varied:
+        return
+    values = numbers.over_members(known[key].transpose(SAMPLE, ...)).mean.values
+    objectives = np.stack([values, *(places[name] for name, _ in varied)], axis=1)
+    front = pareto_front(objectives, [False, *(larger for _, larger in varied)])
+    label = _label(known[key], key)
+    y = Axis(key, label, False)
+    better = ", ".join(
+        f"{'larger' if larger else 'smaller'} {axes[name].label.partition(' / ')[0]}"
+        for name, larger in varied
+    )
+    text = (
+        f"{int(front.sum())} of {int(np.isfinite(values).sum())} points (orange) are not improved "
+        f"on in everything at once. Better: smaller {label.partition(' / ')[0]}, {better}."
+    )
+    if len(varied) > 1:
+        text += " The lines are the fronts of error and one knob alone."
+    drawn = []
+    for name, larger in varied:
+        pair = pareto_front(np.stack([values, places[name]], axis=1), [False, larger])
+        drawn.append(
+            figures.draw_scatter("", axes[name], places[name], y, values, points, front, pair)
+        )
+    yield Block("Pareto front", text, drawn)
+
+
+def _sensitivity_text(found: SobolIndices) -> str:
+    luck = (
+        ""
+        if np.isnan(found.luck)
+        else f" Luck (members of a point) is {percent(found.luck)} of it."
+    )
+    if not found.determined:
+        return f"Sobol' indices are undetermined: {found.reason}.{luck}"
+    left = max(0.0, 1 - found.explained)
+    return (
+        f"Sobol' indices with 95 % intervals, from {found.points} points. The knobs explain "
+        f"{percent(found.explained)} of the variance (cross-validated Q²); {percent(left)} is luck "
+        f"or too sharp for so few points.{luck}"
+    )
+
+
+def _coverage_rows(known: Mapping[str, xr.DataArray]) -> list[tuple[str, str, list[str]]]:
+    def shown(value: float, error: float) -> str:
+        if np.isnan(error):
+            return f"{100 * value:.1f}"
+        return with_error(100 * value, 100 * error) if error else f"{100 * value:.1f} ± 0"
+
+    return [
+        (
+            one.quantity,
+            "",
+            [
+                str(one.count),
+                shown(one.within_68, one.stderr_68),
+                shown(one.within_95, one.stderr_95),
+            ],
+        )
+        for one in numbers.coverages(known)
+    ]
