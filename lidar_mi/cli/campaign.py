@@ -88,7 +88,7 @@ def run(
         bool, typer.Option("--job-script", help="Print SLURM's job and run nothing.")
     ] = False,
 ) -> None:
-    """Run all points of a campaign that are not done, and collect them.
+    """Run all points of a campaign that are not done, and collect them, and write the report.
 
     Files are the truth: a campaign that was stopped is completed by the same command. A point that
     fails does not stop the others.
@@ -134,6 +134,7 @@ def run(
     if state.finished < state.total:
         output.print(f"{state.total - state.finished} points are left: run it again")
     output.print(f"data     {folder.path / 'campaign.nc'}")
+    output.print(f"report   {folder.path / 'report.html'}")
 
 
 @app.command()
@@ -147,19 +148,40 @@ def status(folder: Folder) -> None:
 
 @app.command()
 def collect(folder: Folder) -> None:
-    """Collect the points that are done into campaign.nc."""
+    """Collect the points that are done into campaign.nc, and write the report."""
     from lidar_mi.campaign.folder import open_folder
 
     _conclude(open_folder(folder))
     output.print(f"data     {folder / 'campaign.nc'}")
+    output.print(f"report   {folder / 'report.html'}")
+
+
+@app.command()
+def report(
+    folder: Folder,
+    metric: Annotated[
+        list[str] | None,
+        typer.Option("--metric", help="A metric to show, as often as needed. Default: chosen."),
+    ] = None,
+) -> None:
+    """Write report.html from campaign.nc, with the metrics that you choose."""
+    from lidar_mi.campaign.report import write_report
+
+    with progress() as notice:
+        notice("writing the report", None)
+        path = write_report(folder, metric)
+    output.print(f"report   {path}")
 
 
 def _conclude(folder: "CampaignFolder") -> None:
-    """Collect a campaign."""
+    """Collect a campaign and write its report."""
     from lidar_mi.campaign.collect import collect
+    from lidar_mi.campaign.report import write_report
 
     with progress() as notice:
         collect(folder, notice)
+        notice("writing the report", None)
+        write_report(folder.path)
 
 
 def _run_point(folder: "CampaignFolder", number: int) -> None:

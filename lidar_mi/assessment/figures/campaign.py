@@ -107,14 +107,20 @@ def draw_requirements(
     handles = []
     for (name, one), colour in zip(margins.items(), COLOURS * 3, strict=False):
         mean = means[name].values
-        if not (np.nanmin(mean) < 0 <= np.nanmax(mean)) or min(mean.shape) < 2:
+        if min(mean.shape) < 2 or not _crosses_zero(mean):
             continue
-        axes.contour(across, up, mean, [0.0], colors=colour, linewidths=1.8)
+        axes.contour(across, up, np.ma.masked_invalid(mean), [0.0], colors=colour, linewidths=1.8)
         for bound in (one.low, one.high):
             edge = bound.transpose(*order).values
-            if np.isfinite(edge).all() and edge.min() < 0 <= edge.max():
+            if _crosses_zero(edge):
                 axes.contour(
-                    across, up, edge, [0.0], colors=colour, linewidths=0.8, linestyles="--"
+                    across,
+                    up,
+                    np.ma.masked_invalid(edge),
+                    [0.0],
+                    colors=colour,
+                    linewidths=0.8,
+                    linestyles="--",
                 )
         handles.append(Line2D([], [], color=colour, label=name))
     if handles:
@@ -212,6 +218,12 @@ def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str]) -> 
     axes.set(xlim=(0, 1), xlabel="fraction of the variance")
     axes.legend(fontsize=8)
     return as_svg(axes, [], title)
+
+
+def _crosses_zero(values: np.ndarray) -> bool:
+    """Whether known values have both signs."""
+    known = values[np.isfinite(values)]
+    return bool(known.size and known.min() < 0 <= known.max())
 
 
 def _cells(

@@ -74,7 +74,9 @@ def _element(axes: Axes, mark: Mark, height: float) -> str:
             f'height="{abs(y1 - y0):.1f}"'
         )
     text = f"<title>{escape(mark.text)}</title>"
+    end = "</circle>" if shape.startswith("<circle") else "</rect>"
+    # stroked, as otherwise the page shows between cells
     return (
         f'<a href="{escape(mark.link)}" data-point="{mark.point}">'
-        f'{shape} fill="{mark.colour}">{text}{"</circle>" if "circle" in shape else "</rect>"}</a>'
+        f'{shape} fill="{mark.colour}" stroke="{mark.colour}">{text}{end}</a>'
     )

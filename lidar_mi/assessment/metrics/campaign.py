@@ -140,6 +140,18 @@ def requirements(metrics: Mapping[str, xr.DataArray]) -> dict[tuple[str, str], d
     return found
 
 
+def judged(dataset: xr.Dataset, margin: xr.DataArray) -> xr.DataArray:
+    """A margin, -1 (nothing of what is required) where a finished run gave nothing to be judged."""
+    nothing = (dataset["status"] == 0) & margin.isnull()
+    return margin.where(~nothing, -1.0)
+
+
+def varies_by_factors(values: np.ndarray) -> bool:
+    """Whether all values are positive and the largest is 10 times the smallest or more."""
+    known = values[np.isfinite(values)]
+    return bool(known.size and known.min() > 0 and known.max() >= 10 * known.min())
+
+
 def met(margin: Interval) -> xr.DataArray:
     """1 where the mean margin is that of a requirement met, 0 where not, NaN where not known."""
     return (margin.mean >= 0).where(np.isfinite(margin.mean)).astype(float)

@@ -63,7 +63,8 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
     points = _points(dataset)
     margins = {
         group: {
-            QUANTITIES.get(q, (q, ""))[0]: numbers.over_members(known[k]) for q, k in rows.items()
+            QUANTITIES.get(q, (q, ""))[0]: numbers.over_members(numbers.judged(dataset, known[k]))
+            for q, k in rows.items()
         }
         for group, rows in numbers.requirements(known).items()
     }
@@ -119,7 +120,7 @@ def _links(dataset: xr.Dataset, folder: xr.DataArray) -> xr.DataArray:
     """The report of a point, where reports are kept; else its folder."""
     kept = (dataset["status"] == _DONE) & (dataset.attrs.get("keep") == "everything")
     ends = [
-        f"{one}/report.html" if keep else f"{one}/"
+        f"{one}/run/report.html" if keep else f"{one}/"
         for one, keep in zip(folder.values.ravel(), kept.values.ravel(), strict=True)
     ]
     return folder.copy(data=np.array(ends, dtype=object).reshape(folder.shape))
@@ -249,7 +250,8 @@ def _boundary_text(margin: Interval, axes: Mapping[str, Axis]) -> str:
                 low = three(one.low) if np.isfinite(one.low) else "beyond the sweep"
                 high = three(one.high) if np.isfinite(one.high) else "beyond the sweep"
                 words += f" (95 %: {low} to {high})"
-            texts.append(": ".join([*map(str, labels), words]))
+            place = [str(one) for dim, one in zip(others, labels, strict=True) if dim in axes]
+            texts.append(": ".join([*place, words]))
     return "; ".join(texts)
 
 
@@ -282,7 +284,9 @@ def _sweep_block(dataset, key, values, axes, points) -> Block:
     flat = Points(*(p.squeeze([d for d in p.dims if d not in axes], drop=True) for p in points))
     title = f"{label.partition(' / ')[0]}"
     if not axes:
-        return Block(title, _by_member(values), [])
+        return Block(
+            title, f"{_by_member(values)} Key: {key}.", _member_panel(dataset, values, label)
+        )
     at, lines, rest = _layout(axes, values.sizes)
     selections = _panels(dataset, rest)
     text = "Mean over members. " if MEMBER in values.dims else ""
@@ -322,6 +326,26 @@ def _by_member(values: xr.DataArray) -> str:
         f"{three(spread)}, from {three(float(known.min()))} to {three(float(known.max()))} over "
         f"{known.size} members."
     )
+
+
+def _member_panel(dataset, values, label) -> list[str]:
+    """A metric of every member of a single point."""
+    if MEMBER not in values.dims:
+        return []
+    one = dataset[["status", "folder"]].squeeze([d for d in dataset.dims if d != MEMBER], drop=True)
+    each = xr.Dataset(
+        {
+            "number": (MEMBER, np.zeros(values.size, int)),
+            "failed": one["status"] != _DONE,
+            "link": _links(dataset, dataset["folder"].astype(str)).squeeze(
+                [d for d in dataset.dims if d != MEMBER], drop=True
+            ),
+            "value": values,
+        }
+    ).rename({MEMBER: "run"})
+    points = Points(each["number"], each["failed"], each["link"])
+    along = Axis("run", "member", False)
+    return [figures.draw_lines("", {"": (each["value"], points)}, along, label)]
 
 
 def _requirement_maps(dataset, margins, axes, points) -> Iterator[Block]:
@@ -364,8 +388,11 @@ def _sample_blocks(dataset, known, shown, axes, points) -> Iterator[Block]:
         title, text, drawn = label.partition(" / ")[0], "", []
         y = Axis(key, label, False)
         if places:
-            found = sobol_indices(places, values.values, logarithmic)
-            text = _sensitivity_text(found)
+            # errors vary by factors: so does their surrogate
+            factors = numbers.varies_by_factors(values.values)
+            analysed = np.log10(values.values) if factors else values.values
+            found = sobol_indices(places, analysed, logarithmic)
+            text = ("Of its logarithm. " if factors else "") + _sensitivity_text(found)
             if found.determined:
                 drawn.append(figures.draw_indices(f"Sobol' indices: {title}", found, labels))
         for name, axis in axes.items():

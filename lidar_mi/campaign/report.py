@@ -1,0 +1,31 @@
+"""The report of a campaign, from its data set."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from lidar_mi.assessment.report.campaign import page
+from lidar_mi.campaign.collect import open_campaign
+from lidar_mi.campaign.folder import RECORD, REPORT, open_folder
+from lidar_mi.io.text import read_text, write_text
+
+
+def write_report(folder: str | Path, metrics: Sequence[str] | None = None) -> Path:
+    """Write ``report.html`` of a campaign; returns its path.
+
+    Parameters
+    ----------
+    folder : path
+    metrics : sequence of str, optional
+        Names of those to show. Default: errors, requirements and vortices.
+
+    Raises
+    ------
+    InputError
+        No campaign in the folder, or no such metric.
+    """
+    opened = open_folder(folder)
+    data = open_campaign(opened.path)
+    resolved = read_text(opened.path / RECORD, "the record of a campaign")
+    path = opened.path / REPORT
+    write_text(path, page(data, resolved, metrics))
+    return path
