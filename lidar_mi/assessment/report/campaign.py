@@ -394,7 +394,7 @@ def _sample_blocks(dataset, known, shown, axes, points) -> Iterator[Block]:
             found = sobol_indices(places, analysed, logarithmic)
             text = ("Of its logarithm. " if factors else "") + _sensitivity_text(found)
             if found.determined:
-                drawn.append(figures.draw_indices(f"Sobol' indices: {title}", found, labels))
+                drawn.append(figures.draw_indices("Sobol' indices", found, labels))
         for name, axis in axes.items():
             drawn.append(figures.draw_scatter("", axis, places[name], y, mean, points))
         yield Block(title, f"{text} Key: {key}.", drawn)
