@@ -4,11 +4,15 @@ Detects: a fault that is only met after hours, one that is reported under anothe
 range that miss its ends, a coarse version with points that the whole one has not.
 """
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 import yaml
 
 from lidar_mi.campaign.description import Campaign, read_campaign
+from lidar_mi.campaign.engine import prepare_campaign
 from lidar_mi.campaign.shipped import campaign_file
 from lidar_mi.errors import InputError
 
@@ -101,3 +105,11 @@ def test_the_command_line_changes_keys(tmp_path):
     assert found.sweep["seed_"] == [1]
     with pytest.raises(InputError, match="--set members: expected KEY=VALUE"):
         read_campaign(written(tmp_path / "c.yaml"), ["members"])
+
+
+def test_the_campaign_of_the_guide_is_one(tmp_path):
+    guide = Path(__file__).parents[2] / "docs" / "campaigns.md"
+    (text,) = re.findall(r"^```yaml\n(.*?)^```", guide.read_text(), re.DOTALL | re.MULTILINE)
+    (tmp_path / "my_map.yaml").write_text(text)
+    found = prepare_campaign(tmp_path / "my_map.yaml", tmp_path / "out")
+    assert found.points.shape == (7, 2, 8)
