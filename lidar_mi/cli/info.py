@@ -9,6 +9,9 @@ from lidar_mi.cli.options import quantity
 from lidar_mi.cli.terminal import output, print_rows, print_table
 from lidar_mi.progress import progress
 
+CAMPAIGN = "campaign.yaml"
+"""Record in the folder of a campaign."""
+
 EXAMPLES = (
     "Examples: `lidar-mi info outputs/wake_backscatter` - `lidar-mi info image_t1.exr` - "
     "`lidar-mi info spheroids` - `lidar-mi info molecules --wavelength '355 nm' "
@@ -20,8 +23,8 @@ def info(
     what: Annotated[
         str,
         typer.Argument(
-            help="EXR, NetCDF or scattering-table file (.txt), folder of a run or of variants, or "
-            "a name: molecules, spheroids, spheres, continental, sea_salt, dust, droplets, soot."
+            help="EXR, NetCDF or scattering-table file (.txt), folder of a run, of variants or of a "
+            "campaign, or a name: molecules, spheroids, spheres, continental, sea_salt, dust, droplets, soot."
         ),
     ],
     wavelength: Annotated[
@@ -41,6 +44,12 @@ def info(
     from lidar_mi.experiment.resumable_folder import failure, read_metrics, read_record
     from lidar_mi.experiment.study import RECORD
 
+    if (Path(what) / CAMPAIGN).is_file():
+        from lidar_mi.campaign.status import campaign_status
+
+        for table in campaign_status(what).tables():
+            print_table(table)
+        return
     with progress() as notice:
         found = list(
             sections(
