@@ -48,6 +48,7 @@ ARROWS = {
 that its files hold; only `experiment` and what lies above it see all."""
 
 OPENS = {
+    "assessment/report/campaign.py": "its own script, a resource of the package",
     "assessment/report/page.py": "its own script, a resource of the package",
     "experiment/log.py": "the log, line by line",
     "experiment/resumable_folder.py": "checksums of what a run depends on",

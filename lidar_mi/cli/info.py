@@ -23,8 +23,9 @@ def info(
     what: Annotated[
         str,
         typer.Argument(
-            help="EXR, NetCDF or scattering-table file (.txt), folder of a run, of variants or of a "
-            "campaign, or a name: molecules, spheroids, spheres, continental, sea_salt, dust, droplets, soot."
+            help="EXR, NetCDF or scattering-table file (.txt), folder of a run, of variants or of "
+            "a campaign, or a name: molecules, spheroids, spheres, continental, sea_salt, dust, "
+            "droplets, soot."
         ),
     ],
     wavelength: Annotated[

@@ -35,7 +35,7 @@ def test_shipped_campaigns_can_be_run(tmp_path, name):
     # every point is checked; of the coarse version, too
     whole = prepare_campaign(name, tmp_path / "whole")
     coarse = prepare_campaign(name, tmp_path / "coarse", quick=True)
-    assert len(coarse.points) < len(whole.points) / 8
+    assert len(coarse.points) < len(whole.points) / 6
 
 
 def test_points_of_a_job_array_are_collected(tmp_path, command, capsys):

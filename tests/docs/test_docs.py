@@ -341,7 +341,8 @@ def test_printed_code_runs(pages, workplace, capsys):
         elif block.language == "python":
             file = str(ROOT / block.page)
             code = compile("\n" * (block.line - 1) + block.text, file, "exec")
-            exec(code, {"__name__": "__docs__"})  # that is the test
+            with without_figures():
+                exec(code, {"__name__": "__docs__"})  # that is the test
         else:
             assert block.language == "math", f"{block.place}: {block.language!r}"
 

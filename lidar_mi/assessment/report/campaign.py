@@ -3,7 +3,6 @@
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
 from itertools import product
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -13,29 +12,14 @@ from lidar_mi.assessment.figures import campaign as figures
 from lidar_mi.assessment.figures.campaign import Axis, Points
 from lidar_mi.assessment.metrics import campaign as numbers
 from lidar_mi.assessment.metrics.campaign import MEMBER, SAMPLE, Interval
-from lidar_mi.assessment.metrics.pareto import pareto_front
 from lidar_mi.assessment.metrics.requirements import QUANTITIES
-from lidar_mi.assessment.metrics.sensitivity import SobolIndices, sobol_indices
-from lidar_mi.assessment.metrics.units import unit_of
-from lidar_mi.assessment.report.digits import percent, three, with_error
+from lidar_mi.assessment.report.block import Block, label_of
+from lidar_mi.assessment.report.digits import three, with_error
 from lidar_mi.assessment.report.page import template
+from lidar_mi.assessment.report.sample import sample_blocks
 
 _PANELS = 16
 _DONE, _FAILED = 0, 1
-# Objectives of a Pareto front beside the error: key, whether larger is better.
-_OBJECTIVES = (
-    ("lidar.pulse_energy", False),
-    ("scan.range", True),
-    ("render.samples_per_beam", False),
-)
-
-
-class Block(NamedTuple):
-    """Panels under one heading, SVG."""
-
-    title: str
-    text: str
-    panels: Sequence[str]
 
 
 def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = None) -> str:
@@ -69,7 +53,7 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
         for group, rows in numbers.requirements(known).items()
     }
     if SAMPLE in dataset.dims:
-        blocks = list(_sample_blocks(dataset, known, shown, axes, points))
+        blocks = list(sample_blocks(dataset, known, shown, axes, points))
         required = []
     else:
         blocks = [_sweep_block(dataset, key, known[key], axes, points) for key in shown]
@@ -92,19 +76,14 @@ def _marked(blocks: Sequence[Block]) -> list[Block]:
     return [block._replace(panels=[Markup(panel) for panel in block.panels]) for block in blocks]
 
 
-def _label(array: xr.DataArray, key: str) -> str:
-    unit = array.attrs.get("units") or unit_of(key)
-    return f"{array.attrs.get('long_name') or key}{f' / {unit}' if unit not in ('', '1') else ''}"
-
-
 def _axis(dataset: xr.Dataset, name: str) -> Axis:
     at = dataset[name]
     if not numbers.is_numeric(dataset, name):
-        return Axis(name, _label(at, name), False, tuple(str(value) for value in at.values))
+        return Axis(name, label_of(at, name), False, tuple(str(value) for value in at.values))
     values = at.values
     # without a word of it, by factors where values differ by some
     guess = "log" if values.min() > 0 and values.max() > 20 * values.min() else "linear"
-    return Axis(name, _label(at, name), at.attrs.get("scale", guess) == "log")
+    return Axis(name, label_of(at, name), at.attrs.get("scale", guess) == "log")
 
 
 def _points(dataset: xr.Dataset) -> Points:
@@ -279,7 +258,7 @@ def _panels(dataset: xr.Dataset, names: Sequence[str]) -> list[tuple[str, dict]]
 
 
 def _sweep_block(dataset, key, values, axes, points) -> Block:
-    label = _label(values, key)
+    label = label_of(values, key)
     values = values.squeeze([d for d in values.dims if d not in axes and d != MEMBER], drop=True)
     flat = Points(*(p.squeeze([d for d in p.dims if d not in axes], drop=True) for p in points))
     title = f"{label.partition(' / ')[0]}"
@@ -376,75 +355,6 @@ def _requirement_maps(dataset, margins, axes, points) -> Iterator[Block]:
             else ". Their uncertainty is not known: there is one member."
         )
         yield Block(f"{application.replace('_', ' ')}, {phase}", text, drawn)
-
-
-def _sample_blocks(dataset, known, shown, axes, points) -> Iterator[Block]:
-    logarithmic = [name for name, axis in axes.items() if axis.logarithmic]
-    labels = {name: axis.label.partition(" / ")[0] for name, axis in axes.items()}
-    places = {name: dataset[name].values for name in axes}
-    for key in shown:
-        values = known[key].transpose(SAMPLE, ...)
-        label, mean = _label(values, key), numbers.over_members(values).mean.values
-        title, text, drawn = label.partition(" / ")[0], "", []
-        y = Axis(key, label, False)
-        if places:
-            # errors vary by factors: so does their surrogate
-            factors = numbers.varies_by_factors(values.values)
-            analysed = np.log10(values.values) if factors else values.values
-            found = sobol_indices(places, analysed, logarithmic)
-            text = ("Of its logarithm. " if factors else "") + _sensitivity_text(found)
-            if found.determined:
-                drawn.append(figures.draw_indices("Sobol' indices", found, labels))
-        for name, axis in axes.items():
-            drawn.append(figures.draw_scatter("", axis, places[name], y, mean, points))
-        yield Block(title, f"{text} Key: {key}.", drawn)
-    errors = [key for key in shown if "rmse_" in key][:1]
-    for key in errors:
-        yield from _fronts(key, known, axes, places, points)
-
-
-def _fronts(key, known, axes, places, points) -> Iterator[Block]:
-    varied = [(name, larger) for name, larger in _OBJECTIVES if name in axes]
-    if not varied:
-        return
-    values = numbers.over_members(known[key].transpose(SAMPLE, ...)).mean.values
-    objectives = np.stack([values, *(places[name] for name, _ in varied)], axis=1)
-    front = pareto_front(objectives, [False, *(larger for _, larger in varied)])
-    label = _label(known[key], key)
-    y = Axis(key, label, False)
-    better = ", ".join(
-        f"{'larger' if larger else 'smaller'} {axes[name].label.partition(' / ')[0]}"
-        for name, larger in varied
-    )
-    text = (
-        f"{int(front.sum())} of {int(np.isfinite(values).sum())} points (orange) are not improved "
-        f"on in everything at once. Better: smaller {label.partition(' / ')[0]}, {better}."
-    )
-    if len(varied) > 1:
-        text += " The lines are the fronts of error and one knob alone."
-    drawn = []
-    for name, larger in varied:
-        pair = pareto_front(np.stack([values, places[name]], axis=1), [False, larger])
-        drawn.append(
-            figures.draw_scatter("", axes[name], places[name], y, values, points, front, pair)
-        )
-    yield Block("Pareto front", text, drawn)
-
-
-def _sensitivity_text(found: SobolIndices) -> str:
-    luck = (
-        ""
-        if np.isnan(found.luck)
-        else f" Luck (members of a point) is {percent(found.luck)} of it."
-    )
-    if not found.determined:
-        return f"Sobol' indices are undetermined: {found.reason}.{luck}"
-    left = max(0.0, 1 - found.explained)
-    return (
-        f"Sobol' indices with 95 % intervals, from {found.points} points. The knobs explain "
-        f"{percent(found.explained)} of the variance (cross-validated Q²); {percent(left)} is luck "
-        f"or too sharp for so few points.{luck}"
-    )
 
 
 def _coverage_rows(known: Mapping[str, xr.DataArray]) -> list[tuple[str, str, list[str]]]:
