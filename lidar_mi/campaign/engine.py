@@ -32,6 +32,8 @@ MOST_UNASKED = 100_000
 PATIENCE = 15.0
 """Seconds for a scheduler to answer."""
 
+_ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
 _AT_ONCE = 4
 """Tasks per thread that the scheduler holds: enough that no worker waits."""
 
@@ -200,6 +202,8 @@ def connected(
         "distributed.scheduler.allowed-failures": 10**6,
         "distributed.scheduler.worker-saturation": 1.0,
         "distributed.worker.multiprocessing-method": "spawn",
+        # without dask's limit to what malloc keeps, with which every large array is mapped anew
+        "distributed.nanny.pre-spawn-environ": dict.fromkeys(_ONE_THREAD, threads),
         "distributed.logging.distributed": "critical",
     }
     with dask.config.set(settings):
