@@ -11,6 +11,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize, to_hex
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from scipy.interpolate import RegularGridInterpolator
 
 from lidar_mi.assessment.figures.linked import Mark, as_svg, panel
 from lidar_mi.assessment.metrics.campaign import MEMBER, Interval, over_members
@@ -104,24 +105,20 @@ def draw_requirements(
         lambda v: f"smallest margin {100 * v:+.0f} %",
     )
     across, up = (axis.places(worst[axis.name].values) for axis in (x, y))
+    finer = tuple(_finer(at, axis.logarithmic) for at, axis in ((across, x), (up, y)))
     handles = []
     for (name, one), colour in zip(margins.items(), COLOURS * 3, strict=False):
         mean = means[name].values
         if min(mean.shape) < 2 or not _crosses_zero(mean):
             continue
-        axes.contour(across, up, np.ma.masked_invalid(mean), [0.0], colors=colour, linewidths=1.8)
-        for bound in (one.low, one.high):
-            edge = bound.transpose(*order).values
-            if _crosses_zero(edge):
-                axes.contour(
-                    across,
-                    up,
-                    np.ma.masked_invalid(edge),
-                    [0.0],
-                    colors=colour,
-                    linewidths=0.8,
-                    linestyles="--",
-                )
+        for values, style in (
+            (mean, {"linewidths": 1.8}),
+            (one.low.transpose(*order).values, {"linewidths": 0.8, "linestyles": "--"}),
+            (one.high.transpose(*order).values, {"linewidths": 0.8, "linestyles": "--"}),
+        ):
+            if _crosses_zero(values):
+                between = _between(values, (across, up), finer, (x.logarithmic, y.logarithmic))
+                axes.contour(*finer, np.ma.masked_invalid(between), [0.0], colors=colour, **style)
         handles.append(Line2D([], [], color=colour, label=name))
     if handles:
         axes.legend(handles=handles, fontsize=8, loc="best", framealpha=0.85)
@@ -218,6 +215,24 @@ def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str]) -> 
     axes.set(xlim=(0, 1), xlabel="fraction of the variance")
     axes.legend(fontsize=8)
     return as_svg(axes, [], title)
+
+
+def _finer(places: np.ndarray, logarithmic: bool) -> np.ndarray:
+    """Places along an axis, sixteen steps from each to the next in the axis's scale."""
+    at = np.log(places) if logarithmic else places
+    steps = np.arange(16 * (len(at) - 1) + 1) / 16
+    inner = np.interp(steps, np.arange(len(at)), at)
+    return np.exp(inner) if logarithmic else inner
+
+
+def _between(values: np.ndarray, places, finer, logarithmic) -> np.ndarray:
+    """Values (y, x) between the points, linear in the scale of each axis."""
+    (across, up), (fine_x, fine_y) = (
+        [np.log(one) if log else one for one, log in zip(axes, logarithmic, strict=True)]
+        for axes in (places, finer)
+    )
+    found = RegularGridInterpolator((up, across), values)
+    return found(tuple(np.meshgrid(fine_y, fine_x, indexing="ij")))
 
 
 def _crosses_zero(values: np.ndarray) -> bool:
