@@ -34,6 +34,8 @@ PATIENCE = 15.0
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
+_TRIES = 10
+
 _AT_ONCE = 4
 """Tasks per thread that the scheduler holds: enough that no worker waits."""
 
@@ -378,15 +380,23 @@ def _make_ready(client: Client, threads: int, *, own_cache: bool) -> None:
         raise InputError(
             "--scheduler: no worker within 60 s; expected dask workers of this scheduler"
         ) from None
-    try:
-        client.register_plugin(Prepare(threads, own_cache))
-    except InputError:
-        raise
-    except Exception as error:
-        raise InputError(
-            f"--scheduler: its workers cannot load lidar-mi ({one_line(error)[:100]}); expected "
-            "workers with the same version of it"
-        ) from None
+    for _ in range(_TRIES):
+        try:
+            client.register_plugin(Prepare(threads, own_cache))
+            return
+        except InputError:
+            raise
+        except OSError:  # a worker was lost meanwhile: its successor is made ready, too
+            time.sleep(1.0)
+        except Exception as error:
+            raise InputError(
+                f"--scheduler: its workers cannot load lidar-mi ({one_line(error)[:100]}); "
+                "expected workers with the same version of it"
+            ) from None
+    raise InputError(
+        f"--scheduler: workers were lost {_TRIES} times while they were made ready; expected "
+        "workers that live longer"
+    )
 
 
 def _has_dashboard() -> bool:
