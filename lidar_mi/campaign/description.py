@@ -16,7 +16,7 @@ KEYS = ("base", "sweep", "sample", "members")
 """Keys that only a campaign has."""
 
 LARGEST = 10**7
-"""Points of a campaign, members included, that need no confirmation are fewer."""
+"""Values of a dimension, points of a sample, members: more are a slip of the pen."""
 
 
 class _Section(BaseModel):

@@ -16,14 +16,14 @@ from distributed import Client, Future, KilledWorker, LocalCluster, as_completed
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.campaign.collect import collect
 from lidar_mi.campaign.description import checked_campaign, read_campaign
-from lidar_mi.campaign.folder import CampaignFolder, check_version, create, read_base, signatures
+from lidar_mi.campaign.folder import CampaignFolder, create, read_base, signatures
 from lidar_mi.campaign.points import Points
 from lidar_mi.campaign.shipped import campaign_file
 from lidar_mi.campaign.status import Status, count
 from lidar_mi.campaign.worker import Prepare, carry_out, render_shared
 from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.pipeline import stored_parts
+from lidar_mi.experiment.pipeline import storing_stages
 from lidar_mi.progress import Notice
 
 MOST_UNASKED = 100_000
@@ -165,9 +165,7 @@ def prepare_campaign(
             f"{origin}: {len(points)} points are not allowed unasked; expected at most "
             f"{MOST_UNASKED}, or --yes (confirmed=True)"
         )
-    ready = create(points, folder or Path("outputs") / points.campaign.name, notice)
-    check_version(ready)
-    return ready
+    return create(points, folder or Path("outputs") / points.campaign.name, notice)
 
 
 @contextmanager
@@ -307,21 +305,19 @@ class _Dispatch:
         signatures_ = self.folder.index[number].images
         if all(self.needed[one] < 2 for one in signatures_):
             return [], []
-        parts: dict[str, str] = {}
-        for part, stage in stored_parts(self.folder.points.experiment(number)).items():
-            parts.setdefault(stage.name, part)
+        stages = storing_stages(self.folder.points.experiment(number))
         first: list[int] = []
         tasks: list[Future] = []
-        for signature, part in zip(signatures_, parts.values(), strict=True):
+        for signature, stage in zip(signatures_, stages, strict=True):
             if self.needed[signature] > 1 and signature not in self.shared:
                 first.append(len(tasks))
                 self.shared[signature] = self.client.submit(
                     render_shared,
                     self.path,
                     number,
-                    part,
+                    stage.name,
                     self.session,
-                    key=f"render-{part}-{signature[:8]}-{uuid.uuid4().hex[:8]}",
+                    key=f"render-{stage.name}-{signature[:8]}-{uuid.uuid4().hex[:8]}",
                     pure=False,
                 )
             if signature in self.shared:

@@ -5,8 +5,8 @@ writing left no such file, and is done again.
 """
 
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ from lidar_mi.campaign.description import Campaign, checked_campaign
 from lidar_mi.campaign.points import Points
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading
-from lidar_mi.experiment.pipeline import stored_parts
+from lidar_mi.experiment.pipeline import storing_stages
 from lidar_mi.experiment.resumable_folder import METRICS, made_by, new_record, refuse_strangers
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.shipped import experiment_file
@@ -28,7 +28,7 @@ from lidar_mi.io.yaml import read_yaml, to_yaml
 from lidar_mi.progress import Notice
 
 RECORD, INDEX, OUTCOME = "campaign.yaml", "points.txt", "outcome.json"
-DATA, REPORT, LOG = "campaign.nc", "report.html", "log.txt"
+DATA, REPORT = "campaign.nc", "report.html"
 POINTS, IMAGES = "points", "images"
 ATTEMPTS = "attempts.txt"
 RUN = "run"
@@ -39,7 +39,10 @@ _SHORT = 20
 
 
 class Row(NamedTuple):
-    """One point in the index: the hash of its settings, inputs and version; those of its images."""
+    """One point in the index: the hash of its settings, inputs and version; those of its images.
+
+    Images have one for each of `lidar_mi.experiment.pipeline.storing_stages`.
+    """
 
     point: str
     images: tuple[str, ...]
@@ -128,8 +131,7 @@ class CampaignFolder:
         with suppress(OSError):  # others are left in it
             (self.path / IMAGES).rmdir()
 
-    @contextmanager
-    def claimed(self) -> Iterator[None]:
+    def claimed(self) -> AbstractContextManager[None]:
         """Lock the folder for the one process that hands out its points.
 
         Raises
@@ -137,8 +139,7 @@ class CampaignFolder:
         InputError
             Another process does.
         """
-        with locked(self.path):
-            yield
+        return locked(self.path)
 
 
 def read_outcome(place: Path) -> Outcome | None:
@@ -279,9 +280,8 @@ def _checked(points: Points, notice: Notice) -> list[Row]:
 
 def _row(experiment: Experiment, beside: Path) -> Row:
     record = new_record(experiment, beside)
-    # equal stages have equal signatures: of each one part is enough
-    stages = {stage.name: stage for stage in stored_parts(experiment).values()}
-    images = [made_by(record, stage.indifferent_to or ()) for stage in stages.values()]
+    stages = storing_stages(experiment)
+    images = [made_by(record, stage.indifferent_to or ()) for stage in stages]
     return Row(made_by(record)[:_SHORT], tuple(images))
 
 

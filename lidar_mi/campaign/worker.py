@@ -26,7 +26,6 @@ from lidar_mi.campaign.folder import (
     Outcome,
     check_version,
     open_folder,
-    read_outcome,
     signatures,
     write_outcome,
 )
@@ -34,7 +33,7 @@ from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment import resumable_folder
 from lidar_mi.experiment.image_store import ImageStore
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.pipeline import stages_of, stored_parts
+from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.run import complete, finish, prepare
 from lidar_mi.experiment.schema import Experiment
@@ -111,7 +110,7 @@ def carry_out(
     campaign = _opened(folder, (Path(folder) / RECORD).stat().st_mtime_ns)
     place = campaign.place(number)
     if campaign.is_done(number):
-        found = read_outcome(place)
+        found = campaign.outcome(number)
         assert found is not None
         return found
     make_folder(place)
@@ -143,7 +142,7 @@ def carry_out(
     return outcome
 
 
-def render_shared(folder: str, number: int, part: str, session: str) -> int:
+def render_shared(folder: str, number: int, name: str, session: str) -> int:
     """Render the images of one stage, which several points share; those that are there stay.
 
     Parameters
@@ -152,8 +151,8 @@ def render_shared(folder: str, number: int, part: str, session: str) -> int:
         As of `carry_out`.
     number : int
         One of the points.
-    part : str
-        A part of the result of that stage.
+    name : str
+        Of that stage.
 
     Returns
     -------
@@ -164,8 +163,12 @@ def render_shared(folder: str, number: int, part: str, session: str) -> int:
     campaign = _opened(folder, (Path(folder) / RECORD).stat().st_mtime_ns)
     experiment = campaign.points.experiment(number)
     keeper = PointKeeper(campaign, number, experiment)
-    stage = stored_parts(experiment)[part]
-    images = keeper.images.folder_of(part)
+    stages = storing_stages(experiment)
+    signatures_ = campaign.index[number].images
+    stage, signature = next(
+        (stage, one) for stage, one in zip(stages, signatures_, strict=True) if stage.name == name
+    )
+    images = campaign.images(signature)
     make_folder(images)
     try:
         _begin(images, session)
@@ -204,9 +207,8 @@ class PointKeeper:
     def __init__(self, campaign: CampaignFolder, number: int, experiment: Experiment):
         self._keep, self.place = campaign.campaign.keep, campaign.place(number)
         self._experiment, self.signature = experiment.name, campaign.index[number].point
-        stages = list(dict.fromkeys(stage.name for stage in stored_parts(experiment).values()))
-        signatures = dict(zip(stages, campaign.index[number].images, strict=True))
-        of = {part: signatures[stage.name] for part, stage in stored_parts(experiment).items()}
+        pairs = zip(storing_stages(experiment), campaign.index[number].images, strict=True)
+        of = {part: one for stage, one in pairs if stage.parts for part in stage.parts(experiment)}
         self.images = ImageStore(lambda part: campaign.images(of[part]), of.__getitem__)
         self.rendered = self.reused = 0
 

@@ -256,11 +256,6 @@ def stages_of(experiment: Experiment) -> list[Stage]:
     return in_order([stage for stage in STAGES if stage.wanted(experiment)], GIVEN)
 
 
-def stored_parts(experiment: Experiment) -> dict[str, Stage]:
-    """The stage of every part of a result that takes long: rendered images of both lidars."""
-    return {
-        part: stage
-        for stage in stages_of(experiment)
-        if stage.parts
-        for part in stage.parts(experiment)
-    }
+def storing_stages(experiment: Experiment) -> list[Stage]:
+    """The stages of an experiment whose results are stored in parts: images of both lidars."""
+    return [stage for stage in stages_of(experiment) if stage.parts]

@@ -13,7 +13,7 @@ from lidar_mi.experiment.pipeline import (
     BEHIND_RING_IMAGES,
     STAGES,
     stages_of,
-    stored_parts,
+    storing_stages,
 )
 from lidar_mi.experiment.resumable_folder import made_by, new_record
 from lidar_mi.experiment.run import prepare
@@ -88,7 +88,8 @@ def signatures(experiment):
     record = new_record(experiment, ".")
     return {
         part: made_by(record, stage.indifferent_to)
-        for part, stage in stored_parts(experiment).items()
+        for stage in storing_stages(experiment)
+        for part in stage.parts(experiment)
     }
 
 
