@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.beams import Beams
 from lidar_mi.units import Angle, Length, Speed, Within, quantity
 
 MOST_BEAMS = 10**7
@@ -84,6 +85,8 @@ class ScanPlan:
     position : float
         Distance of the telescope along x from the first scan, in the frame of the air, in which the
         gates are fixed.
+    beams : Beams, optional
+        Time and pose of every beam. None: all at once, from one place, to the nodes (y, z).
     """
 
     y: np.ndarray
@@ -93,6 +96,7 @@ class ScanPlan:
     gate_kind: str
     gate_count: int
     position: float
+    beams: Beams | None = None
 
     @property
     def centre(self) -> float:
