@@ -259,7 +259,7 @@ def define():
             lidar = Lidar(scene, sensor, differentiable)
             sample = lidar.emit(seed, beam, number)
 
-            low, high = sensor.ranges(sample.frame.n)
+            low, high = sensor.ranges(sample.frame.n, sample.start)
             width = 2 * (high - low) / gates
             near = 2 * (low - sample.delay) + width * gate
             where = sample.rng.next_float32()
@@ -413,21 +413,20 @@ def _check_gate_meets_medium(scene, sensor):
     """A gate without any medium in it is an error of the scene, not a black image."""
     if sensor.get_medium() is not None:
         return
-    near, far = sensor.nearest_and_farthest()
-    origin = sensor.world_transform() @ mi.Point3f(0)
-    position = mi.ScalarPoint3f(origin.x[0], origin.y[0], origin.z[0])
+    origins, (near, far) = sensor.origins_and_ranges()
     spans = []
     for shape in scene.shapes():
         if shape.interior_medium() is None and shape.exterior_medium() is None:
             continue
-        box = shape.bbox()
-        corners = [dr.norm(box.corner(i) - position) for i in range(8)]
-        spans.append((float(box.distance(position)), float(max(corners))))
-    if not any(first <= far and last >= near for first, last in spans):
-        where = ", ".join(f"{a:g} to {b:g} m" for a, b in spans) or "nowhere"
-        fail(
-            NAME, "gates", f"{near:g} to {far:g} m", f"ranges with a medium (there is one: {where})"
-        )
+        low, high = (np.array(corner, float) for corner in (shape.bbox().min, shape.bbox().max))
+        first = np.linalg.norm(np.maximum(0, np.maximum(low - origins, origins - high)), axis=1)
+        last = np.linalg.norm(np.maximum(origins - low, high - origins), axis=1)
+        if ((first <= far) & (last >= near)).any():
+            return
+        spans.append((first.min(), last.max()))
+    where = ", ".join(f"{a:g} to {b:g} m" for a, b in spans) or "nowhere"
+    gates = f"{near.min():g} to {far.max():g} m"
+    fail(NAME, "gates", gates, f"ranges with a medium (there is one: {where})")
 
 
 register(KIND, NAME, define)

@@ -136,7 +136,7 @@ def _corners(cube):
     return np.array(cube.vertex_positions_buffer(), float).reshape(-1, 3)
 
 
-def interaction(medium, position, direction, wavelengths):
+def interaction(medium, position, direction, wavelengths, time):
     """The medium interaction of light that arrives at ``position`` along ``direction``."""
     mei = dr.zeros(mi.MediumInteraction3f)
     mei.p = position
@@ -144,6 +144,7 @@ def interaction(medium, position, direction, wavelengths):
     mei.sh_frame = mi.Frame3f(-direction)
     mei.medium = medium
     mei.wavelengths = wavelengths
+    mei.time = time
     return mei
 
 
@@ -161,6 +162,7 @@ def transmittance(
     distance,
     channel,
     wavelengths,
+    time,
     rng,
     active,
     differentiable=False,
@@ -184,11 +186,12 @@ def transmittance(
             where,
             channel,
             wavelengths,
+            time,
             rng,
             active,
         )
     if differentiable:
-        mei = interaction(between, origin + direction * where, direction, wavelengths)
+        mei = interaction(between, origin + direction * where, direction, wavelengths, time)
         inside = active & (between != None)
         _, extinction = coefficients(between, mei, channel, inside)
         depth = dr.select(inside, extinction * distance, 0)
@@ -197,7 +200,7 @@ def transmittance(
 
 
 @dr.syntax
-def _walk(air, medium, origin, direction, distance, where, channel, wavelengths, rng, active):
+def _walk(air, medium, origin, direction, distance, where, channel, wavelengths, time, rng, active):
     """Transmittance, medium at the end, and medium at the distance ``where``."""
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
@@ -212,7 +215,7 @@ def _walk(air, medium, origin, direction, distance, where, channel, wavelengths,
         inside = active & (medium != None)
         # control variate: the extinction in the middle of the segment; the remainder is tracked
         middle = origin + direction * (0.5 * (travelled + end))
-        mei = interaction(medium, middle, direction, wavelengths)
+        mei = interaction(medium, middle, direction, wavelengths, time)
         _, control = coefficients(medium, mei, channel, inside)
         value = dr.select(inside, value * dr.exp(-control * (end - travelled)), value)
         majorant = medium.get_majorant(mei, inside)[channel]
@@ -221,7 +224,7 @@ def _walk(air, medium, origin, direction, distance, where, channel, wavelengths,
         while dr.hint(tracking, label="ratio tracking"):
             position -= dr.log(1 - rng.next_float32(tracking)) / majorant
             tracking &= position < end
-            mei = interaction(medium, origin + direction * position, direction, wavelengths)
+            mei = interaction(medium, origin + direction * position, direction, wavelengths, time)
             _, extinction = coefficients(medium, mei, channel, tracking)
             excess = (extinction - control) / majorant
             value = dr.select(tracking, value * (1 - excess), value)
@@ -234,7 +237,7 @@ def _walk(air, medium, origin, direction, distance, where, channel, wavelengths,
 
 
 @dr.syntax
-def collision(air, medium, origin, direction, distance, channel, wavelengths, rng, active):
+def collision(air, medium, origin, direction, distance, channel, wavelengths, time, rng, active):
     """Distance to the first real collision by delta tracking, its medium, and whether it happened.
 
     Not forced: a sample without a collision within ``distance``, or at an opaque surface, is lost.
@@ -250,13 +253,13 @@ def collision(air, medium, origin, direction, distance, channel, wavelengths, rn
         )
         skip = SURFACE_SKIP * (size + end)
         inside = active & (medium != None)
-        mei = interaction(medium, origin + direction * travelled, direction, wavelengths)
+        mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
         majorant = medium.get_majorant(mei, inside)[channel]
         tracking = inside & (majorant > 0)
         while dr.hint(tracking, label="delta tracking"):
             travelled -= dr.select(tracking, dr.log(1 - rng.next_float32(tracking)) / majorant, 0)
             tracking &= travelled < end
-            mei = interaction(medium, origin + direction * travelled, direction, wavelengths)
+            mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
             _, extinction = coefficients(medium, mei, channel, tracking)
             real = tracking & (rng.next_float32(tracking) * majorant < extinction)
             found |= real

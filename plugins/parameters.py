@@ -80,7 +80,10 @@ def check_pose(placed, plugin: str, field: str = "to_world") -> None:
 
 
 def table(plugin: str, field: str, source, columns: int) -> np.ndarray:
-    """Numbers given as a tensor, or by the name of a ``.npy`` or text file (``#`` comments)."""
+    """Numbers given as a tensor, or by the name of a ``.npy`` or text file.
+
+    Text has a line per row, blanks or commas between its numbers, and ``#`` before comments.
+    """
     if not isinstance(source, str):
         return np.array(source)
     path = Path(str(mi.file_resolver().resolve(source)))
@@ -89,7 +92,10 @@ def table(plugin: str, field: str, source, columns: int) -> np.ndarray:
     try:
         if path.suffix == ".npy":
             return np.asarray(np.load(path), float)
-        return np.loadtxt(path, ndmin=2)
+        rows = (
+            line.split("#")[0].replace(",", " ").split() for line in path.read_text().splitlines()
+        )
+        return np.array([row for row in rows if row], float)
     except (ValueError, EOFError) as error:
         fail(plugin, field, source, f"N lines of {columns} numbers ({error})")
 

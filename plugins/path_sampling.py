@@ -35,13 +35,14 @@ ROULETTE_FACTOR = 30.0
 class Sample:
     """Monte Carlo samples at the laser, each with the telescope point it will be connected to.
 
-    World coordinates. ``frame`` holds the beam's axes in the lidar's own frame, ``axes`` in the
-    world. ``delay`` is half the light path (m) by which the sample is emitted after the middle of
-    the pulse. ``stokes`` refers to ``mi.mueller.stokes_basis(direction)``.
+    World coordinates. ``frame`` holds the beam's axes in the lidar's own frame and ``start`` its
+    origin there, ``axes`` its axes in the world, ``time`` its time. ``delay`` is half the light
+    path (m) by which the sample is emitted after the middle of the pulse. ``stokes`` refers to
+    ``mi.mueller.stokes_basis(direction)``.
     """
 
-    def __init__(self, rng, frame, axes, origin, direction, aperture, delay, stokes):
-        self.rng, self.frame, self.axes = rng, frame, axes
+    def __init__(self, rng, frame, start, time, axes, origin, direction, aperture, delay, stokes):
+        self.rng, self.frame, self.start, self.time, self.axes = rng, frame, start, time, axes
         self.origin, self.direction, self.aperture = origin, direction, aperture
         self.delay, self.stokes = delay, stokes
 
@@ -63,10 +64,11 @@ class Lidar:
         sensor, laser = self.sensor, self.sensor.laser
         to_world = sensor.world_transform()
         frame = sensor.beam_frame(beam)
+        start, time = sensor.beam_origin(beam), sensor.beam_time(beam)
         origin, direction = laser.sample_local(pair(rng), pair(rng))
-        origin = to_world @ mi.Point3f(frame.to_world(mi.Vector3f(origin)))
+        origin = to_world @ mi.Point3f(start + frame.to_world(mi.Vector3f(origin)))
         direction = dr.normalize(to_world @ frame.to_world(direction))
-        aperture = to_world @ sensor.sample_aperture(frame, pair(rng))
+        aperture = to_world @ mi.Point3f(start + sensor.sample_aperture(frame, pair(rng)))
         axes = mi.Frame3f(*(to_world @ axis for axis in (frame.s, frame.t, frame.n)))
         delay = mi.Float(0)
         if laser.pulse_duration > 0:
@@ -80,7 +82,9 @@ class Lidar:
                 transverse(axes.s, direction),
                 mi.mueller.stokes_basis(direction),
             )
-        return Sample(rng, frame, axes, origin, direction, aperture, delay, list(stokes))
+        return Sample(
+            rng, frame, start, time, axes, origin, direction, aperture, delay, list(stokes)
+        )
 
     def forced(self, sample, low, high, position, max_order, split, by_order, cell):
         """Stokes vector (about e_h) received from each sample's gate.
@@ -135,12 +139,13 @@ class Lidar:
                 flight,
                 self.channel,
                 self.wavelengths,
+                sample.time,
                 rng,
                 active,
             )
             active &= medium != None
             position = mi.Point3f(position + direction * flight)
-            mei = interaction(medium, position, direction, self.wavelengths)
+            mei = interaction(medium, position, direction, self.wavelengths, sample.time)
             scattering, _ = coefficients(medium, mei, self.channel, active)
             weight *= out * scattering
             # no roulette at the first vertex: in thin air it is the signal
@@ -234,7 +239,7 @@ class Lidar:
             from_telescope = dr.select(in_view, from_telescope, 0)
             in_view &= dr.all((end > self.low) & (end < self.high))
             scattered, pdf = self._scatter(medium, mei, stokes, wo, in_view)
-            there = interaction(medium, end, wo, self.wavelengths)
+            there = interaction(medium, end, wo, self.wavelengths, sample.time)
             back = dr.normalize(sample.aperture - end)
             received, back_pdf = self._scatter(medium, there, scattered, back, in_view)
             density = PHASE_FRACTION * pdf + backward * from_telescope
@@ -308,11 +313,12 @@ class Lidar:
             distance,
             self.channel,
             self.wavelengths,
+            sample.time,
             rng,
             active,
             self.differentiable,
         )
-        mei = interaction(medium, vertex, direction, self.wavelengths)
+        mei = interaction(medium, vertex, direction, self.wavelengths, sample.time)
         active = active & (medium != None)
         scattering, _ = coefficients(medium, mei, self.channel, active)
         return self._receive(sample, rng, medium, mei, stokes, active, out * scattering * volume)
@@ -331,6 +337,7 @@ class Lidar:
             distance,
             self.channel,
             self.wavelengths,
+            sample.time,
             rng,
             active,
             self.differentiable,
@@ -359,7 +366,7 @@ class Lidar:
         then is it squared.
         """
         rng, aperture = sample.rng, sample.aperture
-        low, high = self.sensor.ranges(sample.frame.n)
+        low, high = self.sensor.ranges(sample.frame.n, sample.start)
         position, direction = mi.Point3f(sample.origin), mi.Vector3f(sample.direction)
         stokes = _copied(sample.stokes)
         medium = mi.MediumPtr(self.sensor.get_medium())
@@ -376,12 +383,13 @@ class Lidar:
                 2 * high - travelled,
                 self.channel,
                 self.wavelengths,
+                sample.time,
                 rng,
                 active,
             )
             position = mi.Point3f(position + direction * flight)
             travelled += flight
-            mei = interaction(medium, position, direction, self.wavelengths)
+            mei = interaction(medium, position, direction, self.wavelengths, sample.time)
             scattering, extinction = coefficients(medium, mei, self.channel, active)
             albedo = dr.select(active, scattering / extinction, 0)
             stokes = _scaled(stokes, albedo)

@@ -4,11 +4,12 @@
 Scanning monostatic lidar (``scanning_lidar``)
 ----------------------------------------------
 
-A telescope at the origin that points along many beams, one per pixel of its film, and receives the
-light of a nested :ref:`laser <emitter-laser>` that is scattered back from range gates. The
-telescope of each beam is a disc perpendicular to its axis, centred at the laser aperture. Light is
-received if it arrives at the disc within the field of view and half its optical path length lies
-in a gate.
+A telescope that points along many beams, one per pixel of its film, and receives the light of a
+nested :ref:`laser <emitter-laser>` that is scattered back from range gates. The telescope of each
+beam is a disc perpendicular to its axis, centred at the laser aperture. Light is received if it
+arrives at the disc within the field of view and half its optical path length lies in a gate. All
+beams start at the lidar's origin at once, or, with ``beams``, each at a place and a time of its
+own, as those of a scanner on an aircraft.
 
 ============================ ========= ==================================================== =======
 Parameter                    Type      Meaning                                              Default
@@ -26,6 +27,9 @@ Parameter                    Type      Meaning                                  
 ``directions``               tensor,   N x 3 beam directions in place of the angles, film   none
                              string    row by row from the top left; or a ``.npy`` or text
                                        file of them
+``beams``                    tensor,   N x 7 numbers in place of ``directions``: x, y, z    none
+                             string    (origin of a beam in the lidar's frame, m),
+                                       dx, dy, dz (its direction) and t (its time, s)
 ``to_world``                 transform of the lidar's frame (x forward, y left, z up)       identity
 *(nested)*                   emitter   a ``laser``                                          required
 *(nested)*                   medium    the environment in which the telescope is            vacuum
@@ -36,8 +40,26 @@ normalised. A single column (row) is at the middle of its angles. The local +z a
 the beam axis, its local +x axis the horizontal axis e_h.
 
 The range of a light path is half its optical length. A ``planar`` gate between x = X0 and X1 covers
-the ranges from X0 to X1 over the cosine of the angle between beam axis and x. Directions, gates,
-aperture and pose can be changed through ``mi.traverse`` without recompilation.
+the ranges from X0 to X1 over the cosine of the angle between beam axis and x. A beam whose origin
+is at x reaches these planes at ranges that are shorter by x over that cosine. ``spherical`` gates
+are ranges from each beam's own origin, shorter by x: the gates follow the air, not the lidar.
+
+Files of tables are ``.npy``, or text with numbers separated by blanks or commas and ``#`` comments.
+The time of a beam is that of its light everywhere; the pulse itself takes none. Directions,
+``origins`` (x, y, z of every beam) and ``times``, gates, aperture and pose can be changed through
+``mi.traverse`` without recompilation.
+
+.. code-block:: xml
+
+    <sensor type="scanning_lidar">
+      <string name="beams" value="raster.csv"/>
+      <float name="gate_start" value="498.75"/> <float name="gate_stop" value="501.25"/>
+      <emitter type="laser"/>
+      <film type="hdrfilm">
+        <integer name="width" value="3"/> <integer name="height" value="2"/>
+        <rfilter type="box"/>
+      </film>
+    </sensor>
 """
 
 import drjit as dr
@@ -77,13 +99,20 @@ def define():
                     fail(NAME, field, "nothing", "a range in m")
             self.m_gate_start = dr.opaque(mi.Float, number(props, NAME, "gate_start", 0.0))
             self.m_gate_stop = dr.opaque(mi.Float, number(props, NAME, "gate_stop", 0.0))
-            if "directions" in props:
-                directions = read_directions(props["directions"], width * height)
+            beams = width * height
+            origins, times = np.zeros((beams, 3)), np.zeros(beams)
+            if "beams" in props:
+                if "directions" in props:
+                    fail(NAME, "beams", "with directions", "one of both")
+                origins, directions, times = read_beams(props["beams"], beams)
+            elif "directions" in props:
+                directions = read_directions(props["directions"], beams)
             else:
                 directions = angle_directions(
                     _angles(props, "azimuth", width), _angles(props, "elevation", height)
                 )
             self.m_directions = mi.Float(directions.ravel())
+            self.m_origins, self.m_times = mi.Float(origins.ravel()), mi.Float(times)
             self.m_pose = pose(props, NAME)
             dr.make_opaque(self.m_pose)
             self._check()
@@ -98,15 +127,23 @@ def define():
             horizontal = horizontal_axis(axis)
             return mi.Frame3f(horizontal, dr.cross(axis, horizontal), axis)
 
-        def ranges(self, axis):
+        def beam_origin(self, beam):
+            """Where beams start: the middle of the telescope, in the lidar's frame."""
+            return dr.gather(mi.Point3f, self.m_origins, beam)
+
+        def beam_time(self, beam):
+            """Time of beams, s."""
+            return dr.gather(mi.Float, self.m_times, beam)
+
+        def ranges(self, axis, origin):
             """First and last range (m) of all gates together along a beam axis."""
             scale = dr.rcp(axis.x) if self.gate_kind == "planar" else mi.Float(1)
-            return self.m_gate_start * scale, self.m_gate_stop * scale
+            return tuple((end - origin.x) * scale for end in (self.m_gate_start, self.m_gate_stop))
 
         def sample_aperture(self, frame, sample):
-            """A point of the telescope disc of a beam, uniformly."""
+            """A point of the telescope disc of a beam, uniformly, from its middle."""
             disc = mi.warp.square_to_uniform_disk(sample) * self.m_aperture
-            return mi.Point3f(frame.s * disc.x + frame.t * disc.y)
+            return frame.s * disc.x + frame.t * disc.y
 
         def aperture_area(self):
             """Area of the telescope, m^2."""
@@ -118,13 +155,13 @@ def define():
             limit = self.m_fov_tan * local.z
             return (local.z > 0) & (dr.squared_norm(local.xy) <= limit * limit)
 
-        def nearest_and_farthest(self) -> tuple[float, float]:
-            """Smallest and largest range (m) any beam records."""
-            first, last = self.ranges(dr.gather(mi.Vector3f, self.m_directions, self._beams()))
-            return float(dr.min(first)[0]), float(dr.max(last)[0])
-
-        def _beams(self):
-            return dr.arange(mi.UInt32, self.beam_count)
+        def origins_and_ranges(self) -> tuple[np.ndarray, np.ndarray]:
+            """Of all beams: origins in the world, (n, 3), first and last recorded range, (2, n)."""
+            beam = dr.arange(mi.UInt32, self.beam_count)
+            origin = self.beam_origin(beam)
+            ranges = self.ranges(dr.gather(mi.Vector3f, self.m_directions, beam), origin)
+            places = np.array(self.world_transform() @ origin, float).T
+            return places, np.array([np.array(end, float) for end in ranges])
 
         def world_transform(self):
             return self.m_pose
@@ -134,11 +171,11 @@ def define():
             width, height = self.film().size()
             column = dr.clip(mi.UInt32(sample2.x * width), 0, width - 1)
             row = dr.clip(mi.UInt32(sample2.y * height), 0, height - 1)
-            frame = self.beam_frame(row * width + column)
+            beam = row * width + column
             to_world = self.world_transform()
-            direction = dr.normalize(to_world @ frame.n)
-            ray = mi.Ray3f(to_world @ mi.Point3f(0), direction, time, self.laser.wavelengths())
-            return ray, mi.Spectrum(1)
+            direction = dr.normalize(to_world @ self.beam_frame(beam).n)
+            origin, time = to_world @ self.beam_origin(beam), time + self.beam_time(beam)
+            return mi.Ray3f(origin, direction, time, self.laser.wavelengths()), mi.Spectrum(1)
 
         def sample_ray_differential(self, time, sample1, sample2, sample3, active=True):
             ray, weight = self.sample_ray(time, sample1, sample2, sample3, active)
@@ -148,6 +185,8 @@ def define():
             super().traverse(callback)
             kind = mi.ParamFlags.NonDifferentiable
             callback.put("directions", self.m_directions, kind)
+            callback.put("origins", self.m_origins, kind)
+            callback.put("times", self.m_times, kind)
             callback.put("gate_start", self.m_gate_start, kind)
             callback.put("gate_stop", self.m_gate_stop, kind)
             callback.put("aperture_radius", self.m_aperture, kind)
@@ -173,6 +212,14 @@ def define():
             self.m_directions = mi.Float(directions.ravel())
             if self.gate_kind == "planar" and directions[:, 0].min() <= 0:
                 fail(NAME, "gate_kind", "planar", "'spherical' when a beam does not point forward")
+            for name, values, each in (("origins", self.m_origins, 3), ("times", self.m_times, 1)):
+                values = np.array(values)
+                if values.size != each * self.beam_count or not np.isfinite(values).all():
+                    what = f"{values.size} numbers, {np.sum(~np.isfinite(values))} of them NaN"
+                    fail(NAME, name, what, f"{each * self.beam_count} finite ones")
+            farthest = np.array(self.m_origins).reshape(-1, 3)[:, 0].max()
+            if not farthest < start:
+                fail(NAME, "origins", f"x = {farthest:g} m", f"before gate_start = {start:g} m")
 
         def bbox(self):
             return mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
@@ -207,6 +254,19 @@ def read_directions(source, count: int) -> np.ndarray:
     if not (np.isfinite(length).all() and (length > 0).all()):
         fail(NAME, "directions", "a row of zero length or NaN", "finite vectors")
     return table / length
+
+
+def read_beams(source, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A table of beams (tensor or file name), checked: origins, directions (count, 3), times."""
+    table = read_table(NAME, "beams", source, 7).astype(float)
+    if table.shape != (count, 7):
+        fail(NAME, "beams", f"shape {table.shape}", f"({count}, 7), one beam per film pixel")
+    length = np.linalg.norm(table[:, 3:6], axis=1, keepdims=True)
+    bad = np.flatnonzero(~(np.isfinite(table).all(1) & (length[:, 0] > 0)))
+    if bad.size:
+        values = ", ".join(f"{value:g}" for value in table[bad[0]])
+        fail(NAME, f"beams[{bad[0]}]", values, "finite numbers and a direction longer than 0")
+    return table[:, :3], table[:, 3:6] / length, table[:, 6]
 
 
 def _angles(props, name: str, count: int) -> np.ndarray:

@@ -130,19 +130,24 @@ def _as_dataset(image: np.ndarray, names: list[str], sensor) -> xr.Dataset:
     rows, columns, _ = image.shape
     gates = sensor.gate_count
     start, stop = sensor.m_gate_start[0], sensor.m_gate_stop[0]
-    beams = np.array(sensor.m_directions, float).reshape(rows, columns, 3)[::-1, ::-1]
+    beams, origins = (
+        np.array(table, float).reshape(rows, columns, 3)[::-1, ::-1]
+        for table in (sensor.m_directions, sensor.m_origins)
+    )
+    centre = (start + stop) / 2
     grid = bool((beams[..., 0] > 1e-6).all())
     if grid:
-        slope_y, slope_z = beams[..., 1] / beams[..., 0], beams[..., 2] / beams[..., 0]
-        grid = np.ptp(slope_y, 0).max() < 1e-6 and np.ptp(slope_z, 1).max() < 1e-6
+        along = (centre - origins[..., 0]) / beams[..., 0]
+        y, z = (origins[..., axis] + along * beams[..., axis] for axis in (1, 2))
+        grid = np.ptp(y, 0).max() < 1e-6 * centre and np.ptp(z, 1).max() < 1e-6 * centre
     if grid:
-        y, z = (start + stop) / 2 * slope_y[0], (start + stop) / 2 * slope_z[:, 0]
+        y, z = y[0], z[:, 0]
     else:
         y, z = np.arange(columns, dtype=float), np.arange(rows, dtype=float)
     variables = unpack(image, names, gates)
     oblique = 1 / beams[..., 0] if sensor.gate_kind == "planar" else 1.0
     length = (stop - start) / gates * oblique
-    middle = (start + (stop - start) / gates / 2) * oblique
+    middle = (start + (stop - start) / gates / 2 - origins[..., 0]) * oblique
     area = np.pi * sensor.m_aperture[0] ** 2
     variables["Y"] = (("z", "y"), variables["S0"][1][0] * middle**2 / (area * length))
     attributes = {

@@ -349,13 +349,15 @@ def test_printed_code_runs(pages, workplace, capsys):
 
 @pytest.mark.usefixtures("variant")
 def test_plugin_examples_load(workplace):
-    """XML and Python of the plugin reference, with a shipped table for the one it names."""
+    """XML and Python of the plugin reference, with tables for those it names."""
     import mitsuba as mi
 
     table = np.loadtxt(ROOT / "scenes" / "aerosol_spheroids_532nm.txt")
     Path("spheroids_532nm.txt").write_text(
         (ROOT / "scenes" / "aerosol_spheroids_532nm.txt").read_text()
     )
+    raster = [[7.5 * t, 0, 0, 1, y, z, t] for t, (z, y) in enumerate(np.ndindex(2, 3))]
+    np.savetxt("raster.csv", raster, delimiter=",")
     found = list(blocks("docs/plugins.md"))
     assert len(found) >= 6
     for block in found:

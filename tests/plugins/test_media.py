@@ -63,7 +63,15 @@ def walk(air, origin, direction, distance):
     ]
     rng = mi.PCG32(size=LINES)
     value, _ = transmittance(
-        air, mi.MediumPtr(None), *points, mi.Float(distance), 0, mi.Color0f(), rng, mi.Bool(True)
+        air,
+        mi.MediumPtr(None),
+        *points,
+        mi.Float(distance),
+        0,
+        mi.Color0f(),
+        mi.Float(0),
+        rng,
+        True,
     )
     return np.array(value, float)
 

@@ -121,7 +121,7 @@ class TestWherePixelsLook:
             matrix = np.array(pose.matrix).astype(float)
             expected = directions(sensor) @ matrix[:3, :3].T
             assert np.abs(np.array(ray.d).T - expected).max() < 1e-6
-            assert np.abs(np.array(ray.o).ravel() - [10, -2, 3]).max() < 1e-6
+            assert np.abs(np.array(ray.o).T - [10, -2, 3]).max() < 1e-6
             assert np.array(weight).max() == 1
 
     def test_beam_frame_is_e_h_e_v_axis(self, world, optics):
@@ -143,14 +143,15 @@ class TestGates:
             world.lidar((7, 1), GATE, azimuth_min_deg=-60.0, azimuth_max_deg=60.0)
         )
         axis = sensor.beam_frame(beams(7)).n
-        low, high = (np.array(r).astype(float) for r in sensor.ranges(axis))
+        low, high = (np.array(r).astype(float) for r in sensor.ranges(axis, mi.Point3f(0)))
         x = np.array(axis.x).astype(float)
         assert low * x == pytest.approx(500, rel=1e-6) and high * x == pytest.approx(
             502.5, rel=1e-6
         )
-        near, far = sensor.nearest_and_farthest()
-        assert near == pytest.approx(500, rel=1e-6)
-        assert far == pytest.approx(502.5 / math.cos(math.radians(60)), rel=1e-6)
+        origins, (near, far) = sensor.origins_and_ranges()
+        assert not origins.any()
+        assert near.min() == pytest.approx(500, rel=1e-6)
+        assert far.max() == pytest.approx(502.5 / math.cos(math.radians(60)), rel=1e-6)
 
     def test_spherical_gates_have_one_range(self, world):
         sensor = mi.load_dict(
@@ -158,9 +159,9 @@ class TestGates:
                 (7, 1), GATE, azimuth_min_deg=-60.0, azimuth_max_deg=60.0, gate_kind="spherical"
             )
         )
-        low, high = sensor.ranges(sensor.beam_frame(beams(7)).n)
+        low, high = sensor.ranges(sensor.beam_frame(beams(7)).n, mi.Point3f(0))
         assert (np.array(low) == 500).all() and (np.array(high) == 502.5).all()
-        assert sensor.nearest_and_farthest() == (500, 502.5)
+        assert (sensor.origins_and_ranges()[1].T == (500, 502.5)).all()
 
 
 class TestTelescope:
