@@ -139,7 +139,7 @@ def test_wind_file_is_cf(demo):
         assert wind["algorithm"].values.tolist() == ["cc", "ws"]
         for name, variable in wind.variables.items():
             if variable.dtype.kind == "f":
-                assert variable.attrs["units"] in ("m", "m s-1", "1"), name
+                assert variable.attrs["units"] in ("m", "m s-1", "s", "1"), name
                 assert variable.attrs.get("long_name") or name in wind.coords, name
         for name in ("v", "w", "v_true", "w_true"):
             assert wind[name].attrs["units"] == "m s-1"

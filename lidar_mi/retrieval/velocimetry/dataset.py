@@ -53,7 +53,7 @@ def centres(image: xr.DataArray, windows: Windows, what: str) -> dict[str, Varia
 
 
 def winds(
-    found: Displacement, axes: Sequence[str], steps: Sequence[float], dt: float
+    found: Displacement, axes: Sequence[str], steps: Sequence[float], dt: float | np.ndarray
 ) -> dict[str, Variable]:
     """Every component with its standard error and the correlations of their errors (m/s, 1).
 
@@ -67,8 +67,8 @@ def winds(
         Of its components.
     steps : sequence of float
         Pixel spacing along them, m.
-    dt : float
-        s
+    dt : float or ndarray
+        Of all vectors or of each, s.
     """
     names = {COMPONENTS[axis]: (number, axis) for number, axis in enumerate(axes)}
     names = dict(sorted(names.items()))

@@ -74,7 +74,7 @@ METHODS: Mapping[str, Method] = {
     "vortex_fit": Method(
         vortex_windows,
         ("correlation", "correlation of the images, each warped to mid-time"),
-        ("noise", "axes", "dt"),
+        ("noise", "axes", "dt", "times"),
         centred=True,
         local=False,
         reach=0,

@@ -11,6 +11,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
+from lidar_mi.retrieval.velocimetry.beam_times import checked_times, vector_times
 from lidar_mi.retrieval.velocimetry.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.velocimetry.bound import displacement_bound
 from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
@@ -44,6 +45,7 @@ def retrieve_wind(
     min_isotropy: float = 0.2,
     noise: float | xr.DataArray | None = None,
     more: Sequence[xr.DataArray] = (),
+    times: Sequence[xr.DataArray] | None = None,
     blur: float = 0.0,
     median_size: int = 3,
     median_threshold: float = MEDIAN_THRESHOLD,
@@ -83,6 +85,11 @@ def retrieve_wind(
     more : sequence of xr.DataArray
         Further images on the same grid, each dt after the one before ("variational"): a burst.
         The winds are those at its mid-time.
+    times : sequence of two xr.DataArray, optional
+        When each pixel of image 1 and of image 2 was seen, s from its image's reference time, on
+        their grid (not with `more`). ``dt`` is then from reference time to reference time, and
+        winds follow from each vector's own time difference, see `beam_times.vector_times`. Left
+        out: images are photographs.
     blur : float
         Standard deviation, m, of the Gaussian by which the instrument blurs the air, as a beam of
         1/e^2 radius 2 `blur` does ("variational", which then sharpens; square pixels only).
@@ -104,8 +111,9 @@ def retrieve_wind(
     xr.Dataset, dims (z, y)
         At the template centres (an even template's lies between pixels): `v`, `w` (m s-1),
         `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
-        their correlation ("cc" and "multipass": see `bootstrap`; NaN from "ws"), `displacement_y`,
-        `displacement_z` (m), `correlation` or `mismatch`, `texture` (px^-1), `isotropy`, `flag`
+        their correlation ("cc" and "multipass": see `bootstrap`; NaN from "ws"), `time` (s from
+        image 1's reference time, the vector's mid-time), `displacement_y`, `displacement_z` (m),
+        `correlation` or `mismatch`, `texture` (px^-1), `isotropy`, `flag`
         (bits of `quality.Flag`, 0 = valid; low texture also means a standard error beyond half a
         pixel in some direction). The auxiliary coordinates `y_vector`, `z_vector` are the
         position of the vector at mid-time: the centre and, with "cc" and "ws", half the
@@ -146,6 +154,9 @@ def retrieve_wind(
             f"more: {len(more) + 2} images are not allowed with method {method!r}; expected two, "
             f"or method {takes}"
         )
+    if times is not None and more:
+        raise InputError(f"times: not allowed with {len(more) + 2} images; expected two")
+    tau = checked_times(times, stack, dt)
     windows = Windows(image1.shape, template, search, stride)
     blurred = _blur_px(image1, blur)
     pixels1, pixels2, *rest = (on_device(image, device) for image in stack)
@@ -160,6 +171,7 @@ def retrieve_wind(
         "axes": axes,
         "dt": dt,
         "more": rest,
+        "times": tau,
         "blur": blurred,
         "settings": settings,
     }
@@ -215,15 +227,22 @@ def retrieve_wind(
     }
     if blur and "blur" in options:
         attributes["blur"] = blur
+    if tau is not None:
+        attributes["timed"] = 1
     if "min_correlation" in options:
         attributes["min_correlation"] = min_correlation
     if str(resting.pattern):
         attributes["fixed_pattern"] = str(resting.pattern)
     if any(map(described, light)):
         attributes["illumination"] = described(light[-1])
-    found = found._replace(flag=flag)
+    # a method that takes times by itself gives the displacement in dt
+    by_itself = "times" in options
+    when = vector_times(None if by_itself else tau, dt, windows, found.d.cpu(), chosen.centred)
+    reversed_time = torch.as_tensor(np.isnan(when.difference), device=flag.device)
+    found = found._replace(flag=flag | (Flag.NO_MATCH * reversed_time).to(torch.int16))
     steps = spacing(image1)
-    variables = winds(found, image1.dims, steps, dt)
+    variables = winds(found, image1.dims, steps, when.difference)
+    variables["time"] = field(image1.dims, when.middle, "mid-time of the vector", "s")
     moved = dict(
         zip(image1.dims, found.d.cpu().numpy() * np.reshape(steps, (2, 1, 1)), strict=True)
     )

@@ -4,6 +4,9 @@ No wind vectors are needed in between: the whole image informs the ten parameter
 works where the texture is too weak for any local method, and elsewhere as well as the noise allows.
 """
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import torch
 import xarray as xr
@@ -11,6 +14,7 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
+from lidar_mi.retrieval.velocimetry.beam_times import checked_times
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.warping import band_limited
@@ -27,6 +31,7 @@ from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder
 from lidar_mi.retrieval.vortices.model import Profile
 from lidar_mi.retrieval.vortices.model_error import mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.retrieval.vortices.pixel_times import PixelTimes
 from lidar_mi.retrieval.vortices.robust_fit import fit, without_step
 from lidar_mi.retrieval.vortices.search import starting_points
 
@@ -49,6 +54,7 @@ def fit_vortices(
     profile: Profile = "lamb_oseen",
     *,
     frozen: bool = False,
+    times: Sequence[xr.DataArray] | None = None,
     device: str | torch.device = "cpu",
 ) -> VortexPairFit:
     """Two vortices and a mean wind that advect image 1 into image 2.
@@ -73,6 +79,10 @@ def fit_vortices(
     frozen : bool
         The vortices do not move during dt. Default: they drift with the mean wind and their mutual
         induction.
+    times : sequence of two DataArray, optional
+        When each pixel was seen, s from the reference time of its image, as `retrieve_wind` takes
+        them. Air is followed to the time of the pixel that sees it; the pair is that at dt / 2
+        after image 1's reference time.
     device : str or torch.device
 
     Returns
@@ -111,12 +121,13 @@ def fit_vortices(
     dt = positive("dt", dt)
     (image1, image2), noise = checked_stack([image1, image2], noise)
     check_profile(profile)
+    tau = checked_times(times, [image1, image2], dt)
     axes = [image1[name].values.astype(float) for name in ("z", "y")]
     pixels = [on_device(image, device) for image in (image1, image2)]
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
     with threads_for(image1.size):
-        return fit_pixels(*pixels, *axes, dt, noise, profile, frozen)
+        return fit_pixels(*pixels, *axes, dt, noise, profile, frozen, tau)
 
 
 def fit_pixels(
@@ -128,8 +139,9 @@ def fit_pixels(
     noise: float | torch.Tensor | None,
     profile: Profile,
     frozen: bool = False,
+    times: Sequence[np.ndarray] | None = None,
 ) -> VortexPairFit:
-    """`fit_vortices` on tensors (z, y) and axes in m."""
+    """`fit_vortices` on tensors (z, y) and axes in m, with times from `checked_times`."""
     finite = torch.isfinite(image1) & torch.isfinite(image2)
     if float(finite.double().mean()) < 0.5:
         return no_fit(profile, f"{float(finite.double().mean()):.0%} of the pixels are finite")
@@ -150,6 +162,8 @@ def fit_pixels(
     bad = torch.nn.functional.max_pool2d((~finite)[None].double(), 5, 1, 2)[0] > 0
     given = noise if isinstance(noise, torch.Tensor) else None
     make = Builder(pair, bad, z, y, dt, level, given, float(contrast), profile, frozen)
+    if times is not None:
+        make = replace(make, times=_from_mid_time(times, make))
     spacing = (make.spacing[0] * make.spacing[1]) ** 0.5
     limits = step_limits(y, z, profile, dt)
 
@@ -200,6 +214,13 @@ def fit_pixels(
         z,
         y,
     )
+
+
+def _from_mid_time(times: Sequence[np.ndarray], make: Builder) -> PixelTimes:
+    """Times of the pixels of both images from half way between their reference times."""
+    first, second = (torch.as_tensor(part, device=make.pair.device) for part in times)
+    values = torch.stack([first - make.dt / 2, second + make.dt / 2])
+    return PixelTimes(values, (float(make.y[0]), float(make.z[0])), make.spacing)
 
 
 def _understated(noise: torch.Tensor, pair: torch.Tensor) -> float:

@@ -10,6 +10,7 @@ from kornia.filters import gaussian_blur2d
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, mismatch
 from lidar_mi.retrieval.vortices.model import Profile, advected, drift, path_sensitivity
+from lidar_mi.retrieval.vortices.pixel_times import PixelTimes, seen
 from lidar_mi.retrieval.vortices.robust_fit import Misfit
 from lidar_mi.retrieval.vortices.search import Observations
 
@@ -44,6 +45,7 @@ class Images:
     dt: float
     profile: Profile
     frozen: bool
+    times: PixelTimes | None = None
     whitening: Spline | None = None
 
     @cached_property
@@ -67,12 +69,19 @@ class Images:
         moving = torch.zeros_like(theta[:2]) if self.frozen else drift(theta, self.profile)
         # the flow is steady in the frame that moves with the pair
         steady = torch.cat([theta[:8], theta[8:] - moving])
-        middle, place = zip(
-            *(advected(steady, self.y, self.z, time, self.profile) for time in (-half, half)),
-            strict=True,
-        )
-        shift = moving[:, None, None] * half
-        place = [place[0] - shift, place[1] + shift]
+        if self.times is None:
+            middle, place = zip(
+                *(advected(steady, self.y, self.z, time, self.profile) for time in (-half, half)),
+                strict=True,
+            )
+            shift = moving[:, None, None] * half
+            place = [place[0] - shift, place[1] + shift]
+            time = -half, half
+        else:
+            views = [
+                seen(self.times, k, steady, moving, self.y, self.z, self.profile) for k in (0, 1)
+            ]
+            middle, place, time = ([view[part] for view in views] for part in range(3))
         columns, rows = (
             (torch.stack([p[axis] for p in place]) - self.first[axis]) / self.spacing[axis]
             for axis in (0, 1)
@@ -87,13 +96,19 @@ class Images:
             valid &= ~self.bad[nearest[0], nearest[1]].any(0)
         slope = torch.stack([slope_y / self.spacing[0], slope_z / self.spacing[1]], 1)
         slope[0] *= gain
+        if self.times is not None:
+            slope = torch.stack([view.along(part) for view, part in zip(views, slope, strict=True)])
         jacobian = value.new_empty(len(parameters), *valid.shape)
         torch.sub(
-            path_sensitivity(steady, middle[1], slope[1], half, self.profile),
-            path_sensitivity(steady, middle[0], slope[0], -half, self.profile),
+            path_sensitivity(steady, middle[1], slope[1], time[1], self.profile),
+            path_sensitivity(steady, middle[0], slope[0], time[0], self.profile),
             out=jacobian[:10],
         )
-        jacobian[8:10] = half * (slope[0] + slope[1])
+        jacobian[8:10] = (
+            half * (slope[0] + slope[1])
+            if self.times is None
+            else time[1] * slope[1] - time[0] * slope[0]
+        )
         jacobian[10:13], jacobian[13:16] = -value[0] * self.linear, -self.linear
         if self.whole is not self.spline:
             value, _, _ = self.whole.sample(rows, columns)
@@ -148,6 +163,8 @@ class Builder:
         Of each pixel, in any unit.
     profile : {"lamb_oseen", "burnham_hallock"}
     frozen : bool
+    times : PixelTimes, optional
+        Left out: -dt / 2 and dt / 2.
     """
 
     pair: torch.Tensor
@@ -160,6 +177,7 @@ class Builder:
     contrast: float
     profile: Profile
     frozen: bool
+    times: PixelTimes | None = None
 
     @property
     def spacing(self) -> tuple[float, float]:
@@ -219,6 +237,7 @@ class Builder:
             self.dt,
             self.profile,
             self.frozen,
+            self.times,
         )
 
     def with_change(

@@ -105,11 +105,16 @@ def sensitivity(
 
 
 def advected(
-    theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, time: float, profile: Profile
+    theta: torch.Tensor,
+    y: torch.Tensor,
+    z: torch.Tensor,
+    time: float | torch.Tensor,
+    profile: Profile,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Positions of air after half of a time and after all of it, (2, ...) each, in m.
 
-    Runge-Kutta of fourth order in a steady flow; `time` in s, negative: backward. The middle,
+    Runge-Kutta of fourth order in a steady flow; `time` in s, of all air or of each, negative:
+    backward. The middle,
     which is used for derivatives only, is by Hermite's cubic. Where the core takes many steps, air
     that turns less than half as fast as four steps allow takes four.
     """
@@ -117,7 +122,8 @@ def advected(
     fastest = max(
         float(centre * theta[first].abs() * (-2 * theta[first + 1]).exp()) for first in (0, 4)
     )
-    steps = int(min(64, 1 + fastest * abs(time) // _STEP_ANGLE))
+    longest = float(time.abs().max()) if isinstance(time, torch.Tensor) else abs(time)
+    steps = int(min(64, 1 + fastest * longest // _STEP_ANGLE))
     start = torch.stack([y, z])
     began = wind(theta, y, z, profile)
     if steps <= _FEW_STEPS:
@@ -126,13 +132,14 @@ def advected(
         near = _turning(theta, y, z, profile) * abs(time) > _FEW_STEPS / 2 * _STEP_ANGLE
         place, ended = torch.empty_like(start), torch.empty_like(start)
         for some, number in ((near, steps), (~near, _FEW_STEPS)):
+            part = time[some] if isinstance(time, torch.Tensor) else time
             place[:, some], ended[:, some] = _followed(
-                theta, start[:, some], began[:, some], time, number, profile
+                theta, start[:, some], began[:, some], part, number, profile
             )
     return (start + place) / 2 + time / 8 * (began - ended), place
 
 
-def _followed(theta, place, k1, time: float, steps: int, profile: Profile):
+def _followed(theta, place, k1, time: float | torch.Tensor, steps: int, profile: Profile):
     """Where air at places (2, n) with the wind k1 comes in so many steps, and the wind there."""
     h = time / steps
     for _ in range(steps):
@@ -171,7 +178,11 @@ def drift(theta: torch.Tensor, profile: Profile) -> torch.Tensor:
 
 
 def path_sensitivity(
-    theta: torch.Tensor, middle: torch.Tensor, along: torch.Tensor, time: float, profile: Profile
+    theta: torch.Tensor,
+    middle: torch.Tensor,
+    along: torch.Tensor,
+    time: float | torch.Tensor,
+    profile: Profile,
 ) -> torch.Tensor:
     """Derivatives (10, ...) of along . (end of the path) with respect to `PARAMETERS`.
 

@@ -1,5 +1,7 @@
 """The wind of a fitted pair at the windows of the local methods."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 
@@ -19,6 +21,7 @@ def vortex_windows(
     axes: tuple[np.ndarray, np.ndarray],
     dt: float,
     noise: float | torch.Tensor | None = None,
+    times: Sequence[np.ndarray] | None = None,
 ) -> Displacement:
     """The wind of a fitted pair at the windows' centres, as displacement in dt.
 
@@ -33,6 +36,8 @@ def vortex_windows(
         s.
     noise : float or torch.Tensor, optional
         As `fit_vortices`.
+    times : sequence of ndarray, optional
+        Of the pixels, from `lidar_mi.retrieval.velocimetry.beam_times.checked_times`.
 
     Returns
     -------
@@ -42,7 +47,7 @@ def vortex_windows(
     """
     image_pair(image1, image2)
     windows = Windows(tuple(image1.shape), template, search, stride)
-    found = fit_pixels(image1, image2, *axes, dt, noise, "lamb_oseen")
+    found = fit_pixels(image1, image2, *axes, dt, noise, "lamb_oseen", times=times)
     centres = [
         (axis[start := np.asarray(windows.starts(k))] + axis[start + template - 1]) / 2
         for k, axis in enumerate(axes)
