@@ -15,6 +15,9 @@ def attenuated_backscatter(
     is flat. Attenuation by the slab itself is not corrected (0.25 % to the middle of 2.5 m at
     1 / km).
 
+    Of beams with poses of their own the reported ranges are used (`ScanPlan.ranges`), as by an
+    instrument that knows no others.
+
     Parameters
     ----------
     s0 : (gates, rows, columns) array

@@ -111,20 +111,32 @@ class ScanPlan:
         return beams / np.linalg.norm(beams, axis=1, keepdims=True)
 
     def obliquity(self) -> np.ndarray:
-        """1 / cos of the angle between beam and x axis, (rows, columns), y and z ascending."""
+        """1 / cos of the angle between beam and x axis, (rows, columns), y and z ascending.
+
+        With ``beams`` of the reported ones, as are `ranges` and `gate_length`: an instrument
+        corrects its signal by the geometry that it is told.
+        """
+        if self.beams is not None:
+            return self.as_image(1 / self.beams.reported_direction[:, 0])
         return np.sqrt(
             1 + (self.y[None, :] / self.centre) ** 2 + (self.z[:, None] / self.centre) ** 2
         )
 
     def ranges(self) -> np.ndarray:
-        """Middle of every gate along every beam, m, (gates, rows, columns)."""
+        """Middle of every gate along every beam from its own origin, m, (gates, rows, columns)."""
         edges = np.linspace(self.gate_start, self.gate_stop, self.gate_count + 1)
         middle = (edges[1:] + edges[:-1])[:, None, None] / 2
+        if self.beams is not None:
+            middle = middle - self.as_image(self.beams.reported_origin[:, 0] - self.position)
         return middle * self._along_beam()
 
     def gate_length(self) -> np.ndarray:
         """Length of one gate along every beam, m, (rows, columns)."""
         return (self.gate_stop - self.gate_start) / self.gate_count * self._along_beam()
+
+    def as_image(self, values: np.ndarray) -> np.ndarray:
+        """Values of the beams in film order as (rows, columns), y and z ascending."""
+        return values.reshape(len(self.z), len(self.y))[::-1, ::-1]
 
     def _along_beam(self) -> np.ndarray:
         oblique = self.obliquity()

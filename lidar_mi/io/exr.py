@@ -7,10 +7,11 @@ backscatter of the first gate, corrected for range, gate length and the environm
 transmittance, which any viewer shows. Files of a run also have
 ``gate000.depolarization`` and ``gate000.multiple_scattering_fraction`` with their ``_stderr``, and
 with a detector ``gate000.S0_noisy``, ``gate000.S0_noise_std``, ``Y_noisy`` and
-``Y_noise_std``. Everything else (beam positions, gates, instrument, units, seed, version) is in
-typed header attributes: those of the data set, which `lidar_mi.rendering.backscatter` and
-`lidar_mi.rendering.fringes` fill. A fringe camera's file has the layers ``S0`` ... ``S3``,
-``S0_stderr`` and ``Y``, in the camera's view.
+``Y_noise_std``. Files of a scan whose beams have times of their own have ``beam_time``,
+``y_reported`` and ``z_reported``, when and to where each beam pointed. Everything else (beam
+positions, gates, instrument, units, seed, version) is in typed header attributes: those of the data
+set, which `lidar_mi.rendering.backscatter` and `lidar_mi.rendering.fringes` fill. A fringe camera's
+file has the layers ``S0`` ... ``S3``, ``S0_stderr`` and ``Y``, in the camera's view.
 """
 
 import re
@@ -265,7 +266,7 @@ def _quantities(scan: xr.Dataset) -> list[str]:
 
 
 def _once_per_scan(scan: xr.Dataset) -> list[str]:
-    """Variables of a scan without gates: Y, and with a detector Y_noisy and its error."""
+    """Variables of a scan without gates: Y, what a detector adds, times and places of beams."""
     return [
         str(name) for name, variable in scan.data_vars.items() if set(variable.dims) == {"z", "y"}
     ]
@@ -300,13 +301,21 @@ def label_scan(scan: xr.Dataset) -> xr.Dataset:
         if scan.attrs.get(f"{name}_is_bound"):
             text = f"upper bound of the {text}"
         scan[name].attrs = {"long_name": text, "units": "1"}
+    backscatter = "m-1 sr-1"
     once = {
-        "Y": "attenuated backscatter of the first gate, corrected for range and environment",
-        "Y_noisy": "attenuated backscatter with the detector's noise",
-        "Y_noise_std": "standard deviation of the noise of Y_noisy",
+        "Y": (
+            "attenuated backscatter of the first gate, corrected for range and environment",
+            backscatter,
+        ),
+        "Y_noisy": ("attenuated backscatter with the detector's noise", backscatter),
+        "Y_noise_std": ("standard deviation of the noise of Y_noisy", backscatter),
+        "beam_time": ("time of the beam, from the scan's reference time", "s"),
+        "y_reported": ("distance to port, in the middle of the gates, of the reported beam", "m"),
+        "z_reported": ("height, in the middle of the gates, of the reported beam", "m"),
     }
     for name in _once_per_scan(scan):
-        scan[name].attrs = {"long_name": once.get(name, name), "units": "m-1 sr-1"}
+        text, units = once.get(name, (name, backscatter))
+        scan[name].attrs = {"long_name": text, "units": units}
     scan["y"].attrs = {"long_name": "distance to port", "units": "m", "axis": "Y"}
     scan["z"].attrs = {
         "long_name": "height above the beam axis",

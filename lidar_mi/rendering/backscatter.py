@@ -23,12 +23,22 @@ from lidar_mi.rendering.settings import RenderSettings
 MOST_CELLS = 1e8  # of an extended plane: 0.8 GB
 
 
-def extrude(plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar) -> xr.DataArray:
+def extrude(
+    plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar, scans: Sequence[ScanPlan] = ()
+) -> xr.DataArray:
     """A plane of air (z, y) extended to the depth and width of all beams of the scan, (x, y, z).
 
     Beams are wide and oblique: at the slab's faces and rims some of their light crosses outside
     the gate's planes and the outermost nodes. The plane is extended by that much (the outermost
     values repeated), so that the whole gate is filled with it.
+
+    Parameters
+    ----------
+    plane : (z, y) array
+    plan : ScanPlan
+        The scan from farthest away.
+    scans : sequence of ScanPlan
+        All scans that have beams of their own: these may be more oblique or cross beside the plane.
 
     Raises
     ------
@@ -39,19 +49,33 @@ def extrude(plane: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar) -> xr.
     # the Gaussian divergence exceeds 2.2 times its 1/e^2 angle once in 16 000 samples
     radius += 2.2 * lidar.divergence_full / 2 * plan.gate_stop
     slope = np.hypot(np.abs(plan.y).max(), np.abs(plan.z).max()) / plan.centre
+    oblique = plan.obliquity().max()
+    beside = np.zeros((2, 2))  # the plane, beams cross: before and behind it along y and z
+    for beams in (scan.beams for scan in scans):
+        if beams is not None:
+            secant = 1 / beams.direction[:, 0]
+            oblique = max(oblique, secant.max())
+            slope = max(slope, np.sqrt(secant.max() ** 2 - 1))
+            places = beams.true_places(plan.centre + plan.position)
+            ends = np.array([plane[axis].values[[0, -1]] for axis in ("y", "z")])
+            outside = np.stack([ends[:, 0] - places.min(0), places.max(0) - ends[:, 1]], 1)
+            beside = np.maximum(beside, outside)
     # spherical gates are curved: their rim lies nearer by the beam's obliquity
-    bulge = (plan.obliquity().max() - 1) * plan.gate_stop if plan.gate_kind == "spherical" else 0
+    bulge = (oblique - 1) * plan.gate_stop if plan.gate_kind == "spherical" else 0
     margin = radius * slope + bulge
-    pad = {axis: int(np.ceil(radius / _spacing(plane, axis))) for axis in ("y", "z")}
-    cells = math.prod(plane.sizes[axis] + 2 * n for axis, n in pad.items())
+    pad = {}
+    for axis, sides in zip(("y", "z"), beside, strict=True):
+        before, behind = np.ceil((radius + sides) / _spacing(plane, axis)).astype(int)
+        pad[axis] = (int(before), int(behind))
+    cells = math.prod(plane.sizes[axis] + sum(n) for axis, n in pad.items())
     if cells > MOST_CELLS:
         raise InputError(
             f"scan.range: {plan.gate_stop:g} m is not allowed with beams that spread by "
             f"{radius:.3g} m until there; the plane would have {cells:.2g} nodes, expected at most "
             f"{MOST_CELLS:g} (a narrower beam, a nearer range or a coarser wake.spacing)"
         )
-    padded = plane.pad({axis: (n, n) for axis, n in pad.items()}, mode="edge")
-    for axis, n in pad.items():
+    padded = plane.pad(pad, mode="edge")
+    for axis, (n, _) in pad.items():
         start = float(plane[axis][0]) - n * _spacing(plane, axis)
         padded[axis] = start + _spacing(plane, axis) * np.arange(padded.sizes[axis])
     thickness = plan.gate_stop - plan.gate_start + 2 * margin
@@ -102,7 +126,9 @@ def render_scans(
     ------
     xr.Dataset
         S0 ... S3, S0_stderr and, with more than one order, each order's S0 as ``orderK.S0``, dims
-        (gate, z, y); Y (z, y); y and z ascending. One scan at a time, as soon as it is rendered.
+        (gate, z, y); Y (z, y); y and z ascending. Where a plan has beams, also ``beam_time`` (s)
+        and ``y_reported``, ``z_reported`` (m), where a beam as reported crosses the plane in the
+        middle of the gates. One scan at a time, as soon as it is rendered.
     """
     chosen = list(range(len(plans)) if scans is None else scans)
     if not chosen:
@@ -182,7 +208,7 @@ def scene_dict(
             "gate_start": plan.gate_start,
             "gate_stop": plan.gate_stop,
             "gate_count": plan.gate_count,
-            "directions": mi.TensorXf(plan.directions()),
+            "beams": mi.TensorXf(_beams(plan)),
             "to_world": mi.ScalarTransform4f().translate([plan.position, 0, 0]),
             "laser": {
                 "type": "laser",
@@ -231,7 +257,10 @@ def _move(
 ) -> None:
     """Update the telescope, its beams and the air in the slab to a later scan."""
     parameters["sensor.to_world"] = mi.Transform4f().translate([plan.position, 0, 0])
-    parameters["sensor.directions"] = mi.Float(plan.directions().ravel())
+    beams = _beams(plan)
+    parameters["sensor.origins"] = mi.Float(beams[:, :3].ravel())
+    parameters["sensor.directions"] = mi.Float(beams[:, 3:6].ravel())
+    parameters["sensor.times"] = mi.Float(beams[:, 6])
     parameters["sensor.gate_start"] = plan.gate_start
     parameters["sensor.gate_stop"] = plan.gate_stop
     fields = {"sigma_t": extinction}
@@ -241,6 +270,15 @@ def _move(
     for name, field in fields.items():
         parameters[f"slab.interior_medium.{name}.data"] = mi.TensorXf(_voxels(field))
     parameters.update()
+
+
+def _beams(plan: ScanPlan) -> np.ndarray:
+    """Origin in the telescope's frame, direction and time of the true beams, (n, 7)."""
+    if plan.beams is None:
+        directions = plan.directions()
+        return np.column_stack([np.zeros_like(directions), directions, np.zeros(len(directions))])
+    origins = plan.beams.origin - [plan.position, 0, 0]
+    return np.column_stack([origins, plan.beams.direction, plan.beams.time])
 
 
 def _voxels(extinction: xr.DataArray) -> np.ndarray:
@@ -268,6 +306,16 @@ def _as_dataset(image, names, plan, lidar, environment, settings, seed) -> xr.Da
     variables = unpack(image, names, plan.gate_count)
     y = attenuated_backscatter(variables["S0"][1], plan, lidar.aperture_area, environment)
     variables["Y"] = (("z", "y"), y[0].astype(np.float32))
+    timed = {}
+    if plan.beams is not None:
+        places = plan.beams.reported_places(plan.position + plan.centre)
+        for name, values in (
+            ("beam_time", plan.beams.time),
+            ("y_reported", places[:, 0]),
+            ("z_reported", places[:, 1]),
+        ):
+            variables[name] = (("z", "y"), plan.as_image(values).astype(np.float32))
+        timed = {"timed": 1, "gridded": 0}
     attributes = {
         "software": f"lidar-mi {__version__}",
         "units": "Stokes: received over emitted energy; Y: m-1 sr-1; lengths: m; angles: rad",
@@ -292,6 +340,7 @@ def _as_dataset(image, names, plan, lidar, environment, settings, seed) -> xr.Da
         "stokes_emitted": list(lidar.stokes),
         "aperture_radius": lidar.aperture_radius,
         "fov_half": lidar.fov_half,
+        **timed,
     }
     return label_scan(
         xr.Dataset(

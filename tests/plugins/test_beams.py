@@ -16,7 +16,10 @@ pytestmark = pytest.mark.usefixtures("variant")
 GATE = (500.0, 502.5)
 SIZE = (7, 5)
 NUMBER = SIZE[0] * SIZE[1]
-VARIANTS = ("llvm_ad_mono", "llvm_ad_rgb", "llvm_ad_mono_polarized")
+VARIANTS = [
+    "llvm_ad_mono_polarized",
+    *(pytest.param(name, marks=pytest.mark.slow) for name in ("llvm_ad_mono", "llvm_ad_rgb")),
+]
 AREA = math.pi * 0.5**2
 
 

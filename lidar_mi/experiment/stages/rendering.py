@@ -146,6 +146,8 @@ def render_images(
     for index, scan in zip(wanted, rendered, strict=True):
         scan = with_products(scan)
         scan.attrs |= platform
+        if plans[index].beams is not None:
+            scan.attrs["reference_time"] = index * experiment.platform.dt
         yield IMAGES[index], scan
 
 
@@ -201,5 +203,6 @@ def _media(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan]) -> l
         return list(fields)
     reach = max(plans, key=lambda plan: plan.gate_stop)
     return [
-        extrude(field.isel(x=0).transpose("z", "y"), reach, experiment.lidar) for field in fields
+        extrude(field.isel(x=0).transpose("z", "y"), reach, experiment.lidar, plans)
+        for field in fields
     ]
