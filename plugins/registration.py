@@ -20,7 +20,7 @@ def register(kind: str, name: str, define: Callable[[], type]) -> None:
     Parameters
     ----------
     kind : str
-        Kind of Mitsuba plugin: emitter, sensor, integrator, phase, texture or bsdf.
+        Kind of Mitsuba plugin: emitter, sensor, integrator, phase, texture, volume or bsdf.
     name : str
         Type name in scenes.
     define : callable
@@ -57,4 +57,6 @@ def _register_now(name: str) -> None:
     variant = mi.variant()
     if variant and not variant.startswith("scalar"):
         kind, define = _known[name]
+        # Mitsuba 3.9 has no function for volumes; any registers what a class is derived from
+        kind = kind if hasattr(mi, f"register_{kind}") else "texture"
         getattr(mi, f"register_{kind}")(name, define())

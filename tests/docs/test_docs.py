@@ -358,6 +358,7 @@ def test_plugin_examples_load(workplace):
     )
     raster = [[7.5 * t, 0, 0, 1, y, z, t] for t, (z, y) in enumerate(np.ndindex(2, 3))]
     np.savetxt("raster.csv", raster, delimiter=",")
+    np.save("puff.npy", np.ones((5, 4, 3, 2)))
     found = list(blocks("docs/plugins.md"))
     assert len(found) >= 6
     for block in found:
