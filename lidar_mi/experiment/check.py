@@ -5,16 +5,20 @@ from pathlib import Path
 
 import numpy as np
 
+from lidar_mi.assessment.metrics.cores import find_cores
+from lidar_mi.assessment.metrics.flow_checks import relative_divergence, sense_of_rotation
 from lidar_mi.assessment.metrics.requirements import look_ahead
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.forecast import forecast, lines_seconds
+from lidar_mi.experiment.light_budget import light_budget
 from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import Truth
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.memory import ceiling
+from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
 
 
@@ -36,20 +40,30 @@ def sections(
     InputError
         Anything that a run would refuse before it starts.
     """
-    ahead = experiment.prepare(asked, beside, notice).results
+    prepared = experiment.prepare(asked, beside, notice)
+    ahead = prepared.results
     if asked.wake:
-        yield from _backscatter(asked, ahead["truth"], ahead["plans"][0])
+        yield from _backscatter(asked, ahead["truth"], ahead["plans"][0], ahead["air"])
     if asked.doppler:
         yield _doppler(asked)
     if asked.sensor:
         yield _sensor(asked, ahead["requirements"])
+    if prepared.warnings:
+        yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
 
 
-def _backscatter(asked: Experiment, truth: Truth, plan: ScanPlan) -> Iterator[Section]:
-    wind, (air, _) = truth.wind, truth.extinction
+def _backscatter(
+    asked: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer
+) -> Iterator[Section]:
+    wind, extinction = truth.wind, truth.extinction[0]
     rows = [(axis, _span(wind[axis].values, "m")) for axis in ("y", "z")]
     rows += [(name, _span(wind[name].values, "m/s")) for name in ("u", "v", "w") if name in wind]
-    rows.append(("extinction", _span(1e3 * air.values, "1/km")))
+    if not asked.wake.turbine:
+        rows.append(("vortices", sense_of_rotation(find_cores(wind))))
+    divergence = relative_divergence(wind)
+    if divergence == divergence:
+        rows.append(("divergence of v, w", f"{divergence:.2g} of the vorticity's rms"))
+    rows.append(("extinction", _span(1e3 * extinction.values, "1/km")))
     rows.append(("texture, rms", f"{asked.wake.texture.rms:.0%}"))
     title = asked.wake.file or ("vortex_pair" if asked.wake.vortex_pair else "turbine")
     yield f"{asked.name}: extinction in the gates ({title}, about the scan's axis)", rows
@@ -67,11 +81,32 @@ def _backscatter(asked: Experiment, truth: Truth, plan: ScanPlan) -> Iterator[Se
             f"{asked.render.samples_per_beam}, orders 1 to {asked.render.max_order}",
         ),
         ("time between the images", f"{platform.dt:g} s"),
+        *_light(asked, truth, plan, air),
         *_forecast(asked, plan),
     ]
     if not asked.volume:
         rows += _displacements(asked, wind, pixel)
     yield "backscatter lidar", rows
+
+
+def _light(
+    asked: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer
+) -> list[tuple[str, str]]:
+    """What scatters, how much of it arrives, and with how much noise."""
+    light, kind = light_budget(asked, truth, plan, air), asked.scattering
+    named = kind.aerosol or kind.table
+    what = f"{kind.phase} {named}" if named else kind.phase.replace("_", "-")
+    rows = [
+        ("scattering", f"{what}, {light.lidar_ratio:.3g} sr of extinction over backscatter"),
+        ("overlap with the field of view", f"{light.overlap:.1%}"),
+        ("transmittance there and back", f"{light.transmittance:.1%}"),
+    ]
+    if light.photoelectrons is not None:
+        rows += [
+            ("photoelectrons of a pulse", f"{light.photoelectrons:.3g} in the median pixel"),
+            ("noise of a pixel", f"{light.noise:.2g} of its signal"),
+        ]
+    return rows
 
 
 def _forecast(asked: Experiment, plan: ScanPlan) -> list[tuple[str, str]]:

@@ -19,6 +19,7 @@ from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.measure import measure
 from lidar_mi.experiment.pipeline import stages_of
 from lidar_mi.experiment.reading import dump
+from lidar_mi.experiment.remarks import remarks
 from lidar_mi.experiment.report import chapters
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.resumable_folder import RunFolder
@@ -121,6 +122,8 @@ def prepare(
         if stage.check:
             there = [prepared.results[n] for n in stage.needs if n in prepared.results]
             stage.check(experiment, *there)
+    for text in remarks(experiment, prepared.results):
+        prepared.log.remark(text)
     return prepared
 
 

@@ -43,7 +43,9 @@ class Platform(Section):
 class Retrieval(Section):
     """How winds are retrieved from the image pair."""
 
-    methods: tuple[ImageMethod, ...] = Field((ImageMethod.CC, ImageMethod.WS), min_length=1)
+    methods: tuple[ImageMethod, ...] = Field(
+        (ImageMethod.VARIATIONAL, ImageMethod.CC), min_length=1
+    )
     template: Annotated[int, Within(2, 4096, "wider than any image")] = 8
     search: Annotated[int, Within(4, 8192, "wider than any image")] = 16
     stride: Annotated[int, Within(1, 8192, "wider than any image")] = 1

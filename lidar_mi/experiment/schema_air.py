@@ -190,6 +190,11 @@ class _Scatterer(Section):
             value = getattr(self, name)
             if (self.phase == name) != (value is not None):
                 raise ValueError(f"{name}: {value!r} is not allowed with phase {self.phase}")
+        if self.depolarization and self.phase != "rayleigh":
+            raise ValueError(
+                f"depolarization: {self.depolarization:g} is not allowed with phase {self.phase}; "
+                "expected phase: rayleigh"
+            )
         return self
 
 
@@ -208,7 +213,7 @@ class Scattering(_Scatterer):
 
     phase: Literal[
         "rayleigh", "molecules", "isotropic", "henyey_greenstein", "aerosol", "table", "mixture"
-    ] = "rayleigh"
+    ] = "aerosol"
     asymmetry: Annotated[
         Number, Within(-0.999, 0.999, "at 0.999 the forward peak is 0.06 degrees wide")
     ] = Field(0.0, description="of Henyey-Greenstein")
@@ -217,9 +222,21 @@ class Scattering(_Scatterer):
         None, description="scattered fraction of the extinction; default: the scatterers'"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _aerosol_unless_stated(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("phase", "aerosol") == "aerosol":
+            return data | {"aerosol": data.get("aerosol") or "spheroids"}
+        return data
+
     @model_validator(mode="after")
     def _parts_of_a_mixture(self):
         if (self.phase == "mixture") != (self.parts is not None):
             value = None if self.parts is None else f"{len(self.parts)} parts"
             raise ValueError(f"parts: {value} is not allowed with phase {self.phase}")
+        if self.asymmetry and self.phase != "henyey_greenstein":
+            raise ValueError(
+                f"asymmetry: {self.asymmetry:g} is not allowed with phase {self.phase}; expected "
+                "phase: henyey_greenstein"
+            )
         return self

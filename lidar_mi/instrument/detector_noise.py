@@ -128,7 +128,9 @@ def detect(
     within = (polarization >= 0) & (polarization <= 1)
     _check("polarization", polarization, within, "0 to 1")
     random = _generator(seed)
-    signal, background, dark, modes = _means(s0, lidar, detector, duration, distance, polarization)
+    signal, background, dark, modes = expected_counts(
+        s0, lidar, detector, duration, distance, polarization
+    )
     if signal.size and (signal + background + dark).max() > 1e15:
         raise InputError(
             f"lidar.pulse_energy: {lidar.pulse_energy:g} J is not allowed; it gives up to "
@@ -230,7 +232,7 @@ def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) 
     if not np.nanmax(s0, initial=0) > 0:
         raise InputError("S0: 0 everywhere is not allowed; expected a scan with light in it")
     duration = gate_duration(plan.gate_length())
-    signal, background, dark, modes = _means(
+    signal, background, dark, modes = expected_counts(
         s0, lidar, detector, duration, plan.ranges(), _polarization(scan)
     )
     terms = noise_terms(signal, background, dark, modes, detector)
@@ -242,7 +244,7 @@ def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) 
         "dark": dark,
     }
     if detector.speckle:
-        budget["speckle_modes"] = modes
+        budget["speckle_modes"] = np.asarray(modes)
     terms["all"] = noise_variance(signal, background, dark, modes, detector)
     for name, variance in terms.items():
         spread = np.sqrt(np.broadcast_to(variance, s0.shape)[lit])
@@ -250,8 +252,18 @@ def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) 
     return {name: float(np.median(value)) for name, value in budget.items()}
 
 
-def _means(s0, lidar, detector, duration, distance, polarization):
-    """Signal, background and dark photoelectrons, and modes; the first three of one shape."""
+def expected_counts(
+    s0: np.ndarray,
+    lidar: BackscatterLidar,
+    detector: Detector,
+    duration: ArrayLike,
+    distance: ArrayLike,
+    polarization: ArrayLike,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float | np.ndarray]:
+    """Mean photoelectrons of signal, background and dark current, of one shape; speckle modes.
+
+    Parameters are those of `detect`.
+    """
     signal = signal_photoelectrons(s0, lidar.pulse_energy, lidar.wavelength, detector)
     background = background_photoelectrons(
         detector, duration, lidar.aperture_area, lidar.fov_half, lidar.wavelength
@@ -259,7 +271,8 @@ def _means(s0, lidar, detector, duration, distance, polarization):
     dark = dark_counts(detector, duration)
     modes = speckle_modes(detector, lidar, duration, distance, polarization)
     shape = np.broadcast_shapes(signal.shape, background.shape, np.shape(modes))
-    return *(np.broadcast_to(x, shape) for x in (signal, background, dark)), modes
+    signal, background, dark = (np.broadcast_to(x, shape) for x in (signal, background, dark))
+    return signal, background, dark, modes
 
 
 def _polarization(scan: xr.Dataset) -> np.ndarray:

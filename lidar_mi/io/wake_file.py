@@ -20,6 +20,8 @@ _VARIABLES = {
     "aerosol": ("1", "background aerosol relative to its mean"),
 }
 _REQUIRED = ("v", "w")
+# Axes and components, of which a file may have the opposite sign.
+_DIRECTED = ("x", "y", "z", "u", "v", "w")
 
 # Largest deviation of a step from the mean step, in steps: float32 axes a few kilometres from
 # their origin reach 5e-4.
@@ -50,14 +52,22 @@ def _numbers(variable: xr.DataArray, path: Path) -> np.ndarray:
 
 
 def _file_names(names, path):
-    """Our name -> the file's, for all dimensions and variables."""
+    """Our name -> the file's, for all dimensions and variables; and those of opposite sign."""
     known = (*_DIMENSIONS, *_VARIABLES)
-    names = dict(names or {})
+    names, opposite = dict(names or {}), set()
     for ours, theirs in names.items():
         if ours not in known:
             raise InputError(f"wake.names: {ours!r} is not known; allowed: {', '.join(known)}")
         if not isinstance(theirs, str):
             raise InputError(f"wake.names.{ours}: {theirs!r} is not allowed; a text is")
+        if theirs.startswith("-"):
+            if ours not in _DIRECTED:
+                raise InputError(
+                    f"wake.names.{ours}: {theirs!r} is not allowed; the sign can be changed of "
+                    f"{', '.join(_DIRECTED)}"
+                )
+            names[ours] = theirs[1:].strip()
+            opposite.add(ours)
     table = {ours: names.get(ours, ours) for ours in known}
     doubled = {t for t in table.values() if list(table.values()).count(t) > 1}
     if doubled:
@@ -65,7 +75,7 @@ def _file_names(names, path):
             f"wake.names: {', '.join(sorted(doubled))} of {path} stands for more than one "
             "variable; allowed: one each"
         )
-    return table
+    return table, opposite
 
 
 def _pick_time(data, name, time, path):
@@ -105,7 +115,7 @@ def _pick_time(data, name, time, path):
     return data.isel({name: index}) if name in data.dims else data, float(times[index])
 
 
-def _axis(data, name, ours, path):
+def _axis(data, name, ours, path, sign):
     """The axis in metres, ascending and exact, and whether the file's runs the other way."""
     if name not in data.variables:
         raise InputError(
@@ -113,7 +123,7 @@ def _axis(data, name, ours, path):
             f"variable {name!r} in m"
         )
     variable = data[name]
-    values = _numbers(variable, path) * _scale_to(variable, "m", name, path)
+    values = _numbers(variable, path) * (sign * _scale_to(variable, "m", name, path))
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         raise InputError(
@@ -184,7 +194,9 @@ def read_wake(
         In "seconds since ..." axes the count is meant.
     names : mapping, optional
         Our name to the file's, for time, x, y, z, u, v, w, tracer, aerosol, where they differ:
-        {"v": "V_wind", "y": "lateral"}. A variable named here must exist.
+        {"v": "V_wind", "y": "lateral"}. A variable named here must exist. A minus sign before the
+        file's name changes the sign, of a file whose y points to starboard for instance:
+        {"y": "-y", "v": "-V"}.
     x : float, optional
         m; keeps the one plane nearest to it. Default: all planes.
     require : iterable of str
@@ -205,7 +217,8 @@ def read_wake(
         uniform, a time or plane that is not there.
     """
     path = Path(path)
-    table = _file_names(names, path)
+    table, opposite = _file_names(names, path)
+    sign = {name: -1.0 if name in opposite else 1.0 for name in _DIRECTED}
     for name in require:
         if name not in _VARIABLES:
             raise InputError(
@@ -213,7 +226,7 @@ def read_wake(
             )
     asked = {*_REQUIRED, *require, *(n for n in (names or {}) if n in _VARIABLES)}
     with open_netcdf(path) as data:
-        return _read(data, table, asked, time, x, path)
+        return _read(data, table, sign, asked, time, x, path)
 
 
 def _hint(name, table):
@@ -224,7 +237,7 @@ def _hint(name, table):
     return f"; expected wake.names: {{{name}: its name there}}{none}"
 
 
-def _read(data, table, asked, time, x, path):
+def _read(data, table, sign, asked, time, x, path):
     for name in _VARIABLES:
         if name in asked and table[name] not in data.data_vars:
             raise InputError(
@@ -251,7 +264,7 @@ def _read(data, table, asked, time, x, path):
     data, seconds = _pick_time(data, table["time"], time, path)
     axes, reverse = {}, []
     for theirs, ours in spatial.items():
-        axes[ours], turned = _axis(data, theirs, ours, path)
+        axes[ours], turned = _axis(data, theirs, ours, path, sign[ours])
         if turned:
             reverse.append(theirs)
     data = data.isel({theirs: slice(None, None, -1) for theirs in reverse})
@@ -260,7 +273,7 @@ def _read(data, table, asked, time, x, path):
         place = 0.0
         if theirs in data.variables and data[theirs].ndim == 0:
             place = float(_numbers(data[theirs], path))
-            place *= _scale_to(data[theirs], "m", theirs, path)
+            place *= sign["x"] * _scale_to(data[theirs], "m", theirs, path)
         elif x is not None:
             raise InputError(
                 f"{path}: x = {x:g} m is asked for, but there is no {theirs!r}; it has the "
@@ -285,6 +298,7 @@ def _read(data, table, asked, time, x, path):
             unit = variable.attrs.get("units", "1")
         else:
             scale = _scale_to(variable, unit, f"variable {table[name]!r}", path)
+        scale *= sign.get(name, 1.0)
         variable = variable.transpose(*(table[d] for d in "xyz" if table[d] in variable.dims))
         values = _numbers(variable, path).reshape([axes[d].size for d in "xyz"]) * scale
         amount = name in asked and name in ("tracer", "aerosol")

@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import NamedTuple
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -99,6 +100,20 @@ def scatterer(
             table = _table(scattering, beside, wavelength, "scattering", notice)
             phase, albedo = _tabulated(table)
     return Scatterer(phase, albedo if scattering.albedo is None else scattering.albedo)
+
+
+def backscatter_phase_function(air: Scatterer) -> float:
+    """Fraction of the scattered light that is scattered straight back, per solid angle, sr^-1.
+
+    1 / (4 pi) where light is scattered evenly; Rayleigh's is 3 / (8 pi).
+    """
+    phase = mi.load_dict(air.phase)
+    at = dr.zeros(mi.MediumInteraction3f)
+    at.wi = mi.Vector3f(0, 0, 1)
+    at.sh_frame = mi.Frame3f(mi.Vector3f(0, 0, -1))
+    value, _ = phase.eval_pdf(mi.PhaseFunctionContext(None), at, mi.Vector3f(0, 0, 1))
+    intensity = value[0, 0] if mi.is_polarized else value
+    return float(np.ravel(np.array(intensity))[0])
 
 
 def table_files(scattering, beside: str | Path = ".") -> dict[str, Path]:

@@ -42,7 +42,7 @@ def test_least_experiment_has_the_papers_values(write):
     assert experiment.wake.extinction.maximum == pytest.approx(1.8e-3)
     assert experiment.wake.extinction.stretch == 2
     assert (experiment.retrieval.template, experiment.retrieval.search) == (8, 16)
-    assert experiment.scattering.phase == "rayleigh"
+    assert experiment.scattering.phase == "aerosol"
     assert experiment.render.variant == "llvm_ad_mono_polarized"
 
 
@@ -178,7 +178,7 @@ FAULTS = [
     ("scattering={phase: mixture}", "scattering: parts: None is not allowed with phase mixture"),
     (
         "scattering={parts: [{phase: molecules, fraction: 1}]}",
-        "scattering: parts: 1 parts is not allowed with phase rayleigh",
+        "scattering: parts: 1 parts is not allowed with phase aerosol",
     ),
     ("wake.vortex_pair.gamma=1", "wake.vortex_pair.gamma: unknown key (allowed: model, "),
     # wrong units
@@ -297,7 +297,7 @@ FAULTS = [
     ("wake={vortex_pair: {}, second: 41 s}", "wake: second: 41.0 is not allowed with vortex_pair"),
     ("wake={vortex_pair: {}, depth: volume}", "wake: depth: 'volume' is not allowed with vortex"),
     ("scattering.phase=table", "scattering: table: None is not allowed with phase table"),
-    ("scattering.table=a.txt", "scattering: table: 'a.txt' is not allowed with phase rayleigh"),
+    ("scattering.table=a.txt", "scattering: table: 'a.txt' is not allowed with phase aerosol"),
     ("retrieval.search=9", "retrieval: search: 9 is not allowed; expected at least template + 2"),
     ("scan.range=15 m", "scan.range: 15 m is not allowed; expected more than the 15 m flown"),
 ]

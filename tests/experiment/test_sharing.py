@@ -43,7 +43,7 @@ BEHIND_RINGS = {
     "lidar": {"pulse_energy": "2 mJ"},
     "detector": {},
     "scan": {"range": "400 m"},
-    "scattering": {"phase": "isotropic"},
+    "scattering": {"phase": "isotropic", "aerosol": None},
     "render": {"samples_per_beam": 16},
     "retrieval": {"methods": ["cc"], "stride": 2},
     "sensor": {"method": "cc"},

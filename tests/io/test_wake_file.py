@@ -320,3 +320,17 @@ def test_sample_is_a_plane_of_the_full_simulation():
     part = plane.sel(y=sample.y, z=sample.z)
     for name in sample.data_vars:
         np.testing.assert_array_equal(part[name], sample[name])
+
+
+def test_a_minus_sign_changes_the_sign(write):
+    """A file whose y points to starboard: the same air, mirrored back."""
+    data = example()
+    starboard = data.assign(v=-data["v"]).assign_coords(y=("y", -Y, {"units": "m"}))
+    starboard["v"].attrs = starboard["w"].attrs = {"units": "m s-1"}
+    path = write(starboard)
+    found = read_wake(path, 1.0, {"y": "-y", "v": "- v"})
+    expected = read_wake(write(data, name="port.nc"), 1.0)
+    xr.testing.assert_allclose(found, expected.assign_attrs(found.attrs))
+    with pytest.raises(InputError, match=r"wake.names.tracer: '-tracer'.* of x, y, z, u, v, w"):
+        read_wake(path, 1.0, {"tracer": "-tracer"})
+    fails(path, "variable 'V' (v) is missing", time=1.0, names={"v": "-V"})

@@ -11,33 +11,26 @@ from lidar_mi.atmosphere.molecules import molecular_scattering
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema_air import Scattering
 from lidar_mi.io.scattering_table import aerosol_table, write_table
-from lidar_mi.rendering.phase import scatterer, table_files
+from lidar_mi.rendering.phase import backscatter_phase_function, scatterer, table_files
 
 pytestmark = pytest.mark.usefixtures("variant")
-
-
-def backscatter(dictionary):
-    mei = mi.MediumInteraction3f()
-    mei.wi = mi.Vector3f(0, 0, 1)
-    mei.sh_frame = mi.Frame3f(0, 0, -1)
-    value, _ = mi.load_dict(dictionary).eval_pdf(
-        mi.PhaseFunctionContext(), mei, mi.Vector3f(0, 0, 1)
-    )
-    return np.array(value[0, 0]).ravel()[0]
 
 
 @pytest.mark.parametrize(
     ("scattering", "expected"),
     [
-        (Scattering(), 3 / (8 * np.pi)),
+        (Scattering(phase="rayleigh"), 3 / (8 * np.pi)),
         # Delta = (1 - D) / (1 + D / 2) of the dipole part
-        (Scattering(depolarization=0.2), (0.8 / 1.1 * 1.5 + 0.3 / 1.1) / (4 * np.pi)),
+        (
+            Scattering(phase="rayleigh", depolarization=0.2),
+            (0.8 / 1.1 * 1.5 + 0.3 / 1.1) / (4 * np.pi),
+        ),
         (Scattering(phase="isotropic"), 1 / (4 * np.pi)),
         (Scattering(phase="henyey_greenstein", asymmetry=0.6), (1 - 0.36) / (4 * np.pi * 1.6**3)),
     ],
 )
 def test_phase_function_at_180_degrees(scattering, expected):
-    assert backscatter(scatterer(scattering).phase) == pytest.approx(expected, rel=1e-5)
+    assert backscatter_phase_function(scatterer(scattering)) == pytest.approx(expected, rel=1e-5)
 
 
 def test_table_is_found_beside_the_experiment(tmp_path):
@@ -48,7 +41,7 @@ def test_table_is_found_beside_the_experiment(tmp_path):
     )
     found = scatterer(Scattering(phase="table", table="table.txt"), tmp_path)
     assert found.albedo == 1  # the file says nothing of it
-    assert backscatter(found.phase) == pytest.approx(1 / (4 * np.pi), rel=1e-3)
+    assert backscatter_phase_function(found) == pytest.approx(1 / (4 * np.pi), rel=1e-3)
 
 
 def test_missing_table_is_named(tmp_path):
@@ -102,7 +95,7 @@ def test_a_mixture_is_weighted_by_scattering_coefficient(cosine):
     ]
     mixture = scatterer(Scattering.model_validate({"phase": "mixture", "parts": parts}))
     soot = scatterer(Scattering(phase="aerosol", aerosol="soot"))
-    molecules = scatterer(Scattering(depolarization=0.1))
+    molecules = scatterer(Scattering(phase="rayleigh", depolarization=0.1))
     assert mixture.albedo == pytest.approx((3 * soot.albedo + 1) / 4)
     weight = 3 * soot.albedo / (3 * soot.albedo + 1)
     expected = weight * matrix(soot.phase, cosine) + (1 - weight) * matrix(molecules.phase, cosine)

@@ -1,0 +1,58 @@
+"""Whether a cross-flow can be that of a wake: its sense of rotation, its divergence.
+
+A velocity or an axis of the wrong sign makes a flow that no air has, or one that rises where wakes
+descend. Every number of a run is then computed without complaint.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.metrics.cores import Core
+
+MOST_DIVERGENCE = 0.5
+"""Of a cross-section, by `relative_divergence`. Sections of a simulated wake have 0.1, those of
+isotropic turbulence 1 / sqrt(5) (Taylor 1935: <(du/dx)^2> is a fifth of the mean square of a
+component of the vorticity). With a component or an axis of the wrong sign they have 1."""
+
+
+def relative_divergence(wind: xr.Dataset) -> float:
+    """Rms of the divergence over the rms of the vorticity of a cross-flow (v, w on z, y).
+
+    Of air that is stretched along x, the cross-flow has the divergence -du/dx. NaN where there is
+    no vorticity.
+    """
+    spacing = {axis: wind[axis].values for axis in ("y", "z")}
+    v, w = (wind[name].transpose("z", "y").values.astype(float) for name in ("v", "w"))
+    if min(v.shape) < 2:
+        return float("nan")
+    along = np.gradient(v, spacing["y"], axis=1) + np.gradient(w, spacing["z"], axis=0)
+    turning = np.gradient(w, spacing["y"], axis=1) - np.gradient(v, spacing["z"], axis=0)
+    rms = np.sqrt((turning**2).mean())
+    return float(np.sqrt((along**2).mean()) / rms) if rms > 0 else float("nan")
+
+
+def rises(cores: Sequence[Core]) -> bool:
+    """Whether a pair of vortices turns against the lift of an aircraft, and so rises.
+
+    Behind a lifting wing the port vortex (larger y) turns from +y towards +z, and the air between
+    both sinks.
+    """
+    if len(cores) != 2:
+        return False
+    port, starboard = sorted(cores, key=lambda core: -core.y)
+    return port.circulation < 0 < starboard.circulation
+
+
+def sense_of_rotation(cores: Sequence[Core]) -> str:
+    """The vortices of a cross-flow in words, port first."""
+    if not cores:
+        return "no vortices"
+    found = sorted(cores, key=lambda core: -core.y)
+    senses = ", ".join(
+        f"{core.circulation:+.0f} m²/s at y = {core.y:.1f} m, z = {core.z:.1f} m" for core in found
+    )
+    if len(found) < 2:
+        return senses
+    return f"{senses}: the pair {'rises' if rises(found) else 'sinks'}"

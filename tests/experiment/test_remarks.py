@@ -1,0 +1,61 @@
+"""What is warned of before a run, and the light that is forecast.
+
+Detects: a wake of a wrong sign or a lidar that loses its light without a word, warnings of what is
+right, and a forecast of light or noise that is not what the rendered images and the detector have.
+"""
+
+import numpy as np
+import pytest
+
+from lidar_mi.experiment import reading
+from lidar_mi.experiment.check import sections
+from lidar_mi.experiment.light_budget import light_budget
+from lidar_mi.experiment.run import finish, prepare
+
+WAKE = {
+    "name": "warned",
+    "wake": {"file": "wake_slab_40s.nc", "time": "40 s", "spacing": "1 m"},
+    "render": {"samples_per_beam": 16, "max_order": 1},
+    "retrieval": {"methods": ["cc"], "stride": 8, "sources": "measured"},
+    "detector": {},
+}
+
+
+def prepared(**changes):
+    return prepare(reading.check(reading.merged(WAKE, changes), "warned"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"wake": {"names": {"v": "-v"}}}, "the divergence of v, w has 1"),
+        ({"wake": {"names": {"v": "-v", "w": "-w"}}}, "the pair rises"),
+        ({"wake": {"names": {"z": "-z", "w": "-w"}}}, "the pair rises"),
+        ({"scan": {"range": "76 m"}}, "lidar.fov_half: 5 mrad sees"),
+        ({}, None),
+    ],
+)
+def test_what_is_likely_wrong_is_said_once(changes, words):
+    found = prepared(**changes).warnings
+    assert len(found) == (words is not None)
+    assert words is None or words in found[0]
+
+
+def test_check_ends_with_the_warnings():
+    asked = reading.check(reading.merged(WAKE, {"scan": {"range": "76 m"}}), "warned")
+    *_, (title, rows) = sections(asked)
+    assert title == "warned: warnings" and "overlap" in rows[0][0]
+
+
+def test_light_and_noise_are_those_of_the_rendered_image():
+    """The first order's median, to the spread of air in the median pixels (3 %)."""
+    run = prepared()
+    results = run.results
+    light = light_budget(run.experiment, results["truth"], results["plans"][0], results["air"])
+    finish(run, illustrated=False)
+    scan = run.scans[0].isel(gate=0)
+    s0 = scan["S0"].values
+    assert light.s0 == pytest.approx(np.median(s0), rel=0.03)
+    noise = np.median(scan["S0_noise_std"].values / s0)
+    assert light.noise == pytest.approx(noise, rel=0.03)
+    assert light.photoelectrons == pytest.approx(run.metrics["detector.signal"], rel=0.03)
