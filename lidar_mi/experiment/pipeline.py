@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from lidar_mi.experiment.remarks import image_remarks
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Stage, in_order
 from lidar_mi.experiment.stages.error_budget import error_budgets
@@ -173,6 +174,7 @@ STAGES = (
         ("truth", "plans", "air"),
         has_wake,
         check=check_light,
+        remarks=image_remarks,
         parts=lambda experiment: IMAGES,
         indifferent_to=BEHIND_IMAGES,
     ),

@@ -1,30 +1,28 @@
-"""Warnings before a run starts: of what is allowed and likely wrong."""
+"""Warnings before images are rendered: of what is allowed and likely wrong."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Sequence
+
+import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_divergence, rises
 from lidar_mi.experiment.light_budget import LEAST_OVERLAP, light_budget
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.truth import Truth
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.rendering.phase import Scatterer
 
 
-def remarks(experiment: Experiment, ahead: Mapping[str, Any]) -> list[str]:
-    """Warnings of an experiment, a line each.
-
-    Parameters
-    ----------
-    ahead : mapping
-        Results of the stages that are computed ahead, by name.
-    """
-    return [*_of_the_flow(experiment, ahead), *_of_the_light(experiment, ahead)]
+def image_remarks(
+    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], air: Scatterer
+) -> list[str]:
+    """Warnings of an experiment with a wake, a line each."""
+    flow = _of_the_flow(truth.wind) if experiment.wake.file else []
+    return [*flow, *_of_the_light(experiment, truth, plans[0], air)]
 
 
-def _of_the_flow(experiment: Experiment, ahead: Mapping[str, Any]) -> list[str]:
+def _of_the_flow(wind: xr.Dataset) -> list[str]:
     """Components or axes of the wrong sign in a user's file; analytic flows have none."""
-    if experiment.wake is None or not experiment.wake.file:
-        return []
-    wind = ahead["truth"].wind
     divergence = relative_divergence(wind)
     if divergence > MOST_DIVERGENCE:
         return [
@@ -41,15 +39,14 @@ def _of_the_flow(experiment: Experiment, ahead: Mapping[str, Any]) -> list[str]:
     return []
 
 
-def _of_the_light(experiment: Experiment, ahead: Mapping[str, Any]) -> list[str]:
+def _of_the_light(
+    experiment: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer
+) -> list[str]:
     """Light that the telescope does not see."""
-    if experiment.wake is None:
-        return []
-    light = light_budget(experiment, ahead["truth"], ahead["plans"][0], ahead["air"])
+    light = light_budget(experiment, truth, plan, air)
     if light.overlap >= LEAST_OVERLAP:
         return []
-    field, distance = 1e3 * experiment.lidar.fov_half, ahead["plans"][0].centre
     return [
-        f"lidar.fov_half: {field:.3g} mrad sees {light.overlap:.0%} of the light from "
-        f"{distance:.0f} m (overlap of beam, telescope and field of view)"
+        f"lidar.fov_half: {1e3 * experiment.lidar.fov_half:.3g} mrad sees {light.overlap:.0%} of "
+        f"the light from {plan.centre:.0f} m (overlap of beam, telescope and field of view)"
     ]

@@ -19,7 +19,6 @@ from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.measure import measure
 from lidar_mi.experiment.pipeline import stages_of
 from lidar_mi.experiment.reading import dump
-from lidar_mi.experiment.remarks import remarks
 from lidar_mi.experiment.report import chapters
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.resumable_folder import RunFolder
@@ -119,11 +118,11 @@ def prepare(
         if stage.ahead and stage.name not in prepared.results:
             _carry_out(stage, prepared)
     for stage in stages:
+        there = [prepared.results[n] for n in stage.needs if n in prepared.results]
         if stage.check:
-            there = [prepared.results[n] for n in stage.needs if n in prepared.results]
             stage.check(experiment, *there)
-    for text in remarks(experiment, prepared.results):
-        prepared.log.remark(text)
+        for text in stage.remarks(experiment, *there) if stage.remarks else ():
+            prepared.log.remark(text)
     return prepared
 
 

@@ -33,6 +33,8 @@ class Stage:
     check : callable, optional
         ``check(experiment, *those of needs that are computed ahead)`` raises InputError for faults
         that would otherwise appear after hours.
+    remarks : callable, optional
+        The same arguments; returns warnings, a line each, of what is allowed and likely wrong.
     parts : callable, optional
         ``parts(experiment)``, names of the parts of a result that takes long. Then ``compute`` also
         takes ``missing=``, the names of those to be computed, and ``keeper=``, the store of
@@ -53,6 +55,7 @@ class Stage:
     wanted: Callable[[Experiment], bool] = _always
     ahead: bool = False
     check: Callable[..., None] | None = None
+    remarks: Callable[..., list[str]] | None = None
     parts: Callable[[Experiment], Sequence[str]] | None = None
     timing: str | None = None
     indifferent_to: tuple[str, ...] | None = None

@@ -11,7 +11,9 @@ import xarray as xr
 
 from lidar_mi.experiment import pipeline
 from lidar_mi.experiment import reading as config
+from lidar_mi.io import png
 
+_PNG = png._png
 SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
 
 FIGURES = {
@@ -96,6 +98,14 @@ def sketched_figures():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lidar_mi.io.png._png", sketch)
+        yield
+
+
+@contextmanager
+def whole_figures():
+    """Figures as a user's run draws them, also within `sketched_figures`."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lidar_mi.io.png._png", _PNG)
         yield
 
 

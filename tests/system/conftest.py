@@ -15,7 +15,7 @@ from lidar_mi.cli import app as cli
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
 from tests.support.command_line import TINY
-from tests.support.experiments import sketched_figures, without_figures
+from tests.support.experiments import sketched_figures, whole_figures, without_figures
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 
@@ -33,12 +33,13 @@ def demo(tmp_path_factory):
     with FileLock(f"{shared}.lock"):
         if not left.is_file():
             reported = []
-            done = experiment.run(
-                loaded,
-                shared / "run",
-                beside=SCENES,
-                notice=lambda text, fraction: reported.append((text, fraction)),
-            )
+            with whole_figures():  # a module's sketches may have begun
+                done = experiment.run(
+                    loaded,
+                    shared / "run",
+                    beside=SCENES,
+                    notice=lambda text, fraction: reported.append((text, fraction)),
+                )
             left.write_bytes(pickle.dumps((done.metrics, reported)))
     metrics, reported = pickle.loads(left.read_bytes())
     return SimpleNamespace(

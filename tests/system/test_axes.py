@@ -25,6 +25,7 @@ def blob_run(tmp_path_factory):
         "name": "blob",
         "wake": {"file": name, "texture": {"rms": 0}},
         "render": {"samples_per_beam": 256, "max_order": 1},
+        "retrieval": {"methods": ["cc", "ws"]},
     }
     with without_figures():
         run(check(data), beside / "run", beside=beside)

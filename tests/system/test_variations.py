@@ -148,7 +148,7 @@ def test_vortex_pair(tmp_path):
 
 def test_extinction_from_speed_and_spherical_gates(tmp_path, quick):
     data = small(extinction={"source": "speed"}, texture={"rms": 0})
-    data["scan"] = {"gates": "spherical"}
+    data |= {"scan": {"gates": "spherical"}, "scattering": {"phase": "rayleigh"}}
     run(check(data), tmp_path / "run")
     scan = read_scan(tmp_path / "run" / IMAGES[0])
     assert scan.attrs["gate_kind"] == "spherical"
