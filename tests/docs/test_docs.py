@@ -26,7 +26,7 @@ from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
 from lidar_mi.experiment import reading, schema, schema_air, truth
 from lidar_mi.rendering.phase import scatterer
-from tests.support.experiments import without_figures
+from tests.support.experiments import sketched_figures, without_figures
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -269,7 +269,7 @@ def run_shell(block, capsys):
             assert words[2:] == []  # it starts a process for every variant; it has its own tests
         else:
             small = [w for key in SMALLER for w in ("--set", key)] if words[1] == "run" else ()
-            with without_figures():
+            with without_figures(), sketched_figures():
                 code, output = command(line, capsys, small)
             assert code == 0, f"{block.place}: {line}\n{output}"
 

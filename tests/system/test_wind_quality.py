@@ -21,6 +21,7 @@ from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 SCENES = Path(str(files("lidar_mi.scenes")))
 
 
+@pytest.mark.slow
 def test_the_images_alone_determine_the_vortices(demo):
     """The paper's case: circulation to 5 % of what the simulation's file says, places to 1 m."""
     scans = [read_scan(demo.folder / name) for name in IMAGES]

@@ -30,7 +30,7 @@ def uniform(noise, seed, rows=100, columns=120):
     return [data_array(i + noise * random.standard_normal(i.shape), y, z) for i in images]
 
 
-@pytest.mark.parametrize("method", ["cc", "multipass"])
+@pytest.mark.parametrize("method", ["cc", pytest.param("multipass", marks=pytest.mark.slow)])
 def test_standard_errors_in_a_uniform_wind(method):
     """Rms error over rms standard error: 1 within 25 %, at 2 % and at 8 % noise.
 
@@ -49,7 +49,10 @@ def test_standard_errors_in_a_uniform_wind(method):
 
 @pytest.mark.parametrize(
     ("method", "case"),
-    [("cc", "5 % of the texture replaced"), ("multipass", "10 % of the texture replaced")],
+    [
+        ("cc", "5 % of the texture replaced"),
+        pytest.param("multipass", "10 % of the texture replaced", marks=pytest.mark.slow),
+    ],
 )
 def test_standard_errors_cover_the_errors_of_air_that_changes(method, case):
     """Errors of white noise alone would be half of what they are here."""

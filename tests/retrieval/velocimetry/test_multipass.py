@@ -39,7 +39,7 @@ def rms(values):
 @pytest.mark.parametrize(
     ("noise", "everywhere", "beyond"),
     [
-        (0.0, 0.35, 0.12),
+        pytest.param(0.0, 0.35, 0.12, marks=pytest.mark.slow),
         pytest.param(0.01, 0.38, 0.17, marks=pytest.mark.slow),
         (0.03, 0.50, 0.32),
         pytest.param(0.06, 0.77, 0.66, marks=pytest.mark.slow),

@@ -35,7 +35,12 @@ def images(seed, columns, rows, length, noise=0.0, number=2):
 
 @pytest.mark.parametrize(
     ("method", "cases", "repeats"),
-    [("cc", CASES, 4), ("ws", CASES, 2), ("multipass", CASES, 2), ("variational", CASES[:2], 1)],
+    [
+        ("cc", CASES, 2),
+        ("ws", CASES, 2),
+        pytest.param("multipass", CASES, 2, marks=pytest.mark.slow),
+        ("variational", CASES[:2], 1),
+    ],
 )
 def test_unrelated_images_give_no_valid_vector(method, cases, repeats):
     """A rate of 1e-3: one of 16 images has a chance of 1.6 %, two of 1e-4."""

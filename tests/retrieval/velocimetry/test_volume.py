@@ -127,7 +127,9 @@ def test_where_volumes_differ_standard_errors_are_larger():
     assert rms([rms(part) for part in reduced.values()]) < 2.5
 
 
-@pytest.mark.parametrize("method", ["correlation", "variational"])
+@pytest.mark.parametrize(
+    "method", ["correlation", pytest.param("variational", marks=pytest.mark.slow)]
+)
 def test_solid_rotation_about_x(method):
     """15 degrees in dt: paths are arcs, whose chords are 0.3 % too short; with a drift along x."""
     shape, angle = (16, 28, 28), 0.26

@@ -201,6 +201,7 @@ def test_missing_pixels_and_a_map_of_the_noise():
     assert stderr[4] > 1.5 * stderr[0]
 
 
+@pytest.mark.slow
 def test_a_noise_map_that_is_too_low():
     """Half of the noise that there is: what the filter takes for texture would be noise, which
     draws displacements to where splines damp it. Twice ten parameters within errors for the
@@ -304,6 +305,7 @@ def test_noise_alone_keeps_no_fit_busy(monkeypatch):
     assert not found.success and len(steps) < 8000
 
 
+@pytest.mark.slow
 def test_a_map_without_noise_says_nothing():
     """As files have it whose pixels have no standard error. Sums of one kind round differently."""
     pair = vortex_pair_images(0.05, seed=6, vortices=uneven(), columns=40, rows=30)
