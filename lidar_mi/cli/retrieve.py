@@ -50,23 +50,35 @@ def retrieve(
     overwrite: Overwrite = False,
 ) -> None:
     """Retrieve the cross-flow wind (v, w) from any two images of the same air."""
+    import xarray as xr
+
     from lidar_mi import __version__
-    from lidar_mi.io.images import read_image, read_noise
+    from lidar_mi.io.images import read_beams, read_image, read_noise
     from lidar_mi.io.netcdf import write_netcdf
     from lidar_mi.io.target import check_target
     from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
+    from lidar_mi.retrieval.velocimetry.gridding import on_nodes
     from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
     paths = (first, second, *(more or []))
     check_target(out, paths, overwrite=overwrite)
     images = [read_image(path, layer, spacing) for path in paths]
+    level: Any = read_noise(first, layer, spacing) if noise is None else noise
+    beams = [read_beams(path, spacing) for path in paths]
+    for number, when in enumerate(beams):
+        if when is not None and "y_reported" in when:
+            scan = when.assign(image=images[number])
+            if number == 0 and isinstance(level, xr.DataArray):
+                scan = scan.assign(image_stderr=level)
+            beams[number] = scan = on_nodes(scan)
+            images[number] = scan["image"]
+            level = scan.get("image_stderr", level)
     pair = on_one_grid(*images[:2])
-    level: Any = noise
-    if noise is None:
-        level = read_noise(first, layer, spacing)
-        if level is not None and pair[0] is not images[0]:
-            # noise cannot be interpolated: its median is used
-            level = float(level.median())
+    if isinstance(level, xr.DataArray) and pair[0] is not images[0]:
+        # noise cannot be interpolated: its median is used
+        level = float(level.median())
+    seen = [when["beam_time"] for when in beams if when is not None and not when.frozen_air]
+    times = on_one_grid(*seen[:2]) if len(seen) == len(paths) else None
     wind = retrieve_wind(
         *pair,
         dt=dt,
@@ -77,6 +89,7 @@ def retrieve(
         device=device,
         noise=level,
         more=images[2:],
+        times=times,
     )
     write_netcdf(wind.assign_attrs(software=f"lidar-mi {__version__}"), out)
     valid = float((wind["flag"] == 0).mean())

@@ -19,6 +19,7 @@ from lidar_mi.experiment.stages.rendering import (
     check_light,
     detect_images,
     detector_noise,
+    gridded_scans,
     read_truth,
     render_images,
     scan_plans,
@@ -178,7 +179,8 @@ STAGES = (
         parts=lambda experiment: IMAGES,
         indifferent_to=BEHIND_IMAGES,
     ),
-    Stage("scans", _quiet(detect_images), ("images", "plans"), has_wake),
+    Stage("detected", _quiet(detect_images), ("images", "plans"), has_wake),
+    Stage("scans", _quiet(gridded_scans), ("detected",), has_wake),
     Stage(
         "wind",
         cross_flow_winds,
@@ -190,7 +192,7 @@ STAGES = (
     Stage(
         "texture_sweep", texture_sweep, ("flows",), has_images, timing="retrieve", illustrates=True
     ),
-    Stage("detector_noise", _quiet(detector_noise), ("scans",), has_detector),
+    Stage("detector_noise", _quiet(detector_noise), ("detected",), has_detector),
     Stage("eye_safety", _quiet(scan_safety), ("plans",), has_images),
     Stage(
         "volumes",

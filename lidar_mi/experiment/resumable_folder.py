@@ -187,7 +187,7 @@ class RunFolder:
 
     def keep(self, name: str, value: Any) -> None:
         """Write a result into its file, if it has one; None: there is no such result."""
-        if name == "scans":
+        if name == "detected":
             self._keep_noise(value)
         write_result(self.path, name, value, self._experiment.name, self.made_by)
 

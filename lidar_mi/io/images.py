@@ -179,6 +179,31 @@ def read_noise(
     return read_image(path, known, spacing) if known in layers else None
 
 
+def read_beams(path: str | Path, spacing: float | None = None) -> xr.Dataset | None:
+    """When and to where the beams of a scan pointed, on the axes of `read_image`.
+
+    Returns
+    -------
+    xr.Dataset, dims (z, y), or None
+        `beam_time` (s) and, where the pixels are beams beside the nodes, `y_reported` and
+        `z_reported` (m). The attribute `frozen_air` is 1 if all beams saw the air of the scan's
+        reference time, as simulated ones may. None if the file does not state times.
+
+    Raises
+    ------
+    InputError
+        As `read_image`.
+    """
+    if not _is_exr(path):
+        return None
+    header, layers = read_layers(path)
+    if "beam_time" not in layers:
+        return None
+    names = [name for name in ("beam_time", "y_reported", "z_reported") if name in layers]
+    found = xr.Dataset({name: read_image(path, name, spacing) for name in names})
+    return found.assign_attrs(frozen_air=int(header.get("frozen_air", 0)))
+
+
 def as_webp(path: str | Path) -> bytes:
     """An image file in colours as lossless WebP, two thirds of its PNG.
 

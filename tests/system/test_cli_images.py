@@ -12,6 +12,8 @@ import pytest
 import xarray as xr
 
 from lidar_mi.io.exr import read_layers, read_scan
+from tests.support.flows import axes, data_array, plane_waves, texture
+from tests.support.timed import uniform_wind
 
 
 def test_render_fills_in_the_scene(there, lidar_mi):
@@ -136,6 +138,49 @@ def tool(name, package):
     if path is None:
         pytest.skip(f"{name} is not installed (Debian package {package})")
     return path
+
+
+def write_timed(path, image, time, places=None, **header):
+    """An image with the times and places of its beams, as a run's, in the pilot's view."""
+    layers = {"Y": image.values, "beam_time": time.values}
+    if places is not None:
+        layers |= {"y_reported": places[0], "z_reported": places[1]}
+    layers = {n: np.ascontiguousarray(v[::-1, ::-1], dtype="f4") for n, v in layers.items()}
+    axes = {axis: image[axis].values.astype("f4") for axis in ("y", "z")}
+    OpenEXR.File(axes | header, layers).write(str(path))
+
+
+def test_retrieve_uses_the_times_of_scans(there, lidar_mi):
+    """Of air that moves during the scan; not where the file says that it was frozen."""
+    images, times = uniform_wind("raster", 6.0, 12.0, (60, 50))
+    for number in (0, 1):
+        write_timed(there / f"moving{number}.exr", images[number], times[number])
+        write_timed(there / f"frozen{number}.exr", images[number], times[number], frozen_air=1)
+    found = {}
+    for name in ("moving", "frozen"):
+        files = [f"{name}{number}.exr" for number in (0, 1)]
+        options = ["--dt", 0.1, "--method", "multipass", "-o", f"{name}.nc"]
+        assert lidar_mi("retrieve", *files, *options)[0] == 0
+        found[name] = xr.load_dataset(there / f"{name}.nc")
+    assert float(found["moving"]["w"].mean()) == pytest.approx(12.0, abs=0.05)
+    # 1 / (1 - g . v), as in tests/retrieval/velocimetry/test_beam_times.py: 5 %
+    assert float(found["frozen"]["w"].mean()) == pytest.approx(12.61, abs=0.05)
+    assert np.ptp(found["moving"]["time"].values) > 0.05
+
+
+def test_retrieve_puts_beams_on_the_nodes(there, lidar_mi):
+    """Beams 0.6 px further to port in scan 2: not a wind of 3 m/s."""
+    y, z = axes(50, 44)
+    nodes = np.stack(np.meshgrid(y, z))
+    waves = plane_waves(5, 4.0, 0.5)
+    for number, offset in enumerate((0.0, 0.3)):
+        places = nodes + np.reshape([offset, 0.0], (2, 1, 1))
+        image = data_array(texture(waves, *places), y, z)
+        write_timed(there / f"beside{number}.exr", image, 0 * image, places)
+    options = ["--dt", 0.1, "--method", "multipass", "-o", "beside.nc"]
+    assert lidar_mi("retrieve", "beside0.exr", "beside1.exr", *options)[0] == 0
+    wind = xr.load_dataset(there / "beside.nc")
+    assert abs(float(wind["v"].where(wind["flag"] == 0).mean())) < 0.03
 
 
 def test_exrheader_reads_the_images(demo):

@@ -48,6 +48,7 @@ def image_scale(blurred: Pair, rendered: Pair, noise: Pair) -> tuple[float, floa
     x, y, s = (
         np.concatenate([i.values.ravel() for i in pair]) for pair in (blurred, rendered, noise)
     )
+    x, y, s = (part[np.isfinite(x) & np.isfinite(y)] for part in (x, y, s))
     if np.ptp(x) < 1e-9 * np.abs(x).max():
         return float(y.mean() / x.mean()), 0.0
     weight = 1 / s if (s > 0).all() else np.ones_like(s)

@@ -17,12 +17,19 @@ from lidar_mi.atmosphere.advection import advect
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.rendering import scan_plans
-from lidar_mi.experiment.stages.winds import known_blur, rendered_pairs, window_settings
+from lidar_mi.experiment.stages.winds import (
+    known_blur,
+    pixel_times,
+    rendered_pairs,
+    window_settings,
+)
 from lidar_mi.experiment.truth import Truth, blur_by_beam
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")
+# Images made of the rendered ones, whose pixels may have times; the others are photographs.
+_RENDERED = ("measured", "detector_noise", "beam_blur", "slab")
 
 
 def error_budgets(
@@ -62,6 +69,7 @@ def budgets(
         See `error_budget`; cores left out: those of the true wind.
     """
     images, blurred = _images(experiment, truth, scans)
+    times = pixel_times(experiment, scans)
     cores = find_cores(truth.wind) if cores is None else cores
     methods = experiment.retrieval.methods
     settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
@@ -83,7 +91,13 @@ def budgets(
                 # the flags that count are those of the images as measured
                 flags = dict.fromkeys(("checks", "standard_errors"), cause == "measured")
                 winds[cause] = retrieve_wind(
-                    *pair, method=method, noise=noise, blur=corrected, **flags, **settings
+                    *pair,
+                    method=method,
+                    noise=noise,
+                    blur=corrected,
+                    times=times if cause in _RENDERED else None,
+                    **flags,
+                    **settings,
                 )
         measured, perfect = winds.pop("measured"), winds.pop("perfect")
         stiff = moved_rigidly(

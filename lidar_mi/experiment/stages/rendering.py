@@ -21,6 +21,7 @@ from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
 from lidar_mi.rendering.variant import use_variant
+from lidar_mi.retrieval.velocimetry.gridding import on_nodes
 
 IMAGES = ("image_t1", "image_t2")
 """Parts of the result of `render_images`."""
@@ -148,6 +149,7 @@ def render_images(
         scan.attrs |= platform
         if plans[index].beams is not None:
             scan.attrs["reference_time"] = index * experiment.platform.dt
+            scan.attrs["frozen_air"] = 1  # all beams see the air of the reference time
         yield IMAGES[index], scan
 
 
@@ -175,7 +177,7 @@ def batches_of(
 def detect_images(
     experiment: Experiment, images: Mapping[str, xr.Dataset], plans: Sequence[ScanPlan]
 ) -> list[xr.Dataset]:
-    """The scans with noisy images in addition, if there is a detector."""
+    """The images of all beams, with noisy ones in addition if there is a detector."""
     # images are per emitted energy: those of another pulse energy are the same
     energy = experiment.lidar.pulse_energy
     scans = [images[name].assign_attrs(pulse_energy=energy) for name in IMAGES]
@@ -191,9 +193,20 @@ def detect_images(
     ]
 
 
-def detector_noise(experiment: Experiment, scans: Sequence[xr.Dataset]) -> dict[str, float]:
+def gridded_scans(experiment: Experiment, detected: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+    """The scans, on regular nodes where beams were reported beside them; see `on_nodes`."""
+    return [
+        # times in double precision, so that those of a node are not rounded twice
+        on_nodes(scan.assign(beam_time=scan["beam_time"].astype(float))).assign_attrs(gridded=1)
+        if "y_reported" in scan
+        else scan
+        for scan in detected
+    ]
+
+
+def detector_noise(experiment: Experiment, detected: Sequence[xr.Dataset]) -> dict[str, float]:
     """Contributions to the noise of the first scan, see `noise_budget`."""
-    return noise_budget(scans[0], experiment.lidar, experiment.detector)
+    return noise_budget(detected[0], experiment.lidar, experiment.detector)
 
 
 def _media(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan]) -> list[xr.DataArray]:

@@ -13,7 +13,7 @@ from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.winds import rendered_pairs
+from lidar_mi.experiment.stages.winds import pixel_times, rendered_pairs
 from lidar_mi.retrieval.lines.combine import CombinedFlag
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
@@ -72,7 +72,8 @@ def fit_pairs(
     method = vectors_method(experiment) if with_vectors else None
     log(f"fitting vortex pairs to the images{f' and to the vectors by {method}' if method else ''}")
     pair, noise = list(rendered_pairs(experiment, scans).values())[-1]
-    ways = {Origin.IMAGES: lambda: fit_vortices(*pair, experiment.platform.dt, noise)}
+    times = pixel_times(experiment, scans)
+    ways = {Origin.IMAGES: lambda: fit_vortices(*pair, experiment.platform.dt, noise, times=times)}
     if with_vectors:
         ways[Origin.VECTORS] = lambda: _from_vectors(vectors)
     fits, refused = {}, {}

@@ -54,7 +54,7 @@ def cross_flow_winds(
     log("retrieving winds")
     _warn_of_wide_beams(experiment, truth, plans, log)
     settings, blur = experiment.retrieval, known_blur(experiment, plans[0])
-    pairs = _image_pairs(experiment, truth, plans, scans)
+    pairs, times = _image_pairs(experiment, truth, plans, scans), pixel_times(experiment, scans)
     sources = []
     for index, (source, (pair, noise)) in enumerate(pairs.items()):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
@@ -68,6 +68,8 @@ def cross_flow_winds(
                 method=method,
                 **window_settings(settings),
                 noise=noise,
+                # the truth's images are photographs
+                times=times if source in RENDERED else None,
                 # the extinction itself has passed no instrument
                 blur=0.0 if source in EXACT else blur,
             )
@@ -135,6 +137,19 @@ def rendered_pairs(
             for name, (pair, level) in pairs.items()
         }
     return pairs
+
+
+def pixel_times(experiment: Experiment, scans: Sequence[xr.Dataset]) -> list[xr.DataArray] | None:
+    """Times of the pixels of `rendered_pairs`, as `retrieve_wind` takes them.
+
+    None: all pixels of a scan show the air of its reference time.
+    """
+    if any("beam_time" not in scan or scan.attrs.get("frozen_air") for scan in scans):
+        return None
+    times = [scan["beam_time"] for scan in scans]
+    if experiment.scan.aim == "angles":
+        times = list(resample_pair(times[0], times[1], experiment.wake.spacing))
+    return times
 
 
 def attenuated_backscatter_stderr(scan: xr.Dataset) -> xr.DataArray:

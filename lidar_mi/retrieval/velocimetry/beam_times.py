@@ -10,10 +10,11 @@ from typing import NamedTuple
 import numpy as np
 import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
-from scipy.ndimage import distance_transform_edt, uniform_filter
+from scipy.ndimage import uniform_filter
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_image, same_grid
+from lidar_mi.retrieval.velocimetry.common_grid import nearest_filled
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
 
@@ -78,7 +79,7 @@ def checked_times(
         )
     if not any(np.nan_to_num(values).any() for values in found):
         return None
-    return [_filled(values) for values in found]
+    return [nearest_filled(values) for values in found]
 
 
 def vector_times(
@@ -127,12 +128,3 @@ def _of_templates(values: np.ndarray, template: int, start: np.ndarray) -> np.nd
     axes = [np.arange(n, dtype=float) for n in boxes.shape]
     read = RegularGridInterpolator(axes, boxes, bounds_error=False, fill_value=None)
     return read(np.moveaxis(start, 0, -1))
-
-
-def _filled(values: np.ndarray) -> np.ndarray:
-    """With the nearest finite value where there is none."""
-    missing = ~np.isfinite(values)
-    if not missing.any():
-        return values
-    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
-    return values[tuple(nearest)]

@@ -2,7 +2,8 @@
 
 import numpy as np
 import xarray as xr
-from scipy.interpolate import RectBivariateSpline
+from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
+from scipy.ndimage import distance_transform_edt
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
@@ -72,8 +73,8 @@ def resample_pair(
 ) -> tuple[xr.DataArray, xr.DataArray]:
     """Both images on the largest grid of square cells that lies inside both.
 
-    Nodes are whole multiples of `spacing` (m). Raises InputError as `resample`, and where the
-    images do not overlap.
+    Nodes are whole multiples of `spacing` (m). Nodes beside a pixel that is not finite have no
+    value. Raises InputError as `resample` otherwise, and where the images do not overlap.
     """
     if not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"spacing: {spacing!r} m is not a number > 0")
@@ -89,8 +90,31 @@ def resample_pair(
                 f"{axes[0][0]:g} ... {axes[0][-1]:g} m by a spacing of {spacing:g} m"
             )
         nodes[name] = np.arange(low, high + 1) * spacing
-    first, second = (resample(image, nodes["y"], nodes["z"]) for image in (image1, image2))
+    first, second = (_around_gaps(image, nodes) for image in (image1, image2))
     return first, second
+
+
+def nearest_filled(values: np.ndarray) -> np.ndarray:
+    """Values with the nearest finite one where one is not."""
+    missing = ~np.isfinite(values)
+    if not missing.any():
+        return values
+    nearest = distance_transform_edt(missing, return_distances=False, return_indices=True)
+    return values[tuple(nearest)]
+
+
+def _around_gaps(image: xr.DataArray, nodes: dict[str, np.ndarray]) -> xr.DataArray:
+    """The image at the nodes, NaN beside pixels that are not finite."""
+    gap = ~np.isfinite(image.values)
+    if not gap.any():
+        return resample(image, nodes["y"], nodes["z"])
+    found = resample(image.copy(data=nearest_filled(image.values)), nodes["y"], nodes["z"])
+    beside = RegularGridInterpolator(
+        [_axis(image, str(dim))[1] for dim in image.dims], gap.astype(float), bounds_error=False
+    )
+    at = np.meshgrid(*(nodes[str(dim)] for dim in image.dims), indexing="ij")
+    free = xr.DataArray(~(beside(np.stack(at, -1)) > 1e-6), dims=image.dims)
+    return found.where(free.transpose("z", "y").values)
 
 
 @checked_arguments
@@ -114,8 +138,7 @@ def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArra
     Raises
     ------
     InputError
-        Images of different size, without coordinates, with values that are not finite, or that do
-        not overlap.
+        Images of different size, without coordinates, or that do not overlap.
 
     Examples
     --------

@@ -12,7 +12,7 @@ import xarray as xr
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid, resample, resample_pair
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
-from tests.support.flows import plane_waves, texture
+from tests.support.flows import axes, data_array, plane_waves, texture
 
 
 def scan(field, distance, kind):
@@ -102,3 +102,21 @@ def test_axes_of_another_order_are_the_same_image():
     first, second = on_one_grid(image, image.T)
     xr.testing.assert_identical(first, image)
     xr.testing.assert_identical(second, image)
+
+
+def test_gaps_stay_gaps():
+    """Nodes beside a pixel without value have none, all others that of an image without gaps."""
+    y, z = axes(60, 50)
+    waves = plane_waves(3, 3.0, 0.5)
+    near, far = (
+        data_array(texture(waves, *np.meshgrid(s * y, s * z)), s * y, s * z) for s in (0.97, 1.0)
+    )
+    holed = near.where(near["y"] > -13.0)
+    found, _ = resample_pair(holed, far, 0.5)
+    whole, _ = resample_pair(near, far, 0.5)
+    assert found.where(found["y"] < -13.0, drop=True).isnull().all()
+    assert found.where(found["y"] > -12.4, drop=True).notnull().all()
+    further = found["y"] > -8.0
+    np.testing.assert_allclose(
+        found.where(further, drop=True), whole.where(further, drop=True), atol=1e-3
+    )
