@@ -34,6 +34,14 @@ Parameter                 Type       Meaning                                    
 .. code-block:: python
 
     {"type": "laser", "beam_radius": 0.1, "beam_cut": 0.1, "divergence_full_mrad": 2.0}
+
+It also lights the surfaces and media of any scene, under ``path``, ``volpath``, ``ptracer`` and
+other integrators of Mitsuba. What they return is then of a pulse: fluence in J/m^2 in place of
+irradiance. Rays do not hit the laser; it is sampled, by its directions where the beam is about as
+wide as the aperture and by places of the aperture where the divergence has made it wider. Both are
+unbiased. Spectral variants draw wavelengths at random, of which none is the laser's: there,
+``gated_volpath`` alone renders it. Energy, radius, cut, divergence and pose can be changed through
+``mi.traverse``.
 """
 
 import math
@@ -41,7 +49,7 @@ import math
 import drjit as dr
 import mitsuba as mi
 
-from .parameters import at_least, fail, pose, positive
+from .parameters import at_least, check_pose, fail, pose, positive
 from .polarization import rotate_stokes, transverse
 from .registration import register
 
@@ -56,18 +64,28 @@ def define():
             super().__init__(props)
             radius = positive(props, NAME, "beam_radius", 0.1)
             cut = positive(props, NAME, "beam_cut", math.inf)
-            divergence = at_least(props, NAME, "divergence_full_mrad", 0.0, 0.0) * 1e-3
+            divergence = at_least(props, NAME, "divergence_full_mrad", 0.0, 0.0)
             self.wavelength = positive(props, NAME, "wavelength", 532e-9)
-            self.pulse_energy = positive(props, NAME, "pulse_energy", 1.0)
             self.pulse_duration = at_least(props, NAME, "pulse_duration", 0.0, 0.0)
             self.stokes = _stokes(props.get("stokes", "1, 1, 0, 0"))
+            self.m_energy = mi.Float(positive(props, NAME, "pulse_energy", 1.0))
+            self.m_radius, self.m_cut = mi.Float(radius), mi.Float(cut)
+            self.m_divergence = mi.Float(divergence)
             self.m_pose = pose(props, NAME)
-            dr.make_opaque(self.m_pose)
-            self.m_radius = dr.opaque(mi.Float, radius)
-            # fraction of an uncut beam inside the aperture; radii are drawn from that fraction
-            self.m_inside = dr.opaque(mi.Float, -math.expm1(-2 * (cut / radius) ** 2))
-            self.m_divergence_half = dr.opaque(mi.Float, divergence / 2)
+            self._derive()
             self.m_flags = mi.EmitterFlags.DeltaDirection  # not hit by rays traced backwards
+
+        @property
+        def pulse_energy(self) -> float:
+            """Energy of a pulse, J."""
+            return float(self.m_energy[0])
+
+        def _derive(self):
+            dr.make_opaque(self.m_energy, self.m_radius, self.m_cut, self.m_divergence, self.m_pose)
+            # fraction of an uncut beam inside the aperture; radii are drawn from that fraction
+            cut = self.m_cut[0] / self.m_radius[0]
+            self.m_inside = dr.opaque(mi.Float, -math.expm1(-2 * cut**2))
+            self.m_divergence_half = dr.opaque(mi.Float, self.m_divergence[0] * 1e-3 / 2)
 
         def sample_local(self, sample_position, sample_direction):
             """Origin and direction of a ray in the laser's own frame, axis along +z."""
@@ -85,20 +103,117 @@ def define():
             origin, local = self.sample_local(sample2, sample3)
             to_world = self.m_pose
             direction = dr.normalize(to_world @ local)
-            axis = transverse(to_world @ mi.Vector3f(1, 0, 0), direction)
             ray = mi.Ray3f(to_world @ origin, direction, time, self.wavelengths())
+            return ray, self._polarised(self.m_energy, direction)
+
+        def _polarised(self, value, direction):
+            """Light of that intensity along a direction, with the laser's Stokes vector."""
             if not mi.is_polarized:
-                return ray, mi.Spectrum(self.pulse_energy)
+                return mi.Spectrum(value)
             stokes = rotate_stokes(
                 [mi.Float(s) for s in self.stokes],
                 direction,
-                axis,
+                transverse(self.m_pose @ mi.Vector3f(1, 0, 0), direction),
                 mi.mueller.stokes_basis(direction),
             )
             weight = mi.Spectrum(0)
-            for row, value in enumerate(stokes):
-                weight[row, 0] = value * self.pulse_energy
-            return ray, weight
+            for row, component in enumerate(stokes):
+                weight[row, 0] = component * value
+            return weight
+
+        def sample_direction(self, it, sample, active=True):
+            """A place of the aperture that lights a point, and the fluence that it brings there."""
+            place = self.m_pose.inverse() @ it.p
+            half = self.m_divergence_half
+            wide = half * place.z > self.m_radius
+            from_aperture, local = self.sample_local(sample, sample)
+            slope = local.xy / local.z
+            back = mi.Point3f(place.x - place.z * slope.x, place.y - place.z * slope.y, 0)
+            origin = dr.select(wide, from_aperture, back)
+            ds = dr.zeros(mi.DirectionSample3f)
+            ds.p = self.m_pose @ origin
+            ds.n = mi.Normal3f(dr.normalize(self.m_pose @ mi.Vector3f(0, 0, 1)))
+            ds.time = it.time
+            ds.pdf, ds.delta = mi.Float(1), mi.Bool(True)
+            ds.emitter = mi.EmitterPtr(self)
+            ds.d = ds.p - it.p
+            ds.dist = dr.norm(ds.d)
+            ds.d *= dr.rcp(ds.dist)
+            return ds, self.eval_direction(it, ds, active)
+
+        def eval_direction(self, it, ds, active=True):
+            """Fluence (J/m^2) at a point from a place of the aperture, over the place's density.
+
+            With places drawn from the aperture's fluence f, the energy times the density of
+            directions over the squared distance; with directions drawn, the energy times f over
+            the cosine.
+            """
+            if mi.is_spectral:
+                raise RuntimeError(
+                    f"{NAME}: variant {mi.variant()} is not allowed with this integrator; expected "
+                    "gated_volpath, or a variant without spectrum: the laser has one wavelength"
+                )
+            to_local = self.m_pose.inverse()
+            place, origin = to_local @ it.p, to_local @ ds.p
+            half, radius = self.m_divergence_half, self.m_radius
+            way = place - origin
+            distance = dr.norm(way)
+            cosine = way.z / distance
+            # the tangent's density, over the cosine's cube a density of directions
+            tangent2 = (dr.square(way.x) + dr.square(way.y)) / dr.square(way.z)
+            narrow = dr.maximum(half, 1e-20)
+            directions = (
+                2 * dr.inv_pi / dr.square(narrow) * dr.exp(-2 * tangent2 / dr.square(narrow))
+            )
+            directions /= cosine**3
+            r2 = dr.square(origin.x) + dr.square(origin.y)
+            fluence = 2 * dr.inv_pi / (dr.square(radius) * self.m_inside)
+            fluence *= dr.select(
+                r2 <= dr.square(self.m_cut), dr.exp(-2 * r2 / dr.square(radius)), 0
+            )
+            wide = half * place.z > radius
+            value = dr.select(wide, directions / dr.square(distance), fluence / cosine)
+            value = dr.select(active & (place.z > 0), value * self.m_energy, 0)
+            return self._polarised(value, -ds.d)
+
+        def pdf_direction(self, it, ds, active=True):
+            """0: no other way of sampling finds the laser."""
+            return mi.Float(0)
+
+        def sample_position(self, time, sample, active=True):
+            """A place of the aperture, by its fluence."""
+            origin, _ = self.sample_local(sample, sample)
+            ps = dr.zeros(mi.PositionSample3f)
+            ps.p = self.m_pose @ origin
+            ps.n = mi.Normal3f(dr.normalize(self.m_pose @ mi.Vector3f(0, 0, 1)))
+            ps.time, ps.pdf, ps.delta = time, mi.Float(1), mi.Bool(False)
+            return ps, mi.Float(1)
+
+        def sample_wavelengths(self, si, sample, active=True):
+            """The laser's own."""
+            return self.wavelengths(), mi.Spectrum(1)
+
+        def traverse(self, callback):
+            super().traverse(callback)
+            kind = mi.ParamFlags.NonDifferentiable
+            callback.put("pulse_energy", self.m_energy, kind)
+            callback.put("beam_radius", self.m_radius, kind)
+            callback.put("beam_cut", self.m_cut, kind)
+            callback.put("divergence_full_mrad", self.m_divergence, kind)
+            callback.put("to_world", self.m_pose, kind)
+
+        def parameters_changed(self, keys=()):
+            for field, value, least in (
+                ("pulse_energy", self.m_energy[0], "above 0"),
+                ("beam_radius", self.m_radius[0], "above 0"),
+                ("beam_cut", self.m_cut[0], "above 0"),
+                ("divergence_full_mrad", self.m_divergence[0], "0 or more"),
+            ):
+                enough = value > 0 or (value == 0 and least == "0 or more")
+                if not enough or (math.isinf(value) and field != "beam_cut"):
+                    fail(NAME, field, value, f"a number {least}")
+            check_pose(self.m_pose, NAME)
+            self._derive()
 
         def wavelengths(self):
             """The laser's wavelength in nm, for a ray (empty outside spectral variants)."""

@@ -167,3 +167,98 @@ def test_bad_values_are_named(parameters, message):
 def test_unknown_parameter_is_named():
     with pytest.raises(RuntimeError, match="beam_radus"):
         laser(beam_radus=0.1)
+
+
+# --- other integrators -------------------------------------------------------------------------
+
+ENERGY, ALBEDO, PIXELS, SIDE = 3.0, 0.5, 16, 0.64
+
+
+def lit_wall(integrator, distance, **beam):
+    """A diffuse wall across the beam, in front of a camera with SIDE / PIXELS m a pixel."""
+    turned = mi.ScalarTransform4f().translate([0, 0, distance]).rotate([1, 0, 0], 180)
+    fov = math.degrees(2 * math.atan(SIDE / 2))
+    film = {"width": PIXELS, "height": PIXELS, "rfilter": {"type": "box"}}
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "integrator": {"type": integrator},
+            "wall": {
+                "type": "rectangle",
+                "to_world": turned.scale(20),
+                "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": ALBEDO}},
+            },
+            "laser": {"type": "laser", "pulse_energy": ENERGY, **beam},
+            "sensor": {
+                "type": "perspective",
+                "fov": fov,
+                "to_world": mi.ScalarTransform4f().look_at(
+                    [0, 0, distance - 1], [0, 0, distance], [0, 1, 0]
+                ),
+                "film": {"type": "hdrfilm", "pixel_format": "luminance", **film},
+            },
+        }
+    )
+
+
+@pytest.mark.parametrize("integrator", ["path", "volpath", "ptracer"])
+@pytest.mark.parametrize(
+    ("distance", "beam"),
+    [
+        (50, {"beam_radius": 0.2}),
+        (50, {"beam_radius": 0.2, "beam_cut": 0.15}),
+        (60, {"beam_radius": 0.2, "divergence_full_mrad": 4.0}),  # drawn from directions
+        (60, {"beam_radius": 0.05, "divergence_full_mrad": 8.0}),  # from the aperture
+    ],
+)
+def test_a_lit_wall_has_the_fluence_of_the_beam(integrator, distance, beam):
+    """Radiance: albedo over pi times a Gaussian's fluence, its squared radii added (4 sigma).
+
+    Means over blocks of 4 x 4 pixels: single pixels' errors are too skewed for 12 runs.
+    """
+    scene = lit_wall(integrator, distance, **beam)
+    runs = [_blocks(np.array(mi.render(scene, spp=64, seed=k))[..., 0]) for k in range(12)]
+    mean, error = np.mean(runs, 0), np.std(runs, 0, ddof=1) / math.sqrt(len(runs))
+    wide = math.hypot(beam["beam_radius"], beam.get("divergence_full_mrad", 0) * 5e-4 * distance)
+    cut = beam.get("beam_cut", math.inf)
+    fine = (np.arange(20 * PIXELS) + 0.5) / (20 * PIXELS) - 0.5
+    r2 = (SIDE * fine) ** 2 + (SIDE * fine[:, None]) ** 2
+    fluence = 2 * ENERGY / (math.pi * wide**2) * np.exp(-2 * r2 / wide**2) * (r2 <= cut**2)
+    fluence /= -math.expm1(-2 * (cut / wide) ** 2)
+    expected = ALBEDO / math.pi * _blocks(fluence)
+    # errors of 12 runs are Student's: 5.5 is 4 sigma; the cut's edge adds that of the quadrature
+    assert (np.abs(mean - expected) < 5.5 * error + 3e-3 * expected.max()).all()
+    total = np.sum(runs, (1, 2)).std(ddof=1) / math.sqrt(len(runs))
+    assert abs(mean.sum() - expected.sum()) < 5.5 * total + 1e-3 * expected.sum()
+
+
+def _blocks(image):
+    """Means over a sixteenth of the image each."""
+    step = image.shape[0] // 4
+    return image.reshape(4, step, 4, step).mean((1, 3))
+
+
+def test_what_it_is_made_of_can_be_changed():
+    scene = lit_wall("path", 50, beam_radius=0.2)
+    before = np.array(mi.render(scene, spp=32))
+    parameters = mi.traverse(scene)
+    parameters["laser.pulse_energy"] = 2 * ENERGY
+    parameters.update()
+    np.testing.assert_allclose(np.array(mi.render(scene, spp=32)), 2 * before, rtol=1e-5)
+    assert {f"laser.{key}" for key in ("beam_radius", "beam_cut", "divergence_full_mrad")} <= set(
+        parameters.keys()
+    )
+    parameters["laser.beam_radius"] = -1.0
+    with pytest.raises(ValueError, match=r"laser\.beam_radius: -1.* is not allowed; expected"):
+        parameters.update()
+
+
+def test_a_wavelength_drawn_at_random_is_refused():
+    before = mi.variant()
+    mi.set_variant("llvm_ad_spectral")
+    try:
+        with pytest.raises(RuntimeError) as caught:
+            mi.render(lit_wall("path", 50), spp=4)
+        assert "variant llvm_ad_spectral is not allowed" in str(caught.value.__cause__)
+    finally:
+        mi.set_variant(before)
