@@ -47,22 +47,22 @@ def to_si(value: object, unit: str, example: str) -> float:
     """
     if isinstance(value, bool) or not isinstance(value, int | float | str):
         raise ValueError(f"{value!r} is not allowed; expected a quantity such as '{example}'")
+    kind = {"rad": "an angle", "": "a number"}.get(unit, f"a quantity in {unit}")
     if not isinstance(value, str):
-        if unit == "rad" and value != 0:
-            raise ValueError(f"{value!r} has no unit; expected an angle such as '{example}'")
+        if unit.startswith("rad") and value != 0:
+            raise ValueError(f"{value!r} has no unit; expected {kind} such as '{example}'")
         try:
             return float(value)
         except OverflowError:
             raise ValueError(f"{value!r} is not allowed; expected a smaller number") from None
-    kind = f"a quantity in {unit}" if unit else "a number"
     wrong = ValueError(f"{value!r} is not allowed; expected {kind}, such as '{example}'")
     match = _TEXT.fullmatch(value.strip()) if len(value) <= _LONGEST else None
     if not match:
         raise wrong
     number, text = float(match[1]), match[2]
     if not text:
-        if unit == "rad" and number != 0:
-            raise ValueError(f"{value!r} has no unit; expected an angle such as '{example}'")
+        if unit.startswith("rad") and number != 0:
+            raise ValueError(f"{value!r} has no unit; expected {kind} such as '{example}'")
         return number
     try:
         given = UNITS.parse_units(_bounded("1" + text if text.startswith("/") else text))
@@ -169,6 +169,8 @@ def quantity(text: str) -> float:
 
 Length = Annotated[float, Unit("m", "500 m")]
 Angle = Annotated[float, Unit("rad", "2 mrad")]
+AngularRate = Annotated[float, Unit("rad/s", "500 deg/s")]
+AngularAcceleration = Annotated[float, Unit("rad/s^2", "1e5 deg/s^2")]
 Speed = Annotated[float, Unit("m/s", "150 m/s")]
 Time = Annotated[float, Unit("s", "0.1 s")]
 Energy = Annotated[float, Unit("J", "1 mJ")]

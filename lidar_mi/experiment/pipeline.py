@@ -160,7 +160,7 @@ STAGES = (
     Stage(
         "plans",
         _quiet(scan_plans),
-        ("truth",),
+        ("truth", "beside"),
         has_wake,
         ahead=True,
         timing="truth",

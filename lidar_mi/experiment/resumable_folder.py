@@ -20,6 +20,7 @@ from lidar_mi.experiment.image_store import BATCHES, MADE_BY, ImageStore
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Keeper
 from lidar_mi.experiment.stages import rendering
+from lidar_mi.experiment.timed_beams import timing_files
 from lidar_mi.experiment.truth import find_file
 from lidar_mi.io import exr
 from lidar_mi.io.atomic import write_atomically
@@ -312,7 +313,7 @@ def _inputs(experiment: Experiment, beside: str | Path) -> dict[str, Path]:
     paths = table_files(experiment.scattering, beside)
     if experiment.wake.file:
         paths["wake.file"] = find_file(experiment.wake.file, beside, "wake.file")
-    return paths
+    return paths | timing_files(experiment, beside)
 
 
 def _checksum(path: Path) -> str:

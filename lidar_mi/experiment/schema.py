@@ -18,7 +18,10 @@ from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.instrument.fringe_camera import FringeCamera
 from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.motion import Motion
+from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import Scan
+from lidar_mi.instrument.scan_timing import ScanTiming
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table, Tabular
@@ -38,6 +41,10 @@ class Platform(Section):
     dt: Annotated[
         Time, Within(1e-6, 10000, "from a repetition rate of 1 MHz to the life of a wake")
     ] = 0.1
+    motion: Motion | None = Field(None, description="departure from straight and level flight")
+    reported: Reported | None = Field(
+        None, description="errors of the pose that is told; default: the true one is known"
+    )
 
 
 class Retrieval(Section):
@@ -192,6 +199,9 @@ class Sensor(Section):
     """Both lidars as one sensor: the Doppler lidar scans the slab of the backscatter lidar."""
 
     directions: DopplerScan = DopplerScan()
+    timing: ScanTiming | None = Field(
+        None, description="when each line is measured; default: all at once"
+    )
     pulses: Annotated[int, Within(1, 10000, "100 s of pulses at 100 Hz")] = Field(
         20, description="averaged per direction of a slab"
     )
@@ -207,6 +217,15 @@ class Sensor(Section):
     exposure: Annotated[
         Time, Within(0, 30000, "exposure limits are defined up to 30 000 s", "(]")
     ] = Field(10.0, description="time of exposure to the beams")
+
+    @model_validator(mode="after")
+    def _pulses_of_a_line(self):
+        if self.timing and self.timing.pulses_per_beam != 1:
+            raise ValueError(
+                f"timing.pulses_per_beam: {self.timing.pulses_per_beam} is not allowed with "
+                "sensor; expected 1, sensor.pulses are those of a line"
+            )
+        return self
 
 
 class Volume(Section):
@@ -291,6 +310,15 @@ class Experiment(Tabular, Section):
             raise ValueError(
                 f"{key}: not allowed with volume, which retrieves the wind in its stead"
             )
+        for key, given in (
+            ("scan.timing", scan.timing),
+            ("platform.motion", self.platform.motion),
+            ("platform.reported", self.platform.reported),
+        ):
+            if given is not None:
+                raise ValueError(
+                    f"{key}: not allowed with volume, whose scans are instantaneous; expected none"
+                )
         if scan.gates != "planar":
             raise ValueError(
                 f"scan.gates: {scan.gates} is not allowed with volume; expected planar"

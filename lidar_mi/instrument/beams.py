@@ -4,6 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar_mi.errors import InputError
+from lidar_mi.instrument.motion import Pose, tilted
+
 
 @dataclass(frozen=True)
 class Beams:
@@ -21,6 +24,8 @@ class Beams:
         True place of the telescope and true unit vectors.
     reported_origin, reported_direction : (n, 3) arrays
         The same as the retrieval is told them.
+    velocity, reported_velocity : (n, 3) arrays, optional
+        Of the telescope less that of straight flight, m/s.
     """
 
     time: np.ndarray
@@ -28,6 +33,8 @@ class Beams:
     direction: np.ndarray
     reported_origin: np.ndarray
     reported_direction: np.ndarray
+    velocity: np.ndarray | None = None
+    reported_velocity: np.ndarray | None = None
 
     def true_places(self, x: float) -> np.ndarray:
         """Where the beams cross the plane at x, in the frame of the air: y, z in m, (n, 2)."""
@@ -41,3 +48,90 @@ class Beams:
 def _crossings(origin: np.ndarray, direction: np.ndarray, x: float) -> np.ndarray:
     distance = (x - origin[:, 0]) / direction[:, 0]
     return origin[:, 1:] + distance[:, None] * direction[:, 1:]
+
+
+def steered_beams(
+    time: np.ndarray,
+    places: np.ndarray,
+    distance: float,
+    position: float,
+    speed: float,
+    true: Pose,
+    reported: Pose,
+    *,
+    body_fixed: bool,
+    jitter: float = 0.0,
+    random: np.random.Generator | None = None,
+) -> Beams:
+    """The beams of a scanner that is steered by the reported pose, or fixed to the body.
+
+    Parameters
+    ----------
+    time : (n,) array
+        s from the scan's reference time.
+    places : (n, 2) array
+        y and z in the plane at ``distance`` (m) from the telescope at the reference time. Steered
+        beams, as reported, go to these; beams fixed to the body go as if from a telescope at rest.
+    position : float
+        x of the telescope at the reference time, m, in the frame of the air.
+    speed : float
+        Of straight flight in the frame of the air, m/s.
+    true, reported : Pose
+        Of the telescope at the times.
+    jitter : float
+        Rms of true directions on both axes, rad, by the generator ``random``.
+
+    Raises
+    ------
+    InputError
+        A pose that takes the telescope beyond the plane or turns beams away from it.
+    """
+    straight = np.zeros((len(time), 3))
+    straight[:, 0] = position + speed * time
+    origin, reported_origin = straight + true.place, straight + reported.place
+    target = np.column_stack([np.full(len(time), distance), places])
+    if body_fixed:
+        reported_direction = reported.attitude.apply(_unit(target))
+    else:
+        reported_direction = _unit(target + np.array([position, 0.0, 0.0]) - reported_origin)
+    error = true.attitude * reported.attitude.inv()
+    direction = error.apply(reported_direction)
+    if jitter > 0 and random is not None:
+        direction = tilted(direction, jitter, random)
+    beams = Beams(
+        time,
+        origin,
+        direction,
+        reported_origin,
+        reported_direction,
+        true.velocity,
+        reported.velocity,
+    )
+    for kind, places_from, going in (
+        ("true", origin, direction),
+        ("reported", reported_origin, reported_direction),
+    ):
+        behind = np.flatnonzero(places_from[:, 0] >= position + distance)
+        if behind.size:
+            first = behind[0]
+            raise InputError(
+                f"the {kind} place at {time[first]:g} s, x = {places_from[first, 0]:.4g} m, is not "
+                f"allowed; expected before the slab, {position + distance:.4g} m"
+            )
+        away = np.flatnonzero(going[:, 0] < _LEAST_AHEAD)
+        if away.size:
+            first = away[0]
+            turned = np.degrees(np.arccos(np.clip(going[first, 0], -1, 1)))
+            raise InputError(
+                f"the {kind} attitude at {time[first]:g} s turns a beam to {turned:.3g} deg from "
+                "the axis; expected at most 86 deg, that it reaches the slab"
+            )
+    return beams
+
+
+# cosine of 86 degrees, as far as a scan may reach
+_LEAST_AHEAD = 0.07
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

@@ -11,10 +11,11 @@ import xarray as xr
 from pydantic import BaseModel, ConfigDict, Field
 from scipy import constants
 from scipy.interpolate import RegularGridInterpolator
-from scipy.spatial.transform import Rotation
 
 from lidar_mi.errors import InputError
+from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler import DopplerLidar
+from lidar_mi.instrument.motion import attitude, tilted
 from lidar_mi.instrument.scan import HalfAngle
 from lidar_mi.units import Angle, Speed, Within, quantity
 
@@ -48,18 +49,29 @@ class DopplerScan(_Model):
 
     def directions(self) -> np.ndarray:
         """Unit vectors, (rows * columns, 3), row by row from the top left."""
-        lateral = np.tan(_spread(self.azimuth_half, self.columns))[::-1]
-        vertical = np.tan(_spread(self.elevation_half, self.rows))[::-1]
-        up, left = np.meshgrid(vertical, lateral, indexing="ij")
+        lateral, vertical = self.nodes()
+        up, left = np.meshgrid(vertical[::-1], lateral[::-1], indexing="ij")
         lines = np.stack([np.ones_like(up), left, up], -1).reshape(-1, 3)
         return lines / np.linalg.norm(lines, axis=1, keepdims=True)
 
-    def ranges(self, lidar: DopplerLidar) -> np.ndarray:
-        """Distance of the middle of every range bin, m, (rows * columns,)."""
-        directions = self.directions()
+    def nodes(self) -> tuple[np.ndarray, np.ndarray]:
+        """y and z of the directions at the distance 1, ascending: tangents of their angles."""
+        return tuple(
+            np.tan(_spread(half, count))
+            for half, count in ((self.azimuth_half, self.columns), (self.elevation_half, self.rows))
+        )
+
+    def ranges(self, lidar: DopplerLidar, beams: Beams | None = None) -> np.ndarray:
+        """Distance of the middle of every range bin, m, (rows * columns,).
+
+        Delays are set by where the telescope is reported to be when each beam is sent, so that the
+        middles stay in the plane, or at the distance from where it was at the reference time.
+        """
+        directions = self.directions() if beams is None else beams.reported_direction
+        flown = 0.0 if beams is None else beams.reported_origin[:, 0]
         if self.gates == "planar":
-            return lidar.range / directions[:, 0]
-        return np.full(len(directions), lidar.range)
+            return (lidar.range - flown) / directions[:, 0]
+        return np.full(len(directions), lidar.range) - flown
 
 
 class PlatformErrors(_Model):
@@ -92,16 +104,11 @@ def pointed(directions: np.ndarray, errors: PlatformErrors, seed: int = 0) -> np
     The attitude rotates all alike (yaw, pitch, roll, in this order), then each one is tilted by
     normally distributed small angles about two axes perpendicular to it.
     """
-    attitude = Rotation.from_euler("ZYX", [errors.yaw, -errors.pitch, errors.roll])
-    rotated = attitude.apply(np.asarray(directions, float))
+    missed = attitude(errors.roll, errors.pitch, errors.yaw)
+    rotated = missed.apply(np.asarray(directions, float))
     if errors.jitter == 0:
         return rotated
-    across = np.cross(rotated, [0.0, 0.0, 1.0])
-    across /= np.linalg.norm(across, axis=1, keepdims=True)
-    above = np.cross(across, rotated)
-    tilt = errors.jitter * np.random.default_rng(seed).standard_normal((2, len(rotated), 1))
-    rotated = rotated + tilt[0] * across + tilt[1] * above
-    return rotated / np.linalg.norm(rotated, axis=1, keepdims=True)
+    return tilted(rotated, errors.jitter, np.random.default_rng(seed))
 
 
 def sight_volumes(
@@ -199,6 +206,7 @@ def scan_wind(
     seed: int,
     speed: float = 0.0,
     errors: PlatformErrors | None = None,
+    beams: Beams | None = None,
 ) -> xr.Dataset:
     """Measurement of a wind field by a Doppler lidar, line by line.
 
@@ -219,30 +227,40 @@ def scan_wind(
         Of the platform along x, as measured on board, m/s.
     errors : PlatformErrors
         Errors of the assumed attitude, pointing and speed; by default none.
+    beams : Beams
+        Time and pose of every line, true and reported, from the telescope's place at the reference
+        time; `errors` come on top of them. None: all at once and from there.
 
     Returns
     -------
     xr.Dataset, dim line (and axis: x, y, z)
         `direction` and `range` (m; where the lines are taken to go), `range_bin` (m),
         `v_los`, `v_los_std` and `v_los_true` (m s-1; without noise), `platform_velocity` (m s-1).
+        With beams these are as reported, line by line, with `time` (s) and `origin` (m).
 
     Raises
     ------
     InputError
         A field that does not contain the scan; a negative standard error.
     """
-    directions, ranges, errors = scan.directions(), scan.ranges(lidar), errors or PlatformErrors()
+    ranges, errors = scan.ranges(lidar, beams), errors or PlatformErrors()
+    directions = scan.directions() if beams is None else beams.reported_direction
     std = np.broadcast_to(np.asarray(v_los_std, float), len(directions)).copy()
     if not (std >= 0).all():
         raise InputError(f"v_los_std: {std.min():g} m/s is not allowed; expected >= 0 m/s")
     jitter_seed, noise_seed = np.random.SeedSequence(seed).generate_state(2)
-    actual = pointed(directions, errors, int(jitter_seed))
+    steered = directions if beams is None else beams.direction
+    actual = pointed(steered, errors, int(jitter_seed))
     points, weights = sight_volumes(actual, ranges, lidar)
+    velocity = told = np.array([speed, 0.0, 0.0])
+    if beams is not None:
+        points = points + beams.origin[:, None]
+        velocity, told = velocity + beams.velocity, told + beams.reported_velocity
     mean = np.einsum("lp,lpc->lc", weights, wind_at(wind, points))
-    toward = np.array([speed + errors.speed, 0.0, 0.0]) - mean
+    toward = velocity + np.array([errors.speed, 0.0, 0.0]) - mean
     true = np.einsum("lc,lc->l", actual, toward)
     noise = np.random.default_rng(int(noise_seed)).standard_normal(len(true))
-    return xr.Dataset(
+    found = xr.Dataset(
         {
             "v_los": _variable("line", true + std * noise, "m s-1", _LOS),
             "v_los_std": _variable("line", std, "m s-1", "standard error of v_los"),
@@ -250,7 +268,10 @@ def scan_wind(
             "range": _variable("line", ranges, "m", "distance of the middle of the range bin"),
             "range_bin": ((), lidar.range_bin, {"units": "m", "long_name": "length of range bin"}),
             "platform_velocity": _variable(
-                "axis", np.array([speed, 0.0, 0.0]), "m s-1", "velocity of the platform"
+                "axis" if beams is None else ("line", "axis"),
+                told,
+                "m s-1",
+                "velocity of the platform",
             ),
         },
         coords={
@@ -258,6 +279,14 @@ def scan_wind(
             "axis": ("axis", ["x", "y", "z"]),
         },
         attrs={"Conventions": "CF-1.11", "title": "Line-of-sight velocities", "seed": seed},
+    )
+    if beams is None:
+        return found
+    return found.assign(
+        time=_variable("line", beams.time, "s", "time from the reference time of the scan"),
+        origin=_variable(
+            ("line", "axis"), beams.reported_origin, "m", "place of the telescope, as reported"
+        ),
     )
 
 

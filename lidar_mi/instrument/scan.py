@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.beams import Beams
+from lidar_mi.instrument.scan_timing import ScanTiming
 from lidar_mi.units import Angle, Length, Speed, Within, quantity
 
 MOST_BEAMS = 10**7
@@ -58,6 +59,9 @@ class Scan(BaseModel):
     )
     azimuth_half: tuple[HalfAngle, HalfAngle] = (quantity("6.2 deg"), quantity("6.4 deg"))
     elevation_half: tuple[HalfAngle, HalfAngle] = (quantity("3.9 deg"), quantity("4.1 deg"))
+    timing: ScanTiming | None = Field(
+        None, description="when each beam is sent; default: all at once"
+    )
 
     @model_validator(mode="after")
     def _fits_into_memory(self):

@@ -25,6 +25,9 @@ from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
 from lidar_mi.experiment import reading, schema, schema_air, truth
+from lidar_mi.instrument import motion
+from lidar_mi.instrument.reported import Reported
+from lidar_mi.instrument.scan_timing import ScanTiming
 from lidar_mi.rendering.phase import scatterer
 from tests.support.experiments import sketched_figures, without_figures
 
@@ -41,7 +44,23 @@ PAGES = (
 )
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
-OPTIONAL = (schema_air.VortexPair, schema_air.Turbine, schema_air.Part)
+OPTIONAL = (
+    schema_air.VortexPair,
+    schema_air.Turbine,
+    schema_air.Part,
+    ScanTiming,
+    motion.Motion,
+    motion.Sinusoid,
+    motion.Attitude,
+    Reported,
+)
+# what they need
+REQUIRED = {
+    schema_air.Part: {"phase": "rayleigh", "fraction": 1.0},
+    ScanTiming: {"duration": 0.1},
+    motion.Sinusoid: {"axis": "y", "amplitude": 1.0, "frequency": 1.0},
+    motion.Attitude: {"rms": 0, "bandwidth": 1.0},
+}
 # what makes a printed run small; nothing else of it changes
 SMALLER = (
     "wake.spacing=1 m",
@@ -106,6 +125,8 @@ def _unit(field):
         for kind, unit in (
             (units.Length, "m"),
             (units.Angle, "rad"),
+            (units.AngularRate, "rad/s"),
+            (units.AngularAcceleration, "rad/s²"),
             (units.Speed, "m/s"),
             (units.Time, "s"),
             (units.Energy, "J"),
@@ -164,7 +185,9 @@ def _value(name, model, *given):
     *parents, key = name.split(".")
     changes = {key: given[0]} if given else {}
     if model in OPTIONAL:
-        whole = {"phase": "rayleigh", "fraction": 1.0} if model is schema_air.Part else {}
+        whole = dict(REQUIRED.get(model, {}))
+        if key == "duration":  # of which there is one or the other
+            whole = {"beam_rate": 1.0}
         return getattr(model.model_validate(whole | changes), key)
     data = copy.deepcopy(BASE)
     if name.split(".")[0] == "sensor":  # it needs both lidars, and a method that knows its errors

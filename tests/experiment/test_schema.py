@@ -342,14 +342,14 @@ def test_every_number_has_a_range_with_its_reason_and_extremes_are_refused(name,
         assert math.isfinite(within.high) and within.low not in (5e-324, -math.inf)
     unit = next((part.symbol for part in parts if isinstance(part, Unit)), "")
     for number in (1e308, -1e308, 2**63, math.nan, -math.inf):
-        value = f"{number!r} {unit}" if unit == "rad" else number
+        value = f"{number!r} {unit}" if unit.startswith("rad") else number
         *sections, key = name.split(".")
         data = {"name": "extreme", "wake": {"vortex_pair": {}}}
         innermost = data
         for section in sections:
             innermost = innermost.setdefault(section, {})
         pairs = ("scan.azimuth_half", "scan.elevation_half", "wake.centre", "doppler.camera.centre")
-        innermost[key] = [value] * 2 if name in pairs else value
+        innermost[key] = [value] * 2 if name in pairs or key == "cycles" else value
         if key in ("v_los", "averaged"):
             innermost[key] = [value]
         if name.startswith("scattering.parts"):
@@ -358,11 +358,18 @@ def test_every_number_has_a_range_with_its_reason_and_extremes_are_refused(name,
                 "parts": [{"phase": "rayleigh", "fraction": 1}],
             }
             data["scattering"]["parts"][0][key] = value
+        if name.startswith("platform.motion.sinusoids"):
+            vibration = {"axis": "y", "amplitude": 1, "frequency": 1}
+            data["platform"] = {"motion": {"sinusoids": [vibration | {key: value}]}}
+        if name.startswith("platform.motion.attitude"):
+            innermost |= {"rms": 0, "bandwidth": 1} | {key: value}
         if key == "stokes":
             innermost[key] = [1, value, 0, 0]
         with pytest.raises(InputError) as error:
             check(data, "file")
-        assert name.split(".parts")[0] in str(error.value) and "\n" not in str(error.value)
+        assert re.split(r"\.parts|\.sinusoids", name)[0] in str(error.value) and "\n" not in str(
+            error.value
+        )
         if within:
             assert within.words(unit).split(" (")[0] in str(error.value) or number != number
 

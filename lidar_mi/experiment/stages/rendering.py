@@ -11,6 +11,7 @@ from lidar_mi.experiment.forecast import check_brightness, check_size
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Keeper
+from lidar_mi.experiment.timed_beams import timed_plans
 from lidar_mi.experiment.truth import Flows, Truth, read_flows
 from lidar_mi.instrument.detector import gate_duration
 from lidar_mi.instrument.detector_noise import noise_budget, noisy_scan
@@ -27,10 +28,21 @@ IMAGES = ("image_t1", "image_t2")
 """Parts of the result of `render_images`."""
 
 
-def scan_plans(experiment: Experiment, truth: Truth) -> list[ScanPlan]:
-    """The scans of both images."""
+def scan_plans(
+    experiment: Experiment, truth: Truth, beside: str | Path | None = None
+) -> list[ScanPlan]:
+    """The scans of both images, with the beams in time where `timed_plans` has any.
+
+    Parameters
+    ----------
+    beside : path, optional
+        Folder in which files of directions and of the trajectory are searched first. Default: the
+        experiment's.
+    """
     flown = (experiment.platform.speed - experiment.scan.follow) * experiment.platform.dt
-    return plan_scans(experiment.scan, truth.wind["y"].values, truth.wind["z"].values, (0.0, flown))
+    y, z = truth.wind["y"].values, truth.wind["z"].values
+    plans = plan_scans(experiment.scan, y, z, (0.0, flown))
+    return timed_plans(experiment, plans, experiment.folder if beside is None else beside)
 
 
 def read_truth(experiment: Experiment, beside: str | Path, *, log: Log) -> Flows:

@@ -1,0 +1,147 @@
+"""Tables of numbers in time, from CSV or NetCDF: trajectories, a scanner's directions."""
+
+import csv
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pint
+
+from lidar_mi.errors import InputError
+from lidar_mi.io.netcdf import load_variable, open_netcdf
+from lidar_mi.io.text import read_text
+from lidar_mi.units import parse_units
+
+TIME = "t"
+"""Name of the time, s."""
+
+_HEAD = re.compile(r"\s*(\w+)\s*(?:[\[(]\s*([^\])]*?)\s*[\])])?\s*")
+
+
+def read_timed_table(path: str | Path, units: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Columns of a table by their names, in SI units, and the time ``t``.
+
+    A CSV file has a head with names and units, "t (s), roll (deg)", and lines that begin with #
+    are comments; a NetCDF file has variables of one dimension with the attribute ``units``. Without
+    a unit, times and lengths are SI; angles must have one.
+
+    Parameters
+    ----------
+    path : path
+        NetCDF by its suffix (.nc, .nc4, .cdf), else CSV.
+    units : mapping of str to str
+        Names of columns and their SI units. Those of the file that are not asked for are ignored.
+
+    Returns
+    -------
+    dict of str to (n,) array
+        ``t`` and what of the columns there is.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, no ``t``, none of the columns, fewer than two times, a unit that
+        does not convert, a value that is no finite number, times that do not increase.
+    """
+    path = Path(path)
+    wanted = {TIME: "s", **units}
+    read = _netcdf if path.suffix in (".nc", ".nc4", ".cdf") else _csv
+    found = read(path, wanted)
+    if TIME not in found or len(found) == 1:
+        missing = TIME if TIME not in found else f"all of {', '.join(units)}"
+        raise InputError(f"{path}: {missing} missing; expected columns {', '.join(wanted)}")
+    table = {}
+    for name, (values, unit) in found.items():
+        bad = np.flatnonzero(~np.isfinite(values))
+        if bad.size:
+            raise InputError(
+                f"{path}: {name}: {values[bad[0]]} in row {bad[0] + 1} is not allowed; expected "
+                "finite numbers"
+            )
+        table[name] = values * _factor(unit, wanted[name], name, path)
+    time = table[TIME]
+    if len(time) < 2:
+        raise InputError(f"{path}: {len(time)} rows; expected two or more")
+    back = np.flatnonzero(~(np.diff(time) > 0))
+    if back.size:
+        row = int(back[0]) + 1
+        raise InputError(
+            f"{path}: t: {time[row]:g} s in row {row + 1} after {time[row - 1]:g} s is not "
+            "allowed; expected times that increase"
+        )
+    return table
+
+
+def _factor(unit: str | None, target: str, name: str, path: Path) -> float:
+    angle = target == "rad"
+    allowed = f"expected {'deg or rad' if angle else f'{target} or a unit that converts to it'}"
+    if unit is None:
+        if angle:
+            raise InputError(f"{path}: {name}: without a unit; {allowed}")
+        return 1.0
+    try:
+        return float(parse_units(unit).to(parse_units(target).units).magnitude)
+    except (ValueError, pint.PintError):
+        raise InputError(f"{path}: {name}: unit {unit!r} is not allowed; {allowed}") from None
+
+
+def _csv(path: Path, wanted: Mapping[str, str]) -> dict[str, tuple[np.ndarray, str | None]]:
+    text = read_text(path, "a table, CSV or NetCDF")
+    lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")]
+    try:
+        rows = list(csv.reader(lines, strict=True))
+    except csv.Error as error:
+        raise InputError(f"{path}: not a CSV table ({error})") from None
+    if not rows:
+        raise InputError(f"{path}: empty; expected a head and numbers: {', '.join(wanted)}")
+    heads = [_HEAD.fullmatch(cell) for cell in rows[0]]
+    names = [head[1] if head else "" for head in heads]
+    units = [head[2] if head else None for head in heads]
+    twice = next((name for name in names if name and names.count(name) > 1), None)
+    if twice:
+        raise InputError(f"{path}: column {twice} twice; expected each once")
+    for number, row in enumerate(rows[1:], 1):
+        if len(row) != len(names):
+            raise InputError(
+                f"{path}: {len(row)} values in row {number}; expected {len(names)}, as in its head"
+            )
+    found = {}
+    for index, (name, unit) in enumerate(zip(names, units, strict=True)):
+        if name in wanted:
+            cells = enumerate((row[index] for row in rows[1:]), 1)
+            found[name] = np.array([_number(cell, name, row, path) for row, cell in cells]), unit
+    return found
+
+
+def _number(cell: str, name: str, row: int, path: Path) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        raise InputError(
+            f"{path}: {name}: {cell.strip()[:40]!r} in row {row} is not allowed; expected a number"
+        ) from None
+
+
+def _netcdf(path: Path, wanted: Mapping[str, str]) -> dict[str, tuple[np.ndarray, str | None]]:
+    found = {}
+    with open_netcdf(path) as data:
+        for name in wanted:
+            if name not in data.variables:
+                continue
+            variable = data[name]
+            if variable.ndim != 1 or variable.dtype.kind not in "iuf":
+                raise InputError(
+                    f"{path}: {name}: {variable.dtype} of {variable.ndim} dimensions is not "
+                    "allowed; expected numbers along one"
+                )
+            values = load_variable(variable, path).values.astype(float)
+            unit = variable.attrs.get("units")
+            # "seconds since 2000-01-01" counts in seconds
+            found[name] = values, None if unit is None else str(unit).split(" since ")[0]
+    sizes = {len(values) for values, _ in found.values()}
+    if len(sizes) > 1:
+        raise InputError(
+            f"{path}: {', '.join(found)} have {sorted(sizes)} values; expected equally many"
+        )
+    return found
