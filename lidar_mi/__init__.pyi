@@ -2,14 +2,13 @@
 
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
-from .campaign.shipped import campaigns
 from .errors import InputError
 from .experiment.own_frames import calibrate_etalon, retrieve_v_los
 from .experiment.reading import load_experiment
 from .experiment.results import Run
 from .experiment.run import run
 from .experiment.schema import Experiment
-from .experiment.shipped import experiments
+from .experiment.shipped import campaigns, experiments
 from .experiment.truth import make_truth
 from .io.exr import read_scan
 from .io.images import read_image, read_noise

@@ -18,12 +18,12 @@ from lidar_mi.campaign.collect import collect
 from lidar_mi.campaign.description import checked_campaign, read_campaign
 from lidar_mi.campaign.folder import CampaignFolder, create, read_base, signatures
 from lidar_mi.campaign.points import Points
-from lidar_mi.campaign.shipped import campaign_file
 from lidar_mi.campaign.status import Status, count
 from lidar_mi.campaign.worker import Prepare, carry_out, render_shared
 from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.pipeline import storing_stages
+from lidar_mi.experiment.shipped import campaign_file
 from lidar_mi.progress import Notice
 
 MOST_UNASKED = 100_000

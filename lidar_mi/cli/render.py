@@ -14,7 +14,9 @@ EXAMPLES = "Example: `lidar-mi render slab.xml -s 256 -D range=485 -o slab.exr`"
 
 
 def render(
-    scene: Annotated[Path, typer.Argument(help="Mitsuba scene (XML).")],
+    scene: Annotated[
+        str, typer.Argument(help="Mitsuba scene (XML), or the name of one of the package: slab.")
+    ],
     variant: Variant = None,
     samples: Annotated[
         int,
@@ -23,7 +25,10 @@ def render(
         ),
     ] = 0,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="EXR file. Default: beside the scene.")
+        Path | None,
+        typer.Option(
+            "-o", "--out", help="EXR file. Default: beside the scene; of a shipped one, here."
+        ),
     ] = None,
     define: Annotated[
         list[str] | None,
@@ -33,20 +38,23 @@ def render(
     overwrite: Overwrite = False,
 ) -> None:
     """Render a Mitsuba scene with the project's plugins, like the `mitsuba` command."""
+    from lidar_mi.experiment.shipped import scene_file
     from lidar_mi.io.target import check_target
     from lidar_mi.rendering.scene import files_of, render_file
 
-    path, definitions = out or scene.with_suffix(".exr"), _definitions(define or [])
-    check_target(path, files_of(scene, definitions), overwrite=overwrite)
+    source, definitions = scene_file(scene), _definitions(define or [])
+    beside = source if Path(scene).is_file() else Path(source.name)
+    path = out or beside.with_suffix(".exr")
+    check_target(path, files_of(source, definitions), overwrite=overwrite)
     with progress() as notice:
         render_file(
-            scene,
+            source,
             path,
             variant or "llvm_ad_mono_polarized",
             samples,
             seed,
             definitions,
-            lambda fraction: notice(f"rendering {scene.name}", fraction),
+            lambda fraction: notice(f"rendering {source.name}", fraction),
         )
     output.print(f"image    {path}")
 

@@ -246,5 +246,8 @@ def value_at(experiment: dict, key: str) -> Any:
 
 
 def _short(value) -> str:
+    """A value in a line; numbers with the 7 digits that single precision has."""
+    if isinstance(value, (float, np.floating)):
+        value = f"{value:.7g}"
     text = " ".join(str(value).split())
     return text if len(text) <= 70 else f"{text[:67]}..."

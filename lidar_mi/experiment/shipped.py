@@ -1,10 +1,25 @@
-"""The experiments that come with the package."""
+"""Experiments, campaigns and scenes that come with the package, found by their names."""
 
 import difflib
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
+from typing import NamedTuple
 
 from lidar_mi.errors import InputError
+
+
+class _Kind(NamedTuple):
+    """What a file is called, and where those of the package are."""
+
+    called: str
+    folder: str
+    suffix: str
+
+
+_EXPERIMENT = _Kind("an experiment file", "", ".yaml")
+_CAMPAIGN = _Kind("a campaign file", "campaigns", ".yaml")
+_SCENE = _Kind("a Mitsuba scene (XML)", "", ".xml")
 
 
 def experiments() -> list[str]:
@@ -16,7 +31,19 @@ def experiments() -> list[str]:
     >>> "wake_backscatter" in lm.experiments()
     True
     """
-    return sorted(path.stem for path in _folder().glob("*.yaml"))
+    return _names(_EXPERIMENT)
+
+
+def campaigns() -> list[str]:
+    """Names of the campaigns that come with the package, in alphabetical order.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> "design_map" in lm.campaigns()
+    True
+    """
+    return _names(_CAMPAIGN)
 
 
 def experiment_file(name: str | Path) -> Path:
@@ -29,22 +56,53 @@ def experiment_file(name: str | Path) -> Path:
     InputError
         Neither a file nor a shipped experiment.
     """
+    return _found(name, [_EXPERIMENT])
+
+
+def campaign_file(name: str | Path) -> Path:
+    """The same of a campaign, or of an experiment, whose variants are one.
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    return _found(name, [_CAMPAIGN, _EXPERIMENT])
+
+
+def scene_file(name: str | Path) -> Path:
+    """The same of a Mitsuba scene.
+
+    Raises
+    ------
+    InputError
+        There is none.
+    """
+    return _found(name, [_SCENE])
+
+
+def _found(name: str | Path, kinds: Sequence[_Kind]) -> Path:
     path = Path(name)
     try:
         if path.is_file():
             return path
     except OSError as error:  # a name that is too long
-        raise InputError(f"{name}: {error.strerror}; expected an experiment file") from None
-    shipped = _folder() / (path.name if path.suffix == ".yaml" else f"{path.name}.yaml")
-    if path.parent == Path() and shipped.is_file():
-        return shipped
-    names = experiments()
-    close = difflib.get_close_matches(path.stem, names, 1)
+        raise InputError(f"{name}: {error.strerror}; expected {kinds[0].called}") from None
+    for kind in kinds:
+        file = path.name if path.suffix == kind.suffix else f"{path.name}{kind.suffix}"
+        shipped = _folder(kind) / file
+        if path.parent == Path() and shipped.is_file():
+            return shipped
+    close = difflib.get_close_matches(path.stem, [n for kind in kinds for n in _names(kind)], 1)
     hint = f"did you mean {close[0]}? Expected" if close else "expected"
     raise InputError(
-        f"{name}: no such file; {hint} an experiment file or one of {', '.join(names)}"
+        f"{name}: no such file; {hint} {kinds[0].called} or one of {', '.join(_names(kinds[0]))}"
     )
 
 
-def _folder() -> Path:
-    return Path(str(files("lidar_mi.scenes")))
+def _names(kind: _Kind) -> list[str]:
+    return sorted(path.stem for path in _folder(kind).glob(f"*{kind.suffix}"))
+
+
+def _folder(kind: _Kind) -> Path:
+    return Path(str(files("lidar_mi.scenes"))) / kind.folder

@@ -2,7 +2,6 @@
 
 from contextlib import contextmanager
 from dataclasses import replace
-from io import BytesIO
 
 import numpy as np
 import OpenEXR
@@ -91,10 +90,8 @@ def sketched_figures():
     """Figures at 40 dots per inch and without layout, in 20 % of the time."""
 
     def sketch(figure, **_):
-        buffer = BytesIO()
         figure.set_layout_engine("none")
-        figure.savefig(buffer, format="png", dpi=40)
-        return buffer.getvalue()
+        return _PNG(figure, dpi=40)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("lidar_mi.io.png._png", sketch)
