@@ -1,4 +1,6 @@
-"""Advection of a scalar field by the wind: the field at t2 from the field at t1."""
+"""Advection of a scalar field by the wind: the field at other times from the field at one."""
+
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import xarray as xr
@@ -40,18 +42,20 @@ def _sampler(values):
     return sample
 
 
-def _departures(velocity, dt, steps):
-    """Node indices from which the air at the nodes came; velocity by axis, in nodes per second."""
+def _departures(velocity, steps: Sequence[float]) -> Iterator[np.ndarray]:
+    """Node indices from which the air at the nodes came, after each of successive steps (s).
+
+    Velocity by axis, in nodes per second.
+    """
     samplers = [_sampler(component) for component in velocity]
-    h = dt / steps
     place = np.indices(velocity[0].shape, dtype=float)
     there = np.stack(velocity)  # of the nodes themselves nothing is to be interpolated
-    for step in range(steps):
-        if step:
+    for number, h in enumerate(steps):
+        if number:
             there = np.stack([sample(place) for sample in samplers])
         half = place - 0.5 * h * there
         place = place - h * np.stack([sample(half) for sample in samplers])
-    return place
+        yield place
 
 
 def advect(
@@ -102,6 +106,54 @@ def advect(
         raise InputError(f"advection.dt: {dt} s is not allowed; any finite time is")
     if steps != int(steps) or steps < 1:
         raise InputError(f"advection.steps: {steps} is not allowed; a whole number >= 1 is")
+    *_, last = _carried(field, v, w, u, [dt / int(steps)] * int(steps), [int(steps) - 1])
+    return last
+
+
+def advect_to(
+    field: xr.DataArray,
+    v: xr.DataArray,
+    w: xr.DataArray,
+    times: Sequence[float] | np.ndarray,
+    u: xr.DataArray | None = None,
+) -> xr.DataArray:
+    """The field at several times before and after its own, as of `advect`.
+
+    Trajectories go on from one time to the next, in midpoint steps no longer than the shortest
+    interval between times: the departure point in solid rotation is off by
+    r (omega t)^3/(6 n^2) after n steps.
+
+    Parameters
+    ----------
+    times : sequence of float
+        s, ascending; 0 is the time of ``field``.
+
+    Returns
+    -------
+    xarray.DataArray
+        float64, dims (time, ...).
+
+    Raises
+    ------
+    InputError
+        Times not finite or not ascending; else as `advect`.
+    """
+    times = np.asarray(times, float)
+    if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
+        raise InputError(f"advection.times: {times} s are not allowed; finite, ascending ones are")
+    states = {0.0: field.astype(float)}
+    longest = np.diff(times).min() if len(times) > 1 else np.abs(times).max() / 4
+    for side in (times[times > 0], times[times < 0][::-1]):
+        intervals = np.diff(side, prepend=0.0)
+        counts = np.ceil(np.abs(intervals) / longest - 1e-6).astype(int).clip(1)
+        steps = np.repeat(intervals / counts, counts)
+        carried = _carried(field, v, w, u, steps, np.cumsum(counts) - 1)
+        states.update(zip(side, carried, strict=True))
+    return xr.concat([states[time] for time in times], xr.Variable("time", times))
+
+
+def _carried(field, v, w, u, steps, wanted) -> Iterator[xr.DataArray]:
+    """The field after successive steps (s), after those of the ``wanted`` numbers."""
     dims = set(field.dims)
     if dims not in ({"y", "z"}, {"x", "y", "z"}) or len(field.dims) != len(dims):
         raise InputError(
@@ -140,14 +192,12 @@ def advect(
         component.transpose(*order).values.astype(float).reshape(shape) / spacing[axis]
         for axis, (_, component) in velocity.items()
     ]
-    moved = np.stack(
-        [
-            _sampler(piece)(_departures(speed, dt, int(steps)))
-            for piece, *speed in zip(pieces, *speeds, strict=True)
-        ]
-    )
-    if pieces.min() >= 0:
-        moved = np.maximum(moved, 0.0)
+    samplers = [_sampler(piece) for piece in pieces]
+    paths = [_departures(speed, steps) for speed in zip(*speeds, strict=True)]
     result = field.transpose(*order).astype(float)
-    result = result.copy(data=moved.reshape(result.shape))
-    return result.transpose(*field.dims)
+    for number, places in enumerate(zip(*paths, strict=True)):
+        if number in wanted:
+            moved = np.stack([sample(p) for sample, p in zip(samplers, places, strict=True)])
+            if pieces.min() >= 0:
+                moved = np.maximum(moved, 0.0)
+            yield result.copy(data=moved.reshape(result.shape)).transpose(*field.dims)

@@ -172,7 +172,7 @@ STAGES = (
     Stage(
         "images",
         render_images,
-        ("truth", "plans", "air"),
+        ("truth", "plans", "air", "flows"),
         has_wake,
         check=check_light,
         remarks=image_remarks,

@@ -14,9 +14,9 @@ from lidar_mi.rendering.phase import Scatterer
 
 
 def image_remarks(
-    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], air: Scatterer
+    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], air: Scatterer, *_: object
 ) -> list[str]:
-    """Warnings of an experiment with a wake, a line each."""
+    """Warnings of an experiment with a wake, a line each; what else images need has none."""
     flow = _of_the_flow(truth.wind) if experiment.wake.file else []
     return [*flow, *_of_the_light(experiment, truth, plans[0], air)]
 

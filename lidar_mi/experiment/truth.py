@@ -81,11 +81,10 @@ def make_truth(
     first, second = flows or read_flows(experiment, beside)
     mapping = experiment.wake.extinction
     smooth1 = _extinction(first, mapping, first, second)
+    flow = mean_flow((first, second))
     if second is None:
-        flow = first
         smooth2 = _advected(smooth1, flow, experiment)
     else:
-        flow = (first + second) / 2
         smooth2 = _extinction(second, mapping, first, second)
     texture = experiment.wake.texture
     if texture.rms > 0:
@@ -120,6 +119,12 @@ def make_truth(
         for pair in ((rough1, rough2), (smooth1, smooth2))
     )
     return Truth(rough, smooth, wind)
+
+
+def mean_flow(flows: Flows) -> xr.Dataset:
+    """The flow that carries the air from t1 to t2: steady, or the mean of both states."""
+    first, second = flows
+    return first if second is None else (first + second) / 2
 
 
 def moves_along(experiment: Experiment) -> bool:

@@ -51,6 +51,9 @@ class Scan(BaseModel):
     follow: Annotated[Speed, Within(-1000, 1000, "the fastest jets")] = Field(
         0.0, description="wind along x with which the gates go along from scan to scan"
     )
+    air: Literal["frozen", "moving"] = Field(
+        "frozen", description="each beam sees the air of the scan's reference time, or of its own"
+    )
     columns: Annotated[int, Within(1, 10**7, "an image has at most 1e7 beams")] = Field(
         219, description="beams across, with aim: angles"
     )

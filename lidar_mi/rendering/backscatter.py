@@ -34,7 +34,7 @@ def extrude(
 
     Parameters
     ----------
-    plane : (z, y) array
+    plane : (z, y) or (time, z, y) array
     plan : ScanPlan
         The scan from farthest away.
     scans : sequence of ScanPlan
@@ -79,7 +79,7 @@ def extrude(
         start = float(plane[axis][0]) - n * _spacing(plane, axis)
         padded[axis] = start + _spacing(plane, axis) * np.arange(padded.sizes[axis])
     thickness = plan.gate_stop - plan.gate_start + 2 * margin
-    solid = padded.expand_dims(x=[plan.centre + plan.position]).transpose("x", "y", "z")
+    solid = padded.expand_dims(x=[plan.centre + plan.position]).transpose(..., "x", "y", "z")
     solid["x"].attrs["cell_width"] = thickness
     return solid
 
@@ -104,7 +104,9 @@ def render_scans(
     ----------
     extinctions : sequence of (x, y, z) arrays
         Extinction coefficient (m^-1) at cell centres, x from the telescope's place at the first
-        scan, all on one grid; a single x plane has its depth in ``x.attrs["cell_width"]``.
+        scan, all on one grid; a single x plane has its depth in ``x.attrs["cell_width"]``. With a
+        first dimension ``time`` (s, equally spaced, from the scan's reference time) every beam
+        meets the air of its own time, linear between these states.
     environment : float
         Extinction coefficient around the slab and up to it, m^-1.
     phase : dict
@@ -180,6 +182,9 @@ def scene_dict(
     place = mi.ScalarTransform4f().translate(low).scale(high - low)
 
     def volume(field):
+        if "time" in field.dims:
+            data = mi.TensorXf(_voxels(field)[..., 0])
+            return {"type": "moving_volume", "data": data, "to_world": place, **_ends(field)}
         grid = mi.VolumeGrid(_voxels(field))
         return {"type": "gridvolume", "grid": grid, "to_world": place, "accel": False}
 
@@ -269,6 +274,9 @@ def _move(
         fields |= {"albedo": both, "phase_function.weight": fraction}
     for name, field in fields.items():
         parameters[f"slab.interior_medium.{name}.data"] = mi.TensorXf(_voxels(field))
+        if "time" in field.dims:
+            for end, time in _ends(field).items():
+                parameters[f"slab.interior_medium.{name}.{end}"] = time
     parameters.update()
 
 
@@ -282,8 +290,13 @@ def _beams(plan: ScanPlan) -> np.ndarray:
 
 
 def _voxels(extinction: xr.DataArray) -> np.ndarray:
-    """Values in the order of a Mitsuba volume grid: z, y, x, channel."""
-    return extinction.transpose("z", "y", "x").values[..., None].astype(np.float32)
+    """Values in the order of a Mitsuba volume grid: time if there is one, z, y, x, channel."""
+    return extinction.transpose(..., "z", "y", "x").values[..., None].astype(np.float32)
+
+
+def _ends(field: xr.DataArray) -> dict[str, float]:
+    """Times of the first and last state of moving air, s."""
+    return {"time_start": float(field["time"][0]), "time_stop": float(field["time"][-1])}
 
 
 def _spacing(field: xr.DataArray, axis: str) -> float:

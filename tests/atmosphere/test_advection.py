@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.atmosphere.advection import advect
+from lidar_mi.atmosphere.advection import advect, advect_to
 from lidar_mi.atmosphere.texture import corrsin_obukhov
 from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
 from lidar_mi.atmosphere.wake import resample
@@ -73,6 +73,40 @@ def test_volumes_turn_about_any_axis():
     # air that has come in through the faces left out
     off = np.abs(moved - exact).sel(x=slice(-7, 7), y=slice(-4, 4), z=slice(-7, 7))
     assert float(off.max()) < 5 * 0.0013 * np.exp(-0.5) / 1.8
+
+
+@pytest.mark.parametrize("omega", [5.0, -5.0])
+def test_rotation_to_several_times_before_and_after(omega):
+    """A blob 8.5 m from the axis: departure points off by r (omega t)^3 / (6 n^2), n steps."""
+    v, w = rotation(omega)
+    times = np.array([-0.1, -0.075, -0.05, -0.025, 0.0, 0.05, 0.1])
+    moved = advect_to(plane(blob), v, w, times)
+    assert moved.dims == ("time", "y", "z") and (moved["time"] == times).all()
+    steepest = np.exp(-0.5) / 3
+    for time in times:
+        exact = rotated(omega * time)
+        inner = {"y": slice(-15, 15), "z": slice(-15, 15)}
+        off = np.abs(moved.sel(time=time) - exact).sel(inner).max()
+        steps = round(abs(time) / 0.025)
+        allowed = 8.55 * abs(omega * time) ** 3 / (6 * max(steps, 1) ** 2) * steepest
+        assert float(off) < 1.2 * allowed + 2e-4
+    assert (moved.sel(time=0) == plane(blob)).all()
+
+
+def test_several_times_are_those_of_advect():
+    """A time far from the first is reached in steps of the others' interval."""
+    v, w = rotation(5.0)
+    for times, steps in (([0.1], 4), ([-0.2], 4), ([0.1, 0.125], 4)):
+        found = advect_to(plane(blob), v, w, times).isel(time=0)
+        expected = advect(plane(blob), v, w, times[0], steps=steps)
+        assert np.abs(found - expected).max() < 1e-12
+
+
+@pytest.mark.parametrize("times", [[0.1, 0.1], [0.2, 0.1], [0.0, np.nan]])
+def test_times_that_do_not_ascend_are_refused(times):
+    v, w = rotation(5.0)
+    with pytest.raises(InputError, match=r"advection\.times: .* finite, ascending ones are"):
+        advect_to(plane(blob), v, w, times)
 
 
 def test_sense_air_moves_with_the_flow():

@@ -13,6 +13,7 @@ from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Keeper
 from lidar_mi.experiment.timed_beams import timed_plans
 from lidar_mi.experiment.truth import Flows, Truth, read_flows
+from lidar_mi.experiment.truth_in_time import air_in_time, state_times
 from lidar_mi.instrument.detector import gate_duration
 from lidar_mi.instrument.detector_noise import noise_budget, noisy_scan
 from lidar_mi.instrument.products import with_products
@@ -89,7 +90,7 @@ def environment_extinction(experiment: Experiment) -> float:
 
 
 def check_light(
-    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], air: Scatterer
+    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], air: Scatterer, flows: Flows
 ) -> None:
     """Check that the images will not be dark or their noise undetermined.
 
@@ -97,9 +98,12 @@ def check_light(
     ------
     InputError
         Air that does not scatter, a detector inconsistent with the pulse, beams too wide for the
-        largest medium.
+        largest medium, moving air in more states than the memory holds.
     """
-    _media(experiment, truth, plans)
+    _media(experiment, truth.extinction, plans)
+    for plan in plans:
+        if plan.beams is not None and experiment.scan.air == "moving":
+            state_times(experiment, flows, plan.beams.time)
     if experiment.detector:
         for plan in plans:
             duration = gate_duration(plan.gate_length())
@@ -120,6 +124,7 @@ def render_images(
     truth: Truth,
     plans: Sequence[ScanPlan],
     air: Scatterer,
+    flows: Flows,
     *,
     log: Log,
     missing: Sequence[str] = IMAGES,
@@ -141,9 +146,15 @@ def render_images(
     def progress(scan: int, done: int, total: int) -> None:
         log.bar(f"rendering scan {scan + 1} of {len(plans)}", done / total)
 
+    fields = list(truth.extinction)
+    if experiment.scan.air == "moving":
+        for index, plan in enumerate(plans):
+            if index in wanted and plan.beams is not None:
+                log.bar(f"moving the air of scan {index + 1} of {len(plans)}", None)
+                fields[index] = air_in_time(experiment, truth, flows, index, plan.beams.time)
     mapping = experiment.wake.extinction
     rendered = render_scans(
-        _media(experiment, truth, plans),
+        _media(experiment, fields, plans),
         plans,
         experiment.lidar,
         environment_extinction(experiment),
@@ -221,13 +232,14 @@ def detector_noise(experiment: Experiment, detected: Sequence[xr.Dataset]) -> di
     return noise_budget(detected[0], experiment.lidar, experiment.detector)
 
 
-def _media(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan]) -> list[xr.DataArray]:
+def _media(
+    experiment: Experiment, fields: Sequence[xr.DataArray], plans: Sequence[ScanPlan]
+) -> list[xr.DataArray]:
     """The extinction at both times, extended to the depth and width of the beams."""
-    fields = truth.extinction
     if fields[0].sizes["x"] > 1:
         return list(fields)
     reach = max(plans, key=lambda plan: plan.gate_stop)
     return [
-        extrude(field.isel(x=0).transpose("z", "y"), reach, experiment.lidar, plans)
+        extrude(field.isel(x=0).transpose(..., "z", "y"), reach, experiment.lidar, plans)
         for field in fields
     ]
