@@ -1,5 +1,6 @@
 """Summary of an experiment before its run, with the checks of a run, in numbers."""
 
+import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -14,9 +15,11 @@ from lidar_mi.experiment.forecast import forecast, lines_seconds
 from lidar_mi.experiment.light_budget import light_budget
 from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth import Truth
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.scan_timing import Schedule
 from lidar_mi.rendering.memory import ceiling
 from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
@@ -44,10 +47,15 @@ def sections(
     ahead = prepared.results
     if asked.wake:
         yield from _backscatter(asked, ahead["truth"], ahead["plans"][0], ahead["air"])
+        if asked.scan.timing:
+            schedule = scan_schedule(asked, ahead["plans"][0], beside)
+            yield "scan of the backscatter lidar", _timing(asked, schedule)
     if asked.doppler:
         yield _doppler(asked)
     if asked.sensor:
         yield _sensor(asked, ahead["requirements"])
+        if asked.sensor.timing:
+            yield "scan of the Doppler lidar", _timing(asked, lines_schedule(asked, beside))
     if prepared.warnings:
         yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
 
@@ -147,6 +155,18 @@ def _doppler(asked: Experiment) -> Section:
         ("range bin", f"{lidar.range_bin:g} m about {lidar.range:g} m"),
         ("photons of a pulse", f"{photons(lidar):.3g}"),
         ("methods", ", ".join(asked.doppler.retrieval.methods)),
+    ]
+
+
+def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
+    """What a scan in time asks of the laser and of the scanner, and how far it is flown."""
+    flown = asked.platform.speed * schedule.duration
+    return [
+        ("duration", f"{schedule.duration:.4g} s"),
+        ("distance flown", f"{flown:.3g} m"),
+        ("beams per second between turns", f"{schedule.beam_rate:.4g}"),
+        ("angular rate", f"{math.degrees(schedule.load.rate):.4g} deg/s"),
+        ("angular acceleration", f"{math.degrees(schedule.load.acceleration):.4g} deg/s^2"),
     ]
 
 

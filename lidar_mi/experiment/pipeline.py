@@ -41,6 +41,7 @@ from lidar_mi.experiment.stages.texture import texture_sweep
 from lidar_mi.experiment.stages.volume import check_volume, scan_volumes, volume_winds
 from lidar_mi.experiment.stages.vortices import combined_vectors, fit_pairs, image_vectors
 from lidar_mi.experiment.stages.winds import check_windows, cross_flow_winds
+from lidar_mi.experiment.timed_beams import line_beams
 from lidar_mi.experiment.truth import make_truth
 from lidar_mi.retrieval.method_names import ImageMethod
 
@@ -193,7 +194,7 @@ STAGES = (
         "texture_sweep", texture_sweep, ("flows",), has_images, timing="retrieve", illustrates=True
     ),
     Stage("detector_noise", _quiet(detector_noise), ("detected",), has_detector),
-    Stage("eye_safety", _quiet(scan_safety), ("plans",), has_images),
+    Stage("eye_safety", _quiet(scan_safety), ("plans", "beside"), has_images),
     Stage(
         "volumes",
         _quiet(scan_volumes),
@@ -229,10 +230,11 @@ STAGES = (
     # both as one sensor
     Stage("requirements", _quiet(requirement_tables), ("beside",), has_sensor, ahead=True),
     Stage("slab_wind", _quiet(slab_wind), ("truth",), has_sensor, ahead=True),
+    Stage("line_beams", _quiet(line_beams), ("beside",), has_sensor, ahead=True),
     Stage(
         "lines",
         measure_lines,
-        ("slab_wind", "rings"),
+        ("slab_wind", "rings", "line_beams"),
         has_sensor,
         check=check_lines,
         timing="sensor",
@@ -241,12 +243,12 @@ STAGES = (
     Stage(
         "u_limits",
         _quiet(limits_of_u),
-        ("slab_wind", "lines", "wind", "wind3d", "cores"),
+        ("slab_wind", "lines", "wind", "wind3d", "cores", "line_beams"),
         has_sensor,
         timing="sensor",
     ),
     Stage("doppler_alone", doppler_alone, ("lines",), has_sensor, timing="sensor"),
-    Stage("costs", _quiet(lidar_costs), ("slab_wind",), has_sensor),
+    Stage("costs", _quiet(lidar_costs), ("slab_wind", "beside"), has_sensor),
     Stage("pulses_needed", _quiet(pulses_needed), ("requirements", "lines"), has_sensor),
     # the vortices, fitted to the most accurate vectors available
     Stage("vectors", _quiet(combined_vectors), ("wind3d",), has_sensor),

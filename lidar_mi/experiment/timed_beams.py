@@ -13,7 +13,7 @@ from lidar_mi.instrument.beams import Beams, steered_beams
 from lidar_mi.instrument.motion import ANGLES, PLACES, Motion, Pose, trajectory, true_pose
 from lidar_mi.instrument.reported import Reported, reported_pose
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.instrument.scan_timing import Directions, Load, ScanTiming, Schedule
+from lidar_mi.instrument.scan_timing import Directions, ScanTiming, Schedule
 from lidar_mi.io.timed_table import read_timed_table
 
 
@@ -70,6 +70,15 @@ def scan_schedule(experiment: Experiment, plan: ScanPlan, beside: str | Path) ->
     return _schedule(
         scan.timing, "scan.timing", plan.y, plan.z, plan.centre, scan.aim == "angles", beside
     )
+
+
+def pulse_train(experiment: Experiment, plan: ScanPlan, beside: str | Path) -> tuple[int, float]:
+    """Pulses of a beam and their rate while they are sent, Hz; a rate of 0 is not known."""
+    if experiment.scan.timing is None:
+        return 1, 0.0
+    pulses = experiment.scan.timing.pulses_per_beam
+    rate = pulses * scan_schedule(experiment, plan, beside).beam_rate
+    return pulses, rate if np.isfinite(rate) else 0.0
 
 
 def lines_schedule(experiment: Experiment, beside: str | Path) -> Schedule:
@@ -219,8 +228,3 @@ def _beams(
         )
     except InputError as error:
         raise InputError(f"platform.motion: {error}") from None
-
-
-def turning_words(load: Load) -> str:
-    """Angular rate and acceleration of a scanner, in words."""
-    return f"{np.degrees(load.rate):.4g} deg/s, {np.degrees(load.acceleration):.4g} deg/s^2"

@@ -108,9 +108,13 @@ def permissible_exposure(wavelength: float, duration: float) -> float:
 
 
 def permissible_pulse(
-    wavelength: float, pulse_duration: float, repetition_rate: float, exposure_duration: float
+    wavelength: float,
+    pulse_duration: float,
+    repetition_rate: float,
+    exposure_duration: float,
+    burst: tuple[float, float] = (1, 0),
 ) -> PulseLimit:
-    """Maximum permissible exposure by each pulse of a regular train.
+    """Maximum permissible exposure by each pulse of a regular train, or of a train of bursts.
 
     The least of three (IEC 60825-1:2014, A.3): a pulse's own limit; the limit of the whole time,
     shared by the pulses in it; and, where light heats the retina (400 to 1400 nm), a pulse's limit
@@ -124,9 +128,11 @@ def permissible_pulse(
         m, s.
     repetition_rate : float
         Pulses per second *that enter the same eye*, Hz; of a scan, those of one direction and of
-        neighbours that overlap with it. 0: a single pulse.
+        neighbours that overlap with it. 0: a single pulse. Of bursts the mean of all time.
     exposure_duration : float
         s, see `time_base`.
+    burst : (pulses, rate)
+        Pulses that follow each other at a rate (Hz) above the mean, as those of one beam do.
 
     Raises
     ------
@@ -148,7 +154,7 @@ def permissible_pulse(
         average = permissible_exposure(wavelength, max(total, pulse_duration)) / pulses
         rules.append((average, "average", total))
         if 400 <= _nanometres(wavelength) < 1400:
-            repeated = _repeated(wavelength, pulse_duration, repetition_rate, total)
+            repeated = _repeated(wavelength, pulse_duration, repetition_rate, total, burst)
             rules.append((repeated, "repeated pulses", pulse_duration))
     exposure, rule, time = min(rules, key=lambda candidate: candidate[0])
     return PulseLimit(exposure, rule, pulses, limiting_aperture(wavelength, time))
@@ -267,6 +273,7 @@ def scan_hazard_distance(
     beams: int,
     scan_rate: float,
     exposure_duration: float,
+    burst: tuple[float, float] = (1, 0),
 ) -> float:
     """Distance from which an eye may look into a whole scan, m.
 
@@ -281,6 +288,8 @@ def scan_hazard_distance(
         Scans per second, Hz.
     exposure_duration : float
         s.
+    burst : (pulses, rate)
+        Pulses of each beam in a scan, and their rate while they are sent, Hz.
 
     Raises
     ------
@@ -298,8 +307,10 @@ def scan_hazard_distance(
     def excess(distance: float) -> float:
         radius2 = beam_radius**2 + (divergence_full / 2 * distance) ** 2
         overlap = min(max(1.0, math.pi / 2 * radius2 / (spacing * distance) ** 2), beams)
+        # beams that overlap may follow each other
+        pulses = burst[0] * overlap
         limit = permissible_pulse(
-            wavelength, pulse_duration, scan_rate * overlap, exposure_duration
+            wavelength, pulse_duration, scan_rate * pulses, exposure_duration, (pulses, burst[1])
         )
         beam = (pulse_energy, beam_radius, divergence_full, limit.aperture)
         return exposure_at(distance, *beam) / limit.exposure - 1
@@ -328,13 +339,14 @@ def assess_pulses(
     exposure_duration: float | None = None,
     extinction: float = 0.0,
     aid: ViewingAid | None = None,
+    burst: tuple[float, float] = (1, 0),
 ) -> EyeSafety:
     """Eye safety of a pulsed Gaussian beam; see `permissible_pulse` and `exposure_at`.
 
     ``exposure_duration`` is by default the standard's `time_base`, ``aid`` binoculars 7 x 50.
     """
     total = time_base(wavelength) if exposure_duration is None else exposure_duration
-    limit = permissible_pulse(wavelength, pulse_duration, repetition_rate, total)
+    limit = permissible_pulse(wavelength, pulse_duration, repetition_rate, total, burst)
     beam = (beam_radius, divergence_full)
     naked = hazard_distance(pulse_energy, limit, *beam, extinction)
     aided = hazard_distance(pulse_energy, limit, *beam, extinction, aid or ViewingAid())
@@ -400,14 +412,15 @@ def _grouping_time(nm: float) -> float:
     return 5e-6 if nm < 1050 else 13e-6
 
 
-def _repeated(wavelength: float, pulse: float, rate: float, total: float) -> float:
+def _repeated(wavelength: float, pulse: float, rate: float, total: float, burst) -> float:
     grouping = _grouping_time(_nanometres(wavelength))
     if pulse > grouping:
         return permissible_exposure(wavelength, pulse)
     counted = min(total, 10.0)  # T2 of a small source
-    inside = rate * grouping
+    inside = max(rate * grouping, min(burst[0], burst[1] * grouping))
     if inside > 1:
-        limit, number = permissible_exposure(wavelength, grouping) / inside, counted / grouping
+        limit = permissible_exposure(wavelength, grouping) / inside
+        number = rate * counted / inside
     else:
         limit, number = permissible_exposure(wavelength, pulse), rate * counted
     if total <= 0.25 or number <= 600:

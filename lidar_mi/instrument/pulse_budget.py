@@ -15,7 +15,7 @@ class PulseBudget:
     Attributes
     ----------
     pulses_per_second : float
-        Of all directions together, Hz.
+        Of all directions together, while they are sent, Hz.
     average_power : float
         Emitted light, W.
     echo_time : float
@@ -41,6 +41,7 @@ def pulse_budget(
     pulse_energy: float,
     farthest: float,
     photons_per_pulse: float = math.nan,
+    sending: float | None = None,
 ) -> PulseBudget:
     """Pulses, power and beams for a scan.
 
@@ -58,6 +59,9 @@ def pulse_budget(
         End of the farthest range bin, m.
     photons_per_pulse : float
         Received from one range bin, see `lidar_mi.instrument.doppler.photons`; NaN: not known.
+    sending : float
+        Time in which the pulses of a slab are sent, without turns of the scanner, s. Default: all
+        the time until the next slab.
 
     Raises
     ------
@@ -70,14 +74,16 @@ def pulse_budget(
         ("pulses_per_direction", pulses_per_direction),
         ("pulse_energy", pulse_energy),
         ("farthest", farthest),
+        ("sending", 1.0 if sending is None else sending),
     ):
         if not (value > 0 and math.isfinite(value)):
             raise InputError(f"{name}: {value} is not allowed; expected more than 0")
-    rate = directions * slabs_per_second * pulses_per_direction
+    mean = directions * slabs_per_second * pulses_per_direction
+    rate = mean if sending is None else directions * pulses_per_direction / sending
     echo_time = 2 * farthest / constants.c
     return PulseBudget(
         pulses_per_second=rate,
-        average_power=rate * pulse_energy,
+        average_power=mean * pulse_energy,
         echo_time=echo_time,
         # rounding must not make an echo that just fits require a second beam
         beams=max(1, math.ceil(rate * echo_time * (1 - 1e-12))),

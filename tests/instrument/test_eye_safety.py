@@ -312,3 +312,25 @@ def test_weak_scan_is_safe_everywhere_and_none_without_spacing():
     assert scan_hazard_distance(1550e-9, 1e-9, 1e-8, 0.08, 2e-3, 1e-3, 100, 10, 10) == 0
     with pytest.raises(InputError, match=r"spacing: 0.0 rad is not allowed"):
         scan_hazard_distance(1550e-9, 1e-3, 1e-8, 0.08, 2e-3, 0.0, 100, 10, 10)
+
+
+def test_pulses_of_a_burst_within_5_us_count_as_one():
+    """IEC 60825-1:2014, A.3 c: the limit of 5 us for all of them together, 2 mJ/m^2 at 532 nm.
+
+    8 pulses at 1 MHz, of which 5 come within it; at 100 kHz each has the limit by itself.
+    """
+    alone = permissible_pulse(532e-9, 10e-9, 80.0, 0.25)
+    assert alone.exposure == pytest.approx(2e-3)
+    assert permissible_pulse(532e-9, 10e-9, 80.0, 0.25, (8, 1e5)) == alone
+    close = permissible_pulse(532e-9, 10e-9, 80.0, 0.25, (8, 1e6))
+    assert close.exposure == pytest.approx(2e-3 / 5)
+    few = permissible_pulse(532e-9, 10e-9, 30.0, 0.25, (3, 1e6))
+    assert few.exposure == pytest.approx(2e-3 / 3)
+
+
+def test_beams_that_follow_each_other_fast_act_together_near_the_scanner():
+    scan = (532e-9, 1e-3, 10e-9, 0.1, 1e-3, 5e-4, 10_000, 10.0, 0.25)
+    slow, fast = scan_hazard_distance(*scan), scan_hazard_distance(*scan, (1, 1e6))
+    assert fast > slow
+    # far below a pulse in 5 us it makes no difference
+    assert scan_hazard_distance(*scan, (1, 1e4)) == slow

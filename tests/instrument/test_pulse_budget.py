@@ -56,3 +56,11 @@ def test_bad_input_is_named():
         with pytest.raises(InputError) as error:
             call()
         assert str(error.value).startswith(start)
+
+
+def test_pulses_sent_in_a_part_of_the_time_need_a_higher_rate_at_the_same_power():
+    """A scan of 50 ms every 100 ms: twice the rate, and echoes overlap earlier."""
+    even = pulse_budget(219 * 139, 10.0, 1, 1e-3, 485.0)
+    part = pulse_budget(219 * 139, 10.0, 1, 1e-3, 485.0, sending=0.05)
+    assert part.pulses_per_second == pytest.approx(2 * even.pulses_per_second)
+    assert part.average_power == even.average_power and (even.beams, part.beams) == (1, 2)

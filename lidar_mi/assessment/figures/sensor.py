@@ -13,7 +13,7 @@ from lidar_mi.assessment.figures.normalised_errors import (
 )
 from lidar_mi.assessment.figures.plates import Drawn, save_all
 from lidar_mi.assessment.metrics.cores import Core
-from lidar_mi.retrieval.lines.vectors import COMPONENTS
+from lidar_mi.retrieval.lines.vectors import COMPONENTS, line_places
 
 _SPEED = "m s$^{-1}$"
 
@@ -43,7 +43,7 @@ def draw_all(
 def _scan(lines, cores):
     figure = Figure(figsize=(13.6, 4.6), layout="compressed")
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    place = (lines["range"] * lines["direction"]).transpose("line", "axis").values
+    place = line_places(lines)
     speed, true = lines["v_los"].values, lines["v_los_true"].values
     normalised = (speed - true) / lines["v_los_std"].values
     read = np.isfinite(speed)
@@ -95,7 +95,7 @@ def _maps(found, lines, cores):
     axes = figure.subplots(3, 3, sharex=True, sharey=True)
     valid = found["flag"] == 0
     y, z = found["y"], found["z"]
-    place = (lines["range"] * lines["direction"]).transpose("line", "axis").values
+    place = line_places(lines)
     for row, name in zip(axes, COMPONENTS, strict=True):
         true, value = found[f"{name}_true"], found[name].where(valid)
         error = value - true

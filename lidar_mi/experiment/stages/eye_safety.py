@@ -1,11 +1,13 @@
 """Eye safety of the backscatter lidar's beams."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
 from lidar_mi.assessment.metrics.safety import ScanSafety
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.timed_beams import pulse_train
 from lidar_mi.instrument.eye_safety import assess_pulses, scan_hazard_distance
 from lidar_mi.instrument.scan import ScanPlan
 
@@ -13,24 +15,29 @@ EXPOSURE = 10.0
 """Time of exposure to the beams, s, unless given by the sensor."""
 
 
-def scan_safety(experiment: Experiment, plans: Sequence[ScanPlan]) -> ScanSafety | None:
+def scan_safety(
+    experiment: Experiment, plans: Sequence[ScanPlan], beside: str | Path
+) -> ScanSafety | None:
     """Distances from which eyes are safe; None: pulses have no duration, so that no limit applies.
 
-    Every direction has a pulse each ``platform.dt``.
+    Every direction has its pulses each ``platform.dt``, at the rate of ``scan.timing``.
     """
     lidar, plan, rate = experiment.lidar, plans[0], 1 / experiment.platform.dt
     if lidar.pulse_duration == 0:
         return None
+    burst = pulse_train(experiment, plan, beside)
     exposure = experiment.sensor.exposure if experiment.sensor else EXPOSURE
     pulse = (lidar.wavelength, lidar.pulse_energy, lidar.pulse_duration)
     beam = (float(lidar.radius_at(0)), lidar.divergence_full)
-    one = assess_pulses(*pulse, *beam, rate, exposure)
+    one = assess_pulses(*pulse, *beam, rate * burst[0], exposure, burst=burst)
     spacing = float(np.mean([np.diff(plan.y).mean(), np.diff(plan.z).mean()])) / plan.centre
     beams = len(plan.y) * len(plan.z)
     return ScanSafety(
         permissible_exposure=one.limit.exposure,
         hazard_distance=one.hazard_distance,
         aided_hazard_distance=one.aided_hazard_distance,
-        scan_hazard_distance=scan_hazard_distance(*pulse, *beam, spacing, beams, rate, exposure),
-        scan_power=lidar.pulse_energy * beams * rate,
+        scan_hazard_distance=scan_hazard_distance(
+            *pulse, *beam, spacing, beams, rate, exposure, burst
+        ),
+        scan_power=lidar.pulse_energy * beams * burst[0] * rate,
     )

@@ -21,6 +21,7 @@ from lidar_mi.experiment.stages.ring_velocities import (
     speeds_to_laser,
 )
 from lidar_mi.experiment.truth import Truth, find_file
+from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_at
 from lidar_mi.instrument.fringe_camera import fringe_image
@@ -56,7 +57,9 @@ def slab_wind(experiment: Experiment, truth: Truth) -> xr.Dataset:
     return wind if "u" in wind else wind.assign(u=xr.zeros_like(wind["v"]))
 
 
-def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
+def check_lines(
+    experiment: Experiment, wind: xr.Dataset, rings: Rings, beams: Beams | None
+) -> None:
     """Check that both lidars observe the same air, in the Doppler lidar's velocity range.
 
     Raises
@@ -75,8 +78,9 @@ def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
     # lines that leave the wake, bins that reach the telescope
     directions = experiment.sensor.directions
     try:
-        volumes = sight_volumes(directions.directions(), directions.ranges(lidar), lidar)[0]
-        wind_at(wind, volumes)
+        going = directions.directions() if beams is None else beams.direction
+        volumes = sight_volumes(going, directions.ranges(lidar, beams), lidar)[0]
+        wind_at(wind, volumes if beams is None else volumes + beams.origin[:, None])
     except InputError as error:
         raise InputError(f"sensor.directions: {error}") from None
     fastest = experiment.platform.speed + float(
@@ -91,7 +95,7 @@ def check_lines(experiment: Experiment, wind: xr.Dataset, rings: Rings) -> None:
 
 
 def measure_lines(
-    experiment: Experiment, truth: xr.Dataset, rings: Rings, *, log: Log
+    experiment: Experiment, truth: xr.Dataset, rings: Rings, beams: Beams | None, *, log: Log
 ) -> xr.Dataset:
     """Line-of-sight velocities retrieved from the Doppler lidar's rings.
 
@@ -114,6 +118,7 @@ def measure_lines(
         experiment.seed,
         experiment.platform.speed,
         sensor.errors,
+        beams,
     )
     true = lines["v_los_true"].values
     log(f"measuring {len(true)} lines of sight, {sensor.pulses} pulses each")

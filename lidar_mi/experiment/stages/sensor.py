@@ -17,6 +17,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import moves_along
+from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
 from lidar_mi.retrieval.lines.combine import combine
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, wind_from_neighbours, wind_from_triples
@@ -124,11 +125,14 @@ def limits_of_u(
     wind: xr.Dataset,
     found: xr.Dataset | None,
     cores: Sequence[Core],
+    beams: Beams | None,
 ) -> dict[str, float]:
     """Error budget of u, see `mean_squares_without`. Empty without a wind from both lidars."""
     if found is None:
         return {}
-    return mean_squares_without(experiment, truth, lines, crossflow(experiment, wind), found, cores)
+    return mean_squares_without(
+        experiment, truth, lines, crossflow(experiment, wind), found, cores, beams
+    )
 
 
 def mean_squares_without(
@@ -138,6 +142,7 @@ def mean_squares_without(
     crossflow: xr.Dataset,
     found: xr.Dataset,
     cores: Sequence[Core],
+    beams: Beams | None = None,
 ) -> dict[str, float]:
     """Mean square error of u without each cause, and without all of them at once, m^2 s^-2.
 
@@ -177,6 +182,7 @@ def mean_squares_without(
             experiment.seed,
             experiment.platform.speed,
             missed,
+            beams,
         )
         # lines without a velocity remain without
         noise, std = lines["v_los"] - lines["v_los_true"], lines["v_los_std"]

@@ -2,39 +2,59 @@
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable
 from lidar_mi.assessment.metrics.sensor import LidarCost
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.timed_beams import lines_schedule, pulse_train
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.eye_safety import assess_pulses
 from lidar_mi.instrument.pulse_budget import pulse_budget, pulses_for_error
 from lidar_mi.instrument.scan import plan_scans
 
 
-def lidar_costs(experiment: Experiment, truth: xr.Dataset) -> dict[str, LidarCost]:
-    """Cost of the scans of "doppler" and "backscatter", the latter with one pulse per beam."""
+def lidar_costs(
+    experiment: Experiment, truth: xr.Dataset, beside: str | Path
+) -> dict[str, LidarCost]:
+    """Cost of the scans of "doppler" and "backscatter", at the pulse rates of their timing."""
     sensor, doppler, lidar = experiment.sensor, experiment.doppler.lidar, experiment.lidar
     far = float(sensor.directions.ranges(doppler).max()) + doppler.range_bin / 2
     directions = sensor.directions.columns * sensor.directions.rows
     rate = sensor.slabs_per_second
+    line_rate = sensor.pulses * lines_schedule(experiment, beside).beam_rate
     lines = pulse_budget(
-        directions, rate, sensor.pulses, doppler.pulse_energy, far, photons(doppler)
+        directions,
+        rate,
+        sensor.pulses,
+        doppler.pulse_energy,
+        far,
+        photons(doppler),
+        directions * sensor.pulses / line_rate if math.isfinite(line_rate) else None,
     )
     plan = plan_scans(experiment.scan, truth["y"].values, truth["z"].values, (0.0,))[0]
+    pulses, pulse_rate = pulse_train(experiment, plan, beside)
+    beams, slabs = len(plan.y) * len(plan.z), 1 / experiment.platform.dt
     images = pulse_budget(
-        len(plan.y) * len(plan.z),
-        1 / experiment.platform.dt,
-        1,
+        beams,
+        slabs,
+        pulses,
         lidar.pulse_energy,
         float((plan.ranges()[-1] + plan.gate_length() / 2).max()),
+        sending=beams * pulses / pulse_rate if pulse_rate else None,
     )
     radius = float(lidar.radius_at(0))
     safe = (
-        _eye_safety(doppler, doppler.beam_radius, sensor.pulses * rate, sensor.exposure),
-        _eye_safety(lidar, radius, rate, sensor.exposure),
+        _eye_safety(
+            doppler,
+            doppler.beam_radius,
+            sensor.pulses * rate,
+            sensor.exposure,
+            (sensor.pulses, line_rate if math.isfinite(line_rate) else 0.0),
+        ),
+        _eye_safety(lidar, radius, pulses * rate, sensor.exposure, (pulses, pulse_rate)),
     )
     return {
         "doppler": LidarCost(
@@ -63,7 +83,9 @@ def pulses_needed(
     return pulses_for_error(one, min(limits))
 
 
-def _eye_safety(beam, radius: float, rate: float, exposure: float) -> dict[str, float]:
+def _eye_safety(
+    beam, radius: float, rate: float, exposure: float, burst: tuple[float, float]
+) -> dict[str, float]:
     """Limits of one beam, by the names of `LidarCost`; none for pulses without a duration."""
     if not beam.pulse_duration > 0:
         return {}
@@ -75,6 +97,7 @@ def _eye_safety(beam, radius: float, rate: float, exposure: float) -> dict[str, 
         beam.divergence_full,
         rate,
         exposure,
+        burst=burst,
     )
     distances = {
         name: getattr(safety, name)

@@ -8,7 +8,7 @@ from scipy import sparse
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.lines.crossflow import Crossflow
-from lidar_mi.retrieval.lines.vectors import wind_along_lines
+from lidar_mi.retrieval.lines.vectors import line_origins, line_places, wind_along_lines
 
 # Points along a range bin: Gauss-Legendre, exact for winds of degree 9.
 _ALONG = 5
@@ -48,7 +48,11 @@ def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridL
     nodes, weights = np.polynomial.legendre.leggauss(_ALONG)
     half = np.broadcast_to(scan["range_bin"].values, len(along)) / 2
     reach = scan["range"].values[:, None] + half[:, None] * nodes
-    place = {"y": reach * direction[:, 1:2], "z": reach * direction[:, 2:]}
+    origin = line_origins(scan)
+    place = {
+        axis: origin[:, k : k + 1] + reach * direction[:, k : k + 1]
+        for axis, k in (("y", 1), ("z", 2))
+    }
     used = np.isfinite(along)
     corners = {}
     for name, axis in (("z", z), ("y", y)):
@@ -71,10 +75,10 @@ def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridL
     ]
     row, column, weight = (np.concatenate(p, axis=1)[used] for p in zip(*parts, strict=True))
     variance = scan["v_los_std"].values[used] ** 2
-    middle = np.stack([scan["range"].values * direction[:, k] for k in (1, 2)], -1)
     direction = direction[used]
     forward = weight * direction[:, :1]
-    return GridLines(direction, along[used], variance, row, column, weight, forward), middle[used]
+    middle = line_places(scan)[used, 1:]
+    return GridLines(direction, along[used], variance, row, column, weight, forward), middle
 
 
 def _part(fraction, side):

@@ -28,7 +28,7 @@ def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
     """The air's velocity along every line of sight, away from the instrument, m s-1.
 
     Direction times wind: the platform's velocity along the line less the measured one, which is
-    positive toward the instrument.
+    positive toward the instrument. That velocity is one for all lines, (axis), or each line's own.
 
     Raises
     ------
@@ -39,14 +39,16 @@ def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
     for name in _NAMES:
         if name not in scan:
             raise InputError(f"scan.{name}: missing; expected {', '.join(_NAMES)}")
+    own = {"line"} & set(scan["platform_velocity"].dims)
     for name, dims in (
         ("v_los", {"line"}),
         ("v_los_std", {"line"}),
         ("range", {"line"}),
         ("direction", {"line", "axis"}),
-        ("platform_velocity", {"axis"}),
+        ("platform_velocity", {"axis"} | own),
+        ("origin", {"line", "axis"}),
     ):
-        if set(scan[name].dims) != dims:
+        if name in scan and set(scan[name].dims) != dims:
             raise InputError(f"scan.{name}: dims {scan[name].dims} are not {tuple(sorted(dims))}")
     if scan.sizes["axis"] != 3:
         raise InputError(f"scan.axis: {scan.sizes['axis']} components are not x, y, z")
@@ -58,6 +60,19 @@ def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
     if not (scan["v_los_std"].values[np.isfinite(scan["v_los"].values)] > 0).all():
         raise InputError("scan.v_los_std: not > 0 m/s everywhere; every line needs its error")
     return scan["direction"].dot(scan["platform_velocity"], dim="axis") - scan["v_los"]
+
+
+def line_origins(scan: xr.Dataset) -> np.ndarray:
+    """Where lines of sight start, (line, 3), m from the telescope at the scan's reference time."""
+    if "origin" not in scan:
+        return np.zeros((scan.sizes["line"], 3))
+    return scan["origin"].transpose("line", "axis").values
+
+
+def line_places(scan: xr.Dataset) -> np.ndarray:
+    """Middles of the range bins, (line, 3), m from the telescope at the scan's reference time."""
+    away = (scan["range"] * scan["direction"]).transpose("line", "axis").values
+    return line_origins(scan) + away
 
 
 def solve_lines(
@@ -114,7 +129,7 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
     ----------
     scan : xr.Dataset, dim line
         `v_los`, `v_los_std`, `range`, `direction` (line, axis), `platform_velocity` (axis), as
-        from `lidar_mi.instrument.doppler_scan.scan_wind`.
+        from `lidar_mi.instrument.doppler_scan.scan_wind`; also `origin` (line, axis; m).
 
     Returns
     -------
@@ -195,7 +210,7 @@ def _vectors(scan, along, lines, method) -> xr.Dataset:
     if freedom:
         text = {"units": "1", "long_name": "squared misfit per degree of freedom"}
         misfit["misfit"] = "vector", np.where(missing | flat, np.nan, chi_square / freedom), text
-    centre = (scan["range"].values[lines][..., None] * directions).mean(1)
+    centre = line_places(scan)[lines].mean(1)
     return xr.Dataset(
         {
             **error_variables("vector", covariance),
