@@ -21,6 +21,7 @@ COMPARISONS = (
     "growth",
     "rendered",
     "renderer",
+    "timed",
     "fringes",
     "rings",
     "campaign",

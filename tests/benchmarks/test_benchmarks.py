@@ -40,6 +40,7 @@ from benchmarks import (
     report,
     settings,
     threads,
+    timed,
     transient,
     velocimetry,
 )
@@ -215,6 +216,28 @@ def test_fraction_of_contributing_analog_samples_is_the_optical_depth_of_the_gat
     ]
     assert parts[2].other == pytest.approx(parts[0].other * parts[1].other, rel=0.5)
     assert len({name for name, _ in found}) == 4
+
+
+@pytest.mark.slow
+def test_time_costs_are_ratios_of_the_same_scan():
+    """Three processes, each with its scene; tiny, so that the times themselves say nothing."""
+    found = timed.compare(2, 15, 9, 8)
+    both = [line for line in found.rows if line.ratio]
+    assert [line.case for line in both] == ["timed, against at once", "moving, against frozen air"]
+    assert all(line.ours > 0 and line.other > 0 for line in both)
+    # 13 m/s in 0.09 s are 2.3 nodes of 0.5 m, at most a quarter at a time; an odd number
+    assert found.rows[-1].note == "11 states"
+
+
+def test_flown_beams_meet_the_nodes():
+    from lidar_mi.instrument.scan import Scan, plan_scans
+
+    (plan,) = plan_scans(Scan(), np.arange(-3.0, 4), np.arange(-2.0, 3), (7.5,))
+    flown = timed.in_flight(plan, 75.0)
+    places = flown.beams.true_places(plan.position + plan.centre)
+    z, y = np.meshgrid(plan.z[::-1], plan.y[::-1], indexing="ij")
+    assert places == pytest.approx(np.column_stack([y.ravel(), z.ravel()]), abs=1e-9)
+    assert np.ptp(flown.beams.origin[:, 0]) == pytest.approx(75 * np.ptp(flown.beams.time))
 
 
 def test_renderer_needs_no_more_samples_than_reported(variant):
