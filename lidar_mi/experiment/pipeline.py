@@ -253,7 +253,7 @@ STAGES = (
     # the vortices, fitted to the most accurate vectors available
     Stage("vectors", _quiet(combined_vectors), ("wind3d",), has_sensor),
     Stage("vectors", _quiet(image_vectors), ("wind",), has_vortices_without_sensor),
-    Stage("vortices", fit_pairs, ("scans", "vectors"), has_vortices, timing="vortex"),
+    Stage("vortices", fit_pairs, ("plans", "scans", "vectors"), has_vortices, timing="vortex"),
 )
 
 

@@ -25,7 +25,7 @@ from lidar_mi.instrument.scan_timing import ScanTiming
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table, Tabular
-from lidar_mi.units import Frequency, Length, Number, Speed, Temperature, Time, Within, to_si
+from lidar_mi.units import Angle, Frequency, Length, Number, Speed, Temperature, Time, Within, to_si
 
 
 def _once(key: str, values: tuple) -> None:
@@ -47,6 +47,26 @@ class Platform(Section):
     )
 
 
+class Pointing(Section):
+    """What is known of the pointing from one scan to the next."""
+
+    offset: Literal["known", "free"] = Field(
+        "known", description="free: lines of sight may estimate the wind that it feigns"
+    )
+    stderr: Annotated[Angle, Within(0, 0.1, "displaced by more than the image")] = Field(
+        0.0, description="standard error of pitch and of yaw between the scans"
+    )
+
+    @model_validator(mode="after")
+    def _free_by_how_much(self):
+        if self.offset == "free" and not self.stderr:
+            raise ValueError(
+                "stderr: 0 rad is not allowed with offset free; expected above 0 rad, the standard "
+                "error of the pointing before"
+            )
+        return self
+
+
 class Retrieval(Section):
     """How winds are retrieved from the image pair."""
 
@@ -62,6 +82,7 @@ class Retrieval(Section):
     blur: Literal["beam"] | Annotated[Length, Within(0, 1000, "the widest beam")] = Field(
         0.0, description="standard deviation of the beam's blur, corrected by variational"
     )
+    pointing: Pointing = Pointing()
     error_budget: bool = Field(False, description="also retrieve winds without each cause of error")
     sources: Literal["all", "measured"] = Field(
         "all",

@@ -172,7 +172,7 @@ def render_images(
         scan.attrs |= platform
         if plans[index].beams is not None:
             scan.attrs["reference_time"] = index * experiment.platform.dt
-            scan.attrs["frozen_air"] = 1  # all beams see the air of the reference time
+            scan.attrs["frozen_air"] = int(experiment.scan.air == "frozen")
         yield IMAGES[index], scan
 
 

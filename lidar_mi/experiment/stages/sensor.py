@@ -19,6 +19,7 @@ from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import moves_along
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
+from lidar_mi.retrieval.common_error import NAMES as COMMON_ERRORS
 from lidar_mi.retrieval.lines.combine import combine
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, wind_from_neighbours, wind_from_triples
 
@@ -164,7 +165,8 @@ def mean_squares_without(
     true = {name: truth[name].interp(at).transpose("z", "y").values for name in COMPONENTS}
     surely = {f"{name}_stderr": np.full_like(true[name], _SURE) for name in ("v", "w")}
     surely |= {"v": true["v"], "w": true["w"], "vw_correlation": np.zeros_like(true["v"])}
-    known = crossflow.assign({name: (("z", "y"), field) for name, field in surely.items()})
+    known = crossflow.drop_vars(COMMON_ERRORS, errors="ignore")
+    known = known.assign({name: (("z", "y"), field) for name, field in surely.items()})
     z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
     chosen = (found["flag"].values == 0) & outside_cores(y, z, list(cores))
 

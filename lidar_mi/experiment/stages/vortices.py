@@ -13,7 +13,8 @@ from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.winds import pixel_times, rendered_pairs
+from lidar_mi.experiment.stages.winds import common_error, pixel_times, rendered_pairs
+from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.lines.combine import CombinedFlag
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
@@ -65,15 +66,24 @@ def vectors_method(experiment: Experiment) -> str | None:
 
 
 def fit_pairs(
-    experiment: Experiment, scans: Sequence[xr.Dataset], vectors: xr.Dataset | None, *, log: Log
+    experiment: Experiment,
+    plans: Sequence[ScanPlan],
+    scans: Sequence[xr.Dataset],
+    vectors: xr.Dataset | None,
+    *,
+    log: Log,
 ) -> VortexFits:
     """Vortex pairs from the images and from the vectors, where there are or should be some."""
     with_vectors = bool(experiment.sensor) or vectors is not None
     method = vectors_method(experiment) if with_vectors else None
     log(f"fitting vortex pairs to the images{f' and to the vectors by {method}' if method else ''}")
     pair, noise = list(rendered_pairs(experiment, scans).values())[-1]
-    times = pixel_times(experiment, scans)
-    ways = {Origin.IMAGES: lambda: fit_vortices(*pair, experiment.platform.dt, noise, times=times)}
+    times, common = pixel_times(experiment, scans), common_error(experiment, plans)
+    ways = {
+        Origin.IMAGES: lambda: fit_vortices(
+            *pair, experiment.platform.dt, noise, times=times
+        ).with_common_error(common, common)
+    }
     if with_vectors:
         ways[Origin.VECTORS] = lambda: _from_vectors(vectors)
     fits, refused = {}, {}

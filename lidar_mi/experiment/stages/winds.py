@@ -13,6 +13,7 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment, Retrieval
 from lidar_mi.experiment.truth import Truth, blur_by_beam
 from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.retrieval.common_error import with_common_error
 from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
 from lidar_mi.retrieval.velocimetry.methods import METHODS
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind, wind_bound
@@ -77,6 +78,9 @@ def cross_flow_winds(
                 log.remark(f"{source}: {wind.attrs['fixed_pattern']} in all images")
             if "illumination" in wind.attrs and not methods:
                 log.remark(f"{source}: {wind.attrs['illumination']} between the images")
+            if settings.pointing.stderr:
+                common = common_error(experiment, plans) if source in RENDERED else 0.0
+                wind = with_common_error(wind, common, settings.pointing.offset)
             wind = wind.assign(
                 {name: (field.dims, field.data, field.attrs) for name, field in bound.items()}
             )
@@ -165,9 +169,15 @@ def known_blur(experiment: Experiment, plan: ScanPlan) -> float:
     return float(experiment.lidar.radius_at(plan.centre)) / 2 if blur == "beam" else blur
 
 
+def common_error(experiment: Experiment, plans: Sequence[ScanPlan]) -> float:
+    """Standard error (m/s) of v and of w that all vectors share by the pointing between scans."""
+    distance = sum(plan.centre for plan in plans) / len(plans)
+    return experiment.retrieval.pointing.stderr * distance / experiment.platform.dt
+
+
 def window_settings(settings: Retrieval) -> dict[str, Any]:
     """Window sizes and thresholds, as `retrieve_wind` takes them."""
-    return settings.model_dump(exclude={"methods", "error_budget", "blur", "sources"})
+    return settings.model_dump(exclude={"methods", "error_budget", "blur", "sources", "pointing"})
 
 
 def _warn_of_wide_beams(experiment, truth, plans, log) -> None:

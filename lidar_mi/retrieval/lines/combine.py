@@ -63,7 +63,9 @@ def combine(
     ----------
     crossflow : xr.Dataset, dims (z, y)
         From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`: `v`, `w`, `v_stderr`, `w_stderr`,
-        `vw_correlation`, `flag`. Vectors are taken at the nodes.
+        `vw_correlation`, `flag`. Vectors are taken at the nodes. An error common to all of them
+        (`lidar_mi.retrieval.common_error`) is an unknown of its own if it is ``free``; the lines
+        determine it as far as they are oblique, and u differs from a plane that leans against it.
     scan : xr.Dataset, dim line
         Line-of-sight velocities of the same air, as for
         `lidar_mi.retrieval.lines.vectors.wind_from_triples`, with `range_bin`. A line of sight
@@ -100,7 +102,9 @@ def combine(
         `CombinedFlag`). Where the images gave no vector, v and w are NaN, and lines have less
         weight: there v and w are assumed to be the mean of the others, with twice their standard
         deviation. Attributes: `lines_used`, `misfit` (of the lines, 1 where errors are as stated),
-        and `u_std`, `u_length`, `u_power` and `u_exponent` of largest evidence.
+        and `u_std`, `u_length`, `u_power` and `u_exponent` of largest evidence. With a common error
+        of v and w `v_common_stderr`, `w_common_stderr`, what is left of it, and if it was estimated
+        `v_offset`, `w_offset` (m s-1): what was subtracted from all vectors of the images.
 
     Raises
     ------
@@ -144,6 +148,10 @@ def combine(
     fixed = np.diag(lines.variance + without_image**2 * (across**2 @ field.prior_std**2))
     fixed += _MEAN_STD**2 * np.outer(forward, forward)
     fixed += covariance_of_lines(lines, crossflow_weights(field, lines), *overlap).sum(0)
+    # the lines' velocities per m/s of an error that all vectors share
+    shared = across * lines.weight.sum(1, keepdims=True)
+    if field.estimated:
+        fixed += (shared * field.common**2) @ shared.T
 
     spacing = line_spacing(lines, z, y)
     relative_stds = relative_std(field, lines, z, y, spacing, u_power)
@@ -156,7 +164,7 @@ def combine(
     for start in range(0, len(z), rows):
         chunk = slice(start, start + rows)
         wind[chunk], covariance[chunk] = _posterior(
-            chunk, field, lines, overlap, found, relative_stds, residual, z, y
+            chunk, field, lines, overlap, found, relative_stds, residual, shared, z, y
         )
     wind[..., 1:] += slope * wind[..., :1]
     shear = np.zeros((*valid.shape, 3, 3)) + np.eye(3)
@@ -165,7 +173,7 @@ def combine(
     wind[~valid, 1:] = np.nan
     covariance[~valid, 1:] = covariance[~valid, :, 1:] = np.nan
     flag = CombinedFlag.NO_CROSSFLOW * ~valid + CombinedFlag.BEYOND_LINES * ~_inside(hull, z, y)
-    return _dataset(
+    combined = _dataset(
         crossflow,
         wind,
         covariance,
@@ -180,14 +188,31 @@ def combine(
             "window": window,
         },
     )
+    if field.common.any():
+        combined = _with_common(combined, field, *_common(field, found, residual, shared))
+    return combined
 
 
-def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, z, y):
+def _with_common(combined: xr.Dataset, field, offset, stderr) -> xr.Dataset:
+    """The data set with the error that the images' vectors share, and what is left of it."""
+    for index, name in enumerate(COMPONENTS[1:]):
+        about = {"long_name": f"part of {name}_stderr that all vectors share", "units": "m s-1"}
+        combined[f"{name}_common_stderr"] = (), stderr[index], about
+        if field.estimated:
+            about = {"long_name": f"error of {name} common to all of the images", "units": "m s-1"}
+            combined[f"{name}_offset"] = (), offset[index], about
+    return combined
+
+
+def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, shared, z, y):
     """Wind (z, y, 3) and covariance (z, y, 3, 3) at the nodes of some rows."""
     root = field.root[rows]
     across = covariance_with_nodes(rows, lines, crossflow_weights(field, lines), *overlap)
     across = np.einsum("zyab,bzyl->azyl", root, across)
     known = np.einsum("zyab,zycb->zyac", root, root)
+    if field.estimated:
+        across = across + (field.common**2 * shared).T[:, None, None, :]
+        known = known + np.diag(field.common**2)
     prior = np.concatenate([np.zeros((*field.value[rows].shape[:2], 1)), field.value[rows]], -1)
     winds, covariances = [], []
     for choice in choices:
@@ -207,12 +232,34 @@ def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, z,
         covariance = -np.einsum("lazy,lbzy->zyab", whitened, whitened, optimize=True)
         covariance[..., 0, 0] += _MEAN_STD**2 + strength[rows] ** 2
         covariance[..., 1:, 1:] += known
+        if field.common.any() and not field.estimated:
+            # an error that the estimate does not allow for (Schmidt 1966)
+            seen = solve_triangular(choice.factor[0], shared, lower=True)
+            left = np.eye(3)[:, 1:] - np.einsum("lazy,lc->zyac", whitened, seen)
+            covariance += (left * field.common**2) @ left.swapaxes(-1, -2)
         covariances.append(covariance)
     probability = np.array([choice.probability for choice in choices])
     wind = np.tensordot(probability, winds, 1)
     apart = np.array(winds) - wind
     spread = np.einsum("n,nzya,nzyb->zyab", probability, apart, apart)
     return wind, np.tensordot(probability, covariances, 1) + spread
+
+
+def _common(field, choices, residual, shared) -> tuple[np.ndarray, np.ndarray]:
+    """The error (2,) that all vectors of the images share, and its standard error, m/s."""
+    if not field.estimated:
+        return np.zeros(2), field.common
+    means, squares = [], []
+    for choice in choices:
+        seen, data = (
+            solve_triangular(choice.factor[0], part, lower=True) for part in (shared, residual)
+        )
+        gain = field.common[:, None] ** 2 * seen.T
+        means.append(-gain @ data)
+        squares.append(field.common**2 - (gain @ seen).diagonal() * field.common**2)
+    probability = np.array([choice.probability for choice in choices])
+    mean = probability @ means
+    return mean, np.sqrt(probability @ (np.array(squares) + (np.array(means) - mean) ** 2))
 
 
 def _inside(middles: np.ndarray, z: np.ndarray, y: np.ndarray) -> np.ndarray:

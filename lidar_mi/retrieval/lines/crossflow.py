@@ -7,6 +7,7 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_image
+from lidar_mi.retrieval.common_error import common_stderr, own_errors
 
 # Standard deviation of v and w where the images gave no vector, over that of the valid ones:
 # vectors are rejected where the wind varies most.
@@ -17,13 +18,16 @@ class Crossflow(NamedTuple):
     """v and w of the images on the grid, arrays (z, y, ...).
 
     ``root`` is the Cholesky factor of the errors' covariance. Where a vector is not ``valid`` the
-    value is the mean of the valid ones, with the standard deviation ``prior_std`` (2,).
+    value is the mean of the valid ones, with the standard deviation ``prior_std`` (2,). All share
+    an error of standard deviation ``common`` (2,), which may be ``estimated`` or is only stated.
     """
 
     value: np.ndarray
     root: np.ndarray
     valid: np.ndarray
     prior_std: np.ndarray
+    common: np.ndarray
+    estimated: bool
 
 
 def apparent_slopes(z: np.ndarray, y: np.ndarray, distance: float | None) -> np.ndarray:
@@ -51,6 +55,7 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
             raise InputError(f"crossflow.{name}: missing; expected v, w and flag on (z, y)")
         checked_image(f"crossflow.{name}", wind[name])
     value = np.stack([wind[n].transpose("z", "y").values.astype(float) for n in ("v", "w")], -1)
+    common = common_stderr(wind)
     if std is not None:
         if not std > 0:
             raise InputError(f"crossflow_std: {std} m/s is not allowed; expected more than 0 m/s")
@@ -63,9 +68,8 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
             raise InputError(
                 f"crossflow.v_stderr: not known by method {method!r}; give crossflow_std"
             )
-        first, second, correlation = (
-            wind[n].transpose("z", "y").values.astype(float) for n in names
-        )
+        *stderr, correlation = (wind[n].transpose("z", "y").values.astype(float) for n in names)
+        (first, second), correlation = own_errors(np.stack(stderr), correlation, common)
     valid = (wind["flag"].transpose("z", "y").values == 0) & np.isfinite(value).all(-1)
     valid &= (first > 0) & (second > 0) & (abs(correlation) < 1)
     if not valid.any():
@@ -76,7 +80,9 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
     root[..., 1, 1] = np.sqrt(1 - correlation**2) * second
     root[~valid] = 0.0
     mean, prior_std = value[valid].mean(0), _PRIOR_WITHOUT_IMAGE * value[valid].std(0)
-    return Crossflow(np.where(valid[..., None], value, mean), root, valid, prior_std)
+    value = np.where(valid[..., None], value, mean)
+    free = bool(common.any()) and wind.attrs.get("pointing_offset") == "free"
+    return Crossflow(value, root, valid, prior_std, common, free)
 
 
 def window_size(crossflow: xr.Dataset) -> float:

@@ -119,6 +119,17 @@ class VortexPairFit(Tabular):
             for (name, value), error in zip(values.items(), spread, strict=True)
         }
 
+    def with_common_error(self, v_stderr: float, w_stderr: float) -> "VortexPairFit":
+        """With an error of the wind, m/s, that all of its observations share, by unknown pointing.
+
+        The mean wind is fitted, and so takes the whole error; what derives from it (drift, the wind
+        anywhere, places after some time) has it too. Circulations, radii and separation are as
+        certain as without. Places are as seen by the mean pointing of both scans.
+        """
+        common = np.zeros(len(self.parameters))
+        common[8:10] = v_stderr, w_stderr
+        return replace(self, covariance=self.covariance + np.diag(common**2))
+
     def after(self, seconds: float) -> "VortexPairFit":
         """The pair after some time of drift, with its growing errors.
 

@@ -8,6 +8,7 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.common_error import common_stderr, own_errors
 from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
     TOLERANCE,
@@ -113,6 +114,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     usable = np.isfinite(value).all(0) & np.isfinite(place).all(0)
     usable &= field("flag", np.zeros(usable.shape)) == 0
     stderr = [field(name, np.full(usable.shape, np.nan)) for name in ("v_stderr", "w_stderr")]
+    common = common_stderr(vectors)
     stderr = np.stack(stderr)
     known = bool(np.isfinite(stderr[:, usable]).any())
     if known:
@@ -121,6 +123,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         raise InputError(f"vectors: {int(usable.sum())} are valid; expected at least 20")
     stderr = np.where(usable, stderr if known else 1.0, 1.0)
     rho = np.nan_to_num(field("vw_correlation", np.zeros(usable.shape))) * usable
+    stderr, rho = own_errors(stderr, rho, common if known else np.zeros(2))
     rho = rho.clip(-0.999, 0.999) if known else 0 * rho
     root = np.zeros((2, 2, *usable.shape))
     root[0, 0] = 1 / stderr[0]
@@ -156,7 +159,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     varied = tensors[2][:, valid] - tensors[2][:, valid].mean(1, keepdim=True)
     explained = 1 - float(left.square().sum() / varied.square().sum())
     spacing = (float(np.diff(y).mean()) * float(np.diff(z).mean())) ** 0.5
-    return checked_fit(
+    found = checked_fit(
         best,
         covariance,
         profile,
@@ -167,6 +170,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         z,
         y,
     )
+    return found.with_common_error(*common)
 
 
 def _components(vectors: _Vectors, flow_variance: float) -> Observations:

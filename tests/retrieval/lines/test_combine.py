@@ -17,6 +17,7 @@ from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors, scan_wind
+from lidar_mi.retrieval.common_error import with_common_error
 from lidar_mi.retrieval.lines.combine import CombinedFlag, combine
 from lidar_mi.retrieval.lines.vectors import wind_from_triples
 
@@ -57,7 +58,7 @@ def lines(places, v_los, std, distance=10.0, range_bin=0.0):
     )
 
 
-def written_out(flow, scan, u_std, length, window, exponent, mean_std=100.0):
+def written_out(flow, scan, u_std, length, window, exponent, mean_std=100.0, common=(0.0, 0.0)):
     """Information of everything that is known, as one big matrix over (u, v, w) of all nodes."""
     zz, yy = (a.ravel() for a in np.meshgrid(flow.z, flow.y, indexing="ij"))
     n = len(zz)
@@ -76,6 +77,8 @@ def written_out(flow, scan, u_std, length, window, exponent, mean_std=100.0):
     prior[2 * n :, n : 2 * n] = np.outer(wv, vv) * overlap
     prior[n : 2 * n, 2 * n :] = prior[2 * n :, n : 2 * n].T
     prior[2 * n :, 2 * n :] = (np.outer(wv, wv) + np.outer(ww, ww)) * overlap
+    prior[n : 2 * n, n : 2 * n] += common[0] ** 2
+    prior[2 * n :, 2 * n :] += common[1] ** 2
     background = np.concatenate([np.zeros(n), flow.v.values.ravel(), flow.w.values.ravel()])
     rows = []
     for k in range(scan.sizes["line"]):
@@ -129,6 +132,73 @@ def test_generalised_least_squares_written_out(window, range_bin, exponent):
         pick = [node, n + node, 2 * n + node]
         expected = covariance[np.ix_(pick, pick)]
         np.testing.assert_allclose(covariance_at(found, z, y), expected, atol=1e-6)
+
+
+COMMON = (1.5, 0.8)
+
+
+def sharing(flow, offset):
+    """Vectors whose errors include those that all share, as stated and as matrices need them."""
+    stated = with_common_error(flow, 0.0, offset)
+    for name, common in zip("vw", COMMON, strict=True):
+        own = flow[f"{name}_stderr"]
+        stated[f"{name}_stderr"] = np.hypot(own, common)
+        stated[f"{name}_common_stderr"] = common
+    both = [f["v_stderr"] * f["w_stderr"] for f in (flow, stated)]
+    stated["vw_correlation"] = flow["vw_correlation"] * both[0] / both[1]
+    return stated
+
+
+@pytest.mark.parametrize("offset", ["free", "known"])
+def test_error_that_all_vectors_share(offset):
+    """Free: least squares with that error in the prior. Known: the estimate without it, whose
+    covariance grows by what a shift of all vectors does to it."""
+    random = np.random.default_rng(4)
+    shape = (len(Z), len(Y))
+    flow = crossflow(
+        random.normal(0, 3, shape),
+        random.normal(0, 3, shape),
+        random.uniform(0.3, 2, shape),
+        random.uniform(-0.8, 0.8, shape),
+    )
+    places = random.uniform([-2.6, -1.6], [2.6, 1.6], (8, 2))
+    scan = lines(places, random.normal(0, 3, 8), random.uniform(0.1, 2, 8), range_bin=1.5)
+    settings = {"window": 2.5, "u_std": 1.3, "u_length": 2.0, "u_power": 0.0, "u_exponent": 1.0}
+    found = combine(sharing(flow, offset), scan, **settings)
+    given = (1.3, 2.0, 2.5, 1.0)
+    wind, covariance, n = written_out(
+        flow, scan, *given, common=COMMON if offset == "free" else (0, 0)
+    )
+    if offset == "known":
+        for name, common in zip("vw", COMMON, strict=True):
+            moved, _, _ = written_out(flow.assign({name: flow[name] + common}), scan, *given)
+            change = (moved - wind).ravel()
+            covariance = covariance + np.outer(change, change)
+    for index, name in enumerate("uvw"):
+        np.testing.assert_allclose(found[name], wind[index], atol=1e-6)
+    for z, y in ((0, 0), (2, 3), (4, 6), (1, 5)):
+        node = z * len(Y) + y
+        pick = [node, n + node, 2 * n + node]
+        np.testing.assert_allclose(
+            covariance_at(found, z, y), covariance[np.ix_(pick, pick)], atol=2e-6
+        )
+    left = [float(found[f"{name}_common_stderr"]) for name in "vw"]
+    if offset == "known":
+        assert left == list(COMMON) and "v_offset" not in found
+    else:
+        assert left[0] < 0.97 * COMMON[0] and left[1] < 0.999 * COMMON[1]
+
+
+def test_lines_straight_ahead_do_not_determine_what_all_vectors_share():
+    """They see u alone: nothing is subtracted, and all of the error is left."""
+    random = np.random.default_rng(6)
+    flow = crossflow(random.normal(0, 3, (5, 7)), random.normal(0, 3, (5, 7)), 0.3)
+    scan = lines(np.zeros((3, 2)), random.normal(0, 3, 3), 0.1)
+    found = combine(with_common_error(flow, 2.0, "free"), scan, window=0.0)
+    assert float(found["v_offset"]) == 0 and float(found["w_offset"]) == 0
+    assert float(found["v_common_stderr"]) == pytest.approx(2.0)
+    np.testing.assert_allclose(found["v"], flow["v"], atol=1e-9)
+    np.testing.assert_allclose(found["v_stderr"], np.hypot(0.3, 2.0), rtol=1e-6)
 
 
 def test_images_that_see_motion_along_x():
