@@ -3,6 +3,7 @@
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
 from .errors import InputError
+from .experiment.export import export
 from .experiment.own_frames import calibrate_etalon, retrieve_v_los
 from .experiment.reading import load_experiment
 from .experiment.results import Run
@@ -43,6 +44,7 @@ __all__ = [
     "campaigns",
     "doctor",
     "experiments",
+    "export",
     "fit_vortices",
     "fit_vortices_to_wind",
     "gap_from_fractions",

@@ -10,6 +10,7 @@ from lidar_mi.cli import (
     campaign,
     check,
     doctor,
+    export,
     info,
     render,
     retrieve,
@@ -23,7 +24,6 @@ app = typer.Typer(
     name="lidar-mi",
     help="Virtual lidars that observe wake vortices: from a simulated wake to retrieved winds.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
 )
@@ -45,6 +45,7 @@ app.command(epilog=check.EXAMPLES)(check.check)
 app.command(epilog=render.EXAMPLES)(render.render)
 app.command(epilog=retrieve.EXAMPLES)(retrieve.retrieve)
 app.command(epilog=info.EXAMPLES)(info.info)
+app.command(epilog=export.EXAMPLES)(export.export)
 app.command(epilog=aerosol.EXAMPLES)(aerosol.aerosol)
 app.command(epilog=rings.EXAMPLES)(rings.rings)
 app.command(epilog=calibrate.EXAMPLES)(calibrate.calibrate)

@@ -25,12 +25,12 @@ def test_version_in_a_fresh_process():
 def test_help_names_every_command(lidar_mi):
     code, out, _ = lidar_mi("--help")
     assert code == 0
-    for command in ("run", "check", "render", "retrieve", "info", "aerosol", "doctor"):
+    for command in ("run", "check", "render", "retrieve", "export", "info", "aerosol", "doctor"):
         assert re.search(rf"^│ {command} ", out, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
-    "command", ["run", "check", "render", "retrieve", "info", "aerosol", "doctor"]
+    "command", ["run", "check", "render", "retrieve", "export", "info", "aerosol", "doctor"]
 )
 def test_help_teaches_by_example(lidar_mi, command):
     code, out, _ = lidar_mi(command, "--help")

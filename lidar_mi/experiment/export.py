@@ -1,0 +1,205 @@
+"""Results of a run folder in formats that other programs read: VTK, CSV, MATLAB."""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.arguments import checked_arguments
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.describe import value_at
+from lidar_mi.experiment.resumable_folder import RESULTS, read_record
+from lidar_mi.experiment.stages.rendering import IMAGES
+from lidar_mi.experiment.study import RECORD
+from lidar_mi.io.exr import read_scan
+from lidar_mi.io.folder import make_folder
+from lidar_mi.io.netcdf import read_netcdf
+from lidar_mi.io.vortex_file import read_vortices
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.units import to_si
+
+FORMATS = ("vtk", "csv", "mat")
+_WINDS = ("wind", "wind_volume", "wind3d")
+_AHEAD = {"units": "m", "long_name": "distance ahead of the first image's telescope"}
+
+
+@checked_arguments
+def export(
+    folder: str | Path,
+    format: str = "vtk",
+    out: str | Path | None = None,
+    *,
+    overwrite: bool = False,
+) -> list[Path]:
+    """Write the results of a run for ParaView, a spreadsheet or MATLAB.
+
+    Winds, volumes, both images, lines of sight and vortices, as far as the run has them. Values,
+    standard errors, flags and NaN are kept; places are x ahead, y to port, z up, m, from the
+    telescope at the first scan.
+
+    Parameters
+    ----------
+    folder : path
+        Of a run.
+    format : {"vtk", "csv", "mat"}
+        VTK: a file for each source and method, ``.vti`` on uniform grids, ``.vts`` for images of
+        several gates, whose beams spread, ``.vtu`` for lines of sight and vortices. CSV: a table
+        for each result, one row a vector, with units in the head and flags in words. MATLAB: a
+        file for each result, with structures ``units``, ``long_name``, ``dims``.
+    out : path, optional
+        Folder of the files. Default: one of the format's name in the run's folder.
+    overwrite : bool
+        Replace files that are there.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+
+    Raises
+    ------
+    InputError
+        No run folder, a run without results, a file that is damaged, an unknown format, or a file
+        that is there.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> lm.export("outputs/wake_sensor", "csv")            # doctest: +SKIP
+    """
+    if format not in FORMATS:
+        raise InputError(f"format: {format!r} is not allowed; expected one of {', '.join(FORMATS)}")
+    folder = Path(folder)
+    if (folder / RECORD).is_file():
+        raise InputError(f"{folder}: a folder of several runs; expected one of them, {folder}/...")
+    record = read_record(folder)
+    results = dict(_results(folder, record))
+    if not results:
+        raise InputError(f"{folder}: has no results yet; expected a run with images or winds")
+    out = folder / format if out is None else Path(out)
+    files = dict(_files(out, format, results))
+    there = [path for path in files if path.exists()]
+    if there and not overwrite:
+        raise InputError(
+            f"{there[0]}: exists; expected another folder (-o DIR), or --overwrite to replace it"
+        )
+    make_folder(out)
+    for write in files.values():
+        write()
+    return list(files)
+
+
+def _files(
+    out: Path, format: str, results: dict[str, xr.Dataset]
+) -> Iterator[tuple[Path, Callable[[], None]]]:
+    """Files to be, and what writes each."""
+    from lidar_mi.io.csv_file import write_csv
+    from lidar_mi.io.mat_file import write_mat
+    from lidar_mi.io.vtk_file import suffix, write_vtk
+
+    write = {"vtk": write_vtk, "csv": write_csv, "mat": write_mat}[format]
+    for name, data in results.items():
+        parts = _one_by_one(name, data) if format == "vtk" else [(name, data)]
+        for stem, part in parts:
+            path = out / f"{stem}{suffix(part) if format == 'vtk' else f'.{format}'}"
+            yield path, partial(write, path, part)
+
+
+def _one_by_one(name: str, data: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]:
+    """A data set for each source, method or fit."""
+    labels = [dim for dim in ("source", "algorithm", "fit") if dim in data.dims]
+    if not labels:
+        yield name, data
+        return
+    for label in data[labels[0]].values:
+        yield from _one_by_one(f"{name}_{label}", data.sel({labels[0]: label}))
+
+
+def _results(folder: Path, record: dict) -> Iterator[tuple[str, xr.Dataset]]:
+    """Data sets with the coordinates x, y, z, as far as their files are there."""
+    for name in IMAGES:
+        if (folder / f"{name}.exr").is_file():
+            yield name, _placed_scan(read_scan(folder / f"{name}.exr"))
+    for name in _WINDS:
+        if (folder / RESULTS[name]).is_file():
+            wind = read_netcdf(folder / RESULTS[name])
+            yield name, wind if "x" in wind.coords else wind.assign_coords(x=_slab(record))
+    if (folder / RESULTS["lines"]).is_file():
+        yield "lines_of_sight", _placed_lines(read_netcdf(folder / RESULTS["lines"]))
+    if (folder / RESULTS["vortices"]).is_file():
+        fits = read_vortices(folder / RESULTS["vortices"])
+        if fits:
+            yield "vortices", _vortices(fits).assign_coords(x=_slab(record))
+
+
+def _slab(record: dict) -> xr.Variable:
+    """Middle of the slab in which cross-flow winds are retrieved."""
+    start, depth = (
+        to_si(value_at(record["experiment"], f"scan.{key}"), "m", "500 m")
+        for key in ("range", "thickness")
+    )
+    return xr.Variable((), start + depth / 2, _AHEAD)
+
+
+def _placed_scan(scan: xr.Dataset) -> xr.Dataset:
+    """An image with the place of every pixel; of several gates, whose beams spread, without Y."""
+    about = scan.attrs
+    start, stop, count = about["gate_start"], about["gate_stop"], scan.sizes["gate"]
+    telescope, centre = about["telescope_position"], (start + stop) / 2
+    if count == 1:
+        return scan.isel(gate=0, drop=True).assign_coords(x=((), float(telescope + centre), _AHEAD))
+    edges = np.linspace(start, stop, count + 1)
+    middle = xr.DataArray((edges[1:] + edges[:-1]) / 2, dims="gate")
+    if about["gate_kind"] == "spherical":
+        middle = middle / np.sqrt(1 + (scan["y"] ** 2 + scan["z"] ** 2) / centre**2)
+    dims = ("gate", "z", "y")
+    x = middle.broadcast_like(scan["S0"]).transpose(*dims)
+    places = {"x": telescope + x, "y": x / centre * scan["y"], "z": x / centre * scan["z"]}
+    kept = scan.drop_vars(["y", "z"]).rename_dims(y="column", z="row")
+    dims = ("gate", "row", "column")
+    attrs = {"x": _AHEAD, "y": scan["y"].attrs, "z": scan["z"].attrs}
+    return kept.drop_vars([n for n in kept.data_vars if "gate" not in kept[n].dims]).assign_coords(
+        {n: (dims, p.transpose("gate", "z", "y").values, attrs[n]) for n, p in places.items()}
+    )
+
+
+def _placed_lines(lines: xr.Dataset) -> xr.Dataset:
+    """Lines of sight with the middle of their range bins as place, a column a component."""
+    direction = lines["direction"]
+    places = lines["range"] * direction  # from the telescope at rest in the first image
+    split = lines.drop_vars([n for n in lines.variables if "axis" in lines[n].dims])
+    for axis in ("x", "y", "z"):
+        about = {"units": "m", "long_name": f"{axis} of the middle of the range bin"}
+        split[axis] = "line", places.sel(axis=axis).values, about
+    for axis in ("x", "y", "z"):
+        toward = {"units": "1", "long_name": f"{axis} component of the line's unit vector"}
+        split[f"direction_{axis}"] = "line", direction.sel(axis=axis).values, toward
+        velocity = lines["platform_velocity"]
+        split[f"platform_velocity_{axis}"] = velocity.sel(axis=axis, drop=True)
+    return split.set_coords(["x", "y", "z"])
+
+
+def _vortices(fits: dict[str, VortexPairFit]) -> xr.Dataset:
+    """Parameters of fitted pairs with standard errors: of each vortex, and of the pair."""
+    sides = ("port", "starboard")
+    pairs = []
+    for fit in fits.values():
+        variables: dict[str, tuple] = {}
+        for name, found in fit.quantities.items():
+            about = {"units": found.units, "long_name": found.long_name}
+            side, _, own = name.partition("_")
+            if side not in sides:
+                variables[name] = (), found.value, about
+                variables[f"{name}_stderr"] = (), found.stderr, {"units": found.units}
+            elif side == "port":
+                both = [fit.quantities[f"{one}_{own}"] for one in sides]
+                about["long_name"] = found.long_name.replace(" of the port vortex", "")
+                variables[own] = "vortex", [one.value for one in both], about
+                errors = [one.stderr for one in both]
+                variables[f"{own}_stderr"] = "vortex", errors, {"units": found.units}
+        variables["accepted"] = (), int(fit.success), {"units": "1"}
+        pairs.append(xr.Dataset(variables))
+    found = xr.concat(pairs, "fit").assign_coords(fit=list(fits), vortex=list(sides))
+    return found.set_coords(["y", "z"])

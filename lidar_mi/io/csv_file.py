@@ -1,0 +1,49 @@
+"""Tables as comma-separated text: one row a vector, units in the head, flags also in words."""
+
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.io.text import write_text
+
+
+def write_csv(path: str | Path, data: xr.Dataset) -> None:
+    """Write all values of a data set, one row for each place.
+
+    Columns are coordinates, then variables, as ``v [m s-1]``; numbers that the whole data set
+    shares are repeated in every row. After a column of flags, ``flag in words`` has the reasons,
+    or ``valid``. Missing numbers are ``NaN``.
+
+    Raises
+    ------
+    InputError
+        As of `write_atomically`.
+    """
+    rows = data.expand_dims("row") if not data.dims else data
+    table = rows.to_dataframe(dim_order=[str(dim) for dim in rows.dims]).reset_index()
+    places = [axis for axis in ("x", "y", "z") if axis in data.coords]
+    labels = [str(name) for name in data.coords if name not in places]
+    columns = [*labels, *places, *(str(name) for name in data.data_vars)]
+    table = table[columns]
+    for name in columns:
+        if "flag_masks" in data[name].attrs:
+            words = _in_words(table[name].to_numpy(), data[name].attrs)
+            table.insert(table.columns.get_loc(name) + 1, f"{name} in words", words)
+    heads = {
+        name: f"{name} [{data[name].attrs['units']}]"
+        for name in columns
+        if "units" in data[name].attrs
+    }
+    write_text(path, table.rename(columns=heads).to_csv(index=False, na_rep="NaN"))
+
+
+def _in_words(flags: np.ndarray, attributes: dict) -> list[str]:
+    """Reasons of every flag, ``valid`` where there is none."""
+    masks = np.atleast_1d(attributes["flag_masks"]).astype(int)
+    names = attributes["flag_meanings"].split()
+    words = {
+        int(flag): " ".join(n for n, mask in zip(names, masks, strict=True) if int(flag) & mask)
+        for flag in np.unique(flags)
+    }
+    return [words[int(flag)] or "valid" for flag in flags]

@@ -1,0 +1,88 @@
+"""VTK's XML files: fields on grids and at points in space, for ParaView and its kin."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from pyevtk.hl import gridToVTK, imageToVTK, pointsToVTK
+
+from lidar_mi.io.atomic import write_atomically
+
+AXES = ("x", "y", "z")
+# of a coordinate's steps, relative to their mean: nodes of float32
+_UNEVEN = 1e-4
+
+
+def suffix(data: xr.Dataset) -> str:
+    """``.vti`` for uniform axes, ``.vtr`` for uneven ones, ``.vts`` if curved; points: ``.vtu``."""
+    if any(data[axis].ndim > 1 for axis in AXES):
+        return ".vts"
+    if not set(AXES) & set(data.dims):
+        return ".vtu"
+    return ".vti" if all(_is_uniform(np.atleast_1d(data[axis].values)) for axis in AXES) else ".vtr"
+
+
+def write_vtk(path: str | Path, data: xr.Dataset) -> None:
+    """Write the numbers of a data set as point data of a grid or of points.
+
+    Values keep their types and NaN; u, v, w together become the vector ``wind``, of u = 0 where
+    there is no u. Numbers without dimensions are repeated at every point of a list, and left out
+    of grids. Units are part of an array's name: ``v [m s-1]``.
+
+    Parameters
+    ----------
+    path : str or Path
+        With the suffix that `suffix` gives.
+    data : xr.Dataset
+        With the coordinates x, y, z in m, each a number, an axis, or a value of every node; one
+        dimension of another name: points.
+
+    Raises
+    ------
+    InputError
+        As of `write_atomically`.
+    """
+    kind, shape = suffix(data), data[[*AXES]].sizes
+    dims = tuple(map(str, shape)) if kind in (".vts", ".vtu") else AXES
+    points = {}
+    for name, variable in data.variables.items():
+        there = set(variable.dims) & set(dims) or (kind == ".vtu" and not variable.dims)
+        if variable.dtype.kind in "iuf" and name not in AXES and there:
+            points[_label(data, str(name))] = _values(data[name], data, dims)
+    if {"v", "w"} <= set(data.data_vars) and set(data["v"].dims) & set(dims):
+        v, w = (_values(data[name], data, dims) for name in ("v", "w"))
+        u = _values(data["u"], data, dims) if "u" in data else np.zeros_like(v)
+        points["wind [m s-1]"] = u, v, w  # type: ignore[assignment]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "data"
+        axes = [np.atleast_1d(data[axis].values).astype(float) for axis in AXES]
+        if kind == ".vti":
+            steps = tuple(float(axis[-1] - axis[0]) / max(axis.size - 1, 1) or 1.0 for axis in axes)
+            imageToVTK(str(file), tuple(float(axis[0]) for axis in axes), steps, None, points)
+        elif kind == ".vtr":
+            gridToVTK(str(file), *axes, None, points)
+        else:
+            nodes = [_values(data[axis].astype(float), data, dims) for axis in AXES]
+            if kind == ".vts":
+                gridToVTK(str(file), *nodes, None, points)
+            else:
+                pointsToVTK(str(file), *nodes, points)
+        write_atomically(path, file.with_suffix(kind).read_bytes())
+
+
+def _is_uniform(axis: np.ndarray) -> bool:
+    steps = np.diff(axis)
+    return steps.size == 0 or bool(np.ptp(steps) <= _UNEVEN * abs(steps.mean()))
+
+
+def _label(data: xr.Dataset, name: str) -> str:
+    return f"{name} [{data[name].attrs['units']}]" if "units" in data[name].attrs else name
+
+
+def _values(variable: xr.DataArray, data: xr.Dataset, dims: tuple[str, ...]) -> np.ndarray:
+    """On all nodes, in the memory layout that VTK has: x runs fastest."""
+    sizes = {dim: data.sizes.get(dim, 1) for dim in dims}
+    missing = {dim: size for dim, size in sizes.items() if dim not in variable.dims}
+    full = variable.variable.set_dims({**missing, **variable.sizes}).transpose(*dims).values
+    return np.asfortranarray(full)
