@@ -113,6 +113,30 @@ def test_the_air_of_the_reference_times_is_the_truth(name):
     assert moved > 0.2 * scale
 
 
+def test_air_along_x_in_the_frame_of_the_gates():
+    """Behind a turbine: 8 m/s, gates that follow with 6 m/s; half a second is two nodes."""
+    turbine = lm.load_experiment("turbine", scan={"air": "moving"})
+    assert turbine.scan.follow == 6
+    x, across = 498 + SPACING * np.arange(49), SPACING * np.arange(6)
+    k = 2 * np.pi / WAVE
+
+    def of(values):
+        values = np.broadcast_to(np.asarray(values, float)[:, None, None], (49, 6, 6))
+        return xr.DataArray(values, {"x": x, "y": across, "z": across}, ("x", "y", "z"))
+
+    waves = of(MEAN * (1 + 0.5 * np.cos(k * (x - x[24]))))
+    still, flow = of(np.zeros(49)), of(np.full(49, 8.0))
+    truth = Truth((waves, waves), (waves, waves), xr.Dataset())
+    flows = (xr.Dataset({"u": flow, "v": still, "w": still}), None)
+    air = air_in_time(turbine, truth, flows, 0, np.array([-0.5, 0.5]))
+    assert air.sizes["time"] == 17  # four nodes in the scan
+    inner = slice(8, 40)
+    for time in (-0.5, -0.21, 0.0, 0.33, 0.5):
+        now = air.interp(time=time).values[inner, 3, 3]
+        phase = np.angle((now * np.exp(1j * k * (x[inner] - x[24]))).sum())
+        assert phase / k == pytest.approx(2 * time, abs=0.005 * SPACING)
+
+
 def test_molecules_stay(experiment, carried):
     """They are everywhere the same, and their part is in the sum at any time."""
     truth, flows = carried
