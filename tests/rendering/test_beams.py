@@ -16,6 +16,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.io.exr import read_scan, write_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
+from lidar_mi.rendering.scene import render_file
 from lidar_mi.rendering.settings import RenderSettings
 
 pytestmark = pytest.mark.usefixtures("variant")
@@ -169,3 +170,39 @@ def test_the_plane_is_extended_to_all_beams():
                 assert solid[axis].min() < place.min() - radius
                 assert solid[axis].max() > place.max() + radius
     assert solid.isel(x=0).sel(y=Y, z=Z).shape == (len(Y), len(Z))
+
+
+def test_a_scene_file_with_beams_is_corrected_by_their_own_ranges(tmp_path):
+    """Origins 40 m apart along x: 16 % in S0, nothing in Y but the transmittance."""
+    rng = np.random.default_rng(5)
+    table = np.zeros((12, 7))
+    table[:, 0], table[:, 3] = np.linspace(-20, 20, 12), 1
+    table[:, 4:6] = rng.uniform(-0.05, 0.05, (12, 2))
+    np.savetxt(tmp_path / "beams.csv", table, delimiter=",")
+    (tmp_path / "beams.xml").write_text(
+        f"""<scene version="3.0.0">
+          <integrator type="gated_volpath"/>
+          <medium type="homogeneous" id="air">
+            <float name="sigma_t" value="1e-4"/> <float name="albedo" value="1"/>
+            <phase type="rayleigh_polarized"/>
+          </medium>
+          <sensor type="scanning_lidar">
+            <string name="beams" value="{tmp_path / "beams.csv"}"/>
+            <float name="gate_start" value="500"/> <float name="gate_stop" value="502.5"/>
+            <emitter type="laser"/> <ref id="air"/>
+            <sampler type="independent"> <integer name="sample_count" value="256"/> </sampler>
+            <film type="hdrfilm">
+              <integer name="width" value="4"/> <integer name="height" value="3"/>
+              <rfilter type="box"/>
+            </film>
+          </sensor>
+        </scene>"""
+    )
+    scan = render_file(tmp_path / "beams.xml", tmp_path / "out.exr")
+    cosine = 1 / np.linalg.norm(table[:, 3:6], axis=1)
+    depth = 1e-4 * (501.25 - table[:, 0]) / cosine
+    expected = 1e-4 * BACKSCATTER * np.exp(-2 * depth).reshape(3, 4)[::-1, ::-1]
+    sigma = (scan["S0_stderr"] / scan["S0"]).values[0]
+    assert (np.abs(scan["Y"].values / expected - 1) < 5 * sigma + 1e-4).all()
+    assert np.ptp(scan["S0"].values) > 0.1 * scan["S0"].values.mean()
+    assert scan.attrs["grid"] == 0
