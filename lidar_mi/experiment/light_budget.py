@@ -32,7 +32,8 @@ class LightBudget(NamedTuple):
     s0 : float
         Received energy over emitted pulse energy, of single scattering.
     photoelectrons, noise : float or None
-        Of a pulse, and the relative standard deviation of the signal; None without a detector.
+        Of a pulse, and the relative standard deviation of the signal of all pulses of a beam; None
+        without a detector.
     """
 
     overlap: float
@@ -62,9 +63,9 @@ def light_budget(
     s0 = seen * passing * lidar.aperture_area / distance**2 * backscatter * extinction * length
     counted = spread = None
     if detector:
-        duration = gate_duration(length)
-        means = expected_counts(np.array(s0), lidar, detector, duration, distance, 1.0)
-        variance = noise_variance(*means, detector)
-        counted = float(means[0])
-        spread = math.sqrt(float(variance)) / counted if counted > 0 else math.inf
+        duration, pulses = gate_duration(length), experiment.scan.pulses_per_beam
+        means = expected_counts(np.array(s0), lidar, detector, duration, distance, 1.0, pulses)
+        variance, summed = noise_variance(*means, detector, pulses), float(means[0])
+        counted = summed / pulses
+        spread = math.sqrt(float(variance)) / summed if summed > 0 else math.inf
     return LightBudget(seen, passing, 1 / backscatter, s0, counted, spread)

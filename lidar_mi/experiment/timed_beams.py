@@ -76,7 +76,7 @@ def pulse_train(experiment: Experiment, plan: ScanPlan, beside: str | Path) -> t
     """Pulses of a beam and their rate while they are sent, Hz; a rate of 0 is not known."""
     if experiment.scan.timing is None:
         return 1, 0.0
-    pulses = experiment.scan.timing.pulses_per_beam
+    pulses = experiment.scan.pulses_per_beam
     rate = pulses * scan_schedule(experiment, plan, beside).beam_rate
     return pulses, rate if np.isfinite(rate) else 0.0
 

@@ -5,6 +5,7 @@ receiver, as the paper's light levels need (10^5 photoelectrons in 17 ns leave n
 count). Saturation, dead time, afterpulses and the steps of a digitiser are left out.
 """
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -41,6 +42,7 @@ def noise_terms(
     dark: np.ndarray,
     modes: float | np.ndarray,
     detector: Detector,
+    pulses: int = 1,
 ) -> dict[str, np.ndarray]:
     """Variances of the counts by cause: shot, speckle, background, dark, readout.
 
@@ -52,9 +54,11 @@ def noise_terms(
     Parameters
     ----------
     signal, background, dark : array
-        Mean photoelectrons.
+        Mean photoelectrons of all pulses.
     modes : array
-        Degrees of freedom of the signal's speckle; infinite: none.
+        Degrees of freedom of the signal's speckle, in all pulses; infinite: none.
+    pulses : int
+        Each is read out.
     """
     factor = detector.excess_noise_factor
     return {
@@ -62,7 +66,7 @@ def noise_terms(
         "speckle": signal**2 / modes,
         "background": factor * background,
         "dark": factor * dark,
-        "readout": np.asarray(detector.readout_noise**2),
+        "readout": np.asarray(pulses * detector.readout_noise**2),
     }
 
 
@@ -72,9 +76,10 @@ def noise_variance(
     dark: np.ndarray,
     modes: float | np.ndarray,
     detector: Detector,
+    pulses: int = 1,
 ) -> np.ndarray:
     """Variance of the counts, the sum of `noise_terms`."""
-    terms = noise_terms(signal, background, dark, modes, detector)
+    terms = noise_terms(signal, background, dark, modes, detector, pulses)
     return np.asarray(sum(terms.values()))
 
 
@@ -86,6 +91,7 @@ def detect(
     distance: ArrayLike,
     seed: int | Sequence[int],
     polarization: ArrayLike = 1.0,
+    pulses: int = 1,
 ) -> Detection:
     """Read the detector once, with independent noise of every pixel.
 
@@ -106,6 +112,8 @@ def detect(
         Images with independent noise need different ones.
     polarization : array
         Degree of polarisation of the received light, 0 to 1.
+    pulses : int
+        Whose counts are added up, each with noise and speckle of its own.
 
     Returns
     -------
@@ -129,7 +137,7 @@ def detect(
     _check("polarization", polarization, within, "0 to 1")
     random = _generator(seed)
     signal, background, dark, modes = expected_counts(
-        s0, lidar, detector, duration, distance, polarization
+        s0, lidar, detector, duration, distance, polarization, pulses
     )
     if signal.size and (signal + background + dark).max() > 1e15:
         raise InputError(
@@ -142,9 +150,10 @@ def detect(
     if spread > 0:
         counts = random.gamma(counts / spread, spread)
     if detector.readout_noise > 0:
-        counts = counts + random.normal(0, detector.readout_noise, counts.shape)
-    sensitivity = signal_photoelectrons(1, lidar.pulse_energy, lidar.wavelength, detector)
-    variance = noise_variance(signal, background, dark, modes, detector)
+        readout = math.sqrt(pulses) * detector.readout_noise
+        counts = counts + random.normal(0, readout, counts.shape)
+    sensitivity = pulses * signal_photoelectrons(1, lidar.pulse_energy, lidar.wavelength, detector)
+    variance = noise_variance(signal, background, dark, modes, detector, pulses)
     return Detection(
         counts, (counts - background - dark) / sensitivity, np.sqrt(variance) / sensitivity
     )
@@ -156,6 +165,7 @@ def noisy_scan(
     detector: Detector,
     seed: int | Sequence[int],
     plan: ScanPlan | None = None,
+    pulses: int = 1,
 ) -> xr.Dataset:
     """A scan with the detector's noise, in addition to the noise-free image.
 
@@ -174,6 +184,8 @@ def noisy_scan(
     plan : ScanPlan, optional
         Where the gates lie; left out: as the scan states, in single precision where it was read
         from a file.
+    pulses : int
+        Averaged in every beam.
 
     Raises
     ------
@@ -185,7 +197,7 @@ def noisy_scan(
     s0 = scan["S0"].values
     ranges = np.broadcast_to(plan.ranges(), s0.shape)
     duration = np.broadcast_to(gate_duration(plan.gate_length()), s0.shape)
-    counted = detect(s0, lidar, detector, duration, ranges, seed, _polarization(scan))
+    counted = detect(s0, lidar, detector, duration, ranges, seed, _polarization(scan), pulses)
     scene = (plan, lidar.aperture_area, scan.attrs["environment_extinction"])
     y, y_std = (attenuated_backscatter(x, *scene)[0] for x in (counted.s0, counted.s0_std))
     image, pixel = ("gate", "z", "y"), ("z", "y")
@@ -198,6 +210,8 @@ def noisy_scan(
     fields = detector.model_dump(exclude_none=True)
     attributes = {f"detector_{name}": float(value) for name, value in fields.items()}
     attributes["detector_pulse_energy"] = lidar.pulse_energy
+    if pulses > 1:
+        attributes["detector_pulses"] = float(pulses)
     return scan.assign(
         {
             name: (dims, values.astype(np.float32), {"long_name": text, "units": unit})
@@ -214,8 +228,10 @@ def without_noise(scan: xr.Dataset) -> xr.Dataset:
     return kept
 
 
-def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) -> dict[str, float]:
-    """Contributions to the noise of a scan: medians over all pixels and gates.
+def noise_budget(
+    scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector, pulses: int = 1
+) -> dict[str, float]:
+    """Contributions to the noise of a scan, of all pulses: medians over all pixels and gates.
 
     Keys ``photons`` (at the telescope), ``signal``, ``background``, ``dark`` (photoelectrons),
     ``speckle_modes`` (not without speckle), and the relative standard deviation of S0 by cause,
@@ -233,9 +249,9 @@ def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) 
         raise InputError("S0: 0 everywhere is not allowed; expected a scan with light in it")
     duration = gate_duration(plan.gate_length())
     signal, background, dark, modes = expected_counts(
-        s0, lidar, detector, duration, plan.ranges(), _polarization(scan)
+        s0, lidar, detector, duration, plan.ranges(), _polarization(scan), pulses
     )
-    terms = noise_terms(signal, background, dark, modes, detector)
+    terms = noise_terms(signal, background, dark, modes, detector, pulses)
     lit = signal > 0
     budget = {
         "photons": signal / efficiency(detector),
@@ -245,7 +261,7 @@ def noise_budget(scan: xr.Dataset, lidar: BackscatterLidar, detector: Detector) 
     }
     if detector.speckle:
         budget["speckle_modes"] = np.asarray(modes)
-    terms["all"] = noise_variance(signal, background, dark, modes, detector)
+    terms["all"] = noise_variance(signal, background, dark, modes, detector, pulses)
     for name, variance in terms.items():
         spread = np.sqrt(np.broadcast_to(variance, s0.shape)[lit])
         budget[f"noise.{name}"] = spread / signal[lit]
@@ -259,10 +275,12 @@ def expected_counts(
     duration: ArrayLike,
     distance: ArrayLike,
     polarization: ArrayLike,
+    pulses: int = 1,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float | np.ndarray]:
     """Mean photoelectrons of signal, background and dark current, of one shape; speckle modes.
 
-    Parameters are those of `detect`.
+    Parameters are those of `detect`. Between pulses the air moves by more than a wavelength, so
+    that their speckle is independent.
     """
     signal = signal_photoelectrons(s0, lidar.pulse_energy, lidar.wavelength, detector)
     background = background_photoelectrons(
@@ -271,8 +289,10 @@ def expected_counts(
     dark = dark_counts(detector, duration)
     modes = speckle_modes(detector, lidar, duration, distance, polarization)
     shape = np.broadcast_shapes(signal.shape, background.shape, np.shape(modes))
-    signal, background, dark = (np.broadcast_to(x, shape) for x in (signal, background, dark))
-    return signal, background, dark, modes
+    signal, background, dark = (
+        pulses * np.broadcast_to(x, shape) for x in (signal, background, dark)
+    )
+    return signal, background, dark, pulses * modes
 
 
 def _polarization(scan: xr.Dataset) -> np.ndarray:

@@ -66,6 +66,11 @@ class Scan(BaseModel):
         None, description="when each beam is sent; default: all at once"
     )
 
+    @property
+    def pulses_per_beam(self) -> int:
+        """Pulses averaged in every beam."""
+        return self.timing.pulses_per_beam if self.timing else 1
+
     @model_validator(mode="after")
     def _fits_into_memory(self):
         count = self.columns * self.rows

@@ -109,6 +109,33 @@ def test_mean_and_variance_of_every_noise(changes, mean, variance):
     assert_moments((found.s0 - s0_of(1000)) / found.s0_std, 0, 1)
 
 
+def test_pulses_of_a_beam_are_the_mean_of_as_many_readings():
+    """The same distribution as that of four readings of their own, and half of the noise."""
+    detector = ideal(
+        sky_radiance=3e5,
+        excess_noise_factor=1.5,
+        speckle=True,
+        speckle_modes=2.0,
+        dark_rate=500 / GATE,
+        readout_noise=30.0,
+    )
+    light = np.full(DRAWS, s0_of(300))
+    together = detect(light, LIDAR, detector, GATE, 500.0, 11, pulses=4)
+    each = [detect(light, LIDAR, detector, GATE, 500.0, [11, k + 1]) for k in range(4)]
+    assert together.s0_std == pytest.approx(each[0].s0_std / 2, rel=1e-12)
+    assert_moments((together.s0 - s0_of(300)) / together.s0_std, 0, 1)
+    mean = np.mean([one.s0 for one in each], axis=0)
+    assert stats.ks_2samp(together.s0, mean).pvalue > 1e-3
+    found, one = (
+        noise_budget(a_scan(), LIDAR, Detector(readout_noise=9.0), pulses) for pulses in (4, 1)
+    )
+    assert found["noise.all"] == pytest.approx(one["noise.all"] / 2)
+    assert found["signal"] == pytest.approx(4 * one["signal"])
+    scans = [noisy_scan(a_scan(), LIDAR, Detector(), 7, pulses=pulses) for pulses in (4, 1)]
+    ratio = scans[0]["Y_noise_std"] / scans[1]["Y_noise_std"]
+    assert ratio.values == pytest.approx(0.5, rel=1e-6)
+
+
 def test_no_light_at_all():
     found = read(0, ideal(speckle=True), count=5)
     assert not found.counts.any() and not found.s0.any() and not found.s0_std.any()

@@ -209,9 +209,10 @@ def detect_images(
     lidar, detector, seed = experiment.lidar, experiment.detector, experiment.seed
     # geometry and air are in single precision in a file: here they are known exactly
     air = {"environment_extinction": environment_extinction(experiment)}
+    pulses = experiment.scan.pulses_per_beam
     # random numbers different from those of the light transport
     return [
-        noisy_scan(scan.assign_attrs(air), lidar, detector, [seed, index, 1], plan)
+        noisy_scan(scan.assign_attrs(air), lidar, detector, [seed, index, 1], plan, pulses)
         for index, (scan, plan) in enumerate(zip(scans, plans, strict=True))
     ]
 
@@ -229,7 +230,9 @@ def gridded_scans(experiment: Experiment, detected: Sequence[xr.Dataset]) -> lis
 
 def detector_noise(experiment: Experiment, detected: Sequence[xr.Dataset]) -> dict[str, float]:
     """Contributions to the noise of the first scan, see `noise_budget`."""
-    return noise_budget(detected[0], experiment.lidar, experiment.detector)
+    return noise_budget(
+        detected[0], experiment.lidar, experiment.detector, experiment.scan.pulses_per_beam
+    )
 
 
 def _media(
