@@ -11,6 +11,7 @@ import pytest
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading
+from lidar_mi.experiment.check import sections
 from lidar_mi.experiment.resumable_folder import made_by, new_record
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.timed_beams import line_beams
@@ -216,3 +217,16 @@ def test_lines_that_take_too_long(timing, message):
         line_beams(both(timing), ".")
     with pytest.raises(InputError, match=r"timing.pulses_per_beam: 2 is not allowed with sensor"):
         both(timing | {"pulses_per_beam": 2})
+
+
+def test_check_says_what_a_scan_asks_of_laser_and_scanner():
+    """31 x 21 beams in 80 ms with 20 turns of 1 ms; a turn reverses 31 steps of 1 m at 501.25 m."""
+    asked = experiment({"duration": "80 ms", "dead_time": "1 ms"})
+    rows = dict(dict(sections(asked))["scan of the backscatter lidar"])
+    rate = 31 * 21 / 0.06
+    assert rows["duration"] == "0.08 s" and rows["distance flown"] == "12 m"
+    assert float(rows["beams per second between turns"]) == pytest.approx(rate, rel=1e-3)
+    turning = np.degrees(np.arctan(1 / 501.25)) * rate
+    assert float(rows["angular rate"].split()[0]) == pytest.approx(turning, rel=2e-3)
+    reversal = 2 * turning / 1e-3
+    assert float(rows["angular acceleration"].split()[0]) == pytest.approx(reversal, rel=2e-3)
