@@ -1,13 +1,27 @@
 """Arguments and options common to several commands."""
 
+from pathlib import Path
 from typing import Annotated, overload
 
 import typer
 
 from lidar_mi.errors import InputError
 
+
+def _complete(incomplete: str) -> list[str]:
+    """Experiments of the package and experiment files here, to a shell's completion."""
+    from lidar_mi.experiment.shipped import experiments
+
+    beside = incomplete.rpartition("/")[0]
+    here = Path(beside or ("/" if incomplete.startswith("/") else "."))
+    found = sorted(here.glob("*.yaml")) + sorted(p for p in here.glob("*/") if p.is_dir())
+    names = [f"{path}/" if path.is_dir() else str(path) for path in found]
+    return [name for name in (*experiments(), *names) if name.startswith(incomplete)]
+
+
 ExperimentName = Annotated[
-    str, typer.Argument(help="Experiment file, or the name of a shipped one.")
+    str,
+    typer.Argument(help="Experiment file, or the name of a shipped one.", autocompletion=_complete),
 ]
 Changes = Annotated[
     list[str] | None,

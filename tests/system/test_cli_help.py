@@ -54,8 +54,8 @@ def test_examples_of_the_help_can_be_typed(there, lidar_mi, quick):
 
 
 def test_a_missing_argument_is_a_usage_error(lidar_mi):
-    code, _, err = lidar_mi("retrieve", "a.exr", "b.exr")
-    assert code == 2 and "--dt" in err and "Traceback" not in err
+    code, _, err = lidar_mi("rings")
+    assert code == 2 and "missing argument" in err.lower() and "Traceback" not in err
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,120 @@
+"""``lidar-mi retrieve``: the time step that headers state, the numbers printed, completion.
+
+Detects: a step or an order of images taken on trust where the files contradict it; statistics that
+are not those of the file written; names that a shell does not complete. System tier.
+"""
+
+import re
+
+import numpy as np
+import pytest
+import xarray as xr
+from scipy.ndimage import gaussian_filter
+
+from lidar_mi.cli import options
+from lidar_mi.io.exr import label_scan, write_scan
+from lidar_mi.io.image_times import steps_of
+from tests.support.command_line import shell, words_of
+
+OPTIONS = "--stride", "4", "-o", "w.nc"
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Air that moves by 2 pixels of 0.5 m to port in 0.1 s, from a telescope at 70 m/s."""
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(1)
+    air = 1 + 0.5 * gaussian_filter(rng.normal(size=(40, 60)), 1.5)
+    axes = {"gate": [0], "z": 0.5 * np.arange(40), "y": 0.5 * np.arange(48)}
+    for number, start in enumerate((6, 4, 2)):
+        image = air[:, start : start + 48] + 0.02 * rng.normal(size=(40, 48))
+        names = "S0", "S1", "S2", "S3", "S0_stderr"
+        layers = {name: (("gate", "z", "y"), image[None]) for name in names}
+        about = {"telescope_position": 7.0 * number, "platform_speed": 70.0, "dt": 0.1}
+        layers["S0_stderr"] = ("gate", "z", "y"), 0.02 * image[None]
+        layers |= {"Y": (("z", "y"), image)}
+        scan = label_scan(xr.Dataset(layers, axes, about))
+        write_scan(tmp_path / f"{number}.exr", scan)
+        write_scan(tmp_path / f"silent{number}.exr", scan.drop_attrs(deep=False))
+        timed = scan.assign_attrs(reference_time=0.25 * number)
+        write_scan(tmp_path / f"timed{number}.exr", timed)
+    return tmp_path
+
+
+def test_steps_are_those_of_the_headers(here):
+    assert steps_of(["0.exr", "1.exr", "2.exr"]) == [0.1, 0.1]
+    assert steps_of(["1.exr", "0.exr"]) == [-0.1]
+    assert steps_of(["timed0.exr", "timed1.exr"]) == [0.25]  # by the clock of each scan
+    assert steps_of(["0.exr", "silent1.exr"]) is None
+
+
+def test_order_is_not_judged_where_the_gates_followed_the_air(tmp_path):
+    """A platform at rest whose gates go along with a wind of 12 m/s: its way is -1.2 m."""
+    for number in (0, 1):
+        names = "S0", "S1", "S2", "S3", "S0_stderr"
+        layers = {name: (("gate", "z", "y"), np.ones((1, 2, 3))) for name in names}
+        about = {"telescope_position": -1.2 * number, "platform_speed": 0.0, "dt": 0.1}
+        data = xr.Dataset(
+            layers | {"Y": (("z", "y"), np.ones((2, 3)))},
+            {"gate": [0], "z": [0.0, 1], "y": [0.0, 1, 2]},
+            about,
+        )
+        write_scan(tmp_path / f"{number}.exr", label_scan(data))
+    assert steps_of([tmp_path / "0.exr", tmp_path / "1.exr"]) == [0.1]
+
+
+def test_time_step_and_statistics(here, lidar_mi):
+    code, out, _ = lidar_mi("retrieve", "0.exr", "1.exr", *OPTIONS)
+    assert code == 0 and "dt 0.1 s, by the headers" in words_of(out)
+    wind = xr.load_dataset("w.nc")
+    assert wind.attrs["dt"] == 0.1
+    valid = wind["flag"] == 0
+    np.testing.assert_allclose(wind["v"].where(valid).mean(), 10, atol=0.2)
+    for row, number in (
+        ("mean", lambda a: a.mean()),
+        ("rms", lambda a: float((a**2).mean()) ** 0.5),
+    ):
+        printed = re.search(rf"^│ {row} +│ +(\S+) +│ +(\S+) +│", out, re.MULTILINE).groups()
+        true = [float(number(wind[n].where(valid))) for n in ("v", "w")]
+        np.testing.assert_allclose([float(p) for p in printed], true, rtol=6e-3)
+    printed = re.search(r"^│ mean stated error +│ +(\S+)", out, re.MULTILINE)[1]
+    error = float(wind["v_stderr"].where(valid).mean())
+    np.testing.assert_allclose(float(printed), error, rtol=6e-3)
+    assert f"{float(valid.mean()):.1%} valid" in out
+
+
+def test_contradictions_are_said(here, lidar_mi):
+    code, out, _ = lidar_mi("retrieve", "0.exr", "1.exr", "--dt", 100, *OPTIONS)
+    assert code == 0 and "warning: --dt 100 s, but 0.1 s by the headers" in words_of(out)
+    code, out, _ = lidar_mi("retrieve", "1.exr", "0.exr", "--dt", 0.1, *OPTIONS)
+    assert code == 0 and "warning: by their headers (-0.1 s)" in words_of(out)
+    code, out, _ = lidar_mi("retrieve", "0.exr", "1.exr", "--dt", 0.1, *OPTIONS)
+    assert code == 0 and "warning" not in out
+    for files, words in (
+        (("1.exr", "0.exr"), "images in the order of their times"),
+        (("silent0.exr", "silent1.exr"), "--dt: missing"),
+        (("0.exr", "1.exr", "timed2.exr"), "expected two, or method variational"),
+        (("0.exr", "1.exr", "0.exr"), "images in the order of their times"),
+    ):
+        code, _, err = lidar_mi("retrieve", *files, *OPTIONS)
+        assert code == 2 and words in err and len(err.splitlines()) == 1
+
+
+def test_thresholds_flag_more(here, lidar_mi):
+    def valid(*more):
+        assert lidar_mi("retrieve", "0.exr", "1.exr", *OPTIONS, *more)[0] == 0
+        return int((xr.load_dataset("w.nc")["flag"] == 0).sum())
+
+    usual = valid()
+    for option in ("--min-correlation", "--min-texture", "--min-isotropy"):
+        assert valid(option, "0.95") < usual
+
+
+def test_shells_complete_commands_and_experiments(here):
+    assert "complete" in shell("--show-completion", "bash").stdout
+    (here / "wake_mine.yaml").write_text("")
+    (here / "sub").mkdir()
+    (here / "sub" / "mine.yaml").write_text("")
+    assert {"wake_3d", "wake_sensor", "wake_mine.yaml"} <= set(options._complete("wake_"))
+    assert options._complete("su") == ["sub/"]
+    assert options._complete("sub/m") == ["sub/mine.yaml"]
