@@ -6,6 +6,7 @@ from typing import Any
 
 from lidar_mi.assessment.metrics.images import light_metrics, noise_metrics
 from lidar_mi.assessment.metrics.names import budget_key, timing_key
+from lidar_mi.assessment.metrics.pointing import pointing_metrics
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
 from lidar_mi.assessment.metrics.rings import ring_budget_metrics
 from lidar_mi.assessment.metrics.safety import safety_metrics
@@ -46,6 +47,8 @@ def measure(
     if "wind_volume" in results:
         metrics |= volume_metrics(results["wind_volume"], results["cores"])
         metrics |= noise_metrics(results["scans"][0])
+    if "pointing" in results:
+        metrics |= pointing_metrics(results["pointing"])
     if "error_budget" in results:
         for method, budget in results["error_budget"].items():
             metrics |= {budget_key(method, key): value for key, value in budget.items()}

@@ -14,6 +14,7 @@ from lidar_mi.experiment.stages.lines import (
     requirement_tables,
     slab_wind,
 )
+from lidar_mi.experiment.stages.pointing import beam_pointing
 from lidar_mi.experiment.stages.rendering import (
     IMAGES,
     check_light,
@@ -194,6 +195,7 @@ STAGES = (
         "texture_sweep", texture_sweep, ("flows",), has_images, timing="retrieve", illustrates=True
     ),
     Stage("detector_noise", _quiet(detector_noise), ("detected",), has_detector),
+    Stage("pointing", _quiet(beam_pointing), ("plans",), has_wake),
     Stage("eye_safety", _quiet(scan_safety), ("plans", "beside"), has_images),
     Stage(
         "volumes",

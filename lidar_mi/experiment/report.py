@@ -8,6 +8,7 @@ from pathlib import Path
 from lidar_mi.assessment.figures import backscatter as backscatter_figures
 from lidar_mi.assessment.figures import doppler as doppler_figures
 from lidar_mi.assessment.figures import error_budget as budget_figures
+from lidar_mi.assessment.figures import pointing as pointing_figures
 from lidar_mi.assessment.figures import sensor as sensor_figures
 from lidar_mi.assessment.figures import volume as volume_figures
 from lidar_mi.assessment.figures import vortices as vortex_figures
@@ -17,6 +18,7 @@ from lidar_mi.assessment.report.backscatter import backscatter_chapter
 from lidar_mi.assessment.report.doppler import doppler_chapter
 from lidar_mi.assessment.report.error_budget import budget_chapter
 from lidar_mi.assessment.report.page import Chapter
+from lidar_mi.assessment.report.pointing import pointing_chapter
 from lidar_mi.assessment.report.sensor import sensor_chapter
 from lidar_mi.assessment.report.vector_map import map_data
 from lidar_mi.assessment.report.volume import volume_chapter
@@ -52,7 +54,7 @@ def chapters(
     seconds: dict[str, float] = defaultdict(float)
     log("drawing figures")
     for result, step, chapter in _CHAPTERS:
-        if result in results:
+        if results.get(result) is not None:
             start = time.perf_counter()
             found.append(chapter(experiment, results, metrics, folder, log))
             seconds[step] += time.perf_counter() - start
@@ -73,6 +75,10 @@ def _volume(experiment, results, metrics, folder, log) -> Chapter:
     pair = results["volumes"].pairs[Source.BACKSCATTER]
     drawn = volume_figures.draw_all(folder, results["wind_volume"], pair, results["cores"], log)
     return volume_chapter(experiment, metrics, drawn)
+
+
+def _pointing(experiment, results, metrics, folder, log) -> Chapter:
+    return pointing_chapter(metrics, pointing_figures.draw_all(folder, results["pointing"], log))
 
 
 def _error_budget(experiment, results, metrics, folder, log) -> Chapter:
@@ -116,6 +122,7 @@ def _vortices(experiment, results, metrics, folder, log) -> Chapter:
 _CHAPTERS: tuple[tuple[str, str, Callable[..., Chapter]], ...] = (
     ("wind", "figures", _backscatter),
     ("wind_volume", "figures", _volume),
+    ("pointing", "figures", _pointing),
     ("error_budget", "figures", _error_budget),
     ("v_los", "doppler_figures", _doppler),
     ("lines", "figures", _sensor),

@@ -3,7 +3,11 @@
 from lidar_mi.retrieval.vortices.pair import MEANING
 
 _WIND = ("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_std")
-_DOPPLER = {
+_NAMED = {
+    "pointing.scan_time": "s",
+    "pointing.rms_y": "m",
+    "pointing.rms_z": "m",
+    "pointing.rotation": "rad/s",
     "doppler.line_width": "Hz",
     "doppler.free_spectral_range": "Hz",
     "doppler.velocity_range": "m/s",
@@ -16,11 +20,11 @@ _VORTEX = {
 
 def unit_of(key: str) -> str:
     """Unit of a metric as reports write it; empty for numbers without one."""
+    if key in _NAMED:
+        return _NAMED[key]
     *_, parent, name = ("", *key.split("."))
     if name.startswith(_WIND):
         return "rad" if name.endswith("_direction") else "m/s"
-    if key in _DOPPLER:
-        return _DOPPLER[key]
     if key.startswith("vortex."):
         return _VORTEX.get(name.removesuffix("_stderr"), "")
     if parent.endswith("_core"):
