@@ -21,6 +21,9 @@ def checked_stack(
 ) -> tuple[list[xr.DataArray], float | xr.DataArray | None]:
     """All images, and the noise if it is an image, with these dims on one uniform grid.
 
+    Noise need not be known where image 1 is not finite either, as outside of the beams of a
+    resampled scan: it is the median there, and counts for nothing.
+
     Raises
     ------
     InputError
@@ -32,6 +35,10 @@ def checked_stack(
         noise = others["noise"] = checked_image("noise", noise, axes)
     for other, image in others.items():
         same_grid(stack[0], image, other, f"{name}1")
+    if isinstance(noise, xr.DataArray):
+        unknown = np.isnan(noise) & ~np.isfinite(stack[0])
+        if bool(unknown.any()):
+            noise = noise.where(~unknown, float(noise.median()))
     return stack, noise
 
 
