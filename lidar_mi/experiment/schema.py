@@ -313,6 +313,16 @@ class Experiment(Tabular, Section):
         return copy
 
     @model_validator(mode="after")
+    def _budget_of_photographs(self):
+        timed = self.scan.timing is not None and not self.scan.timing.is_instant
+        if self.retrieval.error_budget and self.scan.air == "moving" and timed:
+            raise ValueError(
+                "retrieval.error_budget: true is not allowed with scan.air: moving, as its causes "
+                "are those of images taken at once; expected scan.air: frozen"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _gates_that_make_a_volume(self):
         if self.volume is None:
             return self
