@@ -18,7 +18,7 @@ def image_remarks(
 ) -> list[str]:
     """Warnings of an experiment with a wake, a line each; what else images need has none."""
     flow = _of_the_flow(truth.wind) if experiment.wake.file else []
-    return [*flow, *_of_the_light(experiment, truth, plans[0], air)]
+    return [*flow, *_of_the_light(experiment, truth, plans[0], air), *_of_the_pattern(experiment)]
 
 
 def _of_the_flow(wind: xr.Dataset) -> list[str]:
@@ -49,4 +49,15 @@ def _of_the_light(
     return [
         f"lidar.fov_half: {1e3 * experiment.lidar.fov_half:.3g} mrad sees {light.overlap:.0%} of "
         f"the light from {plan.centre:.0f} m (overlap of beam, telescope and field of view)"
+    ]
+
+
+def _of_the_pattern(experiment: Experiment) -> list[str]:
+    """Beams along a curve, whose images are resampled."""
+    timing = experiment.scan.timing
+    if timing is None or timing.pattern in ("raster", "serpentine"):
+        return []
+    return [
+        f"scan.timing.pattern: beams of {timing.pattern} are resampled to the nodes of the image; "
+        "stated errors of the wind leave out what this adds, and are too small by up to 3"
     ]

@@ -32,6 +32,11 @@ def prepared(**changes):
         ({"wake": {"names": {"v": "-v", "w": "-w"}}}, "the pair rises"),
         ({"wake": {"names": {"z": "-z", "w": "-w"}}}, "the pair rises"),
         ({"scan": {"range": "76 m"}}, "lidar.fov_half: 5 mrad sees"),
+        (
+            {"scan": {"timing": {"pattern": "lissajous", "cycles": [7, 5], "duration": "50 ms"}}},
+            "beams of lissajous are resampled",
+        ),
+        ({"scan": {"timing": {"pattern": "raster", "duration": "50 ms"}}}, None),
         ({}, None),
     ],
 )
