@@ -48,7 +48,7 @@ def compare(repeats: int = 3, points: int = 24) -> Comparison:
         context = multiprocessing.get_context("spawn")
         pool = stack.enter_context(context.Pool(2, use_threads, (1,)))
         use_threads(1)
-        for samples, count in ((SMALL, points), (LARGE, max(points // 4, 2))):
+        for samples, count in ((SMALL, points), (LARGE, max(points // 2, 2))):
             lines += _rows(folder, clients, pool, samples, count, repeats)
         lines += _costs(folder, clients[2])
     notes = (
