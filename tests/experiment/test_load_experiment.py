@@ -7,14 +7,16 @@ that is no longer found beside the experiment; a message that does not name the 
 import pytest
 
 import lidar_mi as lm
-from lidar_mi.experiment.reading import dump, load
+from lidar_mi.experiment.reading import dump, load, load_variants
 from lidar_mi.experiment.shipped import experiment_file
 
 HERE = "name: here\nwake: {file: air.nc, time: 40 s}\nscan: {range: 300 m}\n"
 
 
 def test_without_changes_it_is_the_file():
-    for name in set(lm.experiments()) - {"near_range", "eye_safe"}:
+    for name in lm.experiments():
+        if load_variants(experiment_file(name)):
+            continue
         assert dump(lm.load_experiment(name)) == dump(load(experiment_file(name)))
 
 

@@ -14,7 +14,7 @@ from tests.support.hostile import KINDS, RENDERED
 from tests.support.sandbox import Sandbox
 
 CORPUS = sorted((Path(__file__).parents[1] / "corpus").glob("*.json"))
-EXAMPLES = 3
+EXAMPLES = 2
 
 
 @pytest.fixture(scope="module")

@@ -110,7 +110,9 @@ def test_thresholds_flag_more(here, lidar_mi):
         assert valid(option, "0.95") < usual
 
 
-def test_shells_complete_commands_and_experiments(here):
+def test_shells_complete_commands_and_experiments(here, monkeypatch):
+    # the shell is named, not looked for among the parents of this process
+    monkeypatch.setenv("_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION", "1")
     assert "complete" in shell("--show-completion", "bash").stdout
     (here / "wake_mine.yaml").write_text("")
     (here / "sub").mkdir()
