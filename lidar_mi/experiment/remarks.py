@@ -2,23 +2,24 @@
 
 from collections.abc import Sequence
 
+import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_divergence, rises
-from lidar_mi.experiment.light_budget import LEAST_OVERLAP, light_budget
+from lidar_mi.experiment.forecast import overlap
+from lidar_mi.experiment.light_budget import LEAST_OVERLAP
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import Truth
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.rendering.phase import Scatterer
 
 
 def image_remarks(
-    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], air: Scatterer, *_: object
+    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], *_: object
 ) -> list[str]:
     """Warnings of an experiment with a wake, a line each; what else images need has none."""
     flow = _of_the_flow(truth.wind) if experiment.wake.file else []
-    return [*flow, *_of_the_light(experiment, truth, plans[0], air), *_of_the_pattern(experiment)]
+    return [*flow, *_of_the_light(experiment, plans[0]), *_of_the_pattern(experiment)]
 
 
 def _of_the_flow(wind: xr.Dataset) -> list[str]:
@@ -39,15 +40,13 @@ def _of_the_flow(wind: xr.Dataset) -> list[str]:
     return []
 
 
-def _of_the_light(
-    experiment: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer
-) -> list[str]:
+def _of_the_light(experiment: Experiment, plan: ScanPlan) -> list[str]:
     """Light that the telescope does not see."""
-    light = light_budget(experiment, truth, plan, air)
-    if light.overlap >= LEAST_OVERLAP:
+    seen = overlap(experiment.lidar, float(np.median(plan.ranges()[0])))
+    if seen >= LEAST_OVERLAP:
         return []
     return [
-        f"lidar.fov_half: {1e3 * experiment.lidar.fov_half:.3g} mrad sees {light.overlap:.0%} of "
+        f"lidar.fov_half: {1e3 * experiment.lidar.fov_half:.3g} mrad sees {seen:.0%} of "
         f"the light from {plan.centre:.0f} m (overlap of beam, telescope and field of view)"
     ]
 
