@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 from pydantic import AliasChoices, Field, PrivateAttr, field_validator, model_validator
 
 from lidar_mi.experiment.schema_air import Scattering, Section, Wake
+from lidar_mi.experiment.schema_encounter import Encounter
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.doppler import DopplerLidar
@@ -293,6 +294,9 @@ class Experiment(Tabular, Section):
     sensor: Sensor | None = Field(None, description="both lidars combined; {} for all defaults")
     volume: Volume | None = Field(
         None, description="u, v, w from all gates, in place of retrieval; {} for all defaults"
+    )
+    encounter: Encounter | None = Field(
+        None, description="a flight through the wake, by fly; {} for all defaults"
     )
     _folder: Path = PrivateAttr(Path())
 

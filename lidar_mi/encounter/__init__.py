@@ -1,0 +1,1 @@
+"""A flight through a wake: aircraft, slabs in time, the lidar as an object that is stepped."""

@@ -1,0 +1,40 @@
+"""What the lidar delivers at a step."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import xarray as xr
+
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Wind and vortices of one slab of air, from the two scans that saw it.
+
+    Attributes
+    ----------
+    time : float
+        When the wind and the vortices are valid: half way between both scans, s.
+    delivered : float
+        When they are there: the second scan's reference time and the latency, s.
+    x : float
+        Plane of the slab along the flight path, m.
+    wind : xarray.Dataset or None, dims (z, y)
+        v, w (m/s) with v_stderr, w_stderr, vw_correlation and flag, and u with u_stderr where there
+        is a Doppler lidar. None before a second scan.
+    pair : VortexPairFit or None
+        The vortices in the slab's plane, at `time`; look at its `success` and `reasons` first.
+    flags : tuple of str
+        What limits the use of the estimate; empty if nothing does.
+    seconds : mapping
+        Time that each part of the estimate took, s, without the rendering.
+    """
+
+    time: float
+    delivered: float
+    x: float
+    wind: xr.Dataset | None
+    pair: VortexPairFit | None
+    flags: tuple[str, ...]
+    seconds: Mapping[str, float]

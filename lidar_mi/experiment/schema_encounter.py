@@ -1,0 +1,108 @@
+"""The keys of an encounter: a flight into the wake, the aircraft, its control."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from lidar_mi.experiment.schema_air import Section
+from lidar_mi.units import (
+    Angle,
+    AngularRate,
+    Area,
+    Frequency,
+    Inertia,
+    Length,
+    Number,
+    Speed,
+    Time,
+    Within,
+    quantity,
+)
+
+_Slope = Annotated[Angle, Within(-0.35, 0.35, "20 degrees")]
+
+
+class Path(Section):
+    """The straight nominal flight path, and where it meets the wake."""
+
+    speed: Annotated[Speed, Within(10, 350, "from a glider to the speed of sound")] = Field(
+        75.0, description="true airspeed"
+    )
+    crossing_angle: Annotated[Angle, Within(0, 1.5708, "0 to 90 degrees")] = Field(
+        quantity("10 deg"), description="of the path and the wake's axis, horizontal"
+    )
+    climb_angle: _Slope = Field(quantity("-3 deg"), description="of the path; the wake is level")
+    miss: tuple[
+        Annotated[Length, Within(-1000, 1000, "an encounter")],
+        Annotated[Length, Within(-1000, 1000, "an encounter")],
+    ] = Field(
+        (0.0, 0.0),
+        description="y and z of the centre of the pair from the path, where and when it arrives",
+    )
+    start: Annotated[Length, Within(1, 20000, "an encounter")] = Field(
+        600.0, description="distance from the wake's centre at the start"
+    )
+    beyond: Annotated[Length, Within(0, 20000, "an encounter")] = Field(
+        300.0, description="distance flown behind the wake's centre"
+    )
+
+
+class Crow(Section):
+    """Sinusoidal deformation of both vortices, in planes inclined by 45 degrees (Crow 1970)."""
+
+    amplitude: Annotated[Length, Within(0, 1000, "less than the separation")] = 0.0
+    wavelength: Annotated[Length, Within(1, 100000, "8.6 separations")] | None = Field(
+        None, description="default: 8.6 separations"
+    )
+
+
+class WakeInTime(Section):
+    """How the wake changes in time and along its axis, beside its drift."""
+
+    decay_time: Annotated[Time, Within(1, 1e9, "a wake's life")] | None = Field(
+        None, description="in which circulation falls to 1/e; default: it stays"
+    )
+    crow: Crow = Crow()
+
+
+class Aircraft(Section):
+    """The aircraft that flies into the wake."""
+
+    model: str = Field(
+        "roll", description="roll: rigid, rolls only; else an aircraft of JSBSim, such as 737"
+    )
+    span: Annotated[Length, Within(1, 200, "aircraft")] = 28.9
+    wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = 91.0
+    roll_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = 6.0e5
+    lift_slope: Annotated[Number, Within(1, 6.2832, "thin wings, per rad")] = Field(
+        5.7, description="of the wing's sections"
+    )
+    largest_aileron: Annotated[Angle, Within(0.001, 1, "aircraft")] = Field(quantity("20 deg"))
+    aileron_rate: Annotated[AngularRate, Within(0.001, 100, "actuators")] = quantity("50 deg/s")
+    aileron_power: Annotated[Number, Within(1e-3, 1, "aircraft")] = Field(
+        0.15, description="rolling moment coefficient per rad of deflection"
+    )
+
+
+class Control(Section):
+    """What steers against the wake."""
+
+    mode: Literal["off", "feedforward", "perfect"] = Field(
+        "feedforward", description="perfect: knows the truth"
+    )
+    latency: Annotated[Time, Within(0, 10, "seconds")] = Field(
+        0.02, description="from the second scan of a slab to its estimate"
+    )
+
+
+class Encounter(Section):
+    """A flight through the wake of the experiment."""
+
+    aircraft: Aircraft = Aircraft()
+    path: Path = Path()
+    wake: WakeInTime = WakeInTime()
+    rate: Annotated[Frequency, Within(0.1, 1000, "slabs a second")] = 10.0
+    look_ahead: Annotated[Length, Within(5, 20000, "a lidar's range")] = Field(
+        150.0, description="range of the farther gate's start"
+    )
+    control: Control = Control()
