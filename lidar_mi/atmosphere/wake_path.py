@@ -81,7 +81,7 @@ class PairAlongPath:
     nearest place of its mean axis. It lacks the self-induction of the curved line, of first order
     in the amplitude, and the difference of the partner's curvature: for an amplitude of 2 m at a
     separation of 47 m and 8.6 separations the velocity differs from that of the curved lines
-    (Biot-Savart) by 1 % of the largest swirl at most.
+    (Biot-Savart) by 0.3 % of the largest swirl at most, outside of the cores.
     """
 
     circulation: float

@@ -139,7 +139,7 @@ def test_the_pair_moves_with_the_air_at_its_vortices():
 
 
 def test_small_deformation_against_curved_lines():
-    """Biot-Savart over sinusoidal lines of 2 m amplitude: within 1 % of the largest swirl."""
+    """Biot-Savart over sinusoidal lines of 2 m amplitude: within 0.3 % of the largest swirl."""
     amplitude, wavelength = 2.0, 8.6 * 47.1
     wake = PairAlongPath(458.0, crow_amplitude=amplitude)
     k = 2 * math.pi / wavelength
@@ -166,7 +166,7 @@ def test_small_deformation_against_curved_lines():
                 np.array(place), start, np.array([1.0, 0, 0]), side * 458.0, wave
             )
         errors.append(np.abs(np.array(wake.wind(*place, 0.0)) - expected).max() / largest)
-    assert max(errors) < 0.01
+    assert max(errors) < 0.003
     straight = PairAlongPath(458.0)
     moved = np.subtract(wake.wind(100.0, 35.0, 8.0, 0.0), straight.wind(100.0, 35.0, 8.0, 0.0))
     assert np.abs(moved).max() > 0.02 * largest
