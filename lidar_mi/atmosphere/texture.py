@@ -192,11 +192,11 @@ class PeriodicTexture:
         places = np.broadcast_arrays(
             *(np.asarray(a, float) / d for a, d in zip((x, y, z), self.spacing, strict=True))
         )
-        return np.exp(
-            map_coordinates(
-                self.coefficients, places, order=_ORDER, mode="grid-wrap", prefilter=False
-            )
+        shape, flat = places[0].shape, np.stack([place.ravel() for place in places])
+        logarithm = map_coordinates(
+            self.coefficients, flat, order=_ORDER, mode="grid-wrap", prefilter=False
         )
+        return np.exp(logarithm).reshape(shape)
 
 
 def periodic_texture(
