@@ -2,6 +2,7 @@
 
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
+from .encounter.virtual_lidar import VirtualLidar
 from .errors import InputError
 from .experiment.export import export
 from .experiment.own_frames import calibrate_etalon, retrieve_v_los
@@ -37,6 +38,7 @@ __all__ = [
     "InputError",
     "Rings",
     "Run",
+    "VirtualLidar",
     "VortexPairFit",
     "__version__",
     "analyse_rings",

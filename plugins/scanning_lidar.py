@@ -210,7 +210,8 @@ def define():
             directions = read_directions(
                 flat.reshape(-1, 3) if flat.size % 3 == 0 else flat, self.beam_count
             )
-            self.m_directions = mi.Float(directions.ravel())
+            # in place: parameters of a traversed scene refer to this array
+            self.m_directions[:] = mi.Float(directions.ravel())
             if self.gate_kind == "planar" and directions[:, 0].min() <= 0:
                 fail(NAME, "gate_kind", "planar", "'spherical' when a beam does not point forward")
             for name, values, each in (("origins", self.m_origins, 3), ("times", self.m_times, 1)):

@@ -1,9 +1,12 @@
 """Sub-grid aerosol texture: the fluctuations that a simulation on a metre grid does not resolve."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike
 from scipy.fft import fftfreq, irfftn, next_fast_len, rfftfreq, rfftn
+from scipy.ndimage import map_coordinates, spline_filter
 
 from lidar_mi.errors import InputError
 
@@ -156,3 +159,79 @@ def corrsin_obukhov(
             "seed": int(seed),
         },
     )
+
+
+# Of the spline through the nodes, as of advection.
+_ORDER = 5
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodicTexture:
+    """The factor of `corrsin_obukhov` anywhere in space, periodic in all directions, without seams.
+
+    Attributes
+    ----------
+    coefficients : (nx, ny, nz) array
+        Of the periodic quintic B-spline of the logarithm.
+    spacing : (float, float, float)
+        Of its nodes, m.
+    """
+
+    coefficients: np.ndarray
+    spacing: tuple[float, float, float]
+
+    @property
+    def period(self) -> tuple[float, ...]:
+        """After which the texture repeats along x, y and z, m."""
+        return tuple(
+            n * step for n, step in zip(self.coefficients.shape, self.spacing, strict=True)
+        )
+
+    def at(self, x: ArrayLike, y: ArrayLike, z: ArrayLike) -> np.ndarray:
+        """The factor at places (m), which broadcast."""
+        places = np.broadcast_arrays(
+            *(np.asarray(a, float) / d for a, d in zip((x, y, z), self.spacing, strict=True))
+        )
+        shape, flat = places[0].shape, np.stack([place.ravel() for place in places])
+        logarithm = map_coordinates(
+            self.coefficients, flat, order=_ORDER, mode="grid-wrap", prefilter=False
+        )
+        return np.exp(logarithm).reshape(shape)
+
+
+def periodic_texture(
+    extent: tuple[float, float, float],
+    spacing: tuple[float, float, float],
+    rms: float,
+    outer_scale: float,
+    seed: int,
+) -> PeriodicTexture:
+    """The texture of `corrsin_obukhov` in a period of at least ``extent`` (m).
+
+    Mean and standard deviation of the Gaussian field are set over the period.
+
+    Raises
+    ------
+    InputError
+        An outer scale of less than two cells, a period too large for memory.
+    """
+    if not outer_scale >= 2 * max(spacing):
+        raise InputError(
+            f"texture.outer_scale: {outer_scale} m is not allowed; it must be at least two "
+            f"cells, {2 * max(spacing):g} m"
+        )
+    nodes = tuple(
+        next_fast_len(int(np.ceil(length / step - 1e-9)), real=True)
+        for length, step in zip(extent, spacing, strict=True)
+    )
+    if np.prod(nodes, dtype=float) > _LARGEST_GRID:
+        raise InputError(
+            f"texture: a period of {' x '.join(f'{a:g}' for a in extent)} m needs a grid of "
+            f"{' x '.join(map(str, nodes))}; allowed: {_LARGEST_GRID} nodes"
+        )
+    if rms == 0:
+        return PeriodicTexture(np.zeros((1, 1, 1)), spacing)
+    g = gaussian_field(nodes, spacing, outer_scale, seed)
+    s = np.sqrt(np.log1p(rms**2))
+    g = (g - g.mean()) * (s / g.std()) - s**2 / 2
+    return PeriodicTexture(spline_filter(g, order=_ORDER, mode="grid-wrap"), spacing)

@@ -63,8 +63,10 @@ def _check_profile(core_radius, model):
         raise InputError(f"vortex.model: {model!r} is not known; allowed: {', '.join(MODELS)}")
 
 
-def _angular_velocity(r2, circulation, core_radius, model):
-    """Tangential speed over radius, s^-1, from the squared radius: finite on the axis."""
+def angular_velocity(
+    r2: ArrayLike, circulation: ArrayLike, core_radius: float, model: Model = "lamb_oseen"
+) -> np.ndarray:
+    """Tangential speed over radius, s^-1, from the squared radius (m^2): finite on the axis."""
     s = np.asarray(r2, dtype=float) / core_radius**2
     if model == "lamb_oseen":
         profile = np.divide(
@@ -75,7 +77,7 @@ def _angular_velocity(r2, circulation, core_radius, model):
         )
     else:
         profile = 1.0 / (s + 1.0)
-    return circulation / (2 * np.pi * core_radius**2) * profile
+    return np.asarray(circulation) / (2 * np.pi * core_radius**2) * profile
 
 
 def tangential_speed(
@@ -102,7 +104,7 @@ def tangential_speed(
     """
     _check_profile(core_radius, model)
     r = np.asarray(r, dtype=float)
-    return r * _angular_velocity(r**2, circulation, core_radius, model)
+    return r * angular_velocity(r**2, circulation, core_radius, model)
 
 
 def velocity(
@@ -127,7 +129,7 @@ def velocity(
     v, w = np.zeros(y.shape), np.zeros(y.shape)
     for vortex in vortices:
         dy, dz = y - vortex.y, z - vortex.z
-        omega = _angular_velocity(
+        omega = angular_velocity(
             dy**2 + dz**2, vortex.circulation, vortex.core_radius, vortex.model
         )
         v -= omega * dz

@@ -148,7 +148,7 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
     gate_middle = experiment.scan.range + experiment.scan.thickness / 2
     if wake.vortex_pair:
         pair = wake.vortex_pair
-        axes = _axes(wake, "vortex_pair", most)
+        axes = analytic_axes(wake, "vortex_pair", most)
         vortices = vortex_pair(
             pair.circulation, pair.separation, pair.core_radius, model=pair.model
         )
@@ -206,15 +206,28 @@ def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
     return turbine_flow(
         mean,
         x,
-        *_axes(wake, "turbine", most_nodes(experiment)),
+        *analytic_axes(wake, "turbine", most_nodes(experiment)),
         turbine.turbulence,
         turbine.outer_scale,
         experiment.seed,
     )
 
 
-def _axes(wake, key: str, most: int) -> list[np.ndarray]:
-    """y and z of an analytic wake, about the scan's axis."""
+def analytic_axes(wake, key: str, most: int) -> list[np.ndarray]:
+    """y and z of the nodes of an analytic wake, m, about the scan's axis.
+
+    Parameters
+    ----------
+    wake : Wake
+    key : "vortex_pair" or "turbine"
+    most : int
+        Nodes that are allowed.
+
+    Raises
+    ------
+    InputError
+        An extent that is not a multiple of the spacing, too many nodes.
+    """
     ends = {}
     for axis, name in (("y", "width"), ("z", "height")):
         extent = getattr(getattr(wake, key), name)

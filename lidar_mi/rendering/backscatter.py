@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -45,9 +46,7 @@ def extrude(
     InputError
         Beams so wide that the extended plane would not fit into the memory.
     """
-    radius = lidar.beam_cut if np.isfinite(lidar.beam_cut) else 3 * lidar.beam_radius
-    # the Gaussian divergence exceeds 2.2 times its 1/e^2 angle once in 16 000 samples
-    radius += 2.2 * lidar.divergence_full / 2 * plan.gate_stop
+    radius = beam_reach(lidar, plan.gate_stop)
     slope = np.hypot(np.abs(plan.y).max(), np.abs(plan.z).max()) / plan.centre
     oblique = plan.obliquity().max()
     beside = np.zeros((2, 2))  # the plane, beams cross: before and behind it along y and z
@@ -82,6 +81,13 @@ def extrude(
     solid = padded.expand_dims(x=[plan.centre + plan.position]).transpose(..., "x", "y", "z")
     solid["x"].attrs["cell_width"] = thickness
     return solid
+
+
+def beam_reach(lidar: BackscatterLidar, distance: float) -> float:
+    """Distance from a beam's axis that its light does not exceed, m, at a distance in m."""
+    radius = lidar.beam_cut if np.isfinite(lidar.beam_cut) else 3 * lidar.beam_radius
+    # the Gaussian divergence exceeds 2.2 times its 1/e^2 angle once in 16 000 samples
+    return radius + 2.2 * lidar.divergence_full / 2 * distance
 
 
 def render_scans(
@@ -133,38 +139,79 @@ def render_scans(
         middle of the gates. One scan at a time, as soon as it is rendered.
     """
     chosen = list(range(len(plans)) if scans is None else scans)
-    if not chosen:
-        return
-    scene = mi.load_dict(
-        scene_dict(
-            extinctions[chosen[0]],
-            plans[chosen[0]],
-            lidar,
-            environment,
-            phase,
-            albedo,
-            settings,
-            molecules,
-        )
-    )
-    parameters = mi.traverse(scene)
+    renderer = None
     for index in chosen:
-        plan = plans[index]
-        if index != chosen[0]:
-            _move(parameters, extinctions[index], plan, albedo, molecules)
-        if progress:
-            scene.integrator().progress = lambda done, total, k=index: progress(k, done, total)
+        air, plan = extinctions[index], plans[index]
+        if renderer is None:
+            renderer = ScanRenderer(
+                air, plan, lidar, environment, phase, albedo, settings, molecules
+            )
+        told = partial(progress, index) if progress else None
         kept = batches(index) if batches else None
-        scene.integrator().batches = kept
+        yield renderer.render(air, plan, seed + (index << 16), told, kept)
+
+
+class ScanRenderer:
+    """A scene that is kept from scan to scan; only the first scan compiles anything.
+
+    Parameters
+    ----------
+    extinction : (x, y, z) array
+        Of the first scan; those of all others are on its grid.
+    plan : ScanPlan
+        Of the first scan; all others have as many beams and gates.
+    lidar, environment, phase, albedo, settings, molecules
+        As `render_scans` takes them.
+    """
+
+    def __init__(
+        self,
+        extinction: xr.DataArray,
+        plan: ScanPlan,
+        lidar: BackscatterLidar,
+        environment: float,
+        phase: dict,
+        albedo: float,
+        settings: RenderSettings,
+        molecules: Molecules | None = None,
+    ):
+        air = (environment, phase, albedo, settings, molecules)
+        self._scene = mi.load_dict(scene_dict(extinction, plan, lidar, *air))
+        self._parameters = mi.traverse(self._scene)
+        self._lidar, self._environment, self._settings = lidar, environment, settings
+        self._albedo, self._molecules = albedo, molecules
+
+    def render(
+        self,
+        extinction: xr.DataArray,
+        plan: ScanPlan,
+        seed: int,
+        progress: Callable[[int, int], None] | None = None,
+        batches: Batches | None = None,
+    ) -> xr.Dataset:
+        """One scan, as `render_scans` yields it.
+
+        Parameters
+        ----------
+        seed : int
+            The header of an image holds 31 bits of it.
+        progress : callable, optional
+            Called with (samples done, samples in all).
+        batches : Batches, optional
+            Store of the samples while they are rendered.
+        """
+        _move(self._parameters, extinction, plan, self._albedo, self._molecules)
+        integrator = self._scene.integrator()
+        integrator.progress, integrator.batches = progress, batches
         start = time.perf_counter()
-        seed_here = (seed + (index << 16)) % 2**31  # a header holds 32 bits with a sign
-        image = np.array(mi.render(scene, seed=seed_here))
+        seed %= 2**31  # a header holds 32 bits with a sign
+        image = np.array(mi.render(self._scene, seed=seed))
         dr.flush_malloc_cache()  # the buffers of the tracing are as large as the image
-        names = scene.integrator().quantities()
-        scan = _as_dataset(image, names, plan, lidar, environment, settings, seed_here)
-        earlier = kept.seconds if kept else 0.0
+        names = integrator.quantities()
+        scan = _as_dataset(image, names, plan, self._lidar, self._environment, self._settings, seed)
+        earlier = batches.seconds if batches else 0.0
         scan.attrs["render_seconds"] = earlier + time.perf_counter() - start
-        yield scan
+        return scan
 
 
 def scene_dict(

@@ -1,9 +1,11 @@
 """Texture statistics: detects 0.05 in the spectral slope, 5 % in the rms, 5 % of anisotropy."""
 
+import math
+
 import numpy as np
 import pytest
 
-from lidar_mi.atmosphere.texture import corrsin_obukhov, gaussian_field
+from lidar_mi.atmosphere.texture import corrsin_obukhov, gaussian_field, periodic_texture
 from lidar_mi.errors import InputError
 
 Y, Z = np.arange(219) * 0.5, np.arange(139) * 0.5
@@ -156,3 +158,40 @@ def test_off():
 def test_bad_input(arguments, words):
     with pytest.raises(InputError, match=words):
         corrsin_obukhov(**{"y": Y, "z": Z, "rms": 0.1, "outer_scale": 10.0, "seed": 1} | arguments)
+
+
+class TestPeriodicTexture:
+    """Anywhere in space: values of the nodes between them, no seam."""
+
+    TEXTURE = periodic_texture((24.0, 40.0, 30.0), (1.0, 0.5, 0.5), 0.3, 8.0, 3)
+
+    def test_mean_and_rms_over_the_period(self):
+        nodes = [step * np.arange(n) for n, step in zip((24, 80, 60), (1, 0.5, 0.5), strict=True)]
+        values = self.TEXTURE.at(*np.meshgrid(*nodes, indexing="ij"))
+        logarithm = np.log(values)
+        assert logarithm.std() == pytest.approx(math.sqrt(math.log1p(0.09)), rel=1e-9)
+        assert values.mean() == pytest.approx(1, abs=0.03)
+        assert values.std() == pytest.approx(0.3, abs=0.03)
+
+    def test_no_seam(self):
+        """Steps across the end of the period are as large as elsewhere, along each axis."""
+        random = np.random.default_rng(1)
+        for axis in range(3):
+            places = [random.uniform(0, period, 2000) for period in self.TEXTURE.period]
+
+            def steps(start, axis=axis, places=places):
+                first = [p if k != axis else start - 0.25 for k, p in enumerate(places)]
+                second = [p if k != axis else start + 0.25 for k, p in enumerate(places)]
+                return np.std(self.TEXTURE.at(*second) - self.TEXTURE.at(*first))
+
+            assert steps(self.TEXTURE.period[axis]) == pytest.approx(steps(5.5), rel=0.25)
+
+    def test_no_texture_is_one(self):
+        flat = periodic_texture((10.0, 10.0, 10.0), (1.0, 1.0, 1.0), 0.0, 5.0, 1)
+        assert (flat.at(np.linspace(-50, 50, 7), 3.0, -2.0) == 1).all()
+
+    def test_what_is_refused(self):
+        with pytest.raises(InputError, match="outer_scale"):
+            periodic_texture((10.0, 10.0, 10.0), (1.0, 1.0, 1.0), 0.1, 1.5, 1)
+        with pytest.raises(InputError, match="period"):
+            periodic_texture((1e4, 1e3, 1e3), (1.0, 1.0, 1.0), 0.1, 10.0, 1)

@@ -236,6 +236,16 @@ class TestUpdates:
         assert after == pytest.approx(expected, rel=1e-6, abs=0)
         assert error_after == pytest.approx(error, rel=1e-4)
 
+    def test_directions_can_be_changed_again(self, world):
+        """Each update reaches the sensor that was traversed once."""
+        sensor = mi.load_dict(world.lidar((2, 1), GATE, azimuth_max_deg=1.0))
+        parameters = mi.traverse(sensor)
+        for slope in (0.1, 0.2, 0.3):
+            parameters["directions"] = mi.Float([1, slope, 0, 1, 0, slope])
+            parameters.update()
+            found = directions(sensor)
+            assert found[0, 1] / found[0, 0] == pytest.approx(slope, rel=1e-6)
+
     def test_new_directions_are_normalised(self, world):
         sensor = mi.load_dict(world.lidar((2, 1), GATE, azimuth_max_deg=1.0))
         parameters = mi.traverse(sensor)

@@ -1,0 +1,273 @@
+"""The lidar as an object that is stepped: light, detector, and what is estimated from them."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.arguments import checked_arguments
+from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.encounter.estimate import Estimate
+from lidar_mi.encounter.pose import AircraftPose
+from lidar_mi.encounter.slabs import Air, Gates, air_of, gates_of
+from lidar_mi.encounter.wake import encounter_of
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.reading import load_experiment
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.rendering import environment_extinction
+from lidar_mi.experiment.stages.vortices import vectors_method
+from lidar_mi.experiment.stages.winds import window_settings
+from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
+from lidar_mi.instrument.detector_noise import noisy_scan
+from lidar_mi.instrument.products import with_products
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.rendering.backscatter import ScanRenderer
+from lidar_mi.rendering.phase import molecules, scatterer
+from lidar_mi.rendering.variant import use_variant
+from lidar_mi.retrieval.common_error import with_common_error
+from lidar_mi.retrieval.velocimetry.common_grid import resample
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+
+NO_EARLIER_SCAN = "no earlier scan of this slab"
+LITTLE_OVERLAP = "the two scans have less than half of the image in common"
+
+# Of a period, by which the time of a scan may be off its raster.
+_OFF_RASTER = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class SlabImages:
+    """Images of one slab from two scans, on one grid in the path frame.
+
+    Attributes
+    ----------
+    first, second : DataArray, dims (z, y)
+        Attenuated backscatter, m^-1 sr^-1, the second one resampled onto the nodes of the first.
+    noise : DataArray, dims (z, y)
+        Standard deviation of the first one's noise.
+    """
+
+    first: xr.DataArray
+    second: xr.DataArray
+    noise: xr.DataArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Scan:
+    """Both images of a scan with the standard deviations of their noise, path frame."""
+
+    near: xr.DataArray
+    far: xr.DataArray
+    far_noise: xr.DataArray
+
+
+class VirtualLidar:
+    """The backscatter lidar of an encounter, stepped from scan to scan by any simulation.
+
+    Every step renders one scan of consecutive gates. The slab in the last gate of one scan is that
+    in the first gate of the next, so every scan completes a pair of images of one slab; wind and
+    vortices are estimated from it. Scans are instantaneous. Their images depend on the experiment,
+    the number of the scan and the pose alone: a step that is repeated gives the same numbers, and
+    several lidars in one process do not disturb each other. Nothing is written.
+
+    Parameters
+    ----------
+    experiment : Experiment, str or path
+        With a section ``encounter`` and a wake of ``vortex_pair``.
+
+    Raises
+    ------
+    InputError
+        An experiment that is not that of an encounter.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> pair = {"circulation": "300 m^2/s", "separation": "20 m", "width": "40 m", "height": "30 m"}
+    >>> experiment = lm.load_experiment(
+    ...     "wake_backscatter",
+    ...     wake={"file": None, "time": None, "vortex_pair": pair, "spacing": "1 m"},
+    ...     render={"samples_per_beam": 16, "max_order": 1},
+    ...     retrieval={"methods": ["cc"]},
+    ...     encounter={"path": {"start": "200 m"}},
+    ... )
+    >>> lidar = lm.VirtualLidar(experiment)
+    >>> lidar.step(0.0).flags
+    ('no earlier scan of this slab',)
+    >>> estimate = lidar.step(0.1)
+    >>> estimate.x, estimate.wind["v"].dims
+    (151.25, ('z', 'y'))
+    """
+
+    @checked_arguments
+    def __init__(self, experiment: Experiment | str | Path):
+        if not isinstance(experiment, Experiment):
+            experiment = load_experiment(experiment)
+        self.experiment = experiment
+        self.encounter = encounter_of(experiment)
+        self.gates: Gates = gates_of(experiment)
+        self.air: Air = air_of(experiment, self.gates)
+        self.images: SlabImages | None = None
+        self._renderer: ScanRenderer | None = None
+        self._scans: dict[int, _Scan] = {}
+
+    @property
+    def wake(self) -> WakeAlongPath:
+        """The truth: wind anywhere at any time, and the vortices in any plane."""
+        return self.air.wake
+
+    @checked_arguments
+    def step(self, t: float, pose: AircraftPose | None = None) -> Estimate:
+        """Scan at a time, and estimate wind and vortices in the slab that is now seen again.
+
+        Parameters
+        ----------
+        t : float
+            s, a multiple of the scans' period.
+        pose : AircraftPose, optional
+            Default: on the nominal path. Scans of a slab by a pose that is nearer or farther than
+            nominal have their gates where the slab is.
+
+        Returns
+        -------
+        Estimate
+            In the path frame. Without wind and vortices if the scan before was not made.
+
+        Raises
+        ------
+        InputError
+            A time between scans or before the first one, a pose in or behind the slab.
+        """
+        number = self._number(t)
+        scan = self._scanned(number, pose or AircraftPose(number * self.gates.stride))
+        before = self._scans.get(number - 1)
+        self._scans = {number: scan} | ({number - 1: before} if before else {})
+        period = self.gates.period
+        delivered = number * period + self.encounter.control.latency
+        valid, x = (number - 0.5) * period, self.gates.slab(number - 1)
+        if before is None:
+            self.images = None
+            return Estimate(valid, delivered, x, None, None, (NO_EARLIER_SCAN,), {})
+        images, flags = _on_first_grid(before, scan)
+        self.images = images
+        if images is None:
+            return Estimate(valid, delivered, x, None, None, flags, {})
+        wind, pair, seconds = self._estimated(images)
+        if not pair.success:
+            flags += tuple(f"vortices: {reason}" for reason in pair.reasons)
+        return Estimate(valid, delivered, x, wind, pair, flags, seconds)
+
+    def _number(self, t: float) -> int:
+        number = round(t / self.gates.period) if np.isfinite(t) else -1
+        if number < 0 or abs(t / self.gates.period - number) > _OFF_RASTER:
+            raise InputError(
+                f"t: {t:g} s is not allowed; expected a multiple of the {self.gates.period:g} s "
+                "from scan to scan, 0 or more"
+            )
+        return number
+
+    def _scanned(self, number: int, pose: AircraftPose) -> _Scan:
+        """Both images of a scan with the detector's noise."""
+        experiment, gates = self.experiment, self.gates
+        plan = gates.plan(pose.x - number * gates.stride)
+        air = self.air.at_scan(number, (pose.y, pose.z))
+        use_variant(experiment.render.variant)
+        if self._renderer is None:
+            lidar, scattering = experiment.lidar, experiment.scattering
+            self._renderer = ScanRenderer(
+                air,
+                plan,
+                lidar,
+                environment_extinction(experiment),
+                *scatterer(scattering, experiment.folder, lidar.wavelength),
+                experiment.render,
+                molecules(self.air.molecules, lidar.wavelength, scattering.band),
+            )
+        # seeds as of the images of an experiment
+        scan = with_products(self._renderer.render(air, plan, experiment.seed + (number << 16)))
+        if experiment.detector:
+            pulses = experiment.scan.pulses_per_beam
+            seed = [experiment.seed, number, 1]
+            scan = noisy_scan(scan, experiment.lidar, experiment.detector, seed, plan, pulses)
+        near, far = (self._image(scan, plan, gate, pose) for gate in (0, -1))
+        return _Scan(near[0], *far)
+
+    def _image(
+        self, scan: xr.Dataset, plan: ScanPlan, gate: int, pose: AircraftPose
+    ) -> tuple[xr.DataArray, xr.DataArray]:
+        """Attenuated backscatter of a gate, and the standard deviation of its noise."""
+        noisy = "S0_noisy" in scan
+        noise = scan["S0_stderr"].values.astype(float)
+        if noisy:
+            noise = np.hypot(noise, scan["S0_noise_std"].values)
+        y, z = self.gates.axes(plan, gate)
+        axes = {"z": ("z", pose.z + z, {"units": "m"}), "y": ("y", pose.y + y, {"units": "m"})}
+        found = []
+        for s0 in (scan["S0_noisy" if noisy else "S0"].values.astype(float), noise):
+            values = attenuated_backscatter(
+                s0, plan, self.experiment.lidar.aperture_area, scan.attrs["environment_extinction"]
+            )
+            found.append(xr.DataArray(values[gate], axes, ("z", "y"), attrs={"units": "m-1 sr-1"}))
+        return found[0], found[1]
+
+    def _estimated(
+        self, images: SlabImages
+    ) -> tuple[xr.Dataset | None, VortexPairFit, dict[str, float]]:
+        """Wind, vortices, and the seconds that each took."""
+        experiment, dt = self.experiment, self.gates.period
+        settings, seconds = experiment.retrieval, {}
+        middle = self.gates.look_ahead - self.gates.stride / 2
+        common = settings.pointing.stderr * middle / dt
+        pair_of_images = (images.first, images.second)
+
+        def timed(name: str, function: Callable[[], Any]) -> Any:
+            start = time.perf_counter()
+            found = function()
+            seconds[name] = time.perf_counter() - start
+            return found
+
+        method = vectors_method(experiment)
+        wind = None
+        if method is not None:
+            blur = settings.blur
+            if blur == "beam":
+                blur = float(experiment.lidar.radius_at(middle)) / 2
+            wind = timed(
+                "wind",
+                lambda: retrieve_wind(
+                    *pair_of_images,
+                    dt=dt,
+                    method=method,
+                    **window_settings(settings),
+                    noise=images.noise,
+                    blur=blur,
+                ),
+            )
+            if common:
+                wind = with_common_error(wind, common, settings.pointing.offset)
+        pair = timed("vortices", lambda: fit_vortices(*pair_of_images, dt, images.noise))
+        return wind, pair.with_common_error(common, common), seconds
+
+
+def _on_first_grid(before: _Scan, scan: _Scan) -> tuple[SlabImages | None, tuple[str, ...]]:
+    """Both images of the slab on those nodes of the first that the second covers."""
+    inside = {}
+    for name in ("z", "y"):
+        nodes, other = before.far[name].values, scan.near[name].values
+        slack = 1e-6 * (other[1] - other[0])
+        inside[name] = (nodes >= other[0] - slack) & (nodes <= other[-1] + slack)
+    covered = inside["z"].mean() * inside["y"].mean()
+    if min(inside["z"].sum(), inside["y"].sum()) < 4:
+        return None, (LITTLE_OVERLAP,)
+    first, noise = (
+        image.isel({name: np.flatnonzero(where) for name, where in inside.items()})
+        for image in (before.far, before.far_noise)
+    )
+    second = resample(scan.near, first["y"].values, first["z"].values)
+    return SlabImages(first, second, noise), (() if covered >= 0.5 else (LITTLE_OVERLAP,))

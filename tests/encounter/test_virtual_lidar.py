@@ -1,0 +1,156 @@
+"""The lidar stepped along a flight. Physics and system tier.
+
+Detects: estimates beyond their stated errors, images of other air than the slab's, a step that
+depends on earlier steps or on other lidars, kernels compiled at every step, bad input with a
+traceback.
+"""
+
+import drjit as dr
+import numpy as np
+import pytest
+
+import lidar_mi as lm
+from lidar_mi.encounter.pose import AircraftPose
+from lidar_mi.encounter.virtual_lidar import LITTLE_OVERLAP, NO_EARLIER_SCAN
+from lidar_mi.errors import InputError
+from tests.support.encounters import small_encounter
+
+
+@pytest.fixture(scope="module")
+def flight():
+    """Four scans of a lidar that only this fixture steps: estimates, images, lidar."""
+    lidar = lm.VirtualLidar(small_encounter())
+    steps = [(lidar.step(0.1 * number), lidar.images) for number in range(4)]
+    return [estimate for estimate, _ in steps], [images for _, images in steps], lidar
+
+
+def parameters(lidar, estimate):
+    """True port and starboard vortex as `VortexPairFit.parameters` has them; no mean wind."""
+    pair = lidar.wake.vortices(estimate.x, estimate.time)
+    sides = [(v.circulation, np.log(v.core_radius), v.y, v.z) for v in pair]
+    return np.array([*sides[0], *sides[1], 0.0, 0.0])
+
+
+def same(first, second):
+    return all(
+        (getattr(first, name).values == getattr(second, name).values).all()
+        for name in ("first", "second", "noise")
+    )
+
+
+def test_first_scan_has_no_estimate(flight):
+    (first, second, *_), images, _ = flight
+    assert first.flags == (NO_EARLIER_SCAN,) and first.wind is None and first.pair is None
+    assert images[0] is None and second.pair.success and second.flags == ()
+
+
+def test_times_and_places(flight):
+    estimates, _, _ = flight
+    for number, estimate in enumerate(estimates):
+        assert estimate.time == pytest.approx(0.1 * number - 0.05)
+        assert estimate.delivered == pytest.approx(0.1 * number + 0.02)
+        assert estimate.x == pytest.approx(7.5 * (number - 1) + 151.25)
+
+
+def test_vortices_within_stated_errors(flight):
+    """Three slabs without detector noise: 30 numbers, chi-square within 4 sigma, 5 % and 0.5 m."""
+    estimates, _, lidar = flight
+    chi2 = []
+    for estimate in estimates[1:]:
+        miss = estimate.pair.parameters - parameters(lidar, estimate)
+        chi2.append(miss @ np.linalg.solve(estimate.pair.covariance, miss))
+        assert np.abs(miss[[0, 4]]).max() < 0.1 * 300
+        assert np.abs(miss[[2, 3, 6, 7]]).max() < 1.0
+    assert sum(chi2) < 30 + 4 * np.sqrt(2 * 30)
+
+
+def test_both_images_show_the_air_of_the_slab(flight):
+    """The first image is that of the texture at its first sighting, per unit of backscatter."""
+    _, images, lidar = flight
+    pair = images[2]
+    y, z = np.meshgrid(pair.first["y"], pair.first["z"])
+    depth = np.linspace(-1, 1, 9)
+    # gates that the renderer fills linearly between planes, at all depths alike
+    x = lidar.gates.slab(1) + 1.25 * depth
+    seen = np.mean([lidar.air.texture.at(place, y, z) for place in x], 0)
+    assert np.corrcoef(seen.ravel(), pair.first.values.ravel())[0, 1] > 0.9
+    # from image to image the vortices turn air
+    assert np.corrcoef(pair.second.values.ravel(), pair.first.values.ravel())[0, 1] < 0.9
+
+
+def test_a_repeated_step_gives_the_same_numbers(flight):
+    estimates, images, _ = flight
+    lidar = lm.VirtualLidar(small_encounter())
+    other = lm.VirtualLidar(small_encounter(seed=7))
+    other.step(0.0)
+    lidar.step(0.1)
+    other.step(0.1)
+    found = lidar.step(0.2)
+    assert same(lidar.images, images[2])
+    assert (found.pair.parameters == estimates[2].pair.parameters).all()
+    other.step(0.2)
+    again = lidar.step(0.2)
+    assert same(lidar.images, images[2])
+    assert (again.pair.covariance == found.pair.covariance).all()
+    assert not same(lidar.images, other.images)
+
+
+def test_only_the_first_steps_compile(flight):
+    _, _, lidar = flight
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        lidar.step(0.4)
+        lidar.step(0.5, AircraftPose(37.9, 0.4, -0.2))
+        kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert len(kernels) > 0
+    assert sum(not k["cache_hit"] for k in kernels) == 0
+
+
+def test_a_scan_that_was_left_out():
+    lidar = lm.VirtualLidar(small_encounter())
+    lidar.step(0.0)
+    assert lidar.step(0.2).flags == (NO_EARLIER_SCAN,)
+
+
+def test_an_aircraft_beside_its_path():
+    """Estimates stay in the path frame: vortices are where they are on the nominal path."""
+    lidar = lm.VirtualLidar(small_encounter())
+    lidar.step(0.0, AircraftPose(0.3, 2.3, -1.7, roll=0.3))
+    estimate = lidar.step(0.1, AircraftPose(7.2, 3.1, -0.4))
+    miss = estimate.pair.parameters - parameters(lidar, estimate)
+    assert miss @ np.linalg.solve(estimate.pair.covariance, miss) < 10 + 4 * np.sqrt(20)
+    assert np.abs(miss[[2, 3, 6, 7]]).max() < 1.0
+    assert float(lidar.images.first["y"].mean()) == pytest.approx(2.3, abs=1.5)
+
+
+def test_scans_of_places_far_apart():
+    lidar = lm.VirtualLidar(small_encounter())
+    lidar.step(0.0)
+    estimate = lidar.step(0.1, AircraftPose(7.5, 200.0))
+    assert estimate.flags == (LITTLE_OVERLAP,) and estimate.pair is None
+
+
+def test_wind_where_a_method_gives_vectors():
+    lidar = lm.VirtualLidar(
+        small_encounter(retrieval={"methods": ["cc"], "stride": 2}, detector={})
+    )
+    lidar.step(0.0)
+    estimate = lidar.step(0.1)
+    wind, valid = estimate.wind, estimate.wind["flag"] == 0
+    assert set(estimate.seconds) == {"wind", "vortices"} and float(valid.mean()) > 0.5
+    _, v, w = lidar.wake.wind(estimate.x, wind["y_vector"], wind["z_vector"], estimate.time)
+    for found, true in ((wind["v"], v), (wind["w"], w)):
+        assert float(abs(found - true).where(valid).median()) < 1.0
+
+
+@pytest.mark.parametrize("t", [-0.1, 0.05, float("nan")])
+def test_times_between_scans_are_refused(flight, t):
+    with pytest.raises(InputError, match="^t: .* is not allowed; expected a multiple of the 0.1 s"):
+        flight[2].step(t)
+
+
+def test_what_is_no_encounter_is_refused():
+    with pytest.raises(InputError, match="encounter: missing"):
+        lm.VirtualLidar("wake_sensor")
+    with pytest.raises(InputError, match="^t: 'now' is not allowed; expected a number"):
+        lm.VirtualLidar(small_encounter()).step("now")
