@@ -1,0 +1,76 @@
+"""Kalman filter and smoother of a state of which the first elements are measured.
+
+Covariances are updated in Joseph's form, a sum of positive semidefinite terms: they stay symmetric
+and positive whatever the gain and the rounding (Bar-Shalom, Li, Kirubarajan 2001, Estimation with
+Applications to Tracking and Navigation, 5.2.3; Bierman 1977, Factorization Methods for Discrete
+Sequential Estimation, II.5).
+"""
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+
+
+def updated(
+    state: np.ndarray, covariance: np.ndarray, measured: np.ndarray, error: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """State and covariance after a measurement of the first elements of the state.
+
+    Parameters
+    ----------
+    state, covariance : ndarray, shapes (n,) and (n, n)
+        Before.
+    measured, error : ndarray, shapes (m,) and (m, m), m <= n
+        The measurement and its covariance; its error is independent of that of the state.
+    """
+    m = len(measured)
+    # K = P H^T S^-1 with H = [1 0]
+    gain = cho_solve(cho_factor(covariance[:m, :m] + error), covariance[:m]).T
+    remains = np.eye(len(state))
+    remains[:, :m] -= gain
+    after = remains @ covariance @ remains.T + gain @ error @ gain.T
+    return state + gain @ (measured - state[:m]), (after + after.T) / 2
+
+
+def innovation(
+    state: np.ndarray, covariance: np.ndarray, measured: np.ndarray, error: np.ndarray
+) -> float:
+    """Normalised square of a measurement's departure from its prediction: chi-square of (m,).
+
+    Arguments as of `updated`.
+    """
+    m = len(measured)
+    departure = measured - state[:m]
+    factor = cho_factor(covariance[:m, :m] + error)
+    return float(departure @ cho_solve(factor, departure))
+
+
+def smoothed(
+    filtered: tuple[np.ndarray, np.ndarray],
+    transition: np.ndarray,
+    noise: np.ndarray,
+    predicted: np.ndarray,
+    later: tuple[np.ndarray, np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """State and covariance given what was measured later, too.
+
+    One step back of Rauch, Tung and Striebel (1965, AIAA J. 3, 1445-1450). With the gain
+    G = P F^T (F P F^T + Q)^-1 the covariance P + G (P' - F P F^T - Q) G^T is written as
+    (1 - G F) P (1 - G F)^T + G (Q + P') G^T.
+
+    Parameters
+    ----------
+    filtered : (n,), (n, n)
+        State and covariance P after the update of this step.
+    transition, noise : ndarray, shape (n, n)
+        F and Q from this step to the next.
+    predicted : ndarray, shape (n,)
+        State of the next step before its update.
+    later : (n,), (n, n)
+        Smoothed state and covariance P' of the next step.
+    """
+    state, covariance = filtered
+    ahead = transition @ covariance
+    gain = cho_solve(cho_factor(ahead @ transition.T + noise), ahead).T
+    remains = np.eye(len(state)) - gain @ transition
+    after = remains @ covariance @ remains.T + gain @ (noise + later[1]) @ gain.T
+    return state + gain @ (later[0] - predicted), (after + after.T) / 2

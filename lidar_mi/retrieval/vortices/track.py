@@ -1,0 +1,375 @@
+"""The track of a pair of vortices over successive slabs of air along a flight path.
+
+An extended Kalman filter of the pair's parameters and of its slopes along the path
+(`lidar_mi.retrieval.vortices.track_motion`), fed with the fits of the slabs. The errors of
+different slabs are taken for independent: slabs do not overlap, so that their images have different
+air and different photons. Valid while texture and the turbulence that the pair does not describe
+decorrelate over less than the distance of the slabs. An error that all slabs have in common, such
+as a drift of the reported attitude, does not average out: keep it out of the fits, and add it to
+what `Track.pair_at` returns (`VortexPairFit.with_common_error`).
+"""
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import numpy as np
+from scipy.stats import chi2
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.vortices import kalman
+from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.retrieval.vortices.track_motion import (
+    CIRCULATIONS,
+    PLACES,
+    SLOPES,
+    Wandering,
+    moved,
+    unsteady,
+    wandered,
+)
+
+MEASURED = len(PARAMETERS)
+
+
+@dataclass(frozen=True)
+class TrackSettings:
+    """What a track assumes, accepts, and when it is lost.
+
+    Attributes
+    ----------
+    wandering : Wandering
+        How much the wake departs from a straight, steady pair.
+    slope, unlike_slope : float
+        Standard deviations of the slopes before a second slab: of their mean over both vortices,
+        and of each from it. 1 allows for crossing angles up to 60 degrees; 0.15 for Crow waves of
+        20 % of the separation, or vortices that converge by 9 degrees.
+    gate : float
+        Probability up to which the normalised innovation is accepted: of correct fits 1 in 1000 is
+        rejected.
+    patience : int
+        The track is lost after so many slabs without an update: 5 at 10 Hz are 0.5 s, the time
+        there is to act.
+    memory : int
+        Slabs that are kept to predict planes behind the newest: 64 at 7.5 m are 480 m.
+    least_updates : int
+        Of a usable track: with two the slopes have no redundancy, and no innovation tested them.
+    circulation_error, place_error : float
+        Largest standard errors of a usable track, relative and in m. An error of 10 % of the
+        circulation leaves 10 % of the rolling moment; 1 m beside the core of 3 m changes the moment
+        on an elliptic wing of 29 m by up to 10 % of its largest. With either, four fifths of the
+        moment are removed.
+
+    Raises
+    ------
+    InputError
+        A value out of range.
+    """
+
+    wandering: Wandering = field(default_factory=Wandering)
+    slope: float = 1.0
+    unlike_slope: float = 0.15
+    gate: float = 0.999
+    patience: int = 5
+    memory: int = 64
+    least_updates: int = 3
+    circulation_error: float = 0.1
+    place_error: float = 1.0
+
+    def __post_init__(self):
+        for name in ("slope", "unlike_slope", "circulation_error", "place_error"):
+            if not 0 < getattr(self, name) < np.inf:
+                raise InputError(
+                    f"track.{name}: {getattr(self, name)!r} is not allowed; a number > 0 is"
+                )
+        if not 0 < self.gate < 1:
+            raise InputError(f"track.gate: {self.gate!r} is not allowed; between 0 and 1")
+        for name in ("patience", "memory", "least_updates"):
+            value = getattr(self, name)
+            if not (isinstance(value, int) and value >= 1):
+                raise InputError(f"track.{name}: {value!r} is not allowed; a whole number >= 1 is")
+
+
+@dataclass(frozen=True, eq=False)
+class Slab:
+    """The state of a track in one slab, and how the track came there.
+
+    Attributes
+    ----------
+    x, time : float
+        m and s.
+    state, covariance : ndarray, shapes (14,) and (14, 14)
+        After the update of the slab, if there was one.
+    predicted : ndarray, shape (14,)
+        Before it.
+    transition, noise : ndarray, shape (14, 14)
+        Derivatives of the prediction by the state of the slab before, and its own covariance.
+    """
+
+    x: float
+    time: float
+    state: np.ndarray
+    covariance: np.ndarray
+    predicted: np.ndarray
+    transition: np.ndarray
+    noise: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A pair of vortices followed from slab to slab.
+
+    Attributes
+    ----------
+    slabs : tuple of Slab
+        The newest last.
+    fit : VortexPairFit
+        The last that was used.
+    settings : TrackSettings
+    updates, rejected : int
+        Fits used, and fits beyond the gate or of a pair of the opposite sense.
+    missed : int
+        Slabs since the last update.
+    innovation : (float, int) or None
+        Normalised square of the newest fit's departure from the prediction and its degrees of
+        freedom, also of a rejected one; None where there is nothing to compare.
+    """
+
+    slabs: tuple[Slab, ...]
+    fit: VortexPairFit
+    settings: TrackSettings
+    updates: int = 1
+    rejected: int = 0
+    missed: int = 0
+    innovation: tuple[float, int] | None = None
+
+    @property
+    def x(self) -> float:
+        """Plane of the newest slab, m."""
+        return self.slabs[-1].x
+
+    @property
+    def time(self) -> float:
+        """Of the newest slab, s."""
+        return self.slabs[-1].time
+
+    @property
+    def state(self) -> np.ndarray:
+        """Parameters and slopes (14,) in the newest slab."""
+        return self.slabs[-1].state
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Of the state, (14, 14)."""
+        return self.slabs[-1].covariance
+
+    @property
+    def profile(self) -> Profile:
+        """Of the swirl."""
+        return self.fit.profile
+
+    @property
+    def lost(self) -> bool:
+        """Whether too many slabs went by without an update; the next accepted fit starts anew."""
+        return self.missed >= self.settings.patience
+
+    @property
+    def usable(self) -> bool:
+        """Whether the track is certain enough to act upon; see `TrackSettings`."""
+        spread = np.sqrt(np.diagonal(self.covariance))
+        limits = self.settings
+        relative = spread[CIRCULATIONS] / np.abs(self.state[CIRCULATIONS])
+        return bool(
+            not self.lost
+            and self.updates >= limits.least_updates
+            and relative.max() <= limits.circulation_error
+            and spread[PLACES].max() <= limits.place_error
+        )
+
+    def pair_at(self, x: float, time: float) -> VortexPairFit:
+        """The pair in a plane at a time, from all slabs so far.
+
+        From the slab nearest to the plane, whose state all later slabs have improved
+        (Rauch-Tung-Striebel), it moves along the slopes and with the drift. Its covariance grows by
+        the random walks over the distance and the time from that slab, and by the unknown steady
+        rates. Beyond the newest slab this is the prediction of the filter.
+
+        Parameters
+        ----------
+        x : float
+            m along the path, anywhere.
+        time : float
+            s; that of the wing's arrival in the plane, say.
+
+        Returns
+        -------
+        VortexPairFit
+            Model error and correlation are those of the last fit that was used. Not a success where
+            the track is lost.
+
+        Raises
+        ------
+        InputError
+            Values that are not finite.
+        """
+        _check_finite(x=x, time=time)
+        nearest = int(np.argmin([abs(slab.x - x) for slab in self.slabs]))
+        slab, (state, covariance) = self.slabs[nearest], self._smoothed[nearest]
+        wandering = self.settings.wandering
+        dt = time - slab.time
+        state, covariance, _, _ = _predicted(
+            state, covariance, x - slab.x, dt, wandering, self.profile
+        )
+        covariance = covariance + unsteady(state, dt, wandering)
+        return replace(
+            self.fit,
+            parameters=state[:MEASURED],
+            covariance=covariance[:MEASURED, :MEASURED],
+            reasons=(f"no update in {self.missed} slabs",) if self.lost else (),
+        )
+
+    @cached_property
+    def _smoothed(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """State and covariance of every slab, given all fits."""
+        found = [(self.slabs[-1].state, self.slabs[-1].covariance)]
+        for slab, later in zip(self.slabs[-2::-1], self.slabs[:0:-1], strict=True):
+            found.append(
+                kalman.smoothed(
+                    (slab.state, slab.covariance),
+                    later.transition,
+                    later.noise,
+                    later.predicted,
+                    found[-1],
+                )
+            )
+        return found[::-1]
+
+
+def first_track(
+    pair: VortexPairFit, x: float, time: float, settings: TrackSettings | None = None
+) -> Track:
+    """A track that begins with the fit of one slab.
+
+    Parameters
+    ----------
+    pair : VortexPairFit
+        Accepted, with the port vortex of positive circulation.
+    x, time : float
+        Plane of the slab, m, and time at which the fit is valid, s.
+    settings : TrackSettings, optional
+
+    Raises
+    ------
+    InputError
+        A fit that is not accepted or has no covariance, circulations of the wrong signs, numbers
+        that are not finite.
+    """
+    _check_finite(x=x, time=time)
+    if not _is_fit(pair):
+        reason = pair.reasons[0] if pair.reasons else "numbers that are no pair and its covariance"
+        raise InputError(f"pair: {reason}; expected an accepted fit")
+    if not _has_sense(pair):
+        port, starboard = pair.parameters[CIRCULATIONS]
+        raise InputError(
+            f"pair: circulations of {port:.0f} (port) and {starboard:.0f} m2/s are not allowed; "
+            "port is positive, starboard negative"
+        )
+    settings = settings or TrackSettings()
+    state = np.concatenate([pair.parameters, np.zeros(len(SLOPES))])
+    covariance = np.zeros((len(state), len(state)))
+    covariance[:MEASURED, :MEASURED] = pair.covariance
+    # of each slope, and of port and starboard in common
+    covariance[MEASURED:, MEASURED:] = settings.unlike_slope**2 * np.eye(
+        len(SLOPES)
+    ) + settings.slope**2 * np.kron(np.ones((2, 2)), np.eye(2))
+    nothing = np.zeros_like(covariance)
+    slab = Slab(float(x), float(time), state, covariance, state, nothing, nothing)
+    return Track((slab,), pair, settings)
+
+
+def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> Track:
+    """The track after one more slab.
+
+    Parameters
+    ----------
+    track : Track
+    pair : VortexPairFit or None
+        The slab's fit. None, a fit that is not accepted, or one without a positive definite
+        covariance: the track is predicted only. The same holds for a fit beyond the gate or of
+        circulations of the wrong signs, which counts as rejected. After `patience` such slabs the
+        track is lost, and the next accepted fit begins a new one, whose counts of fits begin anew.
+    x, time : float
+        Plane of the slab, m, and time at which its fit is valid, s, after that of the last slab.
+
+    Raises
+    ------
+    InputError
+        Time that does not advance, numbers that are not finite, another profile.
+    """
+    _check_finite(x=x, time=time)
+    if not time > track.time:
+        raise InputError(f"time: {time:g} s is not allowed; the last slab's is {track.time:g} s")
+    fits = pair is not None and _is_fit(pair)
+    if fits and pair.profile != track.profile:
+        raise InputError(f"pair.profile: {pair.profile!r} is not that of the track")
+    if track.lost and fits and _has_sense(pair):
+        return first_track(pair, x, time, track.settings)
+    state, covariance, transition, noise = _predicted(
+        track.state,
+        track.covariance,
+        x - track.x,
+        time - track.time,
+        track.settings.wandering,
+        track.profile,
+    )
+    predicted, innovation, accepted = state, None, False
+    if fits:
+        measured = pair.parameters, pair.covariance
+        square = kalman.innovation(state, covariance, *measured)
+        innovation = square, MEASURED
+        accepted = _has_sense(pair) and square <= chi2.ppf(track.settings.gate, MEASURED)
+        if accepted:
+            state, covariance = kalman.updated(state, covariance, *measured)
+    slab = Slab(float(x), float(time), state, covariance, predicted, transition, noise)
+    return Track(
+        slabs=(*track.slabs, slab)[-track.settings.memory :],
+        fit=pair if accepted else track.fit,
+        settings=track.settings,
+        updates=track.updates + accepted,
+        rejected=track.rejected + (fits and not accepted),
+        missed=0 if accepted else track.missed + 1,
+        innovation=innovation,
+    )
+
+
+def _predicted(state, covariance, dx, dt, wandering, profile):
+    """State and covariance after a move, its derivatives and its own covariance."""
+    reached, along, later = moved(state, dx, dt, profile)
+    path, time = wandered(state, dx, dt, wandering)
+    transition = later @ along
+    noise = later @ path @ later.T + time
+    return reached, transition @ covariance @ transition.T + noise, transition, noise
+
+
+def _is_fit(pair: VortexPairFit) -> bool:
+    """Whether there is an accepted fit with a covariance that can be used."""
+    if not (pair.success and np.isfinite(pair.parameters).all()):
+        return False
+    if not np.isfinite(pair.covariance).all():
+        return False
+    try:
+        np.linalg.cholesky(pair.covariance)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
+def _has_sense(pair: VortexPairFit) -> bool:
+    """Whether port is the vortex of positive circulation, starboard that of negative."""
+    return bool(pair.parameters[0] > 0 > pair.parameters[4])
+
+
+def _check_finite(**numbers: float) -> None:
+    for name, value in numbers.items():
+        if not np.isfinite(value):
+            raise InputError(f"{name}: {value!r} is not allowed; any finite number is")
