@@ -73,8 +73,9 @@ class VirtualLidar:
     Every step renders one scan of consecutive gates. The slab in the last gate of one scan is that
     in the first gate of the next, so every scan completes a pair of images of one slab; wind and
     vortices are estimated from it. Scans are instantaneous. Their images depend on the experiment,
-    the number of the scan and the pose alone: a step that is repeated gives the same numbers, and
-    several lidars in one process do not disturb each other. Nothing is written.
+    the number of the scan and the pose alone: a step that is repeated gives the same images bit for
+    bit, and the same estimate but for rounding; several lidars in one process do not disturb each
+    other. Nothing is written.
 
     Parameters
     ----------

@@ -21,7 +21,7 @@ def test_the_keys_reach_the_wake():
             "crossing_angle": "20 deg",
             "climb_angle": "-2 deg",
             "miss": ["3 m", "-4 m"],
-        },
+        }
     )
     wake = wake_along_path(experiment)
     port, starboard = wake.vortices(400.0, 5.0)
