@@ -53,7 +53,7 @@ def test_times_and_places(flight):
 
 
 def test_vortices_within_stated_errors(flight):
-    """Accepted fits of three slabs, without detector noise: chi-square within 4 sigma, 10 %, 1 m."""
+    """Accepted fits of three slabs, without detector noise: 4 sigma of chi-square, 10 %, 1 m."""
     estimates, _, lidar = flight
     chi2 = []
     for estimate in estimates[1:]:
@@ -152,12 +152,14 @@ def test_wind_where_a_method_gives_vectors():
 
 @pytest.mark.parametrize("t", [-0.1, 0.05, float("nan")])
 def test_times_between_scans_are_refused(flight, t):
-    with pytest.raises(InputError, match="^t: .* is not allowed; expected a multiple of the 0.1 s"):
+    with pytest.raises(
+        InputError, match=r"^t: .* is not allowed; expected a multiple of the 0\.1 s"
+    ):
         flight[2].step(t)
 
 
 def test_what_is_no_encounter_is_refused():
     with pytest.raises(InputError, match="encounter: missing"):
         lm.VirtualLidar("wake_sensor")
-    with pytest.raises(InputError, match="^t: 'now' is not allowed; expected a number"):
+    with pytest.raises(InputError, match=r"^t: 'now' is not allowed; expected a number"):
         lm.VirtualLidar(small_encounter()).step("now")
