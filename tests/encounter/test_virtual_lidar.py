@@ -152,9 +152,7 @@ def test_wind_where_a_method_gives_vectors():
 
 @pytest.mark.parametrize("t", [-0.1, 0.05, float("nan")])
 def test_times_between_scans_are_refused(flight, t):
-    with pytest.raises(
-        InputError, match=r"^t: .* is not allowed; expected a multiple of the 0\.1 s"
-    ):
+    with pytest.raises(InputError, match=r"^t: .* is not allowed; expected a multiple of"):
         flight[2].step(t)
 
 
