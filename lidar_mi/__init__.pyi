@@ -2,6 +2,7 @@
 
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
+from .encounter.pose import AircraftPose
 from .encounter.virtual_lidar import VirtualLidar
 from .errors import InputError
 from .experiment.export import export
@@ -31,6 +32,7 @@ from .system.doctor import doctor
 __version__: str
 
 __all__ = [
+    "AircraftPose",
     "Calibration",
     "Experiment",
     "Flag",

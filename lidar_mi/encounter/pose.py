@@ -20,6 +20,12 @@ class AircraftPose:
         m: along the path, to the left, up.
     roll, pitch, yaw : float
         rad: port wing up, nose up, nose to port.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> lm.AircraftPose(x=75.0, y=0.5, roll=0.1).z
+    0.0
     """
 
     x: float

@@ -101,9 +101,10 @@ def gates_of(experiment: Experiment) -> Gates:
         ("scan.timing", scan.timing, None),
         ("platform.motion", experiment.platform.motion, None),
         ("platform.reported", experiment.platform.reported, None),
+        ("retrieval.blur", experiment.retrieval.blur, 0.0),
     ):
         if given != expected:
-            shown = f" {given} is" if isinstance(given, str) else ""
+            shown = f" {given} is" if isinstance(given, str | float) else ""
             raise InputError(f"{key}:{shown} not allowed in an encounter; expected {expected}")
     wake_along_path(experiment)
     period = 1 / encounter.rate

@@ -1,10 +1,7 @@
 """The lidar as an object that is stepped: light, detector, and what is estimated from them."""
 
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -12,6 +9,7 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.estimate import Estimate
+from lidar_mi.encounter.estimator import Estimator
 from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.encounter.wake import encounter_of
@@ -19,8 +17,6 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.reading import load_experiment
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.rendering import environment_extinction
-from lidar_mi.experiment.stages.vortices import vectors_method
-from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector_noise import noisy_scan
 from lidar_mi.instrument.products import with_products
@@ -30,8 +26,6 @@ from lidar_mi.rendering.phase import molecules, scatterer
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.common_error import with_common_error
 from lidar_mi.retrieval.velocimetry.common_grid import resample
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
-from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 NO_EARLIER_SCAN = "no earlier scan of this slab"
@@ -73,8 +67,9 @@ class VirtualLidar:
     Every step renders one scan of consecutive gates. The slab in the last gate of one scan is that
     in the first gate of the next, so every scan completes a pair of images of one slab; wind and
     vortices are estimated from it. Scans are instantaneous. Their images depend on the experiment,
-    the number of the scan and the pose alone: a step that is repeated gives the same numbers, and
-    several lidars in one process do not disturb each other. Nothing is written.
+    the number of the scan and the pose alone: a step that is repeated gives the same images bit for
+    bit, and the same estimate but for rounding; several lidars in one process do not disturb each
+    other. Nothing is written.
 
     Parameters
     ----------
@@ -114,6 +109,7 @@ class VirtualLidar:
         self.gates: Gates = gates_of(experiment)
         self.air: Air = air_of(experiment, self.gates)
         self.images: SlabImages | None = None
+        self._estimator = Estimator(experiment)
         self._renderer: ScanRenderer | None = None
         self._scans: dict[int, _Scan] = {}
 
@@ -123,7 +119,9 @@ class VirtualLidar:
         return self.air.wake
 
     @checked_arguments
-    def step(self, t: float, pose: AircraftPose | None = None) -> Estimate:
+    def step(
+        self, t: float, pose: AircraftPose | None = None, expected: VortexPairFit | None = None
+    ) -> Estimate:
         """Scan at a time, and estimate wind and vortices in the slab that is now seen again.
 
         Parameters
@@ -133,6 +131,9 @@ class VirtualLidar:
         pose : AircraftPose, optional
             Default: on the nominal path. Scans of a slab by a pose that is nearer or farther than
             nominal have their gates where the slab is.
+        expected : VortexPairFit, optional
+            The pair that a track expects in the slab, at the estimate's time: the fit starts there,
+            and is faster and less often lost. Default: it starts from nothing.
 
         Returns
         -------
@@ -158,7 +159,15 @@ class VirtualLidar:
         self.images = images
         if images is None:
             return Estimate(valid, delivered, x, None, None, flags, {})
-        wind, pair, seconds = self._estimated(images)
+        wind, pair, seconds = self._estimator.pair_of(
+            images.first, images.second, period, images.noise, expected
+        )
+        pointing = self.experiment.retrieval.pointing
+        common = pointing.stderr * (self.gates.look_ahead - self.gates.stride / 2) / period
+        if common:
+            pair = pair.with_common_error(common, common)
+            if wind is not None:
+                wind = with_common_error(wind, common, pointing.offset)
         if not pair.success:
             flags += tuple(f"vortices: {reason}" for reason in pair.reasons)
         return Estimate(valid, delivered, x, wind, pair, flags, seconds)
@@ -215,44 +224,6 @@ class VirtualLidar:
             )
             found.append(xr.DataArray(values[gate], axes, ("z", "y"), attrs={"units": "m-1 sr-1"}))
         return found[0], found[1]
-
-    def _estimated(
-        self, images: SlabImages
-    ) -> tuple[xr.Dataset | None, VortexPairFit, dict[str, float]]:
-        """Wind, vortices, and the seconds that each took."""
-        experiment, dt = self.experiment, self.gates.period
-        settings, seconds = experiment.retrieval, {}
-        middle = self.gates.look_ahead - self.gates.stride / 2
-        common = settings.pointing.stderr * middle / dt
-        pair_of_images = (images.first, images.second)
-
-        def timed(name: str, function: Callable[[], Any]) -> Any:
-            start = time.perf_counter()
-            found = function()
-            seconds[name] = time.perf_counter() - start
-            return found
-
-        method = vectors_method(experiment)
-        wind = None
-        if method is not None:
-            blur = settings.blur
-            if blur == "beam":
-                blur = float(experiment.lidar.radius_at(middle)) / 2
-            wind = timed(
-                "wind",
-                lambda: retrieve_wind(
-                    *pair_of_images,
-                    dt=dt,
-                    method=method,
-                    **window_settings(settings),
-                    noise=images.noise,
-                    blur=blur,
-                ),
-            )
-            if common:
-                wind = with_common_error(wind, common, settings.pointing.offset)
-        pair = timed("vortices", lambda: fit_vortices(*pair_of_images, dt, images.noise))
-        return wind, pair.with_common_error(common, common), seconds
 
 
 def _on_first_grid(before: _Scan, scan: _Scan) -> tuple[SlabImages | None, tuple[str, ...]]:

@@ -1,7 +1,8 @@
 """Gates of successive scans and the air in them. Physics tier.
 
-Detects: a slab that is not the same in both scans, air that is carried the wrong way or by 0.02 m too
-far, texture whose neighbouring slabs are independent or too much alike, scans that a gate of zero range is asked of.
+Detects: a slab that is not the same in both scans, air that is carried the wrong way or by 0.02 m
+too far, texture whose neighbouring slabs are independent or too much alike, gates behind the
+aircraft.
 """
 
 import numpy as np
@@ -46,7 +47,7 @@ def test_beams_go_to_the_nodes_of_the_last_gate():
 
 
 def test_air_is_carried_by_the_wind_from_the_first_sighting(oblique):
-    """Trajectories by an integrator of scipy; the texture of a slab as first seen at their starts."""
+    """Trajectories by an integrator of scipy; texture as first seen where they start."""
     gates, air = oblique
     second = air.at_scan(6, (0.0, 0.0))
     middle = gates.look_ahead - gates.stride + gates.depth / 2
@@ -113,5 +114,5 @@ def test_what_is_refused(changes, message):
 
 
 def test_a_pose_in_the_slab_is_refused():
-    with pytest.raises(InputError, match="pose.x: 143 m ahead"):
+    with pytest.raises(InputError, match=r"pose\.x: 143 m ahead"):
         gates_of(small_encounter()).plan(143.0)

@@ -1,6 +1,6 @@
 """The wake of an encounter from its keys. Unit tier.
 
-Detects: a key that does not reach the wake, a wake that is not known along its axis and is accepted.
+Detects: a key that does not reach the wake, an unsuitable wake that is accepted.
 """
 
 import math
@@ -21,7 +21,7 @@ def test_the_keys_reach_the_wake():
             "crossing_angle": "20 deg",
             "climb_angle": "-2 deg",
             "miss": ["3 m", "-4 m"],
-        },
+        }
     )
     wake = wake_along_path(experiment)
     port, starboard = wake.vortices(400.0, 5.0)
@@ -44,7 +44,7 @@ def test_decay_and_deformation_reach_the_wake():
 
 
 def test_what_is_not_known_along_the_axis_is_refused():
-    with pytest.raises(InputError, match="wake: wake_slab_40s.nc is not allowed in an encounter"):
+    with pytest.raises(InputError, match=r"wake: wake_slab_40s\.nc is not allowed"):
         wake_along_path(lm.load_experiment("wake_sensor", encounter={}))
     with pytest.raises(InputError, match="encounter: missing in wake_sensor"):
         wake_along_path(lm.load_experiment("wake_sensor"))

@@ -28,6 +28,14 @@ def test_a_blurred_slab_is_recovered_by_gradient_descent():
     assert found.shape == truth.shape and float(found.min()) > 0
 
 
+def test_own_simulation_steps_the_lidar(capsys):
+    """Two slabs with 1/4 of the samples: circulations within 5 stated errors of the truth."""
+    example = runpy.run_path(str(EXAMPLES / "own_simulation.py"))
+    found = example["main"](slabs=2, samples=16)
+    assert found and capsys.readouterr().out.count("m^2/s") == 2 * len(found)
+    assert all(abs(value - true) < 5 * error for value, error, true in found)
+
+
 def test_the_example_runs_from_the_command_line(tmp_path, monkeypatch, capsys):
     image = tmp_path / "slab.png"
     options = ["--steps", "1", "--samples", "4", "--out", str(image)]
