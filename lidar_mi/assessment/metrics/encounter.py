@@ -1,0 +1,192 @@
+"""Numbers of a flight through a wake: what the pilot felt, what the lidar knew, and when.
+
+Every function takes data sets of a flight: ``series``, dims (flight, time), with the flights off,
+feedforward and perfect; ``track``, dims (source, slab), with the sources estimate, track and truth.
+Angles in rad, times in s.
+"""
+
+from collections.abc import Mapping
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
+
+AFTER = 5
+"""Slabs after which the track is held against the truth."""
+
+_FELT = 0.1
+"""Fraction of the largest rolling moment of the wake from which on it counts as felt."""
+
+_CIRCULATIONS = ("port_circulation", "starboard_circulation")
+_PLACES = ("port_y", "port_z", "starboard_y", "starboard_z")
+_SIGMAS = 2.0
+
+
+def encounter_metrics(
+    series: xr.Dataset,
+    track: xr.Dataset | None,
+    *,
+    hazard_roll: float | None = None,
+) -> dict[str, float]:
+    """All numbers of a flight, flat.
+
+    Parameters
+    ----------
+    series, track : xr.Dataset
+        `track` is None without a lidar.
+    hazard_roll : float, optional
+        Bank angle (rad) that counts as a hazard.
+    """
+    found: dict[str, float] = {}
+    for mode in series["flight"].values:
+        one = series.sel(flight=mode)
+        key = f"encounter.{mode}"
+        found[f"{key}.largest_roll"] = _largest(one["roll"])
+        found[f"{key}.largest_roll_rate"] = _largest(one["roll_rate"])
+        found[f"{key}.residual_moment"] = residual_moment(one)
+        found[f"{key}.departed"] = float(one["departed"].max())
+        if hazard_roll is not None:
+            above = found[f"{key}.largest_roll"] > hazard_roll
+            found[f"{key}.hazardous"] = float(above or found[f"{key}.departed"] > 0)
+    if hazard_roll is not None:
+        found["encounter.hazard_roll"] = hazard_roll
+    for quantity in ("largest_roll", "largest_roll_rate"):
+        found |= _removed(found, quantity)
+    if track is not None:
+        found |= {f"encounter.{k}": v for k, v in _tracking(series, track).items()}
+    return {key: value for key, value in found.items() if np.isfinite(value)}
+
+
+def residual_moment(one: xr.Dataset) -> float:
+    """Rms rolling moment of wake and controls together, over that of the wake alone."""
+    wake, control = one["roll_moment"].values, one["control_roll_moment"].values
+    strength = float(np.sqrt(np.mean(wake**2)))
+    return float(np.sqrt(np.mean((wake + control) ** 2))) / strength if strength else float("nan")
+
+
+def prediction_error(one: xr.Dataset) -> float:
+    """Rms difference of predicted and true rolling moment, over the rms of the true one."""
+    known = np.isfinite(one["predicted_roll_moment"].values)
+    true = one["roll_moment"].values[known]
+    error = one["predicted_roll_moment"].values[known] - true
+    strength = float(np.sqrt(np.mean(true**2))) if true.size else 0.0
+    return float(np.sqrt(np.mean(error**2))) / strength if strength else float("nan")
+
+
+def felt_from(series: xr.Dataset) -> float:
+    """Time (s) at which the wake's rolling moment on the flight off is first felt; NaN: never."""
+    moment = np.abs(series["roll_moment"].sel(flight="off").values)
+    felt = np.flatnonzero(moment > _FELT * moment.max()) if moment.max() else []
+    return float(series["time"][felt[0]]) if len(felt) else float("nan")
+
+
+def measured_in_flight(
+    series: xr.Dataset, track: xr.Dataset, slab_depth: float
+) -> dict[str, float]:
+    """Rows of a requirement table as flown: range from the time from an estimate to its slab.
+
+    The range is what the aircraft flies from the moment at which an estimate is there to its slab;
+    errors of v and w are those of valid vectors against the truth.
+    """
+    seen = track.where(track["vectors"] > 0, drop=True)
+    speed = float(series["airspeed"].isel(time=0).mean())
+    delivered = track["delivered"].values
+    ahead = _ahead(series, track)
+    found = {
+        "range": float(np.median(ahead) * speed) if ahead.size else float("nan"),
+        "slabs_per_second": float(1 / np.median(np.diff(delivered))) if delivered.size > 1 else 0.0,
+        "slab_depth": slab_depth,
+        "points_per_slab": float(seen["vectors"].median()) if seen.sizes["slab"] else 0.0,
+    }
+    for name in "vw":
+        errors = seen[f"error_{name}"].values
+        errors = errors[np.isfinite(errors)]
+        if errors.size:
+            found[f"error_{name}"] = float(np.sqrt(np.mean(errors**2)))
+    return found
+
+
+def judged_in_flight(
+    tables: Mapping[tuple[str, str], RequirementTable], measured: Mapping[str, float]
+) -> list[tuple[RequirementTable, list[Finding]]]:
+    """Requirements of flight control against what was measured."""
+    return [
+        (table, judge(table, measured))
+        for (application, _), table in tables.items()
+        if application == "flight_control"
+    ]
+
+
+def _ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:
+    """Time (s) from each estimate to the aircraft's arrival in its plane, where it arrives."""
+    flown = series.sel(flight="feedforward")
+    arrival = np.interp(
+        track["x"].values, flown["x"].values, flown["time"].values, left=np.nan, right=np.nan
+    )
+    ahead = arrival - track["delivered"].values
+    return ahead[np.isfinite(ahead)]
+
+
+def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
+    """Lead time, slabs to a track, errors after some slabs and over all of them, consistency."""
+    found: dict[str, float] = {"slabs": float(track.sizes["slab"])}
+    one = series.sel(flight="feedforward")
+    found["prediction_error"] = prediction_error(one)
+    ahead = _ahead(series, track)
+    if ahead.size:
+        found["look_ahead"] = float(np.median(ahead))
+    usable = np.flatnonzero(track["usable"].values > 0)
+    found["usable_slabs"] = float(usable.size)
+    accepted = track["accepted"].values > 0
+    found["accepted_slabs"] = float(accepted.sum())
+    found["rejected_slabs"] = float(track["rejected"].max()) if track.sizes["slab"] else 0.0
+    if usable.size:
+        first = int(usable[0])
+        seen = np.flatnonzero(accepted)
+        found["slabs_to_track"] = float((seen <= first).sum())
+        found["lead_time"] = felt_from(series) - float(track["delivered"][first])
+    after = np.flatnonzero(track["updates"].values >= AFTER)
+    if after.size:
+        found |= {f"after_{AFTER}_slabs.{k}": v for k, v in _errors(track, after[:1]).items()}
+        found |= {f"tracked.{k}": v for k, v in _errors(track, after).items()}
+    dof = track["innovation_dof"].values
+    known = (dof > 0) & np.isfinite(track["innovation"].values) & accepted
+    if known.any():
+        found["normalised_innovation"] = float(
+            track["innovation"].values[known].sum() / dof[known].sum()
+        )
+    return found
+
+
+def _errors(track: xr.Dataset, slabs: np.ndarray) -> dict[str, float]:
+    """Largest errors of circulations (relative) and cores (m) of the track; fraction in 2 sigma."""
+    some = track.isel(slab=slabs)
+    ours, truth = some.sel(source="track"), some.sel(source="truth")
+    relative = [np.abs(ours[q] / truth[q] - 1) for q in _CIRCULATIONS]
+    cores = [
+        np.hypot(*(ours[f"{side}_{axis}"] - truth[f"{side}_{axis}"] for axis in "yz"))
+        for side in ("port", "starboard")
+    ]
+    within = [
+        np.abs(ours[q] - truth[q]) <= _SIGMAS * ours[f"{q}_stderr"]
+        for q in (*_CIRCULATIONS, *_PLACES)
+    ]
+    return {
+        "circulation_error": float(np.max(relative)),
+        "core_error": float(np.max(cores)),
+        "within_2_sigma": float(np.mean(within)),
+    }
+
+
+def _largest(values: xr.DataArray) -> float:
+    return float(np.abs(values).max())
+
+
+def _removed(found: Mapping[str, float], quantity: str) -> dict[str, float]:
+    """Fraction of what perfect preview removes that the lidar removes."""
+    values = [found.get(f"encounter.{mode}.{quantity}") for mode in ("off", "feedforward", "perfect")]
+    if None in values or values[0] == values[2]:
+        return {}
+    off, ours, perfect = values
+    return {f"encounter.removed_of_perfect.{quantity}": (off - ours) / (off - perfect)}

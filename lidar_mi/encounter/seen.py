@@ -1,0 +1,56 @@
+"""What the lidar saw of every slab, for figures: the image and the wind vectors."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.encounter.estimate import Estimate
+from lidar_mi.encounter.preview import Lidar
+
+# Vectors along y that a figure has room for.
+_VECTORS = 24
+
+
+@dataclass(eq=False)
+class Seen:
+    """Collects images and vectors, estimate by estimate.
+
+    Attributes
+    ----------
+    lidar : Lidar
+        Its ``images``, if it has them, are those of the last slab.
+    """
+
+    lidar: Lidar
+    _slabs: list[xr.Dataset] = field(default_factory=list)
+
+    def add(self, estimate: Estimate) -> None:
+        """What was seen at the last step; nothing at a first scan."""
+        images = getattr(self.lidar, "images", None)
+        if estimate.wind is None and images is None:
+            return
+        found = {}
+        if images is not None:
+            image = images.first.transpose("z", "y").astype(np.float32)
+            found["image"] = image.rename({"y": "image_y", "z": "image_z"})
+        if estimate.wind is not None:
+            vectors = estimate.wind
+            every = max(1, round(vectors.sizes["y"] / _VECTORS))
+            some = slice(every // 2, None, every)
+            vectors = vectors[["v", "w", "flag"]].isel(y=some, z=some).transpose("z", "y")
+            valid = vectors["flag"] == 0
+            found |= {name: vectors[name].where(valid).astype(np.float32) for name in ("v", "w")}
+        about = {"time": estimate.time, "x": estimate.x, "delivered": estimate.delivered}
+        self._slabs.append(xr.Dataset(found).assign(about))
+
+    def dataset(self) -> xr.Dataset | None:
+        """All slabs, dims (slab, z, y) and (slab, image_z, image_y); None: nothing was seen.
+
+        On the nodes of the first slab; NaN where a later one has none.
+        """
+        if not self._slabs:
+            return None
+        first = self._slabs[0]
+        grid = {name: first[name] for name in first.dims}
+        return xr.concat([one.interp(grid) for one in self._slabs], "slab")

@@ -1,0 +1,210 @@
+"""A flight as data sets: its time series, the track slab by slab, what the lidar saw."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.encounter.aircraft import AircraftState, Commands
+from lidar_mi.encounter.preview import Slab
+from lidar_mi.encounter.strips import Loads
+from lidar_mi.retrieval.vortices.model import PARAMETERS
+from lidar_mi.retrieval.vortices.pair import MEANING, VortexPairFit
+
+QUANTITIES = tuple(
+    f"{side}_{name}"
+    for side in ("port", "starboard")
+    for name in ("circulation", "core_radius", "y", "z")
+)
+"""Of the track's data set, as of `VortexPairFit.quantities`."""
+
+SOURCES = ("estimate", "track", "truth")
+
+_STATES: dict[str, tuple[str, str]] = {
+    "x": ("m", "place along the path"),
+    "y": ("m", "place to the left of the path"),
+    "z": ("m", "place above the path"),
+    "roll": ("rad", "bank angle, port wing up"),
+    "pitch": ("rad", "pitch angle, nose up"),
+    "yaw": ("rad", "yaw angle, nose to port"),
+    "roll_rate": ("rad s-1", "roll rate"),
+    "pitch_rate": ("rad s-1", "pitch rate"),
+    "yaw_rate": ("rad s-1", "yaw rate"),
+    "airspeed": ("m s-1", "true airspeed"),
+    "departed": ("1", "1 from the moment at which the aircraft is upset"),
+}
+_LOADS = {
+    "force_x": ("N", "force of the wake forward"),
+    "force_y": ("N", "force of the wake to the left"),
+    "force_z": ("N", "force of the wake upwards"),
+    "roll_moment": ("N m", "rolling moment of the wake, port wing up"),
+    "pitch_moment": ("N m", "pitching moment of the wake, nose down"),
+    "yaw_moment": ("N m", "yawing moment of the wake, nose to port"),
+}
+_COMMANDS = {name: ("rad", f"{name} asked for") for name in ("aileron", "elevator", "rudder")}
+_DEFLECTION = ("rad", "aileron as deflected")
+_CONTROL = ("N m", "rolling moment of the controls")
+
+
+class Recorder:
+    """Collects a flight instant by instant."""
+
+    def __init__(self) -> None:
+        self._rows: list[dict[str, float]] = []
+
+    def add(
+        self,
+        state: AircraftState,
+        loads: Loads,
+        predicted: Loads | None,
+        commands: Commands,
+        deflection: np.ndarray,
+        control_moments: np.ndarray,
+    ) -> None:
+        """One instant."""
+        row = {field.name: float(getattr(state, field.name)) for field in fields(state)}
+        row |= _named(loads, "")
+        nothing = Loads(np.full(3, np.nan), np.full(3, np.nan))
+        row |= _named(predicted or nothing, "predicted_")
+        row |= {name: float(getattr(commands, name)) for name in _COMMANDS}
+        row["aileron_deflection"] = float(deflection[0])
+        row["control_roll_moment"] = float(control_moments[0] @ deflection)
+        self._rows.append(row)
+
+    def dataset(self) -> xr.Dataset:
+        """All instants, dims (time,)."""
+        meaning = {
+            **_STATES,
+            **_LOADS,
+            **{f"predicted_{name}": (u, f"predicted {text}") for name, (u, text) in _LOADS.items()},
+            **_COMMANDS,
+            "aileron_deflection": _DEFLECTION,
+            "control_roll_moment": _CONTROL,
+        }
+        time = np.array([row["time"] for row in self._rows])
+        return xr.Dataset(
+            {
+                name: (
+                    "time",
+                    np.array([row[name] for row in self._rows]),
+                    {"units": units, "long_name": text},
+                )
+                for name, (units, text) in meaning.items()
+            },
+            coords={"time": ("time", time, {"units": "s", "long_name": "time of flight"})},
+        )
+
+
+def _named(loads: Loads, prefix: str) -> dict[str, float]:
+    values = [*loads.force, *loads.moment]
+    return {f"{prefix}{name}": float(v) for name, v in zip(_LOADS, values, strict=True)}
+
+
+def flights_dataset(flights: dict[str, xr.Dataset]) -> xr.Dataset:
+    """Flights of the same duration as one data set, dims (flight, time)."""
+    names = xr.DataArray(list(flights), dims="flight", attrs={"long_name": "what steers"})
+    return xr.concat(list(flights.values()), names.rename("flight"), join="exact")
+
+
+def track_dataset(slabs: Sequence[Slab], wake: WakeAlongPath) -> xr.Dataset:
+    """Estimates, track and truth in the plane and at the time of every slab.
+
+    Returns
+    -------
+    xr.Dataset, dims (slab) and (source, slab)
+        The quantities `QUANTITIES`, with their standard errors, for `SOURCES`; NaN where there is
+        none.
+    """
+    rows = [_row(slab, wake) for slab in slabs]
+    found = xr.Dataset(
+        coords={
+            "slab": ("slab", np.arange(len(rows)), {"long_name": "slab delivered"}),
+            "source": ("source", list(SOURCES)),
+        }
+    )
+    for name, (units, text) in _PER_SLAB.items():
+        found[name] = ("slab", [row[name] for row in rows], {"units": units, "long_name": text})
+    found["flags"] = ("slab", np.array(["; ".join(s.estimate.flags) for s in slabs], dtype=object))
+    for name in QUANTITIES:
+        units, text = MEANING[name]
+        for suffix in ("", "_stderr"):
+            values = np.array([[row[source, name + suffix] for row in rows] for source in SOURCES])
+            about = {"units": units, "long_name": f"standard error of {text}" if suffix else text}
+            found[name + suffix] = (("source", "slab"), values.reshape(len(SOURCES), -1), about)
+    return found
+
+
+_PER_SLAB = {
+    "time": ("s", "time at which the estimate is valid"),
+    "delivered": ("s", "time at which the estimate is there"),
+    "x": ("m", "plane of the slab along the path"),
+    "accepted": ("1", "1: the fit of this slab is valid"),
+    "usable": ("1", "1: the track can be steered by"),
+    "updates": ("1", "slabs that the track took in"),
+    "rejected": ("1", "slabs that the track refused"),
+    "innovation": ("1", "normalised square of the innovation"),
+    "innovation_dof": ("1", "its degrees of freedom"),
+    "error_v": ("m s-1", "rms error of v over the valid vectors"),
+    "error_w": ("m s-1", "rms error of w over the valid vectors"),
+    "vectors": ("1", "number of valid vectors"),
+    "seconds": ("s", "time that the estimate took"),
+}
+
+
+def _row(slab: Slab, wake: WakeAlongPath) -> dict[Any, float]:
+    estimate, track = slab.estimate, slab.track
+    pair = estimate.pair
+    innovation = (track.innovation if track else None) or (np.nan, np.nan)
+    row: dict[Any, float] = {
+        "time": estimate.time,
+        "delivered": estimate.delivered,
+        "x": estimate.x,
+        "accepted": float(pair is not None and pair.success),
+        "usable": float(track is not None and track.usable),
+        "updates": float(track.updates if track else 0),
+        "rejected": float(track.rejected if track else 0),
+        "innovation": float(innovation[0]),
+        "innovation_dof": float(innovation[1]),
+        "seconds": float(sum(estimate.seconds.values())),
+        **_wind_errors(estimate.wind, wake, estimate.x, estimate.time),
+    }
+    tracked = track.pair_at(estimate.x, estimate.time) if track else None
+    for source, found in (("estimate", pair), ("track", tracked)):
+        row |= {(source, name): value for name, value in _numbers(found).items()}
+    truth = dict(zip(("port", "starboard"), wake.vortices(estimate.x, estimate.time), strict=True))
+    for name in QUANTITIES:
+        side, quantity = name.split("_", 1)
+        row["truth", name] = getattr(truth[side], quantity)
+        row["truth", f"{name}_stderr"] = 0.0
+    return row
+
+
+def _numbers(pair: VortexPairFit | None) -> dict[str, float]:
+    """Quantities of a valid pair with their standard errors; else NaN."""
+    if pair is None or not pair.success:
+        return {name + suffix: np.nan for name in QUANTITIES for suffix in ("", "_stderr")}
+    stderr, found = np.sqrt(np.diagonal(pair.covariance)), {}
+    for name in QUANTITIES:
+        logarithm = name.endswith("core_radius")
+        k = PARAMETERS.index(name.replace("core_radius", "log_radius"))
+        value = float(np.exp(pair.parameters[k]) if logarithm else pair.parameters[k])
+        found[name] = value
+        found[f"{name}_stderr"] = float(stderr[k]) * (value if logarithm else 1.0)
+    return found
+
+
+def _wind_errors(wind: xr.Dataset | None, wake, x: float, time: float) -> dict[str, float]:
+    """Rms errors of the vectors that are valid."""
+    if wind is None:
+        return {"error_v": np.nan, "error_w": np.nan, "vectors": 0.0}
+    y, z = np.meshgrid(wind["y"].values, wind["z"].values)
+    _, *truth = wake.wind(np.full(y.shape, x), y, z, time)
+    valid = (wind["flag"].transpose("z", "y") == 0).values
+    found = {"vectors": float(valid.sum())}
+    for name, true in zip("vw", truth, strict=True):
+        error = (wind[name].transpose("z", "y").values - true)[valid]
+        found[f"error_{name}"] = float(np.sqrt(np.mean(error**2))) if error.size else np.nan
+    return found
