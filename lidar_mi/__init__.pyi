@@ -2,6 +2,7 @@
 
 from .campaign.collect import open_campaign
 from .campaign.engine import run_campaign
+from .encounter.fly import Flight, fly
 from .encounter.pose import AircraftPose
 from .encounter.virtual_lidar import VirtualLidar
 from .errors import InputError
@@ -36,6 +37,7 @@ __all__ = [
     "Calibration",
     "Experiment",
     "Flag",
+    "Flight",
     "Gap",
     "InputError",
     "Rings",
@@ -51,6 +53,7 @@ __all__ = [
     "export",
     "fit_vortices",
     "fit_vortices_to_wind",
+    "fly",
     "gap_from_fractions",
     "gap_from_lines",
     "load_experiment",

@@ -11,6 +11,7 @@ from lidar_mi.cli import (
     check,
     doctor,
     export,
+    fly,
     info,
     render,
     retrieve,
@@ -41,6 +42,7 @@ def _top(
 
 
 app.command(epilog=run.EXAMPLES)(run.run)
+app.command(epilog=fly.EXAMPLES)(fly.fly)
 app.command(epilog=check.EXAMPLES)(check.check)
 app.command(epilog=render.EXAMPLES)(render.render)
 app.command(epilog=retrieve.EXAMPLES)(retrieve.retrieve)

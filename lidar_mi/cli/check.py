@@ -16,6 +16,7 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
 
     Reads the wake, the scattering and the requirements as run does, and writes nothing.
     """
+    from lidar_mi.encounter.check import sections as flight_sections
     from lidar_mi.experiment import reading as config
     from lidar_mi.experiment.check import sections
 
@@ -23,7 +24,13 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
     asked = config.load_variants(path, changes) or {"": config.load(path, changes)}
     with progress() as notice:
         found = [
-            section for one in asked.values() for section in sections(one, path.parent, notice)
+            section
+            for one in asked.values()
+            for section in (
+                flight_sections(one.read_from(path.parent), notice)
+                if one.encounter
+                else sections(one, path.parent, notice)
+            )
         ]
     for title, rows in found:
         print_rows(title, rows)

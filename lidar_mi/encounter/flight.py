@@ -12,12 +12,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
-from lidar_mi.encounter.aircraft import (
-    AircraftModel,
-    AircraftState,
-    deflected,
-    loads_in_wind,
-)
+from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
 from lidar_mi.encounter.control import Controller, Preview, feedforward, wings_level
 from lidar_mi.encounter.preview import Lidar, Lookout, preview_of
 from lidar_mi.encounter.roll_model import RollModel
@@ -148,7 +143,7 @@ def flown(
     for step in range(count + 1):
         state = aircraft.state
         if step % a_scan == 0:
-            notice(f"{state.time:.1f} of {count * dt:.1f} s", step / count)
+            notice(f"{state.time:.0f} of {count * dt:.0f} s", step / count)
         preview = ahead(state)
         loads = loads_in_wind(aircraft.strips, state, wake.wind, aircraft.density)
         predicted = preview(state.time) if preview else None

@@ -11,13 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from lidar_mi.atmosphere.vortex import Vortex, velocity
-from lidar_mi.encounter.aircraft import (
-    AircraftModel,
-    AircraftState,
-    Wind,
-    flown_on,
-    loads_in_wind,
-)
+from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Wind, flown_on, loads_in_wind
 from lidar_mi.encounter.control import Preview
 from lidar_mi.encounter.estimate import Estimate
 from lidar_mi.encounter.pose import AircraftPose

@@ -193,7 +193,9 @@ def settings(experiment: Experiment) -> dict[str, Any]:
     """
     unused = {"wake", *BACKSCATTER} if experiment.wake is None else set()
     unused |= {
-        name for name in ("doppler", "sensor", "volume") if getattr(experiment, name) is None
+        name
+        for name in ("doppler", "sensor", "volume", "encounter")
+        if getattr(experiment, name) is None
     }
     return experiment.model_dump(mode="json", exclude=unused)
 

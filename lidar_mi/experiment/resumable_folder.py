@@ -194,18 +194,25 @@ class RunFolder:
 
     def keep_verdict(self, metrics: Mapping[str, float], page: str) -> None:
         """Write report and metrics: the run is complete. The record has the metrics' checksum."""
-        text = to_json(metrics)
-        (self.path / METRICS).unlink(missing_ok=True)
-        record = self.record | {"metrics": hashlib.sha256(text.encode()).hexdigest()}
-        write_text(self.path / RECORD, to_yaml(record))
-        write_text(self.path / REPORT, page)
-        write_text(self.path / METRICS, text)
+        write_verdict(self.path, self.record, metrics, page)
 
     def _keep_noise(self, scans: list[xr.Dataset]) -> None:
         """Add noisy images to the files of those without noise."""
         for part, scan in zip(rendering.IMAGES, scans, strict=True):
             if "Y_noisy" in scan and "Y_noisy" not in exr.read_scan(self._images.path(part)):
                 self._images.write(part, scan)
+
+
+def write_verdict(
+    folder: Path, record: Mapping[str, Any], metrics: Mapping[str, float], page: str
+) -> None:
+    """Write report and metrics of a folder, last the metrics: whatever is in it is complete."""
+    text = to_json(metrics)
+    (folder / METRICS).unlink(missing_ok=True)
+    checked = {**record, "metrics": hashlib.sha256(text.encode()).hexdigest()}
+    write_text(folder / RECORD, to_yaml(checked))
+    write_text(folder / REPORT, page)
+    write_text(folder / METRICS, text)
 
 
 def write_result(folder: Path, name: str, value: Any, experiment: str, signature: str) -> None:

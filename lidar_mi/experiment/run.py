@@ -111,6 +111,10 @@ def prepare(
     InputError
         Bad input.
     """
+    if experiment.encounter is not None:
+        raise InputError(
+            f"encounter: {experiment.name} is a flight, not a run; expected lidar-mi fly (lm.fly)"
+        )
     beside = experiment.folder if beside is None else beside
     prepared = Run(experiment, {"beside": beside, **(known or {})}, Log(notice))
     stages = stages_of(experiment)

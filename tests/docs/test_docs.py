@@ -136,6 +136,7 @@ def _unit(field):
             (units.SpectralRadiance, "W/m³/sr"),
             (units.Backscatter, "1/m/sr"),
             (units.Area, "m²"),
+            (units.Inertia, "kg m²"),
             (units.Memory, "byte"),
             (units.Temperature, "K"),
             (units.Number, None),

@@ -11,6 +11,17 @@ STDERR = np.array([4.0, 0.03, 0.15, 0.15, 4.0, 0.03, 0.15, 0.15, 0.1, 0.1])
 """Of the parameters of a pair."""
 
 
+def encounter_keys(**encounter):
+    """A short flight through a wake of 30 m, as the dictionary of an experiment."""
+    path = {"start": "220 m", "beyond": "130 m"}
+    pair = {"circulation": 350, "separation": 30, "core_radius": 3, "width": 100, "height": 70}
+    return {
+        "name": "flight",
+        "wake": {"vortex_pair": pair, "spacing": 1},
+        "encounter": encounter | {"path": path | encounter.get("path", {})},
+    }
+
+
 class SyntheticLidar:
     """Delivers the pair of the wake in the slab, with Gaussian errors; refuses none.
 
@@ -26,8 +37,16 @@ class SyntheticLidar:
         Called with the number of a scan; True: no estimate.
     """
 
-    def __init__(self, wake: WakeAlongPath, rate=10.0, speed=75.0, look_ahead=150.0, seed=1,
-                 latency=0.02, blind=lambda number: False):
+    def __init__(
+        self,
+        wake: WakeAlongPath,
+        rate=10.0,
+        speed=75.0,
+        look_ahead=150.0,
+        seed=1,
+        latency=0.02,
+        blind=lambda number: False,
+    ):
         self.wake, self.blind = wake, blind
         self._rate, self._speed, self._far, self._latency = rate, speed, look_ahead, latency
         self._random = np.random.default_rng(seed)
@@ -41,11 +60,14 @@ class SyntheticLidar:
         if len(self.steps) > 1 and not self.blind(len(self.steps) - 1):
             parameters = []
             for vortex in self.wake.vortices(x, time):
-                parameters += [
-                    vortex.circulation, np.log(vortex.core_radius), vortex.y, vortex.z
-                ]
+                parameters += [vortex.circulation, np.log(vortex.core_radius), vortex.y, vortex.z]
             pair = VortexPairFit(
-                np.array([*parameters, 0.0, 0.0]) + noise, np.diag(STDERR**2), "lamb_oseen",
-                1.0, 0.9, 0.0, 1.0,
+                np.array([*parameters, 0.0, 0.0]) + noise,
+                np.diag(STDERR**2),
+                "lamb_oseen",
+                1.0,
+                0.9,
+                0.0,
+                1.0,
             )
         return Estimate(time, t + self._latency, x, None, pair, (), {"vortices": 0.01})

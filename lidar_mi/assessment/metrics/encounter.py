@@ -15,6 +15,10 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 AFTER = 5
 """Slabs after which the track is held against the truth."""
 
+HAZARD_ROLL = np.radians(7.0)
+"""Bank angle (rad) above which an encounter near the ground and in clouds counts as a hazard: pilots
+in simulators called smaller ones harmless (Rossow and Tinling 1988, J. Aircraft 25)."""
+
 _FELT = 0.1
 """Fraction of the largest rolling moment of the wake from which on it counts as felt."""
 
@@ -24,10 +28,7 @@ _SIGMAS = 2.0
 
 
 def encounter_metrics(
-    series: xr.Dataset,
-    track: xr.Dataset | None,
-    *,
-    hazard_roll: float | None = None,
+    series: xr.Dataset, track: xr.Dataset | None, hazard_roll: float = HAZARD_ROLL
 ) -> dict[str, float]:
     """All numbers of a flight, flat.
 
@@ -35,7 +36,7 @@ def encounter_metrics(
     ----------
     series, track : xr.Dataset
         `track` is None without a lidar.
-    hazard_roll : float, optional
+    hazard_roll : float
         Bank angle (rad) that counts as a hazard.
     """
     found: dict[str, float] = {}
@@ -46,11 +47,9 @@ def encounter_metrics(
         found[f"{key}.largest_roll_rate"] = _largest(one["roll_rate"])
         found[f"{key}.residual_moment"] = residual_moment(one)
         found[f"{key}.departed"] = float(one["departed"].max())
-        if hazard_roll is not None:
-            above = found[f"{key}.largest_roll"] > hazard_roll
-            found[f"{key}.hazardous"] = float(above or found[f"{key}.departed"] > 0)
-    if hazard_roll is not None:
-        found["encounter.hazard_roll"] = hazard_roll
+        above = found[f"{key}.largest_roll"] > hazard_roll
+        found[f"{key}.hazardous"] = float(above or found[f"{key}.departed"] > 0)
+    found["encounter.hazard_roll"] = hazard_roll
     for quantity in ("largest_roll", "largest_roll_rate"):
         found |= _removed(found, quantity)
     if track is not None:
@@ -146,7 +145,7 @@ def _tracking(series: xr.Dataset, track: xr.Dataset) -> dict[str, float]:
         seen = np.flatnonzero(accepted)
         found["slabs_to_track"] = float((seen <= first).sum())
         found["lead_time"] = felt_from(series) - float(track["delivered"][first])
-    after = np.flatnonzero(track["updates"].values >= AFTER)
+    after = np.flatnonzero((track["updates"].values >= AFTER) & (track["usable"].values > 0))
     if after.size:
         found |= {f"after_{AFTER}_slabs.{k}": v for k, v in _errors(track, after[:1]).items()}
         found |= {f"tracked.{k}": v for k, v in _errors(track, after).items()}
@@ -185,7 +184,9 @@ def _largest(values: xr.DataArray) -> float:
 
 def _removed(found: Mapping[str, float], quantity: str) -> dict[str, float]:
     """Fraction of what perfect preview removes that the lidar removes."""
-    values = [found.get(f"encounter.{mode}.{quantity}") for mode in ("off", "feedforward", "perfect")]
+    values = [
+        found.get(f"encounter.{mode}.{quantity}") for mode in ("off", "feedforward", "perfect")
+    ]
     if None in values or values[0] == values[2]:
         return {}
     off, ours, perfect = values

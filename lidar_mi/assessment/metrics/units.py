@@ -13,6 +13,14 @@ _NAMED = {
     "doppler.velocity_range": "m/s",
     "doppler.render.largest_error": "m/s",
 }
+_ENCOUNTER = {
+    "largest_roll": "rad",
+    "largest_roll_rate": "rad/s",
+    "hazard_roll": "rad",
+    "lead_time": "s",
+    "look_ahead": "s",
+    "core_error": "m",
+}
 _VORTEX = {
     name: units.replace(" s-1", "/s").replace("m2", "m²") for name, (units, _) in MEANING.items()
 } | {"model_error": "m/s"}
@@ -25,6 +33,8 @@ def unit_of(key: str) -> str:
     *_, parent, name = ("", *key.split("."))
     if name.startswith(_WIND):
         return "rad" if name.endswith("_direction") else "m/s"
+    if key.startswith("encounter.") and parent != "removed_of_perfect":
+        return _ENCOUNTER.get(name, "")
     if key.startswith("vortex."):
         return _VORTEX.get(name.removesuffix("_stderr"), "")
     if parent.endswith("_core"):

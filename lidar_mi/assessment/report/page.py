@@ -1,6 +1,7 @@
 """The report of a run: one self-contained HTML file."""
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
@@ -25,6 +26,24 @@ class Tables(NamedTuple):
     tables: Sequence[tuple[str, Sequence[str], Sequence[tuple[str, str, Sequence[str]]]]]
 
 
+class Film(NamedTuple):
+    """Frames with a slider.
+
+    Attributes
+    ----------
+    title, caption : str
+    frames : sequence of (bytes, str)
+        WebP images and what each shows.
+    seconds : float
+        For which each is shown.
+    """
+
+    title: str
+    caption: str
+    frames: Sequence[tuple[bytes, str]]
+    seconds: float
+
+
 class Chapter(NamedTuple):
     """The part of the report on one instrument.
 
@@ -39,6 +58,8 @@ class Chapter(NamedTuple):
         Compliance with the requirements; placed before all chapters' numbers.
     vectors : dict, optional
         `vector_map.map_data` with a ``title``, for an interactive map of the vectors.
+    film : Film, optional
+        Placed before the figures.
     """
 
     title: str
@@ -47,6 +68,7 @@ class Chapter(NamedTuple):
     numbers: Tables
     verdict: Tables | None = None
     vectors: dict | None = None
+    film: Film | None = None
 
 
 def page(
@@ -83,9 +105,14 @@ def page(
         resolved=resolved,
         metrics={key: _rounded(key, value) for key, value in metrics.items()},
         warnings=[text.rstrip(".") for text in warnings],
-        script=Markup(files("lidar_mi.assessment.report").joinpath("vector_map.js").read_text()),
+        script=_script("vector_map.js"),
+        film_script=_script("film.js"),
         chapters=[
-            chapter._asdict() | {"images": [(d.title, d.caption, images[d]) for d in chapter.drawn]}
+            chapter._asdict()
+            | {
+                "images": [(d.title, d.caption, images[d]) for d in chapter.drawn],
+                "film": _packed(chapter.film) if chapter.film else None,
+            }
             for chapter in chapters
         ],
     )
@@ -98,6 +125,27 @@ def template(name: str) -> jinja2.Template:
         undefined=jinja2.StrictUndefined,
         loader=jinja2.PackageLoader("lidar_mi.assessment.report", ""),
     ).get_template(name)
+
+
+def _script(name: str) -> Markup:
+    return Markup(files("lidar_mi.assessment.report").joinpath(name).read_text())
+
+
+def _packed(film: Film) -> dict:
+    """A film as the template takes it; shown first is the frame in the middle."""
+    frames = [
+        {"data": base64.b64encode(data).decode(), "caption": text} for data, text in film.frames
+    ]
+    middle = len(frames) // 2
+    return {
+        "title": film.title,
+        "caption": film.caption,
+        "frames": frames,
+        "middle": middle,
+        "first": f"data:image/webp;base64,{frames[middle]['data']}",
+        "now": frames[middle]["caption"],
+        "milliseconds": round(1000 * film.seconds),
+    }
 
 
 def embedded(path: Path) -> str:
@@ -131,12 +179,12 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
             scale = f"outer scale {wake.texture.outer_scale:g} m"
             texture = f"texture of {percent(wake.texture.rms)} rms, {scale}"
         rows.append(("wake", f"{flow}; {texture}"))
-        platform = experiment.platform
-        rows.append(("platform", f"{platform.speed:g} m/s, images {platform.dt:g} s apart"))
+        rows.append(_flight(experiment) if experiment.encounter else _platform(experiment))
+        distance = experiment.encounter.look_ahead if experiment.encounter else scan.range
         beam = (
             f"{lidar.wavelength * 1e9:.5g} nm, {lidar.pulse_energy * 1e3:g} mJ, divergence "
             f"{lidar.divergence_full * 1e3:g} mrad, telescope of {2 * lidar.aperture_radius:g} m; "
-            f"slab of {scan.thickness:g} m from {scan.range:g} m"
+            f"slab of {scan.thickness:g} m from {distance:g} m"
         )
         detector = "with the noise of a detector" if experiment.detector else "no detector"
         rows.append(("backscatter lidar", f"{beam}; {detector}"))
@@ -166,6 +214,24 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
     rows.append(("seed", str(experiment.seed)))
     rows.append(("versions", ", ".join(f"{name} {version}" for name, version in versions.items())))
     return rows
+
+
+def _platform(experiment) -> tuple[str, str]:
+    platform = experiment.platform
+    return "platform", f"{platform.speed:g} m/s, images {platform.dt:g} s apart"
+
+
+def _flight(experiment) -> tuple[str, str]:
+    encounter = experiment.encounter
+    path, aircraft = encounter.path, encounter.aircraft
+    kind = (
+        "a rigid aircraft that rolls" if aircraft.model == "roll" else f"JSBSim's {aircraft.model}"
+    )
+    return "flight", (
+        f"{kind} at {path.speed:g} m/s, crossing the wake at "
+        f"{math.degrees(path.crossing_angle):.3g} degrees on a path of "
+        f"{math.degrees(path.climb_angle):+.3g} degrees; {encounter.rate:g} slabs a second"
+    )
 
 
 def _rounded(key: str, value: float) -> str:

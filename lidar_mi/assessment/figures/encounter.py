@@ -1,0 +1,364 @@
+"""Figures of a flight into a wake: the approach, the track, the moments, the rolling."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.metrics.encounter import HAZARD_ROLL
+
+FLIGHTS = {
+    "off": ("without help", "tab:red", "-"),
+    "feedforward": ("with the lidar", "tab:blue", "-"),
+    "perfect": ("perfect preview", "0.35", "--"),
+}
+"""Names, colours and lines of the flights."""
+
+SIDES = {"port": "#c2571a", "starboard": "#2c7a3f"}
+TWO_SIGMA = 2.0
+
+_ROWS = (
+    ("circulation", "circulation / m$^2$ s$^{-1}$"),
+    ("core_radius", "core radius / m"),
+    ("y", "y / m"),
+    ("z", "z / m"),
+)
+
+
+def draw_all(
+    folder: Path,
+    series: xr.Dataset,
+    track: xr.Dataset | None,
+    seen: xr.Dataset | None,
+    span: float,
+    log: Callable,
+) -> list[Drawn]:
+    """Draw all figures of a flight.
+
+    Parameters
+    ----------
+    folder : Path
+    series : xr.Dataset, dims (flight, time)
+    track : xr.Dataset or None, dims (source, slab)
+    seen : xr.Dataset or None
+        Images and vectors of the slabs.
+    span : float
+        Of the aircraft, m.
+    log : callable
+    """
+    plates = [("fig30_roll", "Roll angle and roll rate", _roll(series))]
+    if track is not None and track.sizes["slab"]:
+        plates.append(
+            (
+                "fig31_approach",
+                "The approach from above and from the side",
+                _approach(series, track, seen),
+            )
+        )
+        if seen is not None:
+            plates.append(("fig32_cockpit", "A slab from the cockpit", _cockpit(track, seen, span)))
+        plates.append(("fig33_track", "The vortices, estimated and tracked", _track(track)))
+    if "feedforward" in series["flight"]:
+        plates.append(("fig34_moment", "Predicted and true rolling moment", _moment(series)))
+    plates.append(("fig35_commands", "The ailerons", _commands(series)))
+    return save_all(folder, plates, log)
+
+
+def _flown(series: xr.Dataset):
+    """Flights in the order in which they are drawn, the one with the lidar on top."""
+    there = [str(mode) for mode in series["flight"].values]
+    return [
+        (mode, series.sel(flight=mode))
+        for mode in ("off", "perfect", "feedforward")
+        if mode in there
+    ]
+
+
+def _lines(axes, series, name, factor=1.0) -> None:
+    for mode, one in _flown(series):
+        label, colour, style = FLIGHTS[mode]
+        axes.plot(one["time"], factor * one[name], color=colour, ls=style, lw=1.8, label=label)
+    axes.grid(alpha=0.3)
+
+
+def _roll(series):
+    figure = Figure(figsize=(10.5, 6.4), layout="compressed")
+    angle, rate = figure.subplots(2, 1, sharex=True)
+    _lines(angle, series, "roll", np.degrees(1))
+    _lines(rate, series, "roll_rate", np.degrees(1))
+    limit = np.degrees(HAZARD_ROLL)
+    angle.axhspan(-limit, limit, color="0.5", alpha=0.12, lw=0, label=f"below {limit:.0f} degrees")
+    angle.set_ylabel("roll angle / degrees")
+    rate.set(ylabel="roll rate / degrees s$^{-1}$", xlabel="time of flight / s")
+    angle.legend(fontsize=9, loc="best")
+    return figure, "Positive: port wing up. Shaded: bank angles below the stated hazard limit."
+
+
+def _approach(series, track, seen):
+    figure = Figure(figsize=(11.5, 7.2), layout="compressed")
+    above, side = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
+    one = series.sel(flight="feedforward")
+    truth, tracked, found = (track.sel(source=s) for s in ("truth", "track", "estimate"))
+    for axes, axis in ((above, "y"), (side, "z")):
+        for name, colour in SIDES.items():
+            key = f"{name}_{axis}"
+            axes.plot(
+                track["x"],
+                truth[key],
+                color="k",
+                lw=1.2,
+                label="true vortices" if name == "port" else None,
+            )
+            axes.errorbar(
+                track["x"],
+                found[key],
+                TWO_SIGMA * found[f"{key}_stderr"],
+                fmt=".",
+                ms=4,
+                color="0.55",
+                elinewidth=0.8,
+                label="estimate of each slab, 2 sigma" if name == "port" else None,
+            )
+            axes.plot(track["x"], tracked[key], color=colour, lw=2, label=f"{name}, tracked")
+        axes.plot(one["x"], one[axis], color="tab:blue", lw=2, label="flight path")
+        axes.grid(alpha=0.3)
+        axes.margins(x=0.01)
+    if seen is not None and "image_y" in seen:
+        low, high = float(seen["image_y"].min()), float(seen["image_y"].max())
+        above.vlines(
+            track["x"],
+            low,
+            high,
+            color="tab:cyan",
+            lw=0.7,
+            alpha=0.5,
+            zorder=0,
+            label="slabs seen by the lidar",
+        )
+    above.set_ylabel("y / m (port is up)")
+    side.set(ylabel="z / m", xlabel="x along the path / m")
+    above.legend(fontsize=8, ncols=3, loc="best")
+    return figure, (
+        "Each slab is seen twice, from 150 m ahead. Vortices are shown in the plane of each slab at "
+        "the time when it was seen; the path frame is inclined as the path, so that a level wake "
+        "rises along it on a descent."
+    )
+
+
+def _cockpit(track, seen, span):
+    at = best_slab(track, seen)
+    figure = Figure(figsize=(10.5, 7.0), layout="compressed")
+    axes = figure.subplots()
+    view = seen.isel(slab=at)
+    draw_image(axes, view)
+    draw_vectors(axes, view)
+    number = int(np.argmin(np.abs(track["x"].values - float(view["x"]))))
+    draw_vortices(axes, track.isel(slab=number))
+    axes.plot(
+        [-span / 2, span / 2],
+        [0, 0],
+        color="tab:blue",
+        lw=4,
+        solid_capstyle="round",
+        label="wing, where it will pass",
+    )
+    axes.set(xlabel="y / m (port is left)", ylabel="z / m")
+    axes.legend(loc="lower center", ncols=3, fontsize=9)
+    ahead = float(view["x"]) / float(np.gradient(track["x"], track["time"]).mean())
+    return figure, (
+        f"Backscatter of the slab at x = {float(view['x']):.0f} m with the wind retrieved from both "
+        f"images, delivered at {float(view['delivered']):.2f} s; the wing is there at about "
+        f"{ahead:.1f} s. Circles: cores with the radius of their largest swirl."
+    )
+
+
+def best_slab(track: xr.Dataset, seen: xr.Dataset) -> int:
+    """The last slab whose vortices were found on both sides of the path; else the last accepted."""
+    found = track.sel(source="estimate")
+    both = (found["port_y"] > 0) & (found["starboard_y"] < 0)
+    for chosen in (both, track["accepted"] > 0):
+        x = track["x"].values[chosen.values]
+        if x.size:
+            middle = x[x.size // 2]
+            return int(np.argmin(np.abs(seen["x"].values - middle)))
+    return seen.sizes["slab"] - 1
+
+
+def draw_image(axes, view: xr.Dataset, limits: tuple[float, float] | None = None):
+    """Backscatter of a slab in the pilot's view; the mesh, for later frames."""
+    if "image" not in view:
+        return None
+    low, high = limits or np.nanquantile(view["image"], (0.01, 0.995))
+    mesh = axes.pcolormesh(
+        view["image_y"],
+        view["image_z"],
+        view["image"].values,
+        cmap="gray",
+        vmin=low,
+        vmax=high,
+        shading="nearest",
+        rasterized=True,
+    )
+    axes.set(aspect="equal")
+    axes.set_xlim(float(view["image_y"].max()), float(view["image_y"].min()))
+    axes.set_ylim(float(view["image_z"].min()), float(view["image_z"].max()))
+    return mesh
+
+
+def draw_vectors(axes, view: xr.Dataset):
+    """Wind vectors of a slab, those that are valid."""
+    if "v" not in view:
+        return None
+    y, z = np.meshgrid(view["y"], view["z"])
+    step = float(view["y"][1] - view["y"][0])
+    return axes.quiver(
+        y,
+        z,
+        view["v"],
+        view["w"],
+        color="#f2c14e",
+        angles="xy",
+        scale_units="xy",
+        scale=10 / step,
+        width=0.0022,
+    )
+
+
+def draw_vortices(axes, at: xr.Dataset) -> list:
+    """Cores of a slab: true, and as tracked (else as estimated)."""
+    drawn = []
+    for source, colour, style, label in (
+        ("truth", "white", "-", "true cores"),
+        ("track", "tab:orange", "-", "tracked"),
+    ):
+        one = at.sel(source=source)
+        for side in SIDES:
+            y, z, radius = (float(one[f"{side}_{name}"]) for name in ("y", "z", "core_radius"))
+            if np.isfinite([y, z, radius]).all():
+                width = 1.2 if source == "truth" else 2.2
+                drawn.append(
+                    axes.add_patch(
+                        Circle(
+                            (y, z),
+                            radius,
+                            fill=False,
+                            ec=colour,
+                            ls=style,
+                            lw=width,
+                            label=label if side == "port" else None,
+                        )
+                    )
+                )
+    return drawn
+
+
+def _track(track):
+    figure = Figure(figsize=(11.5, 10.0), layout="compressed")
+    panels = figure.subplots(len(_ROWS), 2, sharex=True)
+    truth, tracked, found = (track.sel(source=s) for s in ("truth", "track", "estimate"))
+    x = track["x"].values
+    for row, (name, label) in zip(panels, _ROWS, strict=True):
+        for axes, (side, colour) in zip(row, SIDES.items(), strict=True):
+            key = f"{side}_{name}"
+            spread = TWO_SIGMA * tracked[f"{key}_stderr"]
+            axes.errorbar(
+                x,
+                found[key],
+                TWO_SIGMA * found[f"{key}_stderr"],
+                fmt=".",
+                ms=4,
+                color="0.6",
+                elinewidth=0.8,
+                label="estimates, 2 sigma",
+            )
+            axes.fill_between(
+                x,
+                tracked[key] - spread,
+                tracked[key] + spread,
+                color=colour,
+                alpha=0.3,
+                lw=0,
+                label="track, 2 sigma",
+            )
+            axes.plot(x, tracked[key], color=colour, lw=1.6)
+            axes.plot(x, truth[key], color="k", lw=1.2, label="truth")
+            axes.set_ylabel(label)
+            axes.grid(alpha=0.3)
+            _fit_limits(axes, truth[key].values, found[key].values, spread.values)
+    for axes, side in zip(panels[0], SIDES, strict=True):
+        axes.set_title(f"{side} vortex")
+    for axes in panels[-1]:
+        axes.set_xlabel("x of the slab / m")
+    panels[0, 0].legend(fontsize=8, loc="best")
+    return figure, (
+        "Parameters in the plane of every slab at the time when it was seen: estimates of single "
+        "slabs, the track after each of them, the truth. An estimate is missing where its fit was "
+        "not accepted, mostly where a vortex is outside the image."
+    )
+
+
+def _fit_limits(axes, truth, found, spread) -> None:
+    """Values of truth and estimates, without the widest bands."""
+    inside = np.isfinite(found)
+    values = np.concatenate([truth[inside], found[inside]]) if inside.any() else truth
+    margin = max(0.3 * float(np.ptp(values)), 2 * float(np.nanmedian(spread)), 0.05)
+    if np.isfinite([values.min(), values.max(), margin]).all():
+        axes.set_ylim(values.min() - margin, values.max() + margin)
+
+
+def _moment(series):
+    figure = Figure(figsize=(10.5, 6.4), layout="compressed")
+    moment, rest = figure.subplots(2, 1, sharex=True)
+    one = series.sel(flight="feedforward")
+    moment.plot(one["time"], 1e-3 * one["roll_moment"], color="k", lw=1.8, label="true")
+    moment.plot(
+        one["time"],
+        1e-3 * one["predicted_roll_moment"],
+        color="tab:blue",
+        lw=1.8,
+        ls="--",
+        label="predicted from the track",
+    )
+    moment.plot(
+        one["time"],
+        -1e-3 * one["control_roll_moment"],
+        color="tab:orange",
+        lw=1.2,
+        label="of the ailerons, reversed",
+    )
+    rest.plot(
+        one["time"],
+        1e-3 * (one["predicted_roll_moment"] - one["roll_moment"]),
+        color="tab:blue",
+        lw=1.5,
+        label="predicted - true",
+    )
+    rest.plot(
+        one["time"],
+        1e-3 * (one["roll_moment"] + one["control_roll_moment"]),
+        color="tab:orange",
+        lw=1.5,
+        label="felt: wake and ailerons",
+    )
+    for axes in (moment, rest):
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=9, loc="best")
+        axes.set_ylabel("rolling moment / kN m")
+    rest.set_xlabel("time of flight / s")
+    return figure, (
+        "Flight with the lidar. Predicted: the moment on this wing from the track alone, of slabs "
+        "that were seen up to two seconds before."
+    )
+
+
+def _commands(series):
+    figure = Figure(figsize=(10.5, 4.0), layout="compressed")
+    axes = figure.subplots()
+    _lines(axes, series, "aileron_deflection", np.degrees(1))
+    axes.set(ylabel="aileron / degrees", xlabel="time of flight / s")
+    axes.legend(fontsize=9)
+    return figure, "Deflections, within the limits and the rate of the actuators."

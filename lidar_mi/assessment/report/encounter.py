@@ -1,0 +1,203 @@
+"""The chapter of a flight into a wake: the answer first, then what was seen, predicted and felt."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from lidar_mi.assessment.figures.encounter import FLIGHTS
+from lidar_mi.assessment.figures.plates import Drawn
+from lidar_mi.assessment.metrics.encounter import AFTER
+from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, fulfilled
+from lidar_mi.assessment.report.digits import fixed, percent, three
+from lidar_mi.assessment.report.page import Chapter, Film, Tables
+from lidar_mi.tables import Table
+
+GOAL = 0.8
+"""Fraction of what perfect preview removes that the lidar should remove."""
+
+_OF_A_FLIGHT = (
+    ("largest_roll", "largest roll angle", "degrees", math.degrees(1)),
+    ("largest_roll_rate", "largest roll rate", "degrees/s", math.degrees(1)),
+    ("residual_moment", "rolling moment felt, of the wake's (rms)", "%", 100.0),
+)
+_OF_THE_LIDAR = (
+    ("lead_time", "from the first usable track to the wake", "s", 1.0),
+    ("look_ahead", "from an estimate to its slab (median)", "s", 1.0),
+    ("slabs", "slabs delivered", "", 1.0),
+    ("accepted_slabs", "of them with an accepted fit", "", 1.0),
+    ("rejected_slabs", "fits that the track refused", "", 1.0),
+    ("slabs_to_track", "accepted slabs to a usable track", "", 1.0),
+    ("prediction_error", "error of the predicted rolling moment (rms)", "%", 100.0),
+    (
+        f"after_{AFTER}_slabs.circulation_error",
+        f"error of the circulation after {AFTER} slabs",
+        "%",
+        100.0,
+    ),
+    (f"after_{AFTER}_slabs.core_error", f"error of the cores after {AFTER} slabs", "m", 1.0),
+    (f"after_{AFTER}_slabs.within_2_sigma", "parameters within 2 stated errors then", "%", 100.0),
+    ("tracked.circulation_error", "largest error of a circulation from then on", "%", 100.0),
+    ("tracked.core_error", "largest error of a core from then on", "m", 1.0),
+    ("tracked.within_2_sigma", "parameters within 2 stated errors from then on", "%", 100.0),
+    ("normalised_innovation", "normalised innovation (1 = as stated)", "", 1.0),
+)
+
+_FLIGHT = {
+    "off": "This flight",
+    "feedforward": "The flight with the lidar",
+    "perfect": "The flight with perfect preview",
+}
+
+
+def encounter_summary(metrics: Mapping[str, float]) -> list[Table]:
+    """The main numbers for a terminal."""
+    modes = [mode for mode in FLIGHTS if f"encounter.{mode}.largest_roll" in metrics]
+    rows = [
+        (f"{label} / {unit}", *_values(metrics, modes, key, factor))
+        for key, label, unit, factor in _OF_A_FLIGHT
+    ]
+    rows.append(("departed", *("yes" if _departed(metrics, m) else "no" for m in modes)))
+    tables = [Table("flights into the wake", rows, ("", *(FLIGHTS[m][0] for m in modes)))]
+    lidar = [
+        (f"{label} / {unit}" if unit else label, _shown(metrics.get(f"encounter.{key}"), factor))
+        for key, label, unit, factor in _OF_THE_LIDAR
+        if f"encounter.{key}" in metrics
+    ]
+    if lidar:
+        tables.append(Table("the lidar in flight", lidar))
+    return tables
+
+
+def encounter_chapter(
+    metrics: Mapping[str, float],
+    judged: Sequence[tuple[RequirementTable, Sequence[Finding]]],
+    drawn: Sequence[Drawn],
+    film: Film | None = None,
+) -> Chapter:
+    """Answer, figures and numbers of a flight.
+
+    Parameters
+    ----------
+    metrics : mapping
+        From `lidar_mi.assessment.metrics.encounter.encounter_metrics`.
+    judged : sequence of (RequirementTable, findings)
+        What was measured in flight against the requirements of flight control.
+    drawn : sequence of Drawn
+    film : Film, optional
+    """
+    modes = [mode for mode in FLIGHTS if f"encounter.{mode}.largest_roll" in metrics]
+    flights = [
+        (label, unit, _values(metrics, modes, key, factor))
+        for key, label, unit, factor in _OF_A_FLIGHT
+    ]
+    flights.append(
+        ("departed", "", ["yes" if _departed(metrics, mode) else "no" for mode in modes])
+    )
+    tables = [("The flights", [FLIGHTS[mode][0] for mode in modes], flights)]
+    lidar = [
+        (label, unit, [_shown(metrics[f"encounter.{key}"], factor)])
+        for key, label, unit, factor in _OF_THE_LIDAR
+        if f"encounter.{key}" in metrics
+    ]
+    if lidar:
+        tables.append(("The lidar and its track", ["value"], lidar))
+    numbers = Tables(
+        heading="Numbers of the flight",
+        legend="All flights meet the same wake with the same levelling of the wings; what differs "
+        "is the preview that steers the ailerons. Rolling moment felt: that of wake and ailerons "
+        "together. Errors are those of the track against the truth, in the slab just seen.",
+        tables=tables,
+    )
+    return Chapter(
+        "Into the wake",
+        _lead(metrics),
+        drawn,
+        numbers,
+        _verdict(judged) if judged else None,
+        film=film,
+    )
+
+
+def _lead(metrics: Mapping[str, float]) -> list[str]:
+    off, ours, perfect = (metrics.get(f"encounter.{mode}.largest_roll") for mode in FLIGHTS)
+    limit = math.degrees(metrics["encounter.hazard_roll"])
+    if off is None:
+        return []
+    answer = f"Without help, the wake rolls the aircraft by {_degrees(off)}"
+    if _departed(metrics, "off"):
+        answer = "Without help, the wake upsets the aircraft"
+    if ours is not None:
+        answer += f"; with the lidar by {_degrees(ours)}"
+        if _departed(metrics, "feedforward"):
+            answer += " (it departs)"
+    if perfect is not None:
+        answer += f"; with perfect preview by {_degrees(perfect)}"
+    answer += "."
+    removed = metrics.get("encounter.removed_of_perfect.largest_roll")
+    if removed is not None:
+        met = "meets" if removed >= GOAL else "misses"
+        answer += (
+            f" The lidar removes {percent(removed)} of the roll angle that perfect preview removes, "
+            f"and so {met} the goal of {percent(GOAL)}."
+        )
+    best = "feedforward" if ours is not None else "perfect" if perfect is not None else "off"
+    verdict = "exceeds" if metrics[f"encounter.{best}.hazardous"] else "stays below"
+    answer += f" {_FLIGHT[best]} {verdict} the hazard limit of {limit:.0f} degrees of bank."
+    lead = [answer]
+    if "encounter.lead_time" in metrics:
+        lead.append(
+            f"A track that can be steered by is there after "
+            f"{metrics['encounter.slabs_to_track']:.0f} slabs with both vortices, "
+            f"{three(metrics['encounter.lead_time'])} s before the wake is felt. The rolling "
+            f"moment predicted from it is wrong by "
+            f"{percent(metrics['encounter.prediction_error'])} (rms)."
+        )
+        lead += _limits(metrics)
+    return lead
+
+
+def _limits(metrics: Mapping[str, float]) -> list[str]:
+    """What leaves a rest, in a sentence."""
+    perfect = metrics.get("encounter.perfect.residual_moment")
+    ours = metrics.get("encounter.feedforward.residual_moment")
+    if perfect is None or ours is None:
+        return []
+    return [
+        f"Of the wake's rolling moment {percent(ours)} is felt with the lidar and "
+        f"{percent(perfect)} with perfect preview: this rest is due to the rate and the limits of "
+        "the ailerons, the difference to the lidar."
+    ]
+
+
+def _verdict(judged: Sequence[tuple[RequirementTable, Sequence[Finding]]]) -> Tables:
+    words = {True: "met", False: "not met", None: "not known"}
+    tables = []
+    for table, findings in judged:
+        rows = [(row[0], "", list(row[1:])) for row in as_rows(list(findings))]
+        title = f"{table.title}, {table.phase}: {words[fulfilled(list(findings))]}"
+        tables.append((title, ["required", "in flight", "margin", ""], rows))
+    return Tables(
+        heading="Requirements, as measured in flight",
+        legend="Range: what the aircraft still flies from the moment at which an estimate is there "
+        "to its slab. Errors of v and w are those of valid vectors against the truth; a lidar "
+        "without Doppler measurements has no u.",
+        tables=tables,
+    )
+
+
+def _values(metrics, modes, key, factor) -> list[str]:
+    return [_shown(metrics.get(f"encounter.{mode}.{key}"), factor) for mode in modes]
+
+
+def _departed(metrics, mode) -> bool:
+    return metrics.get(f"encounter.{mode}.departed", 0) > 0
+
+
+def _degrees(angle: float) -> str:
+    return f"{three(math.degrees(angle))} degrees"
+
+
+def _shown(value: float | None, factor: float) -> str:
+    if value is None:
+        return "-"
+    scaled = factor * value
+    return f"{scaled:.0f}" if scaled == round(scaled) else fixed(scaled)

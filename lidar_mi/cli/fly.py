@@ -1,0 +1,72 @@
+"""``lidar-mi fly``: an aircraft flies into the wake of an experiment."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from lidar_mi.cli.options import Changes, ExperimentName
+from lidar_mi.cli.terminal import output, print_table
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.shipped import experiment_file
+from lidar_mi.progress import progress
+
+EXAMPLES = (
+    "Examples: `lidar-mi fly encounter` - `lidar-mi fly encounter --mode perfect` - "
+    "`lidar-mi fly my.yaml -o outputs/mine --set encounter.path.crossing_angle='30 deg'`"
+)
+
+
+class Mode(StrEnum):
+    """Values of ``encounter.control.mode``."""
+
+    OFF = "off"
+    FEEDFORWARD = "feedforward"
+    PERFECT = "perfect"
+
+
+def fly(
+    experiment: ExperimentName,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", help="Folder. Default: outputs/NAME.")
+    ] = None,
+    mode: Annotated[
+        Mode | None,
+        typer.Option(
+            help="What steers, encounter.control.mode. It is compared with no help and, for "
+            "feedforward, with perfect preview."
+        ),
+    ] = None,
+    set_: Changes = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a flight of a different experiment.")
+    ] = False,
+) -> None:
+    """Fly into the wake of an experiment, with the lidar in the loop.
+
+    Writes the flights and the track (NetCDF), metrics (JSON), figures, an animation and a report.
+    """
+    from lidar_mi.encounter.fly import fly as start
+    from lidar_mi.experiment import reading
+
+    path, changes = experiment_file(experiment), list(set_ or [])
+    if mode:
+        changes.append(f"encounter.control.mode={mode.value!r}")
+    variants = reading.load_variants(path, changes)
+    if variants:
+        raise InputError(f"{path}: variants: not allowed for a flight; expected one experiment")
+    loaded = reading.load(path, changes).read_from(path.parent)
+    if loaded.encounter is None:
+        raise InputError(
+            f"encounter: missing in {loaded.name}; expected the section of a flight, or lidar-mi "
+            "run for an experiment without one"
+        )
+    folder = out or Path("outputs") / loaded.name
+    with progress() as notice:
+        done = start(loaded, folder, overwrite=overwrite, notice=notice)
+    for table in done.tables()[1:]:
+        print_table(table)
+    output.print(f"report   {folder / 'report.html'}")
+    output.print(f"figures  {folder / 'figures'}")
+    output.print(f"flights  {folder / 'flight.nc'}")

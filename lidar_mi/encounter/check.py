@@ -1,0 +1,140 @@
+"""What is known of a flight before it: its geometry, and whether it can succeed."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lidar_mi.encounter.aircraft import AircraftModel, flown_on, loads_in_wind
+from lidar_mi.encounter.flight import aircraft_of, duration
+from lidar_mi.encounter.slabs import Gates, gates_of
+from lidar_mi.encounter.wake import encounter_of, wake_along_path
+from lidar_mi.errors import InputError
+from lidar_mi.experiment import check as of_a_run
+from lidar_mi.experiment.describe import Section
+from lidar_mi.experiment.log import Notice, silent
+from lidar_mi.experiment.schema import Experiment
+
+# A path misses the wake where no rolling moment reaches this fraction of the ailerons'.
+_MISSED = 0.01
+# Slabs with both vortices in the image that a track needs.
+_LEAST_SLABS = 3
+_INSTANTS = 400
+
+
+def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> list[str]:
+    """Check a flight before anything is rendered; warnings, a line each.
+
+    Parameters
+    ----------
+    experiment : Experiment
+        With an encounter.
+    aircraft : AircraftModel, optional
+        In place of that of the experiment.
+
+    Raises
+    ------
+    InputError
+        A near gate behind the aircraft, a look-ahead shorter than the latency allows, an aircraft
+        that JSBSim does not have or that does not trim, a wake that is not known along its axis.
+    """
+    encounter, gates = encounter_of(experiment), gates_of(experiment)
+    if encounter.control.mode == "feedforward":
+        _check_latency(experiment, gates)
+    one = aircraft or aircraft_of(encounter)
+    found = []
+    strength = _strongest(experiment, one)
+    if strength < _MISSED:
+        found.append(
+            "encounter.path: the flight misses the wake: its largest rolling moment is "
+            f"{strength:.1%} of the ailerons'; expected a smaller miss"
+        )
+    slabs = _slabs_in_view(experiment, gates)
+    if encounter.control.mode == "feedforward" and slabs < _LEAST_SLABS:
+        found.append(
+            f"encounter.look_ahead: the images hold both vortices in {slabs} slabs; a track needs "
+            f"{_LEAST_SLABS} (expected a wider image, wake.vortex_pair.width and height)"
+        )
+    return found
+
+
+def sections(experiment: Experiment, notice: Notice = silent) -> Iterator[Section]:
+    """Titled tables of the flight and of the lidar's first slab; nothing is written.
+
+    Raises
+    ------
+    InputError
+        Anything that a flight would refuse before it starts.
+    """
+    warnings = geometry(experiment)
+    encounter, gates = encounter_of(experiment), gates_of(experiment)
+    path = encounter.path
+    yield from of_a_run.sections(_first_slab(experiment), experiment.folder, notice)
+    ahead = (gates.look_ahead - gates.stride) / path.speed - encounter.control.latency
+    rows = [
+        ("aircraft", encounter.aircraft.model),
+        ("flight", f"{duration(encounter):.3g} s at {path.speed:g} m/s"),
+        ("crossing and climb angle", _degrees(path.crossing_angle, path.climb_angle)),
+        ("control", encounter.control.mode),
+        ("slabs", f"{encounter.rate:g} a second, {gates.depth:.3g} m deep"),
+        ("both vortices in the image", f"in {_slabs_in_view(experiment, gates)} slabs"),
+        ("from an estimate to its slab", f"{ahead:.3g} s"),
+        (
+            "largest rolling moment",
+            f"{_strongest(experiment, aircraft_of(encounter)):.0%} of the ailerons'",
+        ),
+    ]
+    yield f"{experiment.name}: flight into the wake", rows
+    if warnings:
+        yield f"{experiment.name}: warnings of the flight", [(text,) for text in warnings]
+
+
+def _first_slab(experiment: Experiment) -> Experiment:
+    """The pair of images of one slab as an experiment without a flight."""
+    encounter = encounter_of(experiment)
+    platform = experiment.platform.model_copy(
+        update={"speed": encounter.path.speed, "dt": 1 / encounter.rate}
+    )
+    scan = experiment.scan.model_copy(update={"range": encounter.look_ahead})
+    changes = {"encounter": None, "platform": platform, "scan": scan}
+    return experiment.model_copy(update=changes).read_from(experiment.folder)
+
+
+def _check_latency(experiment: Experiment, gates: Gates) -> None:
+    encounter = encounter_of(experiment)
+    speed, latency = encounter.path.speed, encounter.control.latency
+    least = gates.stride + latency * speed
+    if gates.look_ahead <= least:
+        raise InputError(
+            f"encounter.look_ahead: {gates.look_ahead:g} m is not allowed; expected more than "
+            f"{least:.3g} m, flown from the first scan of a slab to its estimate "
+            f"({1 / encounter.rate:g} s to the second scan, latency {latency:g} s)"
+        )
+
+
+def _strongest(experiment: Experiment, aircraft: AircraftModel) -> float:
+    """Largest rolling moment of the wake on the nominal path, over that of the ailerons."""
+    encounter, wake = encounter_of(experiment), wake_along_path(experiment)
+    most = aircraft.control_moments[0, 0] * aircraft.limits.deflection[0]
+    moments = [
+        loads_in_wind(aircraft.strips, flown_on(aircraft.state, t), wake.wind, aircraft.density)
+        for t in np.linspace(0, duration(encounter), _INSTANTS)
+    ]
+    largest = max(abs(float(one.moment[0])) for one in moments)
+    return largest / most if most else float("inf")
+
+
+def _slabs_in_view(experiment: Experiment, gates: Gates) -> int:
+    """Slabs before the end of the path whose images hold both vortices, from the nominal path."""
+    encounter, wake = encounter_of(experiment), wake_along_path(experiment)
+    y, z = gates.y, gates.z
+    count = 0
+    for number in range(
+        int((duration(encounter) * encounter.path.speed - gates.look_ahead) // gates.stride)
+    ):
+        pair = wake.vortices(gates.slab(number), (number + 0.5) * gates.period)
+        count += all(y[0] <= one.y <= y[-1] and z[0] <= one.z <= z[-1] for one in pair)
+    return count
+
+
+def _degrees(*angles: float) -> str:
+    return ", ".join(f"{np.degrees(angle):.3g} deg" for angle in angles)

@@ -1,0 +1,124 @@
+"""The folder of a flight: its experiment, its data sets, its report."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+
+import xarray as xr
+
+from lidar_mi.encounter.flight import Flown
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.image_store import MADE_BY
+from lidar_mi.experiment.resumable_folder import (
+    FIGURES,
+    LOG,
+    METRICS,
+    RECORD,
+    REPORT,
+    made_by,
+    new_record,
+    read_metrics,
+    read_record,
+    refuse_strangers,
+    write_verdict,
+)
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.io.atomic import write_atomically
+from lidar_mi.io.folder import locked, make_folder
+from lidar_mi.io.netcdf import read_netcdf, write_netcdf
+from lidar_mi.io.text import encoded
+from lidar_mi.io.yaml import to_yaml
+
+FILES = {"series": "flight.nc", "track": "track.nc", "seen": "slabs.nc"}
+"""File of each data set of `Flown`."""
+
+ANIMATION = "approach.gif"
+
+
+class FlightFolder:
+    """The files of a flight, each written under a temporary name.
+
+    Parameters
+    ----------
+    path : path
+    experiment : Experiment
+    """
+
+    def __init__(self, path: str | Path, experiment: Experiment):
+        self.path = Path(path)
+        self.figures, self.log = self.path / FIGURES, self.path / LOG
+        self.record = new_record(experiment, experiment.folder)
+        self.made_by = made_by(self.record)
+        self._beside = experiment.folder.resolve()
+
+    @contextmanager
+    def claimed(self, overwrite: bool) -> Iterator[None]:
+        """Lock the folder for this flight.
+
+        Raises
+        ------
+        InputError
+            Another process uses the folder; it is no folder of a flight, or holds that of another
+            experiment or version and ``overwrite`` is not set.
+        """
+        refuse_strangers(self.path, RECORD, "flight's folder")
+        make_folder(self.path)
+        with locked(self.path):
+            # the former holder of the lock may have changed its experiment
+            refuse_strangers(self.path, RECORD, "flight's folder")
+            self._begin(overwrite)
+            yield
+
+    def _begin(self, overwrite: bool) -> None:
+        marker = self.path / RECORD
+        if marker.is_file():
+            before = read_record(self.path)
+            if made_by(before) == self.made_by:
+                return
+            if not overwrite:
+                raise InputError(
+                    f"{self.path}: holds another experiment or was made by another version; "
+                    "expected an empty folder (-o DIR), or --overwrite to replace it"
+                )
+            if self._beside == self.path.resolve():
+                raise InputError(
+                    f"{self.path}: holds the experiment that this one was made from; expected "
+                    "another folder (-o DIR)"
+                )
+        old = [self.path / name for name in (METRICS, REPORT, LOG, ANIMATION, *FILES.values())]
+
+        def remove_old() -> None:
+            for path in (*old, *self.figures.glob("*.png")):
+                path.unlink(missing_ok=True)
+
+        # if the disk is full, the earlier flight remains unchanged
+        write_atomically(marker, encoded(to_yaml(self.record)), first=remove_old)
+
+    def flown(self) -> Flown | None:
+        """The data sets of this experiment's flights; None: not flown yet."""
+        found = {name: self._read(self.path / file) for name, file in FILES.items()}
+        return Flown(**found) if found["series"] is not None else None
+
+    def metrics(self) -> dict[str, float] | None:
+        """Of a flight that is complete."""
+        return read_metrics(self.path)
+
+    def keep(self, flown: Flown) -> None:
+        """Write the data sets, the time series last: with it, the flight is there."""
+        (self.path / FILES["series"]).unlink(missing_ok=True)
+        for name in ("seen", "track", "series"):
+            value = getattr(flown, name)
+            if value is None:
+                (self.path / FILES[name]).unlink(missing_ok=True)
+            else:
+                write_netcdf(value.assign_attrs({MADE_BY: self.made_by}), self.path / FILES[name])
+
+    def keep_verdict(self, metrics: Mapping[str, float], page: str) -> None:
+        """Write report and metrics: the flight is complete."""
+        write_verdict(self.path, self.record, metrics, page)
+
+    def _read(self, path: Path) -> xr.Dataset | None:
+        if not path.is_file():
+            return None
+        found = read_netcdf(path)
+        return found if found.attrs.get(MADE_BY) == self.made_by else None

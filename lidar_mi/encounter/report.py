@@ -1,0 +1,63 @@
+"""Figures, animation and report of a flight, into its folder."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from lidar_mi.assessment.figures.encounter import draw_all
+from lidar_mi.assessment.figures.encounter_film import MOST_FRAMES, film
+from lidar_mi.assessment.metrics.encounter import judged_in_flight, measured_in_flight
+from lidar_mi.assessment.metrics.requirements import read_requirements
+from lidar_mi.assessment.report.encounter import encounter_chapter
+from lidar_mi.assessment.report.page import Film, page
+from lidar_mi.encounter.flight import Flown, aircraft_of
+from lidar_mi.encounter.folder import ANIMATION, FlightFolder
+from lidar_mi.encounter.wake import encounter_of
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.reading import dump
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.io.film import frame_as_webp, write_gif
+
+
+def write_report(
+    kept: FlightFolder, experiment: Experiment, flown: Flown, metrics: Mapping[str, float], log: Log
+) -> None:
+    """Draw, and write figures, animation, report and metrics, these last."""
+    log("drawing figures")
+    span = float(np.ptp(aircraft_of(encounter_of(experiment)).strips.places[:, 1]))
+    drawn = draw_all(kept.figures, flown.series, flown.track, flown.seen, span, log)
+    judged = []
+    if flown.track is not None:
+        encounter = encounter_of(experiment)
+        stride = encounter.path.speed / encounter.rate
+        depth = stride / max(1, round(stride / experiment.scan.thickness))
+        measured = measured_in_flight(flown.series, flown.track, depth)
+        judged = judged_in_flight(read_requirements(), measured)
+    chapter = encounter_chapter(metrics, judged, drawn, _film(kept, flown, span, log))
+    html = page(
+        experiment, dump(experiment), kept.record["versions"], metrics, [chapter], log.warnings
+    )
+    kept.keep_verdict(metrics, html)
+
+
+def _film(kept: FlightFolder, flown: Flown, span: float, log: Log) -> Film | None:
+    """Frames for the report; the same as an animation in the folder."""
+    pixels, frames, times = [], [], []
+    for frame in film(flown.series, flown.track, flown.seen, span):
+        log.bar("drawing the animation", len(frames) / MOST_FRAMES)
+        pixels.append(frame.pixels)
+        frames.append((frame_as_webp(frame.pixels), frame.caption))
+        times.append(frame.time)
+    if len(frames) < 2:
+        return None
+    # twice as slow as flown
+    seconds = 2 * (times[-1] - times[0]) / (len(times) - 1)
+    write_gif(kept.path / ANIMATION, pixels, seconds)
+    return Film(
+        "The flight",
+        "Above: backscatter of the slab that is seen now, true cores (white) and tracked ones, and "
+        "the wings of the aircraft at this moment. Middle: from above, what the lidar looks at. "
+        "Below: roll angles.",
+        frames,
+        seconds,
+    )

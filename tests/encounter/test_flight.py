@@ -1,0 +1,117 @@
+"""Flights through a wake: three of the same wake, steered by nothing, by the lidar, by the truth.
+
+Detects flights that do not meet the same wake, a track that is not used or used before it was
+delivered, a wing that is steered the wrong way, a track that is forgotten when the lidar no longer
+sees the vortices, scans of slabs that nobody meets, an upset that is an error.
+"""
+
+import numpy as np
+import pytest
+
+from lidar_mi.assessment.metrics.encounter import encounter_metrics
+from lidar_mi.encounter.aircraft import Commands
+from lidar_mi.encounter.flight import aircraft_of, fly_all
+from lidar_mi.encounter.wake import wake_along_path
+from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.reading import check
+from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
+
+# no error of the track: the lidar's delay and the track's interpolation remain
+REST = 0.03
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    return check(encounter_keys(), "test")
+
+
+@pytest.fixture(scope="module")
+def lidar(experiment):
+    return SyntheticLidar(wake_along_path(experiment))
+
+
+@pytest.fixture(scope="module")
+def flown(experiment, lidar):
+    return fly_all(experiment, silent, lidar=lidar)
+
+
+def test_all_meet_the_same_wake(flown, experiment):
+    """On the nominal path the rolling moment is that of the wings level, whatever steers."""
+    assert list(flown.series["flight"].values) == ["off", "feedforward", "perfect"]
+    off, _, perfect = (flown.series.isel(flight=k) for k in range(3))
+    assert np.array_equal(off["x"], perfect["x"])
+    # banked wings meet the wind of other places: by the square of 30 degrees
+    strongest = float(np.abs(off["roll_moment"]).max())
+    assert np.abs(off["roll_moment"] - perfect["roll_moment"]).max() < 0.15 * strongest
+    assert float(off["time"][-1]) == pytest.approx(350 / 75, abs=0.051)
+
+
+def test_help_lessens_the_roll(flown):
+    found = encounter_metrics(flown.series, flown.track)
+    off, ours, perfect = (
+        found[f"encounter.{mode}.largest_roll"] for mode in ("off", "feedforward", "perfect")
+    )
+    assert perfect < 0.4 * off
+    assert found["encounter.removed_of_perfect.largest_roll"] > 0.9
+    assert found["encounter.prediction_error"] < 0.1
+    assert ours < 0.5 * off
+
+
+def test_track_is_used_when_it_is_delivered(flown, lidar):
+    one, track = flown.series.sel(flight="feedforward"), flown.track
+    first = track["delivered"].values[np.flatnonzero(track["usable"].values)[0]]
+    known = np.isfinite(one["predicted_roll_moment"].values)
+    assert one["time"].values[known][0] == pytest.approx(first, abs=0.0101)
+    # the second scan's time and the latency
+    assert np.allclose(track["delivered"], track["time"] + 0.05 + 0.02)
+    # no scan of slabs behind the end of the flight
+    assert lidar.steps[-1] * 75 + 150 <= 350 + 7.5
+
+
+def test_commands_keep_the_limits(flown, experiment):
+    limits = aircraft_of(experiment.encounter).limits
+    deflection = flown.series["aileron_deflection"]
+    step = float(flown.series["time"][1] - flown.series["time"][0])
+    assert np.abs(deflection).max() <= limits.deflection[0] * (1 + 1e-9)
+    assert np.abs(deflection.diff("time")).max() <= limits.rate[0] * step * (1 + 1e-9)
+    # the moment is that of the deflection
+    power = aircraft_of(experiment.encounter).control_moments[0, 0]
+    assert np.allclose(flown.series["control_roll_moment"], power * deflection)
+
+
+def test_what_was_seen_is_not_forgotten(experiment):
+    """A lidar that goes blind after the tenth slab: those slabs are still ahead, and steered by."""
+    blind = SyntheticLidar(wake_along_path(experiment), blind=lambda number: number > 10)
+    flown = fly_all(experiment, silent, lidar=blind)
+    one = flown.series.sel(flight="feedforward")
+    known = np.isfinite(one["predicted_roll_moment"].values)
+    assert flown.track["usable"][-1] == 0
+    # ten slabs up to 150 + 9 x 7.5 m, and the few that the track may miss
+    assert 200 < float(one["x"].values[known].max()) < 150 + 14 * 7.5 + 6
+    assert not known[-1]
+
+
+def test_only_what_a_mode_needs_is_flown(experiment):
+    class Unused:
+        def step(self, *_):
+            raise AssertionError
+
+    for mode, expected in (("off", ["off"]), ("perfect", ["off", "perfect"])):
+        one = check(encounter_keys(control={"mode": mode}), "test")
+        flown = fly_all(one, silent, lidar=Unused())
+        assert list(flown.series["flight"].values) == expected and flown.track is None
+
+
+def test_an_upset_is_a_result():
+    """Ailerons that help the wake."""
+
+    def wrong(aircraft):
+        return lambda preview, state: Commands(aileron=np.sign(state.roll or 1.0))
+
+    one = check(encounter_keys(control={"mode": "perfect", "levelling_time": None}), "test")
+    flown = fly_all(one, silent, controller=wrong)
+    perfect = flown.series.sel(flight="perfect")
+    found = encounter_metrics(flown.series, None)
+    assert found["encounter.perfect.departed"] == 1 == found["encounter.perfect.hazardous"]
+    assert perfect["departed"][-1] == 1 and np.isfinite(perfect["roll"]).all()
+    assert perfect.sizes["time"] == flown.series.sizes["time"]

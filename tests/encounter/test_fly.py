@@ -1,0 +1,122 @@
+"""An encounter into a folder: files, resuming, what is refused, the command.
+
+Detects a flight that is computed again or mixed with another, a report without its answer or its
+slider, faults that are no one line, an experiment that the wrong command takes.
+"""
+
+import json
+import re
+
+import pytest
+import xarray as xr
+
+import lidar_mi as lm
+from lidar_mi.encounter.check import geometry
+from lidar_mi.encounter.wake import wake_along_path
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.log import silent
+from lidar_mi.experiment.reading import check
+from tests.support.command_line import shell
+from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
+
+
+def experiment(**changes):
+    return check(encounter_keys(**changes), "test")
+
+
+def test_folder_holds_the_flight(tmp_path):
+    one = experiment(control={"mode": "perfect"})
+    flight = lm.fly(one, tmp_path / "out", notice=silent)
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {
+        "experiment.yaml",
+        "flight.nc",
+        "metrics.json",
+        "report.html",
+        "log.txt",
+        "figures",
+    }
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    assert metrics == flight.metrics and metrics["encounter.off.largest_roll"] > 0.1
+    with xr.open_dataset(tmp_path / "out" / "flight.nc", engine="h5netcdf") as found:
+        assert found["roll"].attrs["units"] == "rad" and found.sizes["flight"] == 2
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "Without help, the wake rolls the aircraft by" in page and "http" not in page
+    # again: nothing is flown
+    before = (tmp_path / "out" / "flight.nc").stat().st_mtime_ns
+    again = lm.fly(one, tmp_path / "out", notice=silent)
+    assert again.metrics == flight.metrics
+    assert (tmp_path / "out" / "flight.nc").stat().st_mtime_ns == before
+    # a lost report is written again, without a flight
+    (tmp_path / "out" / "metrics.json").unlink()
+    assert lm.fly(one, tmp_path / "out", notice=silent).metrics == flight.metrics
+    assert (tmp_path / "out" / "flight.nc").stat().st_mtime_ns == before
+    other = experiment(control={"mode": "off"})
+    with pytest.raises(InputError, match="holds another experiment"):
+        lm.fly(other, tmp_path / "out", notice=silent)
+    lm.fly(other, tmp_path / "out", overwrite=True, notice=silent)
+    assert json.loads((tmp_path / "out" / "metrics.json").read_text()).keys() < metrics.keys()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "mine.txt").write_text("mine")
+    with pytest.raises(InputError, match="is no flight's folder"):
+        lm.fly(one, tmp_path / "other", notice=silent)
+
+
+def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
+    monkeypatch.setattr("lidar_mi.encounter.report.draw_all", lambda *_: [])
+    one = experiment()
+    flight = lm.fly(one, tmp_path, lidar=SyntheticLidar(wake_along_path(one)), notice=silent)
+    page = (tmp_path / "report.html").read_text()
+    assert "with the lidar by" in page and "meets the goal of 80 %" in page
+    assert "Requirements, as measured in flight" in page
+    assert "slabs per second</td><td>at least 10 Hz</td><td>10 Hz" in page
+    assert flight.metrics["encounter.normalised_innovation"] < 2
+    shown = str(flight)
+    assert "largest roll angle / degrees" in shown and "from the first usable track" in shown
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"look_ahead": "9 m"}, "encounter.look_ahead: 9 m is not allowed; expected more than 9 m"),
+        ({"look_ahead": "7 m"}, "encounter.look_ahead: 7 m is not allowed"),
+        ({"control": {"latency": "2 s"}}, "encounter.look_ahead: 150 m is not allowed"),
+        ({"path": {"altitude": "10 m"}}, "below the ground"),
+        ({"aircraft": {"model": "paper plane"}}, "encounter.aircraft.model: 'paper plane'"),
+        ({"control": {"mode": "hope"}}, "encounter.control.mode"),
+    ],
+)
+def test_faults_are_one_line(changes, message):
+    with pytest.raises(InputError) as error:
+        lm.fly(experiment(**changes), notice=silent)
+    assert message in str(error.value) and "\n" not in str(error.value)
+
+
+def test_path_that_misses_is_warned_of():
+    assert geometry(experiment()) == []
+    (text,) = geometry(experiment(path={"miss": ["0 m", "400 m"]}, control={"mode": "off"}))
+    assert text.startswith("encounter.path: the flight misses the wake")
+    # beside the image, too
+    assert len(geometry(experiment(path={"miss": ["0 m", "400 m"]}))) == 2
+
+
+def test_each_command_takes_its_own(tmp_path):
+    with pytest.raises(InputError, match="is a flight, not a run; expected lidar-mi fly"):
+        lm.run(experiment())
+    with pytest.raises(InputError, match="encounter: missing in wake_sensor"):
+        lm.fly("wake_sensor", notice=silent)
+    done = shell(
+        "fly",
+        "encounter",
+        "--mode",
+        "off",
+        "--set",
+        "encounter.path.start=60 m",
+        "-o",
+        str(tmp_path / "out"),
+    )
+    assert done.returncode == 0, done.stderr
+    assert "largest roll angle" in done.stdout and (tmp_path / "out" / "flight.nc").is_file()
+    assert re.search(r"without help: \d+ of \d+ s", done.stderr)
+    wrong = shell("fly", "wake_sensor")
+    assert wrong.returncode and "lidar-mi run" in wrong.stderr
