@@ -42,7 +42,7 @@ ARROWS = {
         "encounter",
         "system",
     },
-    "campaign": {"assessment", "io", "experiment", "system"},
+    "campaign": {"assessment", "io", "experiment", "encounter", "system"},
     "encounter": {
         "atmosphere",
         "instrument",

@@ -29,10 +29,11 @@ from lidar_mi.campaign.folder import (
     signatures,
     write_outcome,
 )
+from lidar_mi.encounter.fly import fly
 from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment import resumable_folder
 from lidar_mi.experiment.image_store import ImageStore
-from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.run import complete, finish, prepare
@@ -121,17 +122,23 @@ def carry_out(
         _begin(place, session)
         experiment = campaign.points.experiment(number)
         keeper = PointKeeper(campaign, number, experiment)
-        run = _prepared(experiment, campaign.points.beside)
-        run.log.path = log.path
-        _compute(campaign, run, keeper)
-        seconds = {"total": time.perf_counter() - start, **run.seconds}
+        if experiment.encounter is not None:
+            kept = place / RUN if campaign.campaign.keep == "everything" else None
+            flight = fly(experiment, kept, overwrite=True, notice=silent)
+            seconds, metrics = {}, flight.metrics
+        else:
+            run = _prepared(experiment, campaign.points.beside)
+            run.log.path = log.path
+            _compute(campaign, run, keeper)
+            seconds, metrics = run.seconds, run.metrics
+        seconds = {"total": time.perf_counter() - start, **seconds}
         before = sum(ready[k] for k in first)
         outcome = Outcome(
             "done", "", _rounded(seconds), keeper.rendered + before, keeper.reused - before
         )
         # metrics last: they say that the point is done
         write_outcome(place, outcome)
-        write_text(place / resumable_folder.METRICS, to_json(run.metrics))
+        write_text(place / resumable_folder.METRICS, to_json(metrics))
     except Exception as error:
         log.fail(error)
         counts = (keeper.rendered, keeper.reused) if keeper else (0, 0)

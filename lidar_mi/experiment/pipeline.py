@@ -265,5 +265,10 @@ def stages_of(experiment: Experiment) -> list[Stage]:
 
 
 def storing_stages(experiment: Experiment) -> list[Stage]:
-    """The stages of an experiment whose results are stored in parts: images of both lidars."""
+    """The stages of an experiment whose results are stored in parts: images of both lidars.
+
+    An encounter has none: its images depend on the flight.
+    """
+    if experiment.encounter is not None:
+        return []
     return [stage for stage in stages_of(experiment) if stage.parts]

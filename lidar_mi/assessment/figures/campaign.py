@@ -201,6 +201,21 @@ def draw_scatter(
     return as_svg(axes, marks, f"{y.label} against {x.label}")
 
 
+def draw_distributions(
+    title: str, groups: Mapping[str, np.ndarray], label: str, limit: float | None = None
+) -> str:
+    """Fractions of values up to each value, a line per group; a limit is marked."""
+    figure, axes = panel(title)
+    for (name, values), colour in zip(groups.items(), COLOURS, strict=False):
+        axes.ecdf(values, color=colour, label=name)
+    if limit is not None:
+        axes.axvline(limit, color=FAILED, ls="--", lw=1, label="limit")
+    axes.set(xlabel=label, ylabel="fraction of flights", xlim=(0, None))
+    axes.grid(alpha=0.3)
+    figure.legend(fontsize=8, loc="outside lower center", ncols=4, frameon=False)
+    return as_svg(axes, [], f"{label}, {title}")
+
+
 def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str]) -> str:
     """First-order and total indices of every knob with their intervals."""
     _, axes = panel(title)

@@ -15,6 +15,7 @@ from lidar_mi.assessment.metrics.campaign import MEMBER, SAMPLE, Interval
 from lidar_mi.assessment.metrics.requirements import QUANTITIES
 from lidar_mi.assessment.report.block import Block, label_of
 from lidar_mi.assessment.report.digits import three, with_error
+from lidar_mi.assessment.report.encounters import encounter_blocks
 from lidar_mi.assessment.report.page import template
 from lidar_mi.assessment.report.sample import sample_blocks
 
@@ -58,6 +59,7 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
     else:
         blocks = [_sweep_block(dataset, key, known[key], axes, points) for key in shown]
         required = list(_requirement_maps(dataset, margins, axes, points))
+    blocks = [*encounter_blocks(known), *blocks]
     return template("campaign.html").render(
         name=dataset.attrs.get("name", "campaign"),
         lead=_lead(dataset, axes, margins),
@@ -164,6 +166,8 @@ def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Mapping) -> st
         ]
         kind = "Sampled" if SAMPLE in dataset.dims else "Varied"
         text += f" {kind}: {', '.join(sizes)}."
+    if not margins and any(str(name).startswith("encounter.") for name in dataset):
+        return text
     if not margins:
         return text + " No requirement was judged: that needs both lidars as one sensor."
     found = []

@@ -1,0 +1,42 @@
+"""What a campaign's report says of many encounters: how far the aircraft rolls, and how often."""
+
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.figures.campaign import draw_distributions
+from lidar_mi.assessment.report.block import Block
+from lidar_mi.assessment.report.digits import with_error
+
+_MODES = {"off": "no control", "feedforward": "with the lidar", "perfect": "perfect preview"}
+
+
+def encounter_blocks(known: Mapping[str, xr.DataArray]) -> Iterator[Block]:
+    """Distribution of the largest bank angle of all flights, and the fraction below the limit."""
+    rolls = {
+        name: np.degrees(np.abs(known[f"encounter.{mode}.largest_roll"].values.ravel()))
+        for mode, name in _MODES.items()
+        if f"encounter.{mode}.largest_roll" in known
+    }
+    rolls = {name: values[np.isfinite(values)] for name, values in rolls.items()}
+    rolls = {name: values for name, values in rolls.items() if values.size}
+    if not rolls:
+        return
+    limit = None
+    if "encounter.hazard_roll" in known:
+        limit = float(np.degrees(np.nanmax(known["encounter.hazard_roll"].values)))
+    text = "Largest bank angle of every flight: the fraction of flights that stay below. "
+    if limit is not None:
+        below = [f"{name} {_fraction(values <= limit)}" for name, values in rolls.items()]
+        text += f"Within {limit:.3g}°: {', '.join(below)}."
+    yield Block(
+        "Bank angle", text, [draw_distributions("", rolls, "largest bank angle / °", limit)]
+    )
+
+
+def _fraction(met: np.ndarray) -> str:
+    """Percentage with its standard error, by Laplace's rule so that none and all have one, too."""
+    mean, count = met.mean(), met.size
+    ruled = (met.sum() + 1) / (count + 2)
+    return f"{with_error(100 * mean, 100 * np.sqrt(ruled * (1 - ruled) / count))} %"

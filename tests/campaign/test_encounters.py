@@ -1,0 +1,72 @@
+"""Campaigns of encounters: every point is flown, its numbers are collected, shown as a distribution.
+
+Detects: points that are run instead of flown, images taken for shared ones, a distribution that
+is not that of the flights.
+"""
+
+import re
+
+import numpy as np
+import yaml
+
+from lidar_mi.assessment.report.campaign import page
+from lidar_mi.campaign.collect import collect
+from lidar_mi.campaign.engine import prepare_campaign
+from lidar_mi.campaign.worker import carry_out
+from lidar_mi.encounter.fly import fly
+
+
+def flown(folder, keep):
+    """A campaign of flights without a lidar: no control, and perfect preview."""
+    base = {
+        "name": "base",
+        "wake": {"vortex_pair": {"circulation": "350 m^2/s"}, "spacing": "1 m"},
+        "encounter": {
+            "path": {"start": "150 m", "beyond": "150 m"},
+            "control": {"mode": "perfect"},
+        },
+    }
+    (folder / "base.yaml").write_text(yaml.safe_dump(base))
+    described = {
+        "name": "encounters",
+        "base": "base.yaml",
+        "seed": 1,
+        "keep": keep,
+        "sample": {
+            "method": "latin_hypercube",
+            "n": 5,
+            "over": {"wake.vortex_pair.circulation": {"linear": ["50 m^2/s", "500 m^2/s"]}},
+        },
+    }
+    path = folder / "encounters.yaml"
+    path.write_text(yaml.safe_dump(described))
+    ready = prepare_campaign(path, folder / "out")
+    outcomes = [carry_out(str(ready.path), number, "once") for number in range(5)]
+    assert [one.status for one in outcomes] == ["done"] * 5
+    assert {(one.rendered, one.reused) for one in outcomes} == {(0, 0)}
+    return ready
+
+
+def test_points_are_flown_and_their_bank_angles_shown(tmp_path):
+    ready = flown(tmp_path, "metrics")
+    data = collect(ready)
+    off = data["encounter.off.largest_roll"]
+    alone = fly(ready.points.experiment(3), notice=lambda text, fraction: None)
+    assert float(off[3]) == alone.metrics["encounter.off.largest_roll"]
+    # a stronger wake rolls the aircraft further
+    order = np.argsort(data["wake.vortex_pair.circulation"].values)
+    assert (np.diff(off.values[order]) > 0).all() and off.attrs["units"] == "rad"
+    html = page(data, "name: encounters")
+    limit = float(data["encounter.hazard_roll"][0])
+    within = 20 * int((off <= limit).sum())
+    assert 0 < within < 100  # the test sees both
+    found = re.search(r"no control ([\d.]+) ± [\d.]+ %", html)
+    assert found and float(found[1]) == within
+    assert "fraction of flights" in html and "No requirement was judged" not in html
+
+
+def test_everything_of_a_flight_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr("lidar_mi.encounter.fly.write_report", lambda *args, **keys: None)
+    ready = flown(tmp_path, "everything")
+    names = {entry.name for entry in (ready.place(2) / "run").iterdir()}
+    assert {"experiment.yaml", "flight.nc"} <= names
