@@ -112,7 +112,10 @@ def sketched_figures():
 @contextmanager
 def whole_figures():
     """Figures as a user's run draws them, also within `sketched_figures`."""
-    with pytest.MonkeyPatch.context() as patch, rc_context({key: rcParamsDefault[key] for key in FIXED}):
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        rc_context({key: rcParamsDefault[key] for key in FIXED}),
+    ):
         patch.setattr("lidar_mi.io.png._png", _PNG)
         yield
 
