@@ -60,7 +60,7 @@ def test_points_are_flown_and_their_bank_angles_shown(tmp_path):
     limit = float(data["encounter.hazard_roll"][0])
     within = 20 * int((off <= limit).sum())
     assert 0 < within < 100  # the test sees both
-    found = re.search(r"no control ([\d.]+) ± [\d.]+ %", html)
+    found = re.search(r"no control ([\d.]+)\s±\s[\d.]+ %", html)
     assert found and float(found[1]) == within
     assert "fraction of flights" in html and "No requirement was judged" not in html
 
