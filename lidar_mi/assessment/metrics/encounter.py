@@ -15,9 +15,9 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 AFTER = 5
 """Slabs after which the track is held against the truth."""
 
-HAZARD_ROLL = np.radians(7.0)
-"""Bank angle (rad) above which an encounter near the ground and in clouds counts as a hazard: pilots
-in simulators called smaller ones harmless (Rossow and Tinling 1988, J. Aircraft 25)."""
+HAZARD_ROLL = float(np.radians(7.0))
+"""Bank angle (rad) above which an encounter near the ground and in clouds counts as a hazard:
+pilots in simulators called smaller ones harmless (Rossow and Tinling 1988, J. Aircraft 25)."""
 
 _FELT = 0.1
 """Fraction of the largest rolling moment of the wake from which on it counts as felt."""
@@ -90,11 +90,10 @@ def measured_in_flight(
     """
     seen = track.where(track["vectors"] > 0, drop=True)
     speed = float(series["airspeed"].isel(time=0).mean())
-    delivered = track["delivered"].values
     ahead = _ahead(series, track)
     found = {
         "range": float(np.median(ahead) * speed) if ahead.size else float("nan"),
-        "slabs_per_second": float(1 / np.median(np.diff(delivered))) if delivered.size > 1 else 0.0,
+        "slabs_per_second": _rate(track["delivered"].values),
         "slab_depth": slab_depth,
         "points_per_slab": float(seen["vectors"].median()) if seen.sizes["slab"] else 0.0,
     }
@@ -115,6 +114,11 @@ def judged_in_flight(
         for (application, _), table in tables.items()
         if application == "flight_control"
     ]
+
+
+def _rate(times: np.ndarray) -> float:
+    """Estimates a second (Hz), without the rounding of their times."""
+    return round(float(1 / np.median(np.diff(times))), 9) if times.size > 1 else 0.0
 
 
 def _ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:

@@ -136,8 +136,8 @@ def _lead(metrics: Mapping[str, float]) -> list[str]:
     if removed is not None:
         met = "meets" if removed >= GOAL else "misses"
         answer += (
-            f" The lidar removes {percent(removed)} of the roll angle that perfect preview removes, "
-            f"and so {met} the goal of {percent(GOAL)}."
+            f" The lidar removes {percent(removed)} of the roll angle that perfect preview "
+            f"removes, and so {met} the goal of {percent(GOAL)}."
         )
     best = "feedforward" if ours is not None else "perfect" if perfect is not None else "off"
     verdict = "exceeds" if metrics[f"encounter.{best}.hazardous"] else "stays below"
