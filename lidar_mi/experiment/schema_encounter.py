@@ -1,8 +1,9 @@
 """The keys of an encounter: a flight into the wake, the aircraft, its control."""
 
+import math
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from lidar_mi.experiment.schema_air import Section
 from lidar_mi.units import (
@@ -39,12 +40,25 @@ class Path(Section):
         (0.0, 0.0),
         description="y and z of the centre of the pair from the path, where and when it arrives",
     )
+    altitude: Annotated[Length, Within(1, 15000, "the lower atmosphere")] = Field(
+        300.0, description="height above the ground (sea level) at the start"
+    )
     start: Annotated[Length, Within(1, 20000, "an encounter")] = Field(
         600.0, description="distance from the wake's centre at the start"
     )
     beyond: Annotated[Length, Within(0, 20000, "an encounter")] = Field(
         300.0, description="distance flown behind the wake's centre"
     )
+
+    @model_validator(mode="after")
+    def _above_the_ground(self) -> "Path":
+        lowest = self.altitude + (self.start + self.beyond) * math.sin(min(self.climb_angle, 0.0))
+        if lowest <= 0:
+            raise ValueError(
+                f"altitude {self.altitude:g} m: the path ends {-lowest:.0f} m below the ground; "
+                f"expected more than {self.altitude - lowest:.0f} m, or a flatter or shorter path"
+            )
+        return self
 
 
 class Crow(Section):
@@ -66,21 +80,27 @@ class WakeInTime(Section):
 
 
 class Aircraft(Section):
-    """The aircraft that flies into the wake."""
+    """The aircraft that flies into the wake.
+
+    Defaults are the Boeing 737 of JSBSim, its metrics, inertia, control power and (with the
+    finite-span slope of an elliptic wing) its lift slope of 4.35 per rad; the aileron's rate is
+    usual for transport aircraft. The numbers are those of the roll model; an aircraft of JSBSim
+    has its own, but for the rate of the controls.
+    """
 
     model: str = Field(
         "roll", description="roll: rigid, rolls only; else an aircraft of JSBSim, such as 737"
     )
     span: Annotated[Length, Within(1, 200, "aircraft")] = 28.9
-    wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = 91.0
-    roll_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = 6.0e5
+    wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = 108.8
+    roll_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = 7.62e5
     lift_slope: Annotated[Number, Within(1, 6.2832, "thin wings, per rad")] = Field(
-        5.7, description="of the wing's sections"
+        5.3, description="of the wing's sections"
     )
     largest_aileron: Annotated[Angle, Within(0.001, 1, "aircraft")] = Field(quantity("20 deg"))
     aileron_rate: Annotated[AngularRate, Within(0.001, 100, "actuators")] = quantity("50 deg/s")
     aileron_power: Annotated[Number, Within(1e-3, 1, "aircraft")] = Field(
-        0.15, description="rolling moment coefficient per rad of deflection"
+        0.1, description="rolling moment coefficient per rad of deflection"
     )
 
 
@@ -88,10 +108,13 @@ class Control(Section):
     """What steers against the wake."""
 
     mode: Literal["off", "feedforward", "perfect"] = Field(
-        "feedforward", description="perfect: knows the truth"
+        "feedforward", description="off: the wings are levelled; perfect: knows the truth"
     )
     latency: Annotated[Time, Within(0, 10, "seconds")] = Field(
         0.02, description="from the second scan of a slab to its estimate"
+    )
+    levelling_time: Annotated[Time, Within(0.1, 1000, "a pilot")] | None = Field(
+        3.0, description="in which the wings are levelled, in every mode; null: they are not"
     )
 
 

@@ -1,0 +1,180 @@
+"""The aircraft: its state, what steers it, and what any model of it offers."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from lidar_mi.encounter.strips import Loads, Strips, wake_loads
+from lidar_mi.instrument.motion import attitude
+
+LARGEST_ROLL = np.pi / 2
+"""Bank angle (rad) beyond which an aircraft counts as departed."""
+
+Wind = Callable[..., tuple[np.ndarray, np.ndarray, np.ndarray]]
+"""u, v, w (m/s) from x, y, z (m) and time (s), in the path frame."""
+
+
+@dataclass(frozen=True)
+class AircraftState:
+    """Where the aircraft is and how it moves, in the path frame (x forward, y left, z up).
+
+    Attributes
+    ----------
+    time : float
+        s.
+    x, y, z : float
+        Centre of gravity, m.
+    roll, pitch, yaw : float
+        rad: port wing up, nose up, nose to port.
+    roll_rate, pitch_rate, yaw_rate : float
+        rad/s, about the body's axes, signs as the angles.
+    airspeed : float
+        m/s.
+    departed : bool
+        The aircraft rolled beyond `LARGEST_ROLL`, or its equations have no finite solution any
+        more: the flight is over, and this is its result.
+    """
+
+    time: float = 0.0
+    x: float = 0.0
+    y: float = 0.0
+    z: float = 0.0
+    roll: float = 0.0
+    pitch: float = 0.0
+    yaw: float = 0.0
+    roll_rate: float = 0.0
+    pitch_rate: float = 0.0
+    yaw_rate: float = 0.0
+    airspeed: float = 75.0
+    departed: bool = False
+
+
+@dataclass(frozen=True)
+class Commands:
+    """Deflections asked for, rad.
+
+    Positive ones roll the port wing up (aileron), move the nose down (elevator) and to port
+    (rudder): each gives a positive moment of `Loads`.
+    """
+
+    aileron: float = 0.0
+    elevator: float = 0.0
+    rudder: float = 0.0
+
+    @property
+    def array(self) -> np.ndarray:
+        """(3,), rad."""
+        return np.array([self.aileron, self.elevator, self.rudder])
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Largest deflections (rad) and their rates (rad/s), of aileron, elevator and rudder.
+
+    Attributes
+    ----------
+    deflection, rate : ndarray, shape (3,)
+        0 for a control that the model does not have.
+    """
+
+    deflection: np.ndarray
+    rate: np.ndarray
+
+
+class AircraftModel(Protocol):
+    """What a flight needs of an aircraft.
+
+    Attributes
+    ----------
+    state : AircraftState
+    strips : Strips
+        Of the surfaces on which the wake acts.
+    limits : Limits
+        Of the controls.
+    density : float
+        Of the air at the start, kg m^-3.
+    control_moments : ndarray, shape (3, 3)
+        Moment (row, N m) per deflection (column, rad) at the start; zero columns for controls that
+        the model does not have.
+    roll_damping : float
+        Rolling moment per roll rate at the start, N m per rad/s, negative.
+    """
+
+    @property
+    def state(self) -> AircraftState: ...  # noqa: D102
+    @property
+    def strips(self) -> Strips: ...  # noqa: D102
+    @property
+    def limits(self) -> Limits: ...  # noqa: D102
+    @property
+    def density(self) -> float: ...  # noqa: D102
+    @property
+    def control_moments(self) -> np.ndarray: ...  # noqa: D102
+    @property
+    def roll_damping(self) -> float: ...  # noqa: D102
+
+    def step(self, dt: float, loads: Loads, commands: Commands) -> AircraftState:
+        """State after dt (s), with the wake's loads constant and the controls moving."""
+        ...
+
+
+def loads_in_wind(strips: Strips, state: AircraftState, wind: Wind, density: float) -> Loads:
+    """The wake's force and moment on an aircraft in a given state.
+
+    Parameters
+    ----------
+    strips : Strips
+    state : AircraftState
+        Place, attitude, time and airspeed.
+    wind : callable
+        Of the path frame: ``wind(x, y, z, time)``.
+    density : float
+        Of the air, kg m^-3.
+    """
+    turned = attitude(state.roll, state.pitch, state.yaw)
+    places = turned.apply(strips.places) + np.array([state.x, state.y, state.z])
+    there = np.stack(np.broadcast_arrays(*wind(*places.T, state.time)), -1)
+    return wake_loads(strips, turned.inv().apply(there), state.airspeed, density)
+
+
+def flown_on(state: AircraftState, time: float) -> AircraftState:
+    """The state at another time (s) if attitude, course and speed stay; rates are dropped."""
+    return replace(
+        state,
+        time=time,
+        x=state.x + state.airspeed * (time - state.time),
+        roll_rate=0.0,
+        pitch_rate=0.0,
+        yaw_rate=0.0,
+    )
+
+
+def deflected(
+    deflection: np.ndarray, commands: Commands, dt: float, limits: Limits
+) -> tuple[np.ndarray, np.ndarray]:
+    """Controls that move to their commands at most at their rate, within their limits.
+
+    Parameters
+    ----------
+    deflection : ndarray, shape (3,)
+        Now, rad.
+    commands : Commands
+    dt : float
+        s.
+    limits : Limits
+
+    Returns
+    -------
+    after : ndarray, shape (3,)
+        Deflection after dt, rad.
+    moving : ndarray, shape (3,)
+        Time of dt in which each moves, s; it rests in the remainder.
+    """
+    target = np.clip(commands.array, -limits.deflection, limits.deflection)
+    way = target - deflection
+    after = deflection + np.clip(way, -limits.rate * dt, limits.rate * dt)
+    moved = np.abs(after - deflection)
+    time = np.divide(moved, limits.rate, out=np.zeros(3), where=limits.rate > 0)
+    return after, np.minimum(time, dt)

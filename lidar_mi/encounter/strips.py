@@ -1,0 +1,194 @@
+"""Forces and moments of the wake's wind on wing and tail, by strip theory.
+
+Every strip of a surface meets the wind as if it were alone: its force along the normal is
+q S_i a w_n / V, with the dynamic pressure q, the strip's area S_i, the airspeed V, the wind w_n
+along the normal and a lift slope a that accounts for the finite span. On an elliptic wing,
+Prandtl's lifting line has the slope a0 / (1 + n a0 / (pi A)) for the n-th mode of the loading, A
+the aspect ratio and a0 the slope of the sections (Glauert 1926). Lift is the first mode, rolling
+moment the second, so that strips with n = 1 for forces and n = 2 for rolling moments have the lift
+and the rolling moment of the lifting line in any wind; the aspect ratio of n = 2 is that of one
+half of the wing (Barrows 1977).
+
+Left out: unsteady lift (the chord is short against the wake), stall, sweep, the fuselage, the
+wing's downwash at the tail, and the forces in a surface's plane.
+
+Body frame: x forward, y left, z up, from the centre of gravity.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from lidar_mi.errors import InputError
+
+STRIPS = 40
+
+
+@dataclass(frozen=True, eq=False)
+class Loads:
+    """Force and moment in the body frame, about the centre of gravity.
+
+    Attributes
+    ----------
+    force : ndarray, shape (3,)
+        N.
+    moment : ndarray, shape (3,)
+        N m, right-handed about each axis: positive with the port wing up, the nose down, the nose
+        to port.
+    """
+
+    force: np.ndarray
+    moment: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Strips:
+    """Strips of lifting surfaces.
+
+    Attributes
+    ----------
+    places, normals : ndarray, shape (n, 3)
+        Of the strips' centres of pressure, m, and unit vectors along which they lift.
+    areas : ndarray, shape (n,)
+        m^2.
+    slopes, roll_slopes : ndarray, shape (n,)
+        Lift slope of forces, and of moments about the body's x axis, per rad.
+    """
+
+    places: np.ndarray
+    normals: np.ndarray
+    areas: np.ndarray
+    slopes: np.ndarray
+    roll_slopes: np.ndarray
+
+
+def finite_span_slope(section_slope: float, aspect_ratio: float, mode: int = 1) -> float:
+    """Lift slope a0 / (1 + n a0 / (pi A)) of the n-th mode of an elliptic wing, per rad.
+
+    Source: Glauert 1926, chapter 11, equations of the monoplane with elliptic chord.
+
+    Parameters
+    ----------
+    section_slope : float
+        a0 of the sections, per rad.
+    aspect_ratio : float
+        A, squared span over area.
+    mode : int
+        1 for lift, 2 for rolling moment.
+    """
+    return section_slope / (1 + mode * section_slope / (np.pi * aspect_ratio))
+
+
+def wing_strips(
+    span: float, area: float, lift_slope: float, n: int = STRIPS, place: ArrayLike = (0.0, 0.0, 0.0)
+) -> Strips:
+    """A wing or horizontal tail with elliptic chord, c = 4 S / (pi b) sqrt(1 - (2 y / b)^2).
+
+    The strips are the nodes y_k = b/2 cos(k pi / (n + 1)) of Gauss-Chebyshev quadrature of the
+    second kind, whose weight is the elliptic chord: lift and moments are exact for winds that are
+    polynomials in y up to the degree 2 n - 1.
+
+    Parameters
+    ----------
+    span, area : float
+        b (m) and S (m^2).
+    lift_slope : float
+        Of the sections, per rad.
+    n : int
+        Number of strips.
+    place : array_like, shape (3,)
+        Middle of the surface in the body frame, m.
+
+    Raises
+    ------
+    InputError
+        Span, area, slope or number not positive.
+    """
+    angle = _angles(n)
+    places = np.tile(np.asarray(place, dtype=float), (n, 1))
+    places[:, 1] += span / 2 * np.cos(angle)
+    return _surface(places, (0.0, 0.0, 1.0), angle, area, lift_slope, span, area)
+
+
+def fin_strips(
+    height: float, area: float, lift_slope: float, n: int = STRIPS, place: ArrayLike = (0, 0, 0)
+) -> Strips:
+    """A vertical tail: the upper half of an elliptic wing, mirrored at its root.
+
+    Parameters
+    ----------
+    height, area : float
+        m and m^2.
+    lift_slope, n
+        As in `wing_strips`.
+    place : array_like, shape (3,)
+        The root in the body frame, m.
+    """
+    angle = _angles(2 * n)[:n]
+    places = np.tile(np.asarray(place, dtype=float), (n, 1))
+    places[:, 2] += height * np.cos(angle)
+    surface = _surface(places, (0.0, 1.0, 0.0), angle, area, lift_slope, 2 * height, 2 * area)
+    # half a symmetric loading: its moment about the root has the slope of the force
+    return Strips(
+        surface.places, surface.normals, surface.areas, surface.slopes, surface.slopes.copy()
+    )
+
+
+def joined(*surfaces: Strips) -> Strips:
+    """Strips of several surfaces."""
+    names = ("places", "normals", "areas", "slopes", "roll_slopes")
+    return Strips(*(np.concatenate([getattr(one, name) for one in surfaces]) for name in names))
+
+
+def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float) -> Loads:
+    """Force and moment of a wind on the strips.
+
+    Parameters
+    ----------
+    strips : Strips
+    wind : array_like, shape (n, 3)
+        Wind at the strips, in the body frame, m/s.
+    airspeed : float
+        V, m/s.
+    density : float
+        Of the air, kg m^-3.
+    """
+    normal_wind = np.einsum("ij,ij->i", np.asarray(wind, dtype=float), strips.normals)
+    pressure = (0.5 * density * airspeed) * strips.areas * normal_wind  # q S_i w_n / V
+    forces = (pressure * strips.slopes)[:, None] * strips.normals
+    moment = np.cross(strips.places, forces).sum(0)
+    arms = np.cross(strips.places, strips.normals)[:, 0]
+    moment[0] = (pressure * strips.roll_slopes * arms).sum()
+    return Loads(forces.sum(0), moment)
+
+
+def roll_damping(strips: Strips, airspeed: float, density: float) -> float:
+    """Rolling moment per roll rate of the strips, N m per rad/s, negative.
+
+    For an elliptic wing C_lp = -a/8, with the slope a of the second mode.
+    """
+    wind = -np.cross([1.0, 0.0, 0.0], strips.places)  # of an aircraft that rolls at 1 rad/s
+    return float(wake_loads(strips, wind, airspeed, density).moment[0])
+
+
+def _angles(n):
+    if n < 2:
+        raise InputError(f"strips.n: {n} is not allowed; expected 2 or more")
+    return np.arange(1, n + 1) * np.pi / (n + 1)
+
+
+def _surface(places, normal, angle, area, lift_slope, span, whole_area):
+    for name, value in (("span", span), ("area", area), ("lift_slope", lift_slope)):
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"strips.{name}: {value} is not allowed; expected a number > 0")
+    weights = np.sin(angle) ** 2
+    ones = np.ones(len(places))
+    aspect_ratio = span**2 / whole_area
+    return Strips(
+        places,
+        np.tile(np.asarray(normal, dtype=float), (len(places), 1)),
+        area * weights / weights.sum(),
+        finite_span_slope(lift_slope, aspect_ratio) * ones,
+        finite_span_slope(lift_slope, aspect_ratio, mode=2) * ones,
+    )
