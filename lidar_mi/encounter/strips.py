@@ -9,13 +9,13 @@ moment the second, so that strips with n = 1 for forces and n = 2 for rolling mo
 and the rolling moment of the lifting line in any wind; the aspect ratio of n = 2 is that of one
 half of the wing (Barrows 1977).
 
-Left out: unsteady lift (the chord is short against the wake), stall, sweep, the fuselage, the
-wing's downwash at the tail, and the forces in a surface's plane.
+Left out: unsteady lift (the chord is short against the wake), stall, sweep, the fuselage, and the
+forces in a surface's plane.
 
 Body frame: x forward, y left, z up, from the centre of gravity.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -130,9 +130,27 @@ def fin_strips(
     places[:, 2] += height * np.cos(angle)
     surface = _surface(places, (0.0, 1.0, 0.0), angle, area, lift_slope, 2 * height, 2 * area)
     # half a symmetric loading: its moment about the root has the slope of the force
-    return Strips(
-        surface.places, surface.normals, surface.areas, surface.slopes, surface.slopes.copy()
-    )
+    return replace(surface, roll_slopes=surface.slopes)
+
+
+def in_downwash(tail: Strips, section_slope: float, aspect_ratio: float) -> Strips:
+    """A horizontal tail in the downwash of a wing that meets the same wind.
+
+    Far behind an elliptic wing the induced angle is twice that at the wing: the tail keeps the
+    fraction 1 - 2 n a_n / (pi A) of the n-th mode, with the wing's slope a_n. The downwash is
+    there at once, and that of the wind's linear parts is taken for all of it.
+
+    Parameters
+    ----------
+    tail : Strips
+    section_slope, aspect_ratio : float
+        Of the wing, as in `finite_span_slope`.
+    """
+    left = [
+        1 - 2 * n * finite_span_slope(section_slope, aspect_ratio, n) / (np.pi * aspect_ratio)
+        for n in (1, 2)
+    ]
+    return replace(tail, slopes=left[0] * tail.slopes, roll_slopes=left[1] * tail.roll_slopes)
 
 
 def joined(*surfaces: Strips) -> Strips:

@@ -82,10 +82,10 @@ class WakeInTime(Section):
 class Aircraft(Section):
     """The aircraft that flies into the wake.
 
-    Defaults are the Boeing 737 of JSBSim, its metrics, inertia, control power and (with the
-    finite-span slope of an elliptic wing) its lift slope of 4.35 per rad; the aileron's rate is
-    usual for transport aircraft. The numbers are those of the roll model; an aircraft of JSBSim
-    has its own, but for the rate of the controls.
+    Defaults are the Boeing 737 of JSBSim: its metrics, inertia with fuel, control power and, with
+    the finite-span slope of an elliptic wing, its lift slope of 4.35 per rad. The aileron's rate
+    is usual for transport aircraft. The numbers are those of the roll model; an aircraft of JSBSim
+    has its own, but for the lift slope of the sections and the rate of the controls.
     """
 
     model: str = Field(
@@ -93,7 +93,7 @@ class Aircraft(Section):
     )
     span: Annotated[Length, Within(1, 200, "aircraft")] = 28.9
     wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = 108.8
-    roll_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = 7.62e5
+    roll_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = 8.0e5
     lift_slope: Annotated[Number, Within(1, 6.2832, "thin wings, per rad")] = Field(
         5.3, description="of the wing's sections"
     )

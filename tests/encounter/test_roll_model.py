@@ -27,7 +27,7 @@ def test_step_response():
     rolling = model()
     for _ in range(120):
         state = rolling.step(1 / 120, loads(2e5), Commands())
-    tau = 7.62e5 / -rolling.roll_damping
+    tau = 8.0e5 / -rolling.roll_damping
     end, grown = 2e5 / -rolling.roll_damping, -np.expm1(-1 / tau)
     assert rolling.time_constant == pytest.approx(tau, rel=1e-12)
     assert state.roll_rate == pytest.approx(end * grown, rel=1e-9)
@@ -51,7 +51,7 @@ def test_moving_aileron_against_an_integrator(step):
 
     def derivative(t, y):
         deflection = min(np.radians(50) * t, np.radians(15))
-        return [y[1], (-1e5 + power * deflection + damping * y[1]) / 7.62e5]
+        return [y[1], (-1e5 + power * deflection + damping * y[1]) / 8.0e5]
 
     exact = solve_ivp(derivative, (0, 0.7), [0, 0], rtol=1e-10, atol=1e-12, max_step=0.01).y[:, -1]
     np.testing.assert_allclose([state.roll, state.roll_rate], exact, rtol=1e-6)

@@ -12,6 +12,7 @@ from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.encounter.strips import (
     fin_strips,
     finite_span_slope,
+    in_downwash,
     joined,
     roll_damping,
     wake_loads,
@@ -142,6 +143,18 @@ def test_tail_surfaces_pitch_and_yaw():
     height = 1 + 6 * 4 / (3 * np.pi)
     expected = [-height * side, 14 * lift, -13 * side]
     np.testing.assert_allclose(loads.moment, expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize("mode", [1, 2])
+def test_downwash_at_the_tail_is_that_of_the_wings_trailing_vortices(mode):
+    """Far behind the wing, w = -sum n A_n sin(n t) / sin(t) 2 V: twice that at the wing."""
+    m = SLOPE / (np.pi * ASPECT_RATIO)  # a0 c / (4 b) / sin t
+    # the wind w/V = sin(n t) / sin(t), 1 or 2 cos t, has A_n = m / (1 + n m) alone
+    left = 1 - 2 * mode * m / (1 + mode * m)
+    tail = wing_strips(11.0, 32.0, SLOPE)
+    behind = in_downwash(tail, SLOPE, ASPECT_RATIO)
+    name = {1: "slopes", 2: "roll_slopes"}[mode]
+    np.testing.assert_allclose(getattr(behind, name) / getattr(tail, name), left)
 
 
 @pytest.mark.parametrize("bad", [(0.0, 1.0, 5.0, 9), (9.0, -1.0, 5.0, 9), (9.0, 1.0, np.nan, 9)])

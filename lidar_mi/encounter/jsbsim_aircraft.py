@@ -1,0 +1,288 @@
+"""An aircraft of JSBSim (Berndt 2004) on which the wake's force and moment act.
+
+JSBSim integrates the six degrees of freedom of an aircraft with its engines and control system.
+The wake enters as a force at the centre of gravity and a moment (``external_reactions``); the
+aircraft's own aerodynamics see air at rest. Its axes are x forward, y to starboard, z down.
+"""
+
+import math
+import tempfile
+from dataclasses import replace
+from functools import partial
+from pathlib import Path as FilePath
+from typing import Any
+
+import numpy as np
+from scipy.constants import foot, inch, lbf, slug
+
+from lidar_mi.encounter.aircraft import LARGEST_ROLL, AircraftState, Commands, Limits, deflected
+from lidar_mi.encounter.strips import Loads, Strips, fin_strips, in_downwash, joined, wing_strips
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema_encounter import Aircraft, Path
+from lidar_mi.instrument.motion import attitude
+from lidar_mi.io.jsbsim_files import AXES, shipped_aircraft, write_aircraft_in_wake
+
+STEP = 1 / 120
+"""Largest step of JSBSim, s."""
+
+FLAPS = (0.0, 0.25, 0.5, 0.75, 1.0)
+LARGEST_INCIDENCE = math.radians(6)
+"""The least flaps are set with which the aircraft trims at this angle of attack or a smaller one;
+with flaps the gear is down."""
+
+TAIL_ASPECT_RATIO, FIN_ASPECT_RATIO = 4.0, 1.6
+"""Usual for transport aircraft (Raymer 2018, table 4.3); JSBSim knows areas and arms alone."""
+
+_TO_OURS = np.array([1.0, -1.0, -1.0])
+_CONTROLS = ("aileron", "elevator", "rudder")
+_POSITIONS = ("fcs/left-aileron-pos-rad", "fcs/elevator-pos-rad", "fcs/rudder-pos-rad")
+_TRIMS = ("fcs/roll-trim-cmd-norm", "fcs/pitch-trim-cmd-norm", "fcs/yaw-trim-cmd-norm")
+_NOMINAL = math.radians(20)  # full deflection of a control that states no angle
+_SETTLED = 30  # steps in which a control reaches a small command
+
+
+class JSBSimAircraft:
+    """An aircraft of JSBSim, trimmed on the path; a model of `aircraft.AircraftModel`.
+
+    Its wing has JSBSim's span and area and lies at JSBSim's aerodynamic reference point; the tail
+    has JSBSim's areas and arms. The controls move at the rate of `Aircraft.aileron_rate`, beside
+    what JSBSim's own actuators do.
+
+    Parameters
+    ----------
+    aircraft : lidar_mi.experiment.schema_encounter.Aircraft
+        Its model, the lift slope of the sections, the rate of the controls.
+    path : lidar_mi.experiment.schema_encounter.Path
+        Speed, climb angle and altitude.
+
+    Raises
+    ------
+    InputError
+        There is no JSBSim, or it has no such aircraft, or it does not trim on this path.
+    """
+
+    def __init__(self, aircraft: Aircraft, path: Path):
+        self._climb = path.climb_angle
+        self._fdm = _trimmed(aircraft.model, path, FLAPS)
+        self.density = self._fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
+        self.strips = _strips(self._fdm, aircraft.lift_slope)
+        again = partial(_trimmed, aircraft.model, path, [self._fdm["fcs/flap-cmd-norm"]])
+        self.control_moments, self._per_command = _control_moments(again)
+        self._at_trim = _commands(self._fdm)
+        trims = self._at_trim + [self._fdm[name] for name in _TRIMS]
+        self.limits = Limits(
+            np.abs(self._per_command) * np.clip(1 - np.abs(trims), 0, 1),
+            np.where(self._per_command != 0, aircraft.aileron_rate, 0.0),
+        )
+        self.roll_damping = _roll_damping(again)
+        self.deflection = np.zeros(3)
+        self._start = _place(self._fdm)
+        self.state = self._read(0.0)
+
+    @property
+    def mass(self) -> float:
+        """Now, kg."""
+        return self._fdm["inertia/mass-slugs"] * slug
+
+    @property
+    def roll_inertia(self) -> float:
+        """Moment of inertia about the body's x axis, kg m^2."""
+        return self._fdm["inertia/ixx-slugs_ft2"] * slug * foot**2
+
+    def step(self, dt: float, loads: Loads, commands: Commands) -> AircraftState:
+        """State after dt (s), in equal steps of at most `STEP`, with constant loads.
+
+        JSBSim moves the aircraft before it sums up forces: loads and controls act one step later.
+        """
+        time = self.state.time + dt
+        given = np.concatenate([loads.force, loads.moment, commands.array])
+        if self.state.departed or not np.isfinite(given).all():
+            self.state = replace(self.state, time=time, departed=True)
+            return self.state
+        count = max(1, math.ceil(dt / STEP - 1e-6))
+        self._fdm.set_dt(dt / count)
+        _set_loads(self._fdm, loads.force, loads.moment)
+        for _ in range(count):
+            self.deflection, _ = deflected(self.deflection, commands, dt / count, self.limits)
+            _set_commands(self._fdm, self._at_trim + self._normalised(self.deflection))
+            self._fdm.run()
+        self.state = self._read(time)
+        return self.state
+
+    def _normalised(self, deflection):
+        return np.divide(
+            deflection, self._per_command, out=np.zeros(3), where=self._per_command != 0
+        )
+
+    def _read(self, time):
+        """State in the path frame."""
+        fdm = self._fdm
+        north, east, up = _place(fdm) - self._start
+        along, upward = math.cos(self._climb), math.sin(self._climb)
+        level = attitude(
+            fdm["attitude/phi-rad"], fdm["attitude/theta-rad"], -fdm["attitude/psi-rad"]
+        )
+        numbers = [north, east, up, *level.as_quat(), fdm["velocities/vt-fps"]]
+        if not np.isfinite(numbers).all():
+            return replace(self.state, time=time, departed=True)
+        turned = attitude(0.0, self._climb, 0.0).inv() * level
+        yaw, nose_down, roll = turned.as_euler("ZYX")
+        p, q, r = (fdm[f"velocities/{axis}-rad_sec"] for axis in "pqr")
+        return AircraftState(
+            time=time,
+            x=float(north * along + up * upward),
+            y=float(-east),
+            z=float(up * along - north * upward),
+            roll=float(roll),
+            pitch=float(-nose_down),
+            yaw=float(yaw),
+            roll_rate=p,
+            pitch_rate=q,
+            yaw_rate=-r,
+            airspeed=fdm["velocities/vt-fps"] * foot,
+            departed=bool(abs(roll) > LARGEST_ROLL or fdm["position/h-agl-ft"] <= 0),
+        )
+
+
+def _loaded(name) -> Any:
+    try:
+        import jsbsim
+    except ImportError:
+        raise InputError(
+            f"encounter.aircraft.model: {name!r} needs JSBSim, which is not installed "
+            "(pip install lidar-mi[flight]); roll needs nothing"
+        ) from None
+    root = FilePath(jsbsim.__file__).parent
+    names = shipped_aircraft(root)
+    if name not in names:
+        raise InputError(
+            f"encounter.aircraft.model: {name!r} is not known; expected roll or an aircraft of "
+            f"JSBSim: {', '.join(names)}"
+        )
+    jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.FATAL))
+    fdm = jsbsim.FGFDMExec(str(root))
+    fdm.set_debug_level(0)
+    with tempfile.TemporaryDirectory() as folder:
+        write_aircraft_in_wake(root, name, FilePath(folder))
+        fdm.set_aircraft_path(folder)
+        fdm.set_engine_path(str(root / "engine"))
+        fdm.set_systems_path(str(root / "systems"))
+        if not fdm.load_model(name):
+            raise InputError(f"encounter.aircraft.model: JSBSim does not load {name!r}")
+    fdm.set_dt(STEP)
+    return fdm
+
+
+def _trimmed(name, path, flap_settings) -> Any:
+    """JSBSim on the path, in equilibrium."""
+    best = None
+    for flaps in flap_settings:
+        fdm = _loaded(name)
+        fdm["ic/h-sl-ft"] = path.altitude / foot
+        fdm["ic/vt-fps"] = path.speed / foot
+        fdm["ic/gamma-rad"] = path.climb_angle
+        for part, value in (("gear/gear", float(flaps > 0)), ("fcs/flap", flaps)):
+            fdm[f"{part}-cmd-norm"] = value
+            fdm[f"{part}-pos-norm"] = value
+        fdm["propulsion/set-running"] = -1
+        if not fdm.run_ic():
+            continue
+        try:
+            fdm["simulation/do_simple_trim"] = 1
+        except RuntimeError:  # jsbsim's TrimFailureError
+            continue
+        best = fdm
+        if fdm["aero/alpha-rad"] <= LARGEST_INCIDENCE:
+            break
+    if best is None:
+        raise InputError(
+            f"encounter.path: {name} does not trim at {path.speed:g} m/s and "
+            f"{math.degrees(path.climb_angle):g} deg at {path.altitude:g} m; expected a speed and "
+            "climb angle at which it flies"
+        )
+    return best
+
+
+def _place(fdm):
+    """North, east, up, m."""
+    return foot * np.array([fdm[f"position/from-start-neu-{axis}-ft"] for axis in "neu"])
+
+
+def _set_loads(fdm, force, moment):
+    for k, axis in enumerate(AXES):
+        # the force acts at the centre of gravity, which moves as fuel burns
+        for other in AXES:
+            place = f"external_reactions/wake-force-{axis}/location-{other}-in"
+            fdm[place] = fdm[f"inertia/cg-{other}-in"]
+        fdm[f"external_reactions/wake-force-{axis}/magnitude"] = _TO_OURS[k] * force[k] / lbf
+        fdm[f"external_reactions/wake-moment-{axis}/magnitude-lbsft"] = (
+            _TO_OURS[k] * moment[k] / (lbf * foot)
+        )
+
+
+def _commands(fdm):
+    return np.array([fdm[f"fcs/{name}-cmd-norm"] for name in _CONTROLS])
+
+
+def _set_commands(fdm, normalised):
+    for name, value in zip(_CONTROLS, normalised, strict=True):
+        fdm[f"fcs/{name}-cmd-norm"] = value
+
+
+def _moments(fdm):
+    """Aerodynamic moment in our axes, N m."""
+    names = [f"moments/{axis}-aero-lbsft" for axis in "lmn"]
+    return _TO_OURS * [fdm[name] for name in names] * lbf * foot
+
+
+def _control_moments(again, small=0.05):
+    """Moment per deflection, and deflection per normalised command, from small commands in trim."""
+    moments, per_command = np.zeros((3, 3)), np.zeros(3)
+    for k, position in enumerate(_POSITIONS):
+        flown, trimmed = again(), again()
+        before = flown[position]
+        _set_commands(flown, _commands(flown) + small * np.eye(3)[k])
+        last = before
+        for _ in range(_SETTLED):
+            flown.run()
+            trimmed.run()
+            if flown[position] == last != before:
+                break
+            last = flown[position]
+        change = _moments(flown) - _moments(trimmed)
+        turned = flown[position] - before
+        if not change.any():
+            continue
+        per_command[k] = (turned or small * _NOMINAL) / small
+        moments[:, k] = change / (per_command[k] * small)
+    return moments, per_command
+
+
+def _roll_damping(again, steps=6):
+    """Aerodynamic rolling moment per roll rate, from a moment that acts for 0.05 s in trim."""
+    flown, trimmed = again(), again()
+    inertia = flown["inertia/ixx-slugs_ft2"] * slug * foot**2
+    _set_loads(flown, np.zeros(3), np.array([inertia * 1.0, 0.0, 0.0]))
+    for _ in range(steps):
+        flown.run()
+        trimmed.run()
+    change = _moments(flown)[0] - _moments(trimmed)[0]
+    return float(change / (flown["velocities/p-rad_sec"] - trimmed["velocities/p-rad_sec"]))
+
+
+def _strips(fdm, lift_slope) -> Strips:
+    """Wing, and the tail surfaces that JSBSim knows."""
+    arm = [fdm[f"metrics/aero-rp-{axis}-in"] - fdm[f"inertia/cg-{axis}-in"] for axis in AXES]
+    place = np.array([-arm[0], 0.0, arm[2]]) * inch  # JSBSim's x is to the rear here, z up
+    span, area = fdm["metrics/bw-ft"] * foot, fdm["metrics/Sw-sqft"] * foot**2
+    surfaces = [wing_strips(span, area, lift_slope, place=place)]
+    tail, fin = (fdm[f"metrics/S{which}-sqft"] * foot**2 for which in "hv")
+    if tail > 0:
+        behind = (-fdm["metrics/lh-ft"] * foot, 0.0, 0.0)
+        strips = wing_strips(math.sqrt(TAIL_ASPECT_RATIO * tail), tail, lift_slope, place=behind)
+        surfaces.append(in_downwash(strips, lift_slope, span**2 / area))
+    if fin > 0:
+        behind = (-fdm["metrics/lv-ft"] * foot, 0.0, 0.0)
+        height = math.sqrt(FIN_ASPECT_RATIO * fin)
+        surfaces.append(fin_strips(height, fin, lift_slope, place=behind))
+    return joined(*surfaces)

@@ -1,0 +1,62 @@
+"""Aircraft of JSBSim: the files that it ships, and copies on which a wake acts."""
+
+import shutil
+from pathlib import Path
+from xml.etree import ElementTree
+
+AXES = ("x", "y", "z")
+
+
+def shipped_aircraft(root: Path) -> tuple[str, ...]:
+    """Names of the aircraft below a folder of JSBSim's, in alphabetical order.
+
+    Parameters
+    ----------
+    root : Path
+        With the folders ``aircraft``, ``engine`` and ``systems``.
+    """
+    return tuple(sorted(path.parent.name for path in root.glob("aircraft/*/*.xml") if _main(path)))
+
+
+def write_aircraft_in_wake(root: Path, name: str, folder: Path) -> None:
+    """Copy an aircraft to ``folder/name`` and let forces and moments of the body frame act on it.
+
+    They are the properties ``external_reactions/wake-force-AXIS/magnitude`` (lbf) and
+    ``external_reactions/wake-moment-AXIS/magnitude-lbsft``, in JSBSim's axes: x forward, y to
+    starboard, z down. Sockets and files that the original opens are left out.
+
+    Parameters
+    ----------
+    root : Path
+        As in `shipped_aircraft`.
+    name : str
+    folder : Path
+        An existing folder.
+    """
+    shutil.copytree(root / "aircraft" / name, folder / name)
+    path = folder / name / f"{name}.xml"
+    tree = ElementTree.parse(path)
+    top = tree.getroot()
+    for tag in ("input", "output"):
+        for element in top.findall(tag):
+            top.remove(element)
+    reactions = top.find("external_reactions")
+    if reactions is None:
+        reactions = ElementTree.SubElement(top, "external_reactions")
+    for kind in ("force", "moment"):
+        for axis in AXES:
+            one = ElementTree.SubElement(reactions, kind, name=f"wake-{kind}-{axis}", frame="BODY")
+            if kind == "force":
+                _vector(one, "location", "000", unit="IN")
+            _vector(one, "direction", ["1" if axis == other else "0" for other in AXES])
+    tree.write(path)
+
+
+def _main(path):
+    return path.stem == path.parent.name
+
+
+def _vector(parent, tag, values, **attributes):
+    element = ElementTree.SubElement(parent, tag, attributes)
+    for axis, value in zip(AXES, values, strict=True):
+        ElementTree.SubElement(element, axis).text = value

@@ -1,0 +1,158 @@
+"""An aircraft of JSBSim: force over mass, moment over inertia, the derivatives of its file.
+
+Detects 1 % in the wake's force and moment, a wrong sense of any axis or control, a trim that is
+none, an upset that ends in an exception.
+"""
+
+import math
+import sys
+
+import numpy as np
+import pytest
+
+from lidar_mi.encounter.aircraft import Commands
+from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
+from lidar_mi.encounter.roll_model import RollModel
+from lidar_mi.encounter.strips import Loads
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema_encounter import Aircraft, Path
+
+pytest.importorskip("jsbsim")
+
+NOTHING = Loads(np.zeros(3), np.zeros(3))
+# of JSBSim's file 737.xml, in m^2 and m
+AREA, SPAN, CHORD = 1171 * 0.3048**2, 94.7 * 0.3048, 12.31 * 0.3048
+PRESSURE = 0.5 * 1.190 * 75**2  # standard atmosphere at 300 m
+
+
+def boeing(speed=75.0, **path):
+    return JSBSimAircraft(Aircraft(model="737"), Path(speed=speed, **path))
+
+
+def flown(aircraft, duration, loads=NOTHING, commands=Commands(), step=1 / 120):  # noqa: B008
+    for _ in range(round(duration / step)):
+        aircraft.step(step, loads, commands)
+    return aircraft.state
+
+
+def test_trimmed_on_the_path():
+    state = flown(boeing(), 5.0)
+    assert state.x == pytest.approx(375, abs=0.2) and state.time == pytest.approx(5)
+    assert abs(state.y) < 0.01 and abs(state.z) < 0.3 and abs(state.roll) < 1e-3
+    assert not state.departed
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_force_accelerates_the_mass(axis):
+    """m times 1 m/s^2 moves by t^2 / 2: the drag of the motion changes it by 2 % in 0.1 s."""
+    free, pushed = boeing(climb_angle=0.0), boeing(climb_angle=0.0)
+    force = np.zeros(3)
+    force[axis] = pushed.mass
+    before, after = flown(free, 0.1), flown(pushed, 0.1, Loads(force, np.zeros(3)))
+    moved = np.array([after.x - before.x, after.y - before.y, after.z - before.z])
+    angle = before.pitch  # the body's axes on the path
+    turn = [
+        [math.cos(angle), 0, -math.sin(angle)],
+        [0, 1, 0],
+        [math.sin(angle), 0, math.cos(angle)],
+    ]
+    # 12 steps of Adams-Bashforth: 0.1^2 / 2 up to one step in 12
+    np.testing.assert_allclose(
+        np.transpose(turn) @ moved / (force[axis] / pushed.mass),
+        0.005 * np.eye(3)[axis],
+        atol=0.005 * 0.12,
+    )
+
+
+def test_initial_roll_acceleration_is_moment_over_inertia():
+    """Between the third and the fourth step: the integrator has started, damping has not."""
+    aircraft = boeing()
+    loads = Loads(np.zeros(3), np.array([2e5, 0, 0]))
+    before = flown(aircraft, 3 / 120, loads).roll_rate
+    after = flown(aircraft, 1 / 120, loads).roll_rate
+    damped = math.exp(-2.5 / 120 * -aircraft.roll_damping / aircraft.roll_inertia)
+    assert (after - before) * 120 == pytest.approx(2e5 / aircraft.roll_inertia * damped, rel=0.01)
+
+
+def test_roll_mode_of_the_published_damping():
+    """C_lp = -0.4 and the inertia of the file: the time constant of the roll rate."""
+    aircraft = boeing()
+    damping = -0.4 * PRESSURE * AREA * SPAN**2 / (2 * 75)
+    assert aircraft.roll_damping == pytest.approx(damping, rel=0.02)
+    tau = -aircraft.roll_inertia / damping
+    state = flown(aircraft, 0.5, Loads(np.zeros(3), np.array([1e5, 0, 0])))
+    expected = 1e5 / -damping * -np.expm1(-0.5 / tau)
+    assert state.roll_rate == pytest.approx(expected, rel=0.04)
+
+
+def test_roll_model_and_jsbsim_roll_alike():
+    """Default keys against JSBSim's 737: -a/8 is -0.46, JSBSim's C_lp -0.4."""
+    loads = Loads(np.zeros(3), np.array([2e5, 0, 0]))
+    simple = flown(RollModel(Aircraft(), Path()), 1.0, loads)
+    full = flown(boeing(), 1.0, loads)
+    assert simple.roll == pytest.approx(full.roll, rel=0.1)
+
+
+def test_control_moments_are_the_derivatives_of_the_file():
+    moments, mach = boeing().control_moments, 75 / 339.1
+    lift = PRESSURE * AREA
+    roll = lift * SPAN * (0.1 - 0.067 * mach / 2)
+    # the elevator's lift acts 0.36 m behind the centre of gravity
+    pitch = lift * (CHORD * (1.2 - 0.9 * mach / 2) + 0.2 * 0.36)
+    yaw = lift * SPAN * 0.2
+    np.testing.assert_allclose(np.diag(moments), [roll, pitch, yaw], rtol=0.02)
+    assert abs(moments[0, 1]) < 1e-3 * roll and abs(moments[2, 0]) < 1e-3 * yaw
+
+
+@pytest.mark.parametrize(
+    ("axis", "angle", "sign"), [(0, "roll", 1), (1, "pitch", -1), (2, "yaw", 1)]
+)
+def test_moments_and_controls_turn_the_same_way(axis, angle, sign):
+    """Port wing up, nose down, nose to port."""
+    moment = np.zeros(3)
+    moment[axis] = 3e5
+    names = ("aileron", "elevator", "rudder")
+    still = flown(boeing(), 0.3)
+    turned = flown(boeing(), 0.3, Loads(np.zeros(3), moment))
+    steered = flown(boeing(), 0.3, commands=Commands(**{names[axis]: 0.1}))
+    for state in (turned, steered):
+        assert sign * (getattr(state, angle) - getattr(still, angle)) > 1e-3
+        assert sign * getattr(state, f"{angle}_rate") > 0
+
+
+def test_strips_have_the_aircrafts_surfaces():
+    strips = boeing().strips
+    assert strips.areas.sum() == pytest.approx((1171 + 348 + 297) * 0.3048**2)
+    assert strips.places[:, 1].max() == pytest.approx(SPAN / 2, rel=0.01)
+    assert strips.places[:, 0].min() == pytest.approx(-48.04 * 0.3048)
+
+
+def test_controls_keep_their_limits():
+    aircraft = boeing()
+    for _ in range(120):
+        aircraft.step(1 / 120, NOTHING, Commands(aileron=2.0, elevator=-2.0))
+        assert (np.abs(aircraft.deflection) <= aircraft.limits.deflection + 1e-12).all()
+    assert aircraft.deflection[0] == pytest.approx(0.35, abs=1e-5)
+
+
+def test_an_upset_is_a_result():
+    aircraft = boeing()
+    state = flown(aircraft, 4.0, Loads(np.zeros(3), np.array([5e6, 0, 0])), step=0.05)
+    assert state.departed and state.time == pytest.approx(4)
+    assert boeing().step(0.1, Loads(np.full(3, np.nan), np.zeros(3)), Commands()).departed
+
+
+def test_unknown_aircraft_names_those_that_there_are():
+    with pytest.raises(InputError, match=r"'nope' is not known.*737"):
+        JSBSimAircraft(Aircraft(model="nope"), Path())
+
+
+def test_a_speed_at_which_it_does_not_fly():
+    with pytest.raises(InputError, match="737 does not trim at 20 m/s"):
+        boeing(speed=20.0)
+
+
+def test_without_jsbsim(monkeypatch):
+    monkeypatch.setitem(sys.modules, "jsbsim", None)
+    with pytest.raises(InputError, match="needs JSBSim, which is not installed"):
+        boeing()
