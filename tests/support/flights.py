@@ -53,13 +53,14 @@ def oblique(crossing=0.0, climb=0.0, crow=0.0, decay_time=np.inf, phase=0.0):
     return truth
 
 
-def walking(random, wandering, length, stride=SPEED / RATE, steps=4):
+def walking(random, wandering, length, stride=SPEED / RATE, steps=2):
     """Parameters slab by slab, and in the planes of the slabs at any later time.
 
     Steps shorter than the slabs, each along the path and in time by the standard deviations of
     ``wandering``, the drift that of two line vortices in complex numbers.
     """
-    state, slopes = vector((23.5, -23.5), (0.0, 0.0)), random.normal(0, 0.05, 4)
+    state, slopes = vector((23.5, -23.5), (0.0, 0.0)), random.normal(0, 0.01, 4)
+    slopes += np.tile(random.normal(0, 0.1, 2), 2)
     rate = random.normal(0, wandering.decay)
     own = random.normal(0, wandering.departure, 4)
     places, circulations = [2, 3, 6, 7], [0, 4]

@@ -22,6 +22,7 @@ from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.track_motion import (
     CIRCULATIONS,
+    MEAN_WIND,
     PLACES,
     SLOPES,
     Wandering,
@@ -219,8 +220,8 @@ class Track:
         (Rauch-Tung-Striebel), it moves along the slopes and with the drift. Its covariance, times
         `inflation`, grows by the random walks over the distance and the time from that slab, and by
         the unknown steady rates. The velocity of a bent pair is uncertain by the difference of this
-        slab's drift from the mean over all. Beyond the newest slab this is the prediction of the
-        filter.
+        slab's mutual induction from the mean over all. Beyond the newest slab this is the
+        prediction of the filter.
 
         Parameters
         ----------
@@ -248,7 +249,7 @@ class Track:
         state, covariance, _, _ = _predicted(
             state, covariance, x - slab.x, dt, wandering, self.profile
         )
-        bent = self._drifts[:, nearest] - self._drifts.mean(1)
+        bent = self._inductions[:, nearest] - self._inductions.mean(1)
         covariance = self.inflation * covariance + unsteady(state, dt, wandering, bent)
         return replace(
             self.fit,
@@ -274,9 +275,10 @@ class Track:
         return found[::-1]
 
     @cached_property
-    def _drifts(self) -> np.ndarray:
-        """Of the smoothed slabs, (2, number), m/s."""
+    def _inductions(self) -> np.ndarray:
+        """Drift without the mean wind in the smoothed slabs, (2, number), m/s."""
         states = np.array([state for state, _ in self._smoothed]).T
+        states[MEAN_WIND] = 0
         return oblique_drift(torch.as_tensor(states), self.profile).numpy()
 
 

@@ -19,7 +19,7 @@ PLACES = [2, 3, 6, 7]
 """Parameters that move along the slopes and with the drift."""
 CIRCULATIONS = [0, 4]
 _RADII = [1, 5]
-_WIND = [8, 9]
+MEAN_WIND = [8, 9]
 _OF_SLOPES = slice(len(PARAMETERS), len(PARAMETERS) + len(SLOPES))
 
 # Along y and z the places of both vortices drift together.
@@ -62,7 +62,7 @@ class Wandering:
         air that drifts with the wake as that of fluid particles, 6.5 dissipation t. 1e-5 is a calm
         atmosphere at cruise or in the evening; 1e-3 a convective boundary layer.
     decay : float
-        Unknown relative rate of the circulations, s^-1: between those of slow diffusion, about
+        Unknown relative rate of both circulations, s^-1: between those of slow diffusion, about
         1/400 s^-1, and of rapid decay, about 1/60 s^-1 (Holzäpfel 2003, J. Aircr. 40, 323-331).
         Enters as rate times time in predictions: what changes steadily is no random walk.
     departure : float
@@ -166,14 +166,14 @@ def wandered(
     path[CIRCULATIONS] = (wandering.circulation * state[CIRCULATIONS]) ** 2
     path[_RADII] = wandering.log_radius**2
     path[PLACES] = wandering.place**2 + wandering.slope**2 * length**2 / 3
-    path[_WIND] = _TRANSVERSE * (wandering.dissipation * _MATCHED) ** (2 / 3) / _MATCHED
+    path[MEAN_WIND] = _TRANSVERSE * (wandering.dissipation * _MATCHED) ** (2 / 3) / _MATCHED
     path[_OF_SLOPES] = wandering.slope**2
     along = np.diag(path * length)
     both = np.eye(len(SLOPES)) * wandering.slope**2 * length * dx / 2
     along[PLACES, _OF_SLOPES] += both
     along[_OF_SLOPES, PLACES] += both
     later = np.zeros(len(state))
-    later[_WIND] = _LAGRANGIAN * wandering.dissipation * abs(dt)
+    later[MEAN_WIND] = _LAGRANGIAN * wandering.dissipation * abs(dt)
     return along, np.diag(later)
 
 
@@ -185,7 +185,10 @@ def unsteady(
     ``bent`` (2,) is a velocity along y and z, m/s, by which both vortices may depart together from
     the drift: where they are bent it is neither that of the slab nor that of the whole pair.
     """
-    variance = np.zeros(len(state))
-    variance[CIRCULATIONS] = (wandering.decay * dt * state[CIRCULATIONS]) ** 2
-    variance[PLACES] = (wandering.departure * dt) ** 2
-    return np.diag(variance) + (dt * _DRIFTING * bent) @ (dt * _DRIFTING * bent).T
+    # both vortices decay together, each moves on its own, the bent pair as a whole
+    decayed = np.zeros(len(state))
+    decayed[CIRCULATIONS] = wandering.decay * dt * state[CIRCULATIONS]
+    departed = np.zeros(len(state))
+    departed[PLACES] = (wandering.departure * dt) ** 2
+    together = dt * _DRIFTING * bent
+    return np.outer(decayed, decayed) + np.diag(departed) + together @ together.T
