@@ -5,6 +5,7 @@ import numpy as np
 
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.track import first_track, updated
+from lidar_mi.retrieval.vortices.track_motion import Wandering
 
 SPEED, RATE = 75.0, 10.0
 """Of the aircraft, m/s, and slabs a second."""
@@ -133,13 +134,21 @@ def times(number, start=0.0):
     return start + SPEED / RATE * index, index / RATE
 
 
-def tracks(random, truths, start=0.0, settings=None, error=None):
-    """The track after each slab, of fits that scatter about the truths (10,) of the slabs."""
-    error = errors_of_a_fit() if error is None else error
+ERROR = errors_of_a_fit()
+"""Covariance of the fits that `drawn` makes."""
+
+
+def drawn(random, truths):
+    """Fits that scatter about the truths (10,) of slabs with `ERROR`."""
+    return [fit(random.multivariate_normal(truth, ERROR), ERROR) for truth in truths]
+
+
+def tracks(random, truths, start=0.0, settings=None, measure=drawn):
+    """The track after each slab."""
     x, t = times(len(truths), start)
-    drawn = [fit(random.multivariate_normal(truth, error), error) for truth in truths]
-    found = [first_track(drawn[0], x[0], t[0], settings)]
-    for pair, at, time in zip(drawn[1:], x[1:], t[1:], strict=True):
+    pairs = measure(random, truths)
+    found = [first_track(pairs[0], x[0], t[0], settings)]
+    for pair, at, time in zip(pairs[1:], x[1:], t[1:], strict=True):
         found.append(updated(found[-1], pair, at, time))
     return found
 
@@ -147,3 +156,68 @@ def tracks(random, truths, start=0.0, settings=None, error=None):
 def normalised(departure, covariance):
     """Square of a departure in units of its covariance."""
     return float(departure @ np.linalg.solve(covariance, departure))
+
+
+def arrival(track):
+    """Plane of the slab that the wing meets next, and when; of a young track, of its first."""
+    slab = track.slabs[-min(round(0.75 * AHEAD * RATE), len(track.slabs))]
+    return slab.x, slab.time + AHEAD
+
+
+def flights(number, make, settings=None, seed=11, length=16, measure=drawn):
+    """What a number of flights left.
+
+    Parameters
+    ----------
+    make : callable
+        Of a generator and a number of slabs: the truths in the slabs, the state at the end, a
+        function of the last track that gives the truth at the wing, and where the slabs begin.
+    measure : callable
+        Of a generator and truths: fits.
+
+    Returns
+    -------
+    dict
+        Squares of the innovations, of the errors of the last state and of the pair at the wing,
+        each normalised; departures of the latter over their stated errors; the last tracks.
+    """
+    random = np.random.default_rng(seed)
+    found = {"innovations": [], "state": [], "arrival": [], "departures": [], "tracks": []}
+    for _ in range(number):
+        truths, at_end, at_arrival, start = make(random, length)
+        every = tracks(random, truths, start, settings, measure)
+        last = every[-1]
+        found["tracks"].append(last)
+        found["innovations"] += [t.innovation[0] for t in every[1:] if t.innovation]
+        size = len(at_end)
+        found["state"].append(normalised(at_end - last.state[:size], last.covariance[:size, :size]))
+        pair = last.pair_at(*arrival(last))
+        departure = at_arrival(last) - pair.parameters
+        found["arrival"].append(normalised(departure, pair.covariance))
+        found["departures"].append(departure / np.sqrt(np.diagonal(pair.covariance)))
+    return found
+
+
+def wakes_in_space(**properties):
+    """Flights past straight or deformed lines, of a random phase and place along the path."""
+
+    def make(random, length):
+        truth = oblique(phase=random.uniform(0, 2 * np.pi), **properties)
+        start = random.uniform(-150, 0)
+        x, t = times(length, start)
+        truths = [truth(*at) for at in zip(x, t, strict=True)]
+        return truths, truths[-1], lambda track: truth(*arrival(track)), start
+
+    return make
+
+
+def wakes_that_walk(random, length):
+    states, later = walking(random, Wandering(), length)
+
+    def at_arrival(track):
+        state = states[-round(0.75 * AHEAD * RATE)][0]
+        for _ in range(20):
+            state = later(state, AHEAD / 20)
+        return state
+
+    return [state for state, _ in states], np.concatenate(states[-1]), at_arrival, 0.0
