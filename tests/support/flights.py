@@ -188,7 +188,8 @@ def flights(number, make, settings=None, seed=11, length=16, measure=drawn):
         every = tracks(random, truths, start, settings, measure)
         last = every[-1]
         found["tracks"].append(last)
-        found["innovations"] += [t.innovation[0] for t in every[1:] if t.innovation]
+        # that of the second slab is the prior's of the slopes, which are no draw from it
+        found["innovations"] += [t.innovation[0] for t in every[2:] if t.innovation]
         size = len(at_end)
         found["state"].append(normalised(at_end - last.state[:size], last.covariance[:size, :size]))
         pair = last.pair_at(*arrival(last))
