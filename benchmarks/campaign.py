@@ -53,25 +53,27 @@ def compare(repeats: int = 3, points: int = 24) -> Comparison:
         lines += _costs(folder, clients[2])
     notes = (
         "Loop: prepare and finish of every point in one process, metrics written to a file. Pool: "
-        "the same in two processes. Workers and pool are started before.",
+        "the same in two processes. Workers and pool are started before; what is done once for all "
+        "points has a row of its own.",
     )
     return Comparison("Campaigns", "campaign", "loop or pool", tuple(lines), notes)
 
 
 def _rows(folder: Path, clients: dict, pool: Any, samples: int, count: int, repeats: int):
-    def campaign(workers: int) -> Callable[[int], None]:
+    def campaign(workers: int) -> Callable[[int], float]:
         return lambda turn: _campaign(folder, clients[workers], samples, count, turn)
 
     tasks: dict[str, Callable[[int], Any]] = {
         "one": campaign(1),
         "two": campaign(2),
-        "loop": lambda turn: [_point(*case) for case in _cases(folder, samples, count, turn)],
-        "pool": lambda turn: pool.starmap(
-            _point, _cases(folder, samples, count, turn), chunksize=1
-        ),
+        "loop": lambda turn: _loop(_cases(folder, samples, count, turn)),
+        "pool": lambda turn: _pool(pool, _cases(folder, samples, count, turn)),
     }
     timed = in_turns(tasks, repeats)
-    seconds = {name: [one.seconds / count for one in found] for name, found in timed.items()}
+    seconds = {
+        name: [(one.seconds - one.result) / count for one in found] for name, found in timed.items()
+    }
+    once = sorted(one.result for one in timed["one"])[repeats // 2]
     about = f"{count} points, {samples} samples a beam"
     added = [a - b for a, b in zip(seconds["one"], seconds["loop"], strict=True)]
     yield row(
@@ -89,6 +91,7 @@ def _rows(folder: Path, clients: dict, pool: Any, samples: int, count: int, repe
         "lower",
     )
     yield Row(f"{about}: one worker", "added to a point", "s", sorted(added)[len(added) // 2])
+    yield Row(f"{about}", "checking all points and collecting, once", "s", once)
 
 
 def _costs(folder: Path, client: Any, count: int = 1000) -> Iterator[Row]:
@@ -124,15 +127,31 @@ def _described(samples: int, count: int, turn: int) -> tuple[Campaign, dict]:
     return Campaign(name="bench", base="point", seed=turn, members=count), base
 
 
-def _campaign(folder: Path, client: Any, samples: int, count: int, turn: int) -> None:
+def _campaign(folder: Path, client: Any, samples: int, count: int, turn: int) -> float:
+    """One campaign; seconds of what is done once, beside its points."""
+    start = time.perf_counter()
     out = folder / "campaign"
     shutil.rmtree(out, ignore_errors=True)
     campaign, base = _described(samples, count, turn)
     ready = prepare_campaign(Points(campaign, base, folder), out)
+    begun = time.perf_counter()
     with ready.claimed():
         state = execute(ready, client, watch=lambda state: None)
+    ended = time.perf_counter()
     assert state.done == count
     collect(ready)
+    return begun - start + time.perf_counter() - ended
+
+
+def _loop(cases: list[tuple]) -> float:
+    for case in cases:
+        _point(*case)
+    return 0.0
+
+
+def _pool(pool: Any, cases: list[tuple]) -> float:
+    pool.starmap(_point, cases, chunksize=1)
+    return 0.0
 
 
 def _cases(folder: Path, samples: int, count: int, turn: int) -> list[tuple]:

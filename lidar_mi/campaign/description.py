@@ -4,8 +4,9 @@ import math
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
+from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.faults import first_fault
 from lidar_mi.experiment.schema import NAME
@@ -19,11 +20,7 @@ LARGEST = 10**7
 """Values of a dimension, points of a sample, members: more are a slip of the pen."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class Span(_Section):
+class Span(Description):
     """An interval of values, between two ends of the same unit.
 
     Attributes
@@ -105,7 +102,7 @@ class Range(Span):
         return self.quantities([k / (self.n - 1) for k in range(self.n)])
 
 
-class Sample(_Section):
+class Sample(Description):
     """A space-filling sample of several keys (`scipy.stats.qmc`)."""
 
     method: Literal["sobol", "latin_hypercube"] = "sobol"
@@ -123,7 +120,7 @@ class Sample(_Section):
         return self
 
 
-class Campaign(_Section):
+class Campaign(Description):
     """Many experiments that differ from a base in some keys.
 
     Attributes
@@ -151,12 +148,12 @@ class Campaign(_Section):
     name: str = Field(pattern=f"^{NAME}$")
     base: str
     seed: Annotated[int, Within(0, 2**31 - 1, "integers of an image header")] | None = None
-    set: dict[str, Any] = {}
-    sweep: dict[str, Range | list[Any] | dict[str, dict[str, Any]]] = {}
+    set: dict[str, Any] = Field(default_factory=dict)
+    sweep: dict[str, Range | list[Any] | dict[str, dict[str, Any]]] = Field(default_factory=dict)
     sample: Sample | None = None
     members: Annotated[int, Within(1, LARGEST, "a point for each")] = 1
     keep: Literal["metrics", "estimates", "everything"] = "metrics"
-    quick: dict[str, Any] = {}
+    quick: dict[str, Any] = Field(default_factory=dict)
 
     @field_validator("sweep", mode="before")
     @classmethod

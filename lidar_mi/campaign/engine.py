@@ -200,11 +200,17 @@ def connected(
     # a point is given up by its own count of killed workers, not by that of the scheduler
     settings: dict[str, Any] = {
         "distributed.scheduler.allowed-failures": 10**6,
-        "distributed.scheduler.worker-saturation": 1.0,
+        "distributed.scheduler.worker-saturation": 1.1,
         "distributed.worker.multiprocessing-method": "spawn",
         # without dask's limit to what malloc keeps, with which every large array is mapped anew
-        "distributed.nanny.pre-spawn-environ": dict.fromkeys(_ONE_THREAD, threads),
+        "distributed.nanny.pre-spawn-environ": dict.fromkeys(_ONE_THREAD, threads)
+        # points run in a thread of their own, whose memory is otherwise mapped anew every time
+        | {"MALLOC_ARENA_MAX": 1},
         "distributed.logging.distributed": "critical",
+        # its profiler looks at the workers a hundred times a second: a fifth of a short point
+        "distributed.worker.profile.enabled": False,
+        "distributed.worker.memory.monitor-interval": "1s",
+        "distributed.admin.tick.interval": "1s",
     }
     with dask.config.set(settings):
         cluster = LocalCluster(

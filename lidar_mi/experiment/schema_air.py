@@ -2,8 +2,9 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AliasChoices, ConfigDict, Field, field_validator, model_validator
 
+from lidar_mi.description import Description
 from lidar_mi.units import (
     Circulation,
     Extinction,
@@ -23,17 +24,11 @@ _Place = Annotated[Length, Within(-1e6, 1e6, "models of a region")]
 _Moment = Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")]
 
 
-class Section(BaseModel):
+class Section(Description):
     """A part of an experiment file: frozen, every key known, no NaN or infinity."""
 
     # enumerations hold what is allowed; values are plain strings, as files and data sets hold them
-    model_config = ConfigDict(
-        frozen=True,
-        extra="forbid",
-        validate_default=True,
-        allow_inf_nan=False,
-        use_enum_values=True,
-    )
+    model_config = ConfigDict(use_enum_values=True)
 
 
 class VortexPair(Section):

@@ -6,14 +6,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.multiplication import intensified, register_excess, register_output
 from lidar_mi.units import Frequency, Number, Time, Within, quantity
 
 
-class CCD(BaseModel):
+class CCD(Description):
     """A CCD, an EMCCD or an intensified CCD; numbers of electrons unless stated otherwise.
 
     ``quantum_efficiency`` is 1 by default because the paper's photon numbers count the photons
@@ -31,10 +32,6 @@ class CCD(BaseModel):
     ``nonlinearity`` a records q (1 - a q / q_full) of q electrons: positive where the response
     falls. q_full is ``register_well``, or without one what full wells of the chip become.
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     quantum_efficiency: Annotated[
         Number, Within(1e-9, 1, "one photoelectron per photon at most")

@@ -4,13 +4,14 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from scipy import constants
 
+from lidar_mi.description import Description
 from lidar_mi.units import Frequency, Length, Number, SpectralRadiance, Within, quantity
 
 
-class Detector(BaseModel):
+class Detector(Description):
     """Optics and detector behind the telescope; defaults: a photomultiplier by day.
 
     Transmission of the filter at the laser's wavelength is part of ``optics_efficiency``.
@@ -27,10 +28,6 @@ class Detector(BaseModel):
     ``line_width`` is that of the received light: the laser's (30 GHz: a Nd:YAG laser without
     seeding; 0.44 / pulse duration: a perfect one) and, for molecules, their Doppler broadening.
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     optics_efficiency: Annotated[
         Number, Within(1e-9, 1, "from a blocking filter of 90 dB to all light")

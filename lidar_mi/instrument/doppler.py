@@ -6,9 +6,10 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from pydantic import AliasChoices, BaseModel, ConfigDict, Field, model_validator
+from pydantic import AliasChoices, Field, model_validator
 
 from lidar_mi.atmosphere.line import Line
+from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.detector import gate_duration, photons_per_energy
 from lidar_mi.instrument.etalon import Etalon, harmonics, series
@@ -30,7 +31,7 @@ from lidar_mi.units import (
 )
 
 
-class DopplerLidar(BaseModel):
+class DopplerLidar(Description):
     """A monostatic direct-detection Doppler lidar; defaults are the paper's Table 2.
 
     The paper has ranges of 56 m and 76 m. Not from the paper are: the widths of the laser's line
@@ -44,10 +45,6 @@ class DopplerLidar(BaseModel):
     The default ``sky_radiance`` is that of a white surface of reflectance 0.5, such as a sunlit
     cloud, under an overhead sun of 1.1 W m^-2 nm^-1 (ASTM E490, 355 nm).
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     wavelength: Annotated[
         Length, Within(1e-7, 2e-5, "from the vacuum ultraviolet to the far infrared")

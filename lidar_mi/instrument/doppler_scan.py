@@ -8,10 +8,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 import xarray as xr
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy import constants
 from scipy.interpolate import RegularGridInterpolator
 
+from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler import DopplerLidar
@@ -23,13 +24,7 @@ from lidar_mi.units import Angle, Speed, Within, quantity
 _BIN, _PULSE, _BEAM = 8, 3, 3
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
-
-
-class DopplerScan(_Model):
+class DopplerScan(Description):
     """Directions of a Doppler lidar, equidistant in azimuth and elevation.
 
     The default has the 63 directions of the paper's table 1 and holds a wing of 60 m from 76 m
@@ -74,7 +69,7 @@ class DopplerScan(_Model):
         return np.full(len(directions), lidar.range) - flown
 
 
-class PlatformErrors(_Model):
+class PlatformErrors(Description):
     """Errors of the platform's attitude, pointing and speed: truth minus the assumed value.
 
     Pitch is positive nose up, yaw nose to port, roll port wing up. An angle error e causes a

@@ -11,14 +11,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from lidar_mi.description import Description
 from lidar_mi.instrument import etalon as fabry_perot
 from lidar_mi.instrument.etalon import Etalon
 from lidar_mi.units import Angle, Frequency, Number, Within, quantity
 
 
-class DoubleEdge(BaseModel):
+class DoubleEdge(Description):
     """Two etalons of one design on both flanks of the line.
 
     The defaults are derived: a free spectral range of 12 GHz and peaks of 1.7 GHz full width (1.8
@@ -29,10 +30,6 @@ class DoubleEdge(BaseModel):
     ``arrangement`` ``split`` divides the light between both etalons by a beam splitter;
     ``sequential`` sends all of it to the first, and what that reflects to the second.
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     etalon: Etalon = Field(
         Etalon(gap=12.5e-3, reflectivity=0.64, order_fraction=None),

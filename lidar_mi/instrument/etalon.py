@@ -17,11 +17,12 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from scipy import constants
 from scipy.optimize import brentq
 
 from lidar_mi.atmosphere.line import Line
+from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.units import Length, Number, Within
 
@@ -49,7 +50,7 @@ class Mirrors(NamedTuple):
     order_shift: float
 
 
-class Etalon(BaseModel):
+class Etalon(Description):
     """A plane Fabry-Perot etalon; lengths in m, text with units is read as such.
 
     The paper gives no numbers for its etalon. The defaults are derived: they give four rings on
@@ -59,10 +60,6 @@ class Etalon(BaseModel):
     of both plates. Outer faces are taken as perfectly antireflecting. A tilt is no property of the
     etalon: it moves the centre of the rings (`lidar_mi.instrument.fringe_camera.FringeCamera`).
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     gap: Annotated[
         Length, Within(1e-6, 1, "from a few wavelengths to the coherence length of the laser")

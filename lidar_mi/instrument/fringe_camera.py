@@ -10,9 +10,10 @@ from typing import Annotated
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from lidar_mi.atmosphere.line import Line
+from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.etalon import Etalon, cosine_inside, fractional_order, harmonics, series
 from lidar_mi.units import Length, Within
@@ -24,7 +25,7 @@ _NODES = {1: (0.0,), 2: (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))}
 _Place = Annotated[float, Within(-1e6, 1e6, "rings far beyond the CCD are straight")]
 
 
-class FringeCamera(BaseModel):
+class FringeCamera(Description):
     """Lens and the CCD's pixels; lengths in m, text with units is read as such.
 
     The paper gives 960 x 780 pixels; the other defaults are derived, as those of the
@@ -32,10 +33,6 @@ class FringeCamera(BaseModel):
     f tan(theta) from ``centre``. The light's fall-off towards the rim is a Gaussian about that
     centre; what a lens loses by itself, cos(theta)^4, is 0.05 % in the corners and left out.
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     focal_length: Annotated[
         Length, Within(0.001, 100, "from a telephone's camera to the longest telescope")

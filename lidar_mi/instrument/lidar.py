@@ -5,20 +5,17 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
+from lidar_mi.description import Description
 from lidar_mi.units import Angle, Energy, Length, Time, Within, quantity
 
 
-class BackscatterLidar(BaseModel):
+class BackscatterLidar(Description):
     """A monostatic pulsed lidar; defaults are the paper's.
 
     Lengths in m, angles in rad, energy in J, time in s; text with units is read as such.
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     wavelength: Annotated[
         Length, Within(1e-7, 2e-5, "from the vacuum ultraviolet to the far infrared")

@@ -15,13 +15,14 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy import constants
 
+from lidar_mi.description import Description
 from lidar_mi.units import Length, Number, Within
 
 
-class Michelson(BaseModel):
+class Michelson(Description):
     """A field-widened Michelson interferometer with a line detector; lengths in m.
 
     ``path_difference`` is the one published for molecules at 355 nm, about 3 cm (Bruneau 2002,
@@ -30,10 +31,6 @@ class Michelson(BaseModel):
     element; it stands for all defects of the optics: plates, polarisation, what field widening
     leaves.
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     path_difference: Annotated[
         Length, Within(1e-6, 100, "from a few wavelengths to the coherence length of the laser")

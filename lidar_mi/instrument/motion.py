@@ -9,18 +9,11 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, cast
 
 import numpy as np
-from pydantic import (
-    BaseModel,
-    ConfigDict,
-    Field,
-    ValidationInfo,
-    field_serializer,
-    field_validator,
-    model_validator,
-)
+from pydantic import Field, ValidationInfo, field_serializer, field_validator, model_validator
 from scipy import special
 from scipy.spatial.transform import Rotation, Slerp
 
+from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.units import Angle, Frequency, Within, to_si
 
@@ -34,13 +27,7 @@ TrueFrequency = Annotated[
 ]
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
-
-
-class Sinusoid(_Model):
+class Sinusoid(Description):
     """A vibration of one axis: amplitude times sin(2 pi frequency t + phase)."""
 
     axis: Literal["x", "y", "z", "roll", "pitch", "yaw"]
@@ -70,7 +57,7 @@ class Sinusoid(_Model):
         return self
 
 
-class Attitude(_Model):
+class Attitude(Description):
     """Random roll, pitch and yaw, independent of each other, each with this spectrum."""
 
     rms: Annotated[Angle, Within(0, 0.3, "beams still go ahead")] = Field(
@@ -79,7 +66,7 @@ class Attitude(_Model):
     bandwidth: TrueFrequency = Field(description="at which the spectrum has half its power")
 
 
-class Motion(_Model):
+class Motion(Description):
     """How the platform departs from straight flight at its speed; nothing: not at all."""
 
     trajectory: str | None = Field(None, description="file of t, x, y, z, roll, pitch, yaw")

@@ -7,18 +7,12 @@ from collections.abc import Callable
 from typing import Annotated, cast
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from lidar_mi.description import Description
 from lidar_mi.instrument.motion import ANGLES, PLACES, Pose, attitude, random_process
 from lidar_mi.units import Angle, AngularRate, Frequency, Length, Speed, Time, Within
-
-
-class _Model(BaseModel):
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
-
 
 _Place = Annotated[Length, Within(-10000, 10000, "no navigation at all")]
 _Turn = Annotated[Angle, Within(-1, 1, "larger errors are no errors of an attitude")]
@@ -28,7 +22,7 @@ _PlaceRms = Annotated[Length, Within(0, 10000, "no navigation at all")]
 _TurnRms = Annotated[Angle, Within(0, 0.3, "larger errors are no errors of an attitude")]
 
 
-class Offset(_Model):
+class Offset(Description):
     """Constant errors."""
 
     x: _Place = 0.0
@@ -39,7 +33,7 @@ class Offset(_Model):
     yaw: _Turn = 0.0
 
 
-class Drift(_Model):
+class Drift(Description):
     """Errors that grow with time, from 0 at the first scan."""
 
     x: _PlaceRate = 0.0
@@ -50,7 +44,7 @@ class Drift(_Model):
     yaw: _TurnRate = 0.0
 
 
-class Noise(_Model):
+class Noise(Description):
     """Rms of random errors."""
 
     x: _PlaceRms = 0.0
@@ -61,7 +55,7 @@ class Noise(_Model):
     yaw: _TurnRms = 0.0
 
 
-class Reported(_Model):
+class Reported(Description):
     """How the reported pose differs from the true one; nothing: not at all."""
 
     offset: Offset = Offset()

@@ -7,8 +7,9 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.scan_timing import ScanTiming
@@ -22,7 +23,7 @@ HalfAngle = Annotated[
 ]
 
 
-class Scan(BaseModel):
+class Scan(Description):
     """How the beams are aimed and gated; defaults are the paper's slab at 500 m.
 
     ``aim: grid`` sends every beam to a node of the wake's (y, z) grid in the middle of the gates,
@@ -34,10 +35,6 @@ class Scan(BaseModel):
     and by a little more from 485 m than from 500 m, which looks like an outward wind of up to
     0.3 m/s at the image's corners.
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     aim: Literal["grid", "angles"] = "grid"
     range: Annotated[

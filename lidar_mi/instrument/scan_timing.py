@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from lidar_mi.description import Description
 from lidar_mi.errors import InputError
 from lidar_mi.units import AngularAcceleration, AngularRate, Frequency, Time, Within
 
@@ -74,7 +75,7 @@ class Schedule:
     load: Load
 
 
-class ScanTiming(BaseModel):
+class ScanTiming(Description):
     """When each beam of a scan is sent.
 
     ``raster`` and ``serpentine`` go over the nodes of the image row by row, always from the left or
@@ -83,10 +84,6 @@ class ScanTiming(BaseModel):
     elevation with ``cycles`` in a scan, or the sum of two deflections that rotate ``cycles`` times
     in a scan, over the largest circle in the field. ``table``: times and directions of a file.
     """
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", validate_default=True, allow_inf_nan=False
-    )
 
     pattern: Literal["raster", "serpentine", "lissajous", "risley", "table"] = "serpentine"
     duration: Annotated[Time, Within(0, 10000, "the life of a wake")] | None = Field(

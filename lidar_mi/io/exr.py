@@ -66,13 +66,17 @@ def write_scan(path: str | Path, scan: xr.Dataset) -> None:
     their type.
     """
     path = Path(path)
-    pilot = scan.transpose("gate", "z", "y").sortby(["z", "y"], ascending=False)
-    channels = {name: pilot[name].transpose("z", "y").values for name in _once_per_scan(pilot)}
-    for gate in range(pilot.sizes["gate"]):
-        for quantity in _quantities(pilot):
-            channels[f"gate{gate:03d}.{quantity}"] = pilot[quantity].values[gate]
-    # ascending, whatever the order in the dataset
-    axes = {axis: pilot[axis].values[::-1] for axis in ("y", "z")}
+    # rows from the top, columns from the left, whatever their order in the dataset
+    axes = {axis: np.sort(scan[axis].values) for axis in ("y", "z")}
+    rows, columns = (np.argsort(-scan[axis].values) for axis in ("z", "y"))
+
+    def pilot(name: str) -> np.ndarray:
+        return scan[name].transpose(..., "z", "y").values[..., rows[:, None], columns]
+
+    channels = {name: pilot(name) for name in _once_per_scan(scan)}
+    gated = {name: pilot(name) for name in _quantities(scan)}
+    for gate in range(scan.sizes["gate"]):
+        channels |= {f"gate{gate:03d}.{name}": values[gate] for name, values in gated.items()}
     _write(path, axes | scan.attrs, channels)
 
 

@@ -16,6 +16,8 @@ DEEPEST = 40
 """Sections in sections."""
 
 _LARGEST_NUMBER = 10**300
+# ten times as fast where PyYAML was built with libyaml
+_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 # what Python raises on the text of a number or a date that is none
 _NO_VALUE = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError)
 
@@ -112,4 +114,4 @@ def read_yaml(path: str | Path, expected: str) -> Any:
 
 def to_yaml(data: Any) -> str:
     """Plain data as YAML text, keys in the order in which they are."""
-    return yaml.safe_dump(data, sort_keys=False)
+    return yaml.dump(data, Dumper=_DUMPER, sort_keys=False)

@@ -2,8 +2,9 @@
 
 from typing import Annotated, Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from lidar_mi.description import Description
 from lidar_mi.units import Length, Memory, Within
 
 Variant = Literal[
@@ -24,10 +25,8 @@ VARIANTS: tuple[str, ...] = get_args(Variant)
 _CEILING = Within(1e8, 1e15, "from a small scene to the largest machine")
 
 
-class RenderSettings(BaseModel):
+class RenderSettings(Description):
     """Settings of the light transport."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     variant: Variant = "llvm_ad_mono_polarized"
     samples_per_beam: Annotated[
@@ -45,10 +44,8 @@ class RenderSettings(BaseModel):
     )
 
 
-class FringeSettings(BaseModel):
+class FringeSettings(Description):
     """Settings of the rendering of a fringe camera's rings."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
     variant: Variant = "llvm_ad_mono_polarized"
     samples_per_pixel: Annotated[

@@ -264,6 +264,7 @@ def test_mueller_matrix_turns_fields_as_their_s_and_p_parts(optics, mode, compon
     wi = leaving if mode == "Radiance" else -arriving
     expected_wo = -arriving if mode == "Radiance" else leaving
     sampled, weight = bsdf.sample(context, interaction(wi.T), mi.Float(0.3), mi.Point2f(0.5), True)
+    dr.eval(sampled, weight)  # at once, not element by element
     np.testing.assert_allclose(np.array(sampled.wo).T, expected_wo, atol=1e-6)
     matrix = np.array([[weight[r, c][0] for c in range(4)] for r in range(4)])
     matrix = np.moveaxis(np.broadcast_to(matrix, (4, 4, number)), 2, 0).astype(float)

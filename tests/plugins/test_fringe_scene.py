@@ -104,12 +104,10 @@ def _curve(cosine, v_los, reflectivity):
     defects = np.exp(-2 * (np.pi * n * 2 * 2e-9 / WAVELENGTH) ** 2)
     coefficients = reflectivity**n * line * defects
     level = (1 - reflectivity) ** 2 / (1 - reflectivity**2)
-    result = np.full(np.shape(cosine), level)
     order = (ORDER + 2 * v_los / WAVELENGTH / SPECTRAL_RANGE) * cosine
-    for k, c in zip(n, coefficients, strict=True):
-        if abs(c) > 1e-9:
-            result += 2 * level * np.real(c * np.exp(2j * np.pi * k * order))
-    return result
+    # a power series in the wave of one round trip: exp once, not for every term
+    wave = np.exp(2j * np.pi * order)
+    return level + 2 * level * (np.polyval([*coefficients[::-1], 0], wave)).real
 
 
 def rings(

@@ -42,7 +42,7 @@ SMALL = {
         "retrieval": {
             "methods": ["annular", "pixels", "ca", "ca_r2", "ml", "sg"],
             "averaged": [1, 9],
-            "images": 6,
+            "images": 4,
             "slow_images": 1,
         },
     },
@@ -159,7 +159,7 @@ def test_images_are_described_by_their_headers(small):
 @pytest.mark.parametrize("centre", ["free", "known"])
 @pytest.mark.parametrize("averaged", [1, 9])
 def test_winds_scatter_as_the_bound_says(small, found, centre, averaged):
-    """Squared errors over the bound's variance follow chi-square: bias and spread at once, 12
+    """Squared errors over the bound's variance follow chi-square: bias and spread at once, 8
     images; to 1e-4 on each side."""
     case = found.sel(algorithm="annular", centre=centre, averaged=averaged)
     bound = small[1][f"doppler.bound.centre_{centre}.averaged_{averaged}.std"]

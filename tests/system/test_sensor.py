@@ -26,7 +26,7 @@ from lidar_mi.experiment.stages import lines as line_stage
 from lidar_mi.experiment.stages.sensor import mean_squares_without, with_truth
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
-from tests.support.experiments import leave_out_figures, replace_stages
+from tests.support.experiments import leave_out_figures, replace_stages, without_figures
 
 # a coarse wake, single scattering, a CCD of a sixteenth of the pixels
 SMALL = {
@@ -68,10 +68,12 @@ def changed(**sections):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Folder and metrics of one run."""
+    """Folder and metrics of one run, without the figures that each lidar has alone."""
     mi.set_variant("llvm_ad_mono_polarized")
     folder = tmp_path_factory.mktemp("whole") / "run"
-    return folder, run(changed(), folder).metrics
+    with without_figures(), pytest.MonkeyPatch.context() as patch:
+        patch.setattr("lidar_mi.assessment.figures.doppler.draw_all", lambda *_: [])
+        return folder, run(changed(), folder).metrics
 
 
 def test_the_whole_chain(whole):

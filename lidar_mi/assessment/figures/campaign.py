@@ -89,7 +89,7 @@ def draw_requirements(
     title: str, margins: Mapping[str, Interval], x: Axis, y: Axis, points: Points
 ) -> str:
     """Where all requirements are met (green), and the boundary of each with its uncertainty."""
-    _, axes = panel(title)
+    figure, axes = panel(title)
     order = (y.name, x.name)
     means = {name: one.mean.transpose(*order) for name, one in margins.items()}
     worst = xr.concat(list(means.values()), "row", coords="minimal", compat="override").min(
@@ -121,7 +121,42 @@ def draw_requirements(
                 axes.contour(*finer, np.ma.masked_invalid(between), [0.0], colors=colour, **style)
         handles.append(Line2D([], [], color=colour, label=name))
     if handles:
-        axes.legend(handles=handles, fontsize=8, loc="best", framealpha=0.85)
+        # beside the map: inside it would hide boundaries
+        figure.legend(
+            handles=handles, fontsize=8, loc="outside lower center", ncols=3, frameon=False
+        )
+    return as_svg(axes, marks, title)
+
+
+MET, UNMET = "#2c7a3f", FAILED
+
+
+def draw_margins(
+    title: str,
+    worst: np.ndarray,
+    x: Axis,
+    across: np.ndarray,
+    y: Axis,
+    up: np.ndarray,
+    points: Points,
+) -> str:
+    """Points of a sample in the plane of two knobs: green where all requirements are met."""
+    figure, axes = panel(title)
+    axes.plot(across, up, ",", alpha=0)
+    marks = []
+    for k, value in enumerate(worst):
+        known = np.isfinite(value)
+        lost = "failed" if bool(points.failed.values[k]) else "no value"
+        text = f"smallest margin {100 * value:+.0f} %" if known else lost
+        colour = (MET if value >= 0 else UNMET) if known else ABSENT
+        marks.append(_dot(across[k], up[k], text, colour, points, k))
+    _scale(axes, x, y)
+    axes.grid(alpha=0.3)
+    handles = [
+        Line2D([], [], ls="", marker="o", color=colour, label=name)
+        for name, colour in (("all rows met", MET), ("some row not met", UNMET))
+    ]
+    figure.legend(handles=handles, fontsize=8, loc="outside lower center", ncols=2, frameon=False)
     return as_svg(axes, marks, title)
 
 

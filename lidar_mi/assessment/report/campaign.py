@@ -16,7 +16,7 @@ from lidar_mi.assessment.metrics.requirements import QUANTITIES
 from lidar_mi.assessment.report.block import Block, label_of
 from lidar_mi.assessment.report.digits import three, with_error
 from lidar_mi.assessment.report.page import template
-from lidar_mi.assessment.report.sample import sample_blocks
+from lidar_mi.assessment.report.sample import margin_blocks, sample_blocks
 
 _PANELS = 16
 _DONE, _FAILED = 0, 1
@@ -54,7 +54,7 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
     }
     if SAMPLE in dataset.dims:
         blocks = list(sample_blocks(dataset, known, shown, axes, points))
-        required = []
+        required = list(margin_blocks(dataset, margins, axes, points))
     else:
         blocks = [_sweep_block(dataset, key, known[key], axes, points) for key in shown]
         required = list(_requirement_maps(dataset, margins, axes, points))

@@ -4,11 +4,12 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import xarray as xr
+from scipy import stats
 
 from lidar_mi.assessment.figures import campaign as figures
 from lidar_mi.assessment.figures.campaign import Axis, Points
 from lidar_mi.assessment.metrics import campaign as numbers
-from lidar_mi.assessment.metrics.campaign import SAMPLE
+from lidar_mi.assessment.metrics.campaign import SAMPLE, Interval
 from lidar_mi.assessment.metrics.pareto import pareto_front
 from lidar_mi.assessment.metrics.sensitivity import SobolIndices, sobol_indices
 from lidar_mi.assessment.report.block import Block, label_of
@@ -29,7 +30,7 @@ def sample_blocks(
     axes: Mapping[str, Axis],
     points: Points,
 ) -> Iterator[Block]:
-    """Sobol' indices and scatter of every metric, then the Pareto front of the first error."""
+    """Sobol' indices and scatter of every metric, then the Pareto front of every error."""
     logarithmic = [name for name, axis in axes.items() if axis.logarithmic]
     labels = {name: axis.label.partition(" / ")[0] for name, axis in axes.items()}
     places = {name: dataset[name].values for name in axes}
@@ -49,9 +50,9 @@ def sample_blocks(
         for name, axis in axes.items():
             drawn.append(figures.draw_scatter("", axis, places[name], y, mean, points))
         yield Block(title, f"{text} Key: {key}.", drawn)
-    errors = [key for key in shown if "rmse_" in key][:1]
-    for key in errors:
-        yield from _fronts(key, known, axes, places, points)
+    for key in shown:
+        if "rmse_" in key:
+            yield from _fronts(key, known, axes, places, points)
 
 
 def _fronts(key, known, axes, places, points) -> Iterator[Block]:
@@ -79,7 +80,46 @@ def _fronts(key, known, axes, places, points) -> Iterator[Block]:
         drawn.append(
             figures.draw_scatter("", axes[name], places[name], y, values, points, front, pair)
         )
-    yield Block("Pareto front", text, drawn)
+    yield Block(f"Pareto front, {label.partition(' / ')[0]}", text, drawn)
+
+
+def margin_blocks(
+    dataset: xr.Dataset,
+    margins: Mapping[tuple[str, str], Mapping[str, Interval]],
+    axes: Mapping[str, Axis],
+    points: Points,
+) -> Iterator[Block]:
+    """Where in the sample requirements are met, in the plane of the two knobs that decide."""
+    numeric = [name for name, axis in axes.items() if not axis.labels]
+    if len(numeric) < 2 or not margins:
+        return
+    places = {name: dataset[name].values for name in numeric}
+    drawn = []
+    for (application, phase), rows in margins.items():
+        each = np.stack([one.mean.transpose(SAMPLE).values for one in rows.values()])
+        worst = each.min(0)  # NaN where any row has no value
+        x, y = sorted(_decisive(places, worst), key=numeric.index)
+        title = f"{application.replace('_', ' ')}, {phase}"
+        drawn.append(
+            figures.draw_margins(title, worst, axes[x], places[x], axes[y], places[y], points)
+        )
+    text = (
+        "Every point of the sample, in the plane of the two knobs with which the smallest margin "
+        "of all rows rises or falls most (Spearman's rank correlation)."
+    )
+    yield Block("Where all rows are met", text, drawn)
+
+
+def _decisive(places: Mapping[str, np.ndarray], values: np.ndarray) -> list[str]:
+    """The two knobs of largest rank correlation with values; the first ones where none has any."""
+    known = np.isfinite(values)
+    if known.sum() < 3 or np.ptp(values[known]) == 0:
+        return list(places)[:2]
+    strength = {
+        name: abs(stats.spearmanr(at[known], values[known]).statistic)
+        for name, at in places.items()
+    }
+    return sorted(strength, key=lambda name: -np.nan_to_num(strength[name]))[:2]
 
 
 def _sensitivity_text(found: SobolIndices) -> str:

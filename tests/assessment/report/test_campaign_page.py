@@ -107,6 +107,28 @@ def test_a_sample_has_indices_and_a_front():
     assert "63 of 63 points (orange)" in html
 
 
+def test_a_sample_shows_where_requirements_are_met_over_the_knobs_that_decide():
+    n = 64
+    unit = (np.arange(n) + 0.5) / n
+    random = np.random.default_rng(4)
+    coords = {"sample": ("sample", np.arange(n))}
+    for name, values in (
+        ("idle", random.permutation(unit)),
+        ("strong", unit),
+        ("weak", random.permutation(unit)),
+    ):
+        coords[name] = ("sample", values, {"scale": "linear", "long_name": name})
+    error = 2 * coords["strong"][1] + 1.5 * coords["weak"][1] + 0.5
+    data = campaign(coords, ("sample",), error)
+    html = page(data, "name: test")
+    block = html[html.index("Where all rows are met") : html.index("rank correlation")]
+    figure = html[html.index("rank correlation") :].partition("</svg>")[0]
+    assert block and ">strong<" in figure and ">weak<" in figure and ">idle<" not in figure
+    met = re.findall(r'fill="#2c7a3f" stroke="#2c7a3f"><title>smallest margin \+', figure)
+    assert len(met) == (error[1:] <= 2.5).sum()
+    assert "Pareto front" not in html  # no knob that costs anything
+
+
 def test_a_kept_report_is_linked():
     html = page(sweep().assign_attrs(keep="everything"), "name: test")
     assert "points/aa/4/run/report.html" in {link for link, _ in links(html)}

@@ -131,7 +131,7 @@ def test_a_browser_draws_the_map_and_describes_a_vector(tmp_path):
         check=True,
     )
     dom = done.stdout
-    assert '<p class="where">y = 1.0 m, z = 4.0 m: good</p>' in dom
+    assert '<p class="where">y = 1.0 m, z = 4.0 m: valid</p>' in dom
     rows = re.search("<tbody>(<tr><td>u.*?)</tbody>", dom)[1]
     assert "<td>u</td><td>4.00</td><td>3.50</td><td>0.50</td><td>0.25</td>" in rows
     assert "<td>w</td><td>0.25</td><td>-0.25</td><td>0.50</td><td>0.25</td>" in rows
