@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from lidar_mi.assessment.figures.plates import Drawn, save_all
-from lidar_mi.assessment.metrics.encounter import HAZARD_ROLL
+from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
 FLIGHTS = {
     "off": ("without help", "tab:red", "-"),
@@ -90,12 +90,15 @@ def _roll(series):
     angle, rate = figure.subplots(2, 1, sharex=True)
     _lines(angle, series, "roll", np.degrees(1))
     _lines(rate, series, "roll_rate", np.degrees(1))
-    limit = np.degrees(HAZARD_ROLL)
+    limit = np.degrees(ACCEPTED_BANK)
     angle.axhspan(-limit, limit, color="0.5", alpha=0.12, lw=0, label=f"below {limit:.0f} degrees")
     angle.set_ylabel("roll angle / degrees")
     rate.set(ylabel="roll rate / degrees s$^{-1}$", xlabel="time of flight / s")
     angle.legend(fontsize=9, loc="best")
-    return figure, "Positive: port wing up. Shaded: bank angles below the stated hazard limit."
+    return (
+        figure,
+        "Positive: port wing up. Shaded: bank angles that nobody calls out on an approach.",
+    )
 
 
 def _approach(series, track, seen):

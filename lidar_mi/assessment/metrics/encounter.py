@@ -10,14 +10,11 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
+from lidar_mi.assessment.metrics.encounter_hazard import is_hazardous, roll_control_ratio
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
 
 AFTER = 5
 """Slabs after which the track is held against the truth."""
-
-HAZARD_ROLL = float(np.radians(7.0))
-"""Bank angle (rad) above which an encounter near the ground and in clouds counts as a hazard:
-pilots in simulators called smaller ones harmless (Rossow and Tinling 1988, J. Aircraft 25)."""
 
 _FELT = 0.1
 """Fraction of the largest rolling moment of the wake from which on it counts as felt."""
@@ -27,29 +24,26 @@ _PLACES = ("port_y", "port_z", "starboard_y", "starboard_z")
 _SIGMAS = 2.0
 
 
-def encounter_metrics(
-    series: xr.Dataset, track: xr.Dataset | None, hazard_roll: float = HAZARD_ROLL
-) -> dict[str, float]:
+def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str, float]:
     """All numbers of a flight, flat.
 
     Parameters
     ----------
     series, track : xr.Dataset
         `track` is None without a lidar.
-    hazard_roll : float
-        Bank angle (rad) that counts as a hazard.
     """
     found: dict[str, float] = {}
     for mode in series["flight"].values:
         one = series.sel(flight=mode)
-        key = f"encounter.{mode}"
-        found[f"{key}.largest_roll"] = _largest(one["roll"])
+        felt = one["roll_moment"] + one["control_roll_moment"]
+        ratio = roll_control_ratio(felt, float(one["largest_control_roll_moment"]))
+        key, roll = f"encounter.{mode}", _largest(one["roll"])
+        found[f"{key}.largest_roll"] = roll
         found[f"{key}.largest_roll_rate"] = _largest(one["roll_rate"])
         found[f"{key}.residual_moment"] = residual_moment(one)
+        found[f"{key}.roll_control_ratio"] = ratio
         found[f"{key}.departed"] = float(one["departed"].max())
-        above = found[f"{key}.largest_roll"] > hazard_roll
-        found[f"{key}.hazardous"] = float(above or found[f"{key}.departed"] > 0)
-    found["encounter.hazard_roll"] = hazard_roll
+        found[f"{key}.hazardous"] = float(is_hazardous(ratio, roll) or one["departed"].max() > 0)
     for quantity in ("largest_roll", "largest_roll_rate"):
         found |= _removed(found, quantity)
     if track is not None:
