@@ -24,7 +24,7 @@ from pydantic import BaseModel
 from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
-from lidar_mi.experiment import reading, schema, schema_air, schema_encounter, truth
+from lidar_mi.experiment import reading, schema, schema_air, truth
 from lidar_mi.instrument import motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan_timing import ScanTiming
@@ -53,7 +53,6 @@ OPTIONAL = (
     motion.Sinusoid,
     motion.Attitude,
     Reported,
-    schema_encounter.Encounter,
 )
 # what they need
 REQUIRED = {
