@@ -35,7 +35,7 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
     found: dict[str, float] = {}
     for mode in series["flight"].values:
         one = series.sel(flight=mode)
-        felt = one["roll_moment"] + one["control_roll_moment"]
+        felt: np.ndarray = one["roll_moment"].values + one["control_roll_moment"].values
         ratio = roll_control_ratio(felt, float(one["largest_control_roll_moment"]))
         key, roll = f"encounter.{mode}", _largest(one["roll"])
         found[f"{key}.largest_roll"] = roll
@@ -162,7 +162,7 @@ def _errors(track: xr.Dataset, slabs: np.ndarray) -> dict[str, float]:
     ours, truth = some.sel(source="track"), some.sel(source="truth")
     relative = [np.abs(ours[q] / truth[q] - 1) for q in _CIRCULATIONS]
     cores = [
-        np.hypot(*(ours[f"{side}_{axis}"] - truth[f"{side}_{axis}"] for axis in "yz"))
+        np.hypot(ours[f"{side}_y"] - truth[f"{side}_y"], ours[f"{side}_z"] - truth[f"{side}_z"])
         for side in ("port", "starboard")
     ]
     within = [
@@ -182,10 +182,10 @@ def _largest(values: xr.DataArray) -> float:
 
 def _removed(found: Mapping[str, float], quantity: str) -> dict[str, float]:
     """Fraction of what perfect preview removes that the lidar removes."""
-    values = [
-        found.get(f"encounter.{mode}.{quantity}") for mode in ("off", "feedforward", "perfect")
-    ]
-    if None in values or values[0] == values[2]:
+    keys = [f"encounter.{mode}.{quantity}" for mode in ("off", "feedforward", "perfect")]
+    if not all(key in found for key in keys):
         return {}
-    off, ours, perfect = values
+    off, ours, perfect = (found[key] for key in keys)
+    if off == perfect:
+        return {}
     return {f"encounter.removed_of_perfect.{quantity}": (off - ours) / (off - perfect)}
