@@ -168,10 +168,10 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
         "<!-- Written by `python -m validation`; edit validation/ instead. -->",
         "",
         "Comparisons of lidar-mi with independent numbers: closed forms, published",
-        "values, conservation laws and other programs. They concern the light transport and the "
+        "values, conservation laws and other programs. They concern the light transport, the "
         "receivers of",
-        "the Doppler shift; errors of the retrievals are under [accuracy](accuracy.md). Every row "
-        "of this page is computed again by",
+        "the Doppler shift, the loads of a wake on a wing and the track of vortices; errors of the "
+        "retrievals are under [accuracy](accuracy.md). Every row of this page is computed again by",
         "",
         "```sh",
         command,

@@ -100,6 +100,8 @@ class AircraftModel(Protocol):
         the model does not have.
     roll_damping : float
         Rolling moment per roll rate at the start, N m per rad/s, negative.
+    roll_inertia : float
+        Moment of inertia about the body's x axis, kg m^2.
     """
 
     @property
@@ -114,6 +116,8 @@ class AircraftModel(Protocol):
     def control_moments(self) -> np.ndarray: ...  # noqa: D102
     @property
     def roll_damping(self) -> float: ...  # noqa: D102
+    @property
+    def roll_inertia(self) -> float: ...  # noqa: D102
 
     def step(self, dt: float, loads: Loads, commands: Commands) -> AircraftState:
         """State after dt (s), with the wake's loads constant and the controls moving."""

@@ -1,14 +1,15 @@
 """What steers against the wake: commands from the loads that it will bring.
 
-Three modes fly with the same levelling: off has nothing else, feedforward adds the deflections
-against the loads predicted from the lidar's track, perfect those against the true loads.
+Three modes fly with the same wake: off has a pilot who levels the wings, feedforward steers by the
+loads predicted from the lidar's track, perfect by the true loads.
 """
 
 from collections.abc import Callable
 
 import numpy as np
+from scipy.optimize import nnls
 
-from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Commands
+from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Commands, deflected
 from lidar_mi.encounter.strips import Loads
 
 Preview = Callable[[float], Loads]
@@ -17,7 +18,14 @@ Preview = Callable[[float], Loads]
 Controller = Callable[[Preview | None, AircraftState], Commands]
 """Commands from the preview (None while there is none) and the state."""
 
+HORIZON, KNOTS = 2.0, 16
+"""Time for which the aileron is planned (s), and intervals of it."""
+
+RATE_TIME = 0.5
+"""A roll rate counts as much as the bank angle that it makes in this time, s."""
+
 _INSTANTS = 9
+_EFFORT = 1e-2  # of a deflection against a bank angle, both in rad
 
 
 def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
@@ -42,7 +50,66 @@ def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
 
 
 def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Controller:
-    """Deflections whose moments cancel the predicted ones, and levelling.
+    """The aileron planned ahead against the roll that the wake will make; the others cancel.
+
+    Where the wake has more moment than the ailerons, cancelling it leaves what they lack. An
+    aircraft that knows the wake ahead banks a little against it before. The deflections of the
+    next `HORIZON` minimise the sum of roll^2 + (`RATE_TIME` roll rate)^2 of the linear roll mode,
+    from the state flown and the moments expected, within the limits of deflection and rate; the
+    first is commanded, and all are planned again at the next call. Elevator and rudder cancel, as
+    in `cancelling`; the rudder's rolling moment is part of the plan.
+
+    Without a preview the wings are levelled as in `wings_level`. A preview without loads makes it
+    an autopilot that holds the wings level as well as the ailerons can.
+
+    Parameters
+    ----------
+    aircraft : AircraftModel
+    levelling_time : float or None
+        As in `wings_level`.
+    """
+    level, cancel = wings_level(aircraft, levelling_time), cancelling(aircraft, None)
+    limits, moments = aircraft.limits, aircraft.control_moments
+    if not (moments[0, 0] and limits.deflection[0] and limits.rate[0]):
+        return cancel
+    has_others = bool(moments[:, 1:].any())
+    dt = HORIZON / KNOTS
+    from_rate, rolls, rates = _roll_mode(aircraft, dt)
+    effort = _EFFORT * np.eye(KNOTS)
+    matrix = np.concatenate([rolls * moments[0, 0], RATE_TIME * rates * moments[0, 0], effort])
+    turns = np.eye(KNOTS) - np.eye(KNOTS, k=-1)
+    allowed = np.concatenate([np.eye(KNOTS), -np.eye(KNOTS), turns, -turns])
+    largest, reach = limits.deflection[0], limits.rate[0] * dt
+    last, before, deflection = Commands(), np.nan, np.zeros(3)
+
+    def controller(preview: Preview | None, state: AircraftState) -> Commands:
+        nonlocal last, before, deflection
+        # where the controls are now: nobody but this controller has moved them
+        if state.time > before:
+            deflection, _ = deflected(deflection, last, state.time - before, limits)
+        before = state.time
+        last = level(preview, state)
+        if preview is not None:
+            others = cancel(preview, state) if has_others else Commands()
+            expected = [preview(state.time + (k + 0.5) * dt).moment[0] for k in range(KNOTS)]
+            wake = np.array(expected) + moments[0, 1:] @ others.array[1:]
+            start = from_rate * state.roll_rate + [[state.roll], [0.0]]
+            target = -np.concatenate(
+                [start[0] + rolls @ wake, RATE_TIME * (start[1] + rates @ wake), np.zeros(KNOTS)]
+            )
+            now = np.zeros(KNOTS)
+            now[0] = np.clip(deflection[0], -largest, largest)
+            least = np.concatenate([np.full(2 * KNOTS, -largest), now - reach, -now - reach])
+            aileron = _least_squares(matrix, target, allowed, least)[0]
+            aileron = float(np.clip(aileron, -largest, largest))
+            last = Commands(aileron, others.elevator, others.rudder)
+        return last
+
+    return controller
+
+
+def cancelling(aircraft: AircraftModel, levelling_time: float | None) -> Controller:
+    """Deflections whose moments cancel the predicted ones at every moment, and levelling.
 
     The moments -M(t) are shared out to the controls by the least squares of `control_moments`,
     within the limits of deflection. A control that cannot follow fast enough starts early: of all
@@ -75,3 +142,42 @@ def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Contro
         return Commands(*map(float, total))
 
     return controller
+
+
+def _roll_mode(aircraft, dt):
+    """Roll and roll rate after each interval of `HORIZON`.
+
+    From the first roll rate, shape (2, `KNOTS`), and from constant moments in the intervals, two of
+    shape (`KNOTS`, `KNOTS`).
+    """
+    tau = aircraft.roll_inertia / -aircraft.roll_damping
+    decay = np.exp(-dt / tau)
+    gain = tau / aircraft.roll_inertia
+    step = np.array([[1.0, tau * (1 - decay)], [0.0, decay]])
+    pushed = gain * np.array([dt - tau * (1 - decay), 1 - decay])
+    now = np.zeros((2, KNOTS + 1))  # of roll and rate, on each moment and on the first rate
+    now[1, -1] = 1.0
+    all_of_them = []
+    for k in range(KNOTS):
+        now = step @ now
+        now[:, k] += pushed
+        all_of_them.append(now)
+    rolls, rates = np.swapaxes(all_of_them, 0, 1)
+    return np.stack([rolls[:, -1], rates[:, -1]]), rolls[:, :-1], rates[:, :-1]
+
+
+def _least_squares(matrix, target, allowed, least):
+    """The x that minimises |matrix x - target| where allowed x >= least.
+
+    As a least distance problem, solved by non-negative least squares (Lawson and Hanson 1995,
+    chapter 23). The matrix has full rank, and some x is allowed.
+    """
+    q, r = np.linalg.qr(matrix)
+    inverse, free = np.linalg.inv(r), q.T @ target
+    distance = allowed @ inverse
+    dual = np.vstack([distance.T, least - distance @ free])
+    goal = np.zeros(len(dual))
+    goal[-1] = 1.0
+    weights, _ = nnls(dual, goal)
+    residual = dual @ weights - goal
+    return inverse @ (free - residual[:-1] / residual[-1])

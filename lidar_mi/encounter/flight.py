@@ -152,7 +152,9 @@ def flown(
         if step < count:
             aircraft.step(dt, loads, commands)
             deflection, _ = deflected(deflection, commands, dt, aircraft.limits)
-    return record.dataset()
+    most = abs(aircraft.control_moments[0, 0]) * aircraft.limits.deflection[0]
+    about = {"units": "N m", "long_name": "rolling moment of the ailerons at full deflection"}
+    return record.dataset().assign(largest_control_roll_moment=((), most, about))
 
 
 def duration(encounter: Encounter) -> float:

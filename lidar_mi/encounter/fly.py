@@ -128,8 +128,8 @@ def fly(
     >>> flight = lm.fly(
     ...     lm.load_experiment("encounter", encounter={"path": path, "control": {"mode": "off"}})
     ... )
-    >>> list(flight.series["flight"].values)
-    ['off']
+    >>> flight.series["roll"].dims
+    ('flight', 'time')
     """
     if notice is None:
         with progress() as shown:

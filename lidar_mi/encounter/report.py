@@ -55,8 +55,8 @@ def _film(kept: FlightFolder, flown: Flown, span: float, log: Log) -> Film | Non
     write_gif(kept.path / ANIMATION, pixels, seconds)
     return Film(
         "The flight",
-        "Above: backscatter of the slab that is seen now, true cores (white) and tracked ones, and "
-        "the wings of the aircraft at this moment. Middle: from above, what the lidar looks at. "
+        "Above: backscatter of the slab that is seen now, true cores (crosses) and tracked ones, "
+        "and the wings of the aircraft at this moment. Middle: from above, what the lidar looks at. "
         "Below: roll angles.",
         frames,
         seconds,

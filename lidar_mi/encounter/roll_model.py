@@ -39,12 +39,12 @@ class RollModel:
             pressure * aircraft.wing_area * aircraft.span * aircraft.aileron_power
         )
         self.deflection = np.zeros(3)
-        self._inertia = aircraft.roll_inertia
+        self.roll_inertia = aircraft.roll_inertia
 
     @property
     def time_constant(self) -> float:
         """Of the roll mode, I / -L_p, s."""
-        return -self._inertia / self.roll_damping
+        return -self.roll_inertia / self.roll_damping
 
     def step(self, dt: float, loads: Loads, commands: Commands) -> AircraftState:
         """State after dt (s): exact, for loads that are constant over dt and a moving aileron."""
@@ -59,7 +59,7 @@ class RollModel:
         for duration, start, end in ((moving[0], before, after), (dt - moving[0], after, after)):
             if duration > 0:
                 moments = loads.moment[0] + self.control_moments[0, 0] * np.array([start, end])
-                roll, rate = self._rolled(roll, rate, duration, *(moments / self._inertia))
+                roll, rate = self._rolled(roll, rate, duration, *(moments / self.roll_inertia))
         time = state.time + dt
         self.state = replace(
             state,

@@ -56,7 +56,7 @@ class Path(Section):
         if lowest <= 0:
             raise ValueError(
                 f"altitude {self.altitude:g} m: the path ends {-lowest:.0f} m below the ground; "
-                f"expected more than {self.altitude - lowest:.0f} m, or a flatter or shorter path"
+                f"expected above {self.altitude - lowest:.0f} m, or a flatter or shorter path"
             )
         return self
 

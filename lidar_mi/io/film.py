@@ -48,7 +48,10 @@ def write_gif(path: str | Path, frames: Sequence[np.ndarray], seconds: float) ->
     palette = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 4)])).quantize(
         _COLOURS
     )
-    images = [Image.fromarray(frame).quantize(palette=palette, dither=0) for frame in frames]
+    images = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
     content = BytesIO()
     images[0].save(
         content,

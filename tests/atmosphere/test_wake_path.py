@@ -10,6 +10,7 @@ import math
 import numpy as np
 import pytest
 from scipy.integrate import quad_vec
+from scipy.optimize import brentq
 
 from lidar_mi.atmosphere.vortex import (
     MODELS,
@@ -173,10 +174,20 @@ def test_small_deformation_against_curved_lines():
 
 
 def test_deformed_vortices_are_where_the_lines_cross_the_plane():
+    """Oblique lines built here, and cut by the plane with a root finder."""
     wake = PairAlongPath(458.0, crow_amplitude=5.0, crow_wavelength=300.0, crossing_angle=0.4)
-    for port in (wake.vortices(75.0, 0.0)[0], wake.vortices(-40.0, 0.0)[0]):
-        offset = np.array([port.y, port.z])
-        assert np.isfinite(offset).all()
+    along, left = [math.cos(0.4), math.sin(0.4), 0], [-math.sin(0.4), math.cos(0.4), 0]
+
+    def line(s, side):
+        shift = 5 * math.sin(2 * math.pi * s / 300) / math.sqrt(2)
+        start = side * (23.55 + shift) * np.array(left) + [0, 0, shift]
+        return start + s * np.array(along)
+
+    for x in (75.0, -40.0):
+        for side, vortex in zip((1, -1), wake.vortices(x, 0.0), strict=True):
+            ahead = brentq(lambda s, side=side, x=x: line(s, side)[0] - x, -300, 300)
+            _, y, z = line(ahead, side)
+            assert (vortex.y, vortex.z) == pytest.approx((y, z), abs=1e-6)
     along = PairAlongPath(458.0, crow_amplitude=5.0, crow_wavelength=300.0)
     port, starboard = along.vortices(75.0, 0.0)  # a crest: outward and up
     assert port.y - starboard.y == pytest.approx(47.1 + 2 * 5 / math.sqrt(2))

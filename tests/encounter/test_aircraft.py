@@ -1,6 +1,7 @@
 """Loads on an aircraft in a wind of the path frame, and controls within their limits.
 
-Detects a wrong sense of roll or yaw, a place or time not handed on, a limit exceeded.
+Detects a wrong sense of roll or yaw, a place or time not handed on, a limit exceeded, a path below
+the ground.
 """
 
 import numpy as np
@@ -15,6 +16,8 @@ from lidar_mi.encounter.aircraft import (
     loads_in_wind,
 )
 from lidar_mi.encounter.strips import fin_strips, wing_strips
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.reading import load_experiment
 
 WING = wing_strips(28.9, 108.8, 5.3)
 
@@ -67,3 +70,8 @@ def test_controls_move_at_their_rate_within_their_limits():
         after, moving = deflected(after, Commands(5.0, -0.01, 1.0), 0.1, limits)
     np.testing.assert_allclose(after, [0.3, -0.01, 0.0])
     np.testing.assert_allclose(moving, 0)
+
+
+def test_a_path_through_the_ground_is_refused():
+    with pytest.raises(InputError, match=r"encounter\.path: .*27 m below the ground.*above 47 m"):
+        load_experiment("wake_backscatter", **{"encounter.path.altitude": "20 m"})

@@ -16,9 +16,6 @@ from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.reading import check
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 
-# no error of the track: the lidar's delay and the track's interpolation remain
-REST = 0.03
-
 
 @pytest.fixture(scope="module")
 def experiment():
@@ -43,7 +40,7 @@ def test_all_meet_the_same_wake(flown, experiment):
     # banked wings meet the wind of other places: by the square of 30 degrees
     strongest = float(np.abs(off["roll_moment"]).max())
     assert np.abs(off["roll_moment"] - perfect["roll_moment"]).max() < 0.15 * strongest
-    assert float(off["time"][-1]) == pytest.approx(350 / 75, abs=0.051)
+    assert float(off["time"][-1]) == pytest.approx(225 / 75, abs=0.051)
 
 
 def test_help_lessens_the_roll(flown):
@@ -51,10 +48,10 @@ def test_help_lessens_the_roll(flown):
     off, ours, perfect = (
         found[f"encounter.{mode}.largest_roll"] for mode in ("off", "feedforward", "perfect")
     )
-    assert perfect < 0.4 * off
+    assert perfect < 0.7 * off
     assert found["encounter.removed_of_perfect.largest_roll"] > 0.9
     assert found["encounter.prediction_error"] < 0.1
-    assert ours < 0.5 * off
+    assert ours < 0.7 * off
 
 
 def test_track_is_used_when_it_is_delivered(flown, lidar):
@@ -65,7 +62,7 @@ def test_track_is_used_when_it_is_delivered(flown, lidar):
     # the second scan's time and the latency
     assert np.allclose(track["delivered"], track["time"] + 0.05 + 0.02)
     # no scan of slabs behind the end of the flight
-    assert lidar.steps[-1] * 75 + 150 <= 350 + 7.5
+    assert lidar.steps[-1] * 75 + 75 <= 225 + 7.5
 
 
 def test_commands_keep_the_limits(flown, experiment):
@@ -86,8 +83,8 @@ def test_what_was_seen_is_not_forgotten(experiment):
     one = flown.series.sel(flight="feedforward")
     known = np.isfinite(one["predicted_roll_moment"].values)
     assert flown.track["usable"][-1] == 0
-    # ten slabs up to 150 + 9 x 7.5 m, and the few that the track may miss
-    assert 200 < float(one["x"].values[known].max()) < 150 + 14 * 7.5 + 6
+    # ten slabs up to 75 + 9 x 7.5 m, four that the track may miss, five beyond
+    assert 75 + 9 * 7.5 < float(one["x"].values[known].max()) < 75 + 18 * 7.5 + 1
     assert not known[-1]
 
 
@@ -108,7 +105,9 @@ def test_an_upset_is_a_result():
     def wrong(aircraft):
         return lambda preview, state: Commands(aileron=np.sign(state.roll or 1.0))
 
-    one = check(encounter_keys(control={"mode": "perfect", "levelling_time": None}), "test")
+    quick = {"aileron_power": 1.0, "roll_inertia": 1e5}
+    control = {"mode": "perfect", "levelling_time": None}
+    one = check(encounter_keys(control=control, aircraft=quick), "test")
     flown = fly_all(one, silent, controller=wrong)
     perfect = flown.series.sel(flight="perfect")
     found = encounter_metrics(flown.series, None)

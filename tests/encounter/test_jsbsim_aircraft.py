@@ -10,7 +10,9 @@ import sys
 import numpy as np
 import pytest
 
-from lidar_mi.encounter.aircraft import Commands
+from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.encounter.aircraft import Commands, flown_on, loads_in_wind
+from lidar_mi.encounter.control import feedforward, wings_level
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
@@ -156,3 +158,31 @@ def test_without_jsbsim(monkeypatch):
     monkeypatch.setitem(sys.modules, "jsbsim", None)
     with pytest.raises(InputError, match="needs JSBSim, which is not installed"):
         boeing()
+
+
+def test_steered_through_a_core():
+    """A pair of 350 m^2/s, its port core crossed under 10 degrees, with the true wind known."""
+    pair, step = vortex_pair(350.0, 47.0, 3.0), 1 / 30
+
+    def wind(x, y, z, time):
+        v, w = velocity(pair, y - (x - 250) * math.tan(math.radians(10)) + 23.5, z)
+        return 0 * v, v, w
+
+    def largest_roll(controller_of):
+        aircraft = boeing()
+        controller, rolls = controller_of(aircraft), []
+        for _ in range(180):
+            state = aircraft.state
+
+            def preview(time, state=state):
+                there = flown_on(state, time)
+                return loads_in_wind(aircraft.strips, there, wind, aircraft.density)
+
+            aircraft.step(step, preview(state.time), controller(preview, state))
+            rolls.append(abs(aircraft.state.roll))
+        assert not aircraft.state.departed
+        return max(rolls)
+
+    off = largest_roll(lambda one: wings_level(one, 3.0))
+    steered = largest_roll(lambda one: feedforward(one, 3.0))
+    assert off > math.radians(20) and steered < 0.4 * off

@@ -68,6 +68,42 @@ def test_vortices_within_stated_errors(flight):
     assert sum(chi2) < 10 * len(chi2) + 4 * np.sqrt(20 * len(chi2))
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("angle", [0, 10])
+def test_stated_errors_over_a_flight(angle):
+    """Ten slabs with detector noise, 10 numbers each: mean square of normalised errors about 1.
+
+    Its expected scatter is sqrt(2 / 100) = 0.14 for 0 degrees. At 10 degrees the wind along the
+    path, which the fit does not know, may double it. At most one fit may be lost.
+    """
+    lidar = lm.VirtualLidar(
+        small_encounter(
+            path={"crossing_angle": f"{angle} deg"},
+            wake={
+                "vortex_pair": {
+                    "circulation": "300 m^2/s",
+                    "separation": "30 m",
+                    "core_radius": "3 m",
+                    "width": "80 m",
+                    "height": "50 m",
+                }
+            },
+            render={"samples_per_beam": 64},
+            detector={},
+            seed=2,
+        )
+    )
+    estimates = [lidar.step(0.1 * number) for number in range(11)][1:]
+    misses = [e.pair.parameters - parameters(lidar, e) for e in estimates if e.pair.success]
+    spread = [np.sqrt(np.diag(e.pair.covariance)) for e in estimates if e.pair.success]
+    assert len(misses) >= 9
+    squares = (np.array(misses) / spread) ** 2
+    assert 0.4 < squares.mean() < (1.6 if angle == 0 else 2.5)
+    assert (squares < 4).mean() > 0.85
+    rms = np.sqrt((np.array(misses) ** 2).mean(0))
+    assert rms[[0, 4]].max() < 0.06 * 300 and rms[[2, 3, 6, 7]].max() < 0.4
+
+
 def test_both_images_show_the_air_of_the_slab(flight):
     """The first image is that of the texture at its first sighting, per unit of backscatter."""
     _, images, lidar = flight

@@ -245,8 +245,8 @@ class TestVolume:
 
 
 class TestScans:
-    def plans(self, **scan):
-        return plan_scans(Scan(**scan), Y[::20], Z[::20], (0.0, 15.0))
+    def plans(self, flown=(0.0, 15.0), **scan):
+        return plan_scans(Scan(**scan), Y[::20], Z[::20], flown)
 
     def fields(self, plans):
         rng = np.random.default_rng(3)
@@ -256,24 +256,24 @@ class TestScans:
             )
 
     def test_a_moved_scene_gives_the_image_of_a_new_one(self):
-        """The second scan from the first's scene, and rendered alone."""
-        plans = self.plans()
+        """The second and third scan from the first's scene, and each rendered alone."""
+        plans = self.plans((0.0, 15.0, 30.0))
         fields = list(self.fields(plans))
-        _, second = render(fields, plans)
-        (alone,) = render_scans(
-            fields,
-            plans,
-            BackscatterLidar(),
-            ENVIRONMENT,
-            RAYLEIGH,
-            1.0,
-            RenderSettings(max_order=1),
-            1,
-            scans=[1],
-        )
-        for name in ("S0", "S1", "S2", "S3", "S0_stderr", "Y"):
-            assert np.array_equal(alone[name], second[name])
-        assert alone.attrs["telescope_position"] == 15
+        for index, moved in enumerate(render(fields, plans)):
+            (alone,) = render_scans(
+                fields,
+                plans,
+                BackscatterLidar(),
+                ENVIRONMENT,
+                RAYLEIGH,
+                1.0,
+                RenderSettings(max_order=1),
+                1,
+                scans=[index],
+            )
+            for name in ("S0", "S1", "S2", "S3", "S0_stderr", "Y"):
+                assert np.array_equal(alone[name], moved[name])
+            assert alone.attrs["telescope_position"] == 15 * index
 
     def test_scans_differ_in_their_random_numbers(self):
         """Equal air, equal place: only the seeds differ, and the images do."""

@@ -13,12 +13,14 @@ STDERR = np.array([4.0, 0.03, 0.15, 0.15, 4.0, 0.03, 0.15, 0.15, 0.1, 0.1])
 
 def encounter_keys(**encounter):
     """A short flight through a wake of 30 m, as the dictionary of an experiment."""
-    path = {"start": "220 m", "beyond": "130 m"}
+    path = {"start": "150 m", "beyond": "75 m", "crossing_angle": "20 deg"}
     pair = {"circulation": 350, "separation": 30, "core_radius": 3, "width": 100, "height": 70}
     return {
         "name": "flight",
         "wake": {"vortex_pair": pair, "spacing": 1},
-        "encounter": encounter | {"path": path | encounter.get("path", {})},
+        "encounter": {"look_ahead": "75 m"}
+        | encounter
+        | {"path": path | encounter.get("path", {})},
     }
 
 
@@ -42,7 +44,7 @@ class SyntheticLidar:
         wake: WakeAlongPath,
         rate=10.0,
         speed=75.0,
-        look_ahead=150.0,
+        look_ahead=75.0,
         seed=1,
         latency=0.02,
         blind=lambda number: False,

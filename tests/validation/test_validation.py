@@ -318,6 +318,7 @@ def test_every_row_of_the_page_passes(page):
     [
         "molecules.cross_sections",
         "molecules.depolarisation",
+        "strips.lifting_line",
         "scattering_matrices.laws",
         pytest.param("receivers.published", marks=pytest.mark.slow),
     ],

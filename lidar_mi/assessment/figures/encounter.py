@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from lidar_mi.assessment.figures.plates import Drawn, save_all
-from lidar_mi.assessment.metrics.encounter import HAZARD_ROLL
+from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
 FLIGHTS = {
     "off": ("without help", "tab:red", "-"),
@@ -24,8 +24,8 @@ TWO_SIGMA = 2.0
 _ROWS = (
     ("circulation", "circulation / m$^2$ s$^{-1}$"),
     ("core_radius", "core radius / m"),
-    ("y", "y / m"),
-    ("z", "z / m"),
+    ("y", "y - true y / m"),
+    ("z", "z - true z / m"),
 )
 
 
@@ -90,12 +90,15 @@ def _roll(series):
     angle, rate = figure.subplots(2, 1, sharex=True)
     _lines(angle, series, "roll", np.degrees(1))
     _lines(rate, series, "roll_rate", np.degrees(1))
-    limit = np.degrees(HAZARD_ROLL)
+    limit = np.degrees(ACCEPTED_BANK)
     angle.axhspan(-limit, limit, color="0.5", alpha=0.12, lw=0, label=f"below {limit:.0f} degrees")
     angle.set_ylabel("roll angle / degrees")
     rate.set(ylabel="roll rate / degrees s$^{-1}$", xlabel="time of flight / s")
     angle.legend(fontsize=9, loc="best")
-    return figure, "Positive: port wing up. Shaded: bank angles below the stated hazard limit."
+    return (
+        figure,
+        "Positive: port wing up. Shaded: bank angles that nobody calls out on an approach.",
+    )
 
 
 def _approach(series, track, seen):
@@ -143,9 +146,8 @@ def _approach(series, track, seen):
     side.set(ylabel="z / m", xlabel="x along the path / m")
     above.legend(fontsize=8, ncols=3, loc="best")
     return figure, (
-        "Each slab is seen twice, from 150 m ahead. Vortices are shown in the plane of each slab at "
-        "the time when it was seen; the path frame is inclined as the path, so that a level wake "
-        "rises along it on a descent."
+        "Each slab is seen twice. Vortices are shown in its plane at the time when it was seen. "
+        "The path frame is inclined as the path, so that a level wake rises along it on a descent."
     )
 
 
@@ -170,8 +172,8 @@ def _cockpit(track, seen, span):
     axes.legend(loc="lower center", ncols=3, fontsize=9)
     ahead = float(view["x"]) / float(np.gradient(track["x"], track["time"]).mean())
     return figure, (
-        f"Backscatter of the slab at x = {float(view['x']):.0f} m with the wind retrieved from both "
-        f"images, delivered at {float(view['delivered']):.2f} s; the wing is there at about "
+        f"Backscatter of the slab at x = {float(view['x']):.0f} m with the wind retrieved from "
+        f"both images, delivered at {float(view['delivered']):.2f} s; the wing is there at about "
         f"{ahead:.1f} s. Circles: cores with the radius of their largest swirl."
     )
 
@@ -188,12 +190,12 @@ def best_slab(track: xr.Dataset, seen: xr.Dataset) -> int:
     return seen.sizes["slab"] - 1
 
 
-def draw_image(axes, view: xr.Dataset, limits: tuple[float, float] | None = None):
-    """Backscatter of a slab in the pilot's view; the mesh, for later frames."""
+def draw_image(axes, view: xr.Dataset, limits: tuple[float, float] | None = None) -> None:
+    """Backscatter of a slab in the pilot's view."""
     if "image" not in view:
-        return None
+        return
     low, high = limits or np.nanquantile(view["image"], (0.01, 0.995))
-    mesh = axes.pcolormesh(
+    axes.pcolormesh(
         view["image_y"],
         view["image_z"],
         view["image"].values,
@@ -206,16 +208,15 @@ def draw_image(axes, view: xr.Dataset, limits: tuple[float, float] | None = None
     axes.set(aspect="equal")
     axes.set_xlim(float(view["image_y"].max()), float(view["image_y"].min()))
     axes.set_ylim(float(view["image_z"].min()), float(view["image_z"].max()))
-    return mesh
 
 
-def draw_vectors(axes, view: xr.Dataset):
+def draw_vectors(axes, view: xr.Dataset) -> None:
     """Wind vectors of a slab, those that are valid."""
     if "v" not in view:
-        return None
+        return
     y, z = np.meshgrid(view["y"], view["z"])
     step = float(view["y"][1] - view["y"][0])
-    return axes.quiver(
+    axes.quiver(
         y,
         z,
         view["v"],
@@ -228,32 +229,32 @@ def draw_vectors(axes, view: xr.Dataset):
     )
 
 
-def draw_vortices(axes, at: xr.Dataset) -> list:
-    """Cores of a slab: true, and as tracked (else as estimated)."""
-    drawn = []
-    for source, colour, style, label in (
-        ("truth", "white", "-", "true cores"),
-        ("track", "tab:orange", "-", "tracked"),
-    ):
-        one = at.sel(source=source)
-        for side in SIDES:
-            y, z, radius = (float(one[f"{side}_{name}"]) for name in ("y", "z", "core_radius"))
-            if np.isfinite([y, z, radius]).all():
-                width = 1.2 if source == "truth" else 2.2
-                drawn.append(
-                    axes.add_patch(
-                        Circle(
-                            (y, z),
-                            radius,
-                            fill=False,
-                            ec=colour,
-                            ls=style,
-                            lw=width,
-                            label=label if side == "port" else None,
-                        )
-                    )
-                )
-    return drawn
+def draw_vortices(axes, at: xr.Dataset) -> None:
+    """Cores of a slab: true, and as tracked."""
+    for side in SIDES:
+        label = side == "port"
+        truth, track = (at.sel(source=source) for source in ("truth", "track"))
+        axes.plot(
+            truth[f"{side}_y"],
+            truth[f"{side}_z"],
+            "+",
+            color="cyan",
+            ms=12,
+            mew=1.6,
+            label="true cores" if label else None,
+            ls="none",
+        )
+        y, z, radius = (float(track[f"{side}_{name}"]) for name in ("y", "z", "core_radius"))
+        if np.isfinite([y, z, radius]).all():
+            circle = Circle(
+                (y, z),
+                radius,
+                fill=False,
+                ec="tab:orange",
+                lw=2.2,
+                label="tracked" if label else None,
+            )
+            axes.add_patch(circle)
 
 
 def _track(track):
@@ -264,11 +265,16 @@ def _track(track):
     for row, (name, label) in zip(panels, _ROWS, strict=True):
         for axes, (side, colour) in zip(row, SIDES.items(), strict=True):
             key = f"{side}_{name}"
-            spread = TWO_SIGMA * tracked[f"{key}_stderr"]
+            # along the path places change by far more than they are wrong
+            zero = truth[key].values if name in "yz" else 0.0
+            spread = TWO_SIGMA * tracked[f"{key}_stderr"].values
+            middle, single = tracked[key].values - zero, found[key].values - zero
+            true = truth[key].values - zero
+            bars = TWO_SIGMA * found[f"{key}_stderr"].values
             axes.errorbar(
                 x,
-                found[key],
-                TWO_SIGMA * found[f"{key}_stderr"],
+                single,
+                bars,
                 fmt=".",
                 ms=4,
                 color="0.6",
@@ -277,18 +283,18 @@ def _track(track):
             )
             axes.fill_between(
                 x,
-                tracked[key] - spread,
-                tracked[key] + spread,
+                middle - spread,
+                middle + spread,
                 color=colour,
                 alpha=0.3,
                 lw=0,
                 label="track, 2 sigma",
             )
-            axes.plot(x, tracked[key], color=colour, lw=1.6)
-            axes.plot(x, truth[key], color="k", lw=1.2, label="truth")
+            axes.plot(x, middle, color=colour, lw=1.6)
+            axes.plot(x, true, color="k", lw=1.2, label="truth")
             axes.set_ylabel(label)
             axes.grid(alpha=0.3)
-            _fit_limits(axes, truth[key].values, found[key].values, spread.values)
+            _fit_limits(axes, true, single, spread)
     for axes, side in zip(panels[0], SIDES, strict=True):
         axes.set_title(f"{side} vortex")
     for axes in panels[-1]:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from lidar_mi.assessment.figures.encounter import FLIGHTS, SIDES, draw_image, draw_vortices
 
 MOST_FRAMES = 45
-_SIZE, _DOTS = (7.2, 7.0), 90
+_SIZE, _DOTS = (7.2, 8.0), 90
 
 
 class Frame(NamedTuple):
@@ -45,7 +45,7 @@ def film(
 
 def _frame(series, track, seen, span, time, limits) -> Frame:
     figure = Figure(figsize=_SIZE, dpi=_DOTS, layout="constrained")
-    view, above, roll = figure.subplots(3, 1, height_ratios=(3.2, 1.6, 1.3))
+    view, above, roll = figure.subplots(3, 1, height_ratios=(4.4, 1.5, 1.3))
     number = int(np.flatnonzero(seen["delivered"].values <= time)[-1])
     slab = seen.isel(slab=number)
     at = track.isel(slab=int(np.argmin(np.abs(track["x"].values - float(slab["x"])))))

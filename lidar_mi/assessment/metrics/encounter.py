@@ -10,14 +10,11 @@ from collections.abc import Mapping
 import numpy as np
 import xarray as xr
 
+from lidar_mi.assessment.metrics.encounter_hazard import is_hazardous, roll_control_ratio
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
 
 AFTER = 5
 """Slabs after which the track is held against the truth."""
-
-HAZARD_ROLL = np.radians(7.0)
-"""Bank angle (rad) above which an encounter near the ground and in clouds counts as a hazard: pilots
-in simulators called smaller ones harmless (Rossow and Tinling 1988, J. Aircraft 25)."""
 
 _FELT = 0.1
 """Fraction of the largest rolling moment of the wake from which on it counts as felt."""
@@ -27,29 +24,26 @@ _PLACES = ("port_y", "port_z", "starboard_y", "starboard_z")
 _SIGMAS = 2.0
 
 
-def encounter_metrics(
-    series: xr.Dataset, track: xr.Dataset | None, hazard_roll: float = HAZARD_ROLL
-) -> dict[str, float]:
+def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str, float]:
     """All numbers of a flight, flat.
 
     Parameters
     ----------
     series, track : xr.Dataset
         `track` is None without a lidar.
-    hazard_roll : float
-        Bank angle (rad) that counts as a hazard.
     """
     found: dict[str, float] = {}
     for mode in series["flight"].values:
         one = series.sel(flight=mode)
-        key = f"encounter.{mode}"
-        found[f"{key}.largest_roll"] = _largest(one["roll"])
+        felt: np.ndarray = one["roll_moment"].values + one["control_roll_moment"].values
+        ratio = roll_control_ratio(felt, float(one["largest_control_roll_moment"]))
+        key, roll = f"encounter.{mode}", _largest(one["roll"])
+        found[f"{key}.largest_roll"] = roll
         found[f"{key}.largest_roll_rate"] = _largest(one["roll_rate"])
         found[f"{key}.residual_moment"] = residual_moment(one)
+        found[f"{key}.roll_control_ratio"] = ratio
         found[f"{key}.departed"] = float(one["departed"].max())
-        above = found[f"{key}.largest_roll"] > hazard_roll
-        found[f"{key}.hazardous"] = float(above or found[f"{key}.departed"] > 0)
-    found["encounter.hazard_roll"] = hazard_roll
+        found[f"{key}.hazardous"] = float(is_hazardous(ratio, roll) or one["departed"].max() > 0)
     for quantity in ("largest_roll", "largest_roll_rate"):
         found |= _removed(found, quantity)
     if track is not None:
@@ -90,11 +84,10 @@ def measured_in_flight(
     """
     seen = track.where(track["vectors"] > 0, drop=True)
     speed = float(series["airspeed"].isel(time=0).mean())
-    delivered = track["delivered"].values
     ahead = _ahead(series, track)
     found = {
         "range": float(np.median(ahead) * speed) if ahead.size else float("nan"),
-        "slabs_per_second": float(1 / np.median(np.diff(delivered))) if delivered.size > 1 else 0.0,
+        "slabs_per_second": _rate(track["delivered"].values),
         "slab_depth": slab_depth,
         "points_per_slab": float(seen["vectors"].median()) if seen.sizes["slab"] else 0.0,
     }
@@ -115,6 +108,11 @@ def judged_in_flight(
         for (application, _), table in tables.items()
         if application == "flight_control"
     ]
+
+
+def _rate(times: np.ndarray) -> float:
+    """Estimates a second (Hz), without the rounding of their times."""
+    return round(float(1 / np.median(np.diff(times))), 9) if times.size > 1 else 0.0
 
 
 def _ahead(series: xr.Dataset, track: xr.Dataset) -> np.ndarray:
@@ -164,7 +162,7 @@ def _errors(track: xr.Dataset, slabs: np.ndarray) -> dict[str, float]:
     ours, truth = some.sel(source="track"), some.sel(source="truth")
     relative = [np.abs(ours[q] / truth[q] - 1) for q in _CIRCULATIONS]
     cores = [
-        np.hypot(*(ours[f"{side}_{axis}"] - truth[f"{side}_{axis}"] for axis in "yz"))
+        np.hypot(ours[f"{side}_y"] - truth[f"{side}_y"], ours[f"{side}_z"] - truth[f"{side}_z"])
         for side in ("port", "starboard")
     ]
     within = [
@@ -184,10 +182,10 @@ def _largest(values: xr.DataArray) -> float:
 
 def _removed(found: Mapping[str, float], quantity: str) -> dict[str, float]:
     """Fraction of what perfect preview removes that the lidar removes."""
-    values = [
-        found.get(f"encounter.{mode}.{quantity}") for mode in ("off", "feedforward", "perfect")
-    ]
-    if None in values or values[0] == values[2]:
+    keys = [f"encounter.{mode}.{quantity}" for mode in ("off", "feedforward", "perfect")]
+    if not all(key in found for key in keys):
         return {}
-    off, ours, perfect = values
+    off, ours, perfect = (found[key] for key in keys)
+    if off == perfect:
+        return {}
     return {f"encounter.removed_of_perfect.{quantity}": (off - ours) / (off - perfect)}

@@ -16,7 +16,6 @@ _NAMED = {
 _ENCOUNTER = {
     "largest_roll": "rad",
     "largest_roll_rate": "rad/s",
-    "hazard_roll": "rad",
     "lead_time": "s",
     "look_ahead": "s",
     "core_error": "m",

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from lidar_mi.assessment.figures.encounter import FLIGHTS
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.encounter import AFTER
+from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK, ACCEPTED_RATIO
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, fulfilled
 from lidar_mi.assessment.report.digits import fixed, percent, three
 from lidar_mi.assessment.report.page import Chapter, Film, Tables
@@ -18,6 +19,7 @@ _OF_A_FLIGHT = (
     ("largest_roll", "largest roll angle", "degrees", math.degrees(1)),
     ("largest_roll_rate", "largest roll rate", "degrees/s", math.degrees(1)),
     ("residual_moment", "rolling moment felt, of the wake's (rms)", "%", 100.0),
+    ("roll_control_ratio", "largest moment felt, of the controls'", "%", 100.0),
 )
 _OF_THE_LIDAR = (
     ("lead_time", "from the first usable track to the wake", "s", 1.0),
@@ -119,7 +121,6 @@ def encounter_chapter(
 
 def _lead(metrics: Mapping[str, float]) -> list[str]:
     off, ours, perfect = (metrics.get(f"encounter.{mode}.largest_roll") for mode in FLIGHTS)
-    limit = math.degrees(metrics["encounter.hazard_roll"])
     if off is None:
         return []
     answer = f"Without help, the wake rolls the aircraft by {_degrees(off)}"
@@ -136,12 +137,18 @@ def _lead(metrics: Mapping[str, float]) -> list[str]:
     if removed is not None:
         met = "meets" if removed >= GOAL else "misses"
         answer += (
-            f" The lidar removes {percent(removed)} of the roll angle that perfect preview removes, "
-            f"and so {met} the goal of {percent(GOAL)}."
+            f" The lidar removes {percent(removed)} of the roll angle that perfect preview "
+            f"removes, and so {met} the goal of {percent(GOAL)}."
         )
     best = "feedforward" if ours is not None else "perfect" if perfect is not None else "off"
-    verdict = "exceeds" if metrics[f"encounter.{best}.hazardous"] else "stays below"
-    answer += f" {_FLIGHT[best]} {verdict} the hazard limit of {limit:.0f} degrees of bank."
+    bank, ratio = (metrics[f"encounter.{best}.{k}"] for k in ("largest_roll", "roll_control_ratio"))
+    verdict = "stays below" if bank <= ACCEPTED_BANK else "exceeds"
+    side = "below" if ratio <= ACCEPTED_RATIO else "above"
+    answer += (
+        f" {_FLIGHT[best]} {verdict} the {math.degrees(ACCEPTED_BANK):.0f} degrees of bank at which "
+        f"an approach is called unstable; the largest rolling moment felt is {three(ratio)} of the "
+        f"controls' largest, {side} the {ACCEPTED_RATIO:g} that pilots find uncritical."
+    )
     lead = [answer]
     if "encounter.lead_time" in metrics:
         lead.append(

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+import torch
 from scipy.stats import chi2
 
 from lidar_mi.errors import InputError
@@ -21,10 +22,12 @@ from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.track_motion import (
     CIRCULATIONS,
+    MEAN_WIND,
     PLACES,
     SLOPES,
     Wandering,
     moved,
+    oblique_drift,
     unsteady,
     wandered,
 )
@@ -50,15 +53,17 @@ class TrackSettings:
     patience : int
         The track is lost after so many slabs without an update: 5 at 10 Hz are 0.5 s, the time
         there is to act.
+    window : int
+        Newest slabs whose innovations are compared with what is stated, see `Track.inflation`.
     memory : int
         Slabs that are kept to predict planes behind the newest: 64 at 7.5 m are 480 m.
     least_updates : int
         Of a usable track: with two the slopes have no redundancy, and no innovation tested them.
     circulation_error, place_error : float
         Largest standard errors of a usable track, relative and in m. An error of 10 % of the
-        circulation leaves 10 % of the rolling moment; 1 m beside the core of 3 m changes the moment
-        on an elliptic wing of 29 m by up to 10 % of its largest. With either, four fifths of the
-        moment are removed.
+        circulation leaves 10 % of the rolling moment. With 1 m of place the moment on an elliptic
+        wing of 29 m errs by up to 16 % of its largest (core radius 3 m). Both together leave 19 %,
+        so that four fifths are removed.
 
     Raises
     ------
@@ -71,6 +76,7 @@ class TrackSettings:
     unlike_slope: float = 0.15
     gate: float = 0.999
     patience: int = 5
+    window: int = 10
     memory: int = 64
     least_updates: int = 3
     circulation_error: float = 0.1
@@ -84,7 +90,7 @@ class TrackSettings:
                 )
         if not 0 < self.gate < 1:
             raise InputError(f"track.gate: {self.gate!r} is not allowed; between 0 and 1")
-        for name in ("patience", "memory", "least_updates"):
+        for name in ("patience", "window", "memory", "least_updates"):
             value = getattr(self, name)
             if not (isinstance(value, int) and value >= 1):
                 raise InputError(f"track.{name}: {value!r} is not allowed; a whole number >= 1 is")
@@ -104,6 +110,9 @@ class Slab:
         Before it.
     transition, noise : ndarray, shape (14, 14)
         Derivatives of the prediction by the state of the slab before, and its own covariance.
+    innovation : float or None
+        Normalised square of the fit's departure from the prediction, also of a rejected fit; None
+        where there is nothing to compare.
     """
 
     x: float
@@ -113,6 +122,7 @@ class Slab:
     predicted: np.ndarray
     transition: np.ndarray
     noise: np.ndarray
+    innovation: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,9 +140,6 @@ class Track:
         Fits used, and fits beyond the gate or of a pair of the opposite sense.
     missed : int
         Slabs since the last update.
-    innovation : (float, int) or None
-        Normalised square of the newest fit's departure from the prediction and its degrees of
-        freedom, also of a rejected one; None where there is nothing to compare.
     """
 
     slabs: tuple[Slab, ...]
@@ -141,7 +148,6 @@ class Track:
     updates: int = 1
     rejected: int = 0
     missed: int = 0
-    innovation: tuple[float, int] | None = None
 
     @property
     def x(self) -> float:
@@ -169,6 +175,27 @@ class Track:
         return self.fit.profile
 
     @property
+    def innovation(self) -> tuple[float, int] | None:
+        """That of the newest slab, and its degrees of freedom; None where there is none."""
+        square = self.slabs[-1].innovation
+        return None if square is None else (square, MEASURED)
+
+    @cached_property
+    def inflation(self) -> float:
+        """Factor of the variances that the recent innovations ask for, 1 or more.
+
+        Their mean square over what is expected, from rejected fits too, if that is beyond the gate
+        for so many slabs; else 1 (Birge 1932, Phys. Rev. 40, 207-227). Above 1 the wake is bent, or
+        the fits err, by more than stated.
+        """
+        recent = [slab.innovation for slab in self.slabs[-self.settings.window :]]
+        squares = [square for square in recent if square is not None]
+        freedom = MEASURED * len(squares)
+        if not squares or sum(squares) <= chi2.ppf(self.settings.gate, freedom):
+            return 1.0
+        return sum(squares) / freedom
+
+    @property
     def lost(self) -> bool:
         """Whether too many slabs went by without an update; the next accepted fit starts anew."""
         return self.missed >= self.settings.patience
@@ -176,7 +203,7 @@ class Track:
     @property
     def usable(self) -> bool:
         """Whether the track is certain enough to act upon; see `TrackSettings`."""
-        spread = np.sqrt(np.diagonal(self.covariance))
+        spread = np.sqrt(self.inflation * np.diagonal(self.covariance))
         limits = self.settings
         relative = spread[CIRCULATIONS] / np.abs(self.state[CIRCULATIONS])
         return bool(
@@ -190,9 +217,11 @@ class Track:
         """The pair in a plane at a time, from all slabs so far.
 
         From the slab nearest to the plane, whose state all later slabs have improved
-        (Rauch-Tung-Striebel), it moves along the slopes and with the drift. Its covariance grows by
-        the random walks over the distance and the time from that slab, and by the unknown steady
-        rates. Beyond the newest slab this is the prediction of the filter.
+        (Rauch-Tung-Striebel), it moves along the slopes and with the drift. Its covariance, times
+        `inflation`, grows by the random walks over the distance and the time from that slab, and by
+        the unknown steady rates. The velocity of a bent pair is uncertain by the difference of this
+        slab's mutual induction from the mean over all. Beyond the newest slab this is the
+        prediction of the filter.
 
         Parameters
         ----------
@@ -220,7 +249,8 @@ class Track:
         state, covariance, _, _ = _predicted(
             state, covariance, x - slab.x, dt, wandering, self.profile
         )
-        covariance = covariance + unsteady(state, dt, wandering)
+        bent = self._inductions[:, nearest] - self._inductions.mean(1)
+        covariance = self.inflation * covariance + unsteady(state, dt, wandering, bent)
         return replace(
             self.fit,
             parameters=state[:MEASURED],
@@ -243,6 +273,13 @@ class Track:
                 )
             )
         return found[::-1]
+
+    @cached_property
+    def _inductions(self) -> np.ndarray:
+        """Drift without the mean wind in the smoothed slabs, (2, number), m/s."""
+        states = np.array([state for state, _ in self._smoothed]).T
+        states[MEAN_WIND] = 0
+        return oblique_drift(torch.as_tensor(states), self.profile).numpy()
 
 
 def first_track(
@@ -322,15 +359,14 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
         track.settings.wandering,
         track.profile,
     )
-    predicted, innovation, accepted = state, None, False
+    predicted, square, accepted = state, None, False
     if fits:
         measured = pair.parameters, pair.covariance
         square = kalman.innovation(state, covariance, *measured)
-        innovation = square, MEASURED
         accepted = _has_sense(pair) and square <= chi2.ppf(track.settings.gate, MEASURED)
         if accepted:
             state, covariance = kalman.updated(state, covariance, *measured)
-    slab = Slab(float(x), float(time), state, covariance, predicted, transition, noise)
+    slab = Slab(float(x), float(time), state, covariance, predicted, transition, noise, square)
     return Track(
         slabs=(*track.slabs, slab)[-track.settings.memory :],
         fit=pair if accepted else track.fit,
@@ -338,7 +374,6 @@ def updated(track: Track, pair: VortexPairFit | None, x: float, time: float) -> 
         updates=track.updates + accepted,
         rejected=track.rejected + (fits and not accepted),
         missed=0 if accepted else track.missed + 1,
-        innovation=innovation,
     )
 
 

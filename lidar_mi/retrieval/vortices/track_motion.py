@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile, drift
+from lidar_mi.retrieval.vortices.model import PARAMETERS, Profile, angular_velocity
 
 SLOPES = ("port_dy_dx", "port_dz_dx", "starboard_dy_dx", "starboard_dz_dx")
 """Slopes of the vortices along the path, m/m; after the parameters in a state."""
@@ -19,7 +19,7 @@ PLACES = [2, 3, 6, 7]
 """Parameters that move along the slopes and with the drift."""
 CIRCULATIONS = [0, 4]
 _RADII = [1, 5]
-_WIND = [8, 9]
+MEAN_WIND = [8, 9]
 _OF_SLOPES = slice(len(PARAMETERS), len(PARAMETERS) + len(SLOPES))
 
 # Along y and z the places of both vortices drift together.
@@ -62,9 +62,9 @@ class Wandering:
         air that drifts with the wake as that of fluid particles, 6.5 dissipation t. 1e-5 is a calm
         atmosphere at cruise or in the evening; 1e-3 a convective boundary layer.
     decay : float
-        Unknown relative rate of the circulations, s^-1: one of a wake that decays to 1/e in
-        a minute, about two times of descent by a separation. Enters as rate times time in
-        predictions: what changes steadily is no random walk.
+        Unknown relative rate of both circulations, s^-1: between those of slow diffusion, about
+        1/400 s^-1, and of rapid decay, about 1/60 s^-1 (Holzäpfel 2003, J. Aircr. 40, 323-331).
+        Enters as rate times time in predictions: what changes steadily is no random walk.
     departure : float
         Unknown departure of each vortex's velocity from the drift of a straight pair, m/s, likewise
         times time: bent and oblique vortices induce others. Crow waves of 3 % of the separation
@@ -81,7 +81,7 @@ class Wandering:
     place: float = 0.01
     slope: float = 0.002
     dissipation: float = 1e-5
-    decay: float = 1 / 60
+    decay: float = 0.01
     departure: float = 0.035
 
     def __post_init__(self):
@@ -103,7 +103,7 @@ def moved(
     """A state dx further along the path and dt later, with derivatives.
 
     First along the slopes at the same time, then with the drift of the pair in that plane: exact
-    for straight vortices, as the drift depends on their distance alone, which it keeps.
+    for straight vortices that are parallel, as the drift depends on their distance alone.
 
     Parameters
     ----------
@@ -120,12 +120,37 @@ def moved(
     along = np.eye(len(state))
     along[PLACES, _OF_SLOPES] += dx * np.eye(len(SLOPES))
     reached = along @ state
-    theta = torch.as_tensor(reached[: len(PARAMETERS)])
-    speed = drift(theta, profile).numpy()
-    slope = torch.autograd.functional.jacobian(lambda t: drift(t, profile), theta).numpy()
-    later = np.eye(len(state))
-    later[:, : len(PARAMETERS)] += dt * _DRIFTING @ slope
-    return reached + dt * _DRIFTING @ speed, along, later
+    given = torch.as_tensor(reached).requires_grad_()
+    speed = oblique_drift(given, profile)
+    slope = [torch.autograd.grad(one, given, retain_graph=True)[0] for one in speed]
+    later = np.eye(len(state)) + dt * _DRIFTING @ torch.stack(slope).numpy()
+    return reached + dt * _DRIFTING @ speed.detach().numpy(), along, later
+
+
+def oblique_drift(state: torch.Tensor, profile: Profile) -> torch.Tensor:
+    """Velocity (2, ...) of pairs of states (14, ...) in a plane across the path, m s^-1.
+
+    Mean wind plus mutual induction of two lines along the mean direction a of both slopes. At the
+    places d apart in the plane, and so b^2 = d^2 - (d.a)^2 apart across their axis, port and
+    starboard induce the mean velocity u = (omega_s - omega_p)/2 (a x d), with the angular velocity
+    omega of each at b. In the plane the lines move with (v, w) less their slopes times u along the
+    path. For lines across the plane this is `lidar_mi.retrieval.vortices.model.drift`.
+    """
+    dy, dz = state[2] - state[6], state[3] - state[7]
+    slopes = state[_OF_SLOPES]
+    along_y, along_z = (slopes[0] + slopes[2]) / 2, (slopes[1] + slopes[3]) / 2
+    stretch = 1 + along_y**2 + along_z**2
+    square = dy**2 + dz**2 - (dy * along_y + dz * along_z) ** 2 / stretch
+    omega = [
+        circulation / (2 * torch.pi) * (-2 * log_radius).exp() * value
+        for circulation, log_radius in (state[0:2], state[4:6])
+        for value in angular_velocity(square * (-2 * log_radius).exp(), profile)[:1]
+    ]
+    rate = (omega[1] - omega[0]) / 2 / stretch.sqrt()
+    forward = along_y * dz - along_z * dy
+    return torch.stack(
+        [state[8] - rate * (dz + along_y * forward), state[9] + rate * (dy - along_z * forward)]
+    )
 
 
 def wandered(
@@ -141,20 +166,29 @@ def wandered(
     path[CIRCULATIONS] = (wandering.circulation * state[CIRCULATIONS]) ** 2
     path[_RADII] = wandering.log_radius**2
     path[PLACES] = wandering.place**2 + wandering.slope**2 * length**2 / 3
-    path[_WIND] = _TRANSVERSE * (wandering.dissipation * _MATCHED) ** (2 / 3) / _MATCHED
+    path[MEAN_WIND] = _TRANSVERSE * (wandering.dissipation * _MATCHED) ** (2 / 3) / _MATCHED
     path[_OF_SLOPES] = wandering.slope**2
     along = np.diag(path * length)
     both = np.eye(len(SLOPES)) * wandering.slope**2 * length * dx / 2
     along[PLACES, _OF_SLOPES] += both
     along[_OF_SLOPES, PLACES] += both
     later = np.zeros(len(state))
-    later[_WIND] = _LAGRANGIAN * wandering.dissipation * abs(dt)
+    later[MEAN_WIND] = _LAGRANGIAN * wandering.dissipation * abs(dt)
     return along, np.diag(later)
 
 
-def unsteady(state: np.ndarray, dt: float, wandering: Wandering) -> np.ndarray:
-    """Covariance (14, 14) of what unknown steady rates change in a time."""
-    variance = np.zeros(len(state))
-    variance[CIRCULATIONS] = (wandering.decay * dt * state[CIRCULATIONS]) ** 2
-    variance[PLACES] = (wandering.departure * dt) ** 2
-    return np.diag(variance)
+def unsteady(
+    state: np.ndarray, dt: float, wandering: Wandering, bent: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """Covariance (14, 14) of what unknown steady rates change in a time.
+
+    ``bent`` (2,) is a velocity along y and z, m/s, by which both vortices may depart together from
+    the drift: where they are bent it is neither that of the slab nor that of the whole pair.
+    """
+    # both vortices decay together, each moves on its own, the bent pair as a whole
+    decayed = np.zeros(len(state))
+    decayed[CIRCULATIONS] = wandering.decay * dt * state[CIRCULATIONS]
+    departed = np.zeros(len(state))
+    departed[PLACES] = (wandering.departure * dt) ** 2
+    together = dt * _DRIFTING * bent
+    return np.outer(decayed, decayed) + np.diag(departed) + together @ together.T
