@@ -69,8 +69,8 @@ def prediction_error(one: xr.Dataset) -> float:
 def felt_from(series: xr.Dataset) -> float:
     """Time (s) at which the wake's rolling moment on the flight off is first felt; NaN: never."""
     moment = np.abs(series["roll_moment"].sel(flight="off").values)
-    felt = np.flatnonzero(moment > _FELT * moment.max()) if moment.max() else []
-    return float(series["time"][felt[0]]) if len(felt) else float("nan")
+    felt = np.flatnonzero(moment > _FELT * moment.max())
+    return float(series["time"][felt[0]]) if felt.size else float("nan")
 
 
 def measured_in_flight(

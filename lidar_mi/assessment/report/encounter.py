@@ -144,9 +144,10 @@ def _lead(metrics: Mapping[str, float]) -> list[str]:
     bank, ratio = (metrics[f"encounter.{best}.{k}"] for k in ("largest_roll", "roll_control_ratio"))
     verdict = "stays below" if bank <= ACCEPTED_BANK else "exceeds"
     answer += (
-        f" {_FLIGHT[best]} {verdict} the {math.degrees(ACCEPTED_BANK):.0f} degrees of bank at which "
-        "an approach is called unstable. The wake's rolling moment is up to "
-        f"{three(ratio)} of the controls' largest; up to {ACCEPTED_RATIO:g} pilots find an encounter uncritical."
+        f" {_FLIGHT[best]} {verdict} the {math.degrees(ACCEPTED_BANK):.0f} degrees of bank at "
+        "which an approach is called unstable. The wake's rolling moment is up to "
+        f"{three(ratio)} of the controls' largest; up to {ACCEPTED_RATIO:g} pilots find an "
+        "encounter uncritical."
     )
     lead = [answer]
     if "encounter.lead_time" in metrics:
