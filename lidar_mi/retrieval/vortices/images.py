@@ -115,11 +115,20 @@ class Images:
         residual = valid * (value[1] - gain * value[0] - offset)
         if self.whole is not self.spline:
             residual = self.spline.filtered(residual)
-        if self.whitening is not None:
-            jacobian = self.whitening.filtered(jacobian * valid)
-            residual = self.whitening.filtered(residual)
         slope = jacobian[8:10] / self.dt
-        return Misfit(residual, jacobian, slope, valid, self.variance, self.scatter)
+        misfit = Misfit(residual, jacobian, slope, valid, self.variance, self.scatter)
+        return misfit if self.whitening is None else self.whitened(misfit)
+
+    def whitened(self, misfit: Misfit) -> Misfit:
+        """A misfit of the images without the whitening filter, after it."""
+        jacobian = self.whitening.filtered(misfit.jacobian * misfit.valid)
+        residual = self.whitening.filtered(misfit.residual)
+        slope = jacobian[8:10] / self.dt
+        return Misfit(residual, jacobian, slope, misfit.valid, self.variance, self.scatter)
+
+    def weighted(self, misfit: Misfit) -> Misfit:
+        """A misfit with the noise of these images."""
+        return misfit._replace(variance=self.variance, scatter=self.scatter)
 
     def at_least(self, power: float) -> "Images":
         """With residuals of at least this mean square, wherever it comes from."""

@@ -41,6 +41,8 @@ class VortexPairFit(Tabular):
     success : bool
     reasons : tuple of str
         Why the fit is not accepted; empty if it is.
+    from_start : bool
+        Whether it was found from an expected pair, without a search.
     """
 
     parameters: np.ndarray
@@ -51,6 +53,7 @@ class VortexPairFit(Tabular):
     model_error: float
     model_error_length: float
     reasons: tuple[str, ...] = ()
+    from_start: bool = False
 
     @property
     def success(self) -> bool:

@@ -66,6 +66,24 @@ def without_step(misfit: Misfit, flow_variance: float) -> torch.Tensor:
     return misfit.residual + torch.tensordot(step, misfit.jacobian, 1)
 
 
+def stepped(
+    parameters: torch.Tensor, misfit: Misfit, flow_variance: float, turns: int = 2
+) -> Solution | None:
+    """The minimum of residuals that are linear in the parameters, None if there is none.
+
+    The weights are those of the residuals left: the step is taken again with them, `turns` times.
+    """
+    rest = misfit
+    for _ in range(turns):
+        normal, force = _normal(misfit, weights(rest, flow_variance))
+        step = _step(normal, force, 1e-6)
+        if step is None:
+            return None
+        left = misfit.residual + torch.tensordot(step, misfit.jacobian, 1)
+        rest = misfit._replace(residual=left)
+    return _solution(parameters + step, rest, flow_variance, True)
+
+
 def fit(
     evaluate: Callable[[torch.Tensor], Misfit],
     parameters: torch.Tensor,

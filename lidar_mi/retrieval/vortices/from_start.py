@@ -1,0 +1,126 @@
+"""A pair of vortices from two images and an expected pair: a few steps in place of a search."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy.stats import chi2
+
+from lidar_mi.retrieval.vortices.covariance import model_error_of
+from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
+from lidar_mi.retrieval.vortices.model_error import ModelError
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.retrieval.vortices.robust_fit import (
+    Misfit,
+    Solution,
+    fit,
+    stepped,
+    without_step,
+)
+
+# Blur and step between the pixels used (px), and the expected error of displacements (px) that they
+# are for: images of texture 3 px long agree by chance with themselves moved by more.
+_LEVELS = ((3.0, 4, 2.0), (1.5, 2, 0.7), (0.0, 2, 0.0))
+# Points along each axis at which the expected error of the displacements is looked at.
+_PROBES = 15
+# Standard deviation of the model error assumed at first, px.
+_MODEL_ERROR = 0.1
+# Squared step, in standard errors, beyond which the images are warped again after it.
+_NEAR = 1.0
+_ROUNDS = 3
+# Steps on every second pixel at most, and the squared step, in standard errors, after which they
+# end.
+_STEPS, _CLOSE = 6, 1.0
+# Probability with which a start that is as certain as it says is found to be wrong.
+_REJECTED = 1e-6
+
+
+class Found(NamedTuple):
+    """A solution, the images it was found in, what is left of them unwhitened, the model error."""
+
+    solution: Solution
+    images: Images
+    rest: Misfit
+    error: ModelError
+
+
+def fit_from(
+    start: VortexPairFit,
+    make: Builder,
+    limits: Callable[[torch.Tensor, torch.Tensor], bool],
+    lags: float,
+) -> Found | None:
+    """The fit of `image_fit.fit_vortices` near an expected pair; None if there is none.
+
+    Steps on every second pixel of the filtered images, after blurred ones if the start is
+    uncertain; then the unfiltered images are warped once, and noise, change and model error are
+    estimated as from scratch. The last step is linear: its residuals are not looked at again.
+
+    Parameters
+    ----------
+    start : VortexPairFit
+    make : Builder
+    limits : callable
+        (parameters, step) -> whether such a step may be tried.
+    lags : float
+        Over which the noise correlates, px.
+    """
+    if not np.isfinite(start.parameters).all() or not np.isfinite(start.covariance).all():
+        return None
+    theta = make.pair.new_tensor([*start.parameters, *SAME_BRIGHTNESS])
+    if not limits(theta, torch.zeros_like(theta)):
+        return None
+    variance = (_MODEL_ERROR * (make.spacing[0] * make.spacing[1]) ** 0.5) ** 2
+    uncertain = _displacement_error(start, make)
+    for blur, step, least in _LEVELS:
+        if uncertain >= least:
+            thin = make(blur, step)
+            thin = replace(thin, whole=thin.spline)
+            images = thin.at_least(_left(thin(theta), variance))
+            theta = fit(images, theta, limits, variance, _STEPS, _CLOSE).parameters
+    white = make(0.0, 1)
+    for _ in range(_ROUNDS):
+        misfit = white(theta)
+        images = white.at_least(_left(misfit, variance))
+        plain = stepped(theta, images.weighted(misfit), variance)
+        if plain is None or not limits(theta, plain.parameters - theta):
+            return None
+        error = model_error_of(plain, lags, changes=True)
+        images = make.with_change(white, images, plain.misfit, error.variance)
+        if not images.whitening.passed > 0:
+            return None
+        found = stepped(theta, images.whitened(misfit), error.variance)
+        if found is None or not limits(theta, found.parameters - theta):
+            return None
+        step = found.parameters - theta
+        if float(step @ found.normal @ step) < _NEAR:
+            rest = misfit.residual + torch.tensordot(step, misfit.jacobian, 1)
+            error = model_error_of(found, lags, changes=True)
+            return Found(found, images, misfit._replace(residual=rest), error)
+        theta, variance = found.parameters, error.variance
+    return None
+
+
+def _left(misfit: Misfit, variance: float) -> float:
+    """Mean square of the residuals that a linear step to the minimum would leave."""
+    return float(without_step(misfit, variance)[misfit.valid].square().mean())
+
+
+def agrees(start: VortexPairFit, found: VortexPairFit) -> bool:
+    """Whether a fit is where the start, within its errors, said."""
+    off = found.parameters - start.parameters
+    spread = found.covariance + start.covariance
+    scale = np.sqrt(np.diagonal(spread))
+    reduced = np.linalg.pinv(spread / scale / scale[:, None], hermitian=True)
+    square = float((off / scale) @ reduced @ (off / scale))
+    return square < chi2.isf(_REJECTED, len(off))
+
+
+def _displacement_error(start: VortexPairFit, make: Builder) -> float:
+    """Standard error, px, of the start's displacements over the images, where it is large."""
+    places = [np.linspace(axis[0], axis[-1], _PROBES) for axis in (make.y, make.z)]
+    _, spread = start.wind_and_covariance(places[0][None, :], places[1][:, None])
+    px = make.dt / min(make.spacing)
+    return float(np.sqrt(np.quantile(spread[:2].max(0), 0.9))) * px
