@@ -12,13 +12,7 @@ from lidar_mi.retrieval.vortices.covariance import model_error_of
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
 from lidar_mi.retrieval.vortices.model_error import ModelError
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
-from lidar_mi.retrieval.vortices.robust_fit import (
-    Misfit,
-    Solution,
-    fit,
-    stepped,
-    without_step,
-)
+from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, fit, stepped, without_step
 
 # Blur and step between the pixels used (px), and the expected error of displacements (px) that they
 # are for: images of texture 3 px long agree by chance with themselves moved by more.

@@ -1,0 +1,39 @@
+"""The estimator of a slab: the methods of the retrieval, from nothing and from an expected pair."""
+
+import numpy as np
+import pytest
+
+from benchmarks.cases import vortex_pair_images
+from lidar_mi.encounter.estimator import Estimator
+from lidar_mi.experiment.reading import load_experiment
+from tests.support.vortex_pairs import vector
+
+DT = 0.1
+
+
+@pytest.fixture(scope="module")
+def images():
+    return vortex_pair_images(0.03, seed=4)
+
+
+def test_vortices_from_nothing_and_from_the_last_fit(images):
+    estimator = Estimator(load_experiment("wake_sensor"), vectors=False)
+    wind, cold, seconds = estimator.pair_of(images.first, images.second, DT, 0.03)
+    assert wind is None and cold.success and not cold.from_start
+    _, warm, _ = estimator.pair_of(images.first, images.second, DT, 0.03, cold)
+    assert warm.success and warm.from_start
+    stderr = np.sqrt(np.diag(cold.covariance))
+    assert (np.abs(warm.parameters - cold.parameters) < 0.1 * stderr).all()
+    assert (np.abs(warm.parameters - vector(*images.vortices)) < 4 * stderr).all()
+    assert set(seconds) == {"vortices"} and seconds["vortices"] > 0
+
+
+def test_the_wind_is_by_the_most_accurate_method(images):
+    estimator = Estimator(load_experiment("wake_sensor"))
+    wind, _, seconds = estimator.pair_of(images.first, images.second, DT, 0.03)
+    assert wind.attrs["method"] == "variational"
+    valid = wind["flag"] == 0
+    assert valid.mean() > 0.9
+    off = wind["v"] - images.v.interp(y=wind["y"], z=wind["z"])
+    assert float(off.where(valid).std()) < 0.5
+    assert set(seconds) == {"vortices", "wind"}
