@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import NamedTuple
 
 import scipy.fft
@@ -69,9 +69,7 @@ def best_filter(
         See `warping.band_limited`.
     """
     shape = images.shape[1:]
-    frequency = frequencies(sizes, images)
-    radius = _radius(frequency)
-    shell = shells(frequency, shape)
+    radius, shell = radii(tuple(sizes), tuple(shape), images.dtype, images.device)
     density, uncertainty = shell_means(
         images if weight is None else images * weight, shell, sizes, settings.smoothing, known
     )
@@ -143,6 +141,20 @@ def frequencies(sizes: Sequence[int], like: torch.Tensor) -> list[torch.Tensor]:
 def shells(frequency: Sequence[torch.Tensor], shape: Sequence[int]) -> torch.Tensor:
     """Wavenumber in whole cycles per shortest side of the image (at least 16 px)."""
     return (_radius(frequency) * _per_cycle(shape)).long()
+
+
+@lru_cache(maxsize=8)
+def _radii(sizes, shape, dtype, device) -> tuple[torch.Tensor, torch.Tensor]:
+    frequency = frequencies(sizes, torch.empty(0, dtype=dtype, device=device))
+    return _radius(frequency), shells(frequency, shape)
+
+
+def radii(sizes, shape, dtype, device) -> tuple[torch.Tensor, torch.Tensor]:
+    """Frequency of each wave of a real Fourier transform, cycles per px, and its shell.
+
+    They depend on the grid alone: those of images are kept for the next images.
+    """
+    return (_radii if len(sizes) == 2 else _radii.__wrapped__)(sizes, shape, dtype, device)
 
 
 def wavenumbers(of: torch.Tensor, shape: Sequence[int]) -> torch.Tensor:

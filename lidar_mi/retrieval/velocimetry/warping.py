@@ -7,13 +7,14 @@ import scipy.fft
 import torch
 
 from lidar_mi.retrieval.velocimetry.band_limit import (
+    Filter,
     best_filter,
     checked_noise,
     faded,
     frequencies,
     odd_fast_len,
+    radii,
     shell_means,
-    shells,
 )
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
@@ -51,7 +52,8 @@ class Spline(NamedTuple):
         sizes = [scipy.fft.next_fast_len(n + margin, real=True) for n in self.shape]
         dims = tuple(range(-len(sizes), 0))
         # sizes of another parity may reach one shell further
-        shell = shells(frequencies(sizes, field), self.shape).clamp(max=len(self.gain) - 1)
+        _, shell = radii(tuple(sizes), self.shape, field.dtype, field.device)
+        shell = shell.clamp(max=len(self.gain) - 1)
         spectrum = torch.fft.rfftn(field, s=sizes, dim=dims) * self.gain[shell]
         smooth = torch.fft.irfftn(spectrum, s=sizes, dim=dims)
         return smooth[..., *(slice(n) for n in self.shape)]
@@ -213,13 +215,23 @@ def band_limited(
     settings = settings or FilterSettings()
     known = torch.stack([torch.isfinite(image) for image in images])
     images = torch.stack([stored(filled(image)) for image in images])
-    shape, margin, finer = tuple(images.shape[1:]), settings.margin, settings.nodes
-    sizes = [odd_fast_len(n + 2 * margin) for n in shape]
-    dims = tuple(range(1, images.ndim))
+    sizes = transform_sizes(images.shape[1:], settings)
     chosen = best_filter(images, sizes, settings, noise, mismatch, weight, blur, known)
+    return filtered_spline(images, chosen, settings), chosen.level
 
+
+def transform_sizes(shape: Sequence[int], settings: FilterSettings) -> list[int]:
+    """Odd lengths of the Fourier transforms of images with their margins."""
+    return [odd_fast_len(n + 2 * settings.margin) for n in shape]
+
+
+def filtered_spline(images: torch.Tensor, chosen: Filter, settings: FilterSettings) -> Spline:
+    """Splines through finite images (images, ...) after a filter, in their precision."""
+    shape, margin, finer = tuple(images.shape[1:]), settings.margin, settings.nodes
+    sizes = transform_sizes(shape, settings)
+    dims = tuple(range(1, images.ndim))
     frequency = frequencies(sizes, images)
-    gain = chosen.gain[shells(frequency, shape)]
+    gain = chosen.gain[radii(tuple(sizes), shape, images.dtype, images.device)[1]]
     mean = images.mean(dims, keepdim=True)
     spectrum = torch.fft.rfftn(
         faded(images - mean, sizes, margin, settings.antisymmetric), dim=dims
@@ -228,7 +240,7 @@ def band_limited(
         gain = gain / ((2 + torch.cos(2 * torch.pi * axis / finer)) / 3)
     smooth = _refined(spectrum * gain, sizes, finer) + mean
     keep = [slice(finer * (n + 2 * margin)) for n in shape]
-    spline = Spline(
+    return Spline(
         smooth[:, *keep].contiguous(),
         shape,
         chosen.passed,
@@ -237,7 +249,6 @@ def band_limited(
         chosen.efficiency,
         settings,
     )
-    return spline, chosen.level
 
 
 def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
@@ -256,7 +267,7 @@ def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
         As `band_limited` takes it. Infinite where the filter passed nothing.
     """
     sizes = [odd_fast_len(n + 2 * spline.settings.margin) for n in spline.shape]
-    shell = shells(frequencies(sizes, rest), spline.shape)
+    _, shell = radii(tuple(sizes), spline.shape, rest.dtype, rest.device)
     number = len(rest)
     rest = rest * (number / (number - 1)) ** 0.5
     density, _ = shell_means(rest, shell, sizes, spline.settings.smoothing)

@@ -36,12 +36,12 @@ def model_error_of(found: Solution, shortest: float, *, changes: bool = False) -
 def parameter_covariance(found: Solution, error: ModelError, excess: float) -> np.ndarray:
     """Covariance (10, 10): H^-1 M H^-1, M that of the force by noise and flow error."""
     misfit, weight = found.misfit, found.weight
-    spread = _noise_spread(found, error) * excess
+    spread = _noise_spread(found, error).double() * excess
     jacobian, slope = misfit.jacobian, misfit.slope
     if weight.ndim == 2:
         weight, jacobian, slope = weight[None], jacobian[:, None], slope[:, None]
     responses = torch.einsum("ozy,pozy,aozy->pazy", weight, jacobian, slope)
-    spread = spread + spread_of(responses, error)
+    spread = spread + spread_of(responses, error).double()
     scale = found.normal.diagonal().sqrt()
     inverse = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
     inverse = inverse / scale / scale[:, None]
@@ -80,6 +80,7 @@ def _remaining_step(found: Solution) -> torch.Tensor:
     """The remaining step (10,) of a fit that interpolation noise has stopped."""
     misfit, weight = found.misfit, found.weight
     force = -misfit.jacobian.flatten(1) @ (weight * misfit.residual).flatten()
+    force = force.double()
     scale = found.normal.diagonal().sqrt()
     scaled = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
     return (scaled @ (force / scale) / scale)[:10]

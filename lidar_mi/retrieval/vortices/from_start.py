@@ -12,7 +12,7 @@ from lidar_mi.retrieval.vortices.covariance import model_error_of
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
 from lidar_mi.retrieval.vortices.model_error import ModelError
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
-from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, fit, stepped, without_step
+from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, moved, stepped, without_step
 
 # Blur and step between the pixels used (px), and the expected error of displacements (px) that they
 # are for: images of texture 3 px long agree by chance with themselves moved by more.
@@ -21,12 +21,14 @@ _LEVELS = ((3.0, 4, 2.0), (1.5, 2, 0.7), (0.0, 2, 0.0))
 _PROBES = 15
 # Standard deviation of the model error assumed at first, px.
 _MODEL_ERROR = 0.1
-# Squared step, in standard errors, beyond which the images are warped again after it.
-_NEAR = 1.0
-_ROUNDS = 3
-# Steps on every second pixel at most, and the squared step, in standard errors, after which they
-# end.
-_STEPS, _CLOSE = 6, 1.0
+# Length (px) over which an image's slope changes, as far as steps are concerned: a displacement d
+# that is linearised leaves an error of d^2 over it.
+_CURVED = 3.0
+# Displacement (px) to which every second pixel of the filtered images is warped, at most so often.
+_CLOSE, _STEPS = 0.5, 4
+# Error, in standard errors of all parameters together, that the last step may leave; the unfiltered
+# images are warped at most so often.
+_LEFT, _ROUNDS = 0.3, 3
 # Probability with which a start that is as certain as it says is found to be wrong.
 _REJECTED = 1e-6
 
@@ -63,38 +65,60 @@ def fit_from(
     """
     if not np.isfinite(start.parameters).all() or not np.isfinite(start.covariance).all():
         return None
-    theta = make.pair.new_tensor([*start.parameters, *SAME_BRIGHTNESS])
+    theta = torch.tensor([*start.parameters, *SAME_BRIGHTNESS], dtype=torch.float64)
+    theta = theta.to(make.pair.device)
     if not limits(theta, torch.zeros_like(theta)):
         return None
     variance = (_MODEL_ERROR * (make.spacing[0] * make.spacing[1]) ** 0.5) ** 2
     uncertain = _displacement_error(start, make)
     for blur, step, least in _LEVELS:
-        if uncertain >= least:
-            thin = make(blur, step)
-            thin = replace(thin, whole=thin.spline)
-            images = thin.at_least(_left(thin(theta), variance))
-            theta = fit(images, theta, limits, variance, _STEPS, _CLOSE).parameters
+        if uncertain < least:
+            continue
+        thin = make(blur, step)
+        thin = replace(thin, whole=thin.spline)
+        for _ in range(_STEPS):
+            misfit = thin(theta)
+            images = thin.at_least(_left(misfit, variance))
+            found = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
+            if found is None:
+                return None
+            far = _displaced(found.parameters - theta, misfit, make)
+            theta = found.parameters
+            if far < max(_CLOSE, blur):
+                break
     white = make(0.0, 1)
     for _ in range(_ROUNDS):
         misfit = white(theta)
         images = white.at_least(_left(misfit, variance))
-        plain = stepped(theta, images.weighted(misfit), variance)
-        if plain is None or not limits(theta, plain.parameters - theta):
+        plain = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
+        if plain is None:
             return None
         error = model_error_of(plain, lags, changes=True)
         images = make.with_change(white, images, plain.misfit, error.variance)
         if not images.whitening.passed > 0:
             return None
-        found = stepped(theta, images.whitened(misfit), error.variance)
-        if found is None or not limits(theta, found.parameters - theta):
+        found = _near(limits, theta, stepped(theta, images.whitened(misfit), error.variance))
+        if found is None:
             return None
         step = found.parameters - theta
-        if float(step @ found.normal @ step) < _NEAR:
-            rest = misfit.residual + torch.tensordot(step, misfit.jacobian, 1)
+        far = _displaced(step, misfit, make) / _CURVED
+        if float(step @ found.normal @ step) ** 0.5 * far < _LEFT:
             error = model_error_of(found, lags, changes=True)
-            return Found(found, images, misfit._replace(residual=rest), error)
+            return Found(found, images, misfit._replace(residual=moved(misfit, step)), error)
         theta, variance = found.parameters, error.variance
     return None
+
+
+def _near(limits, theta: torch.Tensor, found: Solution | None) -> Solution | None:
+    """A solution that a step from theta may reach."""
+    return found if found and limits(theta, found.parameters - theta) else None
+
+
+def _displaced(step: torch.Tensor, misfit: Misfit, make: Builder) -> float:
+    """Rms displacement (px) of the images by a step, along their slopes."""
+    change = moved(misfit, step) - misfit.residual
+    slope = misfit.slope * make.dt
+    return float((2 * change.square().sum() / slope.square().sum()).sqrt()) / min(make.spacing)
 
 
 def _left(misfit: Misfit, variance: float) -> float:

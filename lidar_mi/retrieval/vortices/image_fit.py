@@ -176,8 +176,9 @@ def fit_pixels(
     limits = step_limits(y, z, profile, dt)
 
     if start is not None:
-        near = fit_from(start, make, limits, _NOISE_LAGS)
-        pair = near and replace(_checked(make, *near), from_start=True)
+        single = make.single()
+        near = fit_from(start, single, limits, _NOISE_LAGS)
+        pair = near and replace(_checked(single, *near), from_start=True)
         if pair and pair.success and agrees(start, pair):
             return pair
     best = None

@@ -7,8 +7,16 @@ import numpy as np
 import torch
 from kornia.filters import gaussian_blur2d
 
+from lidar_mi.retrieval.velocimetry.band_limit import Filter, best_filter
 from lidar_mi.retrieval.velocimetry.quality import filled
-from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, mismatch
+from lidar_mi.retrieval.velocimetry.settings import FilterSettings
+from lidar_mi.retrieval.velocimetry.warping import (
+    Spline,
+    band_limited,
+    filtered_spline,
+    mismatch,
+    transform_sizes,
+)
 from lidar_mi.retrieval.vortices.model import Profile, advected, drift, path_sensitivity
 from lidar_mi.retrieval.vortices.pixel_times import PixelTimes, seen
 from lidar_mi.retrieval.vortices.robust_fit import Misfit
@@ -63,6 +71,7 @@ class Images:
 
     def __call__(self, parameters: torch.Tensor) -> Misfit:
         """Residuals and their derivatives for parameters (16,)."""
+        parameters = parameters.to(self.y)
         theta = parameters[:10]
         gain, offset = (torch.tensordot(parameters[k : k + 3], self.linear, 1) for k in (10, 13))
         half = self.dt / 2
@@ -193,15 +202,29 @@ class Builder:
         """Along y and z, m."""
         return tuple(float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (self.y, self.z))
 
+    def single(self) -> "Builder":
+        """The same in single precision: places to 1e-5 m, brightness to 1e-6 of the contrast."""
+        times = self.times and self.times._replace(values=self.times.values.float())
+        noise = None if self.map is None else self.map.float()
+        return replace(self, pair=self.pair.float(), map=noise, times=times)
+
     @cached_property
     def sharp(self) -> tuple[Spline, float]:
         """The images after the filter against white noise, and the noise."""
-        return band_limited(self.pair, self.level)
+        chosen = self.filter(self.level)
+        return filtered_spline(self.pair, chosen, FilterSettings()), chosen.level
+
+    def filter(self, noise: float | None, mismatch: torch.Tensor | None = None) -> Filter:
+        """The filter of both images, as `warping.band_limited` chooses it."""
+        settings = FilterSettings()
+        sizes = transform_sizes(self.pair.shape[1:], settings)
+        return best_filter(self.pair, sizes, settings, noise, mismatch)
 
     @cached_property
     def unfiltered(self) -> Spline:
         """The images as they are."""
-        return band_limited(self.pair, 0.0)[0]
+        everything = Filter(torch.ones_like(self.sharp[0].gain), 0.0, 1.0, 1.0, 1.0)
+        return filtered_spline(self.pair, everything, FilterSettings())
 
     @property
     def noise(self) -> float:
@@ -216,11 +239,11 @@ class Builder:
             size = 2 * int(np.ceil(4 * blur)) + 1
             size = tuple(min(size, 2 * n - 1) for n in self.pair.shape[1:])
             soft = gaussian_blur2d(self.pair[None], size, (blur, blur), "replicate")[0]
-            spline, _ = band_limited(soft, 0.0)
+            spline = band_limited(soft, 0.0)[0]
+            spline = spline._replace(coefficients=spline.coefficients.to(self.pair))
             passed = 1 / (4 * np.pi * blur**2)
         places = [
-            torch.as_tensor(axis[step // 2 :: step], device=self.pair.device)
-            for axis in (self.z, self.y)
+            torch.as_tensor(axis[step // 2 :: step]).to(self.pair) for axis in (self.z, self.y)
         ]
         vertical, lateral = torch.meshgrid(*places, indexing="ij")
         variance = torch.full_like(lateral, 2 * noise**2)
@@ -228,7 +251,7 @@ class Builder:
             # the filter spreads noise over a few pixels, and with few samples one pixel's estimate
             # is unreliable
             known = torch.nn.functional.avg_pool2d(
-                filled(self.map.double())[None].square(), 9, 1, 4, count_include_pad=False
+                filled(self.map.to(self.pair))[None].square(), 9, 1, 4, count_include_pad=False
             )[0]
             variance = 2 * known[step // 2 :: step, step // 2 :: step] / self.contrast**2
         floor = 2 * _INTERPOLATION**2
@@ -272,12 +295,12 @@ class Builder:
         density = mismatch(before, torch.stack([-rest, rest]))
         density = density.clamp(min=max(least, fraction * level) / 2)
         level = max(least, level)
-        spline, _ = band_limited(self.pair, (level / 2) ** 0.5, density)
-        ratio = torch.where(gain > 0, spline.gain / white.spline.gain.clamp(min=1e-3), 0.0)
+        chosen = self.filter((level / 2) ** 0.5, density)
+        ratio = torch.where(gain > 0, chosen.gain / white.spline.gain.clamp(min=1e-3), 0.0)
         floor = 2 * _INTERPOLATION**2
         return replace(
             white,
-            whitening=spline._replace(gain=ratio),
+            whitening=white.spline._replace(gain=ratio, passed=chosen.passed, excess=chosen.excess),
             variance=level * shape + floor,
-            scatter=spline.passed * level * shape + floor,
+            scatter=chosen.passed * level * shape + floor,
         )

@@ -63,7 +63,12 @@ def without_step(misfit: Misfit, flow_variance: float) -> torch.Tensor:
     step = _step(normal, force, 1e-6)
     if step is None:
         return misfit.residual
-    return misfit.residual + torch.tensordot(step, misfit.jacobian, 1)
+    return moved(misfit, step)
+
+
+def moved(misfit: Misfit, step: torch.Tensor) -> torch.Tensor:
+    """The residuals after a step, as far as they are linear."""
+    return misfit.residual + torch.tensordot(step.to(misfit.residual), misfit.jacobian, 1)
 
 
 def stepped(
@@ -79,7 +84,7 @@ def stepped(
         step = _step(normal, force, 1e-6)
         if step is None:
             return None
-        left = misfit.residual + torch.tensordot(step, misfit.jacobian, 1)
+        left = moved(misfit, step)
         rest = misfit._replace(residual=left)
     return _solution(parameters + step, rest, flow_variance, True)
 
@@ -142,7 +147,8 @@ def _normal(misfit: Misfit, weight: torch.Tensor) -> tuple[torch.Tensor, torch.T
     """Sums of w J J^T and of -w J r."""
     columns = misfit.jacobian.flatten(1)
     weighted = columns * weight.flatten()
-    return weighted @ columns.T, -weighted @ misfit.residual.flatten()
+    sums = weighted @ columns.T, -weighted @ misfit.residual.flatten()
+    return tuple(part.double() for part in sums)
 
 
 def _step(normal, force, damping: float) -> torch.Tensor | None:
