@@ -10,20 +10,16 @@ from collections.abc import Callable, Sequence
 import torch
 
 from lidar_mi.retrieval.velocimetry import direct, iterative, strips
+from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
-from lidar_mi.retrieval.velocimetry.likelihood import Linear, linearised, prepared, with_local_noise
+from lidar_mi.retrieval.velocimetry.likelihood import linearised, prepared, with_local_noise
+from lidar_mi.retrieval.velocimetry.next_flow import Flow, flow_of
 from lidar_mi.retrieval.velocimetry.prior import first_prior, refined
-from lidar_mi.retrieval.velocimetry.quality import (
-    Flag,
-    check_between,
-    no_skill,
-    non_finite,
-    worst_variance,
-)
+from lidar_mi.retrieval.velocimetry.quality import Flag, check_between
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
-from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, window_sums, working
+from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, working
 
 
 def variational(
@@ -99,11 +95,35 @@ def variational(
     InputError
         Sizes, threshold or noise out of range; images that differ in size.
     """
+    return variational_and_flow(
+        [image1, image2, *more],
+        Windows(tuple(image1.shape), template, search, stride),
+        min_correlation,
+        noise,
+        blur,
+        spacing,
+        settings,
+    )[0]
+
+
+def variational_and_flow(
+    stack: Sequence[torch.Tensor],
+    windows: Windows,
+    min_correlation: float = 0.5,
+    noise: float | torch.Tensor | None = None,
+    blur: float = 0.0,
+    spacing: Sequence[float] | None = None,
+    settings: VariationalSettings | None = None,
+    *,
+    keep: bool = False,
+) -> tuple[Displacement, Flow | None]:
+    """`variational`, and if asked what the retrieval of the next images may start from.
+
+    There is none for volumes, and for images of more than `settings.strips.largest` knots.
+    """
     check_between("min_correlation", min_correlation, -1, 1)
-    stack = [image1, image2, *more]
     for other in stack[1:]:
-        image_pair(image1, other, (2, 3))
-    windows = Windows(tuple(image1.shape), template, search, stride)
+        image_pair(stack[0], other, (2, 3))
     if settings is None:
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
     images = prepared(stack, noise, blur, settings)
@@ -112,14 +132,14 @@ def variational(
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
     last, prior, displaced_only = len(settings.knots) - 1, None, flow
     for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
-        apart = max(2.0, knots * template)
+        apart = max(2.0, knots * windows.template)
         axes = [Axis(n, apart) for n in windows.shape]
         mesh = Mesh(axes, pixels)
         solve = _solver(axes, settings)
         coefficients = mesh.fitted(flow)
         if prior is None:
             unit = (1.0,) * windows.dims
-            width = settings.prior_width * template
+            width = settings.prior_width * windows.template
             prior = first_prior(axes, working(coefficients), width, spacing or unit, settings)
         else:
             prior = refined(prior, axes)
@@ -128,7 +148,7 @@ def variational(
             linear = linearised(images, mesh, coefficients, settings)
             if level == last and turn in (settings.noise_round, rounds):
                 displaced_only = displaced_only if turn == rounds else mesh.field(coefficients)
-                width = settings.misfit_width * template
+                width = settings.misfit_width * windows.template
                 images = with_local_noise(images, linear, width, settings.coloured, apart)
                 linear = linearised(images, mesh, coefficients, settings)
             posterior = solve(linear, mesh, coefficients, prior, settings, turn)
@@ -147,11 +167,15 @@ def variational(
     # a flow that depends on how much is assumed to move through the plane is not in the images
     spread = (flow - flow.mean(tuple(range(1, flow.ndim)), keepdim=True)).square().mean()
     undetermined = images.through > 0 and bool((flow - displaced_only).square().mean() > spread)
-    found = _flagged(d, covariance, before, score, stack, windows, min_correlation)
+    found = flagged(d, covariance, before, score, stack, windows, min_correlation)
     if windows.dims > 2:
-        return found
-    unskilled = no_skill(found.d, covariance) | undetermined
-    return found._replace(flag=found.flag | (Flag.NO_SKILL * unskilled).to(torch.int16))
+        return found, None
+    found = found._replace(flag=found.flag | unskilled(found.d, covariance))
+    if undetermined:
+        found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
+    if not (keep and isinstance(posterior, direct.Posterior)):
+        return found, None
+    return found, flow_of(posterior, linear, images, before, windows, settings)
 
 
 def _solver(
@@ -160,54 +184,3 @@ def _solver(
     if len(axes) > 2:
         return iterative.solved
     return direct.solved if axes[0].knots <= settings.strips.largest else strips.solved
-
-
-def _flagged(
-    d: torch.Tensor,
-    covariance: torch.Tensor,
-    before: torch.Tensor,
-    score: torch.Tensor,
-    stack: Sequence[torch.Tensor],
-    windows: Windows,
-    min_correlation: float,
-) -> Displacement:
-    """The result, with flags where images inform too little or do not agree."""
-    # remaining fraction of the prior's variance: in the mean of all directions, and in the worst
-    known = before.diagonal().mean(-1) / 2
-    matched = (covariance.diagonal().mean(-1) < known) & score.isfinite()
-    flag = (
-        Flag.NO_MATCH * ~matched
-        + Flag.LOW_TEXTURE * ((worst_variance(covariance) > known) | ~matched)
-        + Flag.LOW_CORRELATION * (matched & (score < (1 + min_correlation) / 2))
-    ).to(torch.int16)
-    bad = non_finite(stack, windows)
-    flag[bad] |= Flag.NON_FINITE_INPUT.value
-    return Displacement(torch.where(matched, d, torch.nan), score.nan_to_num(0.0), flag, covariance)
-
-
-def agreement(linear: Linear, windows: Windows) -> torch.Tensor:
-    """Smallest correlation, over a template, of a warped image with the others' mean.
-
-    Of shape `windows.count`; NaN without contrast.
-    """
-    warped, valid = working(linear.warped), linear.valid
-    box = [torch.ones(windows.template, dtype=warped.dtype, device=warped.device)]
-    scores = []
-    for image in warped:
-        others = (warped.sum(0) - image) / (len(warped) - 1)
-        sums = torch.stack(
-            [torch.ones_like(image), image, others, image**2, others**2, image * others]
-        )
-        sums = sums * valid
-        for axis, n in enumerate(windows.count):
-            start = windows.starts(axis).start
-            length = (n - 1) * windows.stride + windows.template
-            sums = window_sums(sums.narrow(axis + 1, start, length), box, windows.stride, axis + 1)[
-                0
-            ]
-        first, second, square1, square2, cross = sums[1:] / sums[0].clamp(min=1)
-        contrast = (square1 - first**2).clamp(min=0) * (square2 - second**2).clamp(min=0)
-        rounding = torch.finfo(linear.warped.dtype).eps ** 2 * square1 * square2
-        score = (cross - first * second) / contrast.sqrt()
-        scores.append(torch.where(contrast > rounding, score, torch.nan))
-    return torch.stack(scores).amin(0)
