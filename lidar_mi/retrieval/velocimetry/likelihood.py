@@ -91,16 +91,7 @@ def prepared(
     settings: VariationalSettings,
 ) -> Images:
     """The images, normalised and band-limited, with the noise as given or estimated."""
-    known_at = usable(stack)
-    weight = torch.ones_like(stored(stack[0]))
-    if isinstance(noise, torch.Tensor) and noise.ndim:
-        known = torch.isfinite(noise)
-        known_at = known_at & usable([noise])
-        # a level that few photons determine is lowest where an image is too dark by chance
-        square = averaged(stored(noise).nan_to_num(0.0).square(), known, settings.noise_width)
-        weight = torch.where(square > 0, rms(noise) ** 2 / square, weight)
-        # no pixel may outweigh a window of others
-        weight = weight.clamp(max=100.0)
+    known_at, weight = usable_and_weight(stack, noise, settings)
     images = normalised(stack)
     spline, level = band_limited(
         images,
@@ -113,6 +104,23 @@ def prepared(
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
     time = time - time.mean()
     return Images(spline, known_at, time, level, weight, images, blur, level)
+
+
+def usable_and_weight(
+    stack: Sequence[torch.Tensor], noise: float | torch.Tensor | None, settings: VariationalSettings
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Pixels of known value and noise, and their weights by a map of the noise."""
+    known_at = usable(stack)
+    weight = torch.ones_like(stored(stack[0]))
+    if isinstance(noise, torch.Tensor) and noise.ndim:
+        known = torch.isfinite(noise)
+        known_at = known_at & usable([noise])
+        # a level that few photons determine is lowest where an image is too dark by chance
+        square = averaged(stored(noise).nan_to_num(0.0).square(), known, settings.noise_width)
+        weight = torch.where(square > 0, rms(noise) ** 2 / square, weight)
+        # no pixel may outweigh a window of others
+        weight = weight.clamp(max=100.0)
+    return known_at, weight
 
 
 def with_local_noise(

@@ -34,6 +34,8 @@ class Method:
     repeats : int
         Retrievals of a known motion that the standard errors are from (`bootstrap`). 0: the method
         states its errors by itself, or not at all.
+    name : str
+        Of a method that is not one of `METHODS`.
     """
 
     find: Callable[..., Displacement]
@@ -43,6 +45,7 @@ class Method:
     local: bool = True
     reach: int = 1
     repeats: int = 0
+    name: str = ""
 
 
 METHODS: Mapping[str, Method] = {

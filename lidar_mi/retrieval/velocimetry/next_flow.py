@@ -9,21 +9,22 @@ from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskill
 from lidar_mi.retrieval.velocimetry.band import spread
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.direct import Posterior, solved, variances
+from lidar_mi.retrieval.velocimetry.direct import Posterior, solved
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
-from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
-from lidar_mi.retrieval.velocimetry.likelihood import Images, Linear, linearised
+from lidar_mi.retrieval.velocimetry.flow_spline import Mesh, interpolated
+from lidar_mi.retrieval.velocimetry.likelihood import Images, Linear, linearised, usable_and_weight
 from lidar_mi.retrieval.velocimetry.prior import Prior
-from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
+from lidar_mi.retrieval.velocimetry.quality import misfit_variance
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.warping import filtered_spline
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
-# Largest step (px, of 99 in 100 pixels) after which the images are not warped again.
-_SMALL = 0.15
-_ROUNDS = 2
-# Factor by which the misfit of the next images may differ: beyond, what was learnt does not hold.
-_ALIKE = 1.5
+# Largest step (px, of 99 in 100 pixels) after which the images are not warped again, and how often
+# they are at most.
+_SMALL, _ROUNDS = 0.2, 2
+# Factors by which the misfit and the prior's energy of the next flow may differ: beyond, what was
+# learnt does not hold.
+_MISFIT, _ENERGY = 1.5, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,121 +35,166 @@ class Flow:
     ----------
     coefficients : torch.Tensor, shape (2, knots z, knots y)
         Displacement in dt, px.
-    axes : tuple of Axis
-        The knots along z and y.
     prior : Prior
-        Of largest evidence.
-    free : torch.Tensor, shape (kinds, *prior.mesh.shape)
-        Variance of each kind of motion a priori times its strength, which hardly depends on it.
+        Of largest evidence in a retrieval from scratch.
+    energy : float
+        Of the flow then, in the prior's units.
     before : torch.Tensor, shape (2, 2, *windows.count)
         Covariance of the flow a priori, px^2.
     images : Images
-        Their filter, noise and weights.
+        Their filter and noise.
+    local : torch.Tensor, shape (z, y)
+        Weight of each pixel by its misfit, over that by its noise as given.
     misfit : float
-        Mean square of the residuals over that of the noise.
+        Mean square of the residuals then, over that of the noise.
     windows : Windows
     settings : VariationalSettings
     """
 
     coefficients: torch.Tensor
-    axes: tuple[Axis, ...]
     prior: Prior
-    free: torch.Tensor
+    energy: float
     before: torch.Tensor
     images: Images
+    local: torch.Tensor
     misfit: float
     windows: Windows
     settings: VariationalSettings
 
-    def changed(self, change: torch.Tensor) -> "Flow":
-        """The flow with a change (2, z, y), px in dt, known from elsewhere."""
-        mesh = Mesh(self.axes, _pixels(self.windows, self.coefficients))
-        coefficients = self.coefficients + mesh.fitted(change.to(self.coefficients))
-        return replace(self, coefficients=coefficients)
+    def moved(self, shift: Sequence[float], change: torch.Tensor) -> "Flow":
+        """The flow expected where its structure has moved and changed.
+
+        Parameters
+        ----------
+        shift : (float, float)
+            Along z and y, px; edges continue beyond.
+        change : torch.Tensor, shape (2, z, y)
+            Of the flow after this shift, px in dt, as by a model of both.
+        """
+        axes, like = self.prior.mesh.axes, self.coefficients
+        pixels, centres = _pixels(self.windows, like), _centres(self.windows, like)
+        flow = Mesh(axes, _back(pixels, shift)).field(self.coefficients) + change.to(like)
+        mesh = self.prior.mesh
+        strength = interpolated(self.prior.local.log(), mesh.places, _back(mesh.places, shift))
+        return replace(
+            self,
+            coefficients=Mesh(axes, pixels).fitted(flow),
+            prior=self.prior._replace(local=strength.exp()),
+            before=interpolated(self.before, centres, _back(centres, shift)),
+            local=interpolated(self.local, pixels, _back(pixels, shift)),
+        )
 
 
 def flow_of(
-    posterior: Posterior, linear: Linear, images: Images, before: torch.Tensor, windows: Windows,
+    posterior: Posterior,
+    linear: Linear,
+    images: Images,
+    given: torch.Tensor,
+    before: torch.Tensor,
+    windows: Windows,
     settings: VariationalSettings,
 ) -> Flow:
-    """What the next retrieval starts from, after a retrieval from scratch."""
-    prior = posterior.prior
-    band = posterior.band.covariance(posterior.band.factor(posterior.stiff))
-    free = variances(band, prior) * prior.strength
-    axes = tuple(prior.mesh.axes)
+    """What the next retrieval may start from, after one from scratch.
+
+    `given` is the weight (z, y) by the noise as given; the other arguments are those of its end.
+    """
     return Flow(
-        posterior.coefficients, axes, prior, free, before, images,
-        _misfit(linear, torch.zeros_like(linear.slope), images), windows, settings,
+        posterior.coefficients,
+        posterior.prior,
+        _energy(posterior.prior, posterior.coefficients),
+        before,
+        images,
+        images.weight / given,
+        _misfit(linear, torch.zeros_like(linear.slope), images),
+        windows,
+        settings,
     )
 
 
 def next_flow(
-    start: Flow, stack: Sequence[torch.Tensor], min_correlation: float
+    start: Flow,
+    stack: Sequence[torch.Tensor],
+    noise: float | torch.Tensor | None,
+    min_correlation: float,
 ) -> tuple[Displacement, Flow] | None:
     """`variational.variational` near a flow; None where what was learnt before does not hold.
 
-    The filter, the noise, the weights of the pixels and the prior are those of the last images. The
-    errors follow the misfit. The prior makes one step to largest evidence for the next images.
+    Filter, noise, weights and prior are those learnt from scratch; the errors follow the misfit.
     Images are read in single precision: places to 1e-5 px.
 
     Parameters
     ----------
     start : Flow
+        The expected one.
     stack : sequence of torch.Tensor, shape (z, y)
         Two images of the windows' size.
+    noise : float or torch.Tensor, optional
     min_correlation : float
-        As `variational` takes it.
+        As `variational` takes them.
     """
     windows, settings, prior = start.windows, start.settings, start.prior
-    images = _prepared(start.images, stack, settings)
-    mesh = Mesh(start.axes, _pixels(windows, images.spline.coefficients))
+    images = _prepared(start, stack, noise)
+    mesh = Mesh(prior.mesh.axes, _pixels(windows, images.spline.coefficients))
     coefficients = start.coefficients
     for _ in range(_ROUNDS):
         linear = linearised(images, mesh, coefficients.float(), settings)
         posterior = solved(linear, mesh, coefficients, prior, settings, 0)
         step = mesh.field((posterior.coefficients - coefficients).float())
         coefficients = posterior.coefficients
-        if float(step.abs().flatten().kthvalue(int(0.99 * step.numel())).values) < _SMALL:
+        far = float(step.abs().flatten().kthvalue(int(0.99 * step.numel())).values)
+        if far < _SMALL:
             break
-    else:
-        return None
     worse = _misfit(linear, step, images) / start.misfit
-    if not 1 / _ALIKE < worse < _ALIKE:
+    more = _energy(prior, coefficients) / start.energy
+    if not (far < _SMALL and 1 / _MISFIT < worse < _MISFIT and 1 / _ENERGY < more < _ENERGY):
         return None
-    centres = [windows.centres(axis).to(coefficients) for axis in range(2)]
-    at_centres = Mesh(start.axes, centres)
-    after = posterior.band.covariance(posterior.root)
-    covariance = worse * spread(after, at_centres)
-    d = at_centres.field(coefficients)
-    score = agreement(linear, windows)
+    at_centres = Mesh(prior.mesh.axes, _centres(windows, coefficients))
+    covariance = worse * spread(posterior.band.covariance(posterior.root), at_centres)
+    d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, start.before, score, stack, windows, min_correlation)
     found = found._replace(flag=found.flag | unskilled(found.d, covariance))
-    energy = prior.by_kind(prior.rates(coefficients).square())
-    informed = start.free / prior.strength - variances(after, prior)
-    prior = prior.updated(informed, energy, settings)
-    prior = prior._replace(divergence=prior.divergence._replace(trend=None))
-    return found, replace(start, coefficients=coefficients, prior=prior)
+    return found, replace(start, coefficients=coefficients)
 
 
 def _pixels(windows: Windows, like: torch.Tensor) -> list[torch.Tensor]:
     return [torch.arange(n).to(like) for n in windows.shape]
 
 
-def _prepared(last: Images, stack: Sequence[torch.Tensor], settings: VariationalSettings) -> Images:
-    """New images with the filter, the noise and the weights of the last ones."""
-    spline = last.spline
+def _centres(windows: Windows, like: torch.Tensor) -> list[torch.Tensor]:
+    return [windows.centres(axis).to(like) for axis in range(windows.dims)]
+
+
+def _back(places: Sequence[torch.Tensor], shift: Sequence[float]) -> list[torch.Tensor]:
+    """Where what is at places (px) now was before a shift, or the edge."""
+    return [
+        (axis - by).clamp(float(axis[0]), float(axis[-1]))
+        for axis, by in zip(places, shift, strict=True)
+    ]
+
+
+def _prepared(
+    start: Flow, stack: Sequence[torch.Tensor], noise: float | torch.Tensor | None
+) -> Images:
+    """New images with the filter and the noise of those before."""
+    last, settings = start.images, start.settings
+    known, weight = usable_and_weight(stack, noise, settings)
+    gain = last.spline.gain.float()
     chosen = Filter(
-        spline.gain.float(), last.noise, spline.passed, spline.excess, spline.efficiency
+        gain, last.noise, last.spline.passed, last.spline.excess, last.spline.efficiency
     )
     pair = normalised(stack)
-    spline = filtered_spline(pair.nan_to_num(0.0).float(), chosen, settings.filter)
     return last._replace(
-        spline=spline,
-        usable=usable(stack),
+        spline=filtered_spline(pair.nan_to_num(0.0).float(), chosen, settings.filter),
+        usable=known,
         time=last.time.float(),
-        weight=last.weight.float(),
+        weight=(weight * start.local).float(),
         stack=pair,
     )
+
+
+def _energy(prior: Prior, coefficients: torch.Tensor) -> float:
+    """Mean over all motions and places of their squares times the prior's strength."""
+    return float((prior.weights * prior.rates(coefficients).square()).mean())
 
 
 def _misfit(linear: Linear, step: torch.Tensor, images: Images) -> float:

@@ -127,6 +127,7 @@ def variational_and_flow(
     if settings is None:
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
     images = prepared(stack, noise, blur, settings)
+    given = images.weight
     like = images.spline.coefficients[:0]
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
@@ -175,7 +176,7 @@ def variational_and_flow(
         found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
     if not (keep and isinstance(posterior, direct.Posterior)):
         return found, None
-    return found, flow_of(posterior, linear, images, before, windows, settings)
+    return found, flow_of(posterior, linear, images, given, before, windows, settings)
 
 
 def _solver(

@@ -16,7 +16,7 @@ from lidar_mi.retrieval.velocimetry.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.velocimetry.bound import displacement_bound
 from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.velocimetry.illumination import described, illumination
-from lidar_mi.retrieval.velocimetry.methods import METHODS
+from lidar_mi.retrieval.velocimetry.methods import METHODS, Method
 from lidar_mi.retrieval.velocimetry.outliers import (
     MEDIAN_EPSILON,
     MEDIAN_THRESHOLD,
@@ -34,7 +34,7 @@ def retrieve_wind(
     image1: xr.DataArray,
     image2: xr.DataArray,
     dt: float,
-    method: str = "cc",
+    method: str | Method = "cc",
     template: int = 8,
     search: int = 16,
     stride: int = 1,
@@ -65,7 +65,7 @@ def retrieve_wind(
         Time from image 1 to image 2, s.
     method : {"cc", "ws", "multipass", "variational", "vortex_fit"}
         Cross-correlation, weight shift, multi-pass correlation, a smooth flow or a vortex pair
-        fitted to the images as a whole, see `methods.METHODS`.
+        fitted to the images as a whole, see `methods.METHODS`. Or a `methods.Method` of one's own.
     template, search, stride : int
         Pixels: template n >= 2, search region >= n + 2, step from window to window >= 1. Winds
         beyond ((search - template) // 2 - 1/2) spacing / dt are out of range (17.5 m/s for 8 in 16
@@ -143,12 +143,16 @@ def retrieve_wind(
     >>> print(f"{float(wind['v'].median()):.1f} {wind['v'].units}")
     10.0 m s-1
     """
-    if method not in METHODS:
+    if isinstance(method, Method):
+        method, chosen = method.name, method
+    elif method in METHODS:
+        chosen = METHODS[method]
+    else:
         raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
     dt = positive("dt", dt)
     stack, noise = checked_stack([image1, image2, *more], noise)
     image1 = stack[0]
-    if more and "more" not in METHODS[method].options:
+    if more and "more" not in chosen.options:
         takes = ", ".join(name for name, known in METHODS.items() if "more" in known.options)
         raise InputError(
             f"more: {len(more) + 2} images are not allowed with method {method!r}; expected two, "
@@ -163,7 +167,6 @@ def retrieve_wind(
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
 
-    chosen = METHODS[method]
     axes = tuple(image1[name].values.astype(float) for name in ("z", "y"))
     offered = {
         "min_correlation": min_correlation,
@@ -189,7 +192,6 @@ def retrieve_wind(
         pixels1, pixels2 = _of_one_light(resting.pattern.removed(whole[:2]), light)
         texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
         apart = max(1, round(template / 2 / stride))
-        outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
         flag = resting.flags(found, whole, windows, chosen.centred)
         if chosen.repeats:
             if found.covariance is not None:
@@ -206,6 +208,7 @@ def retrieve_wind(
         if found.covariance is not None:
             flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
         if chosen.local:
+            outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
             flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
         if chosen.reach and checks:
             apart = unrelated([pixels1, pixels2], windows, chosen.reach > 1, noise)

@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.stats import chi2
 
 from lidar_mi.retrieval.vortices.covariance import model_error_of
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
@@ -29,8 +28,8 @@ _CLOSE, _STEPS = 0.5, 4
 # Error, in standard errors of all parameters together, that the last step may leave; the unfiltered
 # images are warped at most so often.
 _LEFT, _ROUNDS = 0.3, 3
-# Probability with which a start that is as certain as it says is found to be wrong.
-_REJECTED = 1e-6
+# Rms normalised difference of fit and start beyond which one of them is wrong.
+_REJECTED = 4.0
 
 
 class Found(NamedTuple):
@@ -133,7 +132,7 @@ def agrees(start: VortexPairFit, found: VortexPairFit) -> bool:
     scale = np.sqrt(np.diagonal(spread))
     reduced = np.linalg.pinv(spread / scale / scale[:, None], hermitian=True)
     square = float((off / scale) @ reduced @ (off / scale))
-    return square < chi2.isf(_REJECTED, len(off))
+    return square < _REJECTED**2 * len(off)
 
 
 def _displacement_error(start: VortexPairFit, make: Builder) -> float:
