@@ -88,3 +88,51 @@ def vortex_pair_images(
     images = [image + noise * random.standard_normal(image.shape) for image in images]
     fields = [data_array(a, y, z) for a in (*images, *wind(*grid))]
     return Pair(*fields, tuple(vortices), noise)
+
+
+def drifting_pair_images(
+    vortices: Sequence[Vortex],
+    mean_wind: tuple[float, float] = (0.0, 0.0),
+    noise: float = 0.0,
+    seed: int = 1,
+    columns: int = 219,
+    rows: int = 139,
+    replaced: float = 0.0,
+) -> Pair:
+    """Images DT / 2 before and after the vortices are where they are said to be.
+
+    The pair moves with the mean wind and the mean of the winds that each vortex has from the other;
+    the wind is steady in its frame.
+
+    Parameters
+    ----------
+    vortices : sequence of Vortex
+        Port, starboard.
+    mean_wind : (float, float)
+        v, w of the ambient air, m s^-1.
+    noise, seed, columns, rows
+        See `vortex_pair_images`.
+    replaced : float
+        Fraction of the texture's variance that is of other air in image 2.
+    """
+    y, z = axes(columns, rows, SPACING)
+    lateral, vertical = np.meshgrid(y, z)
+    mutual = [velocity([a], b.y, b.z) for a, b in (vortices, vortices[::-1])]
+    drift = np.mean(mutual, axis=0) + mean_wind
+
+    def wind(y, z):
+        v, w = velocity(vortices, y, z)
+        return v + mean_wind[0] - drift[0], w + mean_wind[1] - drift[1]
+
+    air, other = (plane_waves([seed, k], CORRELATION_LENGTH, SPACING) for k in (0, 1))
+    random = np.random.default_rng([seed, 2])
+    images = []
+    for time, new in ((-DT / 2, 0.0), (DT / 2, replaced)):
+        place = origin(wind, lateral - drift[0] * time, vertical - drift[1] * time, time, 4)
+        image = 1 + np.sqrt(1 - new) * (texture(air, *place, CONTRAST) - 1)
+        if new:
+            image += np.sqrt(new) * (texture(other, *place, CONTRAST) - 1)
+        images.append(image + noise * random.standard_normal(image.shape))
+    v, w = wind(lateral, vertical)
+    fields = [data_array(a, y, z) for a in (*images, v + drift[0], w + drift[1])]
+    return Pair(*fields, tuple(vortices), noise)

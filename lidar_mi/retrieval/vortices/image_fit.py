@@ -12,6 +12,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
+from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.beam_times import checked_times
@@ -128,6 +129,8 @@ def fit_vortices(
     dt = positive("dt", dt)
     (image1, image2), noise = checked_stack([image1, image2], noise)
     check_profile(profile)
+    if start is not None and start.profile != profile:
+        raise InputError(f"start.profile: {start.profile!r} is not {profile!r}, that of the fit")
     tau = checked_times(times, [image1, image2], dt)
     axes = [image1[name].values.astype(float) for name in ("z", "y")]
     pixels = [on_device(image, device) for image in (image1, image2)]
@@ -217,9 +220,10 @@ def _checked(
     """The pair of a solution in images, with its errors; `misfit` is that without whitening."""
     covariance = parameter_covariance(best, error, images.whitening.excess)
     valid = misfit.valid
-    # image 1 at its places, and image 2 at its own: the residual with image 1 added
+    # image 1 at its places, and image 2 at its own: the residual with image 1 times its gain
     first = -misfit.jacobian[10]
-    second = misfit.residual + first
+    gain = best.parameters[10:13].to(first)
+    second = misfit.residual - torch.tensordot(gain, misfit.jacobian[10:13], 1)
     match = float(torch.corrcoef(torch.stack([first[valid], second[valid]]))[0, 1])
     known = make.noise > 0
     chi2 = float((misfit.residual.square() / misfit.scatter)[valid].mean()) if known else np.nan

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from kornia.filters import gaussian_blur2d
 
-from lidar_mi.retrieval.velocimetry.band_limit import Filter, best_filter
+from lidar_mi.retrieval.velocimetry.band_limit import Filter, best_filter, checked_noise
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.velocimetry.warping import (
@@ -216,6 +216,7 @@ class Builder:
 
     def filter(self, noise: float | None, mismatch: torch.Tensor | None = None) -> Filter:
         """The filter of both images, as `warping.band_limited` chooses it."""
+        checked_noise(noise)
         settings = FilterSettings()
         sizes = transform_sizes(self.pair.shape[1:], settings)
         return best_filter(self.pair, sizes, settings, noise, mismatch)
