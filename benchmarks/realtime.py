@@ -87,7 +87,7 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
 
 
 def slab(number: int, of: int, columns: int, rows: int) -> Pair:
-    """Images of a slab with the pair at that time: it drifts by 1 m/s and 1 m/s down, and decays."""
+    """Images of a slab with the pair at that time: it drifts, descends and decays."""
     seconds = number / RATE
     middle = (of / RATE) / 2
     y, z = MEAN_WIND[0] * (seconds - middle) / 2, 4.0 - 8.0 * number / of
