@@ -89,8 +89,8 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
 def slab(number: int, of: int, columns: int, rows: int) -> Pair:
     """Images of a slab with the pair at that time: it drifts, descends and decays."""
     seconds = number / RATE
-    middle = (of / RATE) / 2
-    y, z = MEAN_WIND[0] * (seconds - middle) / 2, 4.0 - 8.0 * number / of
+    later = seconds - of / RATE / 2
+    y, z = 0.75 * later, -0.8 * later
     decay = np.exp(-seconds / 60.0)
     vortices = [
         Vortex(side * CIRCULATION * decay, CORE_RADIUS, y + side * SEPARATION / 2, z, "lamb_oseen")
