@@ -75,6 +75,7 @@ def page(
     settings: Mapping[str, Mapping],
     metrics: Mapping[str, Mapping[str, float]],
     drawn: Sequence[Drawn],
+    answers: Mapping[str, Sequence[str]],
 ) -> str:
     """Settings, metrics and figures of the variants of a study, as self-contained HTML.
 
@@ -86,6 +87,8 @@ def page(
         As nested sections, with all defaults.
     metrics : mapping of variant to metrics
     drawn : sequence of Drawn
+    answers : mapping of variant to list of str
+        From `lidar_mi.assessment.report.answer.answer`.
     """
     changed = [
         (key, "", [setting(value) for value in values])
@@ -99,6 +102,7 @@ def page(
         name=name,
         version=__version__,
         variants=list(settings),
+        answers=answers,
         images=[(one.title, one.caption, embedded(one.path)) for one in drawn],
         tables=[
             ("Results", legend, list(results(metrics))),

@@ -36,7 +36,7 @@ class Chapter(NamedTuple):
     drawn : sequence of Drawn
     numbers : Tables
     verdict : Tables, optional
-        Compliance with the requirements; placed before all chapters' numbers.
+        Compliance with the requirements; placed on the first page.
     vectors : dict, optional
         `vector_map.map_data` with a ``title``, for an interactive map of the vectors.
     """
@@ -56,6 +56,8 @@ def page(
     metrics: Mapping[str, float],
     chapters: Sequence[Chapter],
     warnings: Sequence[str] = (),
+    answer: Sequence[str] = (),
+    data: Sequence[str] = (),
 ) -> str:
     """The report as HTML, with embedded images; all text of the user is escaped.
 
@@ -71,22 +73,32 @@ def page(
     chapters : sequence of Chapter
     warnings : sequence of str
         Those that matter for the results.
+    answer : sequence of str
+        From `lidar_mi.assessment.report.answer.answer`.
+    data : sequence of str
+        Names of files beside the report, which links to them.
     """
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]
         images = dict(
             zip(drawn, pool.map(lambda figure: embedded(figure.path), drawn), strict=True)
         )
+    shown = [[(d.title, d.caption, images[d]) for d in chapter.drawn] for chapter in chapters]
+    first = next((figures for figures in shown if figures), [])
+    overview, first[:1] = first[:1], []
     return template("report.html").render(
         name=experiment.name,
         simulated=simulated(experiment, versions),
         resolved=resolved,
         metrics={key: _rounded(key, value) for key, value in metrics.items()},
+        answer=answer,
+        overview=overview,
+        data=data,
         warnings=[text.rstrip(".") for text in warnings],
         script=Markup(files("lidar_mi.assessment.report").joinpath("vector_map.js").read_text()),
         chapters=[
-            chapter._asdict() | {"images": [(d.title, d.caption, images[d]) for d in chapter.drawn]}
-            for chapter in chapters
+            chapter._asdict() | {"images": figures}
+            for chapter, figures in zip(chapters, shown, strict=True)
         ],
     )
 
