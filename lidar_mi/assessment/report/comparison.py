@@ -9,7 +9,7 @@ from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import RENDERED, Source, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, READERS
 from lidar_mi.assessment.report.digits import fixed, three
-from lidar_mi.assessment.report.page import embedded, template
+from lidar_mi.assessment.report.page import picture, script, template
 from lidar_mi.io.yaml import to_yaml
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 
@@ -103,7 +103,8 @@ def page(
         version=__version__,
         variants=list(settings),
         answers=answers,
-        images=[(one.title, one.caption, embedded(one.path)) for one in drawn],
+        images=[picture(one) for one in drawn],
+        stacking=script("panels.js"),
         tables=[
             ("Results", legend, list(results(metrics))),
             ("Settings that differ", "In SI units; a dash: the variant has no such key.", changed),

@@ -4,7 +4,6 @@ import base64
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
-from pathlib import Path
 from typing import NamedTuple
 
 import jinja2
@@ -14,7 +13,7 @@ from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.assessment.report.digits import percent
-from lidar_mi.io.images import as_webp
+from lidar_mi.io.images import as_webp, panel_cuts
 
 
 class Tables(NamedTuple):
@@ -23,6 +22,15 @@ class Tables(NamedTuple):
     heading: str
     legend: str
     tables: Sequence[tuple[str, Sequence[str], Sequence[tuple[str, str, Sequence[str]]]]]
+
+
+class Picture(NamedTuple):
+    """A figure as a data URL, and the fractions of its width at which its panels part."""
+
+    title: str
+    caption: str
+    source: str
+    cuts: str
 
 
 class Chapter(NamedTuple):
@@ -80,10 +88,8 @@ def page(
     """
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]
-        images = dict(
-            zip(drawn, pool.map(lambda figure: embedded(figure.path), drawn), strict=True)
-        )
-    shown = [[(d.title, d.caption, images[d]) for d in chapter.drawn] for chapter in chapters]
+        images = dict(zip(drawn, pool.map(picture, drawn), strict=True))
+    shown = [[images[figure] for figure in chapter.drawn] for chapter in chapters]
     first = next((figures for figures in shown if figures), [])
     overview, first[:1] = first[:1], []
     return template("report.html").render(
@@ -95,7 +101,8 @@ def page(
         overview=overview,
         data=data,
         warnings=[text.rstrip(".") for text in warnings],
-        script=Markup(files("lidar_mi.assessment.report").joinpath("vector_map.js").read_text()),
+        script=script("vector_map.js"),
+        stacking=script("panels.js"),
         chapters=[
             chapter._asdict() | {"images": figures}
             for chapter, figures in zip(chapters, shown, strict=True)
@@ -112,9 +119,16 @@ def template(name: str) -> jinja2.Template:
     ).get_template(name)
 
 
-def embedded(path: Path) -> str:
-    """An image as a data URL: lossless WebP, two thirds of its PNG."""
-    return f"data:image/webp;base64,{base64.b64encode(as_webp(path)).decode()}"
+def picture(figure: Drawn) -> Picture:
+    """A figure for a page: lossless WebP, two thirds of its PNG."""
+    source = f"data:image/webp;base64,{base64.b64encode(as_webp(figure.path)).decode()}"
+    cuts = " ".join(f"{cut:.4f}" for cut in panel_cuts(figure.path))
+    return Picture(figure.title, figure.caption, source, cuts)
+
+
+def script(name: str) -> Markup:
+    """A program of this package, for a page."""
+    return Markup(files("lidar_mi.assessment.report").joinpath(name).read_text())
 
 
 def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
