@@ -14,7 +14,8 @@ EXAMPLES = (
 def check(experiment: ExperimentName, set_: Changes = None) -> None:
     """Check whether an experiment can be run; show its instruments and the observed air in numbers.
 
-    Reads the wake, the scattering and the requirements as run does, and writes nothing.
+    Reads the wake, the scattering and the requirements as run does, and writes nothing. A probe of
+    about a second tells how long the run will take on this machine.
     """
     from lidar_mi.experiment import reading as config
     from lidar_mi.experiment.check import sections
@@ -23,7 +24,9 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
     asked = config.load_variants(path, changes) or {"": config.load(path, changes)}
     with progress() as notice:
         found = [
-            section for one in asked.values() for section in sections(one, path.parent, notice)
+            section
+            for one in asked.values()
+            for section in sections(one, path.parent, notice, timed=True)
         ]
     for title, rows in found:
         print_rows(title, rows)
