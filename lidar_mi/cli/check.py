@@ -14,7 +14,8 @@ EXAMPLES = (
 def check(experiment: ExperimentName, set_: Changes = None) -> None:
     """Check whether an experiment can be run; show its instruments and the observed air in numbers.
 
-    Reads the wake, the scattering and the requirements as run does, and writes nothing.
+    Reads the wake, the scattering and the requirements as run does, and writes nothing. A probe of
+    about a second tells how long the run will take on this machine.
     """
     from lidar_mi.encounter.check import sections as flight_sections
     from lidar_mi.experiment import reading as config
@@ -29,7 +30,7 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
             for section in (
                 flight_sections(one.read_from(path.parent), notice)
                 if one.encounter
-                else sections(one, path.parent, notice)
+                else sections(one, path.parent, notice, timed=True)
             )
         ]
     for title, rows in found:

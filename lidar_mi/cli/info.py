@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from lidar_mi.cli.options import quantity
-from lidar_mi.cli.terminal import output, print_rows, print_table
+from lidar_mi.cli.terminal import output, print_answer, print_rows, print_table
 from lidar_mi.progress import progress
 
 CAMPAIGN = "campaign.yaml"
@@ -43,7 +43,7 @@ def info(
     from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment.describe import sections, value_at
     from lidar_mi.experiment.resumable_folder import failure, read_metrics, read_record
-    from lidar_mi.experiment.study import RECORD
+    from lidar_mi.experiment.study import RECORD, answers
 
     if (Path(what) / CAMPAIGN).is_file():
         from lidar_mi.campaign.status import campaign_status
@@ -60,9 +60,14 @@ def info(
                 notice,
             )
         )
+    folder = Path(what)
+    if folder.is_dir():
+        for part, answer in answers(folder):
+            if part:
+                output.print(f"\n{part}", style="bold")
+            print_answer(answer)
     for title, rows in found:
         print_rows(title, rows)
-    folder = Path(what)
     if folder.is_dir():
         metrics = read_metrics(folder)
         if reason := failure(folder):

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from lidar_mi.cli.options import Changes, ExperimentName, Variant
-from lidar_mi.cli.terminal import output, print_table
+from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
 
@@ -50,6 +50,7 @@ def run(
     folder = out or Path("outputs") / loaded.name
     with progress() as notice:
         done = start(loaded, folder, beside=path.parent, overwrite=overwrite, notice=notice)
+    print_answer(done.answer)
     for table in summary(done.metrics, _averaged(loaded)):
         print_table(table)
     output.print(f"report   {folder / 'report.html'}")
@@ -63,12 +64,16 @@ def run(
 def _run_study(variants, out, path, overwrite, start) -> None:
     """Variants of one experiment, each in its own folder, and their comparison."""
     from lidar_mi.assessment.report.summary import summary
+    from lidar_mi.experiment.resumable_folder import read_answer
 
     first, experiment = next(iter(variants.items()))
     name = experiment.name.removesuffix(f".{first}")
     folder = out or Path("outputs") / name
     with progress() as notice:
         metrics = start(name, variants, folder, path.parent, overwrite, notice)
+    for variant in metrics:
+        output.print(f"\n{variant}", style="bold")
+        print_answer(read_answer(folder / variant))
     for variant, found in metrics.items():
         output.print(f"\n{variant}", style="bold")
         for table in summary(found, _averaged(variants[variant])):

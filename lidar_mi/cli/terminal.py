@@ -11,6 +11,12 @@ output = Terminal()
 errors = Terminal(stderr=True)
 
 
+def print_answer(sentences: Sequence[str]) -> None:
+    """What a run found, a sentence a line."""
+    for sentence in sentences:
+        output.print(sentence, soft_wrap=True)
+
+
 def print_rows(title: str, rows: Sequence[Sequence[str]]) -> None:
     """A table without a head: names and values, line by line."""
     print_table(Table(title, rows))

@@ -10,8 +10,9 @@ from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import relative_divergence, sense_of_rotation
 from lidar_mi.assessment.metrics.requirements import look_ahead
 from lidar_mi.experiment import run as experiment
+from lidar_mi.experiment.cost import cost
 from lidar_mi.experiment.describe import Section
-from lidar_mi.experiment.forecast import forecast, lines_seconds
+from lidar_mi.experiment.forecast import forecast
 from lidar_mi.experiment.light_budget import light_budget
 from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.schema import Experiment
@@ -26,7 +27,7 @@ from lidar_mi.retrieval.method_names import ImageMethod
 
 
 def sections(
-    asked: Experiment, beside: str | Path = ".", notice: Notice = silent
+    asked: Experiment, beside: str | Path = ".", notice: Notice = silent, *, timed: bool = False
 ) -> Iterator[Section]:
     """Titled tables of an experiment's instruments and the observed air; nothing is written.
 
@@ -37,6 +38,8 @@ def sections(
         Folder in which files named by the experiment are searched first.
     notice : callable
         Called with the name of the running step.
+    timed : bool
+        With the time of the run, which takes a probe of about a second.
 
     Raises
     ------
@@ -56,6 +59,9 @@ def sections(
         yield _sensor(asked, ahead["requirements"])
         if asked.sensor.timing:
             yield "scan of the Doppler lidar", _timing(asked, lines_schedule(asked, beside))
+    if timed:
+        notice("timing a few samples and a retrieval", None)
+        yield "cost of the run, to a factor of 2", _cost(asked, ahead)
     if prepared.warnings:
         yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
 
@@ -90,7 +96,6 @@ def _backscatter(
         ),
         ("time between the images", f"{platform.dt:g} s"),
         *_light(asked, truth, plan, air),
-        *_forecast(asked, plan),
     ]
     if not asked.volume:
         rows += _displacements(asked, wind, pixel)
@@ -117,13 +122,24 @@ def _light(
     return rows
 
 
-def _forecast(asked: Experiment, plan: ScanPlan) -> list[tuple[str, str]]:
-    """Memory and time, to a factor of two."""
-    expected, allowed = forecast(asked, plan.y.size * plan.z.size), ceiling(asked.render.memory)
-    return [
-        ("memory", f"about {expected.memory / 1e9:.2g} GB, at most {allowed / 1e9:.3g} GB"),
-        ("time on one core", f"about {duration(expected.seconds)}, figures not counted"),
-    ]
+def _cost(asked: Experiment, ahead: Mapping) -> list[tuple[str, str]]:
+    """Time of the parts of a run on one core of this machine, and its memory."""
+    found = cost(asked, ahead)
+    names = {
+        "rendering": "rendering (all cores share it)",
+        "images": "wind from the images",
+        "rings": "rings of the Doppler lidar",
+        "lines": "lines of sight",
+        "figures": "figures and report",
+    }
+    parts = found._asdict()
+    rows = [(text, f"about {duration(parts[key])}") for key, text in names.items() if parts[key]]
+    rows.append(("all, on one core", f"about {duration(found.total)}"))
+    if asked.wake:
+        plan = ahead["plans"][0]
+        expected, allowed = forecast(asked, plan.y.size * plan.z.size), ceiling(asked.render.memory)
+        rows.append(("memory", f"about {expected / 1e9:.2g} GB, at most {allowed / 1e9:.3g} GB"))
+    return rows
 
 
 def duration(seconds: float) -> str:
@@ -179,7 +195,6 @@ def _sensor(asked: Experiment, tables: Mapping) -> Section:
     return "both as one sensor", [
         ("lines of sight", f"{count}, {sensor.pulses} pulses each{flat}"),
         ("pulses per second", f"{count * sensor.pulses * sensor.slabs_per_second:g}"),
-        ("time of the lines on one core", f"about {duration(lines_seconds(asked))}"),
         ("v and w from", sensor.method),
         ("compliance with", ", ".join(" ".join(key) for key in tables) or "no requirements"),
     ]

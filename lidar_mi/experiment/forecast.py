@@ -1,8 +1,7 @@
-"""Estimates before a run: its memory, its time, and whether its images will have light."""
+"""Estimates before a run: its memory, and whether its images will have light."""
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
@@ -28,44 +27,18 @@ PER_VECTOR = 400
 """Bytes of a vector, per method and source: 25 variables, twice where they are concatenated."""
 PER_VOXEL = 200
 """Bytes of a voxel of a volume whose wind is retrieved."""
-SAMPLES_PER_SECOND = 8e6
-"""Times scattering orders, on one core (wake_backscatter on a core of 2024)."""
-VECTORS_PER_SECOND = 15e3
-"""On one core, by correlation of windows of 8 in 16 pixels; other methods are within a factor 3."""
-RING_PIXELS_PER_SECOND = 3e6
-"""On one core: noise drawn for a pixel of the rings, and fitted (wake_sensor)."""
 SINGLE = 1e-17
 """S0 whose squared error is the smallest number of single precision."""
 CONTRIBUTIONS = 5
 """Contributing samples required per pixel, on average: 0.7 % of all pixels then have none."""
 
 
-class Forecast(NamedTuple):
-    """Memory of a run in bytes, time of its rendering and retrieval on one core in s."""
-
-    memory: float
-    seconds: float
-
-
-def forecast(experiment: Experiment, beams: int) -> Forecast:
-    """Memory and time of the backscatter lidar's part of a run, to a factor of two."""
+def forecast(experiment: Experiment, beams: int) -> float:
+    """Memory of a run in bytes, to a factor of two."""
     render, gates = experiment.render, experiment.scan.gate_count
     samples = beams * max(render.samples_per_beam, 2 * gates)
     at_once = samples_at_once(render.samples_per_pass, render.memory)
-    memory = PROGRAM + _per_beam(experiment, gates) * beams + PER_SAMPLE * min(samples, at_once)
-    vectors = _vectors_per_beam(experiment) * beams
-    seconds = 2 * samples * render.max_order / SAMPLES_PER_SECOND + vectors / VECTORS_PER_SECOND
-    return Forecast(memory, seconds)
-
-
-def lines_seconds(experiment: Experiment) -> float:
-    """Time on one core, s, to measure all lines of sight, to a factor of two.
-
-    The pulses of a line are summed before they are evaluated, however many they are.
-    """
-    directions, camera = experiment.sensor.directions, experiment.doppler.camera
-    pixels = camera.width * camera.height
-    return directions.columns * directions.rows * pixels / RING_PIXELS_PER_SECOND
+    return PROGRAM + _per_beam(experiment, gates) * beams + PER_SAMPLE * min(samples, at_once)
 
 
 def _per_beam(experiment: Experiment, gates: int) -> float:
@@ -113,7 +86,7 @@ def check_size(experiment: Experiment, columns: int, rows: int) -> None:
             f"{most}, as an EXR file has at most {MOST_LAYERS} layers"
         )
     check_memory(
-        forecast(experiment, columns * rows).memory,
+        forecast(experiment, columns * rows),
         experiment.render.memory,
         f"scan: {columns} x {rows} beams x {gates} gates",
         "a larger wake.spacing, retrieval.stride or fewer gates",

@@ -95,10 +95,10 @@ def _sensor(results: Results) -> dict[str, float]:
 def judged(
     experiment: Experiment, results: Results, metrics: Mapping[str, float]
 ) -> list[tuple[RequirementTable, list[Finding]]]:
-    """The sensor compared with every requirement table."""
+    """The sensor compared with every requirement table; empty where there are none."""
     return [
         (table, judge(table, measured(experiment, metrics, table)))
-        for table in results["requirements"].values()
+        for table in results.get("requirements", {}).values()
     ]
 
 

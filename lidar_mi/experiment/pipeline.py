@@ -95,7 +95,10 @@ def has_vortices_without_sensor(experiment: Experiment) -> bool:
 
 def has_vortices(experiment: Experiment) -> bool:
     """Whether vortex pairs are fitted."""
-    return has_sensor(experiment) or has_vortices_without_sensor(experiment)
+    asked = ImageMethod.VORTEX_FIT in experiment.retrieval.methods
+    # the wake of a turbine has no pair
+    pair = has_sensor(experiment) and (asked or not experiment.wake.turbine)
+    return pair or has_vortices_without_sensor(experiment)
 
 
 def _quiet(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -10,16 +10,22 @@ from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_di
 from lidar_mi.experiment.forecast import overlap
 from lidar_mi.experiment.light_budget import LEAST_OVERLAP
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.truth import Truth
+from lidar_mi.experiment.truth import Flows, Truth
 from lidar_mi.instrument.scan import ScanPlan
 
 
 def image_remarks(
-    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], *_: object
+    experiment: Experiment,
+    truth: Truth,
+    plans: Sequence[ScanPlan],
+    air: object = None,
+    flows: Flows | None = None,
 ) -> list[str]:
     """Warnings of an experiment with a wake, a line each; what else images need has none."""
     flow = _of_the_flow(truth.wind) if experiment.wake.file else []
-    return [*flow, *_of_the_light(experiment, plans[0]), *_of_the_pattern(experiment)]
+    said = flows[0].attrs.get("interpolated") if flows else None
+    grid = [f"wake.file: {said}"] if said else []
+    return [*grid, *flow, *_of_the_light(experiment, plans[0]), *_of_the_pattern(experiment)]
 
 
 def _of_the_flow(wind: xr.Dataset) -> list[str]:

@@ -53,7 +53,9 @@ def chapters(
     found: list[Chapter] = []
     seconds: dict[str, float] = defaultdict(float)
     log("drawing figures")
-    for result, step, chapter in _CHAPTERS:
+    # the wind behind a turbine is mostly u, which both lidars measure together
+    first = "lines" if experiment.wake and experiment.wake.turbine else None
+    for result, step, chapter in sorted(_CHAPTERS, key=lambda one: one[0] != first):
         if results.get(result) is not None:
             start = time.perf_counter()
             found.append(chapter(experiment, results, metrics, folder, log))
@@ -104,7 +106,11 @@ def _sensor(experiment, results, metrics, folder, log) -> Chapter:
     found, cores = results["wind3d"], results["cores"]
     shown = found if metrics["sensor.vectors"] else None
     drawn = sensor_figures.draw_all(folder, shown, results["lines"], cores, log)
-    vectors = None if found is None else map_data(found, COMPONENTS, cores)
+    vectors = (
+        None
+        if found is None
+        else map_data(found, COMPONENTS, cores, "u" if experiment.wake.turbine else "")
+    )
     verdicts = judged(experiment, results, metrics)
     return sensor_chapter(experiment, metrics, verdicts, drawn, vectors)
 

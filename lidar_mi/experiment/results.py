@@ -11,8 +11,10 @@ from rich.console import Console
 
 from lidar_mi.assessment.figures.backscatter import overview
 from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.report.answer import answer
 from lidar_mi.assessment.report.summary import summary
 from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.measure import judged
 from lidar_mi.experiment.resumable_folder import REPORT
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.vortices import VortexFits
@@ -94,8 +96,16 @@ class Run(Tabular):
         """Vortex pairs fitted to images and to wind vectors."""
         return self.results.get("vortices")
 
+    @property
+    def answer(self) -> list[str]:
+        """Errors and verdicts with their reasons, in sentences; empty until everything is done."""
+        if not self.metrics:
+            return []
+        verdicts = judged(self.experiment, self.results, self.metrics)
+        return answer(self.experiment, self.metrics, verdicts)
+
     def tables(self) -> list[Table]:
-        """The experiment and its main errors."""
+        """The answer, the experiment and its main errors."""
         doppler = self.experiment.doppler
         seconds = sum(self.seconds.values())
         rows = [("experiment", self.experiment.name), ("computed in", f"{seconds:.1f} s")]
@@ -108,7 +118,8 @@ class Run(Tabular):
             replace(pair.tables()[0], title=f"vortex pair fitted to {origin}")
             for origin, pair in fits.items()
         ]
-        return [Table("run", rows), *summary(self.metrics, averaged), *vortices]
+        first = [Table("answer", [(line,) for line in self.answer])] if self.metrics else []
+        return [*first, Table("run", rows), *summary(self.metrics, averaged), *vortices]
 
     def thumbnail(self) -> bytes | None:
         """Image of the backscatter lidar and cross-flow wind, where there are any, as PNG."""

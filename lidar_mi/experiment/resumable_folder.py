@@ -27,12 +27,14 @@ from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.folder import is_free, locked, make_folder
 from lidar_mi.io.json import read_json, to_json
 from lidar_mi.io.netcdf import write_netcdf
-from lidar_mi.io.text import encoded, write_text
+from lidar_mi.io.text import encoded, read_text, write_text
 from lidar_mi.io.vortex_file import write_vortices
 from lidar_mi.io.yaml import read_yaml, to_yaml
 from lidar_mi.rendering.phase import table_files
 
 RECORD, LOG, METRICS, REPORT = "experiment.yaml", "log.txt", "metrics.json", "report.html"
+SUMMARY = "summary.txt"
+"""The answer of a run, a sentence a line."""
 FIGURES = "figures"
 IMAGES = tuple(f"{name}.exr" for name in rendering.IMAGES)
 RENDERED = (*IMAGES, "fringes_*.exr")
@@ -115,7 +117,7 @@ class RunFolder:
         """Write the record; keep the files of an earlier run that are of this experiment."""
         folder, marker = self.path, self.path / RECORD
         images = [path for pattern in RENDERED for path in folder.glob(pattern)]
-        results = [folder / name for name in (METRICS, REPORT, *RESULTS.values())]
+        results = [folder / name for name in (METRICS, REPORT, SUMMARY, *RESULTS.values())]
         results = [path for path in results if path.exists()] + [*folder.glob(f"*{BATCHES}")]
         other = _difference(read_record(folder), self.record) if marker.is_file() else None
         foreign = [path for path in images if self._is_foreign(path)]
@@ -142,7 +144,7 @@ class RunFolder:
     def _refuse_inputs(self, *, changed: bool) -> None:
         """Do not overwrite files that this run reads."""
         here = self.path.resolve()
-        written = {METRICS, REPORT, LOG, *RESULTS.values()}
+        written = {METRICS, REPORT, SUMMARY, LOG, *RESULTS.values()}
         for field, path in self._inputs.items():
             rendered = any(path.match(pattern) for pattern in RENDERED)
             if path.resolve().parent == here and (path.name in written or rendered):
@@ -192,9 +194,20 @@ class RunFolder:
             self._keep_noise(value)
         write_result(self.path, name, value, self._experiment.name, self.made_by)
 
-    def keep_verdict(self, metrics: Mapping[str, float], page: str) -> None:
-        """Write report and metrics: the run is complete. The record has the metrics' checksum."""
-        write_verdict(self.path, self.record, metrics, page)
+    def data_files(self) -> list[str]:
+        """Names of the files beside the report, for links to them."""
+        there = [path for pattern in RENDERED for path in self.path.glob(pattern)]
+        there += [self.path / name for name in RESULTS.values() if (self.path / name).exists()]
+        return [*sorted(path.name for path in there), METRICS, SUMMARY, RECORD, LOG]
+
+    def keep_verdict(
+        self, metrics: Mapping[str, float], page: str, answer: Sequence[str] = ()
+    ) -> None:
+        """Write report, answer and metrics: the run is complete.
+
+        The record has the metrics' checksum.
+        """
+        write_verdict(self.path, self.record, metrics, page, answer)
 
     def _keep_noise(self, scans: list[xr.Dataset]) -> None:
         """Add noisy images to the files of those without noise."""
@@ -204,14 +217,20 @@ class RunFolder:
 
 
 def write_verdict(
-    folder: Path, record: Mapping[str, Any], metrics: Mapping[str, float], page: str
+    folder: Path,
+    record: Mapping[str, Any],
+    metrics: Mapping[str, float],
+    page: str,
+    answer: Sequence[str] = (),
 ) -> None:
-    """Write report and metrics of a folder, last the metrics: whatever is in it is complete."""
+    """Write report, answer and metrics of a folder, last the metrics: then it is complete."""
     text = to_json(metrics)
     (folder / METRICS).unlink(missing_ok=True)
     checked = {**record, "metrics": hashlib.sha256(text.encode()).hexdigest()}
     write_text(folder / RECORD, to_yaml(checked))
     write_text(folder / REPORT, page)
+    if answer:
+        write_text(folder / SUMMARY, "".join(f"{line}\n" for line in answer))
     write_text(folder / METRICS, text)
 
 
@@ -378,6 +397,15 @@ def read_metrics(folder: str | Path) -> dict[str, float] | None:
         if checksum and checksum != _checksum(path):
             raise InputError(f"{path}: was changed or copied here; expected the metrics of its run")
     return {current_name(key): value for key, value in metrics.items()}
+
+
+def read_answer(folder: str | Path) -> list[str]:
+    """The answer of the run in a folder, see `lidar_mi.assessment.report.answer`.
+
+    Empty: not complete, or of an earlier version.
+    """
+    path = Path(folder) / SUMMARY
+    return read_text(path, "the summary of a run").splitlines() if path.is_file() else []
 
 
 def _is_number(value: object) -> bool:

@@ -211,5 +211,14 @@ def _report(run: Run, kept: RunFolder) -> None:
     run.seconds |= seconds
     run.metrics |= {timing_key(step): round(value, 3) for step, value in seconds.items()}
     resolved, versions = dump(run.experiment), kept.record["versions"]
-    html = page(run.experiment, resolved, versions, run.metrics, made, run.warnings)
-    kept.keep_verdict(run.metrics, html)
+    html = page(
+        run.experiment,
+        resolved,
+        versions,
+        run.metrics,
+        made,
+        run.warnings,
+        run.answer,
+        kept.data_files(),
+    )
+    kept.keep_verdict(run.metrics, html, run.answer)

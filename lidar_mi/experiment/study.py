@@ -22,6 +22,7 @@ from lidar_mi.experiment.resumable_folder import (
     LOG,
     METRICS,
     REPORT,
+    read_answer,
     read_metrics,
     read_record,
     refuse_strangers,
@@ -71,10 +72,10 @@ def run(
     with locked(folder):
         refuse_strangers(folder, RECORD, "study's folder")
         write_text(folder / RECORD, to_yaml({"name": name, "variants": list(variants)}))
-        metrics, rows = {}, {}
+        metrics, rows, found = {}, {}, {}
         for key in variants:
             done = experiment.complete(ready.pop(key), folder / key, overwrite=overwrite)
-            metrics[key] = done.metrics
+            metrics[key], found[key] = done.metrics, done.answer
             # a variant without a wake has rings only, which the table compares
             if done.wind is not None:
                 rows[key] = _shown(done)
@@ -85,7 +86,7 @@ def run(
             f"{key}.{name}": value for key, one in metrics.items() for name, value in one.items()
         }
         write_json(folder / METRICS, merged)
-        write_text(folder / REPORT, page(name, settings, metrics, drawn))
+        write_text(folder / REPORT, page(name, settings, metrics, drawn, found))
         log("done")
     return metrics
 
@@ -123,6 +124,15 @@ def read_study(
     records = {key: read_record(folder / key) if started[key] else None for key in variants}
     metrics = {key: read_metrics(folder / key) for key in variants}
     return name, records, {key: one for key, one in metrics.items() if one is not None}
+
+
+def answers(folder: str | Path) -> list[tuple[str, list[str]]]:
+    """Answers of the variants in a study's folder, or of a run's own, with an empty name."""
+    folder = Path(folder)
+    if not (folder / RECORD).is_file():
+        return [("", read_answer(folder))]
+    _, records, _ = read_study(folder)
+    return [(variant, read_answer(folder / variant)) for variant in records]
 
 
 def _of(variant: str, notice: Notice) -> Notice:

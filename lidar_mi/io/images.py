@@ -333,3 +333,34 @@ def _grey(file):
 
 def _short(error: Exception) -> str:
     return " ".join(str(error).split())[:120]
+
+
+def panel_cuts(path: str | Path) -> list[float]:
+    """Where the panels of a figure side by side part, as fractions of its width.
+
+    A figure of n equal columns parts at white gaps of its full height near k / n; the smallest n
+    up to 4 is taken. Empty: one column, or panels that something spans.
+
+    Raises
+    ------
+    InputError
+        No readable image.
+    """
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            pixels = np.asarray(image.convert("L"))
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise InputError(f"{path}: no readable image ({_short(error)})") from None
+    white = np.flatnonzero((pixels > 250).all(0)) / max(pixels.shape[1], 1)
+    # one panel is about as high as it is wide
+    most = min(4, round(2 * pixels.shape[1] / max(pixels.shape[0], 1)))
+    for columns in range(2, most + 1):
+        wanted = [k / columns for k in range(1, columns)]
+        near = [white[abs(white - cut) < 0.1 / columns] for cut in wanted]
+        if all(gap.size for gap in near):
+            return [
+                float(gap[abs(gap - cut).argmin()]) for gap, cut in zip(near, wanted, strict=True)
+            ]
+    return []

@@ -9,6 +9,7 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.io.netcdf import load_variable, open_netcdf
+from lidar_mi.io.regrid import even_axis, interpolated, is_even, statement
 from lidar_mi.units import parse_units
 
 _DIMENSIONS = ("time", "x", "y", "z")
@@ -22,10 +23,6 @@ _VARIABLES = {
 _REQUIRED = ("v", "w")
 # Axes and components, of which a file may have the opposite sign.
 _DIRECTED = ("x", "y", "z", "u", "v", "w")
-
-# Largest deviation of a step from the mean step, in steps: float32 axes a few kilometres from
-# their origin reach 5e-4.
-_UNEVEN = 1e-3
 
 
 def _scale_to(variable: xr.DataArray, target: str, name: str, path: Path) -> float:
@@ -116,7 +113,7 @@ def _pick_time(data, name, time, path):
 
 
 def _axis(data, name, ours, path, sign):
-    """The axis in metres, ascending and exact, and whether the file's runs the other way."""
+    """The axis in metres, ascending, exact if it is even, and whether the file's descends."""
     if name not in data.variables:
         raise InputError(
             f"{path}: dimension {name!r} ({ours}) has no values; allowed: a coordinate "
@@ -132,16 +129,17 @@ def _axis(data, name, ours, path, sign):
         )
     if values.size == 1:
         return values, False
-    exact = np.linspace(values[0], values[-1], values.size)
-    step = exact[1] - exact[0]
-    off = np.abs(np.diff(values) - step)
-    if step == 0 or off.max() > _UNEVEN * abs(step):
-        worst = int(off.argmax())
+    steps = np.diff(values)
+    if not (np.all(steps > 0) or np.all(steps < 0)):
+        worst = int(np.argmin(steps * np.sign(values[-1] - values[0])))
         raise InputError(
-            f"{path}: axis {name!r} is not uniform, the step after index {worst} is "
-            f"{values[worst + 1] - values[worst]:g} m, the mean {step:g} m; allowed: equal steps"
+            f"{path}: axis {name!r} turns back, the step after index {worst} is "
+            f"{steps[worst]:g} m; allowed: values that only rise or only fall"
         )
-    return (exact[::-1], True) if step < 0 else (exact, False)
+    falls = bool(steps[0] < 0)
+    values = values[::-1] if falls else values
+    exact = np.linspace(values[0], values[-1], values.size)
+    return (exact if is_even(values) else values), falls
 
 
 def _plane_index(axis, x, path, name):
@@ -183,7 +181,8 @@ def read_wake(
 
     The file's variables lie on (time, x, y, z) in any order; time and x may be missing (a slab
     gets one x plane, at its scalar coordinate or at 0). Descending axes are turned round, units
-    are converted; nothing is interpolated.
+    are converted. Stretched axes and staggered variables are interpolated to even nodes, see
+    `lidar_mi.io.regrid`; the attribute ``interpolated`` then states with which error.
 
     Parameters
     ----------
@@ -213,8 +212,8 @@ def read_wake(
     ------
     InputError
         Naming file and variable: unreadable, missing, wrong dims or units, values that are not
-        finite, a tracer or aerosol that is asked for and negative somewhere, axes that are not
-        uniform, a time or plane that is not there.
+        finite, a tracer or aerosol that is asked for and negative somewhere, axes that turn
+        back, a time or plane that is not there.
     """
     path = Path(path)
     table, opposite = _file_names(names, path)
@@ -237,6 +236,25 @@ def _hint(name, table):
     return f"; expected wake.names: {{{name}: its name there}}{none}"
 
 
+def _own_dims(data, table, name, spatial) -> dict[str, str]:
+    """The dimensions in space of a variable, and which of ours each is; empty: others.
+
+    One of them may be staggered: another than that of the other variables, with values of its own.
+    """
+    dims = [d for d in data[table[name]].dims if d != table["time"]]
+    missing = [d for d in spatial if d not in dims]
+    extra = [d for d in dims if d not in spatial]
+    if len(missing) != len(extra) or len(extra) > 1 or any(d not in data.variables for d in extra):
+        return {}
+    staggered = dict(zip(extra, missing, strict=True))
+    return {d: spatial[staggered.get(d, d)] for d in dims}
+
+
+def _staggered(own, spatial) -> set[str]:
+    """Axes that some variable has at nodes of its own."""
+    return {ours for dims in own.values() for d, ours in dims.items() if d not in spatial}
+
+
 def _read(data, table, sign, asked, time, x, path):
     for name in _VARIABLES:
         if name in asked and table[name] not in data.data_vars:
@@ -252,22 +270,29 @@ def _read(data, table, sign, asked, time, x, path):
             )
     present = [name for name in _VARIABLES if table[name] in data.data_vars]
     spatial = {table[d]: d for d in ("x", "y", "z") if table[d] in data.dims}
-    for name in present:
-        dims = set(data[table[name]].dims)
-        if not dims - {table["time"]} == set(spatial):
-            raise InputError(
-                f"{path}: variable {table[name]!r} has the dimensions "
-                f"({', '.join(map(str, data[table[name]].dims))}); allowed: "
-                f"{', '.join(spatial)} and, at choice, {table['time']}, in any order"
-            )
+    own = {name: _own_dims(data, table, name, spatial) for name in present}
+    odd = [name for name in present if not own[name]]
+    if odd:
+        raise InputError(
+            f"{path}: variable {table[odd[0]]!r} has the dimensions "
+            f"({', '.join(map(str, data[table[odd[0]]].dims))}); allowed: {', '.join(spatial)} "
+            f"and, at choice, {table['time']}, in any order, one of them staggered"
+        )
 
     data, seconds = _pick_time(data, table["time"], time, path)
     axes, reverse = {}, []
-    for theirs, ours in spatial.items():
-        axes[ours], turned = _axis(data, theirs, ours, path, sign[ours])
+    places = {theirs: ours for dims in own.values() for theirs, ours in dims.items()} | spatial
+    found = {}
+    for theirs, ours in places.items():
+        found[theirs], turned = _axis(data, theirs, ours, path, sign[ours])
         if turned:
             reverse.append(theirs)
+    axes = {ours: found[theirs] for theirs, ours in spatial.items()}
     data = data.isel({theirs: slice(None, None, -1) for theirs in reverse})
+    for ours in spatial.values():
+        ends = [found[d][[0, -1]] for dims in own.values() for d, o in dims.items() if o == ours]
+        low, high = max(end[0] for end in ends), min(end[1] for end in ends)
+        axes[ours] = even_axis(axes[ours], low, high)
     if "x" not in axes:
         theirs = table["x"]
         place = 0.0
@@ -283,13 +308,18 @@ def _read(data, table, sign, asked, time, x, path):
     if x is not None:
         index = _plane_index(axes["x"], x, path, table["x"])
         axes["x"] = axes["x"][index : index + 1]
-        if table["x"] in data.dims:
+        # planes that are not needed are not read
+        kept = found.get(table["x"], axes["x"])
+        if kept.size > 1 and is_even(kept) and "x" not in _staggered(own, spatial):
+            index = int(np.argmin(np.abs(kept - axes["x"][0])))
             data = data.isel({table["x"]: slice(index, index + 1)})
+            found[table["x"]] = axes["x"]
 
     wake = xr.Dataset(
         coords={d: (d, axes[d], {"units": "m"}) for d in ("x", "y", "z")},
         attrs={"source": path.name},
     )
+    errors: dict[str, float] = {}
     for name in present:
         variable = data[table[name]]
         unit, long_name = _VARIABLES[name]
@@ -299,11 +329,21 @@ def _read(data, table, sign, asked, time, x, path):
         else:
             scale = _scale_to(variable, unit, f"variable {table[name]!r}", path)
         scale *= sign.get(name, 1.0)
-        variable = variable.transpose(*(table[d] for d in "xyz" if table[d] in variable.dims))
-        values = _numbers(variable, path).reshape([axes[d].size for d in "xyz"]) * scale
+        dims = sorted(own[name], key=lambda theirs: own[name][theirs])
+        variable = variable.transpose(*dims)
+        along = {own[name][theirs]: found[theirs] for theirs in dims}
+        nodes = [along.get(d, axes[d]) for d in "xyz"]
+        values = _numbers(variable, path).reshape([n.size for n in nodes]) * scale
         amount = name in asked and name in ("tracer", "aerosol")
-        _check_values(values, axes, table[name], path, may_be_negative=not amount)
+        here = dict(zip("xyz", nodes, strict=True))
+        _check_values(values, here, table[name], path, may_be_negative=not amount)
+        low, high = values.min(), values.max()
+        values, errors[name] = interpolated(values, nodes, [axes[d] for d in "xyz"])
+        if name in ("tracer", "aerosol"):
+            values = values.clip(low, high)
         wake[name] = ("x", "y", "z"), values, {"units": unit, "long_name": long_name}
+    if said := statement(errors, {name: wake[name].attrs["units"] for name in present}):
+        wake.attrs["interpolated"] = said
     if seconds is not None:
         wake = wake.assign_coords(time=((), seconds, {"units": "s"}))
     return wake

@@ -12,9 +12,11 @@ import numpy as np
 import pytest
 
 from lidar_mi.experiment import pipeline
+from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.pipeline import STAGES, stages_of
 from lidar_mi.experiment.run import complete, prepare, run
+from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.experiment.stage import Stage, in_order, result_of
 from tests.support.experiments import check, small
 
@@ -22,6 +24,10 @@ from tests.support.experiments import check, small
 def add(*numbers, log):
     """A stage's computation: the first of what it gets is the experiment."""
     return 1 + sum(numbers[1:])
+
+
+def load(name, changes=()):
+    return config.load(experiment_file(name), list(changes))
 
 
 def names(stages):
@@ -33,6 +39,14 @@ def test_stages_follow_those_they_need():
     assert names(in_order(stages, ("given",))) == ["a", "b", "c"]
     # those that need nothing of each other stay as they are
     assert names(in_order([Stage("y", add), Stage("x", add)])) == ["y", "x"]
+
+
+def test_no_pair_is_fitted_behind_a_turbine_unless_it_is_asked_for():
+    turbine = load("turbine")
+    assert turbine.sensor and "vortices" not in names(stages_of(turbine))
+    asked = load("turbine", ["retrieval.methods=[variational,vortex_fit]"])
+    assert "vortices" in names(stages_of(asked))
+    assert "vortices" in names(stages_of(load("wake_sensor")))
 
 
 @pytest.mark.parametrize(

@@ -56,6 +56,7 @@ FILES = {
     "v_los.nc",
     "metrics.json",
     "report.html",
+    "summary.txt",
     "log.txt",
     "figures",
 }

@@ -38,6 +38,7 @@ def test_everything_a_run_leaves(demo):
         "wind.nc",
         "metrics.json",
         "report.html",
+        "summary.txt",
         "log.txt",
         *(f"figures/{name}.png" for name in FIGURES),
     }

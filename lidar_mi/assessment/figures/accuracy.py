@@ -50,7 +50,9 @@ def error_and_bound(found: xr.Dataset) -> tuple[Figure, str] | None:
             title=f"valid vectors, {name}",
         )
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
+    figure.legend(
+        *axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8
+    )
     return figure, (
         "Errors of valid vectors, in groups by the Cramer-Rao bound of any unbiased method that "
         "uses a single template. Below the line: methods that use more than a template. Far above "

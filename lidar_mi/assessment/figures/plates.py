@@ -12,6 +12,9 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.png import write_png
 
+UNIFORM = 5e-3
+"""Relative range of colours below which a field is called uniform."""
+
 
 @dataclass(frozen=True)
 class Drawn:
@@ -56,9 +59,15 @@ def image_panel(
         y, z, field.transpose("z", "y").values, shading="nearest", rasterized=True, **style
     )
     frame(axes, y, z, title)
-    bar = axes.figure.colorbar(mesh, ax=axes, label=label, pad=0.02, extend=extend)
+    low, high = mesh.get_clim()
+    uniform = high - low <= UNIFORM * max(abs(low), abs(high))
+    bar = axes.figure.colorbar(
+        mesh, ax=axes, label=f"{label}, uniform" if uniform else label, pad=0.02, extend=extend
+    )
     # whole numbers, without an offset
     bar.formatter.set_useOffset(False)
+    if uniform:
+        bar.set_ticks([(low + high) / 2], labels=[f"{(low + high) / 2:.3g}"])
 
 
 def by_factors(axes) -> None:

@@ -33,8 +33,9 @@ def draw_all(
     """
     plates = [("fig19_lines_of_sight", "The scan of the Doppler lidar", _scan(lines, cores))]
     if found is not None:
-        plates += [
+        plates = [
             ("fig20_wind3d", "The wind from both lidars", _maps(found, lines, cores)),
+            *plates,
             ("fig21_uncertainty", "Standard errors of the wind", _uncertainty(found)),
         ]
     return save_all(folder, plates, log)

@@ -42,12 +42,21 @@ class Requirement:
 
 @dataclass(frozen=True)
 class RequirementTable:
-    """Requirements of one application in one phase of flight."""
+    """Requirements of one application in one phase of flight.
+
+    ``slowest`` and ``fastest`` are the air speeds, m/s, between which the phase is flown.
+    """
 
     application: str
     title: str
     phase: str
     rows: tuple[Requirement, ...]
+    slowest: float = 0.0
+    fastest: float = math.inf
+
+    def applies_at(self, speed: float) -> bool:
+        """Whether an aircraft of this air speed, m/s, is in the phase of flight."""
+        return self.slowest <= speed <= self.fastest
 
 
 @dataclass(frozen=True)
@@ -95,8 +104,7 @@ def read_requirements(
         title = phases.pop("title", application)
         for phase, rows in phases.items():
             inside = f"{place}.{phase}"
-            found = tuple(_row(inside, *row) for row in _section(rows, inside).items())
-            tables[application, phase] = RequirementTable(application, str(title), phase, found)
+            tables[application, phase] = _table(inside, application, str(title), phase, rows)
     return tables
 
 
@@ -177,11 +185,29 @@ def _known(name: str, place: str) -> None:
     raise InputError(f"{place}.{name}: unknown row{hint} (allowed: {', '.join(QUANTITIES)})")
 
 
+def _table(place: str, application: str, title: str, phase: str, rows) -> RequirementTable:
+    rows = dict(_section(rows, place))
+    speed = _limits(f"{place}.speed", rows.pop("speed")) if "speed" in rows else {}
+    if "fraction_of_range" in speed:
+        raise InputError(f"{place}.speed.max_of_range: not allowed; expected min or max")
+    found = tuple(_row(place, *row) for row in _section(rows, place).items())
+    slowest, fastest = speed.get("minimum", 0.0), speed.get("maximum", math.inf)
+    return RequirementTable(application, title, phase, found, slowest, fastest)
+
+
 def _row(place: str, quantity: str, limits) -> Requirement:
     _known(quantity, place)
     unit = QUANTITIES[quantity][1]
     place = f"{place}.{quantity}"
-    found = {}
+    row = Requirement(quantity, **_limits(place, limits, unit))
+    if unit != "m" and math.isfinite(row.fraction_of_range):
+        raise InputError(f"{place}.max_of_range: not allowed; only lengths compare with a range")
+    return row
+
+
+def _limits(place: str, limits, unit: str = "m/s") -> dict[str, float]:
+    """Limits in SI by the names that they have in `Requirement`."""
+    found: dict[str, float] = {}
     for limit, value in _section(limits, place).items():
         if limit not in _LIMITS:
             raise InputError(f"{place}.{limit}: unknown limit (allowed: {', '.join(_LIMITS)})")
@@ -192,12 +218,9 @@ def _row(place: str, quantity: str, limits) -> Requirement:
         if not (number > 0 and math.isfinite(number)):
             raise InputError(f"{place}.{limit}: {value!r} is not allowed; expected more than 0")
         found[_LIMITS[limit]] = number
-    row = Requirement(quantity, **found)
-    if row.minimum > row.maximum:
+    if found.get("minimum", 0.0) > found.get("maximum", math.inf):
         raise InputError(f"{place}: min above max is not allowed")
-    if unit != "m" and math.isfinite(row.fraction_of_range):
-        raise InputError(f"{place}.max_of_range: not allowed; only lengths compare with a range")
-    return row
+    return found
 
 
 def _judged(row: Requirement, measured: float, distance: float) -> Finding:

@@ -46,7 +46,9 @@ def backscatter_chapter(
         From `vector_map.map_data`.
     """
     lead = ["A backscatter lidar scans a wake twice; cross-flow winds follow from the two images."]
-    if cores:
+    if experiment.wake.turbine:
+        lead.append("The wake is that of a turbine; most of its wind is u, along the axis.")
+    elif cores:
         places = ", ".join(
             f"a vortex at y = {core.y:.1f} m, z = {core.z:.1f} m (core radius {core.radius:.1f} m)"
             for core in cores

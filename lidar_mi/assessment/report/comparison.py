@@ -9,7 +9,7 @@ from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import RENDERED, Source, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, READERS
 from lidar_mi.assessment.report.digits import fixed, three
-from lidar_mi.assessment.report.page import embedded, template
+from lidar_mi.assessment.report.page import picture, script, template
 from lidar_mi.io.yaml import to_yaml
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 
@@ -75,6 +75,7 @@ def page(
     settings: Mapping[str, Mapping],
     metrics: Mapping[str, Mapping[str, float]],
     drawn: Sequence[Drawn],
+    answers: Mapping[str, Sequence[str]],
 ) -> str:
     """Settings, metrics and figures of the variants of a study, as self-contained HTML.
 
@@ -86,6 +87,8 @@ def page(
         As nested sections, with all defaults.
     metrics : mapping of variant to metrics
     drawn : sequence of Drawn
+    answers : mapping of variant to list of str
+        From `lidar_mi.assessment.report.answer.answer`.
     """
     changed = [
         (key, "", [setting(value) for value in values])
@@ -99,7 +102,9 @@ def page(
         name=name,
         version=__version__,
         variants=list(settings),
-        images=[(one.title, one.caption, embedded(one.path)) for one in drawn],
+        answers=answers,
+        images=[picture(one) for one in drawn],
+        stacking=script("panels.js"),
         tables=[
             ("Results", legend, list(results(metrics))),
             ("Settings that differ", "In SI units; a dash: the variant has no such key.", changed),

@@ -5,7 +5,6 @@ import math
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from importlib.resources import files
-from pathlib import Path
 from typing import NamedTuple
 
 import jinja2
@@ -15,7 +14,7 @@ from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.assessment.report.digits import percent
-from lidar_mi.io.images import as_webp
+from lidar_mi.io.images import as_webp, panel_cuts
 
 
 class Tables(NamedTuple):
@@ -44,6 +43,15 @@ class Film(NamedTuple):
     seconds: float
 
 
+class Picture(NamedTuple):
+    """A figure as a data URL, and the fractions of its width at which its panels part."""
+
+    title: str
+    caption: str
+    source: str
+    cuts: str
+
+
 class Chapter(NamedTuple):
     """The part of the report on one instrument.
 
@@ -55,7 +63,7 @@ class Chapter(NamedTuple):
     drawn : sequence of Drawn
     numbers : Tables
     verdict : Tables, optional
-        Compliance with the requirements; placed before all chapters' numbers.
+        Compliance with the requirements; placed on the first page.
     vectors : dict, optional
         `vector_map.map_data` with a ``title``, for an interactive map of the vectors.
     film : Film, optional
@@ -78,6 +86,8 @@ def page(
     metrics: Mapping[str, float],
     chapters: Sequence[Chapter],
     warnings: Sequence[str] = (),
+    answer: Sequence[str] = (),
+    data: Sequence[str] = (),
 ) -> str:
     """The report as HTML, with embedded images; all text of the user is escaped.
 
@@ -93,27 +103,33 @@ def page(
     chapters : sequence of Chapter
     warnings : sequence of str
         Those that matter for the results.
+    answer : sequence of str
+        From `lidar_mi.assessment.report.answer.answer`.
+    data : sequence of str
+        Names of files beside the report, which links to them.
     """
     with ThreadPoolExecutor() as pool:
         drawn = [figure for chapter in chapters for figure in chapter.drawn]
-        images = dict(
-            zip(drawn, pool.map(lambda figure: embedded(figure.path), drawn), strict=True)
-        )
+        images = dict(zip(drawn, pool.map(picture, drawn), strict=True))
+    shown = [[images[figure] for figure in chapter.drawn] for chapter in chapters]
+    first = next((figures for figures in shown if figures), [])
+    overview, first[:1] = first[:1], []
     return template("report.html").render(
         name=experiment.name,
         simulated=simulated(experiment, versions),
         resolved=resolved,
         metrics={key: _rounded(key, value) for key, value in metrics.items()},
+        answer=answer,
+        overview=overview,
+        data=data,
         warnings=[text.rstrip(".") for text in warnings],
-        script=_script("vector_map.js"),
-        film_script=_script("film.js"),
+        script=script("vector_map.js"),
+        film_script=script("film.js"),
+        stacking=script("panels.js"),
         chapters=[
             chapter._asdict()
-            | {
-                "images": [(d.title, d.caption, images[d]) for d in chapter.drawn],
-                "film": _packed(chapter.film) if chapter.film else None,
-            }
-            for chapter in chapters
+            | {"images": figures, "film": _packed(chapter.film) if chapter.film else None}
+            for chapter, figures in zip(chapters, shown, strict=True)
         ],
     )
 
@@ -125,10 +141,6 @@ def template(name: str) -> jinja2.Template:
         undefined=jinja2.StrictUndefined,
         loader=jinja2.PackageLoader("lidar_mi.assessment.report", ""),
     ).get_template(name)
-
-
-def _script(name: str) -> Markup:
-    return Markup(files("lidar_mi.assessment.report").joinpath(name).read_text())
 
 
 def _packed(film: Film) -> dict:
@@ -148,9 +160,16 @@ def _packed(film: Film) -> dict:
     }
 
 
-def embedded(path: Path) -> str:
-    """An image as a data URL: lossless WebP, two thirds of its PNG."""
-    return f"data:image/webp;base64,{base64.b64encode(as_webp(path)).decode()}"
+def picture(figure: Drawn) -> Picture:
+    """A figure for a page: lossless WebP, two thirds of its PNG."""
+    source = f"data:image/webp;base64,{base64.b64encode(as_webp(figure.path)).decode()}"
+    cuts = " ".join(f"{cut:.4f}" for cut in panel_cuts(figure.path))
+    return Picture(figure.title, figure.caption, source, cuts)
+
+
+def script(name: str) -> Markup:
+    """A program of this package, for a page."""
+    return Markup(files("lidar_mi.assessment.report").joinpath(name).read_text())
 
 
 def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:

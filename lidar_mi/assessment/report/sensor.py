@@ -51,6 +51,7 @@ def sensor_chapter(
             ],
         )
         for table, findings in judged
+        if table.applies_at(speed)
     ]
     if vectors:
         vectors = {"title": "The wind from both lidars, vector by vector"} | vectors
@@ -69,11 +70,11 @@ def sensor_chapter(
             if speed
             else "Compliance with the requirements",
             "Errors of u, v, w are rms errors of valid vectors beyond two core radii, those of "
-            "v_LOS rms errors of lines of sight, in this run for all phases of flight. A margin "
-            "is the distance from the limit, as a fraction of it.",
+            "v_LOS rms errors of lines of sight. A margin is the distance from the limit, as a "
+            "fraction of it. Phases of flight at another air speed are not assessed.",
             tables,
         )
-        if judged
+        if tables
         else None,
         numbers=Tables(
             "Accuracy of the wind from both lidars",

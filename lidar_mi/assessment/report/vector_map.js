@@ -40,13 +40,61 @@
         low: oneWay ? least : -top, high: oneWay ? most : top });
     }
     shown.forEach((s, k) => choice.add(new Option(s.label, k)));
+    choice.value = Math.max(0, shown.findIndex(s => s.label === data.colour));
 
     const half = data.step / 2;
     const left = Math.max(...data.y) + half, right = Math.min(...data.y) - half;
     const top = Math.max(...data.z) + half, bottom = Math.min(...data.z) - half;
     let chosen = -1, width = 0, height = 0, unit = 1;
 
-    const px = (y, z) => [(left - y) * unit, (top - z) * unit];
+    const edge = 46, foot = 40;  // px for the axes, left and below
+    const px = (y, z) => [edge + (left - y) * unit, (top - z) * unit];
+
+    // 1, 2 or 5 times a power of ten, at most a length
+    function round(length) {
+      const power = 10 ** Math.floor(Math.log10(length));
+      return [5, 2, 1].find(n => n * power <= length) * power;
+    }
+
+    function frame(pen) {
+      const right = edge + (left - (Math.min(...data.y) - half)) * unit;
+      pen.strokeStyle = pen.fillStyle = "#444";
+      pen.lineWidth = 1;
+      pen.font = "12px system-ui, sans-serif";
+      pen.strokeRect(edge + 0.5, 0.5, right - edge - 1, height - foot);
+      const gap = round(Math.max(1e-9, (left - (Math.min(...data.y) - half)) / 4));
+      const ticks = (low, high) => Array.from(
+        { length: Math.floor(high / gap) - Math.ceil(low / gap) + 1 }, (_, k) => (Math.ceil(low / gap) + k) * gap);
+      const text = value => String(+value.toPrecision(6)).replace("-", "\u2212");
+      pen.textAlign = "center";
+      for (const y of ticks(Math.min(...data.y) - half, left)) {
+        const x = px(y, 0)[0];
+        pen.fillRect(x, height - foot, 1, 5);
+        pen.fillText(text(y), x, height - foot + 18);
+      }
+      pen.fillText("y / m", (edge + right) / 2, height - 6);
+      pen.textAlign = "right";
+      for (const z of ticks(bottom, top)) {
+        const up = px(0, z)[1];
+        pen.fillRect(edge - 5, up, 5, 1);
+        if (up > 8) pen.fillText(text(z), edge - 8, up + 4);
+      }
+      pen.save();
+      pen.rotate(-Math.PI / 2);
+      pen.textAlign = "center";
+      pen.fillText("z / m", -(height - foot) / 2, 12);
+      pen.restore();
+      // how long an arrow is
+      const speed = round(fastest), long = 1.6 * data.step * unit * speed / fastest;
+      pen.strokeStyle = "#000";
+      pen.lineWidth = 2;
+      pen.beginPath();
+      pen.moveTo(right - long, height - 10); pen.lineTo(right, height - 10);
+      pen.lineTo(right - 4, height - 13); pen.moveTo(right, height - 10); pen.lineTo(right - 4, height - 7);
+      pen.stroke();
+      pen.textAlign = "right";
+      pen.fillText(text(speed) + " m/s", right - long - 6, height - 6);
+    }
 
     function arrow(pen, y, z, v, w) {
       // a step and a half long at the fastest; port is on the left
@@ -65,14 +113,15 @@
 
     function draw() {
       width = canvas.clientWidth;
-      unit = width / (left - right);
-      height = Math.round((top - bottom) * unit);
+      unit = (width - edge - 1) / (left - right);
+      height = Math.round((top - bottom) * unit) + foot;
       canvas.style.height = height + "px";
       const dense = window.devicePixelRatio || 1;
       canvas.width = width * dense;
       canvas.height = height * dense;
       const pen = canvas.getContext("2d"), what = shown[choice.value];
       pen.scale(dense, dense);
+      frame(pen);
       pen.lineWidth = Math.max(1, unit * data.step / 12);
       for (let k = 0; k < many; k++) {
         if (v.retrieved[k] === null || w.retrieved[k] === null) continue;
@@ -132,8 +181,8 @@
     }
 
     function point(event) {
-      const edge = canvas.getBoundingClientRect();
-      show(nearest(left - (event.clientX - edge.left) / unit, top - (event.clientY - edge.top) / unit));
+      const box = canvas.getBoundingClientRect();
+      show(nearest(left - (event.clientX - box.left - edge) / unit, top - (event.clientY - box.top) / unit));
     }
 
     canvas.addEventListener("pointermove", point);

@@ -11,7 +11,9 @@ from lidar_mi.assessment.metrics.cores import Core
 _COLUMNS = 55
 
 
-def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core]) -> dict:
+def map_data(
+    wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core], colour: str = ""
+) -> dict:
     """Every n-th vector with its truth, standard error and flag, ready for JSON.
 
     Parameters
@@ -23,6 +25,8 @@ def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core])
     components : sequence of str
     cores : sequence of Core
         True vortices.
+    colour : str
+        What colours show at first: a component, or the speed of v and w.
 
     Returns
     -------
@@ -48,6 +52,7 @@ def map_data(wind: xr.Dataset, components: Sequence[str], cores: Sequence[Core])
     step = every * float(wind["y"][1] - wind["y"][0]) if wind.sizes["y"] > 1 else 1.0
     return {
         **place,
+        "colour": colour,
         "step": step,
         "components": [
             {

@@ -59,6 +59,16 @@ def test_the_published_table():
         assert [rows[f"error_{c}"].maximum for c in "uvw"] == [2.5] * 3
 
 
+def test_a_phase_of_flight_has_its_speeds():
+    """250 knots, 128.6 m/s, part landing and cruise; a table without speeds applies at any."""
+    for application in ("disturbance", "flight_control"):
+        landing, cruise = TABLES[application, "landing"], TABLES[application, "cruise"]
+        assert landing.applies_at(70) and not cruise.applies_at(70)
+        assert cruise.applies_at(240) and not landing.applies_at(240)
+        assert landing.fastest == cruise.slowest == pytest.approx(250 * 1852 / 3600)
+    assert RequirementTable("a", "a", "any", ()).applies_at(0)
+
+
 GOOD = {
     "range": 76.0,
     "points_per_slab": 63,

@@ -16,6 +16,7 @@ from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.report.page import Chapter, Tables, page
 from lidar_mi.assessment.report.vector_map import map_data
 from lidar_mi.experiment import reading as config
+from lidar_mi.io.images import panel_cuts
 
 EVIL = "</script><script>alert(1)</script>&\"'"
 
@@ -78,8 +79,8 @@ def test_names_are_never_markup(tmp_path):
     )
     assert "alert(1)" in text and "<script>alert" not in text
     found = Tags(text)
-    # the data and the program, nothing else
-    assert found.tags.count("script") == 2
+    # the data and the programs, nothing else
+    assert found.tags.count("script") == 3
     assert json.loads(found.scripts[0])["title"] == EVIL
     assert sum(EVIL in word for word in found.words) >= 10
 
@@ -112,6 +113,36 @@ def test_the_map_accepts_missing_vectors():
     assert min(data["y"]) == -5 + 2 * 2.0 + 0.25
     text = json.dumps(data, allow_nan=False)
     assert len(text) < 10_000 and None in v["retrieved"] + w["stderr"]
+
+
+def test_the_first_page_has_the_answer_an_image_and_the_files(tmp_path):
+    from PIL import Image
+
+    drawn = [Drawn(tmp_path / f"{name}.png", name, "") for name in ("one", "two")]
+    for figure in drawn:
+        Image.new("RGB", (4, 4)).save(figure.path)
+    text = some_page(drawn=drawn, verdict=Tables("Compliance", "", []))
+    head, rest = text.split("</section>")
+    assert head.index('class="answer"') < head.index('alt="one"') < head.index("Compliance")
+    assert 'alt="one"' not in rest and 'alt="two"' in rest and 'alt="two"' not in head
+
+
+@pytest.mark.parametrize(("panels", "cuts"), [(1, 0), (2, 1), (3, 2)], ids=["one", "two", "three"])
+def test_panels_side_by_side_are_separated(tmp_path, panels, cuts):
+    """Panels of 100 px, 10 px apart; none where something spans them."""
+    from PIL import Image
+
+    pixels = np.full((110, 110 * panels + 10), 255, np.uint8)
+    for k in range(panels):
+        pixels[5:105, 110 * k + 10 : 110 * k + 110] = 90
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    found = panel_cuts(tmp_path / "a.png")
+    assert len(found) == cuts
+    for k, cut in enumerate(found, 1):
+        assert 110 * k < cut * pixels.shape[1] < 110 * k + 10
+    pixels[1] = 0
+    Image.fromarray(pixels).save(tmp_path / "b.png")
+    assert panel_cuts(tmp_path / "b.png") == []
 
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")

@@ -1,0 +1,171 @@
+"""The answer of a run in a few sentences: its errors, and the verdict with its reasons."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+from lidar_mi.assessment.labels import METHOD_NAMES
+from lidar_mi.assessment.metrics.names import Source, bound_key, ring_key, vortex_key, wind_key
+from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, look_ahead
+from lidar_mi.assessment.metrics.velocities import READERS
+from lidar_mi.assessment.metrics.winds import has_no_skill
+from lidar_mi.assessment.report.digits import whole_percent
+from lidar_mi.tables import with_error
+
+Judged = Sequence[tuple[RequirementTable, Sequence[Finding]]]
+
+_FAR = "outside_cores."
+
+
+def answer(experiment, metrics: Mapping[str, float], judged: Judged = ()) -> list[str]:
+    """What a run found, the same on the terminal, in the report and in `summary.txt`.
+
+    Parameters
+    ----------
+    experiment : lidar_mi.experiment.schema.Experiment
+    metrics : mapping of str to float
+        Of a run.
+    judged : sequence of (RequirementTable, list of Finding)
+        From `lidar_mi.experiment.measure.judged`.
+
+    Returns
+    -------
+    list of str
+        Sentences: errors of the wind, vortices, and one verdict per requirement table. Tables of
+        phases of flight at another air speed are named and not judged.
+    """
+    lines = [*_wind(experiment, metrics), *_vortices(metrics)]
+    speed = experiment.platform.speed if experiment.wake else 0.0
+    lines += [verdict(table, findings) for table, findings in judged if table.applies_at(speed)]
+    others = [table for table, _ in judged if not table.applies_at(speed)]
+    phases = dict.fromkeys(f"{table.phase} ({_speeds(table)})" for table in others)
+    lines += [f"{_capital(phase)}: not assessed at {speed:g} m/s." for phase in phases]
+    return lines
+
+
+def verdict(table: RequirementTable, findings: Sequence[Finding]) -> str:
+    """Compliance with one table: rows fulfilled, and those that are not with their numbers."""
+    rows = as_rows(list(findings))
+    fulfilled = sum(bool(finding.passed) for finding in findings)
+    count = f"all {len(findings)}" if fulfilled == len(findings) else f"{fulfilled} of {len(rows)}"
+    reasons = [f"{count} rows fulfilled"]
+    for name, required, measured, _, state in rows:
+        if state == "fail":
+            reasons.append(f"{name} {measured} against {required}")
+    unknown = [name for name, *_, state in rows if state == "not known"]
+    if unknown:
+        reasons.append(f"undetermined: {', '.join(unknown)}")
+    return f"{_capital(table.phase)}, {table.title}: {'; '.join(reasons)}."
+
+
+def _wind(experiment, metrics: Mapping[str, float]) -> Iterator[str]:
+    """Errors of the wind from the most complete of the sensors that the run has."""
+    if "sensor.vectors" in metrics:
+        yield _sensor(experiment, metrics)
+    elif f"{Source.BACKSCATTER}.mc_relative_error" in metrics:
+        yield _images(experiment, metrics)
+    elif experiment.doppler:
+        yield from _rings(experiment, metrics)
+
+
+def _sensor(experiment, metrics) -> str:
+    head = f"Both lidars, {_place(experiment)}"
+    if not metrics["sensor.vectors"]:
+        return f"{head}: no valid wind vector."
+    far = _FAR if f"sensor.{_FAR}rmse_u" in metrics else ""
+    errors = _values(metrics, f"sensor.{far}rmse_", "uvw")
+    true = _values(metrics, f"sensor.{far}rms_", "uvw")
+    of_true = f" (true wind {true})" if true else ""
+    valid = whole_percent(metrics["sensor.valid_fraction"])
+    return (
+        f"{head}: rms errors of u, v, w {errors} m/s{_beyond(far)}{of_true}; {valid} of the "
+        "vectors are valid."
+    )
+
+
+def _images(experiment, metrics) -> str:
+    source = Source.NOISY if experiment.detector else Source.BACKSCATTER
+    components = "uvw" if "true_wind.rms_u" in metrics else "vw"
+    far = _FAR if f"true_wind.{_FAR}rms_v" in metrics else ""
+    settings = experiment.volume or experiment.retrieval
+    parts = []
+    for method in settings.methods:
+        valid = metrics.get(wind_key(source, method, "valid_fraction"))
+        errors = _values(metrics, wind_key(source, method, f"{far}rmse_"), components)
+        if valid is None:
+            continue
+        shown = f"{errors} m/s ({whole_percent(valid)} valid)" if errors else "no valid vector"
+        shown = "no skill" if has_no_skill(metrics, source, method) else shown
+        parts.append(f"{METHOD_NAMES[method]} {shown}")
+    true = _values(metrics, f"true_wind.{far}rms_", components)
+    return (
+        f"Backscatter lidar, {_place(experiment)}: rms errors of {', '.join(components)}"
+        f"{_beyond(far)} by {'; '.join(parts)}; the true wind has {true} m/s."
+    )
+
+
+def _rings(experiment, metrics) -> Iterator[str]:
+    """The first method of analysis, for every number of images averaged."""
+    settings = experiment.doppler.retrieval
+    method, centre = settings.methods[0], settings.centre[0]
+    parts = []
+    for number in sorted(settings.averaged):
+        std, bias = (
+            metrics.get(ring_key(method, centre, number, name)) for name in ("std", "bias")
+        )
+        if std is None or bias is None:
+            continue
+        bound = metrics.get(bound_key(centre, number))
+        limit = "" if bound is None else f" (Cramér-Rao bound {bound:.2g})"
+        images = "one image" if number == 1 else f"{number} images"
+        parts.append(f"of {images} {std:.2g} m/s{limit}, bias {bias:.2g} m/s")
+    if parts:
+        yield (
+            f"Doppler lidar, {experiment.doppler.lidar.range:g} m ahead, {READERS[method]}: "
+            f"standard deviation of the line-of-sight velocity {'; '.join(parts)}."
+        )
+
+
+def _vortices(metrics) -> Iterator[str]:
+    """The fit to the wind vectors, or else to the images, where there is a true pair."""
+    sides = ("port", "starboard")
+    for origin in ("vectors", "images"):
+        keys = [vortex_key(origin, f"{side}_circulation_5_15") for side in sides]
+        true = [metrics.get(vortex_key("truth", f"{side}_circulation_5_15")) for side in sides]
+        if any(key not in metrics for key in keys) or any(value is None for value in true):
+            continue
+        found = [with_error(metrics[key], metrics.get(f"{key}_stderr", math.nan)) for key in keys]
+        yield (
+            f"Vortex pair: circulations {found[0]} and {found[1]} m²/s, true "
+            f"{true[0]:.0f} and {true[1]:.0f} m²/s."
+        )
+        return
+
+
+def _place(experiment) -> str:
+    """Range and look-ahead time of the middle of the slab."""
+    scan, speed = experiment.scan, experiment.platform.speed
+    distance = scan.range + scan.thickness / 2
+    if not speed:
+        return f"{distance:.4g} m ahead"
+    return f"{distance:.4g} m ahead ({look_ahead(distance, speed):.2g} s at {speed:g} m/s)"
+
+
+def _values(metrics, key: str, components: str) -> str:
+    """Numbers of all components, two digits; empty where one is not known."""
+    values = [metrics.get(f"{key}{name}") for name in components]
+    return "" if None in values else ", ".join(f"{value:#.2g}".rstrip(".") for value in values)
+
+
+def _beyond(far: str) -> str:
+    return " beyond two core radii" if far else ""
+
+
+def _speeds(table: RequirementTable) -> str:
+    if math.isinf(table.fastest):
+        return f"from {table.slowest:.3g} m/s"
+    low = f"{table.slowest:.3g} to " if table.slowest else "up to "
+    return f"{low}{table.fastest:.3g} m/s"
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

@@ -1,0 +1,112 @@
+"""The answer of a run. Detects numbers that are not those of the metrics, a verdict without its
+reason, a phase of flight that is judged at another speed, and skill that is not there."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from lidar_mi.assessment.metrics.requirements import judge, read_requirements
+from lidar_mi.assessment.report.answer import answer, verdict
+
+TABLES = read_requirements()
+
+
+def an_experiment(speed=70.0, **parts):
+    return SimpleNamespace(
+        wake=True,
+        volume=None,
+        detector=None,
+        doppler=None,
+        platform=SimpleNamespace(speed=speed),
+        scan=SimpleNamespace(range=148.75, thickness=2.5),
+        retrieval=SimpleNamespace(methods=["variational", "cc"]),
+        **parts,
+    )
+
+
+SENSOR = {
+    "sensor.vectors": 190,
+    "sensor.valid_fraction": 0.565,
+    **{
+        f"sensor.outside_cores.rmse_{n}": v for n, v in zip("uvw", (0.231, 0.48, 10.4), strict=True)
+    },
+    **{f"sensor.outside_cores.rms_{n}": v for n, v in zip("uvw", (0.24, 2.8, 3.71), strict=True)},
+}
+MEASURED = {
+    "range": 150.0,
+    "points_per_slab": 63,
+    "slabs_per_second": 10.0,
+    "slab_depth": 10.0,
+    "error_v_los": 0.16,
+}
+
+
+def test_the_errors_of_both_lidars():
+    (line,) = answer(an_experiment(), SENSOR)
+    assert line == (
+        "Both lidars, 150 m ahead (2.1 s at 70 m/s): rms errors of u, v, w 0.23, 0.48, 10 m/s "
+        "beyond two core radii (true wind 0.24, 2.8, 3.7); 56 % of the vectors are valid."
+    )
+    (line,) = answer(an_experiment(), {"sensor.vectors": 0})
+    assert line.endswith("no valid wind vector.")
+    (line,) = answer(an_experiment(speed=0.0), SENSOR)
+    assert line.startswith("Both lidars, 150 m ahead: rms")
+
+
+def test_every_method_of_the_backscatter_lidar_with_its_skill():
+    metrics = {
+        "backscatter.mc_relative_error": 0.01,
+        "true_wind.rms_v": 2.9,
+        "true_wind.rms_w": 3.7,
+        "backscatter.variational.valid_fraction": 1.0,
+        "backscatter.variational.rmse_v": 0.1,
+        "backscatter.variational.rmse_w": 0.11,
+        "backscatter.cc.valid_fraction": 0.03,
+        "backscatter.cc.no_skill_fraction": 0.97,
+        "backscatter.cc.rmse_v": 3.6,
+        "backscatter.cc.rmse_w": 3.8,
+    }
+    (line,) = answer(an_experiment(), metrics)
+    assert "rms errors of v, w by variational retrieval 0.10, 0.11 m/s (100 % valid)" in line
+    assert "cross-correlation no skill; the true wind has 2.9, 3.7 m/s." in line
+
+
+def test_a_verdict_gives_its_reasons():
+    table = TABLES["disturbance", "landing"]
+    assert verdict(table, judge(table, MEASURED)) == (
+        "Landing, disturbance phenomenon, from line-of-sight velocities: 4 of 5 rows fulfilled; "
+        "slab depth 10 m against at most 4.5 m."
+    )
+    better = judge(table, MEASURED | {"slab_depth": 4.0})
+    assert "all 5 rows fulfilled." in verdict(table, better)
+    unknown = judge(table, MEASURED | {"slab_depth": 4.0, "error_v_los": math.nan})
+    assert verdict(table, unknown).endswith(
+        "4 of 5 rows fulfilled; undetermined: error of line-of-sight velocity."
+    )
+
+
+@pytest.mark.parametrize(
+    ("speed", "assessed", "other"),
+    [(70.0, "Landing", "Cruise (from 129 m/s)"), (240.0, "Cruise", "Landing (up to 129 m/s)")],
+)
+def test_a_phase_is_judged_at_its_own_speed(speed, assessed, other):
+    judged = [(table, judge(table, MEASURED)) for table in TABLES.values()]
+    _, *lines, last = answer(an_experiment(speed), SENSOR, judged)
+    assert len(lines) == 2 and all(line.startswith(f"{assessed}, ") for line in lines)
+    assert last == f"{other}: not assessed at {speed:g} m/s."
+
+
+def test_the_vortices_with_their_errors():
+    metrics = SENSOR | {
+        "vortex.truth.port_circulation_5_15": 440.1,
+        "vortex.truth.starboard_circulation_5_15": -439.2,
+        "vortex.vectors.port_circulation_5_15": 412.27,
+        "vortex.vectors.port_circulation_5_15_stderr": 8.495,
+        "vortex.vectors.starboard_circulation_5_15": -416.34,
+        "vortex.vectors.starboard_circulation_5_15_stderr": 8.306,
+    }
+    line = answer(an_experiment(), metrics)[1]
+    assert line == (
+        "Vortex pair: circulations 412.3 ± 8.5 and -416.3 ± 8.3 m²/s, true 440 and -439 m²/s."
+    )
