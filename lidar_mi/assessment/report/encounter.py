@@ -105,9 +105,10 @@ def encounter_chapter(
         tables.append(("The lidar and its track", ["value"], lidar))
     numbers = Tables(
         heading="Numbers of the flight",
-        legend="All flights meet the same wake. Without help, a pilot levels the wings; the autopilot "
-        "is the controller of the flights with a preview, told that there is no wake. Rolling moment felt: that of wake and ailerons "
-        "together. Errors are those of the track against the truth, in the slab just seen.",
+        legend="All flights meet the same wake. Without help, a pilot levels the wings; the "
+        "autopilot is the controller of the flights with a preview, told that there is no wake. "
+        "Rolling moment felt: that of wake and ailerons together. Errors are those of the track "
+        "against the truth, in the slab just seen.",
         tables=tables,
     )
     return Chapter(
