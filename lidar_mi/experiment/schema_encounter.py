@@ -3,7 +3,7 @@
 import math
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from lidar_mi.experiment.schema_air import Section
 from lidar_mi.units import (
@@ -102,6 +102,12 @@ class Aircraft(Section):
     aileron_power: Annotated[Number, Within(1e-3, 1, "aircraft")] = Field(
         0.1, description="rolling moment coefficient per rad of deflection"
     )
+
+    @field_validator("model", mode="before")
+    @classmethod
+    def _name(cls, value: object) -> object:
+        """YAML reads 737 as a number."""
+        return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
 
 
 class Control(Section):

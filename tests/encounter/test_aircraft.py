@@ -72,6 +72,11 @@ def test_controls_move_at_their_rate_within_their_limits():
     np.testing.assert_allclose(moving, 0)
 
 
+def test_the_name_of_an_aircraft_may_be_a_number():
+    changed = load_experiment("wake_backscatter", **{"encounter.aircraft.model": 737})
+    assert changed.encounter.aircraft.model == "737"
+
+
 def test_a_path_through_the_ground_is_refused():
     with pytest.raises(InputError, match=r"encounter\.path: .*27 m below the ground.*above 47 m"):
         load_experiment("wake_backscatter", **{"encounter.path.altitude": "20 m"})

@@ -35,15 +35,14 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
     found: dict[str, float] = {}
     for mode in series["flight"].values:
         one = series.sel(flight=mode)
-        felt: np.ndarray = one["roll_moment"].values + one["control_roll_moment"].values
-        ratio = roll_control_ratio(felt, float(one["largest_control_roll_moment"]))
+        largest = float(one["largest_control_roll_moment"])
         key, roll = f"encounter.{mode}", _largest(one["roll"])
         found[f"{key}.largest_roll"] = roll
         found[f"{key}.largest_roll_rate"] = _largest(one["roll_rate"])
         found[f"{key}.residual_moment"] = residual_moment(one)
-        found[f"{key}.roll_control_ratio"] = ratio
+        found[f"{key}.roll_control_ratio"] = roll_control_ratio(one["roll_moment"].values, largest)
         found[f"{key}.departed"] = float(one["departed"].max())
-        found[f"{key}.hazardous"] = float(is_hazardous(ratio, roll) or one["departed"].max() > 0)
+        found[f"{key}.hazardous"] = float(is_hazardous(roll) or one["departed"].max() > 0)
     for quantity in ("largest_roll", "largest_roll_rate"):
         found |= _removed(found, quantity)
     if track is not None:
@@ -70,8 +69,8 @@ def prediction_error(one: xr.Dataset) -> float:
 def felt_from(series: xr.Dataset) -> float:
     """Time (s) at which the wake's rolling moment on the flight off is first felt; NaN: never."""
     moment = np.abs(series["roll_moment"].sel(flight="off").values)
-    felt = np.flatnonzero(moment > _FELT * moment.max()) if moment.max() else []
-    return float(series["time"][felt[0]]) if len(felt) else float("nan")
+    felt = np.flatnonzero(moment > _FELT * moment.max())
+    return float(series["time"][felt[0]]) if felt.size else float("nan")
 
 
 def measured_in_flight(

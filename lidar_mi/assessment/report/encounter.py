@@ -19,7 +19,7 @@ _OF_A_FLIGHT = (
     ("largest_roll", "largest roll angle", "degrees", math.degrees(1)),
     ("largest_roll_rate", "largest roll rate", "degrees/s", math.degrees(1)),
     ("residual_moment", "rolling moment felt, of the wake's (rms)", "%", 100.0),
-    ("roll_control_ratio", "largest moment felt, of the controls'", "%", 100.0),
+    ("roll_control_ratio", "largest moment of the wake, of the controls'", "%", 100.0),
 )
 _OF_THE_LIDAR = (
     ("lead_time", "from the first usable track to the wake", "s", 1.0),
@@ -147,11 +147,11 @@ def _lead(metrics: Mapping[str, float]) -> list[str]:
     best = "feedforward" if ours is not None else "perfect" if perfect is not None else "off"
     bank, ratio = (metrics[f"encounter.{best}.{k}"] for k in ("largest_roll", "roll_control_ratio"))
     verdict = "stays below" if bank <= ACCEPTED_BANK else "exceeds"
-    side = "below" if ratio <= ACCEPTED_RATIO else "above"
     answer += (
-        f" {_FLIGHT[best]} {verdict} the {math.degrees(ACCEPTED_BANK):.0f} degrees of bank at which "
-        f"an approach is called unstable; the largest rolling moment felt is {three(ratio)} of the "
-        f"controls' largest, {side} the {ACCEPTED_RATIO:g} that pilots find uncritical."
+        f" {_FLIGHT[best]} {verdict} the {math.degrees(ACCEPTED_BANK):.0f} degrees of bank at "
+        "which an approach is called unstable. The wake's rolling moment is up to "
+        f"{three(ratio)} of the controls' largest; up to {ACCEPTED_RATIO:g} pilots find an "
+        "encounter uncritical."
     )
     lead = [answer]
     if "encounter.lead_time" in metrics:

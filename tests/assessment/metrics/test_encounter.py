@@ -87,7 +87,7 @@ def test_roll_and_moments(series):
     assert found["encounter.removed_of_perfect.largest_roll"] == pytest.approx(0.36 / 0.45)
     assert found["encounter.feedforward.residual_moment"] == pytest.approx(0.25)
     assert found["encounter.off.roll_control_ratio"] == pytest.approx(0.5)
-    # 0.14 rad are 8 degrees, 0.05 rad are 3: the latter with 5 % of the controls' moment
+    # 0.14 rad are 8 degrees, 0.05 rad are 3
     assert [found[f"encounter.{m}.hazardous"] for m in series["flight"].values] == [1, 1, 0]
     assert not any("track" in key for key in found)
 
