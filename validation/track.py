@@ -120,10 +120,10 @@ def as_assumed(effort):
         "Wakes as assumed",
         f"{number} flights each. *Walks*: circulations, radii, places, slopes and mean wind walk "
         "as the default settings say, in steps of half a slab; the drift is that of point "
-        "vortices. *Oblique lines*: straight lines in space that sink across their axis, crossed at "
-        "10 degrees on a descent of 3 degrees, and a filter without process noise. Fits scatter by "
-        "the covariance of a least-squares fit to vectors. Innovations are from the third slab on: "
-        "that of the second is given by the prior of the slopes.",
+        "vortices. *Oblique lines*: straight lines in space that sink across their axis, crossed "
+        "at 10 degrees on a descent of 3 degrees, and a filter without process noise. Fits scatter "
+        "by the covariance of a least-squares fit to vectors. Innovations are from the third slab "
+        "on: that of the second is given by the prior of the slopes.",
         tuple(rows),
     )
 
