@@ -68,8 +68,8 @@ class VirtualLidar:
     in the first gate of the next, so every scan completes a pair of images of one slab; wind and
     vortices are estimated from it. Scans are instantaneous. Their images depend on the experiment,
     the number of the scan and the pose alone: a step that is repeated gives the same images bit for
-    bit, and the same estimate but for rounding; several lidars in one process do not disturb each
-    other. Nothing is written.
+    bit, and the same estimate but for rounding, where it starts from nothing; several lidars in one
+    process do not disturb each other. Nothing is written.
 
     Parameters
     ----------

@@ -121,19 +121,18 @@ def test_both_images_show_the_air_of_the_slab(flight):
 def test_a_repeated_step_gives_the_same_numbers(flight):
     estimates, images, _ = flight
     lidar = lm.VirtualLidar(small_encounter())
-    other = lm.VirtualLidar(small_encounter(seed=7))
-    other.step(0.0)
-    lidar.step(0.1)
+    other = lm.VirtualLidar(small_encounter(7, render={"variant": "llvm_ad_mono_polarized"}))
     other.step(0.1)
+    lidar.step(0.1)
+    other.step(0.2)
     found = lidar.step(0.2)
     assert same(lidar.images, images[2])
-    other.step(0.2)
+    assert not same(lidar.images, other.images)
     again = lidar.step(0.2)
     assert same(lidar.images, images[2])
     # sums of the fit differ in their last digits with where the memory lies
     for pair in (estimates[2].pair, again.pair):
         np.testing.assert_allclose(pair.parameters, found.pair.parameters, rtol=1e-6)
-    assert not same(lidar.images, other.images)
 
 
 def test_only_the_first_step_compiles(flight):

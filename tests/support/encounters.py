@@ -19,7 +19,8 @@ def small_encounter(seed=1, path=None, wake=None, render=None, **changes):
             "wake": {"file": None, "time": None, "vortex_pair": pair, "spacing": "1 m"}
             | (wake or {}),
             "lidar": {"pulse_duration": "10 ns"},
-            "render": {"samples_per_beam": 32, "max_order": 1} | (render or {}),
+            "render": {"samples_per_beam": 32, "max_order": 1, "variant": "llvm_ad_mono"}
+            | (render or {}),
             "retrieval": {"methods": ["vortex_fit"]},
             "encounter": {
                 "path": {"start": "190 m", "crossing_angle": "0 deg", "climb_angle": "0 deg"}
