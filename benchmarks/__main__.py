@@ -25,6 +25,7 @@ COMPARISONS = (
     "fringes",
     "rings",
     "campaign",
+    "realtime",
     "imports",
 )
 

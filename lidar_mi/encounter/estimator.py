@@ -83,6 +83,11 @@ class Estimator:
             if self._method is None:
                 wind = None
             elif self._method == ImageMethod.VARIATIONAL:
+        if self._method is None:
+            return None, pair, seconds
+        with _timed(seconds, "wind"):
+            options = self._windows | {"noise": noise, "times": times}
+            if self._method == ImageMethod.VARIATIONAL:
                 start = self._expected(image1, dt, pair) if expected is not None else None
                 wind, flow = wind_of_slab(image1, image2, dt, start, **options)
                 self._last = (flow, pair) if flow is not None and pair.success else None

@@ -156,4 +156,6 @@ def _from_data(data: dict, where: str) -> VortexPairFit:
             raise InputError(
                 f"{where}.covariance: not symmetric and finite; expected that of a fit"
             )
-    return VortexPairFit(parameters, covariance, profile, **numbers, reasons=reasons)
+    return VortexPairFit(
+        parameters, covariance, profile, **numbers, reasons=reasons, from_start=False
+    )

@@ -7,6 +7,16 @@ from benchmarks.cases import vortex_pair_images
 from lidar_mi.encounter.estimator import Estimator
 from lidar_mi.experiment.reading import load_experiment
 from tests.support.vortex_pairs import vector
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.cases import drifting_pair_images, vortex_pair_images
+from benchmarks.realtime import UNFORESEEN
+from lidar_mi.encounter.estimator import Estimator
+from lidar_mi.experiment.reading import load_experiment
+from tests.support.vortex_pairs import uneven, vector
 
 DT = 0.1
 
@@ -37,3 +47,22 @@ def test_the_wind_is_by_the_most_accurate_method(images):
     off = wind["v"] - images.v.interp(y=wind["y"], z=wind["z"])
     assert float(off.where(valid).std()) < 0.5
     assert set(seconds) == {"vortices", "wind"}
+
+
+def test_the_next_slab_starts_from_the_last_one():
+    """Half a pixel on, with other texture: as accurate as from nothing."""
+    near, far = (Estimator(load_experiment("wake_sensor")) for _ in range(2))
+    last, errors = None, {"near": [], "far": []}
+    for seed, y in ((1, 0.0), (2, 0.25)):
+        vortices = [replace(v, y=v.y + y) for v in uneven()]
+        slab = drifting_pair_images(vortices, (0.5, 0.0), 0.03, seed, columns=130, rows=90)
+        found = near.pair_of(slab.first, slab.second, DT, 0.03, last)
+        last = replace(found[1], covariance=found[1].covariance + np.diag(UNFORESEEN**2))
+        for name, (wind, _, _) in {
+            "near": found,
+            "far": far.pair_of(slab.first, slab.second, DT, 0.03),
+        }.items():
+            off = wind["v"] - slab.v.interp(y=wind["y"], z=wind["z"])
+            errors[name].append(float(off.std()))
+    assert found[0].attrs["from_start"] == 1 and found[1].from_start
+    assert errors["near"][1] < 1.05 * errors["far"][1]

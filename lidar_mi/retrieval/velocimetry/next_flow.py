@@ -8,6 +8,7 @@ import torch
 from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
 from lidar_mi.retrieval.velocimetry.band import spread
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
+from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.direct import Posterior, solved
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
@@ -150,6 +151,10 @@ def next_flow(
         return None
     at_centres = Mesh(prior.mesh.axes, _centres(windows, coefficients))
     covariance = worse * spread(posterior.band.covariance(posterior.root), at_centres)
+    # the recursion for the inverse damps rounding: 1e-5 in single precision
+    root = Factor(*(part.float() for part in posterior.root))
+    in_single = Mesh(prior.mesh.axes, _centres(windows, root.root))
+    covariance = worse * spread(posterior.band.covariance(root), in_single).to(coefficients)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, start.before, score, stack, windows, min_correlation)
     found = found._replace(flag=found.flag | unskilled(found.d, covariance))

@@ -38,18 +38,27 @@ def angular_velocity(s: torch.Tensor, profile: Profile) -> tuple[torch.Tensor, t
 
     Lamb-Oseen: (1 - exp(-1.2564 s)) / s. Burnham-Hallock: 1 / (1 + s).
     """
+    value = swirl(s, profile)
     if profile == "burnham_hallock":
-        value = 1 / (1 + s)
         return value, -(value**2)
     a = _LAMB_OSEEN
     small = s < 1e-3
     t = torch.where(small, 1.0, s)
-    value = -torch.expm1(-a * t) / t
     slope = (a - (1 + a * t) * value) / t
-    return (
-        torch.where(small, a - a**2 * s / 2 + a**3 * s**2 / 6, value),
-        torch.where(small, -(a**2) / 2 + a**3 * s / 3, slope),
-    )
+    return value, torch.where(small, -(a**2) / 2 + a**3 * s / 3, slope)
+
+
+def swirl(s: torch.Tensor, profile: Profile) -> torch.Tensor:
+    """The first of `angular_velocity` alone."""
+    if profile == "burnham_hallock":
+        return 1 / (1 + s)
+    a = _LAMB_OSEEN
+    small = s < 1e-3
+    t = torch.where(small, 1.0, s)
+    value = -torch.expm1(-a * t) / t
+    if bool(small.any()):
+        value = torch.where(small, a - a**2 * s / 2 + a**3 * s**2 / 6, value)
+    return value
 
 
 def wind(theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, profile: Profile) -> torch.Tensor:
@@ -58,7 +67,7 @@ def wind(theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, profile: Profile
     for first in (0, 4):
         circulation, radius = theta[first], theta[first + 1].exp()
         dy, dz = y - theta[first + 2], z - theta[first + 3]
-        value, _ = angular_velocity((dy**2 + dz**2) / radius**2, profile)
+        value = swirl((dy**2 + dz**2) / radius**2, profile)
         omega = circulation / (2 * torch.pi * radius**2) * value
         v, w = v - omega * dz, w + omega * dy
     return torch.stack([v, w])
@@ -157,7 +166,7 @@ def _turning(theta, y, z, profile: Profile) -> torch.Tensor:
     for first in (0, 4):
         radius2 = (2 * theta[first + 1]).exp()
         square = (y - theta[first + 2]) ** 2 + (z - theta[first + 3]) ** 2
-        value, _ = angular_velocity(square / radius2, profile)
+        value = swirl(square / radius2, profile)
         total = total + theta[first].abs() / (2 * torch.pi * radius2) * value
     return total
 

@@ -1,0 +1,156 @@
+"""Latency of the estimator of an encounter: slab after slab, against the cold methods.
+
+A pair drifts and decays from slab to slab; every slab has its own texture, exactly advected. The
+estimator starts from the pair expected from the last slab, as in flight.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from lidar_mi.atmosphere.vortex import Vortex
+from lidar_mi.encounter.estimator import Estimator
+from lidar_mi.experiment.reading import load_experiment
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+
+from .cases import CIRCULATION, CORE_RADIUS, DT, SEPARATION, Pair, drifting_pair_images
+from .report import Comparison, Row, row
+
+NOISE, RATE = 0.03, 10.0
+MEAN_WIND = (1.5, 0.2)
+SLABS_A_TURN = 20
+# One in so many slabs is estimated from nothing as well.
+COLD = 10
+# Growth of the expected pair's errors from slab to slab, as by a track: m^2/s, ln m, m, m, m/s.
+UNFORESEEN = np.array([8.0, 0.03, 0.15, 0.15, 8.0, 0.03, 0.15, 0.15, 0.1, 0.1])
+
+
+class Timed(NamedTuple):
+    """A slab's wind and pair, wall time by part (s) and the processor's time for all of it."""
+
+    wind: Any
+    pair: VortexPairFit
+    seconds: Mapping[str, float]
+    cpu: float
+
+
+def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison:
+    """Latency and errors over 20 times ``repeats`` slabs, after one that is not timed."""
+    torch.set_num_threads(1)
+    number = SLABS_A_TURN * repeats
+    experiment = load_experiment("wake_sensor")
+    estimator, cold = Estimator(experiment), Estimator(experiment)
+    warm, scratch, truths = [], [], []
+    last = None
+    for k in range(number + 1):
+        images = slab(k, number, columns, rows)
+        found = timed(estimator, images, last and expected(last))
+        last = found.pair if found.pair.success else None
+        if not k:
+            continue
+        warm.append(found)
+        truths.append(images)
+        if k % COLD == 0:
+            scratch.append((images, timed(cold, images, None), found))
+    case = f"{columns} x {rows} px"
+    lines = []
+    for part in ("vortices", "wind", "total"):
+        now, then = (
+            [sum(t.seconds.values()) if part == "total" else t.seconds[part] for t in those]
+            for those in (warm, [t for _, t, _ in scratch])
+        )
+        lines += _latency(case, part, now, then)
+    cpu = [t.cpu for t in warm]
+    lines += _latency(case, "processor, one thread", cpu, [t.cpu for _, t, _ in scratch])
+    lines += _errors(scratch)
+    started = np.mean([t.pair.from_start and t.wind.attrs["from_start"] for t in warm])
+    latency = np.quantile([sum(t.seconds.values()) for t in warm], 0.99)
+    worst = np.quantile(cpu, 0.99)
+    return Comparison(
+        "Real time: two images to wind and vortices, from slab to slab",
+        "from the expected pair",
+        "from nothing",
+        tuple(lines),
+        (
+            f"{number} slabs, the first one not counted; noise of {NOISE:.0%} of the mean. Found "
+            f"from the start: {started:.0%}. From nothing: every {COLD}th slab.",
+            f"Requirement: {RATE:g} slabs a second, {1e3 / RATE:.0f} ms. 99 % of the slabs took at "
+            f"most {1e3 * latency:.0f} ms ({_verdict(latency)}), {1e3 * worst:.0f} ms of the "
+            f"processor's time ({_verdict(worst)}).",
+            "Errors: of the same slabs by both, against the true pair and wind.",
+        ),
+    )
+
+
+def slab(number: int, of: int, columns: int, rows: int) -> Pair:
+    """Images of a slab with the pair at that time: it drifts, descends and decays."""
+    seconds = number / RATE
+    later = seconds - of / RATE / 2
+    y, z = 0.75 * later, -0.8 * later
+    decay = np.exp(-seconds / 60.0)
+    vortices = [
+        Vortex(side * CIRCULATION * decay, CORE_RADIUS, y + side * SEPARATION / 2, z, "lamb_oseen")
+        for side in (1, -1)
+    ]
+    return drifting_pair_images(vortices, MEAN_WIND, NOISE, number, columns, rows)
+
+
+def expected(last: VortexPairFit) -> VortexPairFit:
+    """The last pair with errors grown by what may change until the next slab."""
+    return replace(last, covariance=last.covariance + np.diag(UNFORESEEN**2))
+
+
+def timed(estimator: Estimator, images: Pair, start: VortexPairFit | None) -> Timed:
+    began = time.process_time()
+    found = estimator.pair_of(images.first, images.second, DT, NOISE, start)
+    return Timed(*found, time.process_time() - began)
+
+
+def _latency(case: str, part: str, warm: list[float], cold: list[float]) -> list[Row]:
+    lines = []
+    for name, of in (("median", np.median), ("99 %", _nearly_all)):
+        now, then = ([1e3 * float(of(values))] for values in (warm, cold))
+        lines.append(row(case, f"{part}, {name}", "ms", now, then, "lower"))
+    return lines
+
+
+def _nearly_all(values: list[float]) -> float:
+    return float(np.quantile(values, 0.99))
+
+
+def _errors(slabs: list[tuple[Pair, Timed, Timed]]) -> list[Row]:
+    """Rms errors by both, of the same slabs."""
+    measures: dict[str, tuple[str, Callable[[Pair, Timed], float]]] = {
+        "circulation error": ("m2/s", lambda images, t: _off(images, t.pair, 0)),
+        "place error": ("m", lambda images, t: _off(images, t.pair, 2)),
+        "wind error": ("m/s", _wind_off),
+    }
+    lines = []
+    for name, (unit, of) in measures.items():
+        then, now = (
+            [float(np.sqrt(np.mean([of(s[0], s[k]) ** 2 for s in slabs])))] for k in (1, 2)
+        )
+        lines.append(row("same slabs", name, unit, now, then, "lower"))
+    return lines
+
+
+def _off(images: Pair, pair: VortexPairFit, parameter: int) -> float:
+    """Rms error of a parameter of both vortices."""
+    true = [(v.circulation, np.log(v.core_radius), v.y, v.z) for v in images.vortices]
+    off = [pair.parameters[4 * k + parameter] - true[k][parameter] for k in (0, 1)]
+    return float(np.sqrt(np.mean(np.square(off))))
+
+
+def _wind_off(images: Pair, found: Timed) -> float:
+    wind = found.wind
+    true = [images.v.interp(y=wind["y"], z=wind["z"]), images.w.interp(y=wind["y"], z=wind["z"])]
+    square = sum((wind[name] - field) ** 2 for name, field in zip("vw", true, strict=True)) / 2
+    return float(square.where(wind["flag"] == 0).mean() ** 0.5)
+
+
+def _verdict(seconds: float) -> str:
+    return "met" if seconds <= 1 / RATE else "not met"
