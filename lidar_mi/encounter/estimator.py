@@ -78,11 +78,6 @@ class Estimator:
         seconds: dict[str, float] = {}
         with _timed(seconds, "vortices"):
             pair = fit_vortices(image1, image2, dt, noise, times=times, start=expected)
-        with _timed(seconds, "wind"):
-            options = self._windows | {"noise": noise, "times": times}
-            if self._method is None:
-                wind = None
-            elif self._method == ImageMethod.VARIATIONAL:
         if self._method is None:
             return None, pair, seconds
         with _timed(seconds, "wind"):

@@ -1,12 +1,5 @@
 """The estimator of a slab: the methods of the retrieval, from nothing and from an expected pair."""
 
-import numpy as np
-import pytest
-
-from benchmarks.cases import vortex_pair_images
-from lidar_mi.encounter.estimator import Estimator
-from lidar_mi.experiment.reading import load_experiment
-from tests.support.vortex_pairs import vector
 from dataclasses import replace
 
 import numpy as np

@@ -150,7 +150,6 @@ def next_flow(
     if not (far < _SMALL and 1 / _MISFIT < worse < _MISFIT and 1 / _ENERGY < more < _ENERGY):
         return None
     at_centres = Mesh(prior.mesh.axes, _centres(windows, coefficients))
-    covariance = worse * spread(posterior.band.covariance(posterior.root), at_centres)
     # the recursion for the inverse damps rounding: 1e-5 in single precision
     root = Factor(*(part.float() for part in posterior.root))
     in_single = Mesh(prior.mesh.axes, _centres(windows, root.root))
