@@ -1,7 +1,8 @@
 """Flights through the wake of an experiment: without help, with the lidar, with perfect preview.
 
 All of them meet the same wake. Only the flight that steers by the lidar needs its images: what the
-other two do is known without it.
+others do is known without it. Between no help and a preview there is an autopilot: the controller
+of the flights with a preview, told that there is no wake. What it leaves is what a preview is for.
 """
 
 import math
@@ -18,16 +19,27 @@ from lidar_mi.encounter.preview import Lidar, Lookout, preview_of
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.seen import Seen
 from lidar_mi.encounter.series import Recorder, flights_dataset, track_dataset
+from lidar_mi.encounter.strips import Loads
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.schema_encounter import Encounter
 from lidar_mi.progress import Notice
 
-OFF, FEEDFORWARD, PERFECT = "off", "feedforward", "perfect"
-FLOWN = {OFF: (OFF,), PERFECT: (OFF, PERFECT), FEEDFORWARD: (OFF, PERFECT, FEEDFORWARD)}
+OFF, AUTOPILOT, FEEDFORWARD, PERFECT = "off", "autopilot", "feedforward", "perfect"
+FLOWN = {
+    OFF: (OFF,),
+    PERFECT: (OFF, AUTOPILOT, PERFECT),
+    FEEDFORWARD: (OFF, AUTOPILOT, PERFECT, FEEDFORWARD),
+}
 """Flights of each mode of control: what it is compared with is flown, too."""
 
-TITLES = {OFF: "without help", PERFECT: "perfect preview", FEEDFORWARD: "with the lidar"}
+TITLES = {
+    OFF: "without help",
+    AUTOPILOT: "autopilot",
+    PERFECT: "perfect preview",
+    FEEDFORWARD: "with the lidar",
+}
+_NO_WAKE = Loads(np.zeros(3), np.zeros(3))
 
 # Longest step of a flight, s: below the time in which the wing crosses a core.
 _STEP = 0.01
@@ -97,6 +109,10 @@ def fly_all(
         one, told = new(), _titled(notice, mode)
         if mode == OFF:
             found[mode] = flown(one, wings_level(one, levelling), wake, encounter, told)
+        elif mode == AUTOPILOT:
+            found[mode] = flown(
+                one, steers(one), wake, encounter, told, lambda state: lambda time: _NO_WAKE
+            )
         elif mode == PERFECT:
             found[mode] = flown(one, steers(one), wake, encounter, told, preview_of(one, wake.wind))
         else:
@@ -108,7 +124,7 @@ def fly_all(
             ahead = lookout.preview(one)
             found[mode] = flown(one, steers(one), wake, encounter, told, ahead)
             track, slabs = track_dataset(lookout.slabs, wake), seen.dataset()
-    order = [mode for mode in (OFF, FEEDFORWARD, PERFECT) if mode in found]
+    order = [mode for mode in (OFF, AUTOPILOT, FEEDFORWARD, PERFECT) if mode in found]
     return Flown(flights_dataset({mode: found[mode] for mode in order}), track, slabs)
 
 

@@ -56,8 +56,8 @@ def _film(kept: FlightFolder, flown: Flown, span: float, log: Log) -> Film | Non
     return Film(
         "The flight",
         "Above: backscatter of the slab that is seen now, true cores (crosses) and tracked ones, "
-        "and the wings of the aircraft at this moment. Middle: from above, what the lidar looks at. "
-        "Below: roll angles.",
+        "and the wings of the aircraft at this moment. Middle: from above, what the lidar looks "
+        "at. Below: roll angles.",
         frames,
         seconds,
     )

@@ -9,7 +9,7 @@ import numpy as np
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
 
-QUALITY = 70
+QUALITY = 55
 """Of lossy frames, 0 to 100."""
 
 _COLOURS = 64

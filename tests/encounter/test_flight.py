@@ -34,8 +34,8 @@ def flown(experiment, lidar):
 
 def test_all_meet_the_same_wake(flown, experiment):
     """On the nominal path the rolling moment is that of the wings level, whatever steers."""
-    assert list(flown.series["flight"].values) == ["off", "feedforward", "perfect"]
-    off, _, perfect = (flown.series.isel(flight=k) for k in range(3))
+    assert list(flown.series["flight"].values) == ["off", "autopilot", "feedforward", "perfect"]
+    off, perfect = (flown.series.sel(flight=mode) for mode in ("off", "perfect"))
     assert np.array_equal(off["x"], perfect["x"])
     # banked wings meet the wind of other places: by the square of 30 degrees
     strongest = float(np.abs(off["roll_moment"]).max())
@@ -45,9 +45,10 @@ def test_all_meet_the_same_wake(flown, experiment):
 
 def test_help_lessens_the_roll(flown):
     found = encounter_metrics(flown.series, flown.track)
-    off, ours, perfect = (
-        found[f"encounter.{mode}.largest_roll"] for mode in ("off", "feedforward", "perfect")
+    off, blind, ours, perfect = (
+        found[f"encounter.{mode}.largest_roll"] for mode in flown.series["flight"].values
     )
+    assert perfect < blind < off
     assert perfect < 0.7 * off
     assert found["encounter.removed_of_perfect.largest_roll"] > 0.9
     assert found["encounter.prediction_error"] < 0.1
@@ -93,7 +94,7 @@ def test_only_what_a_mode_needs_is_flown(experiment):
         def step(self, *_):
             raise AssertionError
 
-    for mode, expected in (("off", ["off"]), ("perfect", ["off", "perfect"])):
+    for mode, expected in (("off", ["off"]), ("perfect", ["off", "autopilot", "perfect"])):
         one = check(encounter_keys(control={"mode": mode}), "test")
         flown = fly_all(one, silent, lidar=Unused())
         assert list(flown.series["flight"].values) == expected and flown.track is None

@@ -39,7 +39,7 @@ def test_folder_holds_the_flight(tmp_path):
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
     assert metrics == flight.metrics and metrics["encounter.off.largest_roll"] > 0.1
     with xr.open_dataset(tmp_path / "out" / "flight.nc", engine="h5netcdf") as found:
-        assert found["roll"].attrs["units"] == "rad" and found.sizes["flight"] == 2
+        assert found["roll"].attrs["units"] == "rad" and found.sizes["flight"] == 3
     page = (tmp_path / "out" / "report.html").read_text()
     assert "Without help, the wake rolls the aircraft by" in page and "http" not in page
     # again: nothing is flown

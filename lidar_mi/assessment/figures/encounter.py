@@ -13,6 +13,7 @@ from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
 FLIGHTS = {
     "off": ("without help", "tab:red", "-"),
+    "autopilot": ("autopilot, no preview", "tab:purple", ":"),
     "feedforward": ("with the lidar", "tab:blue", "-"),
     "perfect": ("perfect preview", "0.35", "--"),
 }
@@ -52,6 +53,11 @@ def draw_all(
     """
     plates = [("fig30_roll", "Roll angle and roll rate", _roll(series))]
     if track is not None and track.sizes["slab"]:
+        if seen is not None:
+            overview = _overview(series, track, seen, span)
+            plates.insert(
+                0, ("fig29_encounter", "A slab ahead, and what the pilot feels", overview)
+            )
         plates.append(
             (
                 "fig31_approach",
@@ -73,7 +79,7 @@ def _flown(series: xr.Dataset):
     there = [str(mode) for mode in series["flight"].values]
     return [
         (mode, series.sel(flight=mode))
-        for mode in ("off", "perfect", "feedforward")
+        for mode in ("off", "autopilot", "perfect", "feedforward")
         if mode in there
     ]
 
@@ -151,11 +157,37 @@ def _approach(series, track, seen):
     )
 
 
+def _overview(series, track, seen, span):
+    figure = Figure(figsize=(13.6, 4.9), layout="compressed")
+    view, angle = figure.subplots(1, 2, width_ratios=(1.25, 1))
+    ahead = _draw_slab(view, track, seen, span)
+    view.set_title(f"backscatter and wind of a slab, {ahead:.1f} s ahead")
+    view.legend(loc="lower center", ncols=3, fontsize=8)
+    _lines(angle, series, "roll", np.degrees(1))
+    angle.set(title="roll angle", ylabel="degrees", xlabel="time of flight / s")
+    angle.legend(fontsize=9)
+    return figure, (
+        "Left: a slab from the cockpit, with the cores of its vortices. Right: roll angles on the "
+        "same flight path through the same wake."
+    )
+
+
 def _cockpit(track, seen, span):
-    at = best_slab(track, seen)
     figure = Figure(figsize=(10.5, 7.0), layout="compressed")
     axes = figure.subplots()
-    view = seen.isel(slab=at)
+    ahead = _draw_slab(axes, track, seen, span)
+    axes.legend(loc="lower center", ncols=3, fontsize=9)
+    view = seen.isel(slab=best_slab(track, seen))
+    return figure, (
+        f"Backscatter of the slab at x = {float(view['x']):.0f} m with the wind retrieved from "
+        f"both images, delivered {ahead:.1f} s before the wing is there. Circles: cores with the "
+        "radius of their largest swirl."
+    )
+
+
+def _draw_slab(axes, track, seen, span) -> float:
+    """Image, wind, vortices and wing; time from the delivery to the wing's arrival, s."""
+    view = seen.isel(slab=best_slab(track, seen))
     draw_image(axes, view)
     draw_vectors(axes, view)
     number = int(np.argmin(np.abs(track["x"].values - float(view["x"]))))
@@ -169,13 +201,8 @@ def _cockpit(track, seen, span):
         label="wing, where it will pass",
     )
     axes.set(xlabel="y / m (port is left)", ylabel="z / m")
-    axes.legend(loc="lower center", ncols=3, fontsize=9)
-    ahead = float(view["x"]) / float(np.gradient(track["x"], track["time"]).mean())
-    return figure, (
-        f"Backscatter of the slab at x = {float(view['x']):.0f} m with the wind retrieved from "
-        f"both images, delivered at {float(view['delivered']):.2f} s; the wing is there at about "
-        f"{ahead:.1f} s. Circles: cores with the radius of their largest swirl."
-    )
+    speed = float(np.gradient(track["x"], track["time"]).mean())
+    return float(view["x"]) / speed - float(view["delivered"])
 
 
 def best_slab(track: xr.Dataset, seen: xr.Dataset) -> int:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from lidar_mi.assessment.figures.encounter import FLIGHTS, SIDES, draw_image, draw_vortices
 
-MOST_FRAMES = 45
+MOST_FRAMES = 40
 _SIZE, _DOTS = (7.2, 8.0), 90
 
 

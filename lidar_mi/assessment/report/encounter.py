@@ -45,6 +45,7 @@ _OF_THE_LIDAR = (
 
 _FLIGHT = {
     "off": "This flight",
+    "autopilot": "The autopilot",
     "feedforward": "The flight with the lidar",
     "perfect": "The flight with perfect preview",
 }
@@ -104,9 +105,10 @@ def encounter_chapter(
         tables.append(("The lidar and its track", ["value"], lidar))
     numbers = Tables(
         heading="Numbers of the flight",
-        legend="All flights meet the same wake with the same levelling of the wings; what differs "
-        "is the preview that steers the ailerons. Rolling moment felt: that of wake and ailerons "
-        "together. Errors are those of the track against the truth, in the slab just seen.",
+        legend="All flights meet the same wake. Without help, a pilot levels the wings; the "
+        "autopilot is the controller of the flights with a preview, told that there is no wake. "
+        "Rolling moment felt: that of wake and ailerons together. Errors are those of the track "
+        "against the truth, in the slab just seen.",
         tables=tables,
     )
     return Chapter(
@@ -120,12 +122,14 @@ def encounter_chapter(
 
 
 def _lead(metrics: Mapping[str, float]) -> list[str]:
-    off, ours, perfect = (metrics.get(f"encounter.{mode}.largest_roll") for mode in FLIGHTS)
+    off, blind, ours, perfect = (metrics.get(f"encounter.{m}.largest_roll") for m in FLIGHTS)
     if off is None:
         return []
     answer = f"Without help, the wake rolls the aircraft by {_degrees(off)}"
     if _departed(metrics, "off"):
         answer = "Without help, the wake upsets the aircraft"
+    if blind is not None:
+        answer += f"; with the same autopilot, but no preview, by {_degrees(blind)}"
     if ours is not None:
         answer += f"; with the lidar by {_degrees(ours)}"
         if _departed(metrics, "feedforward"):
@@ -170,8 +174,8 @@ def _limits(metrics: Mapping[str, float]) -> list[str]:
         return []
     return [
         f"Of the wake's rolling moment {percent(ours)} is felt with the lidar and "
-        f"{percent(perfect)} with perfect preview: this rest is due to the rate and the limits of "
-        "the ailerons, the difference to the lidar."
+        f"{percent(perfect)} with perfect preview. What is left with perfect preview is beyond the "
+        "rate and the deflection of the ailerons; the difference to it is the lidar's."
     ]
 
 
