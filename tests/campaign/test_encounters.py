@@ -1,7 +1,7 @@
 """Campaigns of encounters: every point is flown, its numbers are collected, shown as a distribution.
 
-Detects: points that are run instead of flown, images taken for shared ones, a distribution that
-is not that of the flights.
+Detects: points that are run instead of flown, images taken for shared ones, a distribution that is
+not that of the flights.
 """
 
 import re
