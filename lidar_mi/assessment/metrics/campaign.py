@@ -100,7 +100,10 @@ def chosen(metrics: Mapping[str, xr.DataArray], asked: Sequence[str] | None) -> 
         *vortex,
         "sensor.rmse_v_los",
         "sensor.doppler.pulses_needed",
-        *(f"encounter.{mode}.largest_roll" for mode in ("off", "feedforward", "perfect")),
+        *(
+            f"encounter.{mode}.largest_roll"
+            for mode in ("off", "autopilot", "feedforward", "perfect")
+        ),
         "encounter.removed_of_perfect.largest_roll",
         "encounter.lead_time",
         "encounter.normalised_innovation",

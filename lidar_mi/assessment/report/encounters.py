@@ -1,15 +1,22 @@
 """What a campaign's report says of many encounters: how far the aircraft rolls, and how often."""
 
+import math
 from collections.abc import Iterator, Mapping
 
 import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.figures.campaign import draw_distributions
+from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 from lidar_mi.assessment.report.block import Block
 from lidar_mi.assessment.report.digits import with_error
 
-_MODES = {"off": "no control", "feedforward": "with the lidar", "perfect": "perfect preview"}
+_MODES = {
+    "off": "no control",
+    "autopilot": "autopilot",
+    "feedforward": "with the lidar",
+    "perfect": "perfect preview",
+}
 
 
 def encounter_blocks(known: Mapping[str, xr.DataArray]) -> Iterator[Block]:
@@ -23,13 +30,10 @@ def encounter_blocks(known: Mapping[str, xr.DataArray]) -> Iterator[Block]:
     rolls = {name: values for name, values in rolls.items() if values.size}
     if not rolls:
         return
-    limit = None
-    if "encounter.hazard_roll" in known:
-        limit = float(np.degrees(np.nanmax(known["encounter.hazard_roll"].values)))
+    limit = math.degrees(ACCEPTED_BANK)
     text = "Largest bank angle of every flight: the fraction of flights that stay below. "
-    if limit is not None:
-        below = [f"{name} {_fraction(values <= limit)}" for name, values in rolls.items()]
-        text += f"Within {limit:.3g}°: {', '.join(below)}."
+    below = [f"{name} {_fraction(values <= limit)}" for name, values in rolls.items()]
+    text += f"Within {limit:.3g}°: {', '.join(below)}."
     yield Block(
         "Bank angle", text, [draw_distributions("", rolls, "largest bank angle / °", limit)]
     )
