@@ -1,4 +1,4 @@
-"""Campaigns of encounters: every point is flown, its numbers are collected, shown as a distribution.
+"""Campaigns of encounters: points are flown, their numbers collected and shown as distributions.
 
 Detects: points that are run instead of flown, images taken for shared ones, a distribution that is
 not that of the flights.
