@@ -18,6 +18,7 @@ from matplotlib.image import imread
 from lidar_mi.assessment.report import comparison
 from lidar_mi.assessment.report.comparison import differences, flat
 from lidar_mi.assessment.report.digits import three
+from lidar_mi.encounter.check import geometry
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
@@ -288,8 +289,12 @@ def test_shipped_experiments_are_documented():
     ],
 )
 def test_shipped_experiments_fit_together(name, one):
-    """Everything that a run checks before it writes: files, tables, lines within the wake."""
-    experiment.prepare(one, SCENES)
+    """Everything that a run or a flight checks before it writes: files, tables, lines within the
+    wake, a path that meets it."""
+    if one.encounter:
+        assert geometry(one) == []
+    else:
+        experiment.prepare(one, SCENES)
 
 
 # what makes a shipped experiment small; what it is about stays

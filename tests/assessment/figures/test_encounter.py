@@ -1,0 +1,70 @@
+"""Figures and film of a flight: drawn, with what they claim to show.
+
+Detects a figure that is missing or empty, a mirrored view, frames of several sizes, a caption of
+another moment.
+"""
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from lidar_mi.assessment.figures.encounter import best_slab, draw_all, draw_image, draw_vortices
+from lidar_mi.assessment.figures.encounter_film import film
+from lidar_mi.experiment.log import Log
+from tests.support.encounter_results import flown
+
+SPAN = 28.9
+
+
+def test_all_are_drawn(tmp_path):
+    found = flown()
+    drawn = draw_all(tmp_path, found.series, found.track, found.seen, SPAN, Log())
+    assert [one.path.stem for one in drawn] == [
+        "fig29_encounter",
+        "fig30_roll",
+        "fig31_approach",
+        "fig32_cockpit",
+        "fig33_track",
+        "fig34_moment",
+        "fig35_commands",
+    ]
+    for one in drawn:
+        assert imread(one.path).std() > 0.05 and one.caption.endswith(".")
+
+
+def test_without_a_lidar_there_is_the_flight(tmp_path):
+    alone = flown().series.sel(flight=["off"])
+    drawn = draw_all(tmp_path, alone, None, None, SPAN, Log())
+    assert [one.path.stem for one in drawn] == ["fig30_roll", "fig35_commands"]
+
+
+def test_cockpit_is_the_pilots_view():
+    """Port, positive y, is on the left; cores are where the data set has them."""
+    found = flown()
+    number = best_slab(found.track, found.seen)
+    axes = Figure().subplots()
+    draw_image(axes, found.seen.isel(slab=number))
+    at = found.track.isel(slab=number)
+    draw_vortices(axes, at)
+    left, right = axes.get_xlim()
+    assert left > right
+    (port, starboard) = axes.lines
+    assert port.get_xdata() == pytest.approx(float(at["port_y"].sel(source="truth")))
+    assert port.get_xdata() > starboard.get_xdata()
+    assert [round(c.center[0], 6) for c in axes.patches] == [
+        round(float(at[f"{side}_y"].sel(source="track")), 6) for side in ("port", "starboard")
+    ]
+
+
+def test_film_shows_the_flight(monkeypatch):
+    monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.MOST_FRAMES", 3)
+    found = flown()
+    frames = list(film(found.series, found.track, found.seen, SPAN))
+    assert len(frames) == 3 and len({frame.pixels.shape for frame in frames}) == 1
+    assert all(frame.pixels.dtype == np.uint8 and frame.pixels.std() > 10 for frame in frames)
+    last = found.series.isel(time=-1)
+    angle = np.degrees(float(last["roll"].sel(flight="off")))
+    assert f"without help {angle:+.1f}°" in frames[-1].caption
+    assert frames[0].time < frames[1].time < frames[2].time
+    assert list(film(found.series, None, None, SPAN)) == []

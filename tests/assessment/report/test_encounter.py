@@ -1,0 +1,68 @@
+"""The chapter of a flight: its answer in words.
+
+Detects a goal that is met by the wrong comparison, an upset that is told as an angle, a verdict of
+another flight, a script of frames that the page lacks.
+"""
+
+import math
+
+import pytest
+
+from lidar_mi.assessment.metrics.encounter import judged_in_flight
+from lidar_mi.assessment.metrics.requirements import read_requirements
+from lidar_mi.assessment.report.encounter import encounter_chapter, encounter_summary
+from lidar_mi.assessment.report.page import Film, page
+from lidar_mi.experiment.reading import check
+from tests.support.synthetic_lidar import encounter_keys
+
+
+def numbers(**rolls):
+    found = {}
+    for mode, degrees in rolls.items():
+        found[f"encounter.{mode}.largest_roll"] = math.radians(degrees)
+        found[f"encounter.{mode}.departed"] = float(degrees >= 90)
+        found[f"encounter.{mode}.roll_control_ratio"] = 1.5
+    return found
+
+
+def test_answer_comes_first():
+    metrics = numbers(off=25, autopilot=7, feedforward=9, perfect=2)
+    metrics["encounter.removed_of_perfect.largest_roll"] = 16 / 23
+    answer, *_ = encounter_chapter(metrics, [], []).lead
+    for words in (
+        "Without help, the wake rolls the aircraft by 25 degrees; with the same autopilot, but no "
+        "preview, by 7 degrees; with the lidar by 9 degrees; with perfect preview by 2 degrees.",
+        "removes 70 % of the roll angle that perfect preview removes, and so misses the goal of "
+        "80 %",
+        "The flight with the lidar exceeds the 7 degrees of bank",
+    ):
+        assert words in answer
+
+
+def test_an_upset_is_told():
+    (answer,) = encounter_chapter(numbers(off=120), [], []).lead
+    assert answer.startswith("Without help, the wake upsets the aircraft. This flight exceeds")
+
+
+def test_summary_names_every_flight():
+    table, *_ = encounter_summary(numbers(off=25.3, perfect=2.04))
+    assert table.heads == ("", "without help", "perfect preview")
+    assert table.rows[0] == ("largest roll angle / degrees", "25.3", "2.04")
+
+
+def test_page_has_frames_and_their_script():
+    frames = [(b"one", "0.1 s"), (b"two", "0.2 s"), (b"three", "0.3 s")]
+    judged = judged_in_flight(read_requirements(), {"slabs_per_second": 10.0})
+    shown = Film("The flight", "Frames.", frames, 0.2)
+    chapter = encounter_chapter(numbers(off=25), judged, [], shown)
+    html = page(check(encounter_keys(), "test"), "name: x", {"lidar-mi": "0"}, {}, [chapter])
+    assert html.count('class="film"') == 1 and "for (const film of" in html
+    # the one in the middle is there without a script
+    assert "base64,dHdv" in html and '<p class="now">0.2 s</p>' in html
+    assert "crossing the wake at 20 degrees" in html
+    assert "slabs per second</td><td>at least 10 Hz</td><td>10 Hz</td>" in html
+
+
+@pytest.mark.parametrize("mode", ["off", "perfect"])
+def test_flights_without_a_lidar_have_no_verdict(mode):
+    assert encounter_chapter(numbers(**{mode: 3}), [], []).verdict is None
