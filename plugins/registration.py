@@ -37,8 +37,8 @@ def register(kind: str, name: str, define: Callable[[], type]) -> None:
 def register_plugins() -> None:
     """Register the plugins of lidar-mi with Mitsuba, in the variant in force and every later one.
 
-    May be called at any time and any number of times, before or after ``mi.set_variant``. Scalar
-    variants do not have the plugins.
+    May be called at any time and any number of times, before or after ``mi.set_variant``. In scalar
+    variants a scene with one of the plugins is refused, with the reason.
 
     Examples
     --------
@@ -53,10 +53,24 @@ def register_plugins() -> None:
 
 
 def _register_now(name: str) -> None:
-    # Python plugins handle arrays of rays, which scalar variants do not have.
     variant = mi.variant()
-    if variant and not variant.startswith("scalar"):
-        kind, define = _known[name]
-        # Mitsuba 3.9 has no function for volumes; any registers what a class is derived from
-        kind = kind if hasattr(mi, f"register_{kind}") else "texture"
-        getattr(mi, f"register_{kind}")(name, define())
+    if not variant:
+        return
+    kind, define = _known[name]
+    # Mitsuba 3.9 has no function for volumes; any registers what a class is derived from
+    kind = kind if hasattr(mi, f"register_{kind}") else "texture"
+    # Python plugins handle arrays of rays, which scalar variants do not have.
+    make = _refusal(name, variant) if variant.startswith("scalar") else define()
+    getattr(mi, f"register_{kind}")(name, make)
+
+
+def _refusal(name: str, variant: str) -> Callable:
+    """What a scene gets instead of a plugin in a scalar variant: one line that says so."""
+
+    def refuse(_properties):
+        raise ValueError(
+            f"{name}: the variant {variant} is not allowed, as it has no arrays of rays; expected "
+            "llvm_ad_* or cuda_ad_*"
+        )
+
+    return refuse

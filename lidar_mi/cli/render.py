@@ -37,15 +37,23 @@ def render(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Render a Mitsuba scene with the project's plugins, like the `mitsuba` command."""
+    """Render a Mitsuba scene with the project's plugins, like the `mitsuba` command.
+
+    Writes an EXR, and beside it a PNG of its brightness to look at.
+    """
     from lidar_mi.experiment.shipped import scene_file
+    from lidar_mi.io.images import read_pixels
+    from lidar_mi.io.png import write_preview
     from lidar_mi.io.target import check_target
     from lidar_mi.rendering.scene import files_of, render_file
 
     source, definitions = scene_file(scene), _definitions(define or [])
     beside = source if Path(scene).is_file() else Path(source.name)
     path = out or beside.with_suffix(".exr")
-    check_target(path, files_of(source, definitions), overwrite=overwrite)
+    preview, read = path.with_suffix(".png"), files_of(source, definitions)
+    check_target(path, read, overwrite=overwrite)
+    # made from the image: it is replaced together with it
+    check_target(preview, read, overwrite=overwrite or path.exists())
     with progress() as notice:
         render_file(
             source,
@@ -56,7 +64,9 @@ def render(
             definitions,
             lambda fraction: notice(f"rendering {source.name}", fraction),
         )
+    write_preview(preview, read_pixels(path))
     output.print(f"image    {path}")
+    output.print(f"preview  {preview}")
 
 
 def _definitions(texts: list[str]) -> dict[str, str]:

@@ -1,9 +1,10 @@
-"""Figures as PNG files."""
+"""Figures and previews of images as PNG files."""
 
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from lidar_mi import __version__
@@ -27,6 +28,28 @@ def write_png(figure: Figure, path: str | Path, *, cropped: bool = False) -> Non
 def png_bytes(figure: Figure) -> bytes:
     """A figure as a small PNG file in memory, 70 dots per inch, cropped."""
     return _png(figure, dpi=70, bbox_inches="tight", pad_inches=0.1)
+
+
+def write_preview(path: str | Path, pixels: np.ndarray) -> None:
+    """Write an image of light as 8-bit grey, for viewers that know no EXR.
+
+    Black is 0 and white the value that 0.5 % of the pixels exceed; between them the display's
+    exponent of 2.2 is corrected. What is not finite is black.
+
+    Parameters
+    ----------
+    path : str or Path
+    pixels : (rows, columns) array
+        Top row first.
+    """
+    from PIL import Image
+
+    light = np.nan_to_num(np.asarray(pixels, float), posinf=0.0, neginf=0.0)
+    white = np.quantile(light, 0.995) or light.max() or 1.0
+    grey = np.clip(light / white, 0, 1) ** (1 / 2.2)
+    buffer = BytesIO()
+    Image.fromarray((255 * grey + 0.5).astype(np.uint8)).save(buffer, "PNG")
+    write_atomically(path, buffer.getvalue())
 
 
 def _png(figure: Figure, **options: Any) -> bytes:

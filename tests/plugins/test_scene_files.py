@@ -155,6 +155,10 @@ def test_plugins_survive_every_change_of_variant():
         if not name.startswith("scalar"):
             for plugin in ("laser", "rayleigh_polarized", "gated_volpath"):
                 assert mi.load_dict({"type": plugin}) is not None
+        else:
+            for plugin in ("laser", "rayleigh_polarized", "gated_volpath"):
+                with pytest.raises(RuntimeError, match=f"{plugin}: the variant {name} is not"):
+                    mi.load_dict({"type": plugin})
 
 
 # --- the scenes that ship --------------------------------------------------------------------

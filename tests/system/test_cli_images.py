@@ -10,6 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 import xarray as xr
+from PIL import Image
 
 from lidar_mi.io.exr import read_layers, read_scan
 from tests.support.flows import axes, data_array, plane_waves, texture
@@ -57,6 +58,8 @@ def test_rendered_slab_obeys_the_lidar_equation(there, lidar_mi):
     oblique. The mean over 357 beams of 64 photons scatters by less than 0.01 %; 0.1 % is asked."""
     assert lidar_mi("render", "slab.xml", "-s", 64)[0] == 0
     scan = read_scan(there / "slab.exr")  # beside the scene
+    with Image.open(there / "slab.png") as preview:
+        assert preview.size == (scan.sizes["y"], scan.sizes["z"])
     slope2 = (scan["z"] ** 2 + scan["y"] ** 2).values / 501.25**2
     oblique = np.sqrt(1 + slope2)
     depth = (1e-4 * 499.5 + 1.8e-3 * 1.75) * oblique

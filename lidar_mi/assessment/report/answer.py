@@ -109,15 +109,16 @@ def _rings(experiment, metrics) -> Iterator[str]:
     method, centre = settings.methods[0], settings.centre[0]
     parts = []
     for number in sorted(settings.averaged):
-        std, bias = (
-            metrics.get(ring_key(method, centre, number, name)) for name in ("std", "bias")
-        )
-        if std is None or bias is None:
+        keys = [ring_key(method, centre, number, name) for name in ("std", "bias")]
+        if any(key not in metrics for key in keys):
             continue
+        std, bias = (
+            with_error(metrics[key], metrics.get(f"{key}_stderr", math.nan)) for key in keys
+        )
         bound = metrics.get(bound_key(centre, number))
         limit = "" if bound is None else f" (Cramér-Rao bound {bound:.2g})"
         images = "one image" if number == 1 else f"{number} images"
-        parts.append(f"of {images} {std:.2g} m/s{limit}, bias {bias:.2g} m/s")
+        parts.append(f"of {images} {std} m/s{limit}, bias {bias} m/s")
     if parts:
         yield (
             f"Doppler lidar, {experiment.doppler.lidar.range:g} m ahead, {READERS[method]}: "

@@ -6,7 +6,7 @@ from itertools import product
 from lidar_mi.assessment.metrics.names import Source, bound_key, ring_key, wind_key
 from lidar_mi.assessment.metrics.winds import has_no_skill
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
-from lidar_mi.tables import Table
+from lidar_mi.tables import Table, with_error
 
 _METHODS = tuple(dict.fromkeys((*ImageMethod, *VolumeMethod)))
 
@@ -49,11 +49,12 @@ def _line_of_sight(metrics: Mapping[str, float], numbers: Sequence[int]) -> Tabl
     return Table(
         "line-of-sight wind from averages of images, m/s",
         [
-            (str(name), str(centre), *(_shown(metrics.get(key), 3) for key in keys))
+            (str(name), str(centre), *(_with_error(metrics, key) for key in keys))
             for name, centre, keys in rows
             if any(key in metrics for key in keys)
         ],
         heads,
+        "± one standard error: a standard deviation of few images may come out below its bound.",
     )
 
 
@@ -94,6 +95,14 @@ def _sensor(metrics: Mapping[str, float]) -> Table:
             rows.append((label, *map(_shown, values)))
     title = f"rms error of the wind from both lidars{', beyond cores' if far else ''}, m/s"
     return Table(title, rows, ("", "u", "v", "w"))
+
+
+def _with_error(metrics: Mapping[str, float], key: str) -> str:
+    """A statistic with its standard error, where it has one."""
+    value, stderr = metrics.get(key), metrics.get(f"{key}_stderr")
+    if value is None or stderr is None:
+        return _shown(value, 3)
+    return with_error(value, stderr)
 
 
 def _shown(value: float | None, decimals: int = 2) -> str:

@@ -8,6 +8,7 @@ import pytest
 
 from lidar_mi.assessment.metrics.requirements import judge, read_requirements
 from lidar_mi.assessment.report.answer import answer, verdict
+from lidar_mi.assessment.report.summary import summary
 
 TABLES = read_requirements()
 
@@ -110,3 +111,31 @@ def test_the_vortices_with_their_errors():
     assert line == (
         "Vortex pair: circulations 412.3 ± 8.5 and -416.3 ± 8.3 m²/s, true 440 and -439 m²/s."
     )
+
+
+def test_a_statistic_has_its_error_bar():
+    """Of few images a standard deviation may be below its bound: 0.119 +- 0.021 against 0.136."""
+    experiment = an_experiment()
+    experiment.wake = None
+    experiment.doppler = SimpleNamespace(
+        lidar=SimpleNamespace(range=56.0),
+        retrieval=SimpleNamespace(methods=["annular"], centre=["free"], averaged=[20]),
+    )
+    metrics = {
+        f"doppler.{key}": value
+        for key, value in {
+            "annular.centre_free.averaged_20.std": 0.119,
+            "annular.centre_free.averaged_20.std_stderr": 0.0212,
+            "annular.centre_free.averaged_20.bias": 0.0244,
+            "annular.centre_free.averaged_20.bias_stderr": 0.0301,
+            "bound.centre_free.averaged_20.std": 0.136,
+        }.items()
+    }
+    (line,) = answer(experiment, metrics)
+    assert line == (
+        "Doppler lidar, 56 m ahead, all rings, full model: standard deviation of the line-of-sight "
+        "velocity of 20 images 0.119 ± 0.021 m/s (Cramér-Rao bound 0.14), bias 0.024 ± 0.030 m/s."
+    )
+    (table,) = summary(metrics, [20])
+    assert ("annular", "free", "0.119 ± 0.021", "0.024 ± 0.030") in table.rows
+    assert ("(bound)", "free", "0.136", "-") in table.rows
