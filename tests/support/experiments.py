@@ -11,11 +11,13 @@ import xarray as xr
 from matplotlib import rc_context, rcParamsDefault
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from lidar_mi import __version__
 from lidar_mi.experiment import pipeline
 from lidar_mi.experiment import reading as config
 from lidar_mi.io import png
 
 _PNG = png._png
+SOFTWARE = {"Software": f"lidar-mi {__version__}"}
 FIXED = {"axes.titley": 1.0, "legend.loc": "upper right"}
 SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
 
@@ -100,7 +102,7 @@ def sketched_figures():
         figure.set_layout_engine("none")
         figure.set_dpi(40)
         buffer = BytesIO()
-        FigureCanvasAgg(figure).print_png(buffer)
+        FigureCanvasAgg(figure).print_png(buffer, metadata=SOFTWARE)
         return buffer.getvalue()
 
     # places that would be searched for at every drawing
