@@ -14,6 +14,7 @@ from latex2mathml.converter import convert
 
 project = "lidar-mi"
 author = "The lidar-mi developers"
+copyright = "2026, the lidar-mi developers"
 release = metadata.version("lidar-mi")
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]

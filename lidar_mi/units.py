@@ -151,10 +151,15 @@ class Within:
         above = value > self.low if self.ends[0] == "(" else value >= self.low
         return above and (value < self.high if self.ends[1] == ")" else value <= self.high)
 
-    def words(self, unit: str = "") -> str:
-        """What is allowed: "1e-06 to 10 m (from the mode of a fibre to the largest telescope)"."""
+    def words(self, unit: str = "", scale: float = 1.0) -> str:
+        """What is allowed: "1e-06 to 10 m (from the mode of a fibre to the largest telescope)".
+
+        ``scale`` is that of the unit: 1000 for mrad.
+        """
+        ends = (self.low * scale, self.high * scale) if scale != 1 else (self.low, self.high)
         low, high = (
-            str(end) if isinstance(end, int) else f"{end:g}" for end in (self.low, self.high)
+            str(end) if isinstance(end, int) else f"{end:.{6 if scale == 1 else 3}g}"
+            for end in ends
         )
         low = f"above {low}" if self.ends[0] == "(" else low
         high = f"below {high}" if self.ends[1] == ")" else high

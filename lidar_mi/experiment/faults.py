@@ -1,6 +1,7 @@
 """Faults that pydantic finds in a description, in words of who wrote it."""
 
 import difflib
+import re
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
@@ -48,6 +49,13 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
             # as it was understood, with its unit
             shown = f"{to_si(value, symbol, unit.example):g} {symbol}".strip()
         expected = word + within.words(symbol)
+        if symbol == "rad" and isinstance(value, str):
+            # angles in the unit in which they were given
+            given = re.fullmatch(r"\s*[-+]?[\d.]+(?:[eE][-+]?\d+)?\s*([a-zA-Z]+)\s*", value)
+            if given:
+                shown = " ".join(value.split())
+                size = to_si(f"1 {given[1]}", symbol, unit.example)
+                expected = word + within.words(given[1], 1 / size)
     elif fault["type"].startswith("model_"):
         expected = f"a section with keys out of {', '.join(_keys_at(model, fault['loc']))}"
     elif fault["type"] == "string_pattern_mismatch":

@@ -145,7 +145,11 @@ def check_brightness(
         # samples contribute if they collide in the gate
         key, value, fraction = "render.estimator", "analog", seen * inside * length * arriving
     else:
-        key, value, fraction = "lidar.fov_half", f"{lidar.fov_half:g} rad", seen / plan.gate_count
+        key, value, fraction = (
+            "lidar.fov_half",
+            f"{1e3 * lidar.fov_half:g} mrad",
+            seen / plan.gate_count,
+        )
     bring = fraction * render.samples_per_beam
     if bring < CONTRIBUTIONS and (seen < 0.9 or render.estimator == "analog"):
         raise InputError(

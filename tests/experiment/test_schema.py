@@ -220,7 +220,7 @@ FAULTS = [
     ("scan.range=.inf", "scan.range: inf m is not allowed; expected 0.1 to 100000 m"),
     (
         "scan.azimuth_half=[0 deg, 6 deg]",
-        "scan.azimuth_half.0: 0 rad is not allowed; expected 1e-09 to 1.5 rad",
+        "scan.azimuth_half.0: 0 deg is not allowed; expected 5.73e-08 to 85.9 deg",
     ),
     ("platform.dt=0 s", "platform.dt: 0 s is not allowed; expected 1e-06 to 10000 s"),
     ("platform.speed=-1 m/s", "platform.speed: -1 m/s is not allowed; expected 0 to 12000 m/s"),
