@@ -68,8 +68,8 @@ class Estimator:
         Returns
         -------
         wind : Dataset or None
-            As `retrieve_wind` gives it; None without a method of vectors. Its attribute
-            `from_start` says whether it was found from the last one.
+            As `retrieve_wind` gives it; None without a method of vectors. By "variational" its
+            attribute `from_start` says whether it was found from the last one.
         pair : VortexPairFit
             Its `from_start` says whether it was found from the expected one.
         seconds : dict

@@ -138,6 +138,9 @@ def agrees(start: VortexPairFit, found: VortexPairFit) -> bool:
 def _displacement_error(start: VortexPairFit, make: Builder) -> float:
     """Standard error, px, of the start's displacements over the images, where it is large."""
     places = [np.linspace(axis[0], axis[-1], _PROBES) for axis in (make.y, make.z)]
-    _, spread = start.wind_and_covariance(places[0][None, :], places[1][:, None])
+    # the air's departure from the model is no error of the start
+    _, spread = replace(start, model_error=0.0).wind_and_covariance(
+        places[0][None, :], places[1][:, None]
+    )
     px = make.dt / min(make.spacing)
     return float(np.sqrt(np.quantile(spread[:2].max(0), 0.9))) * px
