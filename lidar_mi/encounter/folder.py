@@ -2,11 +2,13 @@
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.metadata import version
 from pathlib import Path
 
 import xarray as xr
 
 from lidar_mi.encounter.flight import Flown
+from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.image_store import MADE_BY
 from lidar_mi.experiment.resumable_folder import (
@@ -48,6 +50,8 @@ class FlightFolder:
         self.path = Path(path)
         self.figures, self.log = self.path / FIGURES, self.path / LOG
         self.record = new_record(experiment, experiment.folder)
+        if encounter_of(experiment).aircraft.model != "roll":
+            self.record["versions"]["jsbsim"] = version("jsbsim")
         self.made_by = made_by(self.record)
         self._beside = experiment.folder.resolve()
 

@@ -278,7 +278,7 @@ def new_record(experiment: Experiment, beside: str | Path) -> dict[str, Any]:
     return {
         "experiment": reading.settings(experiment),
         "files": {field: _checksum(path) for field, path in _inputs(experiment, beside).items()},
-        "versions": _versions(),
+        "versions": dict(_versions()),
         "metrics": None,
     }
 

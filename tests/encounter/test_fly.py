@@ -11,6 +11,7 @@ import pytest
 import xarray as xr
 
 import lidar_mi as lm
+from lidar_mi.cli.fly import fly as command
 from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.errors import InputError
@@ -105,18 +106,11 @@ def test_each_command_takes_its_own(tmp_path):
         lm.run(experiment())
     with pytest.raises(InputError, match="encounter: missing in wake_sensor"):
         lm.fly("wake_sensor", notice=silent)
-    done = shell(
-        "fly",
-        "encounter",
-        "--mode",
-        "off",
-        "--set",
-        "encounter.path.start=60 m",
-        "-o",
-        str(tmp_path / "out"),
-    )
+    with pytest.raises(InputError, match="expected the section of a flight, or lidar-mi run"):
+        command("wake_sensor")
+    short = ("encounter.path.start=60 m", "encounter.path.beyond=10 m")
+    sets = [part for one in short for part in ("--set", one)]
+    done = shell("fly", "encounter", "--mode", "off", *sets, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "largest roll angle" in done.stdout and (tmp_path / "out" / "flight.nc").is_file()
     assert re.search(r"without help: \d+ of \d+ s", done.stderr)
-    wrong = shell("fly", "wake_sensor")
-    assert wrong.returncode and "lidar-mi run" in wrong.stderr

@@ -13,7 +13,7 @@ from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
 FLIGHTS = {
     "off": ("without help", "tab:red", "-"),
-    "autopilot": ("autopilot, no preview", "tab:purple", ":"),
+    "autopilot": ("autopilot", "tab:purple", ":"),
     "feedforward": ("with the lidar", "tab:blue", "-"),
     "perfect": ("perfect preview", "0.35", "--"),
 }
