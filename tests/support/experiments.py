@@ -11,6 +11,7 @@ import xarray as xr
 from matplotlib import rc_context, rcParamsDefault
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from lidar_mi import __version__
 from lidar_mi.experiment import pipeline
 from lidar_mi.experiment import reading as config
 from lidar_mi.io import png
@@ -100,7 +101,8 @@ def sketched_figures():
         figure.set_layout_engine("none")
         figure.set_dpi(40)
         buffer = BytesIO()
-        FigureCanvasAgg(figure).print_png(buffer)
+        software = {"Software": f"lidar-mi {__version__}"}
+        FigureCanvasAgg(figure).print_png(buffer, metadata=software)
         return buffer.getvalue()
 
     # places that would be searched for at every drawing
