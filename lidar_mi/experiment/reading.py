@@ -24,6 +24,9 @@ BESIDE_VARIANTS = (
 )
 """Names of files in the folder of a study or a run, which no variant may have."""
 
+_LONGEST_NAME = 255
+_OF_A_CAMPAIGN = ("sweep", "sample", "members")
+
 
 @checked_arguments
 def load_experiment(name: str | Path, *, variant: str | None = None, **changes: Any) -> Experiment:
@@ -154,8 +157,12 @@ def merged(data: Any, changes: dict) -> dict:
 
 
 def read_keys(path: str | Path) -> dict:
-    """The keys of an experiment file, as they stand."""
-    path = Path(path)
+    """The keys of an experiment file as they stand, over those of its ``base`` if it has one."""
+    return _read_keys(Path(path), ())
+
+
+def _read_keys(path: Path, above: tuple[Path, ...]) -> dict:
+    """The same of a file that those ``above`` are based on."""
     if path.suffix == ".xml":
         raise InputError(
             f"{path}: a Mitsuba scene, not an experiment; expected lidar-mi render {path}"
@@ -170,7 +177,22 @@ def read_keys(path: str | Path) -> dict:
         raise InputError(f"{path}: holds no keys; expected name, wake, ...")
     if isinstance(data.get("experiment"), dict) and "versions" in data:
         data = data["experiment"]  # the record in a run folder can be run again
-    return data
+    if "base" not in data:
+        return data
+    if set(_OF_A_CAMPAIGN) & set(data):
+        raise InputError(
+            f"{path}: a campaign, not an experiment; expected lidar-mi campaign run {path}"
+        )
+    base = data.pop("base")
+    if not isinstance(base, str) or len(base) > _LONGEST_NAME or "\0" in base:
+        shown = repr(base)[:60]
+        raise InputError(f"{path}: base: {shown} is not allowed; expected an experiment's name")
+    beside = path.parent / base
+    file = beside if beside.is_file() else experiment_file(base)
+    chain = (*above, path.resolve())
+    if file.resolve() in chain:
+        raise InputError(f"{path}: base: {base} is based on this file; expected another experiment")
+    return merged(_read_keys(file, chain), data)
 
 
 def check(data: dict, origin: str) -> Experiment:

@@ -82,3 +82,42 @@ def test_a_wrong_change_is_named(changes, says):
 def test_a_misspelt_name_is_answered_with_the_nearest():
     with pytest.raises(lm.InputError, match="did you mean wake_sensor"):
         lm.load_experiment("wake_senor")
+
+
+def write(path, text):
+    path.write_text(text)
+    return path
+
+
+def test_a_base_is_changed_key_by_key(tmp_path):
+    write(
+        tmp_path / "mine.yaml", "name: mine\nbase: wake_sensor\nscan: {range: 90 m}\nsensor: null"
+    )
+    own = lm.load_experiment(tmp_path / "mine.yaml")
+    base = lm.load_experiment("wake_sensor")
+    assert (own.name, own.scan.range, own.scan.thickness) == ("mine", 90, base.scan.thickness)
+    assert own.sensor is None and own.doppler == base.doppler and own.wake == base.wake
+    # a base of a base, beside it
+    nearer = write(
+        tmp_path / "nearer.yaml", "base: mine.yaml\nname: nearer\nscan: {thickness: 1 m}"
+    )
+    found = lm.load_experiment(nearer, seed=3)
+    assert (found.scan.range, found.scan.thickness, found.seed) == (90, 1, 3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("base: no_such_experiment", "no_such_experiment: no such file"),
+        ("base: 3", "base: 3 is not allowed; expected an experiment's name"),
+        (f"base: {'x' * 300}", "is not allowed; expected an experiment's name"),
+        ("base: a.yaml", "base: a.yaml is based on this file"),
+        ("base: b.yaml", "base: a.yaml is based on this file"),
+        ("base: wake_sensor\nsweep: {seed: [1, 2]}", "a campaign, not an experiment"),
+    ],
+)
+def test_bases_that_are_none(tmp_path, text, message):
+    write(tmp_path / "b.yaml", "base: a.yaml")
+    with pytest.raises(lm.InputError) as error:
+        lm.load_experiment(write(tmp_path / "a.yaml", text))
+    assert message in str(error.value) and "\n" not in str(error.value)

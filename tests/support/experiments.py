@@ -17,7 +17,6 @@ from lidar_mi.experiment import reading as config
 from lidar_mi.io import png
 
 _PNG = png._png
-SOFTWARE = {"Software": f"lidar-mi {__version__}"}
 FIXED = {"axes.titley": 1.0, "legend.loc": "upper right"}
 SOURCES = ("extinction", "extinction_without_texture", "extinction_blurred", "backscatter")
 
@@ -102,7 +101,8 @@ def sketched_figures():
         figure.set_layout_engine("none")
         figure.set_dpi(40)
         buffer = BytesIO()
-        FigureCanvasAgg(figure).print_png(buffer, metadata=SOFTWARE)
+        software = {"Software": f"lidar-mi {__version__}"}
+        FigureCanvasAgg(figure).print_png(buffer, metadata=software)
         return buffer.getvalue()
 
     # places that would be searched for at every drawing
