@@ -23,12 +23,22 @@ def prior_information(model: RingModel, names: Sequence[str], device="cpu") -> t
     return torch.tensor(variances, dtype=torch.float64, device=device)
 
 
+# Of a matrix with a unit diagonal, in double precision: beyond, its inverse is rounding.
+_WORST_CONDITION = 1e13
+
+
 def standard_deviations(fisher: torch.Tensor) -> torch.Tensor:
-    """Roots of the diagonal of the inverse, NaN where there is none, shape (images, free)."""
+    """Roots of the diagonal of the inverse, NaN where there is none, shape (images, free).
+
+    There is none, either, where rounding alone makes the matrix invertible.
+    """
     scale = fisher.diagonal(dim1=1, dim2=2).rsqrt()
-    inverse, info = torch.linalg.inv_ex(fisher * scale[:, :, None] * scale[:, None, :])
+    scaled = fisher * scale[:, :, None] * scale[:, None, :]
+    inverse, info = torch.linalg.inv_ex(scaled)
+    condition = torch.linalg.matrix_norm(scaled, 1) * torch.linalg.matrix_norm(inverse, 1)
     found = inverse.diagonal(dim1=1, dim2=2).sqrt() * scale
-    return torch.where(info[:, None] == 0, found, torch.nan)
+    determined = (info == 0) & (condition < _WORST_CONDITION)
+    return torch.where(determined[:, None], found, torch.nan)
 
 
 def free_names(model: RingModel, free: Sequence[str] | None) -> list[str]:
