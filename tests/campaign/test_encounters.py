@@ -17,14 +17,21 @@ from lidar_mi.campaign.worker import carry_out
 from lidar_mi.encounter.fly import fly
 
 
-def flown(folder, keep):
-    """A campaign of flights without a lidar: no control, and perfect preview."""
+def flown(folder, keep, mode, count):
+    """A campaign of flights without a lidar, in the mode of control off or perfect."""
     base = {
         "name": "base",
         "wake": {"vortex_pair": {"circulation": "350 m^2/s"}, "spacing": "1 m"},
         "encounter": {
-            "path": {"start": "150 m", "beyond": "150 m"},
-            "control": {"mode": "perfect"},
+            # along the core of the port vortex
+            "path": {
+                "crossing_angle": "0 deg",
+                "climb_angle": "0 deg",
+                "miss": ["-23.55 m", "0 m"],
+                "start": "60 m",
+                "beyond": "40 m",
+            },
+            "control": {"mode": mode},
         },
     }
     (folder / "base.yaml").write_text(yaml.safe_dump(base))
@@ -35,21 +42,21 @@ def flown(folder, keep):
         "keep": keep,
         "sample": {
             "method": "latin_hypercube",
-            "n": 5,
-            "over": {"wake.vortex_pair.circulation": {"linear": ["50 m^2/s", "500 m^2/s"]}},
+            "n": count,
+            "over": {"wake.vortex_pair.circulation": {"linear": ["10 m^2/s", "300 m^2/s"]}},
         },
     }
     path = folder / "encounters.yaml"
     path.write_text(yaml.safe_dump(described))
     ready = prepare_campaign(path, folder / "out")
-    outcomes = [carry_out(str(ready.path), number, "once") for number in range(5)]
-    assert [one.status for one in outcomes] == ["done"] * 5
+    outcomes = [carry_out(str(ready.path), number, "once") for number in range(count)]
+    assert [one.status for one in outcomes] == ["done"] * count
     assert {(one.rendered, one.reused) for one in outcomes} == {(0, 0)}
     return ready
 
 
 def test_points_are_flown_and_their_bank_angles_shown(tmp_path):
-    ready = flown(tmp_path, "metrics")
+    ready = flown(tmp_path, "metrics", "perfect", 4)
     data = collect(ready)
     off = data["encounter.off.largest_roll"]
     alone = fly(ready.points.experiment(3), notice=lambda text, fraction: None)
@@ -59,7 +66,7 @@ def test_points_are_flown_and_their_bank_angles_shown(tmp_path):
     assert (np.diff(off.values[order]) > 0).all() and off.attrs["units"] == "rad"
     html = page(data, "name: encounters")
     limit = math.radians(7)
-    within = 20 * int((off <= limit).sum())
+    within = 25 * int((off <= limit).sum())
     assert 0 < within < 100  # the test sees both
     found = re.search(r"no control ([\d.]+)\s±\s[\d.]+ %", html)
     assert found and float(found[1]) == within
@@ -68,6 +75,6 @@ def test_points_are_flown_and_their_bank_angles_shown(tmp_path):
 
 def test_everything_of_a_flight_is_kept(tmp_path, monkeypatch):
     monkeypatch.setattr("lidar_mi.encounter.fly.write_report", lambda *args, **keys: None)
-    ready = flown(tmp_path, "everything")
-    names = {entry.name for entry in (ready.place(2) / "run").iterdir()}
+    ready = flown(tmp_path, "everything", "off", 2)
+    names = {entry.name for entry in (ready.place(0) / "run").iterdir()}
     assert {"experiment.yaml", "flight.nc"} <= names
