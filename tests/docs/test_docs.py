@@ -68,6 +68,11 @@ SMALLER = (
     "retrieval.stride=8",
     "retrieval.methods=[cc]",
 )
+SMALLER_FLIGHT = (
+    "encounter.path.start=60 m",
+    "encounter.path.beyond=10 m",
+    "encounter.control.mode=off",
+)
 
 
 # --- the plugin reference -------------------------------------------------------------------
@@ -292,7 +297,8 @@ def run_shell(block, capsys):
         elif words[1] == "doctor":
             assert words[2:] == []  # it starts a process for every variant; it has its own tests
         else:
-            small = [w for key in SMALLER for w in ("--set", key)] if words[1] == "run" else ()
+            keys = {"run": SMALLER, "fly": SMALLER_FLIGHT}.get(words[1], ())
+            small = [word for key in keys for word in ("--set", key)]
             with without_figures(), sketched_figures():
                 code, output = command(line, capsys, small)
             assert code == 0, f"{block.place}: {line}\n{output}"
