@@ -102,7 +102,7 @@ def test_off_needs_no_quotes(tmp_path):
     path = tmp_path / "calm.yaml"
     path.write_text("base: encounter\nname: calm\nencounter: {control: {mode: off}}\n")
     assert lm.load_experiment(path).encounter.control.mode == "off"
-    with pytest.raises(InputError, match="encounter.control.mode: True is not allowed"):
+    with pytest.raises(InputError, match="mode: True is not allowed"):
         lm.load_experiment(path, **{"encounter.control.mode": True})
 
 
