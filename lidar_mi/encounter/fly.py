@@ -85,15 +85,15 @@ def fly(
     overwrite: bool = False,
     notice: Callable | None = None,
 ) -> Flight:
-    """Fly into the wake: without help, with perfect preview, and steered by the lidar.
+    """Fly into the wake: without help, with an autopilot, steered by the lidar, and by the truth.
 
     All flights meet the same wake. The lidar renders its scans in the flight that it steers.
 
     Parameters
     ----------
     experiment : Experiment, str or path
-        With a section ``encounter``. Its ``control.mode`` says which flights: off alone; off and
-        perfect; all three with feedforward.
+        With a section ``encounter``. Its ``control.mode`` says which flights: off alone; off,
+        autopilot and perfect; all four with feedforward.
     folder : path, optional
         Created if missing. If it holds this flight, only what is missing is computed. Figures and a
         report are only made with a folder.

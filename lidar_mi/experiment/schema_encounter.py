@@ -123,6 +123,12 @@ class Control(Section):
         3.0, description="in which the wings are levelled, in every mode; null: they are not"
     )
 
+    @field_validator("mode", mode="before")
+    @classmethod
+    def _off_is_a_word(cls, value: object) -> object:
+        """YAML reads a bare off as false."""
+        return "off" if value is False else value
+
 
 class Encounter(Section):
     """A flight through the wake of the experiment."""

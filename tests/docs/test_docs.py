@@ -68,10 +68,10 @@ SMALLER = (
     "retrieval.stride=8",
     "retrieval.methods=[cc]",
 )
-SHORTER = (
+SMALLER_FLIGHT = (
     "encounter.path.start=60 m",
-    "encounter.path.beyond=20 m",
-    "encounter.control.mode='off'",
+    "encounter.path.beyond=10 m",
+    "encounter.control.mode=off",
 )
 
 
@@ -297,7 +297,7 @@ def run_shell(block, capsys):
         elif words[1] == "doctor":
             assert words[2:] == []  # it starts a process for every variant; it has its own tests
         else:
-            keys = {"run": SMALLER, "fly": SHORTER}.get(words[1], ())
+            keys = {"run": SMALLER, "fly": SMALLER_FLIGHT}.get(words[1], ())
             small = [word for key in keys for word in ("--set", key)]
             with without_figures(), sketched_figures():
                 code, output = command(line, capsys, small)

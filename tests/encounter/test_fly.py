@@ -97,6 +97,15 @@ def test_faults_are_one_line(changes, message):
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
+def test_off_needs_no_quotes(tmp_path):
+    """YAML reads it as false."""
+    path = tmp_path / "calm.yaml"
+    path.write_text("base: encounter\nname: calm\nencounter: {control: {mode: off}}\n")
+    assert lm.load_experiment(path).encounter.control.mode == "off"
+    with pytest.raises(InputError, match="mode: True is not allowed"):
+        lm.load_experiment(path, **{"encounter.control.mode": True})
+
+
 def test_path_that_misses_is_warned_of():
     assert geometry(experiment()) == []
     (text,) = geometry(experiment(path={"miss": ["0 m", "400 m"]}, control={"mode": "off"}))
