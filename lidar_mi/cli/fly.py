@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from lidar_mi.cli.options import Changes, ExperimentName
-from lidar_mi.cli.terminal import output, print_table
+from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
@@ -65,6 +65,7 @@ def fly(
     folder = out or Path("outputs") / loaded.name
     with progress() as notice:
         done = start(loaded, folder, overwrite=overwrite, notice=notice)
+    print_answer(done.answer)
     for table in done.tables()[1:]:
         print_table(table)
     output.print(f"report   {folder / 'report.html'}")

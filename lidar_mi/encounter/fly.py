@@ -11,7 +11,7 @@ import xarray as xr
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.encounter import encounter_metrics
-from lidar_mi.assessment.report.encounter import encounter_summary
+from lidar_mi.assessment.report.encounter import encounter_answer, encounter_summary
 from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.flight import Flown, fly_all
 from lidar_mi.encounter.folder import FlightFolder
@@ -58,6 +58,11 @@ class Flight(Tabular):
     def track(self) -> xr.Dataset | None:
         """Estimates, track and truth of every slab; None without a lidar."""
         return self.flown.track
+
+    @property
+    def answer(self) -> list[str]:
+        """What a reader wants to know first, in sentences."""
+        return encounter_answer(self.metrics)
 
     def tables(self) -> list[Table]:
         """The flights and the lidar, in numbers."""

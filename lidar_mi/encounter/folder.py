@@ -1,6 +1,6 @@
 """The folder of a flight: its experiment, its data sets, its report."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -17,6 +17,7 @@ from lidar_mi.experiment.resumable_folder import (
     METRICS,
     RECORD,
     REPORT,
+    SUMMARY,
     made_by,
     new_record,
     read_metrics,
@@ -89,7 +90,8 @@ class FlightFolder:
                     f"{self.path}: holds the experiment that this one was made from; expected "
                     "another folder (-o DIR)"
                 )
-        old = [self.path / name for name in (METRICS, REPORT, LOG, ANIMATION, *FILES.values())]
+        names = (METRICS, REPORT, SUMMARY, LOG, ANIMATION, *FILES.values())
+        old = [self.path / name for name in names]
 
         def remove_old() -> None:
             for path in (*old, *self.figures.glob("*.png")):
@@ -117,9 +119,15 @@ class FlightFolder:
             else:
                 write_netcdf(value.assign_attrs({MADE_BY: self.made_by}), self.path / FILES[name])
 
-    def keep_verdict(self, metrics: Mapping[str, float], page: str) -> None:
-        """Write report and metrics: the flight is complete."""
-        write_verdict(self.path, self.record, metrics, page)
+    def data_files(self) -> list[str]:
+        """Names of the files beside the report, for links to them."""
+        names = (*FILES.values(), ANIMATION)
+        there = [name for name in names if (self.path / name).is_file()]
+        return [*there, METRICS, SUMMARY, RECORD, LOG]
+
+    def keep_verdict(self, metrics: Mapping[str, float], page: str, answer: Sequence[str]) -> None:
+        """Write report, answer and metrics: the flight is complete."""
+        write_verdict(self.path, self.record, metrics, page, answer)
 
     def _read(self, path: Path) -> xr.Dataset | None:
         if not path.is_file():

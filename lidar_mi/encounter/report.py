@@ -8,7 +8,8 @@ from lidar_mi.assessment.figures.encounter import draw_all
 from lidar_mi.assessment.figures.encounter_film import MOST_FRAMES, film
 from lidar_mi.assessment.metrics.encounter import judged_in_flight, measured_in_flight
 from lidar_mi.assessment.metrics.requirements import read_requirements
-from lidar_mi.assessment.report.encounter import encounter_chapter
+from lidar_mi.assessment.report.answer import verdict
+from lidar_mi.assessment.report.encounter import encounter_answer, encounter_chapter
 from lidar_mi.assessment.report.page import Film, page
 from lidar_mi.encounter.flight import Flown, aircraft_of
 from lidar_mi.encounter.folder import ANIMATION, FlightFolder
@@ -32,12 +33,20 @@ def write_report(
         stride = encounter.path.speed / encounter.rate
         depth = stride / max(1, round(stride / experiment.scan.thickness))
         measured = measured_in_flight(flown.series, flown.track, depth)
-        judged = judged_in_flight(read_requirements(), measured)
+        judged = judged_in_flight(read_requirements(), measured, encounter.path.speed)
     chapter = encounter_chapter(metrics, judged, drawn, _film(kept, flown, span, log))
+    answer = [*encounter_answer(metrics), *(verdict(table, rows) for table, rows in judged)]
     html = page(
-        experiment, dump(experiment), kept.record["versions"], metrics, [chapter], log.warnings
+        experiment,
+        dump(experiment),
+        kept.record["versions"],
+        metrics,
+        [chapter],
+        log.warnings,
+        answer,
+        kept.data_files(),
     )
-    kept.keep_verdict(metrics, html)
+    kept.keep_verdict(metrics, html, answer)
 
 
 def _film(kept: FlightFolder, flown: Flown, span: float, log: Log) -> Film | None:

@@ -38,6 +38,7 @@ def test_folder_holds_the_flight(tmp_path):
         "metrics.json",
         "report.html",
         "log.txt",
+        "summary.txt",
         "figures",
     }
     metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())

@@ -99,13 +99,13 @@ def measured_in_flight(
 
 
 def judged_in_flight(
-    tables: Mapping[tuple[str, str], RequirementTable], measured: Mapping[str, float]
+    tables: Mapping[tuple[str, str], RequirementTable], measured: Mapping[str, float], speed: float
 ) -> list[tuple[RequirementTable, list[Finding]]]:
-    """Requirements of flight control against what was measured."""
+    """Requirements of flight control at an air speed (m/s) against what was measured."""
     return [
         (table, judge(table, measured))
         for (application, _), table in tables.items()
-        if application == "flight_control"
+        if application == "flight_control" and table.applies_at(speed)
     ]
 
 

@@ -112,16 +112,15 @@ def encounter_chapter(
         tables=tables,
     )
     return Chapter(
-        "Into the wake",
-        _lead(metrics),
-        drawn,
-        numbers,
-        _verdict(judged) if judged else None,
-        film=film,
+        "Into the wake", [], drawn, numbers, _verdict(judged) if judged else None, film=film
     )
 
 
-def _lead(metrics: Mapping[str, float]) -> list[str]:
+def encounter_answer(metrics: Mapping[str, float]) -> list[str]:
+    """What a reader wants to know first, in sentences.
+
+    How far the aircraft rolls in every flight, how early the lidar sees the wake, what limits it.
+    """
     off, blind, ours, perfect = (metrics.get(f"encounter.{m}.largest_roll") for m in FLIGHTS)
     if off is None:
         return []

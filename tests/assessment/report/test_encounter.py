@@ -10,7 +10,11 @@ import pytest
 
 from lidar_mi.assessment.metrics.encounter import judged_in_flight
 from lidar_mi.assessment.metrics.requirements import read_requirements
-from lidar_mi.assessment.report.encounter import encounter_chapter, encounter_summary
+from lidar_mi.assessment.report.encounter import (
+    encounter_answer,
+    encounter_chapter,
+    encounter_summary,
+)
 from lidar_mi.assessment.report.page import Film, page
 from lidar_mi.experiment.reading import check
 from tests.support.synthetic_lidar import encounter_keys
@@ -28,7 +32,7 @@ def numbers(**rolls):
 def test_answer_comes_first():
     metrics = numbers(off=25, autopilot=7, feedforward=9, perfect=2)
     metrics["encounter.removed_of_perfect.largest_roll"] = 16 / 23
-    answer, *_ = encounter_chapter(metrics, [], []).lead
+    answer, *_ = encounter_answer(metrics)
     for words in (
         "Without help, the wake rolls the aircraft by 25 degrees; with the same autopilot, but no "
         "preview, by 7 degrees; with the lidar by 9 degrees; with perfect preview by 2 degrees.",
@@ -40,7 +44,7 @@ def test_answer_comes_first():
 
 
 def test_an_upset_is_told():
-    (answer,) = encounter_chapter(numbers(off=120), [], []).lead
+    (answer,) = encounter_answer(numbers(off=120))
     assert answer.startswith("Without help, the wake upsets the aircraft. This flight exceeds")
 
 
@@ -52,7 +56,7 @@ def test_summary_names_every_flight():
 
 def test_page_has_frames_and_their_script():
     frames = [(b"one", "0.1 s"), (b"two", "0.2 s"), (b"three", "0.3 s")]
-    judged = judged_in_flight(read_requirements(), {"slabs_per_second": 10.0})
+    judged = judged_in_flight(read_requirements(), {"slabs_per_second": 10.0}, 75.0)
     shown = Film("The flight", "Frames.", frames, 0.2)
     chapter = encounter_chapter(numbers(off=25), judged, [], shown)
     html = page(check(encounter_keys(), "test"), "name: x", {"lidar-mi": "0"}, {}, [chapter])
