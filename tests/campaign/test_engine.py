@@ -228,9 +228,11 @@ if __name__ == "__main__":
     import subprocess
     import sys
 
-    for _ in range(2):  # the client is killed twice
+    for some in (40, 80):  # the client is killed twice
         process = subprocess.Popen([sys.executable, tmp_path / "start.py"], start_new_session=True)
-        time.sleep(25)
+        while len(list((tmp_path / "out").glob("points/*/*/metrics.json"))) < some:
+            assert process.poll() is None
+            time.sleep(0.1)
         process.kill()
         process.wait()
     done = campaign_status(tmp_path / "out").done
