@@ -18,16 +18,15 @@ from lidar_mi.experiment.resumable_folder import (
     RECORD,
     REPORT,
     SUMMARY,
+    held,
     made_by,
     new_record,
     read_metrics,
     read_record,
-    refuse_strangers,
     write_verdict,
 )
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.io.atomic import write_atomically
-from lidar_mi.io.folder import locked, make_folder
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 from lidar_mi.io.text import encoded
 from lidar_mi.io.yaml import to_yaml
@@ -66,11 +65,7 @@ class FlightFolder:
             Another process uses the folder; it is no folder of a flight, or holds that of another
             experiment or version and ``overwrite`` is not set.
         """
-        refuse_strangers(self.path, RECORD, "flight's folder")
-        make_folder(self.path)
-        with locked(self.path):
-            # the former holder of the lock may have changed its experiment
-            refuse_strangers(self.path, RECORD, "flight's folder")
+        with held(self.path, "flight's folder"):
             self._begin(overwrite)
             yield
 

@@ -105,11 +105,7 @@ class RunFolder:
             Another run is using the folder; it holds images of another experiment or version, and
             ``overwrite`` is not set; or it is no run folder.
         """
-        refuse_strangers(self.path, RECORD, "run folder")
-        make_folder(self.path)
-        with locked(self.path):
-            # the former holder of the lock may have changed its experiment
-            refuse_strangers(self.path, RECORD, "run folder")
+        with held(self.path, "run folder"):
             self._begin(overwrite)
             yield
 
@@ -259,6 +255,23 @@ def write_result(folder: Path, name: str, value: Any, experiment: str, signature
         write_vortices(path, value.pairs, **about, **{MADE_BY: signature})
     else:
         write_netcdf(value.assign_attrs({MADE_BY: signature}), path)
+
+
+@contextmanager
+def held(folder: Path, kind: str) -> Iterator[None]:
+    """A folder with a record, made if missing and locked, that holds nothing of others.
+
+    Raises
+    ------
+    InputError
+        Another process uses the folder, or it holds files but no record.
+    """
+    refuse_strangers(folder, RECORD, kind)
+    make_folder(folder)
+    with locked(folder):
+        # the former holder of the lock may have changed its experiment
+        refuse_strangers(folder, RECORD, kind)
+        yield
 
 
 def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
