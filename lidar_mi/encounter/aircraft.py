@@ -1,10 +1,11 @@
 """The aircraft: its state, what steers it, and what any model of it offers."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidar_mi.encounter.strips import Loads, Strips, wake_loads
 from lidar_mi.instrument.motion import attitude
@@ -124,8 +125,14 @@ class AircraftModel(Protocol):
         ...
 
 
-def loads_in_wind(strips: Strips, state: AircraftState, wind: Wind, density: float) -> Loads:
-    """The wake's force and moment on an aircraft in a given state.
+def loads_in_wind(
+    strips: Strips,
+    state: AircraftState,
+    wind: Wind,
+    density: float,
+    time: ArrayLike | None = None,
+) -> Loads:
+    """The wake's force and moment on an aircraft in a given state, or as it flies on from there.
 
     Parameters
     ----------
@@ -136,23 +143,20 @@ def loads_in_wind(strips: Strips, state: AircraftState, wind: Wind, density: flo
         Of the path frame: ``wind(x, y, z, time)``.
     density : float
         Of the air, kg m^-3.
+    time : array_like, shape (...), optional
+        s, at which attitude, course and speed are still those of the state. Default: now.
+
+    Returns
+    -------
+    Loads
+        Force and moment of shape (..., 3).
     """
-    turned = attitude(state.roll, state.pitch, state.yaw)
-    places = turned.apply(strips.places) + np.array([state.x, state.y, state.z])
-    there = np.stack(np.broadcast_arrays(*wind(*places.T, state.time)), -1)
-    return wake_loads(strips, turned.inv().apply(there), state.airspeed, density)
-
-
-def flown_on(state: AircraftState, time: float) -> AircraftState:
-    """The state at another time (s) if attitude, course and speed stay; rates are dropped."""
-    return replace(
-        state,
-        time=time,
-        x=state.x + state.airspeed * (time - state.time),
-        roll_rate=0.0,
-        pitch_rate=0.0,
-        yaw_rate=0.0,
-    )
+    then = np.asarray(state.time if time is None else time, dtype=float)[..., None]
+    turned = attitude(state.roll, state.pitch, state.yaw).as_matrix()
+    x, y, z = (strips.places @ turned.T + np.array([state.x, state.y, state.z])).T
+    there = wind(x + state.airspeed * (then - state.time), y, z, then)
+    body = np.stack(np.broadcast_arrays(*there), -1) @ turned
+    return wake_loads(strips, body, state.airspeed, density)
 
 
 def deflected(

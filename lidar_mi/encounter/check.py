@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lidar_mi.encounter.aircraft import AircraftModel, flown_on, loads_in_wind
+from lidar_mi.encounter.aircraft import AircraftModel, loads_in_wind
 from lidar_mi.encounter.flight import aircraft_of, duration
 from lidar_mi.encounter.slabs import Gates, gates_of
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
@@ -115,11 +115,9 @@ def _strongest(experiment: Experiment, aircraft: AircraftModel) -> float:
     """Largest rolling moment of the wake on the nominal path, over that of the ailerons."""
     encounter, wake = encounter_of(experiment), wake_along_path(experiment)
     most = aircraft.control_moments[0, 0] * aircraft.limits.deflection[0]
-    moments = [
-        loads_in_wind(aircraft.strips, flown_on(aircraft.state, t), wake.wind, aircraft.density)
-        for t in np.linspace(0, duration(encounter), _INSTANTS)
-    ]
-    largest = max(abs(float(one.moment[0])) for one in moments)
+    times = np.linspace(0, duration(encounter), _INSTANTS)
+    loads = loads_in_wind(aircraft.strips, aircraft.state, wake.wind, aircraft.density, times)
+    largest = float(np.abs(loads.moment[:, 0]).max())
     return largest / most if most else float("inf")
 
 

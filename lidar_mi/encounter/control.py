@@ -7,13 +7,14 @@ loads predicted from the lidar's track, perfect by the true loads.
 from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import nnls
 
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Commands, deflected
 from lidar_mi.encounter.strips import Loads
 
-Preview = Callable[[float], Loads]
-"""The wake's loads expected at a time (s), for the state flown on."""
+Preview = Callable[[ArrayLike], Loads]
+"""The wake's loads expected at a time or at several (s), for the state flown on."""
 
 Controller = Callable[[Preview | None, AircraftState], Commands]
 """Commands from the preview (None while there is none) and the state."""
@@ -26,6 +27,12 @@ RATE_TIME = 0.5
 
 _INSTANTS = 9
 _EFFORT = 1e-2  # of a deflection against a bank angle, both in rad
+
+
+def no_loads(time: ArrayLike) -> Loads:
+    """The preview of an autopilot, which knows of no wake."""
+    none = np.zeros((*np.shape(time), 3))
+    return Loads(none, none)
 
 
 def wings_level(aircraft: AircraftModel, time: float | None) -> Controller:
@@ -74,6 +81,7 @@ def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Contro
         return cancel
     has_others = bool(moments[:, 1:].any())
     dt = HORIZON / KNOTS
+    middles = (np.arange(KNOTS) + 0.5) * dt
     from_rate, rolls, rates = _roll_mode(aircraft, dt)
     effort = _EFFORT * np.eye(KNOTS)
     matrix = np.concatenate([rolls * moments[0, 0], RATE_TIME * rates * moments[0, 0], effort])
@@ -91,8 +99,8 @@ def feedforward(aircraft: AircraftModel, levelling_time: float | None) -> Contro
         last = level(preview, state)
         if preview is not None:
             others = cancel(preview, state) if has_others else Commands()
-            expected = [preview(state.time + (k + 0.5) * dt).moment[0] for k in range(KNOTS)]
-            wake = np.array(expected) + moments[0, 1:] @ others.array[1:]
+            expected = preview(state.time + middles).moment[:, 0]
+            wake = expected + moments[0, 1:] @ others.array[1:]
             start = from_rate * state.roll_rate + [[state.roll], [0.0]]
             target = -np.concatenate(
                 [start[0] + rolls @ wake, RATE_TIME * (start[1] + rates @ wake), np.zeros(KNOTS)]
@@ -133,7 +141,7 @@ def cancelling(aircraft: AircraftModel, levelling_time: float | None) -> Control
         commands = level(preview, state)
         if preview is None:
             return commands
-        moments = np.stack([preview(state.time + s).moment for s in instants])
+        moments = preview(state.time + instants).moment
         needs = np.clip(-moments @ shares.T, -limits.deflection, limits.deflection)
         ways = instants[:, None] * limits.rate
         least, most = (needs - ways).max(0), (needs + ways).min(0)

@@ -14,7 +14,7 @@ import xarray as xr
 
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
-from lidar_mi.encounter.control import Controller, Preview, feedforward, wings_level
+from lidar_mi.encounter.control import Controller, Preview, feedforward, no_loads, wings_level
 from lidar_mi.encounter.preview import Lidar, Lookout, preview_of
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.seen import Seen
@@ -39,7 +39,6 @@ TITLES = {
     PERFECT: "perfect preview",
     FEEDFORWARD: "with the lidar",
 }
-_NO_WAKE = Loads(np.zeros(3), np.zeros(3))
 
 # Longest step of a flight, s: below the time in which the wing crosses a core.
 _STEP = 0.01
@@ -111,7 +110,7 @@ def fly_all(
             found[mode] = flown(one, wings_level(one, levelling), wake, encounter, told)
         elif mode == AUTOPILOT:
             found[mode] = flown(
-                one, steers(one), wake, encounter, told, lambda state: lambda time: _NO_WAKE
+                one, steers(one), wake, encounter, told, lambda state: no_loads
             )
         elif mode == PERFECT:
             found[mode] = flown(one, steers(one), wake, encounter, told, preview_of(one, wake.wind))

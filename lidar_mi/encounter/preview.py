@@ -9,18 +9,16 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
+import torch
+from numpy.typing import ArrayLike
 
-from lidar_mi.atmosphere.vortex import Vortex, velocity
-from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Wind, flown_on, loads_in_wind
+from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, Wind, loads_in_wind
 from lidar_mi.encounter.control import Preview
 from lidar_mi.encounter.estimate import Estimate
 from lidar_mi.encounter.pose import AircraftPose
-from lidar_mi.retrieval.vortices.model import Profile
+from lidar_mi.retrieval.vortices.model import wind as pair_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.track import Track, first_track, updated
-
-# Distance (m) of planes and step (s) in time in which the pair is predicted.
-_PLANES, _TIMES = 5.0, 0.05
 
 # Slabs ahead of the newest one in which the track is still steered by: as many as it may miss.
 _SLABS_BEYOND = 5
@@ -71,7 +69,6 @@ class Lookout:
     slabs: list[Slab] = field(default_factory=list)
     _waiting: list[Estimate] = field(default_factory=list)
     _usable: list[Track] = field(default_factory=list)
-    _pairs: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
     _scans: int = 0
     _seen_at: tuple[float, float] = (np.nan, np.nan)
 
@@ -101,21 +98,24 @@ class Lookout:
         reach = _SLABS_BEYOND * self.stride
         return any(x <= track.x + reach for track in self._usable)
 
-    def wind(self, x, y, z, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Expected u, v, w (m/s) at places (m, path frame) and a time (s); u is not tracked.
+    def wind(
+        self, x: ArrayLike, y: ArrayLike, z: ArrayLike, time: ArrayLike
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Expected u, v, w (m/s) at places (m, path frame) and times (s); u is not tracked.
 
-        Linear between planes 5 m apart, in steps of 50 ms: a pair drifts by 3 cm in half a step.
+        Places and times broadcast. Each place is told by the usable track with the slab nearest to
+        it.
         """
-        x, y, z = np.broadcast_arrays(*(np.atleast_1d(np.asarray(a, float)) for a in (x, y, z)))
-        v, w = np.zeros(x.shape), np.zeros(x.shape)
-        below = np.floor(x / _PLANES).astype(int)
-        for plane in np.unique(below):
-            here = below == plane
-            first, second = (self._pair(int(plane) + k, time) for k in (0, 1))
-            fraction = float(x[here].mean()) / _PLANES - plane
-            theta = (1 - fraction) * first + fraction * second
-            v[here], w[here] = _pair_wind(theta, y[here], z[here], self._usable[-1].profile)
-        return np.zeros(x.shape), v, w
+        x, y, z, time = np.broadcast_arrays(*(np.asarray(a, float) for a in (x, y, z, time)))
+        away = [np.abs(x[..., None] - [one.x for one in t.slabs]).min(-1) for t in self._usable]
+        nearest = np.argmin(away, axis=0)
+        found = np.zeros((3, *x.shape))
+        for k, track in enumerate(self._usable):
+            here = nearest == k
+            theta = torch.as_tensor(track.parameters_at(x[here], time[here]))
+            places = (torch.as_tensor(a[here]) for a in (y, z))
+            found[1:, here] = pair_wind(theta, *places, track.profile).numpy()
+        return tuple(found)
 
     def preview(self, aircraft: AircraftModel) -> Callable[[AircraftState], Preview | None]:
         """Looks, then gives the loads expected by the track; None while there is none."""
@@ -135,15 +135,6 @@ class Lookout:
         x, time = self._seen_at
         return track.pair_at(x + self.stride, time + self.period)
 
-    def _pair(self, plane: int, time: float) -> np.ndarray:
-        """Parameters in a plane, by the usable track with the slab nearest to it; remembered."""
-        key = plane, round(time / _TIMES)
-        if key not in self._pairs:
-            x = plane * _PLANES
-            track = min(self._usable, key=lambda t: min(abs(slab.x - x) for slab in t.slabs))
-            self._pairs[key] = track.pair_at(x, key[1] * _TIMES).parameters
-        return self._pairs[key]
-
     def _take(self, estimate: Estimate) -> None:
         before, pair = self.track, estimate.pair
         if before is None:
@@ -152,7 +143,6 @@ class Lookout:
         else:
             found = updated(before, pair, estimate.x, estimate.time)
         self.slabs.append(Slab(estimate, found))
-        self._pairs.clear()
         if found is not None and found.usable:
             # the same track with one more slab replaces what it was before
             last = self._usable[-1].x if self._usable else None
@@ -160,21 +150,10 @@ class Lookout:
             self._usable[len(self._usable) - continued :] = [found]
 
 
-def _pair_wind(theta: np.ndarray, y, z, profile: Profile):
-    """v and w of a pair's parameters at places."""
-    vortices = [
-        Vortex(theta[k], float(np.exp(theta[k + 1])), theta[k + 2], theta[k + 3], profile)
-        for k in (0, 4)
-    ]
-    return tuple(a + b for a, b in zip(velocity(vortices, y, z), theta[8:10], strict=True))
-
-
 def preview_of(aircraft: AircraftModel, wind: Wind) -> Callable[[AircraftState], Preview]:
     """The wake's loads on any state flown on, in a wind that is known anywhere at any time."""
 
     def ahead(state: AircraftState) -> Preview:
-        return lambda time: loads_in_wind(
-            aircraft.strips, flown_on(state, time), wind, aircraft.density
-        )
+        return lambda time: loads_in_wind(aircraft.strips, state, wind, aircraft.density, time)
 
     return ahead

@@ -5,9 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from scipy.spatial.transform import Rotation
 
 from lidar_mi.atmosphere.texture import PeriodicTexture, periodic_texture
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.encounter.pointing import check_reported
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.forecast import most_nodes
@@ -100,12 +102,12 @@ def gates_of(experiment: Experiment) -> Gates:
         ("scan.gates", scan.gates, "planar"),
         ("scan.timing", scan.timing, None),
         ("platform.motion", experiment.platform.motion, None),
-        ("platform.reported", experiment.platform.reported, None),
         ("retrieval.blur", experiment.retrieval.blur, 0.0),
     ):
         if given != expected:
             shown = f" {given} is" if isinstance(given, str | float) else ""
             raise InputError(f"{key}:{shown} not allowed in an encounter; expected {expected}")
+    check_reported(experiment.platform.reported)
     wake_along_path(experiment)
     period = 1 / encounter.rate
     stride = encounter.path.speed * period
@@ -144,8 +146,27 @@ class Air:
     gates: Gates
     margin: tuple[float, float]
 
-    def at_scan(self, number: int, place: tuple[float, float]) -> xr.DataArray:
+    def at_scan(
+        self,
+        number: int,
+        place: tuple[float, float],
+        ahead: float = 0.0,
+        turned: Rotation | None = None,
+    ) -> xr.DataArray:
         """Extinction (m^-1) in all gates of a scan, about an aircraft at ``place`` (y, z in m).
+
+        A lidar that is turned about its place looks at air elsewhere: its nodes turn with it.
+
+        Parameters
+        ----------
+        number : int
+            Of the scan.
+        place : (float, float)
+            y and z of the aircraft, m.
+        ahead : float
+            Of its nominal place, m.
+        turned : Rotation, optional
+            True attitude of the lidar from the one that its beams are aimed by.
 
         Returns
         -------
@@ -161,7 +182,11 @@ class Air:
             _extended(axis, margin)
             for axis, margin in zip((gates.y, gates.z), self.margin, strict=True)
         )
-        places = np.meshgrid(number * gates.stride + x, place[0] + y, place[1] + z, indexing="ij")
+        places = np.meshgrid(x - ahead, y, z, indexing="ij")
+        if turned is not None:
+            places = np.einsum("ij,j...->i...", turned.as_matrix(), np.stack(places))
+        telescope = (number * gates.stride + ahead, *place)
+        places = [a + b for a, b in zip(places, telescope, strict=True)]
         # the plane behind the nearer gate is carried with it, for values between both
         carried = np.s_[: 1 + cells + (gates.between > 1)]
         now = number * gates.period

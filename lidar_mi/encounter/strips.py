@@ -31,9 +31,9 @@ class Loads:
 
     Attributes
     ----------
-    force : ndarray, shape (3,)
-        N.
-    moment : ndarray, shape (3,)
+    force : ndarray, shape (..., 3)
+        N; of one moment or of several.
+    moment : ndarray, shape (..., 3)
         N m, right-handed about each axis: positive with the port wing up, the nose down, the nose
         to port.
     """
@@ -165,20 +165,20 @@ def wake_loads(strips: Strips, wind: ArrayLike, airspeed: float, density: float)
     Parameters
     ----------
     strips : Strips
-    wind : array_like, shape (n, 3)
+    wind : array_like, shape (..., n, 3)
         Wind at the strips, in the body frame, m/s.
     airspeed : float
         V, m/s.
     density : float
         Of the air, kg m^-3.
     """
-    normal_wind = np.einsum("ij,ij->i", np.asarray(wind, dtype=float), strips.normals)
+    normal_wind = (np.asarray(wind, dtype=float) * strips.normals).sum(-1)
     pressure = (0.5 * density * airspeed) * strips.areas * normal_wind  # q S_i w_n / V
-    forces = (pressure * strips.slopes)[:, None] * strips.normals
-    moment = np.cross(strips.places, forces).sum(0)
-    arms = np.cross(strips.places, strips.normals)[:, 0]
-    moment[0] = (pressure * strips.roll_slopes * arms).sum()
-    return Loads(forces.sum(0), moment)
+    arms = np.cross(strips.places, strips.normals)
+    lift = pressure * strips.slopes
+    moment = lift @ arms
+    moment[..., 0] = (pressure * strips.roll_slopes) @ arms[:, 0]
+    return Loads(lift @ strips.normals, moment)
 
 
 def roll_damping(strips: Strips, airspeed: float, density: float) -> float:

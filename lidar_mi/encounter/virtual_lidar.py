@@ -11,6 +11,7 @@ from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.estimate import Estimate
 from lidar_mi.encounter.estimator import Estimator
 from lidar_mi.encounter.pose import AircraftPose
+from lidar_mi.encounter.pointing import pointing_error
 from lidar_mi.encounter.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
@@ -185,7 +186,9 @@ class VirtualLidar:
         """Both images of a scan with the detector's noise."""
         experiment, gates = self.experiment, self.gates
         plan = gates.plan(pose.x - number * gates.stride)
-        air = self.air.at_scan(number, (pose.y, pose.z))
+        turned = pointing_error(experiment, number, number * gates.period)
+        ahead = pose.x - number * gates.stride
+        air = self.air.at_scan(number, (pose.y, pose.z), ahead, turned)
         use_variant(experiment.render.variant)
         if self._renderer is None:
             lidar, scattering = experiment.lidar, experiment.scattering

@@ -47,7 +47,7 @@ def wake_along_path(experiment: Experiment) -> WakeAlongPath:
         climb_angle=path.climb_angle,
         x_c=path.start,
         t_c=path.start / path.speed,
-        miss=path.miss,
+        miss=(path.miss.y, path.miss.z),
         decay_time=encounter.wake.decay_time,
         crow_amplitude=encounter.wake.crow.amplitude,
         crow_wavelength=encounter.wake.crow.wavelength,

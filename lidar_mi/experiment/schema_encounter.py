@@ -23,6 +23,17 @@ from lidar_mi.units import (
 _Slope = Annotated[Angle, Within(-0.35, 0.35, "20 degrees")]
 
 
+class Miss(Section):
+    """Where the middle between the vortices is, from the path, when the aircraft arrives."""
+
+    y: Annotated[Length, Within(-1000, 1000, "an encounter")] = Field(
+        0.0, description="to the left of the path"
+    )
+    z: Annotated[Length, Within(-1000, 1000, "an encounter")] = Field(
+        0.0, description="above the path"
+    )
+
+
 class Path(Section):
     """The straight nominal flight path, and where it meets the wake."""
 
@@ -33,13 +44,7 @@ class Path(Section):
         quantity("10 deg"), description="of the path and the wake's axis, horizontal"
     )
     climb_angle: _Slope = Field(quantity("-3 deg"), description="of the path; the wake is level")
-    miss: tuple[
-        Annotated[Length, Within(-1000, 1000, "an encounter")],
-        Annotated[Length, Within(-1000, 1000, "an encounter")],
-    ] = Field(
-        (0.0, 0.0),
-        description="y and z of the centre of the pair from the path, where and when it arrives",
-    )
+    miss: Miss = Miss()
     altitude: Annotated[Length, Within(1, 15000, "the lower atmosphere")] = Field(
         300.0, description="height above the ground (sea level) at the start"
     )

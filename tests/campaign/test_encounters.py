@@ -27,7 +27,7 @@ def flown(folder, keep, mode, count):
             "path": {
                 "crossing_angle": "0 deg",
                 "climb_angle": "0 deg",
-                "miss": ["-23.55 m", "0 m"],
+                "miss": {"y": "-23.55 m"},
                 "start": "60 m",
                 "beyond": "40 m",
             },

@@ -12,7 +12,6 @@ from lidar_mi.encounter.aircraft import (
     Commands,
     Limits,
     deflected,
-    flown_on,
     loads_in_wind,
 )
 from lidar_mi.encounter.strips import fin_strips, wing_strips
@@ -55,10 +54,20 @@ def test_nose_to_port_meets_a_headwind_from_starboard():
     assert along.force[1] == pytest.approx(-10 * np.sin(np.radians(10)) * across.force[1])
 
 
-def test_flown_on():
+def test_flies_on_with_its_attitude():
+    """Loads at several times are those of states that have moved on along their course."""
+
+    def wind(x, y, z, time):
+        return 0 * x + y, 0.1 * x + z, np.sin(x / 20) + 0.2 * time * y
+
     state = AircraftState(time=1.0, x=10.0, y=2.0, roll=0.1, roll_rate=0.5, airspeed=75.0)
-    later = flown_on(state, 1.5)
-    assert (later.x, later.y, later.roll, later.roll_rate) == (47.5, 2.0, 0.1, 0.0)
+    ahead = loads_in_wind(WING, state, wind, 1.2, [1.0, 1.5, 2.25])
+    assert ahead.force.shape == ahead.moment.shape == (3, 3)
+    for k, (time, x) in enumerate(((1.0, 10.0), (1.5, 47.5), (2.25, 103.75))):
+        there = AircraftState(time=time, x=x, y=2.0, roll=0.1)
+        loads = loads_in_wind(WING, there, wind, 1.2)
+        np.testing.assert_allclose(ahead.force[k], loads.force, rtol=1e-12)
+        np.testing.assert_allclose(ahead.moment[k], loads.moment, rtol=1e-12, atol=1e-6)
 
 
 def test_controls_move_at_their_rate_within_their_limits():

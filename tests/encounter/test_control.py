@@ -10,8 +10,8 @@ from scipy.linalg import expm
 from scipy.optimize import linprog
 
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
-from lidar_mi.encounter.aircraft import Commands, flown_on, loads_in_wind
-from lidar_mi.encounter.control import cancelling, feedforward, wings_level
+from lidar_mi.encounter.aircraft import Commands, loads_in_wind
+from lidar_mi.encounter.control import cancelling, feedforward, no_loads, wings_level
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.experiment.schema_encounter import Aircraft, Path
@@ -40,8 +40,7 @@ def flown(controller_of, wind, aircraft=None, duration=6.5):
         state = model.state
 
         def preview(time, state=state):
-            there = flown_on(state, time)
-            return loads_in_wind(model.strips, there, wind, model.density)
+            return loads_in_wind(model.strips, state, wind, model.density, time)
 
         commands = controller(preview, state)
         model.step(STEP, preview(state.time), commands)
@@ -83,8 +82,9 @@ def least_largest_roll(wind, duration=6.5):
         answer = answer + np.outer(step[:2, 3], slope)
         rows.append(answer[0])
     response = np.array(rows)
-    instants = [flown_on(model.state, k * dt) for k in range(count + 1)]
-    moments = [loads_in_wind(model.strips, one, wind, model.density).moment[0] for one in instants]
+    instants = dt * np.arange(count + 1)
+    loads = loads_in_wind(model.strips, model.state, wind, model.density, instants)
+    moments = loads.moment[:, 0]
     wake_roll, power = response @ moments, model.control_moments[0, 0]
     turns = np.diff(np.eye(count + 1), axis=0)
     one, none = np.ones((count, 1)), np.zeros((count, 1))
@@ -118,11 +118,10 @@ def test_a_plan_without_loads_levels_the_wings():
     """An autopilot: from 10 degrees of bank to below 1 in 3 s, without going beyond."""
     model = RollModel(Aircraft(), Path())
     controller = feedforward(model, 3.0)
-    nothing = Loads(np.zeros(3), np.zeros(3))
     while model.state.roll < np.radians(10):
         model.step(STEP, Loads(np.zeros(3), np.array([3e5, 0.0, 0.0])), Commands())
     for _ in range(90):
-        model.step(STEP, nothing, controller(lambda time: nothing, model.state))
+        model.step(STEP, no_loads(0.0), controller(no_loads, model.state))
     assert abs(model.state.roll) < np.radians(1)
 
 
@@ -134,7 +133,8 @@ def test_a_slow_control_starts_early():
     moment = np.radians(10) * model.control_moments[0, 0]
 
     def preview(time):
-        return Loads(np.zeros(3), np.array([-moment if time > 1 else 0.0, 0.0, 0.0]))
+        rolling = np.where(np.asarray(time) > 1, -moment, 0.0)[..., None] * [1.0, 0.0, 0.0]
+        return Loads(0 * rolling, rolling)
 
     deflections = []
     for _ in range(60):
@@ -152,7 +152,7 @@ def test_levelling_decays_with_its_time():
     model = RollModel(Aircraft(), Path())
     controller = wings_level(model, 20.0)
     model.step(0.5, Loads(np.zeros(3), np.array([2e5, 0.0, 0.0])), Commands())
-    nothing = Loads(np.zeros(3), np.zeros(3))
+    nothing = no_loads(0.0)
     rolls = [model.step(STEP, nothing, controller(None, model.state)).roll for _ in range(300)]
     assert np.log(rolls[149] / rolls[299]) == pytest.approx(150 * STEP / 20, rel=0.05)
 

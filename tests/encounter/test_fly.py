@@ -109,10 +109,10 @@ def test_off_needs_no_quotes(tmp_path):
 
 def test_path_that_misses_is_warned_of():
     assert geometry(experiment()) == []
-    (text,) = geometry(experiment(path={"miss": ["0 m", "400 m"]}, control={"mode": "off"}))
+    (text,) = geometry(experiment(path={"miss": {"z": "400 m"}}, control={"mode": "off"}))
     assert text.startswith("encounter.path: the flight misses the wake")
     # beside the image, too
-    assert len(geometry(experiment(path={"miss": ["0 m", "400 m"]}))) == 2
+    assert len(geometry(experiment(path={"miss": {"z": "400 m"}}))) == 2
 
 
 def test_each_command_takes_its_own(tmp_path):

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
-from lidar_mi.encounter.aircraft import Commands, flown_on, loads_in_wind
+from lidar_mi.encounter.aircraft import Commands, loads_in_wind
 from lidar_mi.encounter.control import feedforward, wings_level
 from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.roll_model import RollModel
@@ -175,8 +175,7 @@ def test_steered_through_a_core():
             state = aircraft.state
 
             def preview(time, state=state):
-                there = flown_on(state, time)
-                return loads_in_wind(aircraft.strips, there, wind, aircraft.density)
+                return loads_in_wind(aircraft.strips, state, wind, aircraft.density, time)
 
             aircraft.step(step, preview(state.time), controller(preview, state))
             rolls.append(abs(aircraft.state.roll))

@@ -7,6 +7,7 @@ wrong rhythm, an expectation of another slab, errors of places that are not smal
 import numpy as np
 import pytest
 
+from lidar_mi.atmosphere.vortex import velocity
 from lidar_mi.encounter.aircraft import AircraftState
 from lidar_mi.encounter.preview import Lookout
 from lidar_mi.encounter.wake import wake_along_path
@@ -93,3 +94,17 @@ def test_an_upset_aircraft_does_not_look(wake):
     lidar = Exact(wake)
     Lookout(lidar, PERIOD, STRIDE).look(AircraftState(time=0.5, x=40.0, departed=True))
     assert lidar.steps == []
+
+
+def test_wind_of_many_planes_and_times_is_that_of_each(wake):
+    """Against the parameters that the track states for one plane and one time."""
+    lookout = looked(Exact(wake), 1.6)
+    x, time = np.array([100.0, 140.0, 215.0])[:, None], np.array([1.4, 1.9, 2.8])[:, None]
+    y, z = np.linspace(-20, 20, 9), np.zeros(9)
+    found = np.stack(lookout.wind(x, y, z, time))
+    assert found.shape == (3, 3, 9)
+    for k in range(3):
+        pair = lookout.track.pair_at(float(x[k, 0]), float(time[k, 0]))
+        expected = velocity((pair.port, pair.starboard), y, z)
+        for a, b, mean in zip(found[1:, k], expected, pair.mean_wind, strict=True):
+            np.testing.assert_allclose(a, b + mean, atol=1e-9)

@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from lidar_mi.errors import InputError
@@ -26,6 +27,7 @@ from lidar_mi.retrieval.vortices.track_motion import (
     PLACES,
     SLOPES,
     Wandering,
+    carried,
     moved,
     oblique_drift,
     unsteady,
@@ -257,6 +259,25 @@ class Track:
             covariance=covariance[:MEASURED, :MEASURED],
             reasons=(f"no update in {self.missed} slabs",) if self.lost else (),
         )
+
+    def parameters_at(self, x: ArrayLike, time: ArrayLike) -> np.ndarray:
+        """The parameters of `pair_at` alone, in many planes and at many times at once.
+
+        Parameters
+        ----------
+        x, time : array_like, shape (...)
+            m and s; they broadcast.
+
+        Returns
+        -------
+        ndarray, shape (10, ...)
+        """
+        x, time = np.broadcast_arrays(np.asarray(x, float), np.asarray(time, float))
+        places, times = (np.array([getattr(s, name) for s in self.slabs]) for name in ("x", "time"))
+        nearest = np.abs(x[..., None] - places).argmin(-1)
+        states = np.stack([state for state, _ in self._smoothed], -1)[:, nearest]
+        found = carried(states, x - places[nearest], time - times[nearest], self.profile)
+        return found[:MEASURED]
 
     @cached_property
     def _smoothed(self) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -127,6 +127,16 @@ def moved(
     return reached + dt * _DRIFTING @ speed.detach().numpy(), along, later
 
 
+def carried(
+    state: np.ndarray, dx: np.ndarray, dt: np.ndarray, profile: Profile
+) -> np.ndarray:
+    """States (14, ...) of `moved` alone, for distances and times (...)."""
+    reached = state.copy()
+    reached[PLACES] += dx * state[_OF_SLOPES]
+    speed = oblique_drift(torch.as_tensor(reached), profile).numpy()
+    return reached + dt * np.einsum("ij,j...->i...", _DRIFTING, speed)
+
+
 def oblique_drift(state: torch.Tensor, profile: Profile) -> torch.Tensor:
     """Velocity (2, ...) of pairs of states (14, ...) in a plane across the path, m s^-1.
 
