@@ -103,11 +103,25 @@ class Range(Span):
 
 
 class Sample(Description):
-    """A space-filling sample of several keys (`scipy.stats.qmc`)."""
+    """A space-filling sample of several keys (`scipy.stats.qmc`).
+
+    Attributes
+    ----------
+    method : str
+        Either sobol or latin_hypercube.
+    n : int
+        Number of points.
+    over : dict of str to Span
+        Keys and the intervals of their values.
+    random : str
+        Random numbers of the points: common, so that differences between points are those of the
+        keys, or independent, so that the points are a sample of what may happen.
+    """
 
     method: Literal["sobol", "latin_hypercube"] = "sobol"
     n: Annotated[int, Within(2, LARGEST, "a point for each")]
     over: dict[str, Span] = Field(min_length=1)
+    random: Literal["common", "independent"] = "common"
 
     @model_validator(mode="after")
     def _balanced(self):

@@ -102,7 +102,8 @@ class Points:
         data = self.base
         for dimension, k in zip(self.dimensions, index, strict=True):
             data = reading.merged(data, _nested(dimension.changes[k]))
-        data = data | {"seed": member_seed(self.seed, member)}
+        independent = self.campaign.sample and self.campaign.sample.random == "independent"
+        data = data | {"seed": member_seed(self.seed, member, *(index if independent else ()))}
         found = reading.check(data, self.title(number))
         return found.read_from(self.beside)
 
@@ -156,9 +157,12 @@ class Points:
         return [str(value) for value in self.dimensions[axis].labels]
 
 
-def member_seed(seed: int, member: int) -> int:
-    """Seed of a member: the same at every point, so that differences between points are sharp."""
-    state = np.random.SeedSequence((seed, member)).generate_state(1)
+def member_seed(seed: int, *numbers: int) -> int:
+    """Seed of a member: the same at every point, so that differences between points are sharp.
+
+    Points that are to have random numbers of their own add theirs to the member's number.
+    """
+    state = np.random.SeedSequence((seed, *numbers)).generate_state(1)
     return int(state[0]) % 2**31
 
 
