@@ -126,11 +126,7 @@ class AircraftModel(Protocol):
 
 
 def loads_in_wind(
-    strips: Strips,
-    state: AircraftState,
-    wind: Wind,
-    density: float,
-    time: ArrayLike | None = None,
+    strips: Strips, state: AircraftState, wind: Wind, density: float, time: ArrayLike | None = None
 ) -> Loads:
     """The wake's force and moment on an aircraft in a given state, or as it flies on from there.
 

@@ -109,9 +109,7 @@ def fly_all(
         if mode == OFF:
             found[mode] = flown(one, wings_level(one, levelling), wake, encounter, told)
         elif mode == AUTOPILOT:
-            found[mode] = flown(
-                one, steers(one), wake, encounter, told, lambda state: no_loads
-            )
+            found[mode] = flown(one, steers(one), wake, encounter, told, lambda state: no_loads)
         elif mode == PERFECT:
             found[mode] = flown(one, steers(one), wake, encounter, told, preview_of(one, wake.wind))
         else:

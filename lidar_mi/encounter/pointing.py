@@ -24,9 +24,7 @@ def pointing_error(experiment: Experiment, number: int, time: float) -> Rotation
     if reported is None:
         return None
     level = Pose(np.zeros((1, 3)), np.zeros((1, 3)), Rotation.identity(1))
-    told = reported_pose(
-        reported, lambda _: level, np.array([time]), 0.0, experiment.seed, number
-    )
+    told = reported_pose(reported, lambda _: level, np.array([time]), 0.0, experiment.seed, number)
     return told.attitude[0].inv()
 
 

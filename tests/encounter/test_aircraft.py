@@ -7,13 +7,7 @@ the ground.
 import numpy as np
 import pytest
 
-from lidar_mi.encounter.aircraft import (
-    AircraftState,
-    Commands,
-    Limits,
-    deflected,
-    loads_in_wind,
-)
+from lidar_mi.encounter.aircraft import AircraftState, Commands, Limits, deflected, loads_in_wind
 from lidar_mi.encounter.strips import fin_strips, wing_strips
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.reading import load_experiment

@@ -20,7 +20,7 @@ def test_the_keys_reach_the_wake():
             "start": "400 m",
             "crossing_angle": "20 deg",
             "climb_angle": "-2 deg",
-            "miss": ["3 m", "-4 m"],
+            "miss": {"y": "3 m", "z": "-4 m"},
         }
     )
     wake = wake_along_path(experiment)

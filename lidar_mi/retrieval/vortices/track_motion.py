@@ -127,9 +127,7 @@ def moved(
     return reached + dt * _DRIFTING @ speed.detach().numpy(), along, later
 
 
-def carried(
-    state: np.ndarray, dx: np.ndarray, dt: np.ndarray, profile: Profile
-) -> np.ndarray:
+def carried(state: np.ndarray, dx: np.ndarray, dt: np.ndarray, profile: Profile) -> np.ndarray:
     """States (14, ...) of `moved` alone, for distances and times (...)."""
     reached = state.copy()
     reached[PLACES] += dx * state[_OF_SLOPES]
