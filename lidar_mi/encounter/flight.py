@@ -19,7 +19,6 @@ from lidar_mi.encounter.preview import Lidar, Lookout, preview_of
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.seen import Seen
 from lidar_mi.encounter.series import Recorder, flights_dataset, track_dataset
-from lidar_mi.encounter.strips import Loads
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.schema_encounter import Encounter

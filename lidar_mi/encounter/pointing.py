@@ -1,4 +1,4 @@
-"""Where the lidar of a flight looks, if the attitude that its scanner is told is not the true one."""
+"""Where the lidar of a flight looks, if its scanner is told a wrong attitude."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation

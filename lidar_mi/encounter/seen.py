@@ -53,4 +53,8 @@ class Seen:
             return None
         first = self._slabs[0]
         grid = {name: first[name] for name in first.dims}
-        return xr.concat([one.interp(grid) for one in self._slabs], "slab")
+        found = xr.concat([one.interp(grid) for one in self._slabs], "slab")
+        # interpolation gives double precision, which no figure needs
+        return found.assign(
+            {name: found[name].astype(np.float32) for name in first if first[name].ndim}
+        )

@@ -10,8 +10,8 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.estimate import Estimate
 from lidar_mi.encounter.estimator import Estimator
-from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.pointing import pointing_error
+from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
