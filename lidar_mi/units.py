@@ -191,6 +191,30 @@ Memory = Annotated[float, Unit("byte", "8 GB")]
 Number = Annotated[float, Unit("", "0.5")]
 
 
+_PREFIXED = ("m", "s", "J", "W", "Hz")
+_FEW, _MANY = 0.1, 1e4
+
+
+def usual(number: float, unit: str) -> str:
+    """A quantity in SI units as people write it, to six digits.
+
+    Angles in degrees from 0.5 degrees on; lengths, times, energies, powers and frequencies with the
+    prefix that leaves few digits, below 0.1 and from 10000 on.
+
+    Examples
+    --------
+    >>> usual(5.32e-07, "m"), usual(0.17453292519943295, "rad"), usual(350.0, "m^2/s")
+    ('532 nm', '10 deg', '350 m^2/s')
+    """
+    found = UNITS.Quantity(number, "")
+    if unit == "rad" and abs(number) >= 0.5 * math.pi / 180:
+        found, unit = UNITS.Quantity(math.degrees(number), ""), "deg"
+    elif number and (unit == "rad" or unit in _PREFIXED and not _FEW <= abs(number) < _MANY):
+        found = UNITS.Quantity(number, unit).to_compact()
+        unit = f"{found.units:~}"
+    return f"{found.magnitude:.6g} {unit}".strip()
+
+
 def parse_units(text: str) -> pint.Quantity[float]:
     """A CF units string as a pint quantity: 'm s-1', 'km/h', 'kg m-3', '1', '%'.
 

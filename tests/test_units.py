@@ -5,7 +5,7 @@ import math
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from lidar_mi.units import Angle, Energy, Extinction, Length, Number, Speed, Time
+from lidar_mi.units import Angle, Energy, Extinction, Length, Number, Speed, Time, to_si, usual
 
 
 class Quantities(BaseModel):
@@ -149,3 +149,27 @@ def test_written_quantities_are_read_again_exactly():
     text = one.model_dump(mode="json")
     assert text["angle"].endswith(" rad") and text["extinction"].endswith(" 1/m")
     assert Quantities(**text) == one
+
+
+@pytest.mark.parametrize(
+    ("number", "unit", "text"),
+    [
+        (5.32e-07, "m", "532 nm"),
+        (0.17453292519943295, "rad", "10 deg"),
+        (0.002, "rad", "2 mrad"),
+        (-0.05235987755982989, "rad", "-3 deg"),
+        (350.0, "m^2/s", "350 m^2/s"),
+        (0.001, "J", "1 mJ"),
+        (0.1, "s", "0.1 s"),
+        (1e-8, "s", "10 ns"),
+        (1500.0, "m", "1500 m"),
+        (25000.0, "Hz", "25 kHz"),
+        (0.0, "rad", "0 rad"),
+        (0.0, "m", "0 m"),
+        (1.25, "", "1.25"),
+    ],
+)
+def test_quantities_as_people_write_them(number, unit, text):
+    assert usual(number, unit) == text
+    if unit:
+        assert to_si(text, unit, "1") == pytest.approx(number, rel=1e-5)

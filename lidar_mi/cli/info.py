@@ -1,13 +1,15 @@
 """``lidar-mi info``: contents of a file or a folder of results, properties of a scatterer."""
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from lidar_mi.cli.options import quantity
 from lidar_mi.cli.terminal import output, print_answer, print_rows, print_table
 from lidar_mi.progress import progress
+from lidar_mi.tables import Table
 
 CAMPAIGN = "campaign.yaml"
 """Record in the folder of a campaign."""
@@ -40,8 +42,7 @@ def info(
     Of scatterers: extinction and backscatter coefficient with the number of particles,
     single-scattering albedo, lidar ratio, depolarisation ratio.
     """
-    from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment.describe import sections, value_at
+    from lidar_mi.experiment.describe import sections
     from lidar_mi.experiment.resumable_folder import failure, read_metrics, read_record
     from lidar_mi.experiment.study import RECORD, answers
 
@@ -75,9 +76,20 @@ def info(
         elif metrics is None:
             output.print("unfinished: no metrics.json yet; run it again to resume")
         elif not (folder / RECORD).is_file():
-            asked = value_at(read_record(folder)["experiment"], "doppler.retrieval.averaged")
-            averaged = [n for n in asked if isinstance(n, int)] if isinstance(asked, list) else ()
-            for table in summary(metrics, averaged):
+            for table in _results(metrics, read_record(folder)["experiment"]):
                 print_table(table)
         if (folder / RECORD).is_file() and not reason:
             output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)
+
+
+def _results(metrics: Mapping[str, float], experiment: Mapping[str, Any]) -> list[Table]:
+    """The numbers of a flight or of a run."""
+    from lidar_mi.assessment.report.encounter import encounter_summary
+    from lidar_mi.assessment.report.summary import summary
+    from lidar_mi.experiment.describe import value_at
+
+    if value_at(experiment, "encounter") is not None:
+        return encounter_summary(metrics)
+    asked = value_at(experiment, "doppler.retrieval.averaged")
+    averaged = [n for n in asked if isinstance(n, int)] if isinstance(asked, list) else ()
+    return summary(metrics, averaged)

@@ -1,4 +1,4 @@
-"""Flights through the wake of an experiment: without help, with the lidar, with perfect preview.
+"""Flights through the wake of an experiment: without control, with the lidar, with perfect preview.
 
 All of them meet the same wake. Only the flight that steers by the lidar needs its images: what the
 others do is known without it. Between no help and a preview there is an autopilot: the controller
@@ -33,7 +33,7 @@ FLOWN = {
 """Flights of each mode of control: what it is compared with is flown, too."""
 
 TITLES = {
-    OFF: "without help",
+    OFF: "without control",
     AUTOPILOT: "autopilot",
     PERFECT: "perfect preview",
     FEEDFORWARD: "with the lidar",

@@ -90,7 +90,7 @@ def fly(
     overwrite: bool = False,
     notice: Callable | None = None,
 ) -> Flight:
-    """Fly into the wake: without help, with an autopilot, steered by the lidar, and by the truth.
+    """Fly into the wake: without control, with an autopilot, steered by the lidar, by the truth.
 
     All flights meet the same wake. The lidar renders its scans in the flight that it steers.
 

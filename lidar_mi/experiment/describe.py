@@ -188,13 +188,14 @@ def _study(folder: Path) -> Iterator[Section]:
 
 
 def _run_folder(folder: Path) -> Iterator[Section]:
+    from lidar_mi.assessment.report.comparison import setting
     from lidar_mi.experiment.resumable_folder import read_record
 
     record = read_record(folder)
     experiment = record["experiment"]
     yield (
         f"{folder}: experiment {experiment.get('name')}",
-        [(key, _short(value)) for key, value in _asked_first(experiment)],
+        [(key, setting(value)) for key, value in _asked_first(experiment)],
     )
     yield "versions", [(name, str(number)) for name, number in record["versions"].items()]
     yield _files(folder)
@@ -210,21 +211,33 @@ def _files(folder: Path, beside: Iterable[str] = ()) -> Section:
     ]
 
 
+_OF_A_RUN = ("platform.speed", "platform.dt", "scan.range")
+_OF_A_FLIGHT = (
+    "encounter.aircraft.model",
+    "encounter.path.speed",
+    "encounter.path.crossing_angle",
+    "encounter.control.mode",
+    "encounter.rate",
+    "encounter.look_ahead",
+)
+
+
 def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
-    """The main keys of an experiment, as far as it has them."""
+    """The main keys of an experiment, as far as it has them and they have an effect."""
+    flies = value_at(experiment, "encounter") is not None
     for key in (
         "seed",
         "wake.file",
         "wake.time",
         "wake.second",
+        "wake.vortex_pair.circulation",
         "wake.texture.rms",
-        "platform.speed",
-        "platform.dt",
-        "scan.range",
+        *(_OF_A_FLIGHT if flies else _OF_A_RUN),
         "scan.thickness",
         "scan.gates",
         "scan.gate_count",
         "lidar.wavelength",
+        "lidar.pulse_energy",
         "scattering.phase",
         "scattering.aerosol",
         "render.variant",
@@ -233,8 +246,8 @@ def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
         "retrieval.methods",
     ):
         value = value_at(experiment, key)
-        if value is not None:
-            yield key, ", ".join(map(str, value)) if isinstance(value, list) else value
+        if value is not None and not (flies and key in ("wake.second", "scan.gate_count")):
+            yield key, value
 
 
 def value_at(experiment: dict, key: str) -> Any:

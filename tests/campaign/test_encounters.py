@@ -68,7 +68,7 @@ def test_points_are_flown_and_their_bank_angles_shown(tmp_path):
     limit = math.radians(7)
     within = 25 * int((off <= limit).sum())
     assert 0 < within < 100  # the test sees both
-    found = re.search(r"no control ([\d.]+)\s±\s[\d.]+ %", html)
+    found = re.search(r"without control ([\d.]+)\s±\s[\d.]+ %", html)
     assert found and float(found[1]) == within
     assert "fraction of flights" in html and "No requirement was judged" not in html
 

@@ -46,7 +46,7 @@ def test_folder_holds_the_flight(tmp_path):
     with xr.open_dataset(tmp_path / "out" / "flight.nc", engine="h5netcdf") as found:
         assert found["roll"].attrs["units"] == "rad" and found.sizes["flight"] == 3
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "Without help, the wake rolls the aircraft by" in page and "http" not in page
+    assert "Without control, the wake rolls the aircraft by" in page and "http" not in page
     # again: nothing is flown
     before = (tmp_path / "out" / "flight.nc").stat().st_mtime_ns
     again = lm.fly(one, tmp_path / "out", notice=silent)
@@ -127,4 +127,14 @@ def test_each_command_takes_its_own(tmp_path):
     done = shell("fly", "encounter", "--mode", "off", *sets, "-o", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "largest roll angle" in done.stdout and (tmp_path / "out" / "flight.nc").is_file()
-    assert re.search(r"without help: \d+ of \d+ s", done.stderr)
+    assert re.search(r"without control: \d+ of \d+ s", done.stderr)
+
+
+def test_info_shows_a_flight(tmp_path):
+    """Its settings in usual units, without those that have no effect, and its numbers."""
+    lm.fly(experiment(control={"mode": "off"}, path=SHORT), tmp_path / "out", notice=silent)
+    done = shell("info", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    for words in ("encounter.path.crossing_angle", "20 deg", "532 nm", "largest roll angle"):
+        assert words in done.stdout
+    assert "platform.dt" not in done.stdout and "without control" in done.stdout

@@ -12,7 +12,7 @@ from lidar_mi.assessment.figures.plates import Drawn, save_all
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
 FLIGHTS = {
-    "off": ("without help", "tab:red", "-"),
+    "off": ("without control", "tab:red", "-"),
     "autopilot": ("autopilot", "tab:purple", ":"),
     "feedforward": ("with the lidar", "tab:blue", "-"),
     "perfect": ("perfect preview", "0.35", "--"),

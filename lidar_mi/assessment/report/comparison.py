@@ -12,6 +12,7 @@ from lidar_mi.assessment.report.digits import fixed, three
 from lidar_mi.assessment.report.page import picture, script, template
 from lidar_mi.io.yaml import to_yaml
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
+from lidar_mi.units import usual
 
 # rows of the comparison: key, name, unit; {}: a method's winds
 _ROWS = (
@@ -147,13 +148,13 @@ def _named(source: str, method: str) -> str:
 
 
 def setting(value) -> str:
-    """An experiment's value as text, numbers to six digits; a dash: there is none."""
+    """An experiment's value as text, in the units that people use; a dash: there is none."""
     if value is None:
         return "-"
     if isinstance(value, list):
         return ", ".join(map(setting, value))
-    number, blank, unit = str(value).partition(" ")
+    number, _, unit = str(value).partition(" ")
     try:
-        return f"{float(number):.6g}{blank}{unit}"
+        return usual(float(number), unit)
     except ValueError:
         return str(value)

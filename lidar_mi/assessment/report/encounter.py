@@ -105,7 +105,7 @@ def encounter_chapter(
         tables.append(("The lidar and its track", ["value"], lidar))
     numbers = Tables(
         heading="Numbers of the flight",
-        legend="All flights meet the same wake. Without help, a pilot levels the wings; the "
+        legend="All flights meet the same wake. Without control, a pilot levels the wings; the "
         "autopilot is the controller of the flights with a preview, told that there is no wake. "
         "Rolling moment felt: that of wake and ailerons together. Errors are those of the track "
         "against the truth, in the slab just seen.",
@@ -124,9 +124,9 @@ def encounter_answer(metrics: Mapping[str, float]) -> list[str]:
     off, blind, ours, perfect = (metrics.get(f"encounter.{m}.largest_roll") for m in FLIGHTS)
     if off is None:
         return []
-    answer = f"Without help, the wake rolls the aircraft by {_degrees(off)}"
+    answer = f"Without control, the wake rolls the aircraft by {_degrees(off)}"
     if _departed(metrics, "off"):
-        answer = "Without help, the wake upsets the aircraft"
+        answer = "Without control, the wake upsets the aircraft"
     if blind is not None:
         answer += f"; with the same autopilot, but no preview, by {_degrees(blind)}"
     if ours is not None:

@@ -12,7 +12,7 @@ from lidar_mi.assessment.report.block import Block
 from lidar_mi.assessment.report.digits import with_error
 
 _MODES = {
-    "off": "no control",
+    "off": "without control",
     "autopilot": "autopilot",
     "feedforward": "with the lidar",
     "perfect": "perfect preview",

@@ -65,6 +65,6 @@ def test_film_shows_the_flight(monkeypatch):
     assert all(frame.pixels.dtype == np.uint8 and frame.pixels.std() > 10 for frame in frames)
     last = found.series.isel(time=-1)
     angle = np.degrees(float(last["roll"].sel(flight="off")))
-    assert f"without help {angle:+.1f}°" in frames[-1].caption
+    assert f"without control {angle:+.1f}°" in frames[-1].caption
     assert frames[0].time < frames[1].time < frames[2].time
     assert list(film(found.series, None, None, SPAN)) == []

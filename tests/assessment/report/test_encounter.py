@@ -34,8 +34,8 @@ def test_answer_comes_first():
     metrics["encounter.removed_of_perfect.largest_roll"] = 16 / 23
     answer, *_ = encounter_answer(metrics)
     for words in (
-        "Without help, the wake rolls the aircraft by 25 degrees; with the same autopilot, but no "
-        "preview, by 7 degrees; with the lidar by 9 degrees; with perfect preview by 2 degrees.",
+        "Without control, the wake rolls the aircraft by 25 degrees; with the same autopilot, but "
+        "no preview, by 7 degrees; with the lidar by 9 degrees; with perfect preview by 2 degrees.",
         "removes 70 % of the roll angle that perfect preview removes, and so misses the goal of "
         "80 %",
         "The flight with the lidar exceeds the 7 degrees of bank",
@@ -45,12 +45,12 @@ def test_answer_comes_first():
 
 def test_an_upset_is_told():
     (answer,) = encounter_answer(numbers(off=120))
-    assert answer.startswith("Without help, the wake upsets the aircraft. This flight exceeds")
+    assert answer.startswith("Without control, the wake upsets the aircraft. This flight exceeds")
 
 
 def test_summary_names_every_flight():
     table, *_ = encounter_summary(numbers(off=25.3, perfect=2.04))
-    assert table.heads == ("", "without help", "perfect preview")
+    assert table.heads == ("", "without control", "perfect preview")
     assert table.rows[0] == ("largest roll angle / degrees", "25.3", "2.04")
 
 
