@@ -209,7 +209,7 @@ def usual(number: float, unit: str) -> str:
     found = UNITS.Quantity(number, "")
     if unit == "rad" and abs(number) >= 0.5 * math.pi / 180:
         found, unit = UNITS.Quantity(math.degrees(number), ""), "deg"
-    elif number and (unit == "rad" or unit in _PREFIXED and not _FEW <= abs(number) < _MANY):
+    elif number and (unit == "rad" or (unit in _PREFIXED and not _FEW <= abs(number) < _MANY)):
         found = UNITS.Quantity(number, unit).to_compact()
         unit = f"{found.units:~}"
     return f"{found.magnitude:.6g} {unit}".strip()

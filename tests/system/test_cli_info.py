@@ -31,7 +31,7 @@ def test_info_on_a_run_folder(demo, lidar_mi):
         "image_t2.exr",
         "figures/fig08",
         "scan.range",
-        "500.0 m",
+        "500 m",
         "scan.gate_count",
         "seed",
         "spheroids",
