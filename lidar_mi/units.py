@@ -206,13 +206,12 @@ def usual(number: float, unit: str) -> str:
     >>> usual(5.32e-07, "m"), usual(0.17453292519943295, "rad"), usual(350.0, "m^2/s")
     ('532 nm', '10 deg', '350 m^2/s')
     """
-    found = UNITS.Quantity(number, "")
     if unit == "rad" and abs(number) >= 0.5 * math.pi / 180:
-        found, unit = UNITS.Quantity(math.degrees(number), ""), "deg"
+        number, unit = math.degrees(number), "deg"
     elif number and (unit == "rad" or (unit in _PREFIXED and not _FEW <= abs(number) < _MANY)):
         found = UNITS.Quantity(number, unit).to_compact()
-        unit = f"{found.units:~}"
-    return f"{found.magnitude:.6g} {unit}".strip()
+        number, unit = float(found.magnitude), f"{found.units:~}"
+    return f"{number:.6g} {unit}".strip()
 
 
 def parse_units(text: str) -> pint.Quantity[float]:

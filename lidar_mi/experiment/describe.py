@@ -1,6 +1,6 @@
 """Contents of a file, a folder of results or a named scatterer, as titled tables of text."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -250,7 +250,7 @@ def _asked_first(experiment: dict) -> Iterator[tuple[str, object]]:
             yield key, value
 
 
-def value_at(experiment: dict, key: str) -> Any:
+def value_at(experiment: Mapping[str, Any], key: str) -> Any:
     """The value of a dotted key of a record's experiment; None: it has none."""
     value: Any = experiment
     for part in key.split("."):
