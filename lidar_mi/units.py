@@ -195,23 +195,30 @@ _PREFIXED = ("m", "s", "J", "W", "Hz")
 _FEW, _MANY = 0.1, 1e4
 
 
-def usual(number: float, unit: str) -> str:
-    """A quantity in SI units as people write it, to six digits.
+def usual_unit(number: float, unit: str) -> tuple[float, str]:
+    """Factor from SI to the unit in which people write quantities of this size, and the unit.
 
     Angles in degrees from 0.5 degrees on; lengths, times, energies, powers and frequencies with the
     prefix that leaves few digits, below 0.1 and from 10000 on.
+    """
+    if unit == "rad" and abs(number) >= 0.5 * math.pi / 180:
+        return 180 / math.pi, "deg"
+    if number and (unit == "rad" or (unit in _PREFIXED and not _FEW <= abs(number) < _MANY)):
+        found = UNITS.Quantity(number, unit).to_compact()
+        return float(found.magnitude) / number, f"{found.units:~}"
+    return 1.0, unit
+
+
+def usual(number: float, unit: str) -> str:
+    """A quantity in SI units in its `usual_unit`, to six digits.
 
     Examples
     --------
     >>> usual(5.32e-07, "m"), usual(0.17453292519943295, "rad"), usual(350.0, "m^2/s")
     ('532 nm', '10 deg', '350 m^2/s')
     """
-    if unit == "rad" and abs(number) >= 0.5 * math.pi / 180:
-        number, unit = math.degrees(number), "deg"
-    elif number and (unit == "rad" or (unit in _PREFIXED and not _FEW <= abs(number) < _MANY)):
-        found = UNITS.Quantity(number, unit).to_compact()
-        number, unit = float(found.magnitude), f"{found.units:~}"
-    return f"{number:.6g} {unit}".strip()
+    factor, unit = usual_unit(number, unit)
+    return f"{factor * number:.6g} {unit}".strip()
 
 
 def parse_units(text: str) -> pint.Quantity[float]:

@@ -239,13 +239,22 @@ def draw_scatter(
 def draw_distributions(
     title: str, groups: Mapping[str, np.ndarray], label: str, limit: float | None = None
 ) -> str:
-    """Fractions of values up to each value, a line per group; a limit is marked."""
+    """Fractions of values up to each value, a line per group; a limit is marked.
+
+    Values that differ by factors are on a logarithmic axis.
+    """
     figure, axes = panel(title)
     for (name, values), colour in zip(groups.items(), COLOURS, strict=False):
         axes.ecdf(values, color=colour, label=name)
     if limit is not None:
         axes.axvline(limit, color=FAILED, ls="--", lw=1, label="limit")
-    axes.set(xlabel=label, ylabel="fraction of flights", xlim=(0, None))
+    low, high = (end([end(values) for values in groups.values()]) for end in (np.min, np.max))
+    if low > 0 and high > 30 * low:
+        axes.set(xscale="log")
+        _plain_decades(axes.xaxis)
+    else:
+        axes.set(xlim=(0, None))
+    axes.set(xlabel=label, ylabel="fraction of flights")
     axes.grid(alpha=0.3)
     figure.legend(fontsize=8, loc="outside lower center", ncols=4, frameon=False)
     return as_svg(axes, [], f"{label}, {title}")

@@ -18,6 +18,7 @@ from lidar_mi.assessment.report.digits import three, with_error
 from lidar_mi.assessment.report.encounters import encounter_blocks
 from lidar_mi.assessment.report.page import template
 from lidar_mi.assessment.report.sample import margin_blocks, sample_blocks
+from lidar_mi.units import usual_unit
 
 _PANELS = 16
 _DONE, _FAILED = 0, 1
@@ -42,6 +43,8 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
     InputError
         A metric that the campaign does not have.
     """
+    flown = list(encounter_blocks(numbers.metrics_of(dataset)))
+    dataset = _in_usual_units(dataset)
     known = numbers.metrics_of(dataset)
     shown = numbers.chosen(known, metrics)
     axes = {name: _axis(dataset, name) for name in numbers.knobs(dataset)}
@@ -59,7 +62,7 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
     else:
         blocks = [_sweep_block(dataset, key, known[key], axes, points) for key in shown]
         required = list(_requirement_maps(dataset, margins, axes, points))
-    blocks = [*encounter_blocks(known), *blocks]
+    blocks = [*flown, *blocks]
     return template("campaign.html").render(
         name=dataset.attrs.get("name", "campaign"),
         lead=_lead(dataset, axes, margins),
@@ -76,6 +79,20 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
 
 def _marked(blocks: Sequence[Block]) -> list[Block]:
     return [block._replace(panels=[Markup(panel) for panel in block.panels]) for block in blocks]
+
+
+def _in_usual_units(dataset: xr.Dataset) -> xr.Dataset:
+    """Angles in degrees or mrad, energies in mJ: by the largest value of each variable."""
+    found = {}
+    for name, variable in dataset.variables.items():
+        values = variable.values
+        if values.dtype.kind != "f" or "units" not in variable.attrs:
+            continue
+        largest = np.abs(values[np.isfinite(values)]).max(initial=0.0)
+        factor, unit = usual_unit(float(largest), variable.attrs["units"])
+        if factor != 1:
+            found[name] = (variable.dims, factor * values, variable.attrs | {"units": unit})
+    return dataset.assign({key: xr.Variable(*one) for key, one in found.items()})
 
 
 def _axis(dataset: xr.Dataset, name: str) -> Axis:
