@@ -260,6 +260,25 @@ def draw_distributions(
     return as_svg(axes, [], f"{label}, {title}")
 
 
+def draw_against(
+    label: str, x: tuple[str, np.ndarray], groups: Mapping[str, np.ndarray], limit: float
+) -> str:
+    """Values of several groups against those of one, on logarithmic axes; a limit is marked."""
+    figure, axes = panel("")
+    name, across = x
+    for (group, values), colour in zip(groups.items(), COLOURS[1:], strict=False):
+        axes.plot(across, values, "o", ms=3.5, alpha=0.7, color=colour, label=group)
+    ends = np.array([np.min(across), np.max(across)])
+    axes.plot(ends, ends, color=COLOURS[0], lw=1, label=name)
+    axes.axhline(limit, color=FAILED, ls="--", lw=1, label="limit")
+    axes.set(xscale="log", yscale="log", xlabel=f"{label}, {name}", ylabel=label)
+    for side in (axes.xaxis, axes.yaxis):
+        _plain_decades(side)
+    axes.grid(alpha=0.3)
+    figure.legend(fontsize=8, loc="outside lower center", ncols=4, frameon=False)
+    return as_svg(axes, [], f"{label} against {name}")
+
+
 def draw_indices(title: str, found: SobolIndices, labels: Mapping[str, str]) -> str:
     """First-order and total indices of every knob with their intervals."""
     _, axes = panel(title)

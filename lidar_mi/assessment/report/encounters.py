@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.figures.campaign import draw_distributions
+from lidar_mi.assessment.figures.campaign import draw_against, draw_distributions
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 from lidar_mi.assessment.report.block import Block
 from lidar_mi.assessment.report.digits import with_error
@@ -34,9 +34,13 @@ def encounter_blocks(known: Mapping[str, xr.DataArray]) -> Iterator[Block]:
     text = "Largest bank angle of every flight: the fraction of flights that stay below. "
     below = [f"{name} {_fraction(values <= limit)}" for name, values in rolls.items()]
     text += f"Within {limit:.3g}°: {', '.join(below)}."
-    yield Block(
-        "Bank angle", text, [draw_distributions("", rolls, "largest bank angle / °", limit)]
-    )
+    label = "largest bank angle / °"
+    panels = [draw_distributions("", rolls, label, limit)]
+    off, *steered = rolls
+    if off == _MODES["off"] and steered and min(map(np.min, rolls.values())) > 0:
+        against = {name: rolls[name] for name in steered}
+        panels.append(draw_against(label, (off, rolls[off]), against, limit))
+    yield Block("Bank angle", text, panels)
 
 
 def _fraction(met: np.ndarray) -> str:
