@@ -20,6 +20,8 @@ Parameter                    Type            Meaning
 The matrix has the rows (a1, b1, 0, 0), (b1, a2, 0, 0), (0, 0, a3, b2), (0, 0, -b2, a4) and refers
 to the scattering plane, Q > 0 parallel to it. The table is scaled so that a1 integrates to one
 over the sphere (values are then per steradian); all elements are scaled by the same factor.
+``table`` can be changed through ``mi.traverse``, also to one of other angles, and is
+scaled as well.
 
 .. code-block:: xml
 
@@ -50,7 +52,14 @@ def define():
             super().__init__(props)
             if "table" not in props:
                 fail(NAME, "table", None, "a tensor of N x 7 numbers or a file name")
-            table = check_table(read_table(NAME, "table", props["table"], 7))
+            table = read_table(NAME, "table", props["table"], 7)
+            self._tabulate(table)
+            self.m_table = mi.TensorXf(np.array(table, np.float32))
+            self.m_flags = +mi.PhaseFunctionFlags.Isotropic
+
+        def _tabulate(self, table):
+            """Elements, and the distribution of the cosine, of a table as it was given."""
+            table = check_table(table)
             self.m_angle = mi.Float(np.radians(table[:, 0]))
             self.m_elements = [mi.Float(column) for column in table[:, 1:].T]
             cosine, first = np.unique(np.cos(np.radians(table[:, 0])).astype(np.float32), True)
@@ -59,7 +68,12 @@ def define():
             self.m_cell = mi.DiscreteDistribution(
                 mi.Float(np.diff(cosine) * (density[1:] + density[:-1]))
             )
-            self.m_flags = +mi.PhaseFunctionFlags.Isotropic
+
+        def traverse(self, callback):
+            callback.put("table", self.m_table, mi.ParamFlags.NonDifferentiable)
+
+        def parameters_changed(self, keys=()):
+            self._tabulate(self.m_table.numpy())
 
         def elements(self, angle, active=True):
             """The six elements at a scattering angle in radians, per steradian."""

@@ -9,7 +9,7 @@ from lidar_mi.cli.options import Changes, Electrons, NominalInstrument, Overwrit
 from lidar_mi.cli.terminal import output, print_table
 
 EXAMPLES = (
-    "Examples: `lidar-mi calibrate laser_*.tif --instrument my_lidar.yaml -o etalon.nc` - "
+    "Examples: `lidar-mi calibrate laser_*.tif --instrument my_etalon.yaml -o etalon.nc` - "
     "`lidar-mi calibrate laser.fits --flat white.fits --set doppler.camera.pixel='5.5 um'`"
 )
 

@@ -1,6 +1,7 @@
 """``lidar-mi retrieve``: the cross-flow wind in images of the same air."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,12 +10,16 @@ import typer
 from lidar_mi.cli.options import Overwrite
 from lidar_mi.cli.terminal import output, print_rows, print_table
 from lidar_mi.errors import InputError
+from lidar_mi.progress import progress
 from lidar_mi.tables import Table
 
 if TYPE_CHECKING:
     import xarray as xr
 
-EXAMPLES = "Example: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc`"
+EXAMPLES = (
+    "Examples: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc` - "
+    "`lidar-mi retrieve frame_*.tif --dt 0.1 --spacing 0.5 --pairs all`"
+)
 
 _SAME = 1e-3
 """Relative difference between a time step given and one from headers that is rounding."""
@@ -27,7 +32,15 @@ def retrieve(
     more: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Further images of a burst, each dt after the one before (variational)."
+            help="Further images, each dt after the one before: of a burst (variational), or of "
+            "a sequence (--pairs)."
+        ),
+    ] = None,
+    pairs: Annotated[
+        str | None,
+        typer.Option(
+            help="A wind from each pair: all (each image with the next), or numbers from 0 such "
+            "as 0-1,1-2,3-5."
         ),
     ] = None,
     dt: Annotated[
@@ -70,7 +83,7 @@ def retrieve(
     device: Annotated[str, typer.Option(help="torch device, such as cpu or cuda.")] = "cpu",
     overwrite: Overwrite = False,
 ) -> None:
-    """Retrieve the cross-flow wind (v, w) from any two images of the same air, or from a burst."""
+    """Retrieve the cross-flow wind (v, w) from any two images of the same air, or from many."""
     import xarray as xr
 
     from lidar_mi import __version__
@@ -79,63 +92,117 @@ def retrieve(
     from lidar_mi.io.target import check_target
     from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
     from lidar_mi.retrieval.velocimetry.gridding import on_nodes
+    from lidar_mi.retrieval.velocimetry.methods import METHODS
     from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+    from lidar_mi.retrieval.velocimetry.wind_series import retrieve_winds
 
     paths = (first, second, *(more or []))
+    chosen = None if pairs is None else _pairs(pairs, len(paths))
+    if more and chosen is None and method in METHODS and "more" not in METHODS[method].options:
+        raise InputError(
+            f"{len(paths)} images are not allowed with --method {method}; expected two, --pairs "
+            "all (a wind from each pair), or --method variational (one wind from all)"
+        )
     check_target(out, paths, overwrite=overwrite)
     images = [read_image(path, layer, spacing) for path in paths]
-    step = _time_step(paths, dt)
-    level: Any = read_noise(first, layer, spacing) if noise is None else noise
+    steps = _time_steps(paths, dt, equal=chosen is None)
+    noisy = paths if chosen is not None else paths[:1]
+    levels: list[Any] = [
+        read_noise(path, layer, spacing) if noise is None else noise for path in noisy
+    ]
     beams = [read_beams(path, spacing) for path in paths]
     for number, when in enumerate(beams):
         if when is not None and "y_reported" in when:
             scan = when.assign(image=images[number])
-            if number == 0 and isinstance(level, xr.DataArray):
+            level = levels[number] if number < len(levels) else None
+            if isinstance(level, xr.DataArray):
                 scan = scan.assign(image_stderr=level)
             beams[number] = scan = on_nodes(scan)
             images[number] = scan["image"]
-            level = scan.get("image_stderr", level)
-    pair = on_one_grid(*images[:2])
-    if isinstance(level, xr.DataArray) and pair[0] is not images[0]:
-        # noise cannot be interpolated: its median is used
-        level = float(level.median())
+            if isinstance(level, xr.DataArray):
+                levels[number] = scan["image_stderr"]
     seen = [when["beam_time"] for when in beams if when is not None and not when.frozen_air]
-    times = on_one_grid(*seen[:2]) if len(seen) == len(paths) else None
-    wind = retrieve_wind(
-        *pair,
-        dt=step,
-        method=method,
-        template=template,
-        search=search,
-        stride=stride,
-        device=device,
-        min_correlation=min_correlation,
-        min_texture=min_texture,
-        min_isotropy=min_isotropy,
-        noise=level,
-        more=images[2:],
-        times=times,
-    )
+    timed = len(seen) == len(paths)
+    options: dict[str, Any] = {
+        "method": method,
+        "template": template,
+        "search": search,
+        "stride": stride,
+        "device": device,
+        "min_correlation": min_correlation,
+        "min_texture": min_texture,
+        "min_isotropy": min_isotropy,
+    }
+    if chosen is not None:
+        with progress() as notice:
+            wind = retrieve_winds(
+                images,
+                steps,
+                chosen,
+                beam_times=seen if timed else None,
+                notice=notice,
+                noise=levels,
+                **options,
+            )
+    else:
+        pair = on_one_grid(*images[:2])
+        level = levels[0]
+        if isinstance(level, xr.DataArray) and pair[0] is not images[0]:
+            # noise cannot be interpolated: its median is used
+            level = float(level.median())
+        wind = retrieve_wind(
+            *pair,
+            dt=steps[0],
+            noise=level,
+            more=images[2:],
+            times=on_one_grid(*seen[:2]) if timed else None,
+            **options,
+        )
     write_netcdf(wind.assign_attrs(software=f"lidar-mi {__version__}"), out)
+    if chosen is not None:
+        _print_series(wind)
+    else:
+        _print_wind(wind)
+    output.print(f"winds    {out}")
+
+
+def _pairs(text: str, count: int) -> list[tuple[int, int]]:
+    """The pairs of images that --pairs names; whether they exist is for the retrieval to say."""
+    if text.strip() == "all":
+        return list(pairwise(range(count)))
+    found = []
+    for part in text.split(","):
+        numbers = [number.strip() for number in part.split("-")]
+        if len(numbers) != 2 or not all(n.isascii() and n.isdigit() for n in numbers):
+            raise InputError(
+                f"--pairs: {part.strip()!r} is not allowed; expected all, or pairs of numbers "
+                "such as 0-1,1-2"
+            )
+        found.append((int(numbers[0]), int(numbers[1])))
+    return found
+
+
+def _print_wind(wind: "xr.Dataset") -> None:
+    """What was retrieved from two images or from a burst."""
     if "fit" in wind.attrs:
         _print_vortices(wind)
     if "fixed_pattern" in wind.attrs:
         output.print(f"warning: {wind.attrs['fixed_pattern']} in all images")
     if "illumination" in wind.attrs:
         output.print(f"warning: {wind.attrs['illumination']} between the images")
-    _print_winds(wind)
-    output.print(f"winds    {out}")
+    _print_statistics(wind)
 
 
-def _time_step(paths: Sequence[Path], given: float | None) -> float:
-    """The time between the images as given, else from the files; contradictions are said."""
+def _time_steps(paths: Sequence[Path], given: float | None, *, equal: bool) -> list[float]:
+    """From each image to the next as given, else from the files; contradictions are said."""
     from lidar_mi.io.image_times import steps_of
 
     stated = steps_of(paths)
+    count = len(paths) - 1
     if stated is None:
         if given is None:
             raise InputError("--dt: missing, and the files do not say it; expected seconds")
-        return given
+        return [given] * count
     said = ", ".join(f"{step:g}" for step in dict.fromkeys(stated))
     unequal = any(abs(step - stated[0]) > _SAME * abs(stated[0]) for step in stated)
     if given is not None:
@@ -146,20 +213,20 @@ def _time_step(paths: Sequence[Path], given: float | None) -> float:
             )
         elif unequal or abs(given - stated[0]) > _SAME * stated[0]:
             output.print(f"warning: --dt {given:g} s, but {said} s by the headers of the files")
-        return given
+        return [given] * count
     if min(stated) <= 0:
         raise InputError(
             f"{paths[0]}: {said} s to the next image by the headers; expected images in the order "
             "of their times, or --dt"
         )
-    if unequal:
+    if unequal and equal:
         raise InputError(f"--dt: {said} s by the headers; expected images of equal steps, or --dt")
-    output.print(f"dt       {stated[0]:g} s, by the headers of the files")
-    return stated[0]
+    output.print(f"dt       {said if unequal else f'{stated[0]:g}'} s, by the headers of the files")
+    return stated
 
 
-def _print_winds(wind: "xr.Dataset") -> None:
-    """How many vectors are valid, and their statistics."""
+def _statistics(wind: "xr.Dataset", form: str = ".3g") -> tuple[float, list[tuple[str, str, str]]]:
+    """Fraction of valid vectors; their mean, rms and mean stated error of v and of w."""
     import numpy as np
 
     valid = wind["flag"] == 0
@@ -168,10 +235,34 @@ def _print_winds(wind: "xr.Dataset") -> None:
         values = wind[name].where(valid)
         error = wind[f"{name}_stderr"].where(valid) if f"{name}_stderr" in wind else values * np.nan
         found = (values.mean(), np.sqrt((values**2).mean()), error.mean())
-        columns.append(["-" if np.isnan(one) else f"{float(one):.3g}" for one in found])
+        mean, rms, stated = ("-" if np.isnan(one) else f"{float(one):{form}}" for one in found)
+        columns.append((mean, rms, stated))
+    return float(valid.mean()), columns
+
+
+def _print_statistics(wind: "xr.Dataset") -> None:
+    """How many vectors are valid, and their statistics."""
+    valid, columns = _statistics(wind)
     rows = list(zip(("mean", "rms", "mean stated error"), *columns, strict=True))
-    title = f"{wind.sizes['y']} x {wind.sizes['z']} vectors, {float(valid.mean()):.1%} valid"
+    title = f"{wind.sizes['y']} x {wind.sizes['z']} vectors, {valid:.1%} valid"
     print_table(Table(title, rows, ("valid vectors", "v, m/s", "w, m/s")))
+
+
+def _print_series(winds: "xr.Dataset") -> None:
+    """The statistics of each pair, a row each, and what was remarked on it."""
+    rows = []
+    for number in range(winds.sizes["time"]):
+        wind = winds.isel(time=number)
+        name = f"{int(wind['first_image'])}-{int(wind['second_image'])}"
+        if remark := str(wind["remark"].values):
+            output.print(f"warning: images {name}: {remark}", soft_wrap=True)
+        valid, columns = _statistics(wind, ".3f")
+        numbers = (part for column in columns for part in column)
+        rows.append((name, f"{float(wind['time']):.5g}", f"{valid:.0%}", *numbers))
+    heads = ("images", "time, s", "valid", "v: mean", "rms", "error", "w: mean", "rms", "error")
+    title = f"{winds.sizes['y']} x {winds.sizes['z']} vectors a pair"
+    note = "mean, rms and mean stated error of the valid vectors, m/s"
+    print_table(Table(title, rows, heads, note))
 
 
 def _print_vortices(wind) -> None:

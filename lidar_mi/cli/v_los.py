@@ -12,7 +12,7 @@ from lidar_mi.errors import InputError
 
 EXAMPLES = (
     "Examples: `lidar-mi v_los air_*.tif --reference laser.tif --calibration etalon.nc "
-    "--instrument my_lidar.yaml` - `lidar-mi v_los air.fits --calibration etalon.nc -o v.nc`"
+    "--instrument my_etalon.yaml` - `lidar-mi v_los air.fits --calibration etalon.nc -o v.nc`"
 )
 
 

@@ -25,8 +25,10 @@ from lidar_mi.experiment.truth import find_file
 from lidar_mi.io import exr
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.folder import is_free, locked, make_folder
+from lidar_mi.io.images import read_pixels
 from lidar_mi.io.json import read_json, to_json
 from lidar_mi.io.netcdf import write_netcdf
+from lidar_mi.io.png import write_preview
 from lidar_mi.io.text import encoded, read_text, write_text
 from lidar_mi.io.vortex_file import write_vortices
 from lidar_mi.io.yaml import read_yaml, to_yaml
@@ -38,6 +40,8 @@ SUMMARY = "summary.txt"
 FIGURES = "figures"
 IMAGES = tuple(f"{name}.exr" for name in rendering.IMAGES)
 RENDERED = (*IMAGES, "fringes_*.exr")
+PREVIEWS = tuple(pattern.replace(".exr", ".png") for pattern in RENDERED)
+"""Beside each rendered image one to look at."""
 """Images of an earlier run of the same experiment that a resumed run reuses."""
 RESULTS = {
     "wind": "wind.nc",
@@ -112,7 +116,7 @@ class RunFolder:
     def _begin(self, overwrite: bool) -> None:
         """Write the record; keep the files of an earlier run that are of this experiment."""
         folder, marker = self.path, self.path / RECORD
-        images = [path for pattern in RENDERED for path in folder.glob(pattern)]
+        images = self._those(RENDERED)
         results = [folder / name for name in (METRICS, REPORT, SUMMARY, *RESULTS.values())]
         results = [path for path in results if path.exists()] + [*folder.glob(f"*{BATCHES}")]
         other = _difference(read_record(folder), self.record) if marker.is_file() else None
@@ -128,7 +132,7 @@ class RunFolder:
                 "replace it"
             )
         # results of another experiment must not be mistaken for those of this one
-        drawn = [*self.figures.glob("*.png"), self.log] if other else []
+        drawn = [*self.figures.glob("*.png"), *self._those(PREVIEWS), self.log] if other else []
 
         def remove_old() -> None:
             for path in (*old, *drawn):
@@ -142,7 +146,7 @@ class RunFolder:
         here = self.path.resolve()
         written = {METRICS, REPORT, SUMMARY, LOG, *RESULTS.values()}
         for field, path in self._inputs.items():
-            rendered = any(path.match(pattern) for pattern in RENDERED)
+            rendered = any(path.match(pattern) for pattern in (*RENDERED, *PREVIEWS))
             if path.resolve().parent == here and (path.name in written or rendered):
                 raise InputError(
                     f"{field}: {path} lies where this run writes; expected another folder (-o DIR)"
@@ -190,9 +194,17 @@ class RunFolder:
             self._keep_noise(value)
         write_result(self.path, name, value, self._experiment.name, self.made_by)
 
+    def _those(self, patterns: Sequence[str]) -> list[Path]:
+        return [path for pattern in patterns for path in self.path.glob(pattern)]
+
+    def write_previews(self) -> None:
+        """Write a PNG of its layer Y beside each rendered image, to look at."""
+        for image in self._those(RENDERED):
+            write_preview(image.with_suffix(".png"), read_pixels(image))
+
     def data_files(self) -> list[str]:
         """Names of the files beside the report, for links to them."""
-        there = [path for pattern in RENDERED for path in self.path.glob(pattern)]
+        there = self._those((*RENDERED, *PREVIEWS))
         there += [self.path / name for name in RESULTS.values() if (self.path / name).exists()]
         return [*sorted(path.name for path in there), METRICS, SUMMARY, RECORD, LOG]
 

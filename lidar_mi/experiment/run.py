@@ -210,6 +210,7 @@ def _report(run: Run, kept: RunFolder) -> None:
     made, seconds = chapters(run.experiment, run.results, run.metrics, kept.figures, run.log)
     run.seconds |= seconds
     run.metrics |= {timing_key(step): round(value, 3) for step, value in seconds.items()}
+    kept.write_previews()
     resolved, versions = dump(run.experiment), kept.record["versions"]
     html = page(
         run.experiment,

@@ -2,21 +2,46 @@
 
 import mitsuba as mi
 
+from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.rendering.settings import VARIANTS
 from lidar_mi.system.llvm import require_llvm
 
 
+@checked_arguments
 def use_variant(name: str) -> None:
-    """Set the Mitsuba variant ``name``.
+    """Set the Mitsuba variant ``name``, in which the plugins can be used.
+
+    As ``mitsuba.set_variant``, but a variant that this machine or the plugins do not support is
+    refused in one line; the variant in force stays.
+
+    Parameters
+    ----------
+    name : str
+        One of the ``llvm_ad_*`` and ``cuda_ad_*`` variants.
 
     Raises
     ------
     InputError
-        Not one of `VARIANTS`, no suitable LLVM, or no CUDA device.
+        Another name, no suitable LLVM, no CUDA device.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> lm.use_variant("llvm_ad_mono")
+    >>> lm.use_variant("scalar_rgb")
+    Traceback (most recent call last):
+        ...
+    lidar_mi.errors.InputError: variant: 'scalar_rgb' is not allowed, as it has no arrays of rays; \
+expected one of llvm_ad_mono_polarized, llvm_ad_mono, llvm_ad_rgb, llvm_ad_spectral_polarized, \
+llvm_ad_spectral, cuda_ad_mono_polarized, cuda_ad_mono, cuda_ad_rgb, cuda_ad_spectral_polarized, \
+cuda_ad_spectral
     """
     if name not in VARIANTS:
-        raise InputError(f"variant: {name!r} is not allowed; expected one of {', '.join(VARIANTS)}")
+        reason = ", as it has no arrays of rays" if name.startswith("scalar") else ""
+        raise InputError(
+            f"variant: {name!r} is not allowed{reason}; expected one of {', '.join(VARIANTS)}"
+        )
     if name.startswith("llvm"):
         require_llvm()
     try:

@@ -346,6 +346,16 @@ def check_xml(block):
     )
 
 
+def test_a_file_name_stands_for_one_text():
+    """A reader who follows one page must not write over the files of another recipe."""
+    texts = {}
+    for page in ("docs/user_guide.md", "docs/theory.md", "README.md"):
+        for block in blocks(page):
+            if block.file:
+                first = texts.setdefault(block.file, block)
+                assert first.text == block.text, f"{block.place}: {block.file}, as {first.place}"
+
+
 @pytest.mark.usefixtures("variant")
 @pytest.mark.parametrize("pages", [["docs/theory.md"], ["docs/user_guide.md", "README.md"]])
 def test_printed_code_runs(pages, workplace, capsys):

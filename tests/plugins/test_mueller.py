@@ -266,3 +266,29 @@ def test_bad_files_are_named(tmp_path, name, content, expected):
 def test_missing_table_is_named():
     with pytest.raises(RuntimeError, match=r"mueller\.table: None is not allowed; expected"):
         mi.load_dict({"type": "mueller"})
+
+
+@pytest.mark.parametrize("step", [1.0, 2.5])
+def test_a_table_is_exchanged_through_traverse(optics, step):
+    """A phase function with a new table, of as many angles or not, is that made from it."""
+    rng = np.random.default_rng(5)
+    table = rayleigh_table(np.arange(0, 180 + step, step))
+    changed, made = plugin(forward_peaked_table()), plugin(table)
+    parameters = mi.traverse(changed)
+    np.testing.assert_allclose(parameters["table"].numpy(), forward_peaked_table(), rtol=1e-6)
+    parameters["table"] = mi.TensorXf(table)
+    parameters.update()
+    incident, scattered = directions_at(optics, rng, rng.uniform(0, 180, 200))
+    for one, other in zip(
+        optics.evaluate(changed, incident, scattered),
+        optics.evaluate(made, incident, scattered),
+        strict=True,
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-7)
+
+
+def test_a_bad_table_is_refused_through_traverse():
+    parameters = mi.traverse(plugin(rayleigh_table()))
+    parameters["table"] = mi.TensorXf(rayleigh_table()[:, :6])
+    with pytest.raises(Exception, match="expected N x 7 numbers"):
+        parameters.update()

@@ -93,10 +93,42 @@ def test_contradictions_are_said(here, lidar_mi):
     for files, words in (
         (("1.exr", "0.exr"), "images in the order of their times"),
         (("silent0.exr", "silent1.exr"), "--dt: missing"),
-        (("0.exr", "1.exr", "timed2.exr"), "expected two, or method variational"),
-        (("0.exr", "1.exr", "0.exr"), "images in the order of their times"),
+        (("0.exr", "1.exr", "timed2.exr"), "expected two, --pairs all"),
+        (("0.exr", "1.exr", "0.exr", "--pairs", "all"), "images in the order of their times"),
     ):
         code, _, err = lidar_mi("retrieve", *files, *OPTIONS)
+        assert code == 2 and words in err and len(err.splitlines()) == 1
+
+
+def test_many_images_pair_by_pair(here, lidar_mi):
+    code, out, err = lidar_mi(
+        "retrieve", *(f"{k}.exr" for k in range(3)), "--pairs", "all", *OPTIONS
+    )
+    assert code == 0 and "dt 0.1 s, by the headers" in words_of(out) and "images 1-2" in err
+    winds = xr.load_dataset("w.nc")
+    np.testing.assert_allclose(winds["time"], [0.05, 0.15])
+    assert lidar_mi("retrieve", "1.exr", "2.exr", "--overwrite", *OPTIONS)[0] == 0
+    alone = xr.load_dataset("w.nc")
+    for name in ("v", "w", "v_stderr", "flag"):
+        np.testing.assert_array_equal(winds[name][1], alone[name])
+    mean = float(alone["v"].where(alone["flag"] == 0).mean())
+    row = re.search(r"^│ 1-2 +│ +(\S+) +│ +\S+ +│ +(\S+)", out, re.MULTILINE).groups()
+    np.testing.assert_allclose([float(number) for number in row], [0.15, mean], rtol=6e-3)
+    pairs = "--pairs", "0-2,1-2", "--overwrite"
+    timed = [f"timed{k}.exr" for k in range(3)]
+    code, out, _ = lidar_mi("retrieve", *timed, *pairs, *OPTIONS, "--search", 20)
+    assert code == 0
+    winds = xr.load_dataset("w.nc")
+    np.testing.assert_allclose(winds["time"], [0.25, 0.375])
+    np.testing.assert_allclose(winds["dt"], [0.5, 0.25])
+    speed = winds["v"].where(winds["flag"] == 0).mean(("z", "y"))
+    np.testing.assert_allclose(speed, 4, atol=0.1)  # 1 m in 0.25 s
+    for pairs, words in (
+        ("0-3", "pairs: 0-3 is not allowed; expected two of the images 0 to 2"),
+        ("1-0", "the earlier first"),
+        ("each", "--pairs: 'each' is not allowed"),
+    ):
+        code, _, err = lidar_mi("retrieve", *timed, "--pairs", pairs, "--overwrite", *OPTIONS)
         assert code == 2 and words in err and len(err.splitlines()) == 1
 
 

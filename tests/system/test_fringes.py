@@ -50,9 +50,13 @@ SMALL = {
 FILES = {
     "experiment.yaml",
     "fringes_emitted.exr",
+    "fringes_emitted.png",
     "fringes_photons.exr",
+    "fringes_photons.png",
     "fringes_received_00.exr",
+    "fringes_received_00.png",
     "fringes_received_01.exr",
+    "fringes_received_01.png",
     "v_los.nc",
     "metrics.json",
     "report.html",

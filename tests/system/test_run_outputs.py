@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import xarray as xr
 import yaml
+from PIL import Image
 
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.resumable_folder import IMAGES
@@ -34,7 +35,9 @@ def test_everything_a_run_leaves(demo):
     assert names == {
         "experiment.yaml",
         "image_t1.exr",
+        "image_t1.png",
         "image_t2.exr",
+        "image_t2.png",
         "wind.nc",
         "metrics.json",
         "report.html",
@@ -44,6 +47,18 @@ def test_everything_a_run_leaves(demo):
     }
     log = (demo.folder / "log.txt").read_text().splitlines()
     assert "seed 1" in log[0] and log[-1].endswith("done")
+
+
+def test_previews_show_the_light_as_the_pilot_sees_it(demo):
+    """The tone curve keeps the order of the pixels: ranks of preview and Y are the same."""
+    for name in ("image_t1", "image_t2"):
+        scan = read_scan(demo.folder / f"{name}.exr")
+        light = scan["Y"].transpose("z", "y").values[::-1, ::-1]
+        grey = np.asarray(Image.open(demo.folder / f"{name}.png"), float)
+        white = np.quantile(light, 0.995)
+        expected = 255 * np.clip(light / white, 0, 1) ** (1 / 2.2)
+        np.testing.assert_allclose(grey, expected, atol=0.51)
+        assert np.ptp(grey) > 100
 
 
 def test_the_record_is_enough_to_repeat_the_run(demo):

@@ -97,7 +97,7 @@ def test_report_is_self_contained(demo):
     page = (demo.folder / "report.html").read_text()
     links = Links(page)
     beside = [target for target in links.targets if not target.startswith("data:")]
-    assert {"wind.nc", "image_t1.exr", "metrics.json"} <= set(beside)
+    assert {"wind.nc", "image_t1.exr", "image_t1.png", "metrics.json"} <= set(beside)
     assert all((demo.folder / target).is_file() for target in beside)
     embedded = [target for target in links.targets if target.startswith("data:")]
     assert len(embedded) == len(FIGURES)

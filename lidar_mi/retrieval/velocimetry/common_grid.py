@@ -1,5 +1,7 @@
 """Bring images onto one regular (y, z) grid before they are compared."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import xarray as xr
 from scipy.interpolate import RectBivariateSpline, RegularGridInterpolator
@@ -76,22 +78,30 @@ def resample_pair(
     Nodes are whole multiples of `spacing` (m). Nodes beside a pixel that is not finite have no
     value. Raises InputError as `resample` otherwise, and where the images do not overlap.
     """
+    first, second = _resampled([image1, image2], spacing)
+    return first, second
+
+
+def _resampled(images: Sequence[xr.DataArray], spacing: float) -> list[xr.DataArray]:
+    """All images on the largest grid of square cells that lies inside all."""
     if not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"spacing: {spacing!r} m is not a number > 0")
     nodes = {}
     for name in ("z", "y"):
-        axes = [_axis(image, name)[1] for image in (image1, image2)]
+        axes = [_axis(image, name)[1] for image in images]
         # an edge that is a multiple but for rounding is still a node
         low = np.ceil(max(axis[0] for axis in axes) / spacing - 1e-6)
         high = np.floor(min(axis[-1] for axis in axes) / spacing + 1e-6)
         if high <= low:
+            top = min(range(len(axes)), key=lambda k: axes[k][-1])
+            last = max(range(len(axes)), key=lambda k: axes[k][0])
+            a, b = sorted((top, last))
             raise InputError(
-                f"image2.{name}: {axes[1][0]:g} ... {axes[1][-1]:g} m does not overlap image1's "
-                f"{axes[0][0]:g} ... {axes[0][-1]:g} m by a spacing of {spacing:g} m"
+                f"image{b + 1}.{name}: {axes[b][0]:g} ... {axes[b][-1]:g} m does not overlap "
+                f"image{a + 1}'s {axes[a][0]:g} ... {axes[a][-1]:g} m by a spacing of {spacing:g} m"
             )
         nodes[name] = np.arange(low, high + 1) * spacing
-    first, second = (_around_gaps(image, nodes) for image in (image1, image2))
-    return first, second
+    return [_around_gaps(image, nodes) for image in images]
 
 
 def nearest_filled(values: np.ndarray) -> np.ndarray:
@@ -153,29 +163,35 @@ def on_one_grid(image1: xr.DataArray, image2: xr.DataArray) -> tuple[xr.DataArra
     >>> bool((first["y"] == second["y"]).all()), first.sizes["y"]
     (True, 7)
     """
-    for name, image in (("image1", image1), ("image2", image2)):
+    first, second = all_on_one_grid([image1, image2])
+    return first, second
+
+
+def all_on_one_grid(images: Sequence[xr.DataArray]) -> list[xr.DataArray]:
+    """A sequence of images, two or more, as `on_one_grid` has two; messages count from 1."""
+    for number, image in enumerate(images, 1):
         on_axes = {"z", "y"} == set(image.dims) <= set(image.coords)
         if not on_axes or image.ndim != 2 or min(image.shape) < 2:
             raise InputError(
-                f"{name}: dims {tuple(image.dims)} of {image.shape} px; expected z and y with "
-                "coordinates, two pixels or more each"
+                f"image{number}: dims {tuple(image.dims)} of {image.shape} px; expected z and y "
+                "with coordinates, two pixels or more each"
             )
-    image1, image2 = (
-        i if i.dims == ("z", "y") else i.transpose("z", "y") for i in (image1, image2)
-    )
-    if image1.shape != image2.shape:
-        sizes = " and ".join(f"{i.sizes['y']} x {i.sizes['z']}" for i in (image1, image2))
-        raise InputError(f"image2: sizes {sizes} px (y x z) differ; expected two of one size")
-    steps = [
-        float(image["y"][-1] - image["y"][0]) / (image.sizes["y"] - 1) for image in (image1, image2)
-    ]
+    images = [i if i.dims == ("z", "y") else i.transpose("z", "y") for i in images]
+    first = images[0]
+    for number, image in enumerate(images[1:], 2):
+        if image.shape != first.shape:
+            sizes = " and ".join(f"{i.sizes['y']} x {i.sizes['z']}" for i in (first, image))
+            raise InputError(
+                f"image{number}: sizes {sizes} px (y x z) differ; expected images of one size"
+            )
+    steps = [float(image["y"][-1] - image["y"][0]) / (image.sizes["y"] - 1) for image in images]
     tolerance = 1e-3 * min(steps)
     shared = all(
-        np.abs(np.diff(image1[a].values, 2)).max(initial=0) < tolerance
-        and np.abs(image1[a].values - image2[a].values).max() < tolerance
+        np.abs(np.diff(first[a].values, 2)).max(initial=0) < tolerance
+        and all(np.abs(first[a].values - i[a].values).max() < tolerance for i in images[1:])
         for a in ("y", "z")
     )
-    return (image1, image2) if shared else resample_pair(image1, image2, max(steps))
+    return images if shared else _resampled(images, max(steps))
 
 
 def _axis(image: xr.DataArray, name: str) -> tuple[str, np.ndarray]:

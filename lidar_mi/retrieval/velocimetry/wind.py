@@ -152,6 +152,9 @@ def retrieve_wind(
     dt = positive("dt", dt)
     stack, noise = checked_stack([image1, image2, *more], noise)
     image1 = stack[0]
+    for number, image in enumerate(stack, 1):
+        if not np.isfinite(image.values).any():
+            raise InputError(f"image{number}: no pixel is finite; expected light somewhere")
     if more and "more" not in chosen.options:
         takes = ", ".join(name for name, known in METHODS.items() if "more" in known.options)
         raise InputError(
