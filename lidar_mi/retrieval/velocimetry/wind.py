@@ -26,6 +26,7 @@ from lidar_mi.retrieval.velocimetry.quality import Flag, filled, low_texture, no
 from lidar_mi.retrieval.velocimetry.relation import unrelated
 from lidar_mi.retrieval.velocimetry.rest import all_at_rest, nothing_at_rest
 from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
+from lidar_mi.retrieval.velocimetry.standing import Standing, standing
 from lidar_mi.retrieval.velocimetry.windows import Windows, working
 
 
@@ -210,6 +211,17 @@ def retrieve_wind(
             found = found._replace(covariance=covariance)
         if found.covariance is not None:
             flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+        still = Standing()
+        # a method that takes times by itself gives the displacement in dt
+        by_itself = "times" in options
+        shown = tau is None or not by_itself
+        if checks and not chosen.local and shown and found.covariance is not None:
+            still = standing([pixels1, pixels2], found, windows)
+            # parameters beside the vectors would stay biased
+            if still.spoils or (still.fraction and found.quantities):
+                flag = flag | Flag.AT_REST.value
+            else:
+                found = still.corrected(found)
         if chosen.local:
             outlier = median_outliers(found.d, median_size, apart, median_threshold, median_epsilon)
             flag = flag | (Flag.LOW_TEXTURE * low + Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
@@ -237,12 +249,13 @@ def retrieve_wind(
         attributes["timed"] = 1
     if "min_correlation" in options:
         attributes["min_correlation"] = min_correlation
-    if str(resting.pattern):
-        attributes["fixed_pattern"] = str(resting.pattern)
+    patterns = [str(part) for part in (resting.pattern, still) if str(part)]
+    if patterns:
+        attributes["fixed_pattern"] = ", ".join(patterns)
+    if still.fraction:
+        attributes["standing_fraction"] = still.fraction
     if any(map(described, light)):
         attributes["illumination"] = described(light[-1])
-    # a method that takes times by itself gives the displacement in dt
-    by_itself = "times" in options
     when = vector_times(None if by_itself else tau, dt, windows, found.d.cpu(), chosen.centred)
     reversed_time = torch.as_tensor(np.isnan(when.difference), device=flag.device)
     found = found._replace(flag=flag | (Flag.NO_MATCH * reversed_time).to(torch.int16))
