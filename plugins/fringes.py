@@ -31,7 +31,8 @@ from the line of the source and stored with the ray, as an offset in Hz in place
 ``S3``, ``S0_stderr``; row 0 is the top. The Stokes vector refers to the horizontal axis.
 Unpolarised variants compute intensity only: S1 to S3 are 0. ``sample_count`` of the sensor's
 sampler (or ``spp``) is the number of paths per pixel, for ``forward`` the mean over all pixels.
-With ``forward`` the S0_stderr of a pixel without any path is 0.
+With ``forward`` the S0_stderr of a pixel without any path is 0. Gradients are refused: the orders
+of an etalon are split in two parts, exact in single precision, when it is loaded.
 
 .. code-block:: xml
 
@@ -98,6 +99,17 @@ def define():
             for index, channel in enumerate(channels):
                 dr.scatter(image, channel, pixel + index)
             return mi.TensorXf(image, (height, width, len(channels)))
+
+        def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
+            """Refused: see `render_forward`."""
+            _no_gradients()
+
+        def render_forward(self, scene, params, sensor=0, seed=0, spp=0):
+            """Refused: the order, 77 000, needs more than single precision has.
+
+            A plugin splits it into two parts when it is loaded, where gradients are lost.
+            """
+            _no_gradients()
 
         # --- both directions
 
@@ -260,6 +272,15 @@ def _reach(scene, sensor) -> float:
     sphere = box.bounding_sphere()
     offset = [a[0] - b for a, b in zip((stop.x, stop.y, stop.z), sphere.center, strict=True)]
     return 1.1 * (sum(v * v for v in offset) ** 0.5 + float(sphere.radius)) + 1e-3
+
+
+def _no_gradients():
+    fail(
+        NAME,
+        "gradients",
+        "with respect to the scene",
+        "images alone; lidar_mi.retrieval.rings.mean_image differentiates rings",
+    )
 
 
 def _check_straight(scene):

@@ -27,6 +27,7 @@ from lidar_mi.experiment.stages.rendering import (
     scattering_air,
     true_cores,
 )
+from lidar_mi.experiment.stages.ring_calibration import assumed_rings, calibration_file
 from lidar_mi.experiment.stages.ring_images import (
     check_rings,
     exposure,
@@ -138,6 +139,8 @@ BEHIND_RING_IMAGES = (
     "doppler.ccd",
     "doppler.speckle_modes",
     "doppler.reference",
+    "doppler.assumed",
+    "doppler.calibration",
     "doppler.retrieval",
 )
 """What is used beside or after the Doppler lidar's images, which are in relative units."""
@@ -229,7 +232,21 @@ STAGES = (
         indifferent_to=BEHIND_RING_IMAGES,
     ),
     Stage("lit_rings", _quiet(ring_images), ("ring_images",), has_rings),
-    Stage("v_los", line_of_sight_winds, ("rings", "lit_rings"), has_rings, timing=RING_RETRIEVAL),
+    Stage("calibration_file", calibration_file, ("rings", "beside"), has_rings, ahead=True),
+    Stage(
+        "assumed_rings",
+        assumed_rings,
+        ("rings", "calibration_file"),
+        has_rings,
+        timing=RING_RETRIEVAL,
+    ),
+    Stage(
+        "v_los",
+        line_of_sight_winds,
+        ("assumed_rings", "lit_rings"),
+        has_rings,
+        timing=RING_RETRIEVAL,
+    ),
     Stage("ring_budget", ring_budget, ("rings", "lit_rings"), has_rings, timing=RING_RETRIEVAL),
     Stage("exposure", _quiet(exposure), ("rings", "lit_rings"), has_rings, illustrates=True),
     # both as one sensor
@@ -239,7 +256,7 @@ STAGES = (
     Stage(
         "lines",
         measure_lines,
-        ("slab_wind", "rings", "line_beams"),
+        ("slab_wind", "rings", "line_beams", "assumed_rings"),
         has_sensor,
         check=check_lines,
         timing="sensor",

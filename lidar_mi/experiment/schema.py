@@ -12,6 +12,7 @@ from pydantic import AliasChoices, Field, PrivateAttr, field_validator, model_va
 
 from lidar_mi.experiment.schema_air import Scattering, Section, Wake
 from lidar_mi.experiment.schema_encounter import Encounter
+from lidar_mi.experiment.schema_rings import Assumed, Reference, RingCalibration
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.doppler import DopplerLidar
@@ -157,17 +158,6 @@ class RingRetrieval(Section):
         return self
 
 
-class Reference(Section):
-    """The frame of the laser's own light that every pulse has: the zero of its speed."""
-
-    photons: Annotated[Number, Within(1, 1e15, "a photon to the whole pulse")] | None = Field(
-        None, description="detected; default: as many as of the echo"
-    )
-    laser_drift: Annotated[Frequency, Within(0, 1e12, "hundreds of orders of an etalon")] = Field(
-        0.0, description="rms change of the laser's frequency from its frame to the echo"
-    )
-
-
 _MODES = Within(0.1, 1e15, "from a pixel that sees part of a mode to white light", or_infinite=True)
 
 
@@ -194,6 +184,10 @@ class Doppler(Section):
         validation_alias=AliasChoices("path_samples", "photon_samples"),  # its former name
     )
     reference: Reference = Reference()
+    assumed: Assumed = Assumed()
+    calibration: RingCalibration | None = Field(
+        None, description="of the assumed instrument; {} for 20 frames of the laser"
+    )
     retrieval: RingRetrieval = RingRetrieval()
 
     @field_validator("speckle_modes", mode="before")

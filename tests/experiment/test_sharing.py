@@ -65,6 +65,8 @@ BEHIND_RINGS = {
     "doppler.ccd": {"read_noise": 9},
     "doppler.speckle_modes": 300,
     "doppler.reference": {"laser_drift": "3 MHz"},
+    "doppler.assumed": {"focal_length": "301 mm"},
+    "doppler.calibration": {"frames": 3},
     "doppler.retrieval": {"images": 2, "slow_images": 1},
 }
 

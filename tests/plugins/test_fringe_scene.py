@@ -644,3 +644,16 @@ def test_wrong_scenes_are_named(build, message):
     while cause is not None:
         output, cause = f"{output} {cause}", cause.__cause__ or cause.__context__
     assert re.search(message, output), output
+
+
+def test_gradients_are_refused():
+    """Not taken as 0: neither backward nor forward."""
+    rings = scene(size=(8, 6))
+    integrator = rings.integrator()
+    image = mi.TensorXf(0.0, (6, 8, 5))
+    for call in (
+        lambda: integrator.render_forward(rings, None, spp=2),
+        lambda: integrator.render_backward(rings, None, image, spp=2),
+    ):
+        with pytest.raises(ValueError, match=r"fringes\.gradients: .* expected images alone"):
+            call()

@@ -243,7 +243,7 @@ def test_metrics_are_the_stable_ones(small):
     cases = [f"centre_{c}.averaged_{n}" for c in ("free", "known") for n in (1, 9)]
     expected = {f"doppler.bound.{case}.std" for case in cases}
     for method in SMALL["doppler"]["retrieval"]["methods"]:
-        more = {"expected_std"} if method in ("annular", "pixels") else set()
+        more = {"expected_std", "expected_systematic"} if method in ("annular", "pixels") else set()
         # one image at a speed has no spread
         spread = {"bias_stderr", "std", "std_stderr"} if method != "annular" else set()
         expected |= {
@@ -262,6 +262,11 @@ def test_metrics_are_the_stable_ones(small):
             "velocity_range",
             "render.mc_relative_error",
             "render.largest_error",
+            "reference.laser_drift",
+            "reference.etalon_drift",
+            "reference.bow_and_pupil",
+            "reference.wedge_and_pupil",
+            "reference.scrambling_needed",
         )
     } | {f"timing.doppler_{name}_s" for name in ("render", "retrieve", "figures")}
     assert set(small[1]) == expected

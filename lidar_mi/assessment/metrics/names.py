@@ -31,6 +31,15 @@ def ring_key(method: str, centre: str, averaged: int, quantity: str) -> str:
     return f"doppler.{method}.centre_{centre}.averaged_{averaged}.{quantity}"
 
 
+REFERENCE_ERRORS = ("laser drift", "etalon drift", "bow and pupil", "wedge and pupil")
+"""Causes of errors between the reference shot and the echo."""
+
+
+def reference_key(cause: str) -> str:
+    """Key of an error between the reference shot and the echo."""
+    return f"doppler.reference.{cause.replace(' ', '_')}"
+
+
 def bound_key(centre: str, averaged: int) -> str:
     """Of the Cramer-Rao bound of line-of-sight velocities."""
     return ring_key("bound", centre, averaged, "std")

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from lidar_mi.assessment.metrics.names import bound_key
+from lidar_mi.assessment.metrics.names import bound_key, reference_key
 
 
 @dataclass(frozen=True)
@@ -22,13 +22,20 @@ class RingBudget:
         Unambiguous range of line-of-sight velocities, m s^-1.
     speckle_modes : float
         Degrees of freedom of the speckle in a pixel; inf: no speckle.
-    bound : mapping of str to float
-        Cramer-Rao bound of the standard deviation of one image's velocity, m s^-1, by whether the
-        centre is "free" or "known"; of averages by the root of their number.
+    bound : mapping of str to (float, float)
+        Cramer-Rao bounds of the standard deviation of one image's velocity and of that of its frame
+        of the laser, m s^-1, by whether the centre is "free" or "known"; of averages by the roots
+        of their numbers.
     relative_error : float
         Monte Carlo standard error of a rendered image's pixel over its signal, median.
     largest_error : float
         Of velocities retrieved from the rendered images without noise, m s^-1.
+    reference_every : int
+        Pulses from one frame of the laser to the next.
+    reference_errors : mapping of str to float
+        Standard errors that no image shows, m s^-1, by cause; of drifts those of a single pulse.
+    scrambling_needed : float
+        Fraction of the light to be scrambled for an error of 0.5 m/s by plates and pupil.
     """
 
     photons: float
@@ -39,9 +46,12 @@ class RingBudget:
     finesse: float
     velocity_range: float
     speckle_modes: float
-    bound: Mapping[str, float]
+    bound: Mapping[str, tuple[float, float]]
     relative_error: float
     largest_error: float
+    reference_every: int
+    reference_errors: Mapping[str, float]
+    scrambling_needed: float
 
 
 def ring_budget_metrics(budget: RingBudget, averaged: tuple[int, ...]) -> dict[str, float]:
@@ -62,7 +72,12 @@ def ring_budget_metrics(budget: RingBudget, averaged: tuple[int, ...]) -> dict[s
         metrics["doppler.speckle_modes"] = budget.speckle_modes
     metrics["doppler.render.mc_relative_error"] = budget.relative_error
     metrics["doppler.render.largest_error"] = budget.largest_error
-    for centre, std in budget.bound.items():
+    for centre, (air, laser) in budget.bound.items():
         for number in averaged:
-            metrics[bound_key(centre, number)] = std / math.sqrt(number)
+            frames = max(1, number // budget.reference_every)
+            std = math.hypot(air / math.sqrt(number), laser / math.sqrt(frames))
+            metrics[bound_key(centre, number)] = std
+    for cause, error in budget.reference_errors.items():
+        metrics[reference_key(cause)] = error
+    metrics["doppler.reference.scrambling_needed"] = budget.scrambling_needed
     return metrics

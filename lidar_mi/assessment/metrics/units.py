@@ -2,7 +2,7 @@
 
 from lidar_mi.retrieval.vortices.pair import MEANING
 
-_WIND = ("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_std")
+_WIND = ("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_")
 _NAMED = {
     "pointing.scan_time": "s",
     "pointing.rms_y": "m",
@@ -12,6 +12,10 @@ _NAMED = {
     "doppler.free_spectral_range": "Hz",
     "doppler.velocity_range": "m/s",
     "doppler.render.largest_error": "m/s",
+    "doppler.reference.laser_drift": "m/s",
+    "doppler.reference.etalon_drift": "m/s",
+    "doppler.reference.bow_and_pupil": "m/s",
+    "doppler.reference.wedge_and_pupil": "m/s",
 }
 _ENCOUNTER = {
     "largest_roll": "rad",

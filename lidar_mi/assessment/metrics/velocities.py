@@ -35,7 +35,8 @@ def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
     bias_lowest, bias_highest   mean error of the speed at which it is lowest, highest
     std             standard deviation about each speed's own mean, pooled over all speeds
     std_stderr      its standard error, std / sqrt(2 degrees of freedom), for normal errors
-    expected_std    root mean square of the standard deviations stated by the fits
+    expected_std    root mean square of the random standard deviations as stated
+    expected_systematic   of the systematic ones, which all images share
 
     Undetermined measures are left out.
 
@@ -43,7 +44,7 @@ def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
     ----------
     found : xr.Dataset
         ``v`` and ``v_std`` with dims (algorithm, centre, averaged, v_los, image), NaN where there
-        is none, and ``tried`` (algorithm), the images of every case.
+        is none, ``v_systematic`` likewise, and ``tried`` (algorithm), the images of every case.
     """
     metrics = {}
     for algorithm in found["algorithm"].values:
@@ -53,9 +54,11 @@ def velocity_metrics(found: xr.Dataset) -> dict[str, float]:
                 case = found.sel(algorithm=algorithm, centre=centre, averaged=averaged)
                 error = (case["v"] - case["v_los"]).transpose("v_los", "image").values
                 measures = _spread(error, tried)
-                stated = case["v_std"].values[np.isfinite(case["v_std"].values)]
-                if stated.size:
-                    measures["expected_std"] = float(np.sqrt((stated**2).mean()))
+                for name, part in (("std", "v_std"), ("systematic", "v_systematic")):
+                    stated = case[part].values if part in case else np.empty(0)
+                    stated = stated[np.isfinite(stated)]
+                    if stated.size:
+                        measures[f"expected_{name}"] = float(np.sqrt((stated**2).mean()))
                 for name, value in measures.items():
                     metrics[ring_key(algorithm, centre, averaged, name)] = value
     return metrics

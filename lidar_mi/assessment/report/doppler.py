@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from lidar_mi.assessment.figures.plates import Drawn
-from lidar_mi.assessment.metrics.names import bound_key, ring_key
+from lidar_mi.assessment.metrics.names import REFERENCE_ERRORS, bound_key, reference_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
 from lidar_mi.assessment.report.digits import fixed, three, with_error
 from lidar_mi.assessment.report.page import Chapter, Tables
@@ -36,6 +36,13 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
         f"{metrics['doppler.velocity_range']:.0f} m/s. Without noise, the rendered images give "
         f"the true winds to {metrics['doppler.render.largest_error']:.2g} m/s."
     )
+    errors = {cause: metrics.get(reference_key(cause), 0.0) for cause in REFERENCE_ERRORS}
+    named = ", ".join(f"{cause} {error:.2g} m/s" for cause, error in errors.items() if error)
+    hidden = (
+        f"Errors between the laser's frame and the echo, which no image shows: {named}. Plates and "
+        f"pupil cause less than 0.5 m/s with at least "
+        f"{metrics.get('doppler.reference.scrambling_needed', 0.0):.1%} of the light scrambled."
+    )
     numbers = Tables(
         heading="Accuracy of the line-of-sight winds",
         legend="Winds that each method retrieves from noisy images, or from averages of several "
@@ -47,7 +54,9 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
             for centre in doppler.retrieval.centre
         ],
     )
-    return Chapter("The Doppler lidar", [purpose, light, rings], drawn, numbers)
+    return Chapter(
+        "The Doppler lidar", [purpose, light, rings, *([hidden] if named else [])], drawn, numbers
+    )
 
 
 def _abbreviations(methods: Sequence[str]) -> str:

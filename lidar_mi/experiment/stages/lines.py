@@ -11,15 +11,15 @@ from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.ring_instrument import pixel_noise
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames
-from lidar_mi.experiment.stages.ring_velocities import (
-    FRAMES,
-    REFERENCES,
-    drift_speed,
-    reference_photons,
-    speeds_to_laser,
+from lidar_mi.experiment.ring_reference import (
+    drifts,
+    plate_error,
+    plate_uncertainty,
+    reference_frames,
 )
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames, reference_photons
+from lidar_mi.experiment.stages.ring_velocities import FRAMES, REFERENCES, speeds_to_laser
 from lidar_mi.experiment.truth import Truth, find_file
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler import photons
@@ -31,6 +31,7 @@ from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 # Speeds at which noise-free images are rendered; those between are interpolated (Chebyshev).
 _NODES = 7
 # First number of the lines' images, which selects their random streams.
+_PULSES = "sensor.pulses"
 _STREAMS = 1 << 24
 
 
@@ -68,6 +69,7 @@ def check_lines(
         Lidars that do not observe the same slab, lines that leave the wake, speeds beyond the
         unambiguous range.
     """
+    reference_frames(experiment.sensor.pulses, experiment.doppler.reference.every, _PULSES)
     lidar = experiment.doppler.lidar
     middle = experiment.scan.range + experiment.scan.thickness / 2
     if abs(lidar.range - middle) > lidar.range_bin / 2:
@@ -95,9 +97,17 @@ def check_lines(
 
 
 def measure_lines(
-    experiment: Experiment, truth: xr.Dataset, rings: Rings, beams: Beams | None, *, log: Log
+    experiment: Experiment,
+    truth: xr.Dataset,
+    rings: Rings,
+    beams: Beams | None,
+    assumed: Rings,
+    *,
+    log: Log,
 ) -> xr.Dataset:
     """Line-of-sight velocities retrieved from the Doppler lidar's rings.
+
+    ``assumed`` has the models of the instrument that the retrieval assumes.
 
     Images without noise are made at a few speeds and interpolated between them (their rings
     move by far less than an order); each line's are drawn by the CCD and evaluated by the annular
@@ -106,8 +116,8 @@ def measure_lines(
     Returns
     -------
     xr.Dataset, dim (line)
-        From `scan_wind`, with ``v_los`` and ``v_los_std`` (m s^-1) as retrieved; NaN where an image
-        gives none.
+        From `scan_wind`, with ``v_los``, its random ``v_los_std`` and ``v_los_systematic``, which
+        all lines share (m s^-1), as retrieved; NaN where an image gives none.
     """
     sensor, doppler = experiment.sensor, experiment.doppler
     lines = scan_wind(
@@ -133,9 +143,11 @@ def measure_lines(
     )
     line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
     own = fringe_image(doppler.camera, doppler.etalon, line, 0.0, reference_photons(doppler, rings))
-    noise = pixel_noise(doppler.ccd, rings.modes, sensor.pulses)
+    every = doppler.reference.every
+    frames_of_line, sharing = reference_frames(sensor.pulses, every, _PULSES)
+    noises = [pixel_noise(doppler.ccd, rings.modes, n) for n in (sensor.pulses, frames_of_line)]
     weights = torch.from_numpy(_lagrange(nodes, (true - middle) / half)).to(images.dtype)
-    retrieved = np.empty((2, len(true)))
+    retrieved = np.empty((3, len(true)))
     for start in range(0, len(true), FRAMES):
         log.bar(f"retrieving line of sight {start + 1} of {len(true)}", start / len(true))
         chunk = range(start, min(start + FRAMES, len(true)))
@@ -154,27 +166,32 @@ def measure_lines(
                     doppler,
                     rings,
                     own,
-                    sensor.pulses,
+                    frames_of_line,
                     experiment.seed,
-                    [REFERENCES + _STREAMS + index],
+                    [REFERENCES + _STREAMS + index // sharing],
                 )
             )
         retrieved[:, start : chunk.stop] = speeds_to_laser(
             torch.cat(frames),
             torch.cat(laser),
             doppler,
-            rings,
-            noise,
+            assumed,
+            noises,
             RingMethod.ANNULAR,
             RingCentre.FREE,
         )
-    v_los, std = retrieved
-    drift = drift_speed(doppler, sensor.pulses)
-    v_los += drift * np.random.default_rng([experiment.seed, 2]).standard_normal(len(true))
-    std = np.hypot(std, drift)
+    v_los, std, systematic = retrieved
+    drift, drift_std = drifts(
+        doppler, sensor.pulses, [experiment.seed, _STREAMS], range(len(true)), _PULSES
+    )
     return lines.assign(
-        v_los=("line", v_los, lines["v_los"].attrs),
-        v_los_std=("line", std, lines["v_los_std"].attrs),
+        v_los=("line", v_los + drift + plate_error(doppler), lines["v_los"].attrs),
+        v_los_std=("line", np.hypot(std, drift_std), lines["v_los_std"].attrs),
+        v_los_systematic=(
+            "line",
+            np.hypot(systematic, plate_uncertainty(doppler)),
+            {"units": "m s-1", "long_name": "systematic standard error common to all lines"},
+        ),
     )
 
 

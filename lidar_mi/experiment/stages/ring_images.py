@@ -15,7 +15,9 @@ from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.ring_instrument import air_rings, laser_rings, pixel_noise
+from lidar_mi.experiment.ring_reference import reference_frames
 from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.experiment.schema_rings import Assumed
 from lidar_mi.experiment.stage import Keeper
 from lidar_mi.experiment.stages.rendering import batches_of
 from lidar_mi.instrument.ccd import CCD, expose
@@ -30,7 +32,11 @@ EMITTED, PHOTONS = "fringes_emitted", "fringes_photons"
 
 
 class Rings(NamedTuple):
-    """Instrument and air of a Doppler lidar's images."""
+    """Instrument and air of a Doppler lidar's images.
+
+    ``model`` and ``laser`` are of air and laser by the true instrument, or by the one that a
+    retrieval assumes. ``response`` is that of the pixels, where a calibration leaves some out.
+    """
 
     line: Line
     model: RingModel
@@ -38,6 +44,7 @@ class Rings(NamedTuple):
     photons: float
     background: float
     modes: float
+    response: torch.Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -89,7 +96,9 @@ def ring_instrument(doppler: Doppler) -> Rings:
         lidar.aerosol_fraction,
         lidar.line_shape,
     )
-    model, laser = ring_models(doppler)
+    model, laser = ring_models(doppler.model_copy(update={"assumed": Assumed()}))
+    for number in doppler.retrieval.averaged:
+        reference_frames(number, doppler.reference.every, "doppler.retrieval.averaged")
     for speed in doppler.v_los:
         if not abs(speed) < model.velocity_range / 2:
             raise InputError(
@@ -123,7 +132,14 @@ def ring_instrument(doppler: Doppler) -> Rings:
 
 def ring_models(doppler: Doppler) -> tuple[RingModel, RingModel]:
     """What the ring fit assumes of images of air and of the laser."""
-    told, instrument = doppler.retrieval, (doppler.lidar, doppler.etalon, doppler.camera)
+    told, other = doppler.retrieval, doppler.assumed.model_dump(exclude_none=True)
+    lens = {name: value for name, value in other.items() if name == "focal_length"}
+    plates = {name: value for name, value in other.items() if name != "focal_length"}
+    instrument = (
+        doppler.lidar,
+        doppler.etalon.model_copy(update=plates),
+        doppler.camera.model_copy(update=lens),
+    )
     smooth = {"light_degree": told.light_degree, "background_degree": told.background_degree}
     air = air_rings(
         *instrument, aerosol_std=told.aerosol_std, temperature_std=told.temperature_std, **smooth
@@ -233,6 +249,11 @@ def _path_by_path(experiment: Experiment):
             "samples_per_pixel": doppler.path_samples,
         }
     )
+
+
+def reference_photons(doppler: Doppler, rings: Rings) -> float:
+    """Photons of a frame of the laser's own light."""
+    return doppler.reference.photons or rings.photons
 
 
 def expected_image(image: xr.Dataset, total: float) -> torch.Tensor:

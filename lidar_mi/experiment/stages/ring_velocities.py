@@ -12,13 +12,27 @@ from lidar_mi.assessment.metrics.rings import RingBudget
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.ring_instrument import pixel_noise
+from lidar_mi.experiment.ring_reference import (
+    drifts,
+    plate_error,
+    plate_uncertainty,
+    reference_frames,
+    reference_uncertainty,
+    scrambling_needed,
+)
 from lidar_mi.experiment.schema import Doppler, Experiment
-from lidar_mi.experiment.stages.ring_images import RingImages, Rings, expected_image, exposed_frames
+from lidar_mi.experiment.stages.ring_images import (
+    RingImages,
+    Rings,
+    expected_image,
+    exposed_frames,
+    reference_photons,
+)
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 from lidar_mi.retrieval.rings.bound import cramer_rao_of
 from lidar_mi.retrieval.rings.centre import circular_average
-from lidar_mi.retrieval.rings.likelihood_fit import fit_rings
+from lidar_mi.retrieval.rings.likelihood_fit import difference, fit_rings
 from lidar_mi.retrieval.rings.model import RingModel
 from lidar_mi.retrieval.rings.peaks import (
     COORDINATES,
@@ -47,7 +61,10 @@ REFERENCES = 1 << 25
 def line_of_sight_winds(
     experiment: Experiment, rings: Rings, images: RingImages, *, log: Log
 ) -> xr.Dataset:
-    """Winds by every method from noisy images, and from averages of several; see `velocities`."""
+    """Winds by every method from noisy images, and from averages of several; see `velocities`.
+
+    ``rings`` has the models of the instrument that the retrieval assumes.
+    """
     expected = [expected_image(image, rings.photons) for image in images.received]
     found = velocities(experiment.doppler, rings, images, expected, experiment.seed, log)
     found.attrs |= {
@@ -84,11 +101,14 @@ def ring_budget(
         bound=_bounds(doppler, rings),
         relative_error=float(relative),
         largest_error=float(abs(errors).max()),
+        reference_every=doppler.reference.every,
+        reference_errors=reference_uncertainty(doppler).terms(),
+        scrambling_needed=scrambling_needed(doppler),
     )
 
 
-def _bounds(doppler: Doppler, rings: Rings) -> dict[RingCentre, float]:
-    """Cramer-Rao bound of one image at the first speed less its reference, m/s, by centre."""
+def _bounds(doppler: Doppler, rings: Rings) -> dict[RingCentre, tuple[float, float]]:
+    """Cramer-Rao bounds of one image at the first speed and of its reference, m/s, by centre."""
     efficiency, centres = doppler.ccd.quantum_efficiency, doppler.retrieval.centre
     floor = efficiency * rings.background + doppler.ccd.dark_current * doppler.ccd.integration_time
     both = (
@@ -107,28 +127,13 @@ def _bounds(doppler: Doppler, rings: Rings) -> dict[RingCentre, float]:
         for model, photons, speed in both
     ]
     return {
-        centre: math.hypot(*(bound["v_los"] for bound in pair))
-        for centre, *pair in zip(centres, *found, strict=True)
+        centre: (air["v_los"], laser["v_los"])
+        for centre, air, laser in zip(centres, *found, strict=True)
     }
 
 
 def _unknown(model: RingModel, centre: str) -> list[str]:
     return [n for n in model.parameters if centre == RingCentre.FREE or n not in ("x", "y")]
-
-
-def reference_photons(doppler: Doppler, rings: Rings) -> float:
-    """Photons of a frame of the laser's own light."""
-    return doppler.reference.photons or rings.photons
-
-
-def drift_speed(doppler: Doppler, averaged: int) -> float:
-    """Standard deviation of a speed by the laser's drift after its frame, m/s.
-
-    A change of frequency is a change of speed: lambda / 2 times it. Drifts of averaged pulses are
-    independent.
-    """
-    lidar = doppler.lidar
-    return lidar.wavelength / 2 * doppler.reference.laser_drift / math.sqrt(averaged)
 
 
 def velocities(
@@ -145,9 +150,10 @@ def velocities(
     -------
     xr.Dataset
         ``tried`` (algorithm), the images of every case that were given to it; ``v`` and its
-        standard deviation ``v_std`` stated by the fit, m/s, dims (algorithm, centre, averaged,
-        v_los, image), NaN where there is none; and ``peak_bias`` (coordinate, piece) of the
-        innermost ring's peak without any noise, m/s, at the first speed.
+        random and systematic standard deviations ``v_std`` and ``v_systematic`` as stated, m/s,
+        dims (algorithm, centre, averaged, v_los, image), NaN where there is none; and
+        ``peak_bias`` (coordinate, piece) of the innermost ring's peak without any noise, m/s, at
+        the first speed.
     """
     settings, speeds = doppler.retrieval, doppler.v_los
     shape = (
@@ -157,7 +163,8 @@ def velocities(
         len(speeds),
         settings.images,
     )
-    v, v_std = np.full((2, *shape), np.nan)
+    v, v_std, v_systematic = np.full((3, *shape), np.nan)
+    shift, unknown = plate_error(doppler), plate_uncertainty(doppler)
     emitted = expected_image(rendered.emitted, reference_photons(doppler, rings))
     fits = [m for m in settings.methods if m in FITS]
     peaks = [m for m in settings.methods if m in PEAKS]
@@ -168,7 +175,8 @@ def velocities(
     ]
     done, total = 0, math.prod(shape[2:])
     for j, n in enumerate(settings.averaged):
-        noise = pixel_noise(doppler.ccd, rings.modes, n)
+        own, sharing = reference_frames(n, doppler.reference.every, "doppler.retrieval.averaged")
+        noises = [pixel_noise(doppler.ccd, rings.modes, number) for number in (n, own)]
         for k, true in enumerate(speeds):
             for first in range(0, settings.images, FRAMES):
                 text = f"retrieving winds from averages of {n} images at {true:g} m/s"
@@ -176,13 +184,19 @@ def velocities(
                 images = range(first, min(first + FRAMES, settings.images))
                 numbers = [(j * len(speeds) + k) * settings.images + i for i in images]
                 frames = exposed_frames(doppler, rings, expected[k], n, seed, numbers)
-                # every pulse has its own frame of the laser
+                # those that follow one frame of the laser have the same
+                first_of_case = numbers[0] - first
                 laser = exposed_frames(
-                    doppler, rings, emitted, n, seed, [REFERENCES + i for i in numbers]
+                    doppler,
+                    rings,
+                    emitted,
+                    own,
+                    seed,
+                    [REFERENCES + first_of_case + i // sharing for i in images],
                 )
-                # as a change of the laser's frequency is one of the speed
-                drifted = drift_speed(doppler, n) * np.array(
-                    [np.random.default_rng([seed, 2, i]).standard_normal() for i in numbers]
+                # as a change of frequency or gap is one of the speed
+                drifted, drift_std = drifts(
+                    doppler, n, [seed, first_of_case], images, "doppler.retrieval.averaged"
                 )
                 few = max(0, min(settings.slow_images - first, len(images)))
                 for c, centre in enumerate(settings.centre):
@@ -190,23 +204,24 @@ def velocities(
                         count = len(images) if name == RingMethod.ANNULAR else few
                         if count:
                             place = places[name], c, j, k, slice(first, first + count)
-                            v[place], v_std[place] = speeds_to_laser(
-                                frames[:count], laser[:count], doppler, rings, noise, name, centre
+                            found = speeds_to_laser(
+                                frames[:count], laser[:count], doppler, rings, noises, name, centre
                             )
-                            v[place] += drifted[:count]
-                            v_std[place] = np.hypot(v_std[place], drift_speed(doppler, n))
+                            v[place] = found[0] + drifted[:count] + shift
+                            v_std[place] = np.hypot(found[1], drift_std[:count])
+                            v_systematic[place] = np.hypot(found[2], unknown)
                     for i in range(few if peaks else 0):
-                        found, zero = (
+                        received, zero = (
                             _peak_radii(one[i].numpy(), doppler, centre) for one in (frames, laser)
                         )
                         for name in peaks:
                             speed = velocity_from_radii(
-                                found[name],
+                                received[name],
                                 zero[name],
-                                doppler.camera.focal_length,
+                                rings.model.focal_length,
                                 doppler.camera.pixel,
                             )
-                            v[places[name], c, j, k, first + i] = speed + drifted[i]
+                            v[places[name], c, j, k, first + i] = speed + drifted[i] + shift
                 done += len(images)
     dims = ("algorithm", "centre", "averaged", "v_los", "image")
     return xr.Dataset(
@@ -215,7 +230,15 @@ def velocities(
             "v_std": (
                 dims,
                 v_std,
-                {"units": "m s-1", "long_name": "standard deviation stated by the fit"},
+                {"units": "m s-1", "long_name": "random standard deviation as stated"},
+            ),
+            "v_systematic": (
+                dims,
+                v_systematic,
+                {
+                    "units": "m s-1",
+                    "long_name": "systematic standard deviation as stated, common to all images",
+                },
             ),
             "tried": ("algorithm", tried, {"units": "1", "long_name": "images of every case"}),
             "peak_bias": (
@@ -248,36 +271,44 @@ def velocities(
     )
 
 
-def speeds_to_laser(
-    frames, laser, doppler, rings, noise, method, centre
-) -> tuple[np.ndarray, np.ndarray]:
-    """v_LOS of frames less that of the laser's own frames, and its standard deviation."""
-    v, std = _fitted_speeds(frames, doppler, rings.model, noise, method, centre)
-    # the narrow rings of the laser need no 2-D fit: their error is a third of the air's
-    zero, zero_std = _fitted_speeds(laser, doppler, rings.laser, noise, RingMethod.ANNULAR, centre)
-    return v - zero, np.hypot(std, zero_std)
+def speeds_to_laser(frames, laser, doppler, rings, noises, method, centre) -> np.ndarray:
+    """v_LOS of frames less that of the laser's, random and systematic standard deviation.
 
+    ``noises`` are of the pixels of both; the systematic part is what the calibration leaves.
 
-def _fitted_speeds(frames, doppler, model, noise, method, centre):
-    """v_LOS and its standard deviation by `fit_rings`; NaN for images that it refuses."""
-    start = doppler.camera.centre_pixel if centre == RingCentre.KNOWN else None
+    Returns
+    -------
+    array (3, frames)
+        m/s; NaN for images that `fit_rings` refuses.
+    """
     try:
-        fit = fit_rings(
-            frames,
-            model,
-            noise,
-            method=method,
-            centre=start,
-            free=_unknown(model, centre),
-            max_chi_square=doppler.retrieval.max_chi_square,
+        # the narrow rings of the laser need no 2-D fit: their error is a third of the air's
+        parts = difference(
+            _fit(frames, doppler, rings.model, rings.response, noises[0], method, centre),
+            _fit(laser, doppler, rings.laser, rings.response, noises[1], "annular", centre),
         )
     except InputError:
         if len(frames) == 1:
-            return np.array([np.nan]), np.array([np.nan])
-        alone = [_fitted_speeds(f[None], doppler, model, noise, method, centre) for f in frames]
-        v, std = zip(*alone, strict=True)
-        return np.concatenate(v), np.concatenate(std)
-    return fit.v_los.numpy(), fit.v_los_std.numpy()
+            return np.full((3, 1), np.nan)
+        alone = [
+            speeds_to_laser(one[None], own[None], doppler, rings, noises, method, centre)
+            for one, own in zip(frames, laser, strict=True)
+        ]
+        return np.concatenate(alone, 1)
+    return np.stack([part.numpy() for part in parts])
+
+
+def _fit(frames, doppler, model, response, noise, method, centre):
+    return fit_rings(
+        frames,
+        model,
+        noise,
+        method=method,
+        centre=model.centre if centre == RingCentre.KNOWN else None,
+        free=_unknown(model, centre),
+        response=response if method == RingMethod.ANNULAR else None,
+        max_chi_square=doppler.retrieval.max_chi_square,
+    )
 
 
 def _peak_radii(image: np.ndarray, doppler: Doppler, centre: str) -> dict[str, float]:

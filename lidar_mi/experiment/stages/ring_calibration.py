@@ -1,0 +1,100 @@
+"""The instrument that the retrieval of a run assumes: as on paper, or calibrated."""
+
+from pathlib import Path
+
+import torch
+
+from lidar_mi.atmosphere.line import laser_line
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.ring_instrument import pixel_noise
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.ring_images import (
+    Rings,
+    exposed_frames,
+    reference_photons,
+    ring_models,
+)
+from lidar_mi.experiment.truth import find_file
+from lidar_mi.instrument.fringe_camera import fringe_image
+from lidar_mi.io.netcdf import read_netcdf
+from lidar_mi.retrieval.rings.calibration import Calibration, calibrated, calibration_of
+from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
+
+# First number of the frames of the calibration, which selects their random streams.
+_STREAMS = 3 << 25
+
+
+def calibration_file(
+    experiment: Experiment, rings: Rings, beside: str | Path, *, log: Log
+) -> Calibration | None:
+    """The calibration that an experiment names, or none.
+
+    Raises
+    ------
+    InputError
+        A file that is missing, no calibration, or one of another camera, wavelength or gap.
+    """
+    asked = experiment.doppler.calibration
+    if asked is None or asked.file is None:
+        return None
+    try:
+        found = calibration_of(read_netcdf(find_file(asked.file, beside, "file")))
+        calibrated(rings.model, found)
+    except InputError as error:
+        raise InputError(f"doppler.calibration.file: {error}") from None
+    return found
+
+
+def assumed_rings(
+    experiment: Experiment, rings: Rings, given: Calibration | None, *, log: Log
+) -> Rings:
+    """What the retrieval assumes of the instrument, calibrated where the experiment says so.
+
+    Simulated frames are of the true instrument, each with the noise of its camera; the calibration
+    starts from the assumed one.
+
+    Raises
+    ------
+    InputError
+        Frames that do not fit the assumed instrument.
+    """
+    doppler = experiment.doppler
+    air, laser = ring_models(doppler)
+    asked, found = doppler.calibration, given
+    if asked is not None and found is None:
+        log(f"calibrating the instrument from {asked.frames} frames of the laser")
+        line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
+        light = reference_photons(doppler, rings)
+        mean = fringe_image(doppler.camera, doppler.etalon, line, 0.0, light)
+        numbers = range(_STREAMS, _STREAMS + asked.frames)
+        frames = exposed_frames(doppler, rings, mean, 1, experiment.seed, numbers)
+        try:
+            found = calibrate_rings(
+                frames,
+                laser,
+                pixel_noise(doppler.ccd, rings.modes),
+                light_degree=asked.light_degree,
+                background_degree=doppler.retrieval.background_degree,
+            )
+        except InputError as error:
+            raise InputError(f"doppler.calibration: {error}") from None
+        log(_summary(found))
+    if found is None:
+        return rings._replace(model=air, laser=laser)
+    response = torch.from_numpy(found.response.astype(float))
+    return rings._replace(
+        model=calibrated(air, found),
+        laser=calibrated(laser, found),
+        # pixels of one response need no cells of their own
+        response=None if bool((response == 1).all()) else response,
+    )
+
+
+def _summary(found: Calibration) -> str:
+    text = (
+        f"calibration: focal length {found.focal_length * 1e3:.4f} mm, finesse "
+        f"{found.finesse:.3g}, chi-square {found.chi_square:.3f}"
+    )
+    missing = ", ".join(found.undetermined)
+    return f"{text}; not determined: {missing}" if missing else text
