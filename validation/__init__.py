@@ -13,6 +13,7 @@ gradients            derivatives of an image against those of the lidar equation
 receivers            analysers of the Doppler shift: published efficiencies, cost of 0.5 m/s
 strips               loads of a wake on a wing: closed forms, a lattice of vortices
 track                track of a vortex pair: errors over simulated flights are as stated
+timing               winds of beams with times and poses: closed forms
 coverage             standard errors of winds where air changes; only by name, as some rows fail
 instrument           winds by an etalon with defects; only by name
 resolution           winds from fewer, larger pixels, against their bound; only by name
@@ -31,6 +32,7 @@ GROUPS = (
     "receivers",
     "strips",
     "track",
+    "timing",
 )
 OPEN = ("coverage", "instrument", "resolution")
 """Run only by name. Some rows of ``coverage`` fail as long as the retrievals assume air that does

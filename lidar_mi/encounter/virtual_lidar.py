@@ -147,7 +147,8 @@ class VirtualLidar:
             A time between scans or before the first one, a pose in or behind the slab.
         """
         number = self._number(t)
-        scan = self._scanned(number, pose or AircraftPose(number * self.gates.stride))
+        pose = pose or AircraftPose(number * self.gates.stride)
+        scan = self._scanned(number, pose)
         before = self._scans.get(number - 1)
         self._scans = {number: scan} | ({number - 1: before} if before else {})
         period = self.gates.period
@@ -165,10 +166,11 @@ class VirtualLidar:
         )
         pointing = self.experiment.retrieval.pointing
         common = pointing.stderr * (self.gates.look_ahead - self.gates.stride / 2) / period
-        if common:
-            pair = pair.with_common_error(common, common)
+        rotation, axis = pointing.roll / period, (pose.y, pose.z)
+        if common or rotation:
+            pair = pair.with_common_error(common, common, rotation, axis)
             if wind is not None:
-                wind = with_common_error(wind, common, pointing.offset)
+                wind = with_common_error(wind, common, pointing.offset, rotation, axis)
         if not pair.success:
             flags += tuple(f"vortices: {reason}" for reason in pair.reasons)
         return Estimate(valid, delivered, x, wind, pair, flags, seconds)

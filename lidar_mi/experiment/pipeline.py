@@ -215,7 +215,7 @@ STAGES = (
     Stage(
         "error_budget",
         error_budgets,
-        ("truth", "scans", "wind", "cores"),
+        ("truth", "flows", "scans", "wind", "cores", "beside"),
         has_error_budget,
         timing="error_budget",
     ),

@@ -58,6 +58,9 @@ class Pointing(Section):
     stderr: Annotated[Angle, Within(0, 0.1, "displaced by more than the image")] = Field(
         0.0, description="standard error of pitch and of yaw between the scans"
     )
+    roll: Annotated[Angle, Within(0, 0.1, "displaced by more than the image")] = Field(
+        0.0, description="standard error of roll between the scans"
+    )
 
     @model_validator(mode="after")
     def _free_by_how_much(self):
@@ -309,16 +312,6 @@ class Experiment(Tabular, Section):
         copy = self.model_copy()
         copy._folder = Path(folder)
         return copy
-
-    @model_validator(mode="after")
-    def _budget_of_photographs(self):
-        timed = self.scan.timing is not None and not self.scan.timing.is_instant
-        if self.retrieval.error_budget and self.scan.air == "moving" and timed:
-            raise ValueError(
-                "retrieval.error_budget: true is not allowed with scan.air: moving, as its causes "
-                "are those of images taken at once; expected scan.air: frozen"
-            )
-        return self
 
     @model_validator(mode="after")
     def _gates_that_make_a_volume(self):

@@ -39,7 +39,7 @@ class Truth:
     def image(self, which: int, smooth: bool = False) -> xr.DataArray:
         """Extinction averaged over depth as an image (z, y): that of an ideal lidar."""
         field = (self.smooth if smooth else self.extinction)[which]
-        return _slab_mean(field, self.wind.attrs["gates"])
+        return slab_mean(field, self.wind.attrs["gates"])
 
 
 @checked_arguments
@@ -112,7 +112,7 @@ def make_truth(
     depth = experiment.scan.thickness / experiment.scan.gate_count
     gates = (experiment.scan.range, experiment.scan.range + depth)
     components = [name for name in ("u", "v", "w") if name in flow]
-    wind = xr.Dataset({name: _slab_mean(flow[name], gates) for name in components})
+    wind = xr.Dataset({name: slab_mean(flow[name], gates) for name in components})
     wind.attrs["gates"] = gates
     rough, smooth = (
         tuple(field.copy(data=field.values + mapping.molecules) for field in pair)
@@ -269,8 +269,8 @@ def _extinction(flow, mapping, first, second) -> xr.DataArray:
     return field.transpose("x", "y", "z")
 
 
-def _slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
-    """Mean over the depth of planar gates, (z, y); linear between planes, as in the renderer."""
+def slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
+    """Mean over the depth of planar gates, (..., z, y); linear between planes, as rendered."""
     x = field["x"].values
     weights = np.ones(1)
     if len(x) > 1:
@@ -284,7 +284,7 @@ def _slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
         nodes = np.unique([*gates, *x[(x > gates[0]) & (x < gates[1])]])
         linear = [np.interp(nodes, x, plane) for plane in np.eye(len(x))]
         weights = integrate.trapezoid(linear, nodes) / (gates[1] - gates[0])
-    image = (field * xr.DataArray(weights, dims="x")).sum("x").transpose("z", "y")
+    image = (field * xr.DataArray(weights, dims="x")).sum("x").transpose(..., "z", "y")
     image.attrs = field.attrs
     for axis in ("y", "z"):
         image[axis].attrs["units"] = "m"

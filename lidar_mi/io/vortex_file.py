@@ -157,5 +157,5 @@ def _from_data(data: dict, where: str) -> VortexPairFit:
                 f"{where}.covariance: not symmetric and finite; expected that of a fit"
             )
     return VortexPairFit(
-        parameters, covariance, profile, **numbers, reasons=reasons, from_start=False
+        parameters, covariance, profile, **numbers, reasons=reasons, from_start=False, turned=None
     )

@@ -148,6 +148,9 @@ def _as_dataset(image: np.ndarray, names: list[str], sensor) -> xr.Dataset:
     oblique = 1 / beams[..., 0] if sensor.gate_kind == "planar" else 1.0
     length = (stop - start) / gates * oblique
     middle = (start + (stop - start) / gates / 2 - origins[..., 0]) * oblique
+    times = np.array(sensor.m_times, float).reshape(rows, columns)[::-1, ::-1]
+    if times.any():
+        variables["beam_time"] = ("z", "y"), times.astype(np.float32)
     area = np.pi * sensor.m_aperture[0] ** 2
     variables["Y"] = (("z", "y"), variables["S0"][1][0] * middle**2 / (area * length))
     attributes = {

@@ -2,6 +2,7 @@
 
 If the second scan points off by a small angle in pitch or yaw, its image is displaced as a whole,
 by range times angle, and every vector errs by that displacement over the time between the scans.
+An unknown roll turns the image: the error grows with the distance from the axis of the roll.
 """
 
 from typing import Literal
@@ -13,12 +14,18 @@ from lidar_mi.errors import InputError
 
 NAMES = ("v_common_stderr", "w_common_stderr")
 """Variables of a data set of vectors that state it, m/s."""
+ROTATION = "rotation_common_stderr"
+"""The same of a rotation, rad/s, with the attributes `centre_y` and `centre_z`, m."""
 # Least fraction of a stated error that is the vector's own.
 _LEAST_OWN = 1e-3
 
 
 def with_common_error(
-    wind: xr.Dataset, stderr: float, offset: Literal["known", "free"] = "known"
+    wind: xr.Dataset,
+    stderr: float,
+    offset: Literal["known", "free"] = "known",
+    rotation: float = 0.0,
+    centre: tuple[float, float] = (0.0, 0.0),
 ) -> xr.Dataset:
     """Vectors whose stated errors include one that is common to all of them.
 
@@ -32,45 +39,87 @@ def with_common_error(
     offset : {"known", "free"}
         Whether a combination with other measurements may estimate the common error (free) or only
         states it.
+    rotation : float
+        Standard error of the image's rotation about ``centre`` (y, z in m), rad/s: that of the
+        roll between the scans (rad) over the time between them.
 
     Returns
     -------
     xr.Dataset
-        With `v_common_stderr` and `w_common_stderr` (m s-1), which are part of `v_stderr` and
-        `w_stderr`, the correlation of both, and the errors of a fitted pair's mean wind and drift;
-        attribute ``pointing_offset``.
+        With `v_common_stderr` and `w_common_stderr` (m s-1) and `rotation_common_stderr` (rad s-1),
+        which are part of `v_stderr` and `w_stderr`, the correlation of both, and the errors of a
+        fitted pair; attribute ``pointing_offset``.
 
     Raises
     ------
     InputError
         An error that is not a number of 0 or more.
     """
-    if not 0 <= stderr < np.inf:
-        raise InputError(f"stderr: {stderr!r} m/s is not allowed; expected a number >= 0")
+    for name, value, units in (("stderr", stderr, "m/s"), ("rotation", rotation, "rad/s")):
+        if not 0 <= value < np.inf:
+            raise InputError(f"{name}: {value!r} {units} is not allowed; expected a number >= 0")
     found = wind.copy()
     first, second = wind["v_stderr"], wind["w_stderr"]
-    for name in ("v_stderr", "w_stderr", *_OF_A_PAIR):
-        if name in wind:
-            both = np.hypot(wind[name], stderr).astype(wind[name].dtype)
-            found[name] = both.assign_attrs(wind[name].attrs)
+    arms = [
+        (wind[f"{axis}_vector"] if f"{axis}_vector" in wind else wind[axis]) - middle
+        for axis, middle in zip("yz", centre, strict=True)
+    ]
+    turned = {"v_stderr": -rotation * arms[1], "w_stderr": rotation * arms[0]}
+    for name in turned:
+        both = np.hypot(np.hypot(wind[name], stderr), turned[name])
+        found[name] = _like(both, wind[name])
+    for name in wind.data_vars:
+        of_pair = str(name).endswith("_stderr") and _PER_ROTATION in wind[name].attrs
+        if of_pair or name in _OF_A_PAIR:
+            part = wind[name].attrs.get(_PER_ROTATION, 0.0) + _moved(str(name), centre)
+            shared = stderr if name in _OF_A_PAIR else 0.0
+            both = np.hypot(np.hypot(wind[name], shared), rotation * part)
+            found[name] = _like(both, wind[name])
     larger = found["v_stderr"] * found["w_stderr"]
-    ratio = (first * second / larger.where(larger > 0)).where(larger != 0, 0.0)
-    correlation = wind["vw_correlation"]
-    found["vw_correlation"] = (
-        (correlation * ratio).astype(correlation.dtype).assign_attrs(correlation.attrs)
-    )
+    product = wind["vw_correlation"] * first * second + turned["v_stderr"] * turned["w_stderr"]
+    correlation = (product / larger.where(larger > 0)).where(larger != 0, 0.0)
+    found["vw_correlation"] = _like(correlation, wind["vw_correlation"])
     for name in NAMES:
         about = {"long_name": f"part of {name[0]}_stderr that all vectors share", "units": "m s-1"}
         found[name] = (), float(stderr), about
+    about = {
+        "long_name": "part of v_stderr and w_stderr that is a rotation of all vectors",
+        "units": "rad s-1",
+        "centre_y": float(centre[0]),
+        "centre_z": float(centre[1]),
+    }
+    found[ROTATION] = (), float(rotation), about
     return found.assign_attrs(pointing_offset=str(offset))
 
 
+def _like(values: xr.DataArray, like: xr.DataArray) -> xr.DataArray:
+    """In the type, the order of dims and with the attributes of another field."""
+    return values.transpose(*like.dims).astype(like.dtype).assign_attrs(like.attrs)
+
+
+def _moved(name: str, centre: tuple[float, float]) -> float:
+    """Change of a pair's mean wind or drift by the rotation's centre, m/s per rad/s."""
+    if name not in _OF_A_PAIR:
+        return 0.0
+    return centre[1] if "_v_" in name else -centre[0]
+
+
+# Attribute of a fitted pair's standard errors, see `Quantity`.
+_PER_ROTATION = "per_rotation"
 _OF_A_PAIR = ("mean_v_stderr", "mean_w_stderr", "drift_v_stderr", "drift_w_stderr")
 
 
 def common_stderr(wind: xr.Dataset) -> np.ndarray:
     """Standard errors of v and w (2,), m/s, that all vectors share; 0 where none is stated."""
     return np.array([float(wind[name]) if name in wind else 0.0 for name in NAMES])
+
+
+def common_rotation(wind: xr.Dataset) -> tuple[float, tuple[float, float]]:
+    """Standard error of the rotation of all vectors, rad/s, and its centre y, z, m."""
+    if ROTATION not in wind:
+        return 0.0, (0.0, 0.0)
+    about = wind[ROTATION].attrs
+    return float(wind[ROTATION]), (about.get("centre_y", 0.0), about.get("centre_z", 0.0))
 
 
 def own_errors(

@@ -5,9 +5,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Quantity:
-    """A number with its standard error, unit and name."""
+    """A number with its standard error, unit and name.
+
+    ``per_rotation`` is its change per rad/s by which the image turns about the origin between the
+    scans (a roll of the platform that nobody knows), 0 if there is none.
+    """
 
     value: float
     stderr: float
     units: str
     long_name: str
+    per_rotation: float = 0.0

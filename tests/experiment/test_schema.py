@@ -466,11 +466,3 @@ def test_former_names_of_keys_are_accepted_and_not_written(tmp_path):
     assert not re.search("photon_samples|share", written)
     with pytest.raises(InputError, match="photon_samples: unknown key"):
         load(path, ["doppler.path_samples=5"])
-
-
-def test_a_budget_of_photographs_is_not_made_of_moving_air():
-    data = {"name": "timed", "wake": {"vortex_pair": {}}, "retrieval": {"error_budget": True}}
-    timing = {"pattern": "raster", "duration": "50 ms"}
-    assert check(data | {"scan": {"timing": timing}}, "timed").retrieval.error_budget
-    with pytest.raises(InputError, match=r"retrieval.error_budget: true is not allowed with scan"):
-        check(data | {"scan": {"timing": timing, "air": "moving"}}, "timed")

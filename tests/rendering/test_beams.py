@@ -178,6 +178,7 @@ def test_a_scene_file_with_beams_is_corrected_by_their_own_ranges(tmp_path):
     table = np.zeros((12, 7))
     table[:, 0], table[:, 3] = np.linspace(-20, 20, 12), 1
     table[:, 4:6] = rng.uniform(-0.05, 0.05, (12, 2))
+    table[:, 6] = np.linspace(0, 0.11, 12)
     np.savetxt(tmp_path / "beams.csv", table, delimiter=",")
     (tmp_path / "beams.xml").write_text(
         f"""<scene version="3.0.0">
@@ -206,3 +207,6 @@ def test_a_scene_file_with_beams_is_corrected_by_their_own_ranges(tmp_path):
     assert (np.abs(scan["Y"].values / expected - 1) < 5 * sigma + 1e-4).all()
     assert np.ptp(scan["S0"].values) > 0.1 * scan["S0"].values.mean()
     assert scan.attrs["grid"] == 0
+    times = table[:, 6].reshape(3, 4)[::-1, ::-1]
+    for kept in (scan, read_scan(tmp_path / "out.exr")):
+        assert kept["beam_time"].values == pytest.approx(times, abs=1e-6)

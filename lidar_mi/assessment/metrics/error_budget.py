@@ -19,6 +19,10 @@ CAUSES = {
     "detector_noise": "noise of the detector",
     "monte_carlo": "noise of the simulation",
     "beam_blur": "width of the beam",
+    "scan_time": "air that moves during a scan",
+    "motion": "motion of the platform",
+    "scanner_jitter": "jitter of the scanner",
+    "navigation": "errors of the reported pose",
     "slab": "motion other than the slab's mean wind",
     "window": "averaging over the window",
     "shear": "shear within the window",
@@ -62,6 +66,7 @@ def images_without(
     sharp: Pair,
     rendered: Pair | None = None,
     advected: Pair | None = None,
+    timed: Mapping[str, Pair] | None = None,
 ) -> dict[str, Pair]:
     """Images without one cause of error each, with the same realisation of the others.
 
@@ -82,18 +87,23 @@ def images_without(
         Without the noise of a detector; left out: there is none.
     advected : pair, optional
         As `blurred`, of air advected by the slab's mean wind only.
+    timed : mapping of pair, optional
+        As `blurred`, by cause, with beams that lack it: `scan_time`, `motion`, `scanner_jitter`,
+        `navigation`.
 
     Returns
     -------
     dict
         Pairs by cause: `monte_carlo`, `beam_blur`, with `rendered` `detector_noise`, with
-        `advected` `slab`.
+        `advected` `slab`, and those of `timed`.
     """
     found: dict[str, Pair] = {} if rendered is None else {"detector_noise": rendered}
     found["monte_carlo"] = _plus_difference(blurred, measured, rendered or measured)
     found["beam_blur"] = _plus_difference(measured, sharp, blurred)
     if advected is not None:
         found["slab"] = _plus_difference(measured, advected, blurred)
+    for cause, images in (timed or {}).items():
+        found[cause] = _plus_difference(measured, images, blurred)
     return found
 
 

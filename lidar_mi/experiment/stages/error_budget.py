@@ -1,6 +1,8 @@
 """The error budget of an experiment's cross-flow wind: retrieved without each cause of error."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -13,9 +15,10 @@ from lidar_mi.assessment.metrics.error_budget import (
     moved_rigidly,
 )
 from lidar_mi.assessment.metrics.names import Source
-from lidar_mi.atmosphere.advection import advect
+from lidar_mi.atmosphere.advection import advect, advect_to
+from lidar_mi.experiment.ideal_images import ideal_scan, slab_images
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema import Experiment, Platform
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import (
     known_blur,
@@ -23,27 +26,41 @@ from lidar_mi.experiment.stages.winds import (
     rendered_pairs,
     window_settings,
 )
-from lidar_mi.experiment.truth import Truth, blur_by_beam
+from lidar_mi.experiment.truth import Flows, Truth, blur_by_beam, read_flows
+from lidar_mi.instrument.motion import Motion
+from lidar_mi.instrument.reported import Reported
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")
-# Images made of the rendered ones, whose pixels may have times; the others are photographs.
-_RENDERED = ("measured", "detector_noise", "beam_blur", "slab")
+Times = list[xr.DataArray] | None
+
+
+@dataclass(frozen=True)
+class _Images:
+    """An image pair, its noise (a map or its level), and the times of its pixels if they differ."""
+
+    pair: Sequence[xr.DataArray]
+    noise: xr.DataArray | float
+    times: Times = None
 
 
 def error_budgets(
     experiment: Experiment,
     truth: Truth,
+    flows: Flows,
     scans: Sequence[xr.Dataset],
     wind: xr.Dataset,
     cores: Sequence[Core],
+    beside: str | Path,
     *,
     log: Log,
 ) -> dict[str, dict[str, float]]:
     """`budgets` from a run's winds, where these need not be retrieved again."""
     log("retrieving winds without each cause of error")
-    return budgets(experiment, truth, scans, log.bar, wind, cores)
+    return budgets(experiment, truth, scans, log.bar, wind, cores, flows=flows, beside=beside)
 
 
 def budgets(
@@ -54,6 +71,9 @@ def budgets(
     known: xr.Dataset | None = None,
     cores: Sequence[Core] | None = None,
     flagged: bool = False,
+    *,
+    flows: Flows | None = None,
+    beside: str | Path | None = None,
 ) -> dict[str, dict[str, float]]:
     """`error_budget` of every method of an experiment, by method.
 
@@ -67,13 +87,20 @@ def budgets(
         `lidar_mi.experiment.stages.winds.cross_flow_winds`.
     cores, flagged : optional
         See `error_budget`; cores left out: those of the true wind.
+    flows : optional
+        From `lidar_mi.experiment.truth.read_flows`. Left out: read where the air moves.
+    beside : path, optional
+        Folder in which files are searched first. Default: the experiment's.
     """
-    images, blurred = _images(experiment, truth, scans)
-    times = pixel_times(experiment, scans)
+    beside = experiment.folder if beside is None else beside
+    plans = scan_plans(experiment, truth, beside)
+    if flows is None and experiment.scan.air == "moving":
+        flows = read_flows(experiment, beside)
+    images, blurred = _images(experiment, truth, flows, plans, scans, beside)
     cores = find_cores(truth.wind) if cores is None else cores
     methods = experiment.retrieval.methods
     settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
-    blur = known_blur(experiment, scan_plans(experiment, truth)[0])
+    blur = known_blur(experiment, plans[0])
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
     if experiment.detector:
         sources |= {"measured": Source.NOISY, "detector_noise": Source.BACKSCATTER}
@@ -81,7 +108,7 @@ def budgets(
     for index, method in enumerate(methods):
         progress(f"retrieving without each cause of error, {method}", index / len(methods))
         winds = {}
-        for cause, (pair, noise) in images.items():
+        for cause, case in images.items():
             source = sources.get(cause)
             if known is not None and source:
                 kept = known.sel(source=source, algorithm=method)
@@ -91,35 +118,39 @@ def budgets(
                 # the flags that count are those of the images as measured
                 flags = dict.fromkeys(("checks", "standard_errors"), cause == "measured")
                 winds[cause] = retrieve_wind(
-                    *pair,
+                    *case.pair,
                     method=method,
-                    noise=noise,
+                    noise=case.noise,
                     blur=corrected,
-                    times=times if cause in _RENDERED else None,
+                    times=case.times,
                     **flags,
                     **settings,
                 )
         measured, perfect = winds.pop("measured"), winds.pop("perfect")
-        stiff = moved_rigidly(
-            measured,
-            images["measured"][0],
-            blurred,
-            truth.wind,
-            lambda pair, stride, method=method: retrieve_wind(
-                *pair,
-                method=method,
-                checks=False,
-                standard_errors=False,
-                **settings | {"stride": stride},
-            ),
-        )
-        winds |= {} if stiff is None else {"shear": stiff}
+        # windows that move rigidly are photographs from where they were reported
+        if all(plan.beams is None for plan in plans):
+            stiff = moved_rigidly(
+                measured,
+                images["measured"].pair,
+                blurred,
+                truth.wind,
+                lambda pair, stride, method=method: retrieve_wind(
+                    *pair,
+                    method=method,
+                    checks=False,
+                    standard_errors=False,
+                    **settings | {"stride": stride},
+                ),
+            )
+            winds |= {} if stiff is None else {"shear": stiff}
         found[method] = error_budget(measured, winds, truth.wind, cores, perfect, flagged)
     return found
 
 
-def _images(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataArray]]:
-    """Images and their noise: as measured, without each cause, and of the air itself.
+def _images(
+    experiment, truth, flows, plans, scans, beside
+) -> tuple[dict[str, _Images], list[xr.DataArray]]:
+    """Images as measured, without each cause, and of the air itself, by cause.
 
     Also the air averaged over the beams.
     """
@@ -128,35 +159,114 @@ def _images(experiment, truth, scans) -> tuple[dict[str, tuple], list[xr.DataArr
     measured, level = rendered.get(Source.NOISY, (pair, noise))
     gain = offset = None
 
-    def as_measured(images, blurred=True):
+    def as_measured(air, of=plans, blurred=True):
         """Extinction as the lidar would measure it without noise, on the images' grid."""
-        depth = experiment.scan.thickness / experiment.scan.gate_count
-        if blurred:
-            images = [
-                blur_by_beam(image, experiment.lidar, plan.centre, depth)
-                for image, plan in zip(images, scan_plans(experiment, truth), strict=True)
-            ]
-        if experiment.scan.aim == "angles":
-            images = [image.interp(y=pair[0]["y"], z=pair[0]["z"]) for image in images]
+        images, _ = _without_noise(experiment, air, of, pair, blurred)
         return images if gain is None else [gain * image + offset for image in images]
 
-    air = [truth.image(k) for k in (0, 1)]
+    air = slab_images(experiment, truth, flows, plans)
     noises = [xr.zeros_like(image) + noise for image in pair]
     gain, offset = image_scale(as_measured(air), pair, noises)
     advected = None
     if truth.extinction[0].sizes["x"] > 1 or experiment.wake.second != "advect":
-        moved = advect(air[0], truth.wind["v"], truth.wind["w"], experiment.platform.dt)
-        advected = as_measured([air[0], moved])
-    sharp = as_measured(air, blurred=False)
+        advected = as_measured(_advected_by_the_mean(experiment, truth, air))
+    photographs = [truth.image(k) for k in (0, 1)]
     blurred = as_measured(air)
+    timed, times = {}, {}
+    if any("time" in image.dims for image in air):
+        timed["scan_time"], times["scan_time"] = as_measured(photographs), None
+    for cause, platform in platforms_without(experiment.platform).items():
+        other = experiment.model_copy(update={"platform": platform})
+        flown = scan_plans(other, truth, beside)
+        moving = slab_images(other, truth, flows, flown)
+        timed[cause] = as_measured(moving, flown)
+        times[cause] = _without_noise(other, moving, flown, pair)[1]
     without = images_without(
-        measured, blurred, sharp, pair if experiment.detector else None, advected
+        measured,
+        blurred,
+        as_measured(air, blurred=False),
+        pair if experiment.detector else None,
+        advected,
+        timed,
     )
     # without the simulation's noise the detector's remains, if there is one
     counts = np.sqrt(np.maximum(level**2 - noise**2, 0)) if experiment.detector else 0.0
     levels = {"detector_noise": noise, "monte_carlo": counts}
+    told = pixel_times(experiment, scans)
+    sharp = [gain * image + offset for image in _on_grid(experiment, photographs, pair)]
     return {
-        "measured": (measured, level),
-        "perfect": (sharp, 0.0),
-        **{cause: (images, levels.get(cause, level)) for cause, images in without.items()},
+        "measured": _Images(measured, level, told),
+        "perfect": _Images(sharp, 0.0),
+        **{
+            cause: _Images(images, levels.get(cause, level), times.get(cause, told))
+            for cause, images in without.items()
+        },
     }, blurred
+
+
+def platforms_without(platform: Platform) -> dict[str, Platform]:
+    """The platform without each of its causes of error, by cause; those that it has.
+
+    Errors of the reported pose that come from its age are zero without motion. Random numbers of
+    the other causes are the same.
+    """
+    found = {}
+    motion, reported = platform.motion or Motion(), platform.reported or Reported()
+    still = Motion().model_copy(update={"scanner_jitter": motion.scanner_jitter})
+    if motion != still:
+        found["motion"] = platform.model_copy(update={"motion": still})
+    if motion.scanner_jitter > 0:
+        steady = motion.model_copy(update={"scanner_jitter": 0.0})
+        found["scanner_jitter"] = platform.model_copy(update={"motion": steady})
+    if reported != Reported():
+        found["navigation"] = platform.model_copy(update={"reported": None})
+    return found
+
+
+def _without_noise(
+    experiment: Experiment,
+    air: Sequence[xr.DataArray],
+    plans: Sequence[ScanPlan],
+    like: Sequence[xr.DataArray],
+    blurred: bool = True,
+) -> tuple[list[xr.DataArray], Times]:
+    """The air as both scans see it, and the times of pixels where they are of their own air."""
+    depth = experiment.scan.thickness / experiment.scan.gate_count
+    lidar = experiment.lidar if blurred else None
+    if all(plan.beams is None for plan in plans):
+        images = list(air)
+        if lidar is not None:
+            images = [
+                blur_by_beam(image, lidar, plan.centre, depth)
+                for image, plan in zip(images, plans, strict=True)
+            ]
+        return _on_grid(experiment, images, like), None
+    scans = [
+        ideal_scan(image, plan, lidar, depth).assign_attrs(
+            frozen_air=int(experiment.scan.air == "frozen")
+        )
+        for image, plan in zip(air, plans, strict=True)
+    ]
+    images = [scan["Y"] for scan in scans]
+    if experiment.scan.aim == "angles":
+        images = list(resample_pair(*images, experiment.wake.spacing))
+    return images, pixel_times(experiment, scans)
+
+
+def _on_grid(experiment, images, like) -> list[xr.DataArray]:
+    """Images of the wake's grid on the grid of the measured ones."""
+    if experiment.scan.aim == "grid":
+        return images
+    return [image.interp(y=like[0]["y"], z=like[0]["z"]) for image in images]
+
+
+def _advected_by_the_mean(experiment, truth, air) -> list[xr.DataArray]:
+    """The first scan's air, at its reference time, moved with the slab's mean wind."""
+    start, v, w = truth.image(0), truth.wind["v"], truth.wind["w"]
+    dt = experiment.platform.dt
+    return [
+        advect_to(start, v, w, image["time"].values + which * dt)
+        if "time" in image.dims
+        else (advect(start, v, w, dt) if which else start)
+        for which, image in enumerate(air)
+    ]

@@ -78,11 +78,11 @@ def fit_pairs(
     method = vectors_method(experiment) if with_vectors else None
     log(f"fitting vortex pairs to the images{f' and to the vectors by {method}' if method else ''}")
     pair, noise = list(rendered_pairs(experiment, scans).values())[-1]
-    times, common = pixel_times(experiment, scans), common_error(experiment, plans)
+    times, (common, rotation) = pixel_times(experiment, scans), common_error(experiment, plans)
     ways = {
         Origin.IMAGES: lambda: fit_vortices(
             *pair, experiment.platform.dt, noise, times=times
-        ).with_common_error(common, common)
+        ).with_common_error(common, common, rotation)
     }
     if with_vectors:
         ways[Origin.VECTORS] = lambda: _from_vectors(vectors)

@@ -60,7 +60,9 @@ def cross_flow_winds(
     for index, (source, (pair, noise)) in enumerate(pairs.items()):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
         sizes = {name: getattr(settings, name) for name in ("template", "search", "stride")}
-        bound = wind_bound(*pair, experiment.platform.dt, noise, **sizes)
+        # the truth's images are photographs
+        seen = times if source in RENDERED else None
+        bound = wind_bound(*pair, experiment.platform.dt, noise, **sizes, times=seen)
         methods = []
         for method in settings.methods:
             wind = retrieve_wind(
@@ -69,8 +71,7 @@ def cross_flow_winds(
                 method=method,
                 **window_settings(settings),
                 noise=noise,
-                # the truth's images are photographs
-                times=times if source in RENDERED else None,
+                times=seen,
                 # the extinction itself has passed no instrument
                 blur=0.0 if source in EXACT else blur,
             )
@@ -78,9 +79,9 @@ def cross_flow_winds(
                 log.remark(f"{source}: {wind.attrs['fixed_pattern']} in all images")
             if "illumination" in wind.attrs and not methods:
                 log.remark(f"{source}: {wind.attrs['illumination']} between the images")
-            if settings.pointing.stderr:
-                common = common_error(experiment, plans) if source in RENDERED else 0.0
-                wind = with_common_error(wind, common, settings.pointing.offset)
+            if settings.pointing.stderr or settings.pointing.roll:
+                common = common_error(experiment, plans) if source in RENDERED else (0.0, 0.0)
+                wind = with_common_error(wind, common[0], settings.pointing.offset, common[1])
             wind = wind.assign(
                 {name: (field.dims, field.data, field.attrs) for name, field in bound.items()}
             )
@@ -169,10 +170,14 @@ def known_blur(experiment: Experiment, plan: ScanPlan) -> float:
     return float(experiment.lidar.radius_at(plan.centre)) / 2 if blur == "beam" else blur
 
 
-def common_error(experiment: Experiment, plans: Sequence[ScanPlan]) -> float:
-    """Standard error (m/s) of v and of w that all vectors share by the pointing between scans."""
+def common_error(experiment: Experiment, plans: Sequence[ScanPlan]) -> tuple[float, float]:
+    """Standard errors that all vectors share by the pointing between scans.
+
+    Of v and of w (m/s), and of a rotation about the axis of roll (rad/s).
+    """
+    pointing, dt = experiment.retrieval.pointing, experiment.platform.dt
     distance = sum(plan.centre for plan in plans) / len(plans)
-    return experiment.retrieval.pointing.stderr * distance / experiment.platform.dt
+    return pointing.stderr * distance / dt, pointing.roll / dt
 
 
 def window_settings(settings: Retrieval) -> dict[str, Any]:

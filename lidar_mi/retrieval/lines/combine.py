@@ -13,6 +13,7 @@ from scipy.linalg import solve_triangular
 from scipy.spatial import ConvexHull, QhullError
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.common_error import ROTATION
 from lidar_mi.retrieval.lines.crossflow import (
     apparent_slopes,
     checked_crossflow,
@@ -188,6 +189,8 @@ def combine(
             "window": window,
         },
     )
+    if ROTATION in crossflow:
+        combined[ROTATION] = crossflow[ROTATION]
     if field.common.any():
         combined = _with_common(combined, field, *_common(field, found, residual, shared))
     return combined

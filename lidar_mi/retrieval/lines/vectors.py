@@ -13,6 +13,8 @@ _NAMES = ("v_los", "v_los_std", "direction", "range", "platform_velocity")
 # Singular values of directions, smallest over largest, below which they lie in one plane: rounding
 # gives 1e-16, lines a second of arc apart 5e-6.
 _COPLANAR = 1e-8
+# Altitude over longest side of a triangle of lines, over that of the median one.
+_THINNEST = 0.1
 
 
 class LineFlag(enum.IntFlag):
@@ -123,7 +125,9 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
 
     Neighbours are those of a Delaunay triangulation of the directions (of their tangents, so that
     triangles are those in a plane x = const); the centre is the mean of the middles of the three
-    range bins (paper, fig. 1). The wind is assumed uniform over the three lines.
+    range bins (paper, fig. 1). The wind is assumed uniform over the three lines. Triangles so thin
+    that their altitude is below a tenth of the median one's, both over their longest side, have no
+    vector: at the rim of lines that are not on a grid they have errors of tens of lines.
 
     Parameters
     ----------
@@ -151,9 +155,18 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
             f"scan.direction: all {len(tangents)} lines lie in one plane; expected three lines "
             "that do not"
         ) from None
+    corners = corners[_thinness(tangents[corners]) >= _THINNEST]
     # Qhull's order is arbitrary: sort triangles by the numbers of their lines
     corners = np.sort(corners, axis=1)
     return _vectors(scan, along, corners[np.lexsort(corners.T[::-1])], "triples")
+
+
+def _thinness(corners: np.ndarray) -> np.ndarray:
+    """Altitude over longest side of triangles (n, 3, 2), over the median of all."""
+    sides = np.roll(corners, -1, 1) - corners
+    doubled = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
+    shape = doubled / (sides**2).sum(-1).max(1)
+    return shape / np.median(shape)
 
 
 def wind_from_neighbours(scan: xr.Dataset, count: int = 9) -> xr.Dataset:

@@ -129,6 +129,8 @@ def dataset(
         about = {"long_name": quantity.long_name, "units": quantity.units}
         result[name] = (), quantity.value, about
         about = about | {"long_name": f"standard error of {quantity.long_name}"}
+        if quantity.per_rotation:
+            about["per_rotation"] = quantity.per_rotation
         result[f"{name}_stderr"] = (), quantity.stderr, about
     result.attrs |= found.attributes
     for axis in result.dims:

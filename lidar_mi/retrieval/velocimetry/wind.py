@@ -304,11 +304,13 @@ def wind_bound(
     template: int = 8,
     search: int = 16,
     stride: int = 1,
+    times: Sequence[xr.DataArray] | None = None,
 ) -> xr.Dataset:
     """Least standard error of v and w (m/s) that any unbiased method has from each template alone.
 
     The Cramer-Rao bound, see `bound.displacement_bound`. Grid and parameters are those of
-    `retrieve_wind`. Infinite without texture, NaN near non-finite pixels. A field that is fitted
+    `retrieve_wind`, as is the time difference of a vector, which is that of air at rest. Infinite
+    without texture, NaN near non-finite pixels. A field that is fitted
     to the images as a whole uses more than a template and may be better. Noise below 0.001 of the
     median of a map is raised to that.
 
@@ -332,10 +334,12 @@ def wind_bound(
     rows, columns = (torch.as_tensor(windows.starts(axis)) for axis in (0, 1))
     root = covariance[:2, rows][:, :, columns].sqrt()
     root = torch.where(non_finite(pair, windows), torch.nan, root).numpy()
+    tau = checked_times(times, [image1, image2], dt)
+    apart = vector_times(tau, dt, windows, np.zeros((2, *windows.count)), False).difference
     found = {}
     for name, values, step in zip("wv", root, spacing(image1), strict=True):
         about = f"Cramer-Rao bound of {name} from one template", "m s-1"
-        found[f"{name}_bound"] = field(image1.dims, values * step / dt, *about)
+        found[f"{name}_bound"] = field(image1.dims, values * step / apart, *about)
     return xr.Dataset(found, centres(image1, windows, "template"))
 
 

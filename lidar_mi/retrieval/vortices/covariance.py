@@ -42,9 +42,7 @@ def parameter_covariance(found: Solution, error: ModelError, excess: float) -> n
         weight, jacobian, slope = weight[None], jacobian[:, None], slope[:, None]
     responses = torch.einsum("ozy,pozy,aozy->pazy", weight, jacobian, slope)
     spread = spread + spread_of(responses, error).double()
-    scale = found.normal.diagonal().sqrt()
-    inverse = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
-    inverse = inverse / scale / scale[:, None]
+    inverse = _inverse(found)
     covariance = (inverse @ spread @ inverse)[:10, :10]
     attenuation = _attenuation(found)
     covariance = covariance + torch.outer(attenuation, attenuation)
@@ -52,6 +50,27 @@ def parameter_covariance(found: Solution, error: ModelError, excess: float) -> n
         left = _remaining_step(found)
         covariance = covariance + torch.outer(left, left)
     return covariance.cpu().numpy()
+
+
+def _inverse(found: Solution) -> torch.Tensor:
+    scale = found.normal.diagonal().sqrt()
+    inverse = torch.linalg.pinv(found.normal / scale / scale[:, None], hermitian=True)
+    return inverse / scale / scale[:, None]
+
+
+def change_by_flow(found: Solution, flow: torch.Tensor) -> np.ndarray:
+    """Change (10,) of the parameters by a small flow that the model does not have.
+
+    Parameters
+    ----------
+    flow : torch.Tensor, shape (2, z, y)
+        Along y and z: displacements (m) of images, winds (m/s) of vectors, at the residuals.
+    """
+    misfit = found.misfit
+    flow = flow if misfit.slope.ndim == 3 else flow[:, None]
+    seen = (misfit.slope * flow.to(misfit.slope)).sum(0)
+    force = misfit.jacobian.flatten(1) @ (found.weight * seen).flatten()
+    return (_inverse(found) @ force.double())[:10].cpu().numpy()
 
 
 def _noise_spread(found: Solution, error: ModelError) -> torch.Tensor:

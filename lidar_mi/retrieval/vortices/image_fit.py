@@ -27,7 +27,11 @@ from lidar_mi.retrieval.vortices.acceptance import (
     no_fit,
     step_limits,
 )
-from lidar_mi.retrieval.vortices.covariance import model_error_of, parameter_covariance
+from lidar_mi.retrieval.vortices.covariance import (
+    change_by_flow,
+    model_error_of,
+    parameter_covariance,
+)
 from lidar_mi.retrieval.vortices.from_start import agrees, fit_from
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
 from lidar_mi.retrieval.vortices.model import Profile
@@ -237,6 +241,7 @@ def _checked(
         mean_length(error) * (make.spacing[0] * make.spacing[1]) ** 0.5,
         make.z,
         make.y,
+        change_by_flow(best, make.dt * torch.stack([-images.z, images.y])),
     )
 
 

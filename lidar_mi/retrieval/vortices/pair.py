@@ -9,6 +9,7 @@ import torch
 import xarray as xr
 
 from lidar_mi.atmosphere.vortex import Vortex
+from lidar_mi.errors import InputError
 from lidar_mi.retrieval.quantity import Quantity
 from lidar_mi.retrieval.vortices.model import Profile, angular_velocity, drift, sensitivity, wind
 from lidar_mi.tables import Table, Tabular, with_error
@@ -43,6 +44,9 @@ class VortexPairFit(Tabular):
         Why the fit is not accepted; empty if it is.
     from_start : bool
         Whether it was found from an expected pair, without a search.
+    turned : ndarray, shape (10,), optional
+        Change of the parameters per rad/s by which the observations turn about y = z = 0 between
+        the scans, from +y towards +z; of a roll that nobody knows.
     """
 
     parameters: np.ndarray
@@ -54,6 +58,7 @@ class VortexPairFit(Tabular):
     model_error_length: float
     reasons: tuple[str, ...] = ()
     from_start: bool = False
+    turned: np.ndarray | None = None
 
     @property
     def success(self) -> bool:
@@ -117,21 +122,45 @@ class VortexPairFit(Tabular):
         values = _derived(theta, self.profile)
         slope = torch.autograd.functional.jacobian(derived, theta).numpy()
         spread = np.sqrt(np.einsum("ij,jk,ik->i", slope, self.covariance, slope))
+        turned = np.zeros(len(spread)) if self.turned is None else slope @ self.turned
         return {
-            name: Quantity(float(value), float(error), *MEANING[name])
-            for (name, value), error in zip(values.items(), spread, strict=True)
+            name: Quantity(float(value), float(error), *MEANING[name], float(turn))
+            for (name, value), error, turn in zip(values.items(), spread, turned, strict=True)
         }
 
-    def with_common_error(self, v_stderr: float, w_stderr: float) -> "VortexPairFit":
-        """With an error of the wind, m/s, that all of its observations share, by unknown pointing.
+    def with_common_error(
+        self,
+        v_stderr: float,
+        w_stderr: float,
+        rotation_stderr: float = 0.0,
+        centre: tuple[float, float] = (0.0, 0.0),
+    ) -> "VortexPairFit":
+        """With errors of the wind that all of its observations share, by unknown pointing.
 
-        The mean wind is fitted, and so takes the whole error; what derives from it (drift, the wind
-        anywhere, places after some time) has it too. Circulations, radii and separation are as
-        certain as without. Places are as seen by the mean pointing of both scans.
+        The mean wind is fitted, and so takes all of an error of v and w (m/s); what derives from it
+        (drift, the wind anywhere, places after some time) has it too. Circulations, radii and
+        separation are as certain as without. Places are as seen by the mean pointing of both scans.
+        A rotation (rad/s, about ``centre``: y, z in m) changes all parameters: a vortex pair cannot
+        turn everywhere, and the fit takes part of it for circulation.
+
+        Raises
+        ------
+        InputError
+            A rotation of a pair that is not known to respond to it, as one read from a file.
         """
         common = np.zeros(len(self.parameters))
         common[8:10] = v_stderr, w_stderr
-        return replace(self, covariance=self.covariance + np.diag(common**2))
+        covariance = self.covariance + np.diag(common**2)
+        if rotation_stderr and np.isfinite(self.parameters).all():
+            if self.turned is None:
+                raise InputError(
+                    f"rotation_stderr: {rotation_stderr:g} rad/s is not allowed for a pair without "
+                    "`turned`; expected one that was fitted"
+                )
+            turned = self.turned.copy()
+            turned[8:10] += centre[1], -centre[0]
+            covariance = covariance + rotation_stderr**2 * np.outer(turned, turned)
+        return replace(self, covariance=covariance)
 
     def after(self, seconds: float) -> "VortexPairFit":
         """The pair after some time of drift, with its growing errors.

@@ -8,7 +8,7 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.common_error import common_stderr, own_errors
+from lidar_mi.retrieval.common_error import common_rotation, common_stderr, own_errors
 from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
     TOLERANCE,
@@ -17,7 +17,11 @@ from lidar_mi.retrieval.vortices.acceptance import (
     no_fit,
     step_limits,
 )
-from lidar_mi.retrieval.vortices.covariance import model_error_of, parameter_covariance
+from lidar_mi.retrieval.vortices.covariance import (
+    change_by_flow,
+    model_error_of,
+    parameter_covariance,
+)
 from lidar_mi.retrieval.vortices.model import Profile, sensitivity, wind
 from lidar_mi.retrieval.vortices.model_error import mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
@@ -169,8 +173,9 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         mean_length(error) * spacing,
         z,
         y,
+        change_by_flow(best, torch.stack([-model.z, model.y])),
     )
-    return found.with_common_error(*common)
+    return found.with_common_error(*common, *common_rotation(vectors))
 
 
 def _components(vectors: _Vectors, flow_variance: float) -> Observations:

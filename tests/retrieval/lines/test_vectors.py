@@ -270,3 +270,18 @@ def test_bad_input_is_named(call, start):
     with pytest.raises(InputError) as error:
         call()
     assert str(error.value).startswith(start) and "\n" not in str(error.value)
+
+
+def test_thin_triples_have_no_vector():
+    """Lines of a regular scan that a rolling platform moves a little out of their rows: slivers
+    along the rim, whose errors are many times those of the triples of the rows, are left out."""
+    scan = scanned(rows=5, columns=5)
+    regular = wind_from_triples(scan)
+    assert regular.sizes["vector"] == 32  # two of every square of lines
+    random = np.random.default_rng(3)
+    moved = scan["direction"].values + 1e-4 * random.standard_normal((25, 3))
+    moved /= np.linalg.norm(moved, axis=1, keepdims=True)
+    found = wind_from_triples(scan.assign(direction=(("line", "axis"), moved)))
+    assert found.sizes["vector"] == 32
+    for name in ("u_stderr", "v_stderr", "w_stderr"):
+        assert float(found[name].max()) < 1.2 * float(regular[name].max()), name

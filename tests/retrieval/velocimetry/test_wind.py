@@ -348,5 +348,10 @@ def test_bound_of_two_waves_on_the_grid_of_the_vectors():
     for name, wavenumber in (("v", a), ("w", b)):
         expected = np.sqrt(2) * noise / (16 * 0.1 * wavenumber) / DT
         np.testing.assert_allclose(bound[f"{name}_bound"], expected, rtol=0.02)
+    # rows of image 2 seen one after the other: a displacement over more and more time
+    late = xr.zeros_like(image) + 0.5 * DT * xr.DataArray(z / z[-1], {"z": image["z"]}, "z")
+    timed = wind_bound(image, image, DT, noise, 16, 24, 3, [xr.zeros_like(image), late])
+    expected = bound["v_bound"] / (1 + 0.5 * bound["z"] / z[-1])
+    np.testing.assert_allclose(timed["v_bound"], expected, rtol=1e-6)
     image[30, 40] = np.nan
     assert np.isnan(wind_bound(image, image, DT, noise)["v_bound"]).sum() == 16 * 16
