@@ -15,6 +15,9 @@ from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 # Relative rounding error of a factorisation: fifty times that of one entry.
 _ROUNDING = 1e-14
 
+# Residual over the right hand side that a step with a factor in single precision may leave.
+_SINGLE = 1e-3
+
 
 class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, and the factor of the second derivative there.
@@ -57,6 +60,33 @@ def solved(
     band = Band(*(axis.knots for axis in mesh.axes))
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     root = band.factor(data_form(linear, mesh) + stiff)
+    return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
+
+
+def solved_in_single(
+    linear: Linear,
+    mesh: Mesh,
+    coefficients: torch.Tensor,
+    prior: Prior,
+    settings: VariationalSettings,
+) -> Posterior:
+    """`solved` with a factor in single precision; its residual is looked at in double precision.
+
+    Where there is no such factor, or the residual is not small, all is in double precision.
+    """
+    band = Band(*(axis.knots for axis in mesh.axes))
+    stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
+    whole = data_form(linear, mesh) + stiff
+    try:
+        root = band.factor(whole.float())
+    except torch.linalg.LinAlgError:
+        root = None
+    if root is not None:
+        step = band.solve(root, gradient.float()).to(coefficients)
+        left = gradient - band.apply(whole, step)
+        if bool(left.norm() <= _SINGLE * gradient.norm()):
+            return Posterior(coefficients + step, band, root, prior, stiff)
+    root = band.factor(whole)
     return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
 
 

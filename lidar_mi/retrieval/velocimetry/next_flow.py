@@ -10,7 +10,7 @@ from lidar_mi.retrieval.velocimetry.band import spread
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.direct import Posterior, solved
+from lidar_mi.retrieval.velocimetry.direct import Posterior, solved_in_single
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh, interpolated
 from lidar_mi.retrieval.velocimetry.likelihood import Images, Linear, linearised, usable_and_weight
@@ -139,7 +139,7 @@ def next_flow(
     coefficients = start.coefficients
     for _ in range(_ROUNDS):
         linear = linearised(images, mesh, coefficients.float(), settings)
-        posterior = solved(linear, mesh, coefficients, prior, settings, 0)
+        posterior = solved_in_single(linear, mesh, coefficients, prior, settings)
         step = mesh.field((posterior.coefficients - coefficients).float())
         coefficients = posterior.coefficients
         far = float(step.abs().flatten().kthvalue(int(0.99 * step.numel())).values)

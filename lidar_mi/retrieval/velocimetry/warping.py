@@ -94,13 +94,19 @@ def _read_images(coefficients: torch.Tensor, z: torch.Tensor, y: torch.Tensor):
     row, column = z.floor(), y.floor()
     weight_z, weight_y = spline_weights(z - row), spline_weights(y - column)
     first = torch.arange(images, device=z.device).view(-1, *[1] * (z.ndim - 1)) * height
-    corner = (first + row.long()) * width + column.long()
+    # whole numbers of half the size, and no new memory, take half the time
+    kind = torch.int32 if coefficients.numel() < 2**31 else torch.int64
+    corner = ((first + row.to(kind)) * width + column.to(kind)).reshape(-1)
     flat = coefficients.reshape(-1)
     total = [torch.zeros_like(z) for _ in range(3)]
+    along, knot = [torch.zeros_like(z) for _ in range(2)], torch.empty_like(z)
     for i in range(4):
-        along = [torch.zeros_like(z) for _ in range(2)]
+        for part in along:
+            part.zero_()
+        number = corner + i * width
         for j in range(4):
-            knot = flat[corner + (i * width + j)]
+            torch.index_select(flat, 0, number, out=knot.view(-1))
+            number += 1
             along[0].addcmul_(knot, weight_y[0][j])
             along[1].addcmul_(knot, weight_y[1][j])
         total[0].addcmul_(along[0], weight_z[0][i])

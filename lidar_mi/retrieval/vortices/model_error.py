@@ -58,15 +58,20 @@ class Lags:
         Of the grid.
     like : torch.Tensor
         Of the type and device to work in.
+    reach : float
+        Lags (steps of the grid) that do not wrap. Left out, all of the grid.
     """
 
     shape: tuple[int, int]
     like: torch.Tensor
+    reach: float = np.inf
 
     @property
     def sizes(self) -> list[int]:
         """Lengths of the padded Fourier transform along each axis."""
-        return [scipy.fft.next_fast_len(2 * n, real=True) for n in self.shape]
+        return [
+            scipy.fft.next_fast_len(n + int(min(n, self.reach + 1)), real=True) for n in self.shape
+        ]
 
     def distance(self) -> torch.Tensor:
         """Of every lag, steps of the grid."""
@@ -85,7 +90,8 @@ class Lags:
     ) -> torch.Tensor:
         """Sum over the fields of weight * sum_x f(x) f(x + lag)."""
         power = sum(
-            w * self.transform(f).abs().square() for f, w in zip(fields, weights, strict=True)
+            w * torch.view_as_real(self.transform(f)).square().sum(-1)
+            for f, w in zip(fields, weights, strict=True)
         )
         return torch.fft.irfft2(power, s=self.sizes)
 
@@ -126,28 +132,28 @@ def model_error(
     shortest : float
         Lags below this (steps of the grid) are left out, as noise may correlate over them.
     change : torch.Tensor, optional
-        Correlation by another cause, by lags, of unknown amplitude; see `of_change`.
+        Correlation by another cause, of unknown amplitude, by the lags of `lags_used`; see
+        `of_change`.
     """
-    lags = Lags(tuple(force.shape[1:]), force)
+    lags = lags_used(force)
     observed = lags.autocorrelation(force, (1.0, 1.0))
     unit = lags.autocorrelation(stiffness, (1.0, 2.0, 1.0))
     distance = lags.distance()
-    side = min(lags.shape)
-    lengths = [length for length in _LENGTHS if length <= side / 5] or [side / 5]
-    used = (distance >= shortest) & (distance <= 2 * max(lengths))
+    lengths = _lengths(lags.shape)
+    used = (distance >= shortest) & (distance <= lags.reach)
     scale = unit[0, 0]
     if not float(scale) > 0 or not bool(used.any()):
         return ModelError()
-    columns = [unit[used] / scale * torch.exp(-(distance[used] ** 2) / (2 * n**2)) for n in lengths]
+    found, square = observed[used] / scale, distance[used].square()
+    size = float(found.abs().max())
+    if not size > 0:
+        return ModelError()
+    relative = unit[used] / scale
+    columns = [relative * torch.exp(-square / (2 * n**2)) for n in lengths]
     if change is not None:
         columns.append(change[used] / change.abs().max().clamp(min=1e-300))
     # normalised in both directions: least squares needs numbers near one
-    size = float((observed[used] / scale).abs().max())
-    if not size > 0:
-        return ModelError()
-    amplitudes, _ = nnls(
-        torch.stack(columns, 1).cpu().numpy(), (observed[used] / scale / size).cpu().numpy()
-    )
+    amplitudes, _ = nnls(torch.stack(columns, 1).cpu().numpy(), (found / size).cpu().numpy())
     variances = amplitudes[: len(lengths)] * size
     if change is not None:
         explained = scale * sum(
@@ -159,6 +165,17 @@ def model_error(
             return ModelError()
     kept = [(float(a), n) for a, n in zip(variances, lengths, strict=True) if a > 0]
     return ModelError(tuple(a for a, _ in kept), tuple(n for _, n in kept))
+
+
+def lags_used(like: torch.Tensor) -> Lags:
+    """The lags that `model_error` looks at, of fields (..., z, y)."""
+    shape = tuple(like.shape[-2:])
+    return Lags(shape, like, 2 * max(_lengths(shape)))
+
+
+def _lengths(shape: tuple[int, int]) -> list[float]:
+    side = min(shape)
+    return [length for length in _LENGTHS if length <= side / 5] or [side / 5]
 
 
 def of_change(residual: torch.Tensor, slope: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
@@ -175,7 +192,7 @@ def of_change(residual: torch.Tensor, slope: torch.Tensor, valid: torch.Tensor) 
         Weighted.
     valid : torch.Tensor of bool, shape (z, y)
     """
-    lags = Lags(tuple(residual.shape), residual)
+    lags = lags_used(residual)
     number = lags.autocorrelation([valid.to(residual)], (1.0,)).clamp(min=1)
     alike = lags.autocorrelation([valid * residual], (1.0,)) / number
     return alike * lags.autocorrelation(slope, (1.0, 1.0))

@@ -10,6 +10,9 @@ import pytest
 import torch
 
 from benchmarks.cases import DT, SPACING, drifting_pair_images
+from lidar_mi.retrieval.velocimetry.direct import solved, solved_in_single
+from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
+from lidar_mi.retrieval.velocimetry.likelihood import linearised
 from lidar_mi.retrieval.velocimetry.next_flow import next_flow
 from lidar_mi.retrieval.velocimetry.variational import variational, variational_and_flow
 from lidar_mi.retrieval.velocimetry.windows import Windows
@@ -50,6 +53,26 @@ def learnt(slabs):
 def test_what_is_kept_changes_nothing(slabs, learnt):
     alone = variational(*tensors(slabs[0]), noise=0.03)
     torch.testing.assert_close(learnt[0].d, alone.d, rtol=1e-9, atol=1e-12)
+
+
+def test_a_step_with_a_factor_in_single_precision(slabs, learnt):
+    """To a hundredth of a standard error, and in double precision where there is no such factor."""
+    flow = learnt[1]
+    mesh = Mesh(flow.prior.mesh.axes, [torch.arange(n, dtype=torch.float64) for n in (90, 130)])
+    start = 0.9 * flow.coefficients
+    linear = linearised(flow.images, mesh, start, flow.settings)
+    exact = solved(linear, mesh, start, flow.prior, flow.settings, 0)
+    found = solved_in_single(linear, mesh, start, flow.prior, flow.settings)
+    assert found.root.root.dtype == torch.float32
+    stderr = learnt[0].covariance.diagonal().sqrt().median()
+    off = mesh.field(found.coefficients - exact.coefficients)
+    assert float(off.abs().max()) < 0.05 * float(stderr)
+    assert float(off.square().mean().sqrt()) < 0.01 * float(stderr)
+    # stronger by far than single precision resolves beside the data
+    stiff = flow.prior._replace(local=1e12 * flow.prior.local)
+    assert (
+        solved_in_single(linear, mesh, start, stiff, flow.settings).root.root.dtype == torch.float64
+    )
 
 
 def test_the_same_images_again_give_the_same_flow(slabs, learnt):

@@ -12,6 +12,7 @@ from scipy.ndimage import gaussian_filter
 from lidar_mi.retrieval.vortices.model_error import (
     Lags,
     ModelError,
+    lags_used,
     mean_length,
     model_error,
     of_change,
@@ -65,6 +66,15 @@ def test_autocorrelation_is_the_sum_over_pairs(shape):
                         expected += weight * field[z, y] * field[z + dz, y + dy]
         assert float(found[dz, dy]) == pytest.approx(expected, rel=1e-10, abs=1e-10)
         assert float(distance[dz, dy]) == pytest.approx(np.hypot(dz, dy))
+
+
+def test_lags_within_reach_are_those_of_the_whole_grid():
+    fields = torch.randn(1, 40, 61, generator=torch.Generator().manual_seed(3)).double()
+    few, every = lags_used(fields), Lags((40, 61), fields)
+    assert few.reach == 2 * 6.0 and few.sizes[0] < every.sizes[0]
+    found, expected = (lags.autocorrelation(fields, (1.0,)) for lags in (few, every))
+    for dz, dy in ((0, 0), (12, 0), (-12, 3), (5, -12)):
+        assert float(found[dz, dy]) == pytest.approx(float(expected[dz, dy]), rel=1e-9, abs=1e-9)
 
 
 @pytest.mark.parametrize("shape", [(9, 11), (12, 8)])
