@@ -18,7 +18,13 @@ from .report import Comparison, Row, row
 
 SIZES = ((219, 139), (438, 278), (700, 700), (1000, 1000))
 NOISE = 0.02
-PEER_OF = {"variational": "OpenCV DIS", "multipass": "OpenPIV window deformation"}
+PEER_OF = {
+    "variational": "OpenCV DIS",
+    "multipass": "OpenPIV window deformation",
+    "vortex_fit": None,
+}
+# Images of more pixels are timed once: a turn takes minutes.
+_ONCE = 150_000
 
 
 class Cost(NamedTuple):
@@ -30,21 +36,27 @@ class Cost(NamedTuple):
 
 
 def compare(repeats: int = 5, sizes: Sequence[tuple[int, int]] = SIZES) -> Comparison:
-    """Medians over the turns; last the power of the number of pixels that the times follow."""
+    """Medians over the turns; last the power of the number of pixels that the times follow.
+
+    Images of more than 150000 pixels have one turn. `vortex_fit` has no peer.
+    """
     lines: list[Row] = []
     for method, peer in PEER_OF.items():
-        package = PEERS[peer][1]
-        note = "" if find_spec(package) else f"skipped: pip install {PIP[package]}"
-        names = [method] if note else [method, peer]
+        note = "no peer"
+        if peer is not None:
+            package = PEERS[peer][1]
+            note = "" if find_spec(package) else f"skipped: pip install {PIP[package]}"
+        names = [method] if peer is None or note else [method, peer]
         found = {
-            name: [[measured(name, size) for _ in range(repeats)] for size in sizes]
+            name: [[measured(name, size) for _ in range(_turns(size, repeats))] for size in sizes]
             for name in names
         }
+        title = f"{method} | {peer}" if peer else method
         for which, (columns, rows) in enumerate(sizes):
             sides = [found[name][which] for name in names]
             lines += [
                 row(
-                    f"{method} | {peer}: {columns} x {rows} px",
+                    f"{title}: {columns} x {rows} px",
                     quantity,
                     unit,
                     *([cost[index] for cost in costs] for costs in sides),
@@ -56,7 +68,7 @@ def compare(repeats: int = 5, sizes: Sequence[tuple[int, int]] = SIZES) -> Compa
                 )
             ]
         powers = [[power(sizes, found[name])] for name in names]
-        case = f"{method} | {peer}: time of all cores ~ pixels^p"
+        case = f"{title}: time of all cores ~ pixels^p"
         lines.append(row(case, "p", "", *powers, note=note))
     return Comparison(
         "Growth with the image",
@@ -74,6 +86,10 @@ def measured(name: str, size: tuple[int, int]) -> Cost:
     """The cost of a method of lidar-mi or of a peer for images of so many columns and rows."""
     with fresh_process() as process:
         return process.submit(_cost, name, size).result()
+
+
+def _turns(size: tuple[int, int], repeats: int) -> int:
+    return 1 if size[0] * size[1] > _ONCE else repeats
 
 
 def power(sizes: Sequence[tuple[int, int]], costs: Sequence[Sequence[Cost]]) -> float:
