@@ -137,3 +137,19 @@ def test_a_kept_report_is_linked():
 def test_an_unknown_metric_is_refused():
     with pytest.raises(InputError, match=r"sensor\.rmse_x"):
         page(sweep(), "name: test", ["sensor.rmse_x"])
+
+
+def test_quantities_are_in_the_units_that_people_use():
+    """Angles in degrees, pulses in mJ; what was collected stays in SI."""
+    dataset = sweep(1)
+    angle = (
+        "range",
+        np.radians([10.0, 20.0, 40.0]),
+        {"units": "rad", "long_name": "crossing angle"},
+    )
+    small = 0.02 * dataset["energy"]
+    dataset = dataset.assign_coords(range=angle, energy=small.assign_attrs(dataset["energy"].attrs))
+    html = page(dataset, "name: test")
+    assert "10 to 40 deg" in html and "0.002 to 2 mJ" in html
+    assert "crossing angle / deg" in html and " rad" not in html.split("name: test")[0]
+    assert dataset["range"].attrs["units"] == "rad"
