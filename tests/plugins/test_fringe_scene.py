@@ -650,7 +650,7 @@ def test_gradients_are_refused():
     """Not taken as 0: neither backward nor forward."""
     rings = scene(size=(8, 6))
     integrator = rings.integrator()
-    image = mi.TensorXf(0.0, (6, 8, 5))
+    image = dr.zeros(mi.TensorXf, (6, 8, 5))
     for call in (
         lambda: integrator.render_forward(rings, None, spp=2),
         lambda: integrator.render_backward(rings, None, image, spp=2),
