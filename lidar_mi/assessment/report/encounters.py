@@ -7,23 +7,17 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.figures.campaign import draw_against, draw_distributions
+from lidar_mi.assessment.figures.encounter import FLIGHTS
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 from lidar_mi.assessment.report.block import Block
 from lidar_mi.assessment.report.digits import with_error
-
-_MODES = {
-    "off": "without control",
-    "autopilot": "autopilot",
-    "feedforward": "with the lidar",
-    "perfect": "perfect preview",
-}
 
 
 def encounter_blocks(known: Mapping[str, xr.DataArray]) -> Iterator[Block]:
     """Distribution of the largest bank angle of all flights, and the fraction below the limit."""
     rolls = {
         name: np.degrees(np.abs(known[f"encounter.{mode}.largest_roll"].values.ravel()))
-        for mode, name in _MODES.items()
+        for mode, (name, *_) in FLIGHTS.items()
         if f"encounter.{mode}.largest_roll" in known
     }
     rolls = {name: values[np.isfinite(values)] for name, values in rolls.items()}
@@ -37,7 +31,7 @@ def encounter_blocks(known: Mapping[str, xr.DataArray]) -> Iterator[Block]:
     label = "largest bank angle / °"
     panels = [draw_distributions("", rolls, label, limit)]
     off, *steered = rolls
-    if off == _MODES["off"] and steered and min(map(np.min, rolls.values())) > 0:
+    if off == FLIGHTS["off"][0] and steered and min(map(np.min, rolls.values())) > 0:
         against = {name: rolls[name] for name in steered}
         panels.append(draw_against(label, (off, rolls[off]), against, limit))
     yield Block("Bank angle", text, panels)
