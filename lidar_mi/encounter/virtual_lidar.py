@@ -187,9 +187,9 @@ class VirtualLidar:
     def _scanned(self, number: int, pose: AircraftPose) -> _Scan:
         """Both images of a scan with the detector's noise."""
         experiment, gates = self.experiment, self.gates
-        plan = gates.plan(pose.x - number * gates.stride)
-        turned = pointing_error(experiment, number, number * gates.period)
         ahead = pose.x - number * gates.stride
+        plan = gates.plan(ahead)
+        turned = pointing_error(experiment, number, number * gates.period)
         air = self.air.at_scan(number, (pose.y, pose.z), ahead, turned)
         use_variant(experiment.render.variant)
         if self._renderer is None:
