@@ -1,5 +1,6 @@
 """``lidar-mi fly``: an aircraft flies into the wake of an experiment."""
 
+import os
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -42,6 +43,16 @@ def fly(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace a flight of a different experiment.")
     ] = False,
+    processes: Annotated[
+        int,
+        typer.Option(
+            min=1,
+            max=2,
+            help="2: wind and vortices are estimated at the same time. Default: 2 where there are "
+            "two cores.",
+            show_default=False,
+        ),
+    ] = min(2, os.cpu_count() or 1),
 ) -> None:
     """Fly into the wake of an experiment, with the lidar in the loop.
 
@@ -64,7 +75,7 @@ def fly(
         )
     folder = out or Path("outputs") / loaded.name
     with progress() as notice:
-        done = start(loaded, folder, overwrite=overwrite, notice=notice)
+        done = start(loaded, folder, overwrite=overwrite, processes=processes, notice=notice)
     print_answer(done.answer)
     for table in done.tables()[1:]:
         print_table(table)

@@ -28,7 +28,8 @@ class Estimate:
     flags : tuple of str
         What limits the use of the estimate; empty if nothing does.
     seconds : mapping
-        Time that each part of the estimate took, s, without the rendering.
+        Time that each part of the estimate took, s, without the rendering. `total` is all of it;
+        left out, it is their sum.
     """
 
     time: float

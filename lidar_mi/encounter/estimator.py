@@ -4,17 +4,13 @@ import time
 from collections.abc import Sequence
 from contextlib import contextmanager
 
-import torch
 import xarray as xr
 
+from lidar_mi.encounter.slab_winds import InOwnProcess, SlabPair, SlabWinds
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
-from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST, ImageMethod
-from lidar_mi.retrieval.velocimetry.next_flow import Flow
-from lidar_mi.retrieval.velocimetry.slabs import wind_of_slab
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
-from lidar_mi.retrieval.vortices.model import wind as model_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
@@ -31,15 +27,20 @@ class Estimator:
         Only "variational" has a fast form.
     vectors : bool
         Whether the wind is retrieved besides the vortices.
+    processes : int
+        2: the wind is retrieved in a process of its own, while this one fits the vortices. The
+        numbers are the same but for rounding. It pays where a second core is idle.
     """
 
-    def __init__(self, experiment: Experiment, *, vectors: bool = True):
+    def __init__(self, experiment: Experiment, *, vectors: bool = True, processes: int = 1):
         settings = experiment.retrieval
         methods = [method for method in MOST_ACCURATE_FIRST if method in settings.methods]
-        self._method = methods[0] if vectors and methods else None
-        self._windows = window_settings(settings)
-        # the last slab's flow and pair, from which the next wind starts
-        self._last: tuple[Flow, VortexPairFit] | None = None
+        self._winds: SlabWinds | InOwnProcess | None = None
+        if vectors and methods:
+            form = SlabWinds if processes == 1 else InOwnProcess
+            self._winds = form(methods[0], window_settings(settings))
+        # the last slab's vortices, near which the next wind starts
+        self._last: VortexPairFit | None = None
 
     def pair_of(
         self,
@@ -73,46 +74,20 @@ class Estimator:
         pair : VortexPairFit
             Its `from_start` says whether it was found from the expected one.
         seconds : dict
-            Of the parts `vortices` and `wind`.
+            Of the parts `vortices` and `wind`, and of both, `total`: with two processes about the
+            longer one.
         """
         seconds: dict[str, float] = {}
-        with _timed(seconds, "vortices"):
-            pair = fit_vortices(image1, image2, dt, noise, times=times, start=expected)
-        if self._method is None:
-            return None, pair, seconds
-        with _timed(seconds, "wind"):
-            options = self._windows | {"noise": noise, "times": times}
-            if self._method == ImageMethod.VARIATIONAL:
-                start = self._expected(image1, dt, pair) if expected is not None else None
-                wind, flow = wind_of_slab(image1, image2, dt, start, **options)
-                self._last = (flow, pair) if flow is not None and pair.success else None
-            else:
-                wind = retrieve_wind(image1, image2, dt, str(self._method), **options)
+        slab = SlabPair(image1, image2, dt, noise, times, expected)
+        wind = None
+        with _timed(seconds, "total"):
+            coming = self._winds and self._winds.begun(slab, self._last)
+            with _timed(seconds, "vortices"):
+                pair = fit_vortices(image1, image2, dt, noise, times=times, start=expected)
+            if coming is not None:
+                wind, seconds["wind"] = coming()
+        self._last = pair if pair.success else None
         return wind, pair, seconds
-
-    def _expected(self, image: xr.DataArray, dt: float, pair: VortexPairFit) -> Flow | None:
-        """The last flow, moved with the pair and changed as the winds of both pairs differ."""
-        if self._last is None or not pair.success:
-            return None
-        flow, before = self._last
-        if image.shape != flow.windows.shape:
-            return None
-        y, z = (torch.as_tensor(image[name].values.astype(float)) for name in ("y", "z"))
-        step = [float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (z, y)]
-        now, then = (torch.as_tensor(fit.parameters) for fit in (pair, before))
-        shift = [float((now - then)[places].mean()) for places in ([3, 7], [2, 6])]
-        moved = then.clone()
-        moved[[3, 7]] += shift[0]
-        moved[[2, 6]] += shift[1]
-        places = torch.meshgrid(z, y, indexing="ij")[::-1]
-        v, w = (
-            a - b
-            for a, b in zip(
-                *(model_wind(theta, *places, pair.profile) for theta in (now, moved)), strict=True
-            )
-        )
-        change = torch.stack([w * dt / step[0], v * dt / step[1]])
-        return flow.moved([by / size for by, size in zip(shift, step, strict=True)], change)
 
 
 @contextmanager

@@ -80,6 +80,7 @@ def fly_all(
     lidar: Lidar | None = None,
     aircraft: OwnAircraft | None = None,
     controller: OwnController | None = None,
+    processes: int = 1,
 ) -> Flown:
     """All flights of an experiment's mode of control.
 
@@ -95,6 +96,8 @@ def fly_all(
     controller : callable, optional
         Gives the controller of an aircraft, which steers where there is a preview; default:
         `feedforward`.
+    processes : int
+        As `VirtualLidar` takes it.
     """
     encounter = encounter_of(experiment)
     wake = wake_along_path(experiment)
@@ -112,7 +115,7 @@ def fly_all(
         elif mode == PERFECT:
             found[mode] = flown(one, steers(one), wake, encounter, told, preview_of(one, wake.wind))
         else:
-            instrument = lidar or _virtual_lidar(experiment)
+            instrument = lidar or _virtual_lidar(experiment, processes)
             seen = Seen(instrument)
             period = 1 / encounter.rate
             stride = period * encounter.path.speed
@@ -183,8 +186,8 @@ def _titled(notice: Notice, mode: str) -> Notice:
     return lambda text, fraction: notice(f"{TITLES[mode]}: {text}", fraction)
 
 
-def _virtual_lidar(experiment: Experiment) -> Lidar:
+def _virtual_lidar(experiment: Experiment, processes: int) -> Lidar:
     # loads Mitsuba
     from lidar_mi.encounter.virtual_lidar import VirtualLidar
 
-    return VirtualLidar(experiment)
+    return VirtualLidar(experiment, processes=processes)

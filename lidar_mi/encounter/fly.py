@@ -88,6 +88,7 @@ def fly(
     aircraft: Callable | None = None,
     controller: Callable | None = None,
     overwrite: bool = False,
+    processes: int = 1,
     notice: Callable | None = None,
 ) -> Flight:
     """Fly into the wake: without control, with an autopilot, steered by the lidar, by the truth.
@@ -112,6 +113,9 @@ def fly(
         default: `lidar_mi.encounter.control.feedforward`. It steers wherever there is a preview.
     overwrite : bool
         Replace the flight of another experiment.
+    processes : int
+        2: the lidar's wind is estimated in a process of its own, which is faster where a second
+        core is idle. The flights are the same but for rounding.
     notice : callable, optional
         Called with what is running and how far it is (0 to 1, or None).
 
@@ -145,6 +149,7 @@ def fly(
                 aircraft=aircraft,
                 controller=controller,
                 overwrite=overwrite,
+                processes=processes,
                 notice=shown,
             )
     if not isinstance(experiment, Experiment):
@@ -155,13 +160,13 @@ def fly(
         log.remark(text)
     own = {"lidar": lidar, "aircraft": aircraft, "controller": controller}
     if folder is None:
-        return _in_memory(experiment, own, log)
+        return _in_memory(experiment, own, processes, log)
     kept = FlightFolder(folder, experiment)
     with kept.claimed(overwrite):
         log.path = kept.log
         log(f"lidar-mi {__version__}, flight {experiment.name}, seed {experiment.seed}")
         try:
-            return _into(kept, experiment, own, log)
+            return _into(kept, experiment, own, processes, log)
         except BaseException as error:
             if is_interrupt(error):
                 error.add_note("start it again to fly again")
@@ -172,18 +177,20 @@ def fly(
             raise
 
 
-def _in_memory(experiment: Experiment, own: dict, log: Log) -> Flight:
-    flown = fly_all(experiment, log.bar, **own)
+def _in_memory(experiment: Experiment, own: dict, processes: int, log: Log) -> Flight:
+    flown = fly_all(experiment, log.bar, **own, processes=processes)
     metrics = encounter_metrics(flown.series, flown.track)
     return Flight(experiment, flown, metrics, tuple(log.warnings))
 
 
-def _into(kept: FlightFolder, experiment: Experiment, own: dict, log: Log) -> Flight:
+def _into(
+    kept: FlightFolder, experiment: Experiment, own: dict, processes: int, log: Log
+) -> Flight:
     """Fly what the folder does not have yet; parts of one's own have no record and fly again."""
     flown = None if any(own.values()) else kept.flown()
     metrics = kept.metrics() if flown else None
     if flown is None:
-        flown = fly_all(experiment, log.bar, **own)
+        flown = fly_all(experiment, log.bar, **own, processes=processes)
         kept.keep(flown)
         log(f"flown: {', '.join(map(str, flown.series['flight'].values))}")
     if metrics is None:

@@ -168,7 +168,7 @@ def _row(slab: Slab, wake: WakeAlongPath) -> dict[Any, float]:
         "rejected": float(track.rejected if track else 0),
         "innovation": float(innovation[0]),
         "innovation_dof": float(innovation[1]),
-        "seconds": float(sum(estimate.seconds.values())),
+        "seconds": float(estimate.seconds.get("total", sum(estimate.seconds.values()))),
         **_wind_errors(estimate.wind, wake, estimate.x, estimate.time),
     }
     tracked = track.pair_at(estimate.x, estimate.time) if track else None

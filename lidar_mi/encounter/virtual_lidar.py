@@ -76,6 +76,10 @@ class VirtualLidar:
     ----------
     experiment : Experiment, str or path
         With a section ``encounter`` and a wake of ``vortex_pair``.
+    processes : int
+        2: the wind is estimated in a process of its own, at the same time as the vortices, as by an
+        aircraft's computer with two cores. The estimates are the same but
+        for rounding.
 
     Raises
     ------
@@ -102,7 +106,7 @@ class VirtualLidar:
     """
 
     @checked_arguments
-    def __init__(self, experiment: Experiment | str | Path):
+    def __init__(self, experiment: Experiment | str | Path, *, processes: int = 1):
         if not isinstance(experiment, Experiment):
             experiment = load_experiment(experiment)
         self.experiment = experiment
@@ -110,7 +114,7 @@ class VirtualLidar:
         self.gates: Gates = gates_of(experiment)
         self.air: Air = air_of(experiment, self.gates)
         self.images: SlabImages | None = None
-        self._estimator = Estimator(experiment)
+        self._estimator = Estimator(experiment, processes=processes)
         self._renderer: ScanRenderer | None = None
         self._scans: dict[int, _Scan] = {}
 

@@ -50,6 +50,9 @@ class Flow:
         Mean square of the residuals then, over that of the noise.
     windows : Windows
     settings : VariationalSettings
+    offset : (float, float)
+        Along z and y, px: how far what was learnt of places (the prior's strength, `before`,
+        `local`) has moved since.
     """
 
     coefficients: torch.Tensor
@@ -61,8 +64,11 @@ class Flow:
     misfit: float
     windows: Windows
     settings: VariationalSettings
+    offset: Sequence[float] = (0.0, 0.0)
 
-    def moved(self, shift: Sequence[float], change: torch.Tensor) -> "Flow":
+    def moved(
+        self, shift: Sequence[float], change: torch.Tensor, offset: Sequence[float] | None = None
+    ) -> "Flow":
         """The flow expected where its structure has moved and changed.
 
         Parameters
@@ -71,18 +77,29 @@ class Flow:
             Along z and y, px; edges continue beyond.
         change : torch.Tensor, shape (2, z, y)
             Of the flow after this shift, px in dt, as by a model of both.
+        offset : (float, float), optional
+            See `Flow`. Left out: the last one and the shift.
         """
         axes, like = self.prior.mesh.axes, self.coefficients
-        pixels, centres = _pixels(self.windows, like), _centres(self.windows, like)
+        pixels = _pixels(self.windows, like)
         flow = Mesh(axes, _back(pixels, shift)).field(self.coefficients) + change.to(like)
-        mesh = self.prior.mesh
-        strength = interpolated(self.prior.local.log(), mesh.places, _back(mesh.places, shift))
+        if offset is None:
+            offset = [sum(pair) for pair in zip(self.offset, shift, strict=True)]
+        return replace(self, coefficients=Mesh(axes, pixels).fitted(flow), offset=offset)
+
+    def placed(self) -> "Flow":
+        """What was learnt of places, where it is now: interpolated once, however often it moved."""
+        if not any(self.offset):
+            return self
+        pixels, centres = (of(self.windows, self.coefficients) for of in (_pixels, _centres))
+        places = self.prior.mesh.places
+        strength = interpolated(self.prior.local.log(), places, _back(places, self.offset))
         return replace(
             self,
-            coefficients=Mesh(axes, pixels).fitted(flow),
             prior=self.prior._replace(local=strength.exp()),
-            before=interpolated(self.before, centres, _back(centres, shift)),
-            local=interpolated(self.local, pixels, _back(pixels, shift)),
+            before=interpolated(self.before, centres, _back(centres, self.offset)),
+            local=interpolated(self.local, pixels, _back(pixels, self.offset)),
+            offset=(0.0, 0.0),
         )
 
 
@@ -133,8 +150,9 @@ def next_flow(
     min_correlation : float
         As `variational` takes them.
     """
-    windows, settings, prior = start.windows, start.settings, start.prior
-    images = _prepared(start, stack, noise)
+    placed = start.placed()
+    windows, settings, prior = start.windows, start.settings, placed.prior
+    images = _prepared(placed, stack, noise)
     mesh = Mesh(prior.mesh.axes, _pixels(windows, images.spline.coefficients))
     coefficients = start.coefficients
     for _ in range(_ROUNDS):
@@ -155,7 +173,7 @@ def next_flow(
     in_single = Mesh(prior.mesh.axes, _centres(windows, root.root))
     covariance = worse * spread(posterior.band.covariance(root), in_single).to(coefficients)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
-    found = flagged(d, covariance, start.before, score, stack, windows, min_correlation)
+    found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
     found = found._replace(flag=found.flag | unskilled(found.d, covariance))
     return found, replace(start, coefficients=coefficients)
 

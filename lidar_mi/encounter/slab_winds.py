@@ -1,0 +1,168 @@
+"""The winds of successive slabs, each from the one before; here or in a process of its own."""
+
+import time
+import weakref
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import loky
+import torch
+import xarray as xr
+
+from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.retrieval.velocimetry.next_flow import Flow
+from lidar_mi.retrieval.velocimetry.slabs import wind_of_slab
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.vortices.model import wind as model_wind
+from lidar_mi.retrieval.vortices.pair import VortexPairFit
+
+# Wind and the time that it took, s.
+Found = tuple[xr.Dataset, float]
+
+# Of both vortices, z and y, among the parameters of a pair.
+_PLACES = ([3, 7], [2, 6])
+
+
+class SlabPair(NamedTuple):
+    """Two images of a slab, and the pair of vortices that is expected there.
+
+    Attributes
+    ----------
+    first, second : DataArray, dims (z, y)
+    dt : float
+        s.
+    noise : float or DataArray, optional
+        As `retrieve_wind` takes it.
+    times : sequence of two DataArray, optional
+        Of the pixels, as `retrieve_wind` takes them.
+    expected : VortexPairFit, optional
+        At mid-time.
+    """
+
+    first: xr.DataArray
+    second: xr.DataArray
+    dt: float
+    noise: float | xr.DataArray | None = None
+    times: Sequence[xr.DataArray] | None = None
+    expected: VortexPairFit | None = None
+
+
+class SlabWinds:
+    """The winds of successive slabs by one method.
+
+    By "variational" a wind starts from the last one, moved with the expected pair and changed as
+    the winds of both pairs differ. It does not wait for this slab's vortices. Other methods start
+    from nothing.
+
+    Parameters
+    ----------
+    method : ImageMethod
+    windows : mapping
+        Options of `retrieve_wind`.
+    """
+
+    def __init__(self, method: ImageMethod, windows: dict[str, Any]):
+        self._method, self._windows = method, windows
+        self._flow: Flow | None = None
+        # the pair of the slab whose wind was found from nothing: prior and noise are known there
+        self._learnt: VortexPairFit | None = None
+
+    def begun(self, slab: SlabPair, before: VortexPairFit | None) -> Callable[[], Found]:
+        """The next slab's wind, retrieved when it is asked for.
+
+        Parameters
+        ----------
+        slab : SlabPair
+        before : VortexPairFit, optional
+            Found in the last slab.
+
+        Returns
+        -------
+        callable
+            Gives the wind as `retrieve_wind` does, and the time that it took, s. By "variational"
+            the wind's attribute `from_start` says whether it was found from the last one.
+        """
+        return partial(self._timed, slab, before)
+
+    def _timed(self, slab: SlabPair, before: VortexPairFit | None) -> Found:
+        began = time.perf_counter()
+        return self._wind(slab, before), time.perf_counter() - began
+
+    def _wind(self, slab: SlabPair, before: VortexPairFit | None) -> xr.Dataset:
+        options = self._windows | {"noise": slab.noise, "times": slab.times}
+        images = slab.first, slab.second, slab.dt
+        if self._method != ImageMethod.VARIATIONAL:
+            return retrieve_wind(*images, str(self._method), **options)
+        wind, self._flow = wind_of_slab(*images, self._start(slab, before), **options)
+        if not wind.attrs["from_start"]:
+            self._learnt = None
+        return wind
+
+    def _start(self, slab: SlabPair, before: VortexPairFit | None) -> Flow | None:
+        flow, expected = self._flow, slab.expected
+        if flow is None or expected is None or before is None:
+            return None
+        if slab.first.shape != flow.windows.shape:
+            return None
+        self._learnt = self._learnt or before
+        return _moved(flow, slab, before, self._learnt)
+
+
+def _moved(flow: Flow, slab: SlabPair, before: VortexPairFit, learnt: VortexPairFit) -> Flow:
+    """The flow in the last slab's pair, where the next one is expected."""
+    z, y = (torch.as_tensor(slab.first[name].values.astype(float)) for name in ("z", "y"))
+    step = [float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (z, y)]
+    pair = slab.expected
+    now, then, first = (torch.as_tensor(fit.parameters) for fit in (pair, before, learnt))
+    shift, since = (
+        [float((now - other)[places].mean()) for places in _PLACES] for other in (then, first)
+    )
+    moved = then.clone()
+    for places, by in zip(_PLACES, shift, strict=True):
+        moved[places] += by
+    nodes = torch.meshgrid(z, y, indexing="ij")[::-1]
+    v, w = (
+        a - b
+        for a, b in zip(
+            *(model_wind(theta, *nodes, pair.profile) for theta in (now, moved)), strict=True
+        )
+    )
+    change = torch.stack([w * slab.dt / step[0], v * slab.dt / step[1]])
+    in_pixels = [[by / size for by, size in zip(s, step, strict=True)] for s in (shift, since)]
+    return flow.moved(in_pixels[0], change, in_pixels[1])
+
+
+class InOwnProcess:
+    """`SlabWinds` in a process of its own, so that another core does the work meanwhile.
+
+    Its numbers are those of `SlabWinds` but for rounding. The process ends with this object.
+    """
+
+    def __init__(self, method: ImageMethod, windows: dict[str, Any]):
+        self._pool = loky.ProcessPoolExecutor(1, initializer=_begin, initargs=(method, windows))
+        # before the interpreter takes apart what the pool still needs
+        weakref.finalize(self, self._pool.shutdown)
+        # what is imported once is not a part of the first wind
+        self._pool.submit(_ready).result()
+
+    def begun(self, slab: SlabPair, before: VortexPairFit | None) -> Callable[[], Found]:
+        """As `SlabWinds.begun`; retrieved from now on."""
+        return self._pool.submit(_found, slab, before).result
+
+
+_winds: SlabWinds
+
+
+def _begin(method: ImageMethod, windows: dict[str, Any]) -> None:
+    global _winds
+    torch.set_num_threads(1)
+    _winds = SlabWinds(method, windows)
+
+
+def _ready() -> None:
+    """Nothing."""
+
+
+def _found(slab: SlabPair, before: VortexPairFit | None) -> Found:
+    return _winds.begun(slab, before)()

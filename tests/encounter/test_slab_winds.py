@@ -1,0 +1,83 @@
+"""Winds of successive slabs, in this process and in one of its own.
+
+Detects winds that differ between both, structure learnt once that stays behind as a pair drifts,
+and a wind that waits for vortices it does not have.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from benchmarks.cases import DT, drifting_pair_images
+from benchmarks.realtime import UNFORESEEN
+from lidar_mi.encounter.slab_winds import InOwnProcess, SlabPair, SlabWinds
+from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from tests.support.vortex_pairs import uneven
+
+NOISE = 0.03
+WINDOWS = {"template": 8, "search": 16, "stride": 1}
+
+
+def slab(number, step=0.4):
+    """Images of slabs in which the pair is so much (m) further, with other texture."""
+    vortices = [replace(v, y=v.y + step * number, z=v.z - step * number) for v in uneven()]
+    return drifting_pair_images(vortices, (0.5, 0.0), NOISE, number, columns=130, rows=90)
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    """Slabs, and the pair found in each."""
+    slabs = [slab(number) for number in range(5)]
+    return slabs, [fit_vortices(s.first, s.second, DT, NOISE) for s in slabs]
+
+
+def winds_of(winds, drifting):
+    """One slab after the other, the pair expected where the last one was."""
+    found, before = [], None
+    for images, pair in zip(*drifting, strict=True):
+        expected = before and replace(before, covariance=before.covariance + np.diag(UNFORESEEN**2))
+        pair_of_images = SlabPair(images.first, images.second, DT, NOISE, expected=expected)
+        found.append(winds.begun(pair_of_images, before)())
+        before = pair
+    return found
+
+
+@pytest.fixture(scope="module")
+def here(drifting):
+    return winds_of(SlabWinds(ImageMethod.VARIATIONAL, WINDOWS), drifting)
+
+
+def test_each_wind_starts_from_the_last_one(here, drifting):
+    """Over a drift of two core radii: errors as from nothing, known to 3 %."""
+    near, far = [], []
+    for (wind, seconds), images in zip(here, drifting[0], strict=True):
+        assert seconds > 0
+        alone = SlabWinds(ImageMethod.VARIATIONAL, WINDOWS)
+        nothing = alone.begun(SlabPair(images.first, images.second, DT, NOISE), None)()[0]
+        for found, errors in ((wind, near), (nothing, far)):
+            true = images.v.interp(y=found["y"], z=found["z"])
+            errors.append(float(((found["v"] - true) ** 2).mean()))
+    assert [wind.attrs["from_start"] for wind, _ in here] == [0, 1, 1, 1, 1]
+    assert np.mean(near[1:]) < 1.06**2 * np.mean(far[1:])
+
+
+def test_a_process_of_its_own_finds_the_same(here, drifting):
+    winds = InOwnProcess(ImageMethod.VARIATIONAL, WINDOWS)
+    for (one, _), (other, seconds) in zip(here, winds_of(winds, drifting), strict=True):
+        # but for rounding in single precision
+        for name in ("v", "w"):
+            off = (one[name] - other[name]) / one[f"{name}_stderr"]
+            assert float(abs(off).max()) < 0.01
+        assert bool((one["flag"] == other["flag"]).mean() > 0.99)
+        assert one.attrs["from_start"] == other.attrs["from_start"]
+        assert seconds > 0
+
+
+def test_other_methods_start_from_nothing(drifting):
+    images = drifting[0][0]
+    found = SlabWinds(ImageMethod.CC, WINDOWS).begun(
+        SlabPair(images.first, images.second, DT), None
+    )
+    assert found()[0].attrs["method"] == "cc"
