@@ -19,6 +19,10 @@ import torch
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.geometry import Geometry, straightened
 from lidar_mi.retrieval.rings.smooth import term_values
+from lidar_mi.retrieval.threads import mapped
+
+# Images that a thread adds up at once.
+_AT_ONCE = 8
 
 
 class Cells(NamedTuple):
@@ -70,11 +74,13 @@ class Cells(NamedTuple):
             return flat.double()
         # pixels that do not count have the index after the last cell
         sums = flat.new_zeros((*flat.shape[:-1], len(self.count) + 1))
-        # one image at a time: four times faster than a sum along the last axis of all
-        for total, image in zip(
-            sums.view(-1, sums.shape[-1]), flat.view(-1, flat.shape[-1]), strict=True
-        ):
-            total.index_add_(0, self.index, image)
+        parts = (whole.view(-1, whole.shape[-1]).split(_AT_ONCE) for whole in (sums, flat))
+
+        def add(pair):
+            # half of the time of index_add_
+            pair[0].scatter_add_(-1, self.index.expand_as(pair[1]), pair[1])
+
+        mapped(add, zip(*parts, strict=True))
         return sums[..., :-1].double() / self.count
 
 

@@ -43,7 +43,7 @@ from lidar_mi.retrieval.rings.mean_image import (
 )
 from lidar_mi.retrieval.rings.model import INSTRUMENT, PARAMETERS, PixelNoise, RingModel
 from lidar_mi.retrieval.rings.scoring import POOR, Scored, cell_variance, robust_scoring
-from lidar_mi.retrieval.threads import mapped
+from lidar_mi.retrieval.threads import mapped, threads_for
 
 METHODS = ("annular", "pixels")
 
@@ -53,7 +53,7 @@ STEPS_PER_HARMONIC = 8
 SECTORS = 8
 MOVES = 12  # of the cells toward the rings' centre
 CHUNK_BYTES = 256e6
-AT_ONCE = 16  # images: what they need fits into the cache
+AT_ONCE = 64  # images: what they need fits into the cache
 MOST_SPOTS = 0.02  # of the pixels may be hot or dead
 SIGNIFICANT = 5.0  # standard deviations, the least amplitude of rings
 # standard deviations of chi-square above 1 from which stated errors grow with its root
@@ -201,9 +201,10 @@ def fit_rings(
         centre = model.centre
     task = _Task(model, noise or PixelNoise(), names, max_chi_square, centre, response)
     size = _chunk(model, method)
-    # each thread has images of its own
+    # many images: each thread has some of its own; few: all threads sum them up, one fits
     starts = range(0, len(images), size)
-    parts = mapped(lambda k: _fit(images[k : k + size], task, k, method), starts)
+    with threads_for(0):
+        parts = mapped(lambda k: _fit(images[k : k + size], task, k, method), starts)
     return _joined(parts)
 
 
@@ -251,7 +252,7 @@ def _chunk(model: RingModel, method: str) -> int:
     if method == "annular":
         steps = STEPS_PER_HARMONIC * strongest(model)
         cells = min(cells, steps * SECTORS * int(1 + cells // model.order_spacing))
-    return max(1, min(AT_ONCE, int(CHUNK_BYTES // (300 * cells + 12 * math.prod(model.shape)))))
+    return max(1, min(AT_ONCE, int(CHUNK_BYTES // (300 * cells))))
 
 
 class _Task(NamedTuple):
