@@ -17,6 +17,7 @@ from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected,
 from lidar_mi.encounter.control import Controller, Preview, feedforward, no_loads, wings_level
 from lidar_mi.encounter.preview import Lidar, Lookout, preview_of
 from lidar_mi.encounter.roll_model import RollModel
+from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.seen import Seen
 from lidar_mi.encounter.series import Recorder, flights_dataset, track_dataset
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
@@ -81,6 +82,7 @@ def fly_all(
     aircraft: OwnAircraft | None = None,
     controller: OwnController | None = None,
     processes: int = 1,
+    scans: ScanStore | None = None,
 ) -> Flown:
     """All flights of an experiment's mode of control.
 
@@ -96,8 +98,8 @@ def fly_all(
     controller : callable, optional
         Gives the controller of an aircraft, which steers where there is a preview; default:
         `feedforward`.
-    processes : int
-        As `VirtualLidar` takes it.
+    processes, scans
+        As `VirtualLidar` takes them.
     """
     encounter = encounter_of(experiment)
     wake = wake_along_path(experiment)
@@ -115,7 +117,7 @@ def fly_all(
         elif mode == PERFECT:
             found[mode] = flown(one, steers(one), wake, encounter, told, preview_of(one, wake.wind))
         else:
-            instrument = lidar or _virtual_lidar(experiment, processes)
+            instrument = lidar or _virtual_lidar(experiment, processes, scans)
             seen = Seen(instrument)
             period = 1 / encounter.rate
             stride = period * encounter.path.speed
@@ -186,8 +188,8 @@ def _titled(notice: Notice, mode: str) -> Notice:
     return lambda text, fraction: notice(f"{TITLES[mode]}: {text}", fraction)
 
 
-def _virtual_lidar(experiment: Experiment, processes: int) -> Lidar:
+def _virtual_lidar(experiment: Experiment, processes: int, scans: ScanStore | None) -> Lidar:
     # loads Mitsuba
     from lidar_mi.encounter.virtual_lidar import VirtualLidar
 
-    return VirtualLidar(experiment, processes=processes)
+    return VirtualLidar(experiment, processes=processes, scans=scans)

@@ -169,7 +169,7 @@ def fly(
             return _into(kept, experiment, own, processes, log)
         except BaseException as error:
             if is_interrupt(error):
-                error.add_note("start it again to fly again")
+                error.add_note("start it again to fly again with the scans that are there")
             elif isinstance(error, Exception):
                 log.fail(error)
                 if not isinstance(error, InputError):
@@ -190,7 +190,9 @@ def _into(
     flown = None if any(own.values()) else kept.flown()
     metrics = kept.metrics() if flown else None
     if flown is None:
-        flown = fly_all(experiment, log.bar, **own, processes=processes)
+        if kept.scans.number:
+            log(f"{kept.scans.number} scans of the flight that was stopped are used again")
+        flown = fly_all(experiment, log.bar, **own, processes=processes, scans=kept.scans)
         kept.keep(flown)
         log(f"flown: {', '.join(map(str, flown.series['flight'].values))}")
     if metrics is None:

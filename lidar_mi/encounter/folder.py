@@ -8,6 +8,7 @@ from pathlib import Path
 import xarray as xr
 
 from lidar_mi.encounter.flight import Flown
+from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.image_store import MADE_BY
@@ -34,7 +35,7 @@ from lidar_mi.io.yaml import to_yaml
 FILES = {"series": "flight.nc", "track": "track.nc", "seen": "slabs.nc"}
 """File of each data set of `Flown`."""
 
-ANIMATION = "approach.gif"
+ANIMATION, SCANS = "approach.gif", "scans"
 
 
 class FlightFolder:
@@ -53,6 +54,7 @@ class FlightFolder:
         if encounter_of(experiment).aircraft.model != "roll":
             self.record["versions"]["jsbsim"] = version("jsbsim")
         self.made_by = made_by(self.record)
+        self.scans = ScanStore(self.path / SCANS, self.made_by)
         self._beside = experiment.folder.resolve()
 
     @contextmanager
@@ -91,6 +93,7 @@ class FlightFolder:
         def remove_old() -> None:
             for path in (*old, *self.figures.glob("*.png")):
                 path.unlink(missing_ok=True)
+            self.scans.remove()
 
         # if the disk is full, the earlier flight remains unchanged
         write_atomically(marker, encoded(to_yaml(self.record)), first=remove_old)
@@ -105,7 +108,10 @@ class FlightFolder:
         return read_metrics(self.path)
 
     def keep(self, flown: Flown) -> None:
-        """Write the data sets, the time series last: with it, the flight is there."""
+        """Write the data sets, the time series last: with it, the flight is there.
+
+        What is kept of its scans is in them.
+        """
         (self.path / FILES["series"]).unlink(missing_ok=True)
         for name in ("seen", "track", "series"):
             value = getattr(flown, name)
@@ -113,6 +119,7 @@ class FlightFolder:
                 (self.path / FILES[name]).unlink(missing_ok=True)
             else:
                 write_netcdf(value.assign_attrs({MADE_BY: self.made_by}), self.path / FILES[name])
+        self.scans.remove()
 
     def data_files(self) -> list[str]:
         """Names of the files beside the report, for links to them."""

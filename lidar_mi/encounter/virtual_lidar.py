@@ -12,6 +12,7 @@ from lidar_mi.encounter.estimate import Estimate
 from lidar_mi.encounter.estimator import Estimator
 from lidar_mi.encounter.pointing import pointing_error
 from lidar_mi.encounter.pose import AircraftPose
+from lidar_mi.encounter.scan_store import Scan, ScanStore
 from lidar_mi.encounter.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
@@ -53,15 +54,6 @@ class SlabImages:
     noise: xr.DataArray
 
 
-@dataclass(frozen=True, eq=False)
-class _Scan:
-    """Both images of a scan with the standard deviations of their noise, path frame."""
-
-    near: xr.DataArray
-    far: xr.DataArray
-    far_noise: xr.DataArray
-
-
 class VirtualLidar:
     """The backscatter lidar of an encounter, stepped from scan to scan by any simulation.
 
@@ -70,7 +62,7 @@ class VirtualLidar:
     vortices are estimated from it. Scans are instantaneous. Their images depend on the experiment,
     the number of the scan and the pose alone: a step that is repeated gives the same images bit for
     bit, and the same estimate but for rounding, where it starts from nothing; several lidars in one
-    process do not disturb each other. Nothing is written.
+    process do not disturb each other. Nothing is written, unless `scans` are kept.
 
     Parameters
     ----------
@@ -80,6 +72,8 @@ class VirtualLidar:
         2: the wind is estimated in a process of its own, at the same time as the vortices, as by an
         aircraft's computer with two cores. The estimates are the same but
         for rounding.
+    scans : ScanStore, optional
+        Where scans are kept, and taken from if they were made from the same pose.
 
     Raises
     ------
@@ -106,7 +100,13 @@ class VirtualLidar:
     """
 
     @checked_arguments
-    def __init__(self, experiment: Experiment | str | Path, *, processes: int = 1):
+    def __init__(
+        self,
+        experiment: Experiment | str | Path,
+        *,
+        processes: int = 1,
+        scans: ScanStore | None = None,
+    ):
         if not isinstance(experiment, Experiment):
             experiment = load_experiment(experiment)
         self.experiment = experiment
@@ -116,7 +116,8 @@ class VirtualLidar:
         self.images: SlabImages | None = None
         self._estimator = Estimator(experiment, processes=processes)
         self._renderer: ScanRenderer | None = None
-        self._scans: dict[int, _Scan] = {}
+        self._scans: dict[int, Scan] = {}
+        self._store = scans
 
     @property
     def wake(self) -> WakeAlongPath:
@@ -152,7 +153,11 @@ class VirtualLidar:
         """
         number = self._number(t)
         pose = pose or AircraftPose(number * self.gates.stride)
-        scan = self._scanned(number, pose)
+        scan = self._store and self._store.kept(number, pose)
+        if scan is None:
+            scan = self._scanned(number, pose)
+            if self._store:
+                self._store.keep(number, pose, scan)
         before = self._scans.get(number - 1)
         self._scans = {number: scan} | ({number - 1: before} if before else {})
         period = self.gates.period
@@ -188,7 +193,7 @@ class VirtualLidar:
             )
         return number
 
-    def _scanned(self, number: int, pose: AircraftPose) -> _Scan:
+    def _scanned(self, number: int, pose: AircraftPose) -> Scan:
         """Both images of a scan with the detector's noise."""
         experiment, gates = self.experiment, self.gates
         ahead = pose.x - number * gates.stride
@@ -214,7 +219,7 @@ class VirtualLidar:
             seed = [experiment.seed, number, 1]
             scan = noisy_scan(scan, experiment.lidar, experiment.detector, seed, plan, pulses)
         near, far = (self._image(scan, plan, gate, pose) for gate in (0, -1))
-        return _Scan(near[0], *far)
+        return Scan(near[0], *far)
 
     def _image(
         self, scan: xr.Dataset, plan: ScanPlan, gate: int, pose: AircraftPose
@@ -235,7 +240,7 @@ class VirtualLidar:
         return found[0], found[1]
 
 
-def _on_first_grid(before: _Scan, scan: _Scan) -> tuple[SlabImages | None, tuple[str, ...]]:
+def _on_first_grid(before: Scan, scan: Scan) -> tuple[SlabImages | None, tuple[str, ...]]:
     """Both images of the slab on those nodes of the first that the second covers."""
     inside = {}
     for name in ("z", "y"):
