@@ -48,8 +48,10 @@ light is refracted by Snell's law from air of index 1.
 With ``sampled`` the ``time`` of a ray contains its frequency offset from the laser line in Hz,
 which the :ref:`fringes <integrator-fringes>` integrator sets; use it for several etalons in a row.
 ``folded`` uses the width of the line on the axis: widths are then wrong by 1 - cos(angle), 1e-4 at
-15 mrad. ``gap``, ``reflectivity`` and ``surface_rms``, like the line, can differ between scenes of
-one kind without recompilation.
+15 mrad. ``gap`` and ``order_fraction`` (in double precision), ``surface_rms``, ``bow`` and, without
+a coating, ``reflectivity`` and ``absorption`` can be changed through ``mi.traverse``; a new
+``order_fraction`` tunes the gap again. They and the line can also differ between scenes of one
+kind. Neither recompiles anything.
 
 .. code-block:: xml
 
@@ -64,12 +66,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .parameters import at_least, choice, fail, number, positive
+from .coating import admittance, amplitudes_of, read_coating
+from .parameters import TINY, at_least, choice, fail, number, positive
 from .registration import register
 
 NAME, KIND = "etalon", "bsdf"
 
 SPEED_OF_LIGHT = 299_792_458.0
+# what mi.traverse shows
+CHANGEABLE = ("gap", "order_fraction", "reflectivity", "absorption", "surface_rms", "bow")
 # relative amplitude of the neglected harmonics of a folded line
 NEGLECTED = 1e-8
 # transmittance below which a mirror counts as opaque
@@ -94,27 +99,36 @@ def define():
             self.index = at_least(props, NAME, "index", 1.0, 1.0)
             self.gap = positive(props, NAME, "gap", 13.7e-3)
             self.order_fraction = number(props, NAME, "order_fraction", 0.0)
-            if not 0 <= self.order_fraction < 1:
-                fail(NAME, "order_fraction", self.order_fraction, "0 <= value < 1")
-            self.tuned = "order_fraction" in props
+            tuned = "order_fraction" in props
             self.absorption = at_least(props, NAME, "absorption", 0.0, 0.0)
             self.surface_rms = at_least(props, NAME, "surface_rms", 0.0, 0.0)
             self.bow = number(props, NAME, "bow", 0.0)
-            if not np.isfinite(self.bow):
-                fail(NAME, "bow", self.bow, "a finite number")
             self.plate_index = at_least(props, NAME, "plate_index", 1.4761, 1.0)
-            self.coating = _coating(props)
+            self.coating = read_coating(props, NAME)
             self.reflectivity = number(props, NAME, "reflectivity", 0.7)
             for field in ("reflectivity", "absorption"):
                 if self.coating and field in props:
                     fail(NAME, field, props[field], "either it or a coating")
-            self._prepare()
+            self._prepare(tuned)
+            fixed = ("reflectivity", "absorption") if self.coating else ()
+            # single precision would round the order of the gap
+            self.m_changeable = {
+                name: mi.Float64(getattr(self, name)) for name in CHANGEABLE if name not in fixed
+            }
             sides = mi.BSDFFlags.FrontSide | mi.BSDFFlags.BackSide
             self.m_components = [mi.BSDFFlags.DeltaReflection | sides, mi.BSDFFlags.Null | sides]
             self.m_flags = self.m_components[0] | self.m_components[1]
 
-        def _prepare(self):
-            """All that needs double precision."""
+        def _prepare(self, tuned):
+            """All that needs double precision. ``tuned``: to the fraction of the order."""
+            for field, least in (("gap", TINY), ("absorption", 0.0), ("surface_rms", 0.0)):
+                if not least <= getattr(self, field) < np.inf:
+                    allowed = f"a finite number, {least:g} or more"
+                    fail(NAME, field, getattr(self, field), allowed)
+            if not np.isfinite(self.bow):
+                fail(NAME, "bow", self.bow, "a finite number")
+            if not 0 <= self.order_fraction < 1:
+                fail(NAME, "order_fraction", self.order_fraction, "0 <= value < 1")
             delay, shift = 0.0, 0.0  # of a reflection at a coating: s, half orders
             if self.coating:
                 axial, passed, _ = self._mirror_on_axis(1.0)
@@ -128,11 +142,13 @@ def define():
                 turn = np.angle(above / below)
                 delay = turn / (2 * step) * self.wavelength / (2 * np.pi * SPEED_OF_LIGHT)
             self.order = 2 * self.index * self.gap / self.wavelength
-            if self.tuned:
+            if tuned:
                 rest = self.order + shift - self.order_fraction
                 self.order += round(rest) - rest
                 self.gap = self.order * self.wavelength / (2 * self.index)
             self.order_on_axis = self.order + shift
+            if not tuned:
+                self.order_fraction = float(self.order_on_axis % 1)
             if not 0 < self.reflectivity < 1:
                 fail(NAME, "reflectivity", self.reflectivity, "a number between 0 and 1")
             passed = 1 - self.reflectivity
@@ -169,10 +185,10 @@ def define():
         # --- mirrors
 
         def _mirror_on_axis(self, frequency):
-            """`_stack` at a frequency relative to the laser's, at normal incidence, in float64."""
+            """`amplitudes_of` at normal incidence and a frequency over the laser's, in float64."""
             layers = [(n, n * d * 2 * np.pi / self.wavelength * frequency) for n, d in self.coating]
             with np.errstate(all="ignore"):  # NaN of a thick metal is refused as opaque
-                return _stack(layers, self.index, self.plate_index, np)
+                return amplitudes_of(layers, self.index, self.plate_index, np)
 
         def _mirrors(self, sine2):
             """Amplitudes of the mirrors for s and p, at an outer angle's sine squared.
@@ -191,12 +207,12 @@ def define():
                     index = mi.Complex2f(n.real, n.imag)
                     cosine = dr.sqrt(1 - sine2 / (index * index))
                     phase = cosine * index * (2 * np.pi * thickness / self.wavelength)
-                    layers.append((_admittance(index, cosine, polarisation), phase))
+                    layers.append((admittance(index, cosine, polarisation), phase))
                 ends = [
-                    _admittance(index, dr.sqrt(1 - sine2 / index**2), polarisation)
+                    admittance(index, dr.sqrt(1 - sine2 / index**2), polarisation)
                     for index in (self.index, self.plate_index)
                 ]
-                inside, passed, outside = _stack(layers, *ends, dr)
+                inside, passed, outside = amplitudes_of(layers, *ends, dr)
                 amplitudes.append((inside, passed * self.m_left, outside))
             return amplitudes
 
@@ -352,6 +368,26 @@ def define():
         def traverse(self, callback):
             if self.line is not None:
                 callback.put("line", self.line, mi.ParamFlags.NonDifferentiable)
+            for name, value in self.m_changeable.items():
+                callback.put(name, value, mi.ParamFlags.NonDifferentiable)
+
+        def parameters_changed(self, keys=()):
+            now = {name: float(value[0]) for name, value in self.m_changeable.items()}
+            tuned = now["order_fraction"] != self.order_fraction
+            before = {name: getattr(self, name) for name in now}
+            try:
+                self._set(now, tuned)
+            except ValueError:
+                self._set(before, tuned=False)
+                raise
+
+        def _set(self, values, tuned):
+            for name, value in values.items():
+                setattr(self, name, value)
+            self._prepare(tuned)
+            # in place: parameters of a traversed scene refer to these arrays
+            for name, array in self.m_changeable.items():
+                array[:] = mi.Float64(getattr(self, name))
 
         def to_string(self):
             return (
@@ -372,61 +408,6 @@ def _power_series(harmonics, last, z):
         total = total * z + coefficient
         k -= 1
     return total
-
-
-def _coating(props) -> list[tuple[complex, float]]:
-    """Layers (index + i extinction, thickness in m) of a mirror from its plate to the gap."""
-    text = str(props.get("coating", "")).strip()
-    try:
-        layers = [tuple(float(v) for v in layer.split()) for layer in text.split(",") if text]
-    except ValueError:
-        layers = [()]
-    for layer in layers:
-        fine = len(layer) in (2, 3) and np.isfinite(layer).all()
-        if not fine or layer[0] < 1 or layer[1] <= 0 or min(layer[2:], default=0) < 0:
-            fail(NAME, "coating", text, "layers 'index thickness' (>= 1, > 0 m), comma-separated")
-    return [(complex(index, *rest), thickness) for index, thickness, *rest in layers]
-
-
-def _admittance(index, cosine, polarisation):
-    """Ratio of the transverse magnetic to the transverse electric field, in vacuum's."""
-    return index * cosine if polarisation == "s" else index / cosine
-
-
-def _stack(layers, gap, plate, xp):
-    """Amplitudes of a mirror by the characteristic matrices of its layers (Macleod 2010, ch. 2).
-
-    Parameters
-    ----------
-    layers : list
-        (admittance, phase thickness) from the plate to the gap.
-    gap, plate : array
-        Admittances of the media on both sides.
-    xp : module
-        ``drjit`` or ``numpy``.
-
-    Returns
-    -------
-    tuple
-        Reflection on the side of the gap, product of the transmissions both ways, reflection from
-        the plate, for the transverse electric field and exp(-i omega t).
-    """
-    number = mi.Complex2f if xp is dr else complex
-    a, b, c, d = number(1, 0), number(0, 0), number(0, 0), number(1, 0)
-    for admittance, phase in reversed(layers):
-        cosine, sine = xp.cos(phase), number(0, -1) * xp.sin(phase)
-        a, b, c, d = (
-            a * cosine + b * sine * admittance,
-            a * sine / admittance + b * cosine,
-            c * cosine + d * sine * admittance,
-            c * sine / admittance + d * cosine,
-        )
-    forward, backward = gap * (a + b * plate), c + d * plate
-    total = forward + backward
-    inside = (forward - backward) / total
-    # the same stack from the other side has a and d exchanged
-    outside = (plate * (d + b * gap) - (c + a * gap)) / total
-    return inside, 4 * gap * plate / (total * total), outside
 
 
 register(KIND, NAME, define)

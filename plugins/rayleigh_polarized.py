@@ -15,7 +15,8 @@ Parameter                    Type    Meaning
                                      0.028 for the whole Cabannes and Raman bands). Default 0
 ============================ ======= ============================================================
 
-The linear depolarisation ratio in backscatter is d / (2 - d). Values are per steradian and
+The linear depolarisation ratio in backscatter is d / (2 - d). ``depolarization`` can be changed
+through ``mi.traverse`` without recompilation. Values are per steradian and
 integrate to one over the sphere.
 
 .. code-block:: xml
@@ -39,14 +40,22 @@ def define():
     class RayleighPolarized(mi.PhaseFunction):
         def __init__(self, props):
             super().__init__(props)
-            depolarization = number(props, NAME, "depolarization", 0.0)
-            if not 0 <= depolarization < 0.5:
-                fail(NAME, "depolarization", depolarization, "0 <= value < 0.5")
-            self.depolarization = depolarization
-            # Delta and Delta' of Hansen & Travis
-            self.m_dipole = (1 - depolarization) / (1 + depolarization / 2)
-            self.m_circular = (1 - 2 * depolarization) / (1 - depolarization)
+            self.m_depolarization = mi.Float(number(props, NAME, "depolarization", 0.0))
+            self.parameters_changed()
             self.m_flags = +mi.PhaseFunctionFlags.Isotropic
+
+        def traverse(self, callback):
+            kind = mi.ParamFlags.NonDifferentiable
+            callback.put("depolarization", self.m_depolarization, kind)
+
+        def parameters_changed(self, keys=()):
+            given = self.m_depolarization[0]
+            if not 0 <= given < 0.5:
+                fail(NAME, "depolarization", given, "0 <= value < 0.5")
+            self.depolarization = given
+            # Delta and Delta' of Hansen & Travis
+            self.m_dipole = dr.opaque(mi.Float, (1 - given) / (1 + given / 2))
+            self.m_circular = dr.opaque(mi.Float, (1 - 2 * given) / (1 - given))
 
         def phase(self, cosine):
             """Phase function of natural light, per steradian."""

@@ -347,3 +347,43 @@ def test_wrong_parameters_are_named(parameters, message):
 def test_wrong_lines_are_named(parameters, message):
     with pytest.raises(RuntimeError, match=message):
         mi.load_dict({"type": "spectral_line", **parameters})
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"gap": GAP + 3e-8},
+        {"order_fraction": 0.25},
+        {"reflectivity": 0.8, "absorption": 0.01},
+        {"surface_rms": 3e-9, "bow": 5e-9},
+    ],
+)
+def test_a_changed_etalon_is_a_new_one(changed):
+    """Through ``mi.traverse``, folded with a line; the gap in double precision."""
+    line = {"type": "spectral_line", "wavelength": WAVELENGTH}
+
+    def folded(**values):
+        return etalon(line_shape="folded", line=line, **values)
+
+    bsdf, expected = folded(), folded(**changed)
+    parameters = mi.traverse(bsdf)
+    for name, value in changed.items():
+        parameters[name] = value
+    parameters.update()
+    assert bsdf.gap == pytest.approx(expected.gap, rel=1e-15)
+    assert float(parameters["gap"][0]) == bsdf.gap
+    assert float(parameters["order_fraction"][0]) == pytest.approx(expected.order_on_axis % 1)
+    before = elements(folded(), SINE)[0][0]
+    for found, new in zip(elements(bsdf, SINE), elements(expected, SINE), strict=True):
+        np.testing.assert_allclose(found, new, atol=1e-6)
+    assert np.abs(elements(bsdf, SINE)[0][0] - before).max() > 1e-3
+
+
+def test_a_change_that_is_refused_changes_nothing():
+    bsdf = etalon()
+    parameters = mi.traverse(bsdf)
+    parameters["reflectivity"] = 1.5
+    with pytest.raises(ValueError, match=r"etalon.reflectivity: 1.5 is not allowed"):
+        parameters.update()
+    assert bsdf.reflectivity == 0.7 and float(parameters["reflectivity"][0]) == 0.7
+    assert "reflectivity" not in mi.traverse(coated())

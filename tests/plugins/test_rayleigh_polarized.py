@@ -213,3 +213,17 @@ def test_impossible_depolarisation_is_named(value, expected):
     named = rf"rayleigh_polarized\.depolarization: .* is not allowed; expected {expected}"
     with pytest.raises(RuntimeError, match=named):
         phase(value)
+
+
+def test_depolarization_can_be_changed():
+    phase, expected = (
+        mi.load_dict({"type": "rayleigh_polarized", "depolarization": d}) for d in (0.0, 0.028)
+    )
+    parameters = mi.traverse(phase)
+    parameters["depolarization"] = 0.028
+    parameters.update()
+    cosine = mi.Float(np.linspace(-1, 1, 9))
+    np.testing.assert_array_equal(phase.phase(cosine), expected.phase(cosine))
+    parameters["depolarization"] = 0.5
+    with pytest.raises(ValueError, match=r"depolarization: 0\.5 is not allowed"):
+        parameters.update()
