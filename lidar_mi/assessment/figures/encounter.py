@@ -167,7 +167,7 @@ def _overview(series, track, seen, span):
     angle.set(title="roll angle", ylabel="degrees", xlabel="time of flight / s")
     angle.legend(fontsize=9)
     return figure, (
-        "Left: a slab from the cockpit, with the cores of its vortices. Right: roll angles on the "
+        "A slab from the cockpit, with the cores of its vortices, and the roll angles on the "
         "same flight path through the same wake."
     )
 
