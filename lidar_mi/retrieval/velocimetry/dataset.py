@@ -124,14 +124,16 @@ def dataset(
 ) -> xr.Dataset:
     """The data set, with the scalar quantities of the result."""
     attrs = {"Conventions": "CF-1.11", "title": title, **attributes, "dt_units": "s"}
-    result = xr.Dataset(variables, coords, attrs)
+    # all at once: each variable that a data set takes later copies and aligns it again
+    scalars = {}
     for name, quantity in found.quantities.items():
         about = {"long_name": quantity.long_name, "units": quantity.units}
-        result[name] = (), quantity.value, about
+        scalars[name] = (), quantity.value, about
         about = about | {"long_name": f"standard error of {quantity.long_name}"}
         if quantity.per_rotation:
             about["per_rotation"] = quantity.per_rotation
-        result[f"{name}_stderr"] = (), quantity.stderr, about
+        scalars[f"{name}_stderr"] = (), quantity.stderr, about
+    result = xr.Dataset(variables | scalars, coords, attrs)
     result.attrs |= found.attributes
     for axis in result.dims:
         result[axis].encoding["_FillValue"] = None

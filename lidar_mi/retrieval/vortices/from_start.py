@@ -32,6 +32,10 @@ _LEFT, _ROUNDS = 0.3, 3
 _REJECTED = 4.0
 
 
+Limits = Callable[[torch.Tensor, torch.Tensor], bool]
+"""(parameters, step) -> whether such a step may be tried."""
+
+
 class Found(NamedTuple):
     """A solution, the images it was found in, what is left of them unwhitened, the model error."""
 
@@ -41,12 +45,7 @@ class Found(NamedTuple):
     error: ModelError
 
 
-def fit_from(
-    start: VortexPairFit,
-    make: Builder,
-    limits: Callable[[torch.Tensor, torch.Tensor], bool],
-    lags: float,
-) -> Found | None:
+def fit_from(start: VortexPairFit, make: Builder, limits: Limits, lags: float) -> Found | None:
     """The fit of `image_fit.fit_vortices` near an expected pair; None if there is none.
 
     Steps on every second pixel of the filtered images, after blurred ones if the start is
@@ -68,8 +67,23 @@ def fit_from(
     theta = theta.to(make.pair.device)
     if not limits(theta, torch.zeros_like(theta)):
         return None
+    return fit_near(theta, make, limits, lags, _displacement_error(start, make))
+
+
+def fit_near(
+    theta: torch.Tensor,
+    make: Builder,
+    limits: Limits,
+    lags: float,
+    uncertain: float = 0.0,
+    estimates: int = 1,
+) -> Found | None:
+    """`fit_from` parameters (16,) whose displacements are uncertain by so many px.
+
+    Noise, change and model error are estimated so many times, each with the filter and the weights
+    of the time before.
+    """
     variance = (_MODEL_ERROR * (make.spacing[0] * make.spacing[1]) ** 0.5) ** 2
-    uncertain = _displacement_error(start, make)
     for blur, step, least in _LEVELS:
         if uncertain < least:
             continue
@@ -92,13 +106,15 @@ def fit_from(
         plain = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
         if plain is None:
             return None
-        error = model_error_of(plain, lags, changes=True)
-        images = make.with_change(white, images, plain.misfit, error.variance)
-        if not images.whitening.passed > 0:
-            return None
-        found = _near(limits, theta, stepped(theta, images.whitened(misfit), error.variance))
-        if found is None:
-            return None
+        found = plain
+        for _ in range(estimates):
+            error = model_error_of(found, lags, changes=True)
+            images = make.with_change(white, images, found.misfit, error.variance)
+            if not images.whitening.passed > 0:
+                return None
+            found = _near(limits, theta, stepped(theta, images.whitened(misfit), error.variance))
+            if found is None:
+                return None
         step = found.parameters - theta
         far = _displaced(step, misfit, make) / _CURVED
         if float(step @ found.normal @ step) ** 0.5 * far < _LEFT:

@@ -32,7 +32,7 @@ from lidar_mi.retrieval.vortices.covariance import (
     model_error_of,
     parameter_covariance,
 )
-from lidar_mi.retrieval.vortices.from_start import agrees, fit_from
+from lidar_mi.retrieval.vortices.from_start import Limits, agrees, fit_from, fit_near
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
 from lidar_mi.retrieval.vortices.model import Profile
 from lidar_mi.retrieval.vortices.model_error import ModelError, mean_length
@@ -179,40 +179,64 @@ def fit_pixels(
     make = Builder(pair, bad, z, y, dt, level, given, float(contrast), profile, frozen)
     if times is not None:
         make = replace(make, times=_from_mid_time(times, make))
-    spacing = (make.spacing[0] * make.spacing[1]) ** 0.5
     limits = step_limits(y, z, profile, dt)
 
+    # steps need no more: places to 1e-5 m
+    single = make.single()
     if start is not None:
-        single = make.single()
         near = fit_from(start, single, limits, _NOISE_LAGS)
         pair = near and replace(_checked(single, *near), from_start=True)
         if pair and pair.success and agrees(start, pair):
             return pair
+    found = _searched(single, limits)
+    if found is None:
+        return no_fit(profile, "no vortex signature")
+    near = fit_near(found.parameters, single, limits, _NOISE_LAGS, estimates=2)
+    pair = near and _checked(single, *near)
+    if pair and pair.success:
+        return pair
+    return _iterated(found, make, limits)
+
+
+def _searched(make: Builder, limits: Limits) -> Solution | None:
+    """The fit to blurred images from the best of all pairs of places, None if there is none."""
+    spacing = (make.spacing[0] * make.spacing[1]) ** 0.5
     best = None
     images = make(*_LEVELS[0])
     images = images.at_least(_CHANGE * float(images.differences().value.var()))
-    for start in starting_points(images.differences(), STARTS, profile):
-        parameters = torch.cat([start, start.new_tensor(SAME_BRIGHTNESS)])
+    for start in starting_points(images.differences(), STARTS, make.profile):
+        parameters = torch.cat([start, start.new_tensor(SAME_BRIGHTNESS)]).double()
         found = fit(images, parameters, limits, spacing**2, 12, TOLERANCE)
         if best is None or found.cost < best.cost:
             best = found
     if best is None:
-        return no_fit(profile, "no vortex signature")
+        return None
     variance = (_FIRST_MODEL_ERROR * spacing) ** 2
-    for blur, step in _LEVELS[1:]:
-        white = make(blur, step)
-        # weights from what the parameters so far would leave: with those of the noise alone, air
-        # that changes gives a sum of squares with many minima
-        misfit = white(best.parameters)
-        left = without_step(misfit, variance)[misfit.valid].square().mean()
-        images = white.at_least(float(left))
-        best = fit(images, best.parameters, limits, variance, 12, TOLERANCE)
-        variance = 0.0
+    return _refitted(make(*_LEVELS[1]), best.parameters, variance, limits)[0]
+
+
+def _refitted(
+    white: Images, parameters: torch.Tensor, variance: float, limits: Limits
+) -> tuple[Solution, Images]:
+    """The fit to images, and these with the noise that the parameters so far would leave.
+
+    With weights of the noise alone, air that changes gives a sum of squares with many minima.
+    """
+    misfit = white(parameters)
+    left = without_step(misfit, variance)[misfit.valid].square().mean()
+    images = white.at_least(float(left))
+    return fit(images, parameters, limits, variance, 12, TOLERANCE), images
+
+
+def _iterated(found: Solution, make: Builder, limits: Limits) -> VortexPairFit:
+    """The fit from that to blurred images, by steps until it converges: far starts, no noise."""
+    white = make(*_LEVELS[2])
+    best, images = _refitted(white, found.parameters, 0.0, limits)
     for _ in range(2):
         error = model_error_of(best, _NOISE_LAGS, changes=True)
         images = make.with_change(white, images, best.misfit, error.variance)
         if not images.whitening.passed > 0:
-            return no_fit(profile, "the images have no structure in common")
+            return no_fit(make.profile, "the images have no structure in common")
         best = fit(images, best.parameters, limits, error.variance, 10, TOLERANCE)
     error = model_error_of(best, _NOISE_LAGS, changes=True)
     return _checked(make, best, images, white(best.parameters), error)

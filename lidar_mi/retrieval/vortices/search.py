@@ -8,11 +8,13 @@ from typing import NamedTuple
 
 import torch
 
-from lidar_mi.retrieval.vortices.model import Profile, angular_velocity, wind
+from lidar_mi.retrieval.vortices.model import Profile, swirl, wind
 
 # Places tried for each vortex, and core radii as fractions of the shorter side of the region.
 _PLACES = 700
 _RADII = (0.03, 0.08)
+# Observations that are looked at together: their winds at all places stay near the cache.
+_AT_ONCE = 2048
 
 
 class Observations(NamedTuple):
@@ -62,17 +64,21 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
     apart = torch.cdist(place, place)
     root = observed.weight.sqrt()
     uniform = torch.linalg.qr(observed.everywhere * root[:, None])[0]
-
-    def without_uniform(values):
-        return values - uniform @ (uniform.T @ values)
-
-    value = without_uniform(observed.value * root)
+    value = observed.value * root
+    value = value - uniform @ (uniform.T @ value)
     found = []
     for fraction in _RADII:
         radius = fraction * min(sides)
-        columns = without_uniform(_swirls(observed, root, place, radius, profile))
-        normal, wanted = columns.T @ columns, columns.T @ value
-        gain, first, second = _explained(normal, wanted)
+        normal, across = (
+            place.new_zeros(len(place), n) for n in (len(place), uniform.shape[1] + 1)
+        )
+        for rows in torch.arange(len(root), device=root.device).split(_AT_ONCE):
+            columns = _swirls(observed, rows, root, place, radius, profile)
+            normal += columns.T @ columns
+            across += columns.T @ torch.cat([uniform[rows], value[rows, None]], 1)
+        # the vortices' winds without the part that a mean wind and brightness explain
+        normal -= across[:, :-1] @ across[:, :-1].T
+        gain, first, second = _explained(normal, across[:, -1])
         gain = torch.where((first > 0) & (second < 0) & (apart > 3 * radius), gain, 0.0)
         for p, q in _peaks(gain, apart, count, 2.5 * step):
             vortices = [
@@ -91,12 +97,15 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
     )
 
 
-def _swirls(observed: Observations, root, place, radius: float, profile: Profile) -> torch.Tensor:
-    """Weighted observations of vortices of unit circulation at each place, (n, places)."""
-    dy, dz = (observed[axis][:, None] - place[:, axis] for axis in (0, 1))
-    value, _ = angular_velocity((dy**2 + dz**2) / radius**2, profile)
-    across = observed.along[1][:, None] * dy - observed.along[0][:, None] * dz
-    return root[:, None] * across * value / (2 * torch.pi * radius**2)
+def _swirls(
+    observed: Observations, rows, root, place, radius: float, profile: Profile
+) -> torch.Tensor:
+    """Some weighted observations of vortices of unit circulation at each place, (n, places)."""
+    dy, dz = (observed[axis][rows, None] - place[:, axis] for axis in (0, 1))
+    value = swirl((dy**2 + dz**2) / radius**2, profile)
+    scale = root[rows] / (2 * torch.pi * radius**2)
+    along_y, along_z = observed.along[:, rows] * scale
+    return (dy.mul_(along_z[:, None]) - dz.mul_(along_y[:, None])).mul_(value)
 
 
 def _explained(normal, wanted):

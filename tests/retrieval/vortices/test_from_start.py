@@ -53,7 +53,8 @@ def test_a_wrong_start_is_found_out(images, cold, metres):
     wrong = cold.parameters + metres * np.array([0, 0, 1, 0, 0, 0, 1, 0, 0, 0])
     found = fit_vortices(images.first, images.second, DT, 0.03, start=expected(cold, wrong))
     assert not found.from_start
-    np.testing.assert_allclose(found.parameters, cold.parameters, rtol=1e-9)
+    # sums in single precision depend on where in memory the images lie
+    np.testing.assert_allclose(found.parameters, cold.parameters, rtol=1e-5)
 
 
 def test_an_uncertain_start_is_refined_on_blurred_images(images, cold):
