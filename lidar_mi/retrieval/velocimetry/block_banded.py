@@ -47,22 +47,29 @@ class Factor(NamedTuple):
 
         By the recursion of Takahashi from the last block upwards: as much work as the factor.
         """
+        shape = self.ratio.shape[:-2]
         rows, n = self.ratio.shape[-2:]
-        found = self.ratio.new_empty(*self.ratio.shape[:-2], n + rows, n)
-        behind = found.new_zeros(*found.shape[1:-2], rows, rows)
+        roots = self.root.reshape(shape[0], -1, n, n)
+        ratios = self.ratio.reshape(shape[0], -1, rows, n)
+        reach = rows // n
+        found = ratios.new_empty(*ratios.shape[:2], n + rows, n)
+        # the inverse of the blocks behind; that of k + j at the place (k + j) % reach stays there
+        behind = found.new_zeros(ratios.shape[1], rows, rows)
+        ratio, below = torch.empty_like(ratios[0]), torch.empty_like(ratios[0])
         for k in range(len(found) - 1, -1, -1):
-            root, ratio = self.root[k], self.ratio[k]
-            below = behind @ ratio
-            here = root.mT @ root + ratio.mT @ below
-            found[k, ..., :n, :] = here = (here + here.mT) / 2
-            found[k, ..., n:, :] = below.neg_()
-            # shifted by one block, from the last to the first as memory is shared
-            for j in range(rows // n - 1, 0, -1):
-                behind[..., j * n : (j + 1) * n, n:] = behind[..., (j - 1) * n : j * n, :-n]
-            behind[..., n:, :n] = below[..., :-n, :]
-            behind[..., :n, n:] = below[..., :-n, :].mT
-            behind[..., :n, :n] = here
-        return found
+            first, own = ((place % reach) * n for place in (k + 1, k))
+            last = rows - first
+            ratio[:, first:], ratio[:, :first] = ratios[k, :, :last], ratios[k, :, last:]
+            torch.bmm(behind, ratio, out=below)
+            here = torch.bmm(roots[k].mT, roots[k]).baddbmm_(ratio.mT, below)
+            here = (here + here.mT) / 2
+            below.neg_()
+            found[k, :, :n] = here
+            found[k, :, n : n + last], found[k, :, n + last :] = below[:, first:], below[:, :first]
+            behind[..., own : own + n] = below
+            behind[:, own : own + n] = below.mT
+            behind[:, own : own + n, own : own + n] = here
+        return found.reshape(*shape, n + rows, n)
 
 
 def factor(columns: torch.Tensor) -> Factor:
@@ -78,22 +85,23 @@ def factor(columns: torch.Tensor) -> Factor:
     torch.linalg.LinAlgError
         A matrix is not positive definite.
     """
-    n = columns.shape[-1]
+    shape, n = columns.shape[:-2], columns.shape[-1]
     reach = columns.shape[-2] // n - 1
+    columns = columns.reshape(shape[0], -1, (1 + reach) * n, n)
     unit = torch.eye(n, dtype=columns.dtype, device=columns.device)
-    unit = unit.expand(*columns.shape[1:-2], n, n)
+    unit = unit.expand(columns.shape[1], n, n)
     roots, ratios = torch.empty_like(columns[..., :n, :]), torch.empty_like(columns[..., n:, :])
     last: list[torch.Tensor] = []
     for k, column in enumerate(columns):
         left = column.clone() if last else column
         for j, below in enumerate(reversed(last)):
-            part = left[..., : (reach - j) * n, :]
-            part -= below[..., j * n :, :] @ below[..., j * n : (j + 1) * n, :].mT
-        root = torch.linalg.cholesky(left[..., :n, :])
+            one, other = below[:, j * n :], below[:, j * n : (j + 1) * n]
+            left[:, : (reach - j) * n].baddbmm_(one, other.mT, alpha=-1)
+        root = torch.linalg.cholesky(left[:, :n])
         # as accurate as substitution, which an inverse of the block itself would not be
         inverse = torch.linalg.solve_triangular(root, unit, upper=False)
-        below = left[..., n:, :] @ inverse.mT
-        torch.matmul(below, inverse, out=ratios[k])
+        below = torch.bmm(left[:, n:], inverse.mT)
+        torch.bmm(below, inverse, out=ratios[k])
         roots[k] = inverse
         last = [*last, below][-reach:]
-    return Factor(roots, ratios)
+    return Factor(roots.reshape(*shape, n, n), ratios.reshape(*shape, reach * n, n))

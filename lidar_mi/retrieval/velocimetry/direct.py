@@ -112,11 +112,16 @@ def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
     mesh = prior.mesh
     rows = mesh.axes[0].knots if cells is None else cells.stop - cells.start + REACH
     total = prior.local.new_zeros(2, 2, 2 * REACH + 1, rows, REACH + 1, mesh.axes[1].knots)
-    for terms, strength in zip(_kinds(prior), prior.strength, strict=True):
+    pairs: dict = {}
+    for kind, terms in enumerate(_kinds(prior)):
         for a, first, one in terms:
             for b, second, other in terms:
-                part = form(prior.cell * strength, mesh, first, second, cells)
-                total[a, b] += one * other * part
+                pairs.setdefault((first, second), []).append((kind, a, b, one * other))
+    weight = prior.cell * prior.strength
+    for orders, members in pairs.items():
+        parts = form(weight, mesh, *orders, cells)
+        for kind, a, b, scale in members:
+            total[a, b].add_(parts[kind], alpha=scale)
     return total
 
 

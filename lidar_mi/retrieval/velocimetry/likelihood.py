@@ -56,6 +56,11 @@ class Images(NamedTuple):
     noise_updated: bool = False
     through: float = 0.0
 
+    def single(self) -> "Images":
+        """The same to be warped in single precision: places to 1e-5 px."""
+        spline = self.spline._replace(coefficients=self.spline.coefficients.float())
+        return self._replace(spline=spline, time=self.time.float(), weight=self.weight.float())
+
 
 class Linear(NamedTuple):
     """The log-likelihood linearised about a flow.

@@ -127,16 +127,16 @@ class StripSettings:
         Knots along z up to which images are solved at once, which is faster up to about 60.
     core, overlap : int
         Width of a strip and its overlap with each neighbour, for the prior's strength. The
-        variance of vorticity and divergence that the images remove is 2 % too large.
-    final_overlap : int
+        variance of vorticity and divergence that the images remove is 2 to 3 % too large.
+    final_core, final_overlap : int
         The same for the standard errors, of which 1 in 100 is off by more than 5 %; in still air
         they are too large by up to 24 %.
     solved_core, solved_overlap : int
         The same for the preconditioner.
-    at_once : int
-        Strips of the preconditioner that one thread works on.
+    at_once, solved_at_once : int
+        Strips that one thread works on together, for the prior's strength and the preconditioner.
     tolerance : float
-        Residual over the first one at which conjugate gradients end.
+        Residual over the first one at which conjugate gradients end: each round solves again.
     steps : int
         Largest number of them.
     coarse_cells : int
@@ -145,12 +145,14 @@ class StripSettings:
 
     largest: int = 64
     core: int = 10
-    overlap: int = 6
+    overlap: int = 5
+    at_once: int = 2
+    final_core: int = 15
     final_overlap: int = 12
-    solved_core: int = 9
+    solved_core: int = 14
     solved_overlap: int = 4
-    at_once: int = 4
-    tolerance: float = 1e-5
+    solved_at_once: int = 4
+    tolerance: float = 1e-3
     steps: int = 200
     coarse_cells: int = 24
 

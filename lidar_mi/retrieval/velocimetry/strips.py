@@ -39,46 +39,24 @@ class Strip(NamedTuple):
         """Those that reach into the strip's cells."""
         return slice(self.cells.start, self.cells.stop + REACH)
 
-
-class Matrix(NamedTuple):
-    """A second derivative as a band, with what it is made of.
-
-    Attributes
-    ----------
-    band : torch.Tensor
-    prior : Prior
-    images : (Linear, Mesh), optional
-        None for the prior alone.
-    """
-
-    band: torch.Tensor
-    prior: Prior
-    images: tuple[Linear, Mesh] | None
-
-    def alone(self, strip: Strip) -> torch.Tensor:
-        """The band of a strip as if image and prior ended with it."""
-        cells, last = strip.cells, self.prior.mesh.axes[0].cells
-        own = self.band[:, :, :, strip.knots].clone()
-        # splines at the strip's ends reach into three cells beyond
-        if cells.start:
-            beyond = self._of(slice(max(0, cells.start - REACH), cells.start))
-            own[:, :, :, :REACH] -= beyond[:, :, :, -REACH:]
-        if cells.stop < last:
-            beyond = self._of(slice(cells.stop, min(cells.stop + REACH, last)))
-            own[:, :, :, -REACH:] -= beyond[:, :, :, :REACH]
-        return own
-
-    def _of(self, cells: slice) -> torch.Tensor:
-        form = prior_form(self.prior, cells)
-        return form + data_form(*self.images, cells) if self.images else form
+    def of_core(self, covariance: torch.Tensor) -> torch.Tensor:
+        """The covariance (..., knot z, shift y, knot y) of the knots that reach into the core."""
+        first = self.cells.start
+        return covariance[..., self.core.start - first : self.core.stop - first + REACH, :, :]
 
 
 class Posterior(NamedTuple):
-    """A flow after a Gauss-Newton step, with the second derivative there."""
+    """A flow after a Gauss-Newton step, with the second derivative there.
+
+    `stiff` is the prior's part of the second derivative, `both` all of it: bands. `images` is the
+    likelihood that they are of, and its mesh.
+    """
 
     coefficients: torch.Tensor
-    stiff: Matrix
-    both: Matrix
+    stiff: torch.Tensor
+    both: torch.Tensor
+    prior: Prior
+    images: tuple[Linear, Mesh]
     settings: VariationalSettings
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -86,15 +64,21 @@ class Posterior(NamedTuple):
 
         The variance removed is that in each strip alone.
         """
-        prior, solver = self.stiff.prior, self.settings.strips
+        prior, solver = self.prior, self.settings.strips
 
-        def informed(strip: Strip) -> torch.Tensor:
-            before, after = (_covariance(strip, m.alone(strip)) for m in (self.stiff, self.both))
-            return variances(before - after, prior, strip.core)
+        def informed(part: list[Strip]) -> torch.Tensor:
+            found = _covariances(torch.stack([self._alone(strip) for strip in part]))
+            return torch.cat(
+                [
+                    variances(s.of_core(before - after), prior, s.core)
+                    for s, (before, after) in zip(part, found, strict=True)
+                ],
+                1,
+            )
 
         energy = prior.by_kind(prior.rates(self.coefficients).square())
         cut = strips(prior.mesh.axes[0].cells, solver.core, solver.overlap)
-        return torch.cat(mapped(informed, cut), 1), energy
+        return torch.cat(mapped(informed, _grouped(cut, solver.at_once)), 1), energy
 
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before.
@@ -102,15 +86,33 @@ class Posterior(NamedTuple):
         After the images it is that of strips alone: too large by what lies beyond them, see
         `StripSettings.final_overlap`. Before them it is that of coarser splines.
         """
-        prior, solver = self.stiff.prior, self.settings.strips
+        prior, solver = self.prior, self.settings.strips
         mesh = Mesh(prior.mesh.axes, places)
 
         def after(strip: Strip) -> torch.Tensor:
-            covariance = _covariance(strip, self.both.alone(strip))
-            return spread(covariance, mesh, cells=strip.core)
+            covariance = _covariances(self._alone(strip)[1])
+            return spread(strip.of_core(covariance), mesh, cells=strip.core)
 
-        cut = strips(mesh.axes[0].cells, solver.core, solver.final_overlap)
+        cut = strips(mesh.axes[0].cells, solver.final_core, solver.final_overlap)
         return torch.cat(mapped(after, cut), 2), _before(mesh, prior, self.settings)
+
+    def _alone(self, strip: Strip) -> torch.Tensor:
+        """The bands (2, ...) of prior and posterior as if image and prior ended with a strip."""
+        cells, last = strip.cells, self.prior.mesh.axes[0].cells
+        own = torch.stack([band[:, :, :, strip.knots] for band in (self.stiff, self.both)])
+        # splines at the strip's ends reach into three cells beyond
+        if cells.start:
+            beyond = self._of(slice(max(0, cells.start - REACH), cells.start))
+            own[..., :REACH, :, :] -= beyond[..., -REACH:, :, :]
+        if cells.stop < last:
+            beyond = self._of(slice(cells.stop, min(cells.stop + REACH, last)))
+            own[..., -REACH:, :, :] -= beyond[..., :REACH, :, :]
+        return own
+
+    def _of(self, cells: slice) -> torch.Tensor:
+        """The bands (2, ...) of prior and posterior of some cells."""
+        form = prior_form(self.prior, cells)
+        return torch.stack([form, form + data_form(*self.images, cells)])
 
 
 def strips(cells: int, core: int, overlap: int) -> list[Strip]:
@@ -125,12 +127,15 @@ def strips(cells: int, core: int, overlap: int) -> list[Strip]:
     ]
 
 
-def _covariance(strip: Strip, form: torch.Tensor) -> torch.Tensor:
-    """The inverse of a strip's matrix within the band, of the knots that reach into its core."""
-    band = Band(form.shape[3], form.shape[5])
-    first = strip.cells.start
-    core = slice(strip.core.start - first, strip.core.stop - first + REACH)
-    return band.covariance(band.factor(form))[:, :, :, core]
+def _grouped(cut: list[Strip], at_once: int) -> list[list[Strip]]:
+    """Strips that one thread works on at once."""
+    return [cut[i : i + at_once] for i in range(0, len(cut), at_once)]
+
+
+def _covariances(forms: torch.Tensor) -> torch.Tensor:
+    """The inverses within the band of the matrices of forms (..., 2, 2, 7, Z, 4, Y)."""
+    band = Band(forms.shape[-3], forms.shape[-1])
+    return band.covariance(band.factor(forms))
 
 
 def solved(
@@ -150,34 +155,43 @@ def solved(
     solver = settings.strips
     whole = Band(*(axis.knots for axis in mesh.axes))
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
-    both = Matrix(data_form(linear, mesh) + stiff, prior, (linear, mesh))
+    both = data_form(linear, mesh) + stiff
     cut = strips(mesh.axes[0].cells, solver.solved_core, solver.solved_overlap)
-    # those that one thread solves at once
-    some = [cut[i : i + solver.at_once] for i in range(0, len(cut), solver.at_once)]
-    band = Band(cut[0].cells.stop - cut[0].cells.start + REACH, whole.columns)
-    roots = mapped(
-        lambda part: band.factor(torch.stack([both.band[:, :, :, s.knots] for s in part])), some
-    )
+    some = _grouped(cut, solver.solved_at_once)
+    roots = mapped(lambda part: _root(both, part), some)
 
     def inverse(part: tuple[list[Strip], Factor], right: torch.Tensor) -> torch.Tensor:
         members, root = part
-        return band.solve(root, torch.stack([right[:, s.knots] for s in members]))
+        band = Band(root.root.shape[-1] // 2, whole.columns)
+        right = torch.stack([right[:, s.knots] for s in members]).to(root.root)
+        return band.solve(root, right).to(coefficients)
 
     def preconditioned(right: torch.Tensor) -> torch.Tensor:
         total = torch.zeros_like(right)
         found = mapped(lambda part: inverse(part, right[0]), list(zip(some, roots, strict=True)))
-        for strip, part in zip(cut, torch.cat(found), strict=True):
-            total[0, :, strip.knots] += part
+        for members, parts in zip(some, found, strict=True):
+            for strip, part in zip(members, parts, strict=True):
+                total[0, :, strip.knots] += part
         return total
 
     (change,) = conjugate_gradients(
-        lambda c: whole.apply(both.band, c[0])[None],
+        lambda c: whole.apply(both, c[0])[None],
         gradient[None],
         preconditioned,
         solver.tolerance,
         solver.steps,
     )
-    return Posterior(coefficients + change, Matrix(stiff, prior, None), both, settings)
+    return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings)
+
+
+def _root(both: torch.Tensor, part: list[Strip]) -> Factor:
+    """Factor of the matrices of some strips, in single precision if there is one."""
+    forms = torch.stack([both[:, :, :, strip.knots] for strip in part])
+    band = Band(forms.shape[-3], forms.shape[-1])
+    try:
+        return band.factor(forms.float())
+    except torch.linalg.LinAlgError:
+        return band.factor(forms)
 
 
 def _before(mesh: Mesh, prior: Prior, settings: VariationalSettings) -> torch.Tensor:

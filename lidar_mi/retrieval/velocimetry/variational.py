@@ -135,7 +135,7 @@ def variational_and_flow(
     for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
         apart = max(2.0, knots * windows.template)
         axes = [Axis(n, apart) for n in windows.shape]
-        mesh = Mesh(axes, pixels)
+        mesh, single = Mesh(axes, pixels), Mesh(axes, [place.float() for place in pixels])
         solve = _solver(axes, settings)
         coefficients = mesh.fitted(flow)
         if prior is None:
@@ -144,15 +144,16 @@ def variational_and_flow(
             prior = first_prior(axes, working(coefficients), width, spacing or unit, settings)
         else:
             prior = refined(prior, axes)
-        turn = 0
+        rough, turn = images.single(), 0
         while turn < rounds + settings.rounds_changed * (images.through > 0):
-            linear = linearised(images, mesh, coefficients, settings)
             if level == last and turn in (settings.noise_round, rounds):
+                linear = linearised(images, mesh, coefficients, settings)
                 displaced_only = displaced_only if turn == rounds else mesh.field(coefficients)
                 width = settings.misfit_width * windows.template
                 images = with_local_noise(images, linear, width, settings.coloured, apart)
-                linear = linearised(images, mesh, coefficients, settings)
-            posterior = solve(linear, mesh, coefficients, prior, settings, turn)
+                rough = images.single()
+            linear = linearised(rough, single, coefficients.float(), settings)
+            posterior = solve(linear, single, coefficients, prior, settings, turn)
             coefficients = posterior.coefficients.to(like)
             # the first flow on coarse knots is too far off to estimate the prior from
             if turn or level:
