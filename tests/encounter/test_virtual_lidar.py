@@ -130,9 +130,10 @@ def test_a_repeated_step_gives_the_same_numbers(flight):
     assert not same(lidar.images, other.images)
     again = lidar.step(0.2)
     assert same(lidar.images, images[2])
-    # sums of the fit differ in their last digits with where the memory lies
+    # sums in single precision differ in their last digits with where the memory lies
+    stderr = np.sqrt(np.diag(found.pair.covariance))
     for pair in (estimates[2].pair, again.pair):
-        np.testing.assert_allclose(pair.parameters, found.pair.parameters, rtol=1e-6)
+        assert (np.abs(pair.parameters - found.pair.parameters) < 0.02 * stderr).all()
 
 
 def test_only_the_first_step_compiles(flight):
