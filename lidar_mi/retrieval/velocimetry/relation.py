@@ -8,7 +8,7 @@ from scipy.special import stdtrit
 from torch.nn.functional import pad
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised, rms
-from lidar_mi.retrieval.velocimetry.correlation import correlate
+from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
 from lidar_mi.retrieval.velocimetry.first_pass import coarse_volumes, coarse_windows, volume_scores
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_FILTER, FilterSettings
 from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited
@@ -137,8 +137,7 @@ def _of_images(spline: Spline, finite: torch.Tensor, windows: Windows, wide: boo
     places = [place.expand(2, -1, -1) for place in torch.meshgrid(*along, indexing="ij")]
 
     def score(first, second):
-        found = correlate(first, second, frame.template, frame.search, frame.stride)
-        return found.flatten(0, 1).amax(0)
+        return cross_correlation(first, second, frame.template, frame.search, frame.stride).score
 
     known = frame.of_regions(working(~finite)) == 0
     values = _floored(spline.sample(*places)[0])

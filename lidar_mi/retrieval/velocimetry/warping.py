@@ -22,6 +22,8 @@ from lidar_mi.retrieval.velocimetry.windows import stored
 
 # Points of a volume read at once: their intermediate results stay near the cache.
 _POINTS = 1 << 16
+# Of images more are read one image after the other: their weights take 30 times the memory.
+_TOGETHER = 1 << 19
 
 
 class Spline(NamedTuple):
@@ -91,6 +93,11 @@ class Spline(NamedTuple):
 def _read_images(coefficients: torch.Tensor, z: torch.Tensor, y: torch.Tensor):
     """Values and slopes, per node, at places counted in nodes: two dimensions."""
     images, height, width = coefficients.shape
+    if images > 1 and z.numel() > _TOGETHER:
+        parts = [
+            _read_images(coefficients[k : k + 1], z[k : k + 1], y[k : k + 1]) for k in range(images)
+        ]
+        return [torch.cat(part) for part in zip(*parts, strict=True)]
     row, column = z.floor(), y.floor()
     weight_z, weight_y = spline_weights(z - row), spline_weights(y - column)
     first = torch.arange(images, device=z.device).view(-1, *[1] * (z.ndim - 1)) * height
