@@ -15,6 +15,11 @@ Parameter                   Type       Meaning                                  
 ``pixel``                   float      side of a square pixel, m                            7.4e-6
 ``centre_x, centre_y``      float      where the optical axis meets the CCD, px right and   middle
                                        down from the centre of the top left pixel
+``tilt_x, tilt_y``          float      rad, of the CCD about its y and x axis: the sides of  0
+                                       larger x, of larger y lie farther from the lens
+``distortion``              float      k of r = r_ideal (1 + k (r_ideal / R)^2), R half the 0
+                                       CCD's diagonal; up to 0.05 each way
+``defocus``                 float      diameter of the disc that a point of light is, m     0
 ``stop_radius``             float      m                                                    5e-3
 ``lens``                    string,    ``ideal``: light at an angle goes to r = f tan       ideal
                             tensor     (angle), from everywhere on the stop; or N x 4
@@ -30,6 +35,11 @@ light path, the stop first: radius of curvature (m; positive: the centre is on t
 The lens is assumed to be coated: without loss and without effect on the polarisation. For a real
 lens ``focal_length`` is only information for other parts of the program.
 
+Tilt and distortion are about ``centre``, and come on top of those of a real lens. Light that passes
+the middle of the stop is not moved by a defocus, light at its rim by half the disc; the disc is the
+same everywhere on the CCD. (Rays from the CCD through a real lens take their place in its last
+surface for that in the stop, which differs by 1 to 2 % of the disc.)
+
 The weight of a sampled ray is the étendue (m^2 sr) of its pixel, so that the mean of weight times
 radiance is the power on the pixel.
 
@@ -43,6 +53,8 @@ radiance is the power on the pixel.
       </film>
     </sensor>
 """
+
+import math
 
 import drjit as dr
 import mitsuba as mi
@@ -72,6 +84,17 @@ def define():
                 if not np.isfinite(value):
                     fail(NAME, f"centre_{axis}", value, "a finite number")
             self.stop_radius = positive(props, NAME, "stop_radius", 5e-3)
+            self.tilt = tuple(number(props, NAME, f"tilt_{axis}", 0.0) for axis in "xy")
+            for axis, value in zip("xy", self.tilt, strict=True):
+                if not abs(value) < 0.5:
+                    fail(NAME, f"tilt_{axis}", value, "less than 0.5 rad each way")
+            self.distortion = number(props, NAME, "distortion", 0.0)
+            if not abs(self.distortion) <= 0.05:
+                fail(NAME, "distortion", self.distortion, "up to 0.05 each way")
+            self.defocus = number(props, NAME, "defocus", 0.0)
+            if not 0 <= self.defocus <= 0.01:
+                fail(NAME, "defocus", self.defocus, "0 to 0.01 m")
+            self.half_diagonal = float(np.hypot(width, height)) / 2 * self.pixel
             lens = props.get("lens", "ideal")
             ideal = isinstance(lens, str) and lens == "ideal"
             self.lens = None if ideal else read_lens(lens)
@@ -112,7 +135,10 @@ def define():
                     self.lens, (point.y, point.z), (direction.y, direction.z, -direction.x), dr
                 )
                 arrives &= direction.x < 0
-            place = mi.Point2f(right, down) / self.m_pixel + self.m_centre
+            at = self._distorted(right, down)
+            if self.defocus:
+                at += mi.Point2f(point.y, point.z) * (self.defocus / 2 / self.m_stop)
+            place = at / self.m_pixel + self.m_centre
             width, height = self.film().size()
             arrives &= (place.x >= -0.5) & (place.x < width - 0.5)
             arrives &= (place.y >= -0.5) & (place.y < height - 0.5)
@@ -127,7 +153,10 @@ def define():
             """
             at = (place - self.m_centre) * self.m_pixel
             disc = mi.warp.square_to_uniform_disk(sample)
-            area = self.m_pixel * self.m_pixel
+            if self.defocus:
+                at -= disc * (self.defocus / 2)
+            at, stretch = self._ideal(at)
+            area = self.m_pixel * self.m_pixel * stretch
             if self.lens is None:
                 point = mi.Point3f(0, disc.x * self.m_stop, disc.y * self.m_stop)
                 direction = dr.normalize(mi.Vector3f(self.m_focal_length, -at.x, -at.y))
@@ -145,6 +174,49 @@ def define():
             weight = dr.select(passes, weight / distance**2, 0)
             point, direction = mi.Point3f(0, right, down), mi.Vector3f(out[2], out[0], out[1])
             return self.m_pose @ point, self.m_pose @ direction, weight
+
+        # --- from the CCD to the image of an ideal lens on an upright CCD, and back
+
+        def _ideal(self, at):
+            """Place in the ideal image of a place on the CCD, and its area there over the CCD's.
+
+            Light through the middle of the lens meets the tilted CCD in P = (0, 0, f) + x e_x +
+            y e_y, and the ideal image in f P / P_z.
+            """
+            stretch = mi.Float(1)
+            if any(self.tilt):
+                (cos_x, sin_x), (cos_y, sin_y) = ((math.cos(t), math.sin(t)) for t in self.tilt)
+                nearer = 1 / (1 + (at.x * sin_x * cos_y + at.y * sin_y) / self.m_focal_length)
+                at = mi.Point2f(at.x * cos_x, at.y * cos_y - at.x * sin_x * sin_y) * nearer
+                stretch = cos_x * cos_y * nearer * nearer * nearer
+            if self.distortion:
+                k, far2 = self.distortion, dr.squared_norm(at) / self.half_diagonal**2
+                ideal2 = far2
+                # Newton's method for q (1 + k q)^2, the squared radius of the distorted image
+                for _ in range(3):
+                    wide = 1 + k * ideal2
+                    ideal2 = ideal2 - (ideal2 * wide * wide - far2) / (wide * (1 + 3 * k * ideal2))
+                wide = 1 + k * ideal2
+                at, stretch = at / wide, stretch / (wide * (1 + 3 * k * ideal2))
+            return at, stretch
+
+        def _distorted(self, right, down):
+            """Place on the CCD of a place in the ideal image."""
+            at = mi.Point2f(right, down)
+            if self.distortion:
+                at *= 1 + self.distortion * dr.squared_norm(at) / self.half_diagonal**2
+            if any(self.tilt):
+                (cos_x, sin_x), (cos_y, sin_y) = ((math.cos(t), math.sin(t)) for t in self.tilt)
+                # the light's way meets the CCD: with n = e_x x e_y, t n.(x, y, f) = n_z f
+                normal = -sin_x, -cos_x * sin_y, cos_x * cos_y
+                toward = normal[0] * at.x + normal[1] * at.y
+                # t - 1, without the loss of digits of t
+                step = -toward / (normal[2] * self.m_focal_length + toward)
+                x, y, z = at.x * (1 + step), at.y * (1 + step), step * self.m_focal_length
+                at = mi.Point2f(
+                    cos_x * x - sin_x * sin_y * y + sin_x * cos_y * z, cos_y * y + sin_y * z
+                )
+            return at
 
         def _exit_radius(self) -> float:
             """Radius of the light's cross-section in the tangent plane of the last surface."""

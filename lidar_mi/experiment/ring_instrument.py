@@ -63,6 +63,9 @@ def ring_model(
         harmonics=table,
         temperatures=temperatures,
         falloff=2 * diagonal2 / camera.illumination_radius**2,
+        tilt=camera.tilt,
+        distortion=camera.distortion,
+        blur=(camera.defocus / 2 / camera.pixel) ** 2,
     )
 
 

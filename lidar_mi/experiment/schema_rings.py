@@ -2,11 +2,19 @@
 
 from typing import Annotated
 
-from pydantic import Field, model_validator
+from pydantic import AllowInfNan, Field, model_validator
 
+from lidar_mi.description import Description
 from lidar_mi.experiment.schema_air import Section
-from lidar_mi.units import Frequency, Length, Number, Temperature, Within
+from lidar_mi.units import Angle, Frequency, Length, Number, Temperature, Unit, Within
 
+_Tilt = Annotated[Angle, Within(-0.5, 0.5, "as of the camera")]
+_Radius = Annotated[
+    float,
+    AllowInfNan(True),
+    Unit("m", "6 mm"),
+    Within(1e-6, 1000, "as of the camera", or_infinite=True),
+]
 _Fraction = Annotated[Number, Within(0, 1, "definition of a fraction")]
 
 
@@ -48,6 +56,18 @@ class Assumed(Section):
     focal_length: Annotated[Length, Within(0.001, 100, "as of the camera")] | None = None
     reflectivity: Annotated[Number, Within(1e-9, 0.999999, "as of the etalon")] | None = None
     surface_rms: Annotated[Length, Within(0, 1e-6, "as of the etalon")] | None = None
+    order_fraction: Annotated[Number, Within(0, 1, "as of the etalon", "[)")] | None = None
+    bow: Annotated[Length, Within(0, 1e-4, "as of the etalon")] | None = None
+    illumination_radius: _Radius | None = None
+    tilt: tuple[_Tilt, _Tilt] | None = None
+    distortion: Annotated[Number, Within(-0.05, 0.05, "as of the camera")] | None = None
+    defocus: Annotated[Length, Within(0, 0.01, "as of the camera")] | None = None
+
+    def of(self, described: Description) -> Description:
+        """A part of the instrument with the assumed values in place of its own."""
+        given = self.model_dump(exclude_none=True)
+        own = {name: value for name, value in given.items() if name in type(described).model_fields}
+        return described.model_copy(update=own)
 
 
 class RingCalibration(Section):

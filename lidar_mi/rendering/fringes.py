@@ -96,7 +96,9 @@ def scene_dict(etalon: Etalon, camera: FringeCamera, line: Line, settings: Fring
     wavelength = line.wavelength
     x, y = camera.centre_pixel
     corner = math.hypot(max(x, camera.width - 1 - x) + 0.5, max(y, camera.height - 1 - y) + 0.5)
-    field = math.atan(corner * camera.pixel / camera.focal_length)
+    # what the CCD's defects let in from beyond
+    corner = corner * camera.pixel * (1 + abs(camera.distortion)) + camera.defocus / 2
+    field = math.atan(corner / camera.focal_length) * (1 + sum(map(abs, camera.tilt)))
     lens: Any = "ideal"
     if settings.lens == "singlet":
         rows = singlet(camera.focal_length, wavelength, settings.stop_radius, field)
@@ -149,6 +151,10 @@ def scene_dict(etalon: Etalon, camera: FringeCamera, line: Line, settings: Fring
             "pixel": camera.pixel,
             "centre_x": x,
             "centre_y": y,
+            "tilt_x": camera.tilt[0],
+            "tilt_y": camera.tilt[1],
+            "distortion": camera.distortion,
+            "defocus": camera.defocus,
             "stop_radius": settings.stop_radius,
             "lens": lens,
             "film": {
@@ -188,6 +194,10 @@ def render_image(scene, samples: int = 0, seed: int = 0) -> xr.Dataset:
         "pixel": sensor.pixel,
         "centre_x": x,
         "centre_y": y,
+        "tilt_x": sensor.tilt[0],
+        "tilt_y": sensor.tilt[1],
+        "distortion": sensor.distortion,
+        "defocus": sensor.defocus,
         "stop_radius": sensor.stop_radius,
         "lens": "ideal" if sensor.lens is None else "surfaces",
         "wavelength": line.wavelength,

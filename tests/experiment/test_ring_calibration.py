@@ -76,6 +76,26 @@ def test_calibrated_instrument():
     assert abs(float((normal**2).sum()) / (PULSES - 1) - 1) < 4 * math.sqrt(2 / (PULSES - 1))
 
 
+def test_camera_that_is_tilted_out_of_focus_and_distorts():
+    """Defects of the true camera; each alone is in the table of defects."""
+    camera = CAMERA | {"tilt": ["0.5 deg", "0 deg"], "distortion": 0.002, "defocus": "50 um"}
+    asked = {
+        "camera": camera,
+        "assumed": {"tilt": ["0 deg", "0 deg"], "distortion": 0, "defocus": "0 um"},
+        "retrieval": {"background_degree": 0, "max_chi_square": math.inf},
+    }
+    before, wrong = retrieved(experiment(**asked))
+    after, assumed = retrieved(experiment(**asked, calibration={"frames": 8}))
+    total = math.hypot(np.sqrt((after[1] ** 2).mean() / PULSES), after[2].mean())
+    assert abs(before[0].mean() - SPEED) > 5 * total
+    assert abs(after[0].mean() - SPEED) < 4 * total
+    assert total < 0.1
+    assert (wrong.model.tilt, wrong.model.distortion, wrong.model.blur) == ((0, 0), 0, 0)
+    assert assumed.model.distortion == pytest.approx(0.002, rel=0.02)
+    assert assumed.model.tilt == pytest.approx((math.radians(0.5), 0), abs=1e-3)
+    assert assumed.model.blur == pytest.approx((25 / 29.6) ** 2, rel=0.05)
+
+
 def test_calibration_of_a_file(tmp_path):
     asked = experiment(calibration={"file": "etalon.nc"})
     rings = ring_instrument(asked.doppler)

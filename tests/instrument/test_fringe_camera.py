@@ -12,6 +12,7 @@ import pytest
 import torch
 from pydantic import ValidationError
 from scipy import constants, stats
+from scipy.spatial.transform import Rotation
 
 from lidar_mi.atmosphere.line import backscatter_line, laser_line
 from lidar_mi.errors import InputError
@@ -326,3 +327,63 @@ def test_bad_ccds(changes):
 def test_bad_calls(call, words):
     with pytest.raises(InputError, match=words):
         call()
+
+
+# ---------------------------------------------------------------- a real camera
+
+COARSE = {"width": 96, "height": 78, "pixel": "74 um"}
+
+
+def test_a_tilted_camera_by_rotations():
+    """Pixels are points of a plane turned about its y, then its x axis, projected from the lens."""
+    camera = FringeCamera(**COARSE, tilt=["60 mrad", "-40 mrad"], centre=(40.0, 30.5))
+    x = (np.arange(96) - 40) * 74e-6
+    y = (np.arange(78) - 30.5) * 74e-6
+    plane = np.stack([*np.meshgrid(x, y), np.zeros((78, 96))], -1)
+    # larger x, larger y farther away
+    turned = Rotation.from_rotvec([-0.04, 0, 0]) * Rotation.from_rotvec([0, -0.06, 0])
+    points = turned.apply(plane.reshape(-1, 3)) + [0, 0, 0.3]
+    ideal = 0.3 * points[:, :2] / points[:, 2:]
+    found = camera.radius_squared().ravel()
+    np.testing.assert_allclose(found, (ideal**2).sum(1), rtol=1e-12, atol=1e-18)
+
+
+def test_distortion_moves_pixels_out():
+    camera = FringeCamera(**COARSE, distortion=0.02)
+    upright = FringeCamera(**COARSE)
+    ideal = np.sqrt(camera.radius_squared())
+    distorted = ideal * (1 + 0.02 * (ideal / camera.half_diagonal) ** 2)
+    np.testing.assert_allclose(distorted, np.sqrt(upright.radius_squared()), rtol=1e-12)
+
+
+@pytest.mark.parametrize("defect", [{"distortion": -0.03}, {"tilt": ["0.1 rad", "0 rad"]}])
+def test_light_falls_on_areas_of_the_ideal_image(defect):
+    """Even light per solid angle: a pixel has as much as its area there, by finite differences."""
+    camera = FringeCamera(**COARSE, centre=(47.5, 39.0), **defect)
+    pixel, row = 74e-6, (39, slice(60, None))
+    # y is 0 along the row through the centre
+    right, left = (np.sqrt(camera.radius_squared((dx, 0.0))[row]) for dx in (0.01, -0.01))
+    along = (right - left) / (0.02 * pixel)
+    if "tilt" in defect:
+        # x does not depend on y
+        off, on = (camera.radius_squared((0.0, dy))[row] for dy in (0.1, 0.0))
+        across = np.sqrt(off - on) / (0.1 * pixel)
+    else:
+        across = np.sqrt(camera.radius_squared()[row]) / ((np.arange(60, 96) - 47.5) * pixel)
+    np.testing.assert_allclose(camera.ideal_image()[1][row], along * across, rtol=1e-5)
+
+
+def test_a_lens_out_of_focus_spreads_every_point_over_a_disc():
+    """Mean of 400 shifted images, evenly over the disc, against the seven of the program."""
+    sharp, blurred = FringeCamera(**COARSE), FringeCamera(**COARSE, defocus="60 um")
+    turn = np.pi * (3 - np.sqrt(5)) * np.arange(400)
+    radius = 30 / 74 * np.sqrt((np.arange(400) + 0.5) / 400)
+    middle = np.array(sharp.centre_pixel)
+    mean = 0
+    for x, y in zip(radius * np.cos(turn), radius * np.sin(turn), strict=True):
+        moved = sharp.model_copy(update={"centre": tuple((middle + (x, y)).tolist())})
+        mean = mean + fringe_image(moved, ETALON, AIR, 50.0, 1.0).numpy() / 400
+    found = fringe_image(blurred, ETALON, AIR, 50.0, 1.0).numpy()
+    change = np.abs(mean / fringe_image(sharp, ETALON, AIR, 50.0, 1.0).numpy() - 1).max()
+    assert change > 0.02
+    np.testing.assert_allclose(found, mean, rtol=0.05 * change)

@@ -80,6 +80,8 @@ def fine_image(camera, etalon, line, v_los):
         ({"gap": 11e-3, "order_fraction": 0.2, "reflectivity": 0.6, "absorption": 0.05}, {}),
         ({"order_fraction": None, "index": 1.0003, "surface_rms": 9e-9, "bow": 30e-9}, {}),
         ({}, {"centre": (30.0, 60.5), "focal_length": 0.25, "illumination_radius": 4e-3}),
+        ({}, {"tilt": ("20 mrad", "-30 mrad"), "distortion": 0.02, "centre": (40.0, 45.0)}),
+        ({}, {"defocus": 150e-6, "distortion": -0.02}),
     ],
 )
 @pytest.mark.parametrize(

@@ -132,14 +132,8 @@ def ring_instrument(doppler: Doppler) -> Rings:
 
 def ring_models(doppler: Doppler) -> tuple[RingModel, RingModel]:
     """What the ring fit assumes of images of air and of the laser."""
-    told, other = doppler.retrieval, doppler.assumed.model_dump(exclude_none=True)
-    lens = {name: value for name, value in other.items() if name == "focal_length"}
-    plates = {name: value for name, value in other.items() if name != "focal_length"}
-    instrument = (
-        doppler.lidar,
-        doppler.etalon.model_copy(update=plates),
-        doppler.camera.model_copy(update=lens),
-    )
+    told, assumed = doppler.retrieval, doppler.assumed
+    instrument = doppler.lidar, assumed.of(doppler.etalon), assumed.of(doppler.camera)
     smooth = {"light_degree": told.light_degree, "background_degree": told.background_degree}
     air = air_rings(
         *instrument, aerosol_std=told.aerosol_std, temperature_std=told.temperature_std, **smooth

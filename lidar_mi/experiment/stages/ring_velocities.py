@@ -186,14 +186,15 @@ def velocities(
                 frames = exposed_frames(doppler, rings, expected[k], n, seed, numbers)
                 # those that follow one frame of the laser have the same
                 first_of_case = numbers[0] - first
+                lasers = sorted({i // sharing for i in images})
                 laser = exposed_frames(
                     doppler,
                     rings,
                     emitted,
                     own,
                     seed,
-                    [REFERENCES + first_of_case + i // sharing for i in images],
-                )
+                    [REFERENCES + first_of_case + i for i in lasers],
+                )[[lasers.index(i // sharing) for i in images]]
                 # as a change of frequency or gap is one of the speed
                 drifted, drift_std = drifts(
                     doppler, n, [seed, first_of_case], images, "doppler.retrieval.averaged"

@@ -71,7 +71,41 @@ def doppler_alone(experiment: Experiment, lines: xr.Dataset, *, log: Log) -> dic
     except InputError as error:
         log.remark(f"no wind from lines of sight alone: {error}")
         return {}
-    return {"triples": triples, "neighbours": around}
+    shifted = _shifted(lines)
+    if shifted is None:
+        return {"triples": triples, "neighbours": around}
+    return {
+        "triples": with_systematic(triples, wind_from_triples(shifted)),
+        "neighbours": with_systematic(
+            around, wind_from_neighbours(shifted, min(_AROUND, lines.sizes["line"]))
+        ),
+    }
+
+
+def _shifted(lines: xr.Dataset) -> xr.Dataset | None:
+    """Lines of sight, all with the systematic error that is stated; None where none is."""
+    known = lines.get("v_los_systematic")
+    if known is None or not (known > 0).any():
+        return None
+    return lines.assign(v_los=lines["v_los"] + known)
+
+
+def with_systematic(found: xr.Dataset, shifted: xr.Dataset) -> xr.Dataset:
+    """Vectors with the systematic standard errors of their components, m/s.
+
+    Parameters
+    ----------
+    found, shifted : xr.Dataset
+        Vectors by the same method from lines as measured, and from lines that all have the stated
+        systematic error of v_LOS. It is one error, common to all lines and vectors; the differences
+        of the vectors are what it makes of u, v and w.
+    """
+    for name in COMPONENTS:
+        found[f"{name}_systematic"] = abs(shifted[name] - found[name]).assign_attrs(
+            units="m s-1",
+            long_name=f"systematic standard error of {name}, by that common to all lines of sight",
+        )
+    return found
 
 
 def crossflow(experiment: Experiment, wind: xr.Dataset) -> xr.Dataset:
@@ -95,9 +129,10 @@ def with_truth(
     experiment: Experiment, truth: xr.Dataset, lines: xr.Dataset, crossflow: xr.Dataset
 ) -> xr.Dataset:
     """The wind of `combine` from lines and cross-flow wind, with the truth at its nodes."""
-    found = combine(
-        crossflow, lines, crossflow_std=experiment.sensor.crossflow_std, **_oblique_view(experiment)
-    )
+    settings = {"crossflow_std": experiment.sensor.crossflow_std, **_oblique_view(experiment)}
+    found, shifted = combine(crossflow, lines, **settings), _shifted(lines)
+    if shifted is not None:
+        found = with_systematic(found, combine(crossflow, shifted, **settings))
     for name in COMPONENTS:
         at = {axis: found[axis] for axis in ("z", "y")}
         found[f"{name}_true"] = (
