@@ -22,7 +22,7 @@ def calibrate(
             "(also cubes); two at least, twenty are good."
         ),
     ],
-    instrument: NominalInstrument = "fringes",
+    instrument: NominalInstrument = "fringes_paper",
     changes: Changes = None,
     flat: Annotated[
         list[Path] | None, typer.Option(help="Frames of even white light, once per file.")

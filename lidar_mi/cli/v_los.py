@@ -33,7 +33,7 @@ def v_los(
     calibration: Annotated[
         Path | None, typer.Option(help="File of `lidar-mi calibrate`. Default: the nominal one.")
     ] = None,
-    instrument: NominalInstrument = "fringes",
+    instrument: NominalInstrument = "fringes_paper",
     changes: Changes = None,
     electrons: Electrons = False,
     max_chi_square: Annotated[

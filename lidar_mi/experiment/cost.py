@@ -41,7 +41,9 @@ CAUSES = 5
 VOXEL = 7e-5
 """Seconds of a voxel of a volume, per method."""
 RING_IMAGE = 1.3e-6
-"""Seconds of a pixel of an image of rings, without noise."""
+"""Seconds of a pixel of an image of rings, without noise, of 16 samples."""
+RING_CALIBRATION = 3e-6
+"""Seconds of a pixel of a frame from which the instrument is calibrated."""
 RING_PAIR = 4.0e-7
 """Seconds of a pixel of a noisy frame and its laser's, drawn and fitted."""
 RING_PIXELS_FIT = 4e-6
@@ -166,9 +168,12 @@ def _rings(experiment: Experiment) -> float:
     settings, pixels = doppler.retrieval, doppler.camera.width * doppler.camera.height
     cases = len(settings.averaged) * len(doppler.v_los)
     slow = cases * settings.slow_images * len(settings.centre)
+    asked = doppler.calibration
+    calibrated = 0 if asked is None or asked.file else asked.frames
     peaks = [m for m in settings.methods if m not in (RingMethod.ANNULAR, RingMethod.PIXELS)]
     return pixels * (
-        RING_IMAGE * (len(doppler.v_los) + 1)
+        RING_IMAGE * (len(doppler.v_los) + 1) * doppler.render.samples_per_pixel / 16
+        + RING_CALIBRATION * calibrated
         + RING_PAIR * cases * settings.images
         + RING_PIXELS_FIT * slow * (RingMethod.PIXELS in settings.methods)
         + RING_PEAK * slow * len(peaks)

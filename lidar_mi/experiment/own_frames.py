@@ -77,7 +77,7 @@ def read_electrons(
 @checked_arguments
 def calibrate_etalon(
     frames: Any,
-    instrument: str | Path | Experiment = "fringes",
+    instrument: str | Path | Experiment = "fringes_paper",
     *,
     flat: Any = None,
     light_degree: int = 2,
@@ -137,7 +137,7 @@ is determined
 def retrieve_v_los(
     frames: Any,
     reference: Any = None,
-    instrument: str | Path | Experiment = "fringes",
+    instrument: str | Path | Experiment = "fringes_paper",
     *,
     calibration: Calibration | None = None,
     max_chi_square: float | None = None,

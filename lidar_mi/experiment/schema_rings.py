@@ -12,7 +12,7 @@ _Tilt = Annotated[Angle, Within(-0.5, 0.5, "as of the camera")]
 _Radius = Annotated[
     float,
     AllowInfNan(True),
-    Unit("m", "6 mm"),
+    Unit("m", "500 m"),
     Within(1e-6, 1000, "as of the camera", or_infinite=True),
 ]
 _Fraction = Annotated[Number, Within(0, 1, "definition of a fraction")]

@@ -22,14 +22,13 @@ from lidar_mi.units import Angle, Length, Number, Within
 _NODES = {1: (0.0,), 2: (-0.5 / math.sqrt(3), 0.5 / math.sqrt(3))}
 
 
-# A disc's mean to fifth order: weights and places in its radius (Abramowitz & Stegun 1972, 25.4.61).
-_DISC = ((0.25, 0.0, 0.0),) + tuple(
-    (
-        0.125,
-        math.sqrt(2 / 3) * math.cos(k * math.pi / 3),
-        math.sqrt(2 / 3) * math.sin(k * math.pi / 3),
-    )
-    for k in range(6)
+# Mean over a disc to fifth order (Abramowitz & Stegun 1972, 25.4.61): weight, x and y in radii.
+_DISC = (
+    (0.25, 0.0, 0.0),
+    *(
+        (0.125, math.sqrt(2 / 3) * math.cos(angle), math.sqrt(2 / 3) * math.sin(angle))
+        for angle in (k * math.pi / 3 for k in range(6))
+    ),
 )
 # Newton steps of the inverse distortion: below 1e-15 from a start that is 10 % off.
 _STEPS = 6
@@ -129,7 +128,7 @@ class FringeCamera(Description):
         column, row = self.centre_pixel
         x = (np.arange(self.width) + shift[0] - column) * self.pixel
         y = ((np.arange(self.height) + shift[1] - row) * self.pixel)[:, None]
-        area = 1.0
+        area: np.ndarray | float = 1.0
         if self.tilt != (0, 0):
             (cos_x, sin_x), (cos_y, sin_y) = ((math.cos(t), math.sin(t)) for t in self.tilt)
             nearer = 1 / (1 + (x * sin_x * cos_y + y * sin_y) / self.focal_length)

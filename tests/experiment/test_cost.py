@@ -53,8 +53,10 @@ def test_parts_grow_with_their_work():
     alone = of("wake_backscatter")
     assert alone.lines == alone.rings == 0 and alone.figures < shipped.figures
     # 58, 6, 7 and 3 s were measured, and 3 s of the start
-    rings = of("fringes")
+    rings = of("fringes_paper")
     assert 77 / 2 < rings.total < 77 * 2
+    # rendering, calibration, winds, bound and figures took 8, 11, 8, 2 and 3 s, and 3 s the start
+    assert 35 / 2 < of("fringes").total < 35 * 2
     assert shipped.total == pytest.approx(sum(shipped) + costs.START)
 
 

@@ -342,7 +342,7 @@ def test_a_tilted_camera_by_rotations():
     plane = np.stack([*np.meshgrid(x, y), np.zeros((78, 96))], -1)
     # larger x, larger y farther away
     turned = Rotation.from_rotvec([-0.04, 0, 0]) * Rotation.from_rotvec([0, -0.06, 0])
-    points = turned.apply(plane.reshape(-1, 3)) + [0, 0, 0.3]
+    points = turned.apply(plane.reshape(-1, 3)) + np.array([0, 0, 0.3])
     ideal = 0.3 * points[:, :2] / points[:, 2:]
     found = camera.radius_squared().ravel()
     np.testing.assert_allclose(found, (ideal**2).sum(1), rtol=1e-12, atol=1e-18)
@@ -381,7 +381,7 @@ def test_a_lens_out_of_focus_spreads_every_point_over_a_disc():
     middle = np.array(sharp.centre_pixel)
     mean = 0
     for x, y in zip(radius * np.cos(turn), radius * np.sin(turn), strict=True):
-        moved = sharp.model_copy(update={"centre": tuple((middle + (x, y)).tolist())})
+        moved = sharp.model_copy(update={"centre": tuple((middle + np.array([x, y])).tolist())})
         mean = mean + fringe_image(moved, ETALON, AIR, 50.0, 1.0).numpy() / 400
     found = fringe_image(blurred, ETALON, AIR, 50.0, 1.0).numpy()
     change = np.abs(mean / fringe_image(sharp, ETALON, AIR, 50.0, 1.0).numpy() - 1).max()
