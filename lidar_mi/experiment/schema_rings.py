@@ -2,19 +2,13 @@
 
 from typing import Annotated
 
-from pydantic import AllowInfNan, Field, model_validator
+from pydantic import Field, model_validator
 
 from lidar_mi.description import Description
 from lidar_mi.experiment.schema_air import Section
-from lidar_mi.units import Angle, Frequency, Length, Number, Temperature, Unit, Within
+from lidar_mi.units import Angle, Frequency, Length, Number, Temperature, Within
 
 _Tilt = Annotated[Angle, Within(-0.5, 0.5, "as of the camera")]
-_Radius = Annotated[
-    float,
-    AllowInfNan(True),
-    Unit("m", "500 m"),
-    Within(1e-6, 1000, "as of the camera", or_infinite=True),
-]
 _Fraction = Annotated[Number, Within(0, 1, "definition of a fraction")]
 
 
@@ -58,7 +52,7 @@ class Assumed(Section):
     surface_rms: Annotated[Length, Within(0, 1e-6, "as of the etalon")] | None = None
     order_fraction: Annotated[Number, Within(0, 1, "as of the etalon", "[)")] | None = None
     bow: Annotated[Length, Within(0, 1e-4, "as of the etalon")] | None = None
-    illumination_radius: _Radius | None = None
+    illumination_radius: Annotated[Length, Within(1e-6, 1000, "1000 m is even light")] | None = None
     tilt: tuple[_Tilt, _Tilt] | None = None
     distortion: Annotated[Number, Within(-0.05, 0.05, "as of the camera")] | None = None
     defocus: Annotated[Length, Within(0, 0.01, "as of the camera")] | None = None

@@ -20,10 +20,11 @@ from lidar_mi.assessment.report import sensor as sensor_report
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import check
 from lidar_mi.experiment import reading as config
+from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import measured
 from lidar_mi.experiment.run import prepare, run
 from lidar_mi.experiment.stages import lines as line_stage
-from lidar_mi.experiment.stages.sensor import mean_squares_without, with_truth
+from lidar_mi.experiment.stages.sensor import doppler_alone, mean_squares_without, with_truth
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
 from tests.support.experiments import leave_out_figures, replace_stages, without_figures
@@ -351,6 +352,34 @@ def test_largest_cause_of_error_of_u_is_reported(amplitude, noise, errors, limit
 
 
 @pytest.mark.slow
+def test_an_error_common_to_all_lines_is_stated_apart():
+    """Lines within 22 degrees of x that are all 0.5 m/s too fast: so is u, hardly v and w."""
+    experiment = changed()
+    y, z = np.arange(-54, 54.1, 2.0), np.arange(-34, 34.1, 2.0)
+    metres, zero = {"units": "m"}, np.zeros((len(z), len(y)))
+    truth = xr.Dataset(
+        {n: (("z", "y"), zero + value) for n, value in (("u", 2.0), ("v", 0.0), ("w", 0.0))},
+        coords={"y": ("y", y, metres), "z": ("z", z, metres)},
+    )
+    settings = experiment.sensor
+    lines = scan_wind(
+        truth, settings.directions, experiment.doppler.lidar, 0.1, 1, 70.0, settings.errors
+    )
+    crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), zero.astype(np.uint8)))
+    crossflow.attrs = {"template": 4, "stride": 1}
+    silent = with_truth(experiment, truth, lines, crossflow)
+    biased = lines.assign(v_los_systematic=("line", np.full(lines.sizes["line"], 0.5)))
+    found = with_truth(experiment, truth, biased, crossflow)
+    assert "u_systematic" not in silent
+    xr.testing.assert_identical(found["u_stderr"], silent["u_stderr"])
+    valid = found["flag"] == 0
+    u = found["u_systematic"].where(valid)
+    assert float(u.min()) > 0.4 and float(u.max()) < 0.6
+    assert float(found["v_systematic"].where(valid).max()) < 0.1
+    alone = doppler_alone(experiment, biased, log=Log())["neighbours"]
+    assert float(alone["u_systematic"].median()) == pytest.approx(0.5, rel=0.1)
+
+
 def test_the_fraction_of_noise_is_between_those_of_draws_and_of_the_lines():
     """Mean square error less that without noise, over 8 draws: no less than the variance of u over
     the draws (less 3 sigma), as the estimate also gains by knowing that noise is gone; no more than
