@@ -43,6 +43,35 @@ class WakeAlongPath(Protocol):
         ...
 
 
+def wake_axes(
+    crossing_angle: float, climb_angle: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unit vectors along a wake, across it to the left and upwards, in the path frame; rad."""
+    c, s = math.cos(crossing_angle), math.sin(crossing_angle)
+    level, up = math.cos(climb_angle), math.sin(climb_angle)
+    return (
+        np.array([c * level, s, -c * up]),
+        np.array([-s * level, c, s * up]),
+        np.array([up, 0.0, level]),
+    )
+
+
+def check_cut(along: np.ndarray, crossing_angle: float) -> None:
+    """Whether planes across the path cut a wake with this axis.
+
+    Raises
+    ------
+    InputError
+        A wake that lies in the plane.
+    """
+    if along[0] < _LEAST_ALONG:
+        raise InputError(
+            f"path.crossing_angle: {math.degrees(crossing_angle):.4g} deg is not allowed "
+            "for vortices in a plane across the path, which does not cut them; expected less "
+            f"than {math.degrees(math.acos(_LEAST_ALONG)):.4g} deg"
+        )
+
+
 @dataclass(frozen=True)
 class PairAlongPath:
     """A pair of analytic vortices along an axis that crosses the flight path.
@@ -125,13 +154,7 @@ class PairAlongPath:
     @cached_property
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Unit vectors along the wake, across it to the left and upwards, in the path frame."""
-        c, s = math.cos(self.crossing_angle), math.sin(self.crossing_angle)
-        level, up = math.cos(self.climb_angle), math.sin(self.climb_angle)
-        return (
-            np.array([c * level, s, -c * up]),
-            np.array([-s * level, c, s * up]),
-            np.array([up, 0.0, level]),
-        )
+        return wake_axes(self.crossing_angle, self.climb_angle)
 
     def circulation_at(self, time: ArrayLike) -> np.ndarray:
         """Circulation at a time, m^2 s^-1."""
@@ -194,12 +217,7 @@ class PairAlongPath:
             A wake that lies in the plane.
         """
         along, left, _ = self.axes
-        if along[0] < _LEAST_ALONG:
-            raise InputError(
-                f"path.crossing_angle: {math.degrees(self.crossing_angle):.4g} deg is not allowed "
-                "for vortices in a plane across the path, which does not cut them; expected less "
-                f"than {math.degrees(math.acos(_LEAST_ALONG)):.4g} deg"
-            )
+        check_cut(along, self.crossing_angle)
         centre, strength = np.array(self.centre_at(time)), float(self.circulation_at(time))
         found = []
         for side in (1, -1):

@@ -8,7 +8,9 @@ import xarray as xr
 from scipy.spatial.transform import Rotation
 
 from lidar_mi.atmosphere.texture import PeriodicTexture, periodic_texture
+from lidar_mi.atmosphere.wake import check_nodes
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.encounter.pointing import check_reported
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.errors import InputError
@@ -108,7 +110,7 @@ def gates_of(experiment: Experiment) -> Gates:
             shown = f" {given} is" if isinstance(given, str | float) else ""
             raise InputError(f"{key}:{shown} not allowed in an encounter; expected {expected}")
     check_reported(experiment.platform.reported)
-    wake_along_path(experiment)
+    wake = wake_along_path(experiment)
     period = 1 / encounter.rate
     stride = encounter.path.speed * period
     if encounter.look_ahead <= stride:
@@ -116,9 +118,23 @@ def gates_of(experiment: Experiment) -> Gates:
             f"encounter.look_ahead: {encounter.look_ahead:g} m is not allowed; expected more than "
             f"the {stride:g} m flown from scan to scan"
         )
-    y, z = analytic_axes(experiment.wake, "vortex_pair", most_nodes(experiment))
+    y, z = _image_axes(experiment, wake)
     between = max(1, round(stride / scan.thickness))
     return Gates(period, stride, between, encounter.look_ahead, y, z)
+
+
+def _image_axes(experiment: Experiment, wake: WakeAlongPath) -> tuple[np.ndarray, np.ndarray]:
+    """y and z of the nodes of the images, m: of an analytic pair its domain, else the volume's."""
+    if not isinstance(wake, VolumeAlongPath):
+        y, z = analytic_axes(experiment.wake, "vortex_pair", most_nodes(experiment))
+        return y, z
+    spacing, found = experiment.wake.spacing, {}
+    for name in "yz":
+        cells = math.floor(float(np.ptp(wake.flow[name].values)) / spacing + 1e-6)
+        found[name] = spacing * (np.arange(cells + 1) - cells / 2)
+    counts = {name: len(axis) for name, axis in found.items()}
+    check_nodes(spacing, counts, most_nodes(experiment))
+    return found["y"], found["z"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +211,13 @@ class Air:
             places, self._origins(near, now, step, y[1] - y[0], z[1] - z[0]), strict=True
         ):
             axis[carried] = found
-        values = self.background * self.texture.at(*places) + self.molecules
+        mean: np.ndarray | float = self.background
+        if isinstance(self.wake, VolumeAlongPath):
+            # a plane that is carried has the exhaust of where and when it comes from
+            times = np.full(len(x), now)
+            times[carried] -= gates.period
+            mean = self.wake.extinction(*places, times[:, None, None])
+        values = mean * self.texture.at(*places) + self.molecules
         field = xr.DataArray(values, {"x": x, "y": y, "z": z}, ("x", "y", "z"))
         field["x"].attrs["cell_width"] = step
         return field

@@ -19,6 +19,7 @@ from lidar_mi.atmosphere.wake import centre, check_nodes, resample
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.forecast import most_nodes
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema_air import ExtinctionMapping, Wake
 from lidar_mi.io.wake_file import read_wake
 
 Flows = tuple[xr.Dataset, xr.Dataset | None]
@@ -80,12 +81,12 @@ def make_truth(
     beside = experiment.folder if beside is None else beside
     first, second = flows or read_flows(experiment, beside)
     mapping = experiment.wake.extinction
-    smooth1 = _extinction(first, mapping, first, second)
+    smooth1 = extinction_of(first, mapping, first, second)
     flow = mean_flow((first, second))
     if second is None:
         smooth2 = _advected(smooth1, flow, experiment)
     else:
-        smooth2 = _extinction(second, mapping, first, second)
+        smooth2 = extinction_of(second, mapping, first, second)
     texture = experiment.wake.texture
     if texture.rms > 0:
         x = first["x"].values if first.sizes["x"] > 1 else None
@@ -155,11 +156,7 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
         return pair_wake(vortices, *axes, x=gate_middle), None
     if wake.turbine:
         return _turbine(experiment, gate_middle), None
-    mapping = wake.extinction
-    # tracers of the extinction are renamed to our names, and must be in the file
-    needed = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
-    needed = {n: t for n, t in needed.items() if t and mapping.source == "tracer"}
-    names = wake.names | {n: t for n, t in needed.items() if t != n}
+    needed, names = tracers_of(wake)
     path = find_file(wake.file, beside, "wake.file")
     if wake.second != "advect" and wake.time is not None:
         passed = wake.second - wake.time
@@ -187,6 +184,17 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
         middle = wake.x if wake.x is not None else float(flow["x"].mean())
         flows.append(flow.assign_coords(x=flow["x"] - middle + gate_middle))
     return flows[0], flows[1]
+
+
+def tracers_of(wake: Wake) -> tuple[dict[str, str], dict[str, str]]:
+    """Variables that the extinction needs of a wake's file; names of all in the file.
+
+    Tracers of the extinction have our names once they are read.
+    """
+    mapping = wake.extinction
+    named = {"tracer": mapping.tracer, "aerosol": mapping.aerosol}
+    needed = {n: t for n, t in named.items() if t and mapping.source == "tracer"}
+    return needed, wake.names | {n: t for n, t in needed.items() if t != n}
 
 
 def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
@@ -242,8 +250,10 @@ def analytic_axes(wake, key: str, most: int) -> list[np.ndarray]:
     return [np.linspace(*end) for end in ends.values()]
 
 
-def _extinction(flow, mapping, first, second) -> xr.DataArray:
-    """Extinction of one state, scaled by the largest value of both."""
+def extinction_of(
+    flow: xr.Dataset, mapping: ExtinctionMapping, first: xr.Dataset, second: xr.Dataset | None
+) -> xr.DataArray:
+    """Extinction (m^-1) of one state of a flow, scaled by the largest value of both."""
     limits = {"background": mapping.background, "maximum": mapping.maximum}
     states = [s for s in (first, second) if s is not None]
     if mapping.source == "speed":

@@ -1,16 +1,22 @@
-"""The wake of an encounter from its keys. Unit tier.
+"""The wake of an encounter from its keys. Unit and physics tier.
 
-Detects: a key that does not reach the wake, an unsuitable wake that is accepted.
+Detects: a key that does not reach the wake, an unsuitable wake that is accepted, a volume that is
+met elsewhere, turned or with other loads than the analytic wake that it was sampled from.
 """
 
 import math
 
+import numpy as np
 import pytest
 
 import lidar_mi as lm
-from lidar_mi.encounter.wake import wake_along_path
+from lidar_mi.atmosphere.wake_path import PairAlongPath
+from lidar_mi.encounter.aircraft import loads_in_wind
+from lidar_mi.encounter.flight import aircraft_of
+from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.errors import InputError
 from tests.support.encounters import small_encounter
+from tests.support.wake_volumes import SEPARATION, crow_volume
 
 
 def test_the_keys_reach_the_wake():
@@ -43,8 +49,97 @@ def test_decay_and_deformation_reach_the_wake():
     assert wake.crow_amplitude == 2 and wake.crow_wavelength == 200
 
 
-def test_what_is_not_known_along_the_axis_is_refused():
-    with pytest.raises(InputError, match=r"wake: wake_slab_40s\.nc is not allowed"):
-        wake_along_path(lm.load_experiment("wake_sensor", encounter={}))
+def from_file(file, path=None, **wake):
+    """The small encounter in the wake of a file."""
+    return small_encounter(
+        wake={
+            "vortex_pair": None,
+            "file": str(file),
+            "depth": "volume",
+            "extinction": {"aerosol": None},
+            "texture": {"rms": 0},
+        }
+        | wake,
+        path=path,
+    )
+
+
+@pytest.fixture(scope="module")
+def crow_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("wake") / "crow.nc"
+    crow_volume(waves=1, amplitude=3.0).drop_vars("extinction").to_netcdf(path)
+    return path
+
+
+def test_a_volume_is_repeated_and_its_vortices_are_found(crow_file):
+    """Against the analytic pair: places to 0.1 m, circulation to 2 %, descent to 3 %."""
+    wake = wake_along_path(from_file(crow_file))
+    pair = PairAlongPath(300.0, SEPARATION, crow_amplitude=3.0, x_c=190.0, t_c=190 / 75)
+    # the middle of the file's planes is where the path meets the wake
+    shift = float(wake.flow["x"].mean())
+    for x in (60.0, 190.0, 300.0, 700.0):
+        expected = pair.vortices(x + shift, pair.t_c)
+        for found, true in zip(wake.vortices(x, pair.t_c), expected, strict=True):
+            assert (found.y, found.z) == pytest.approx((true.y, true.z), abs=0.1)
+            assert found.circulation == pytest.approx(true.circulation, rel=0.02)
+            assert found.core_radius == pytest.approx(true.core_radius, abs=0.5)
+    descent = float(pair.centre_at(pair.t_c + 1)[2])
+    assert wake.drift == pytest.approx((0.0, descent), abs=0.03 * abs(descent))
+
+
+def test_loads_in_a_volume_are_those_in_the_analytic_wake(crow_file):
+    """Rolling moments along the path within 1.5 % of the largest, as is the descent's error."""
+    experiment = from_file(crow_file, path={"miss": {"y": "8 m"}})
+    encounter = encounter_of(experiment)
+    aircraft = aircraft_of(encounter)
+    pair = PairAlongPath(
+        300.0, SEPARATION, crow_amplitude=3.0, x_c=190.0, t_c=190 / 75, miss=(8.0, 0.0)
+    )
+    volume = wake_along_path(experiment)
+    shift = float(volume.flow["x"].mean())
+    times = np.linspace(0.0, 6.0, 200)
+
+    def moment(wind):
+        return loads_in_wind(aircraft.strips, aircraft.state, wind, aircraft.density, times).moment
+
+    found = moment(volume.wind)
+    expected = moment(lambda x, y, z, t: pair.wind(x + shift, y, z, t))
+    largest = np.abs(expected[:, 0]).max()
+    assert largest > 1e5  # N m
+    np.testing.assert_allclose(found[:, 0], expected[:, 0], atol=0.015 * largest)
+
+
+def test_the_shipped_plane_can_be_flown():
+    """The simulated pair of 458 m^2/s descends by 458 / (2 pi 47.1) = 1.55 m/s."""
+    wake = wake_along_path(lm.load_experiment("wake_sensor", encounter={}))
+    assert wake.drift[1] == pytest.approx(-1.55, abs=0.05)
+    port, starboard = wake.vortices(600.0, 8.0)
+    assert port.circulation == pytest.approx(440, abs=20)
+    assert (port.y + starboard.y) / 2 == pytest.approx(0.0, abs=1e-6)
+
+
+def test_what_is_not_known_along_the_axis_is_refused(crow_file, tmp_path):
+    with pytest.raises(InputError, match=r"wake: turbine is not allowed in an encounter"):
+        wake_along_path(small_encounter(wake={"vortex_pair": None, "turbine": {}}))
     with pytest.raises(InputError, match="encounter: missing in wake_sensor"):
         wake_along_path(lm.load_experiment("wake_sensor"))
+    with pytest.raises(InputError, match="wake.x: missing"):
+        wake_along_path(from_file(crow_file, depth="plane"))
+    part = tmp_path / "part.nc"
+    crow_volume(waves=1, amplitude=3.0).isel(x=slice(0, 20)).to_netcdf(part)
+    with pytest.raises(InputError, match="not periodic along x"):
+        wake_along_path(from_file(part))
+    calm = tmp_path / "calm.nc"
+    flow = crow_volume(waves=1, amplitude=0.0).isel(x=slice(0, 8))
+    flow.assign({n: flow[n].copy(data=0.01 * flow[n].values) for n in "uvw"}).to_netcdf(calm)
+    with pytest.raises(InputError, match="has 0 vortices in the plane"):
+        wake_along_path(from_file(calm))
+
+
+def test_decay_of_a_file_is_refused(crow_file):
+    experiment = from_file(crow_file)
+    decaying = experiment.encounter.wake.model_copy(update={"decay_time": 10.0})
+    encounter = experiment.encounter.model_copy(update={"wake": decaying})
+    changed = experiment.model_copy(update={"encounter": encounter}).read_from(experiment.folder)
+    with pytest.raises(InputError, match="encounter.wake.decay_time: 10 is not allowed"):
+        wake_along_path(changed)
