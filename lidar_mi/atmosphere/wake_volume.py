@@ -31,8 +31,8 @@ def one_period(flow: xr.Dataset) -> xr.Dataset:
 
     The step from the last plane to the first, and the bend there, are compared with those within
     the volume: where the seam is more than twice as rough as the roughest place inside, the volume
-    is not periodic. A last plane that repeats the first one is left out. A wake that is uniform along
-    its axis becomes a single plane.
+    is not periodic. A last plane that repeats the first one is left out. A wake that is uniform
+    along its axis becomes a single plane.
 
     Parameters
     ----------
@@ -135,7 +135,8 @@ class VolumeAlongPath:
     def _mean_pair(self) -> list[Vortex]:
         sides = (self.port, self.starboard)
         keys = ("circulation", "core_radius", "y", "z")
-        return [Vortex(*(float(np.mean([getattr(v, k) for v in s])) for k in keys)) for s in sides]
+        means = [[float(np.mean([getattr(v, k) for v in s])) for k in keys] for s in sides]
+        return [Vortex(strength, radius, y, z) for strength, radius, y, z in means]
 
     @cached_property
     def _splines(self) -> dict[str, np.ndarray]:
@@ -147,7 +148,7 @@ class VolumeAlongPath:
                 values = spline_filter1d(values, axis=0, mode="grid-wrap")
             for axis in (1, 2):
                 values = spline_filter1d(values, axis=axis, mode="mirror")
-            found[name] = np.take(
+            found[str(name)] = np.take(
                 values, range(-_BEYOND, len(values) + _BEYOND), axis=0, mode="wrap"
             )
         return found

@@ -7,7 +7,7 @@ import numpy as np
 from lidar_mi.encounter.aircraft import AircraftModel, loads_in_wind
 from lidar_mi.encounter.flight import aircraft_of, duration
 from lidar_mi.encounter.slabs import Gates, gates_of
-from lidar_mi.encounter.wake import encounter_of, wake_along_path
+from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import check as of_a_run
 from lidar_mi.experiment.describe import Section
@@ -129,8 +129,10 @@ def _slabs_in_view(experiment: Experiment, gates: Gates) -> int:
     for number in range(
         int((duration(encounter) * encounter.path.speed - gates.look_ahead) // gates.stride)
     ):
-        pair = wake.vortices(gates.slab(number), (number + 0.5) * gates.period)
-        count += all(y[0] <= one.y <= y[-1] and z[0] <= one.z <= z[-1] for one in pair)
+        pair = vortices_in_plane(wake, gates.slab(number), (number + 0.5) * gates.period)
+        count += pair is not None and all(
+            y[0] <= one.y <= y[-1] and z[0] <= one.z <= z[-1] for one in pair
+        )
     return count
 
 

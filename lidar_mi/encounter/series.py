@@ -11,6 +11,7 @@ from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.aircraft import AircraftState, Commands
 from lidar_mi.encounter.preview import Slab
 from lidar_mi.encounter.strips import Loads
+from lidar_mi.encounter.wake import vortices_in_plane
 from lidar_mi.retrieval.vortices.model import PARAMETERS
 from lidar_mi.retrieval.vortices.pair import MEANING, VortexPairFit
 
@@ -174,10 +175,11 @@ def _row(slab: Slab, wake: WakeAlongPath) -> dict[Any, float]:
     tracked = track.pair_at(estimate.x, estimate.time) if track else None
     for source, found in (("estimate", pair), ("track", tracked)):
         row |= {(source, name): value for name, value in _numbers(found).items()}
-    truth = dict(zip(("port", "starboard"), wake.vortices(estimate.x, estimate.time), strict=True))
+    true = vortices_in_plane(wake, estimate.x, estimate.time)
+    truth = dict(zip(("port", "starboard"), true, strict=True)) if true else {}
     for name in QUANTITIES:
         side, quantity = name.split("_", 1)
-        row["truth", name] = getattr(truth[side], quantity)
+        row["truth", name] = getattr(truth[side], quantity) if truth else np.nan
         row["truth", f"{name}_stderr"] = 0.0
     return row
 

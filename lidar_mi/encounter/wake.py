@@ -68,6 +68,17 @@ def wake_along_path(experiment: Experiment) -> WakeAlongPath:
     )
 
 
+def vortices_in_plane(wake: WakeAlongPath, x: float, time: float) -> tuple[Vortex, Vortex] | None:
+    """Port and starboard vortex in the plane x (m) at a time (s).
+
+    None where the plane does not cut them: a wake at right angles to the path lies in it.
+    """
+    try:
+        return wake.vortices(x, time)
+    except InputError:
+        return None
+
+
 def _from_file(experiment: Experiment) -> VolumeAlongPath:
     """A simulated wake: one plane, extruded, or a volume, repeated along its axis."""
     encounter, wake = encounter_of(experiment), experiment.wake

@@ -118,5 +118,5 @@ def test_what_is_not_periodic_is_refused(planes, what):
     """A part of a wave; half a wave of it, which ends where it began, with a bend; too few."""
     # u changes its sign from half a wave to the next, a step
     flow = crow_volume(waves=1, amplitude=3.0).drop_vars("u")
-    with pytest.raises(InputError, match=f"wake.depth: volume is not allowed.*{what}"):
+    with pytest.raises(InputError, match=rf"wake\.depth: volume is not allowed.*{what}"):
         one_period(flow.isel(x=planes))

@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 from lidar_mi.encounter.slabs import air_of, gates_of
 from lidar_mi.errors import InputError
 from tests.support.encounters import small_encounter
+from tests.support.wake_volumes import crow_volume
 
 
 @pytest.fixture(scope="module")
@@ -116,3 +117,53 @@ def test_what_is_refused(changes, message):
 def test_a_pose_in_the_slab_is_refused():
     with pytest.raises(InputError, match=r"pose\.x: 143 m ahead"):
         gates_of(small_encounter()).plan(143.0)
+
+
+@pytest.fixture(scope="module")
+def crow_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("wake") / "crow.nc"
+    crow_volume(waves=1, amplitude=3.0).drop_vars("extinction").to_netcdf(path)
+    return str(path)
+
+
+def in_file(path, tracer):
+    """The air of an encounter in a file's wake; its plane x = 0 where the path meets it."""
+    extinction = {"aerosol": None, "tracer": tracer, "maximum": "1.8/km"}
+    wake = {"vortex_pair": None, "file": path, "depth": "volume", "x": "0 m"}
+    experiment = small_encounter(wake=wake | {"extinction": extinction})
+    gates = gates_of(experiment)
+    return gates, air_of(experiment, gates)
+
+
+def test_air_in_a_volume_is_that_in_the_analytic_wake(crow_file):
+    """The same texture, carried by splines of the same wind: 1 % of its contrast (rms)."""
+    pair = {"circulation": "300 m^2/s", "separation": "24 m", "width": "70 m", "height": "50 m"}
+    analytic = small_encounter(
+        wake={"vortex_pair": pair},
+        encounter={
+            "path": {"start": "190 m", "crossing_angle": "0 deg", "climb_angle": "0 deg"},
+            "wake": {"crow": {"amplitude": "3 m"}},
+        },
+    )
+    gates, found = in_file(crow_file, None)
+    np.testing.assert_allclose(gates.y, gates_of(analytic).y)
+    np.testing.assert_allclose(gates.z, gates_of(analytic).z)
+    expected = air_of(analytic, gates).at_scan(3, (0.0, 0.0))
+    difference = found.at_scan(3, (0.0, 0.0)) - expected
+    assert float(np.sqrt((difference**2).mean())) < 0.01 * float(expected.std())
+
+
+def test_exhaust_is_carried_by_the_wind_from_the_first_sighting(crow_file):
+    """As the texture is: the near slab's exhaust is that of the far slab, one scan ago."""
+    gates, air = in_file(crow_file, "tracer")
+    second = air.at_scan(3, (0.0, 0.0))
+    assert float(second.max()) > 1.5e-3 > 2e-4 > float(second.min())
+    plane = second.sel(x=gates.look_ahead - gates.stride + gates.depth / 2, method="nearest")
+    x, now, before = 3 * gates.stride + float(plane["x"]), 3 * gates.period, 2 * gates.period
+    for y, z in ((12.0, 3.0), (-15.0, 2.0), (8.0, -4.0)):
+        path = solve_ivp(
+            lambda t, place: np.array(air.wake.wind(*place, t)), (now, before), (x, y, z), rtol=1e-8
+        )
+        start = path.y[:, -1]
+        expected = air.wake.extinction(*start, before) * air.texture.at(*start) + air.molecules
+        assert float(plane.sel(y=y, z=z)) == pytest.approx(float(expected), rel=0.02)

@@ -123,7 +123,7 @@ def test_what_is_not_known_along_the_axis_is_refused(crow_file, tmp_path):
         wake_along_path(small_encounter(wake={"vortex_pair": None, "turbine": {}}))
     with pytest.raises(InputError, match="encounter: missing in wake_sensor"):
         wake_along_path(lm.load_experiment("wake_sensor"))
-    with pytest.raises(InputError, match="wake.x: missing"):
+    with pytest.raises(InputError, match=r"wake\.x: missing"):
         wake_along_path(from_file(crow_file, depth="plane"))
     part = tmp_path / "part.nc"
     crow_volume(waves=1, amplitude=3.0).isel(x=slice(0, 20)).to_netcdf(part)
@@ -141,5 +141,5 @@ def test_decay_of_a_file_is_refused(crow_file):
     decaying = experiment.encounter.wake.model_copy(update={"decay_time": 10.0})
     encounter = experiment.encounter.model_copy(update={"wake": decaying})
     changed = experiment.model_copy(update={"encounter": encounter}).read_from(experiment.folder)
-    with pytest.raises(InputError, match="encounter.wake.decay_time: 10 is not allowed"):
+    with pytest.raises(InputError, match=r"encounter\.wake\.decay_time: 10 is not allowed"):
         wake_along_path(changed)

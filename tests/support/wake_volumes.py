@@ -21,10 +21,9 @@ def crow_volume(waves: int, amplitude: float, planes: int = 52) -> xr.Dataset:
         for vortex in pair.vortices(one, 0.0):
             r2 = (places[1][k] - vortex.y) ** 2 + (places[2][k] - vortex.z) ** 2
             tracer[k] += np.exp(-r2 / 50.0)
-    fields = {
-        name: (("x", "y", "z"), a, {"units": "m s-1"}) for name, a in zip("uvw", wind, strict=True)
-    }
-    fields["tracer"] = ("x", "y", "z"), tracer, {"units": "1"}
-    fields["extinction"] = ("x", "y", "z"), 1e-4 + 1.7e-3 * tracer / tracer.max(), {"units": "m-1"}
+    dims = ("x", "y", "z")
+    fields = {name: (dims, a, {"units": "m s-1"}) for name, a in zip("uvw", wind, strict=True)}
+    fields["tracer"] = dims, tracer, {"units": "1"}
+    fields["extinction"] = dims, 1e-4 + 1.7e-3 * tracer / tracer.max(), {"units": "m-1"}
     axes = {name: (name, a, {"units": "m"}) for name, a in zip("xyz", (x, y, z), strict=True)}
     return xr.Dataset(fields, axes)
