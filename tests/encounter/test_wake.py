@@ -12,8 +12,9 @@ import pytest
 import lidar_mi as lm
 from lidar_mi.atmosphere.wake_path import PairAlongPath
 from lidar_mi.encounter.aircraft import loads_in_wind
+from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.flight import aircraft_of
-from lidar_mi.encounter.wake import encounter_of, wake_along_path
+from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
 from lidar_mi.errors import InputError
 from tests.support.encounters import small_encounter
 from tests.support.wake_volumes import SEPARATION, crow_volume
@@ -143,3 +144,13 @@ def test_decay_of_a_file_is_refused(crow_file):
     changed = experiment.model_copy(update={"encounter": encounter}).read_from(experiment.folder)
     with pytest.raises(InputError, match=r"encounter\.wake\.decay_time: 10 is not allowed"):
         wake_along_path(changed)
+
+
+def test_a_wake_at_right_angles_has_no_vortices_in_the_plane():
+    """The check and the truth of the track go on without them."""
+    experiment = small_encounter(path={"crossing_angle": "90 deg"})
+    wake = wake_along_path(experiment)
+    assert vortices_in_plane(wake, 190.0, 2.0) is None
+    assert any("both vortices in 0 slabs" in text for text in geometry(experiment))
+    oblique = wake_along_path(small_encounter(path={"crossing_angle": "80 deg"}))
+    assert vortices_in_plane(oblique, 190.0, 2.0) == oblique.vortices(190.0, 2.0)

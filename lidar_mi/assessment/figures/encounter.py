@@ -67,7 +67,8 @@ def draw_all(
         )
         if seen is not None:
             plates.append(("fig32_cockpit", "A slab from the cockpit", _cockpit(track, seen, span)))
-        plates.append(("fig33_track", "The vortices, estimated and tracked", _track(track)))
+        if np.isfinite(track["port_y"].values).any():
+            plates.append(("fig33_track", "The vortices, estimated and tracked", _track(track)))
     if "feedforward" in series["flight"]:
         plates.append(("fig34_moment", "Predicted and true rolling moment", _moment(series)))
     plates.append(("fig35_commands", "The ailerons", _commands(series)))
@@ -338,7 +339,8 @@ def _fit_limits(axes, truth, found, spread) -> None:
     """Values of truth and estimates, without the widest bands."""
     inside = np.isfinite(found)
     values = np.concatenate([truth[inside], found[inside]]) if inside.any() else truth
-    margin = max(0.3 * float(np.ptp(values)), 2 * float(np.nanmedian(spread)), 0.05)
+    wide = float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
+    margin = max(0.3 * float(np.ptp(values)), 2 * wide, 0.05)
     if np.isfinite([values.min(), values.max(), margin]).all():
         axes.set_ylim(values.min() - margin, values.max() + margin)
 

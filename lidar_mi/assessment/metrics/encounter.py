@@ -16,6 +16,9 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 AFTER = 5
 """Slabs after which the track is held against the truth."""
 
+# Rolling moments, as a fraction of the controls', and angles (rad) below this are rounding.
+_ROUNDING = 1e-9
+
 _FELT = 0.1
 """Fraction of the largest rolling moment of the wake from which on it counts as felt."""
 
@@ -51,10 +54,15 @@ def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str,
 
 
 def residual_moment(one: xr.Dataset) -> float:
-    """Rms rolling moment of wake and controls together, over that of the wake alone."""
+    """Rms rolling moment of wake and controls together, over that of the wake alone.
+
+    NaN where the wake's is rounding: across a wake at right angles both wings meet the same wind.
+    """
     wake, control = one["roll_moment"].values, one["control_roll_moment"].values
     strength = float(np.sqrt(np.mean(wake**2)))
-    return float(np.sqrt(np.mean((wake + control) ** 2))) / strength if strength else float("nan")
+    if strength <= _ROUNDING * float(one["largest_control_roll_moment"]):
+        return float("nan")
+    return float(np.sqrt(np.mean((wake + control) ** 2))) / strength
 
 
 def prediction_error(one: xr.Dataset) -> float:
@@ -185,6 +193,6 @@ def _removed(found: Mapping[str, float], quantity: str) -> dict[str, float]:
     if not all(key in found for key in keys):
         return {}
     off, ours, perfect = (found[key] for key in keys)
-    if off == perfect:
+    if abs(off - perfect) <= _ROUNDING:
         return {}
     return {f"encounter.removed_of_perfect.{quantity}": (off - ours) / (off - perfect)}

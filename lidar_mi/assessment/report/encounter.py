@@ -50,6 +50,9 @@ _FLIGHT = {
     "perfect": "The flight with perfect preview",
 }
 
+# Roll that is no more than this is not worth an answer, rad.
+_NO_ROLL = math.radians(0.01)
+
 
 def encounter_summary(metrics: Mapping[str, float]) -> list[Table]:
     """The main numbers for a terminal."""
@@ -124,6 +127,12 @@ def encounter_answer(metrics: Mapping[str, float]) -> list[str]:
     off, blind, ours, perfect = (metrics.get(f"encounter.{m}.largest_roll") for m in FLIGHTS)
     if off is None:
         return []
+    largest = max(angle for angle in (off, blind, ours, perfect) if angle is not None)
+    if largest < _NO_ROLL:
+        return [
+            f"No flight rolls by more than {three(math.degrees(_NO_ROLL))} degrees: the wake is "
+            "missed, or lies across the path, where both wings meet the same wind."
+        ]
     answer = f"Without control, the wake rolls the aircraft by {_degrees(off)}"
     if _departed(metrics, "off"):
         answer = "Without control, the wake upsets the aircraft"
