@@ -130,9 +130,12 @@ def rendered_pairs(
     By source: the rendered backscatter, and with a detector the same with its noise.
     """
     noise = attenuated_backscatter_stderr(scans[0])
-    pairs = {Source.BACKSCATTER: ([scan["Y"] for scan in scans], noise)}
+    pairs = {
+        Source.BACKSCATTER: ([scan["Y"] for scan in scans], with_resampling(noise, scans, "Y"))
+    }
     if experiment.detector:
         noisy = np.hypot(noise, scans[0]["Y_noise_std"])
+        noisy = with_resampling(noisy, scans, "Y_noisy")
         pairs[Source.NOISY] = [scan["Y_noisy"] for scan in scans], noisy
     if experiment.scan.aim == "angles":
         # noise cannot be interpolated: its rms level is used, as a few pixels have most of it
@@ -142,6 +145,16 @@ def rendered_pairs(
             for name, (pair, level) in pairs.items()
         }
     return pairs
+
+
+def with_resampling(noise: xr.DataArray, scans: Sequence[xr.Dataset], name: str) -> xr.DataArray:
+    """Noise of an image and what resampling of beams that scatter adds, of both in the mean."""
+    name = f"{name}_resampling_std"
+    squares = [scan[name] ** 2 for scan in scans if name in scan]
+    if not squares:
+        return noise
+    added = sum(square.fillna(0.0).values for square in squares) / len(scans)
+    return np.sqrt(noise**2 + added)
 
 
 def pixel_times(experiment: Experiment, scans: Sequence[xr.Dataset]) -> list[xr.DataArray] | None:

@@ -8,6 +8,14 @@ from scipy.sparse import csr_array
 from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.velocimetry.resampling_error import (
+    correlation_area,
+    local_strength,
+    pairs,
+    ratio_at,
+    variance,
+    variogram,
+)
 
 # Beams that a node's value is from, and the width of their covariance, in spacings of the nodes.
 _BEAMS, _LENGTH = 25, 1.5
@@ -20,6 +28,8 @@ _UNCORRELATED, _SLOPE = 1e-3, 1e-6
 _ON_NODE, _RIM, _NEAR = 1e-3, 0.02, 1.5
 # Nodes solved for together.
 _CHUNK = 4096
+# Fields that winds are retrieved from.
+_IMAGES = ("Y", "Y_noisy")
 _ERRORS = re.compile(r".*_(stderr|std)")
 
 
@@ -31,8 +41,11 @@ def on_nodes(scan: xr.Dataset) -> xr.Dataset:
     Data, sect. 3.4) for a structure of Gaussian covariance of 1.5 spacings. It passes through the
     beams' values and is exact for fields linear in place. Standard errors follow from the same
     weights and independent errors of the beams; those of neighbouring nodes are correlated
-    afterwards. The `beam_time` is averaged with the same weights, and is within those of the scan:
-    where beams next to each other have very different times, a node's value mixes times.
+    afterwards. What the weights leave of the structure of `Y` and `Y_noisy` becomes
+    `Y_resampling_std` and `Y_noisy_resampling_std`, see `resampling_error`: the white noise that
+    counts as much as these errors, which are correlated between nodes. The `beam_time` is averaged
+    with the same weights, and is within those of the scan: where beams next to each other have
+    very different times, a node's value mixes times.
 
     Parameters
     ----------
@@ -74,10 +87,18 @@ def on_nodes(scan: xr.Dataset) -> xr.Dataset:
     inside = _inside(places, nodes)
     changed = np.flatnonzero(off & inside)
     weights = _weights(places, nodes[changed])
+    for name in [name for name in _IMAGES if name in rest and rest[name].ndim == 2]:
+        rest[f"{name}_resampling_std"] = _resampling_error(
+            rest, name, places, nodes, changed, weights
+        )
     for name in [name for name in rest.data_vars if {"z", "y"} <= set(rest[name].dims)]:
         field = rest[name].transpose(..., "z", "y")
         values = field.values.reshape(-1, len(nodes))
         found = values.astype(values.dtype if values.dtype.kind == "f" else float)
+        if name.endswith("_resampling_std"):
+            found[:, ~inside] = np.nan
+            rest[name] = field.copy(data=found.reshape(field.shape))
+            continue
         if _ERRORS.fullmatch(name):
             found[:, changed] = np.sqrt(weights.power(2) @ values.T.astype(float) ** 2).T
         else:
@@ -87,6 +108,40 @@ def on_nodes(scan: xr.Dataset) -> xr.Dataset:
         found[:, ~inside] = np.nan
         rest[name] = field.copy(data=found.reshape(field.shape)).transpose(*rest[name].dims)
     return rest
+
+
+def _resampling_error(
+    scan: xr.Dataset,
+    name: str,
+    places: np.ndarray,
+    nodes: np.ndarray,
+    changed: np.ndarray,
+    weights: csr_array,
+) -> xr.DataArray:
+    """Standard deviation of what the weights leave of an image's structure, of its nodes."""
+    image = scan[name].transpose("z", "y")
+    values = image.values.ravel().astype(float)
+    known = np.isfinite(values)
+    values = np.where(known, values, values[known].mean() if known.any() else 0.0)
+    times = np.zeros(len(values))
+    if "beam_time" in scan:
+        times = scan["beam_time"].transpose("z", "y").values.ravel().astype(float)
+    near = pairs(places, times)
+    found = variogram(values, near)
+    beams = weights.indices.reshape(len(changed), -1)
+    factors = weights.data.reshape(beams.shape)
+    when = times[beams]
+    when = when - (factors * when).sum(1, keepdims=True).clip(times.min(), times.max())
+    error = np.zeros(len(nodes))
+    for start in range(0, len(changed), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        from_node = places[beams[part]] - nodes[changed[part]][:, None]
+        error[changed[part]] = variance(found, factors[part], from_node, when[part])
+    error[changed] *= ratio_at(places, local_strength(values, found, near), nodes[changed])
+    error[changed] *= correlation_area(places, nodes[changed])
+    about = {"long_name": f"standard deviation of {name} by resampling"}
+    about |= {key: image.attrs[key] for key in ("units",) if key in image.attrs}
+    return image.copy(data=np.sqrt(error).reshape(image.shape)).assign_attrs(about)
 
 
 def _weights(places: np.ndarray, nodes: np.ndarray) -> csr_array:

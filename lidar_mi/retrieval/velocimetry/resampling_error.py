@@ -1,0 +1,130 @@
+"""What resampling scattered beams adds to an image's error: from the image's own variogram."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial import KDTree
+
+# Neighbours of a beam whose differences make the variogram, and bins along distance and time.
+_NEIGHBOURS, _BINS = 12, 12
+# Beams over which the structure's strength is averaged at a place.
+_LOCAL = 150
+# Nearest beams that tell of their density.
+_AREA = 12
+# Exponent a: of lengths that differ much, and of nearly one.
+_MANY, _ONE = 1.0, 20.0
+
+
+class Variogram(NamedTuple):
+    """Half the mean squared difference of two beams, c (1 - (1 + d^2 / (2 a l^2))^-a), no noise.
+
+    d^2 = h^2 + (s tau)^2, h in spacings and tau in s between the beams: air that passes with the
+    speed s, in spacings a second. A mixture of Gaussians of many lengths (Rasmussen & Williams
+    2006, Gaussian Processes for Machine Learning, eq. 4.19), smooth at the scale of a beam, which
+    has blurred the air.
+    """
+
+    strength: float
+    length: float
+    exponent: float
+    speed: float
+    noise: float
+
+    def __call__(self, apart: np.ndarray, later: np.ndarray) -> np.ndarray:
+        """Of the structure, for distances (..., 2) in spacings and times (...), s."""
+        square = (apart**2).sum(-1) + (self.speed * later) ** 2
+        a = self.exponent
+        return self.strength * -np.expm1(-a * np.log1p(square / (2 * a * self.length**2)))
+
+
+class Pairs(NamedTuple):
+    """Beams next to each other: distances (n, k, 2) in spacings, times (n, k), indices (n, k)."""
+
+    apart: np.ndarray
+    later: np.ndarray
+    near: np.ndarray
+
+
+def pairs(places: np.ndarray, times: np.ndarray) -> Pairs:
+    """Of every beam with its nearest ones; places (n, 2) in spacings, times (n,) in s."""
+    _, near = KDTree(places).query(places, min(_NEIGHBOURS + 1, len(places)))
+    near = near[:, 1:]
+    return Pairs(places[near] - places[:, None], times[near] - times[:, None], near)
+
+
+def variogram(values: np.ndarray, near: Pairs) -> Variogram:
+    """The one that fits the differences of neighbouring beams best (Cressie 1985).
+
+    Bins of distance and time count by their number of pairs over the square of the model (Cressie
+    1985, Math. Geol. 17, 563-586). What no distance explains is the noise.
+    """
+    half = ((values[near.near] - values[:, None]) ** 2 / 2).ravel()
+    distance, later = np.linalg.norm(near.apart, axis=-1).ravel(), np.abs(near.later).ravel()
+    edges = [
+        np.unique(np.quantile(part, np.linspace(0, 1, _BINS + 1))) for part in (distance, later)
+    ]
+    cell = [
+        np.searchsorted(e[1:-1], p, "right") for e, p in zip(edges, (distance, later), strict=True)
+    ]
+    index = cell[0] * (_BINS + 1) + cell[1]
+    number = np.bincount(index)
+    h, tau, seen = (
+        np.bincount(index, part)[number > 0] / number[number > 0]
+        for part in (distance, later, half)
+    )
+    number, scale = number[number > 0], max(float(half.mean()), 1e-300)
+    fastest = np.ptp(distance) / max(float(later.max()), 1e-9)
+
+    def model(p: np.ndarray) -> Variogram:
+        return Variogram(np.exp(p[0]) * scale, np.exp(p[1]), p[2], p[3] * fastest, p[4] * scale)
+
+    def misfit(p: np.ndarray) -> np.ndarray:
+        made = model(p)
+        expected = made(np.stack([h, 0 * h], -1), tau) + made.noise
+        return np.sqrt(number) * (seen / expected - 1)
+
+    start = np.array([1.0, np.log(3.0), 2.0, 1.0, 0.05])
+    low = np.array([-4.0, np.log(0.7), _MANY, 0.0, 1e-6])
+    high = np.array([6.0, np.log(30.0), _ONE, 20.0, 1.5])
+    return model(least_squares(misfit, start, bounds=(low, high), loss="soft_l1").x)
+
+
+def local_strength(values: np.ndarray, found: Variogram, near: Pairs) -> np.ndarray:
+    """Half squared differences about each beam without noise, and by the variogram, (2, n)."""
+    half = ((values[near.near] - values[:, None]) ** 2 / 2).mean(1) - found.noise
+    return np.stack([half, found(near.apart, near.later).mean(1)])
+
+
+def ratio_at(places: np.ndarray, sums: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Variance of the structure over the variogram's at nodes (m,), at least a hundredth."""
+    _, near = KDTree(places).query(nodes, min(_LOCAL, len(places)))
+    above, below = sums[:, near].mean(-1)
+    return np.clip(above / np.maximum(below, 1e-300), 0.01, None)
+
+
+def correlation_area(places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+    """Pixels per independent error about nodes (m,): an error for two beams, at least 2.
+
+    Errors of neighbouring nodes are from the same beams. Sums of them over 7 px vary as those of
+    one error for 1 to 2 beams do, by the texture: the larger one is taken.
+    """
+    count = min(_AREA, len(places))
+    distance, _ = KDTree(places).query(nodes, [count])
+    return 2 * np.clip(np.pi * distance[:, 0] ** 2 / count, 1.0, None)
+
+
+def variance(
+    found: Variogram, weights: np.ndarray, from_node: np.ndarray, times: np.ndarray
+) -> np.ndarray:
+    """Mean squared error of weighted beams for the structure at a node, (m,).
+
+    2 sum w_i g(x_i - x) - sum w_i w_j g(x_i - x_j), g the variogram, for weights (m, k) of sum 1
+    (Cressie 1993, eq. 3.2.6), whether or not they are the best for it; from_node (m, k, 2).
+    Times (m, k) are relative to the node's, which is their weighted mean.
+    """
+    own = 2 * (weights * found(from_node, times)).sum(-1)
+    apart = from_node[:, :, None] - from_node[:, None]
+    later = times[:, :, None] - times[:, None]
+    both = np.einsum("mi,mij,mj->m", weights, found(apart, later), weights)
+    return np.clip(own - both, 0.0, None)

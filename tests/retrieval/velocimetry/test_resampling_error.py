@@ -1,0 +1,103 @@
+"""Errors that resampling of scattered beams leaves, against fields known everywhere.
+
+Detects a variance that is wrong by a factor of 2.5, weights of other times, and winds of scattered
+beams whose stated errors do not hold.
+"""
+
+import numpy as np
+import pytest
+import xarray as xr
+
+from lidar_mi.retrieval.velocimetry.gridding import on_nodes
+from lidar_mi.retrieval.velocimetry.resampling_error import Variogram, correlation_area, variance
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from tests.support.flows import axes, data_array, plane_waves, texture
+from tests.support.timed import DT, scattered_vortices
+from tests.support.vortex_pairs import uneven, vector
+
+MEAN, NOISE = (3.0, -4.0), 0.03
+
+
+def test_variance_of_two_beams_by_hand():
+    """A node half way between two beams, of which one is later."""
+    found = Variogram(2.0, 1.5, 1.0, 3.0, 0.1)
+
+    def gamma(square):
+        return 2.0 * (1 - 1 / (1 + square / (2 * 1.5**2)))
+
+    places = np.array([[[-0.5, 0.0], [0.5, 0.0]]])
+    weights, times = np.full((1, 2), 0.5), np.array([[-0.1, 0.1]])
+    expected = 2 * gamma(0.25 + 0.09) - 0.5 * gamma(1 + 0.36)
+    np.testing.assert_allclose(variance(found, weights, places, times), expected, rtol=1e-12)
+
+
+def test_a_beam_on_its_node_leaves_nothing():
+    found = Variogram(1.0, 2.0, 0.5, 0.0, 0.0)
+    places, weights = np.array([[[0.0, 0.0], [1.0, 0.0]]]), np.array([[1.0, 0.0]])
+    assert variance(found, weights, places, np.zeros((1, 2))) == pytest.approx(0, abs=1e-15)
+
+
+def test_pixels_for_an_error():
+    """Of a grid of beams 2 px apart: two beams, 8 px, to the 12 beams' own grain of a third."""
+    grid = 2.0 * np.stack(np.meshgrid(np.arange(30), np.arange(30)), -1).reshape(-1, 2)
+    nodes = np.random.default_rng(1).uniform(20, 40, (200, 2))
+    assert correlation_area(grid, nodes).mean() == pytest.approx(8, rel=0.33)
+
+
+@pytest.mark.parametrize(("length", "px"), [(3.0, 0.3), (3.0, 0.6), (2.5, 0.6)])
+def test_error_stated_is_the_one_made(length, px):
+    """Rms over the image, of texture with 5 % of noise, within a factor of 2.5.
+
+    Of texture of 2.5 px the smallest scales are hard to tell: up to 6 times too large, not too low.
+    """
+    y, z = axes(80, 60)
+    waves, nodes = plane_waves(2, length, 0.5), np.stack(np.meshgrid(y, z))
+    random = np.random.default_rng(3)
+    places = nodes + 0.5 * px * random.standard_normal(nodes.shape)
+    exact, seen = texture(waves, *nodes), texture(waves, *places)
+    fields = {"y_reported": places[0], "z_reported": places[1]}
+    with_noise = seen + 0.01 * random.standard_normal(seen.shape)
+    clean, noisy = (
+        on_nodes(xr.Dataset({k: data_array(f, y, z) for k, f in (fields | {"Y": image}).items()}))
+        for image in (seen, with_noise)
+    )
+    # two pixels an error: the variance stated is twice that of a pixel, or more
+    stated = float((noisy["Y_resampling_std"] ** 2).mean() / 2) ** 0.5
+    made = float(((clean["Y"] - exact) ** 2).mean()) ** 0.5
+    assert 1 / 2.5 < stated / made < (2.5 if length > 2.5 else 6.0)
+
+
+def normalised(pattern, px, seeds, noise=NOISE, length=3.0):
+    """Errors over stated ones: of variational's vectors, and of the pair's parameters."""
+    winds, fits = [], []
+    for seed in seeds:
+        scans, truth = scattered_vortices(pattern, uneven(), MEAN, px, seed, noise, length)
+        scans = [on_nodes(scan) for scan in scans]
+        images, times = ([scan[name] for scan in scans] for name in ("Y", "beam_time"))
+        added = sum(scan["Y_resampling_std"].fillna(0.0) ** 2 for scan in scans) / 2
+        level = np.sqrt(scans[0]["Y_noise_std"].fillna(noise) ** 2 + added)
+        found = retrieve_wind(
+            *images, DT, "variational", times=times, noise=level, stride=3, checks=False
+        )
+        valid = (found["flag"] == 0).values
+        y, z = np.meshgrid(found["y"], found["z"])
+        for name, true in zip("vw", truth(y, z, found["time"].values - DT / 2), strict=True):
+            off = (found[name].values - true) / found[f"{name}_stderr"].values
+            winds.append(off[valid])
+        fit = fit_vortices(*images, DT, level, times=times)
+        assert fit.success, fit.reasons
+        off = fit.parameters - vector(*uneven(), mean=MEAN)
+        fits.append(off / np.sqrt(np.diag(fit.covariance)))
+    return np.concatenate(winds), np.concatenate(fits)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("px", [0.3, 0.6])
+def test_stated_errors_of_scattered_beams(px):
+    """A serpentine of 0.1 s whose beams scatter, 3 of 20 % noise, over 12 seeds."""
+    winds, fits = normalised("serpentine", px, range(101, 113))
+    for off in (winds, fits):
+        assert 0.8 < (off**2).mean() < 1.25
+        assert (np.abs(off) < 1).mean() == pytest.approx(0.68, abs=0.05)
+        assert (np.abs(off) < 1.96).mean() == pytest.approx(0.95, abs=0.05)
