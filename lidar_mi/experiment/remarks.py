@@ -64,6 +64,5 @@ def _of_the_pattern(experiment: Experiment) -> list[str]:
         return []
     return [
         f"scan.timing.pattern: beams of {timing.pattern} are resampled to the nodes of the image; "
-        "stated errors of the wind are up to 1.3 times too small where it comes back after the air "
-        "has moved"
+        "stated errors of the wind hold part of what this adds, and can be too small"
     ]
