@@ -70,3 +70,8 @@ def test_page_has_frames_and_their_script():
 @pytest.mark.parametrize("mode", ["off", "perfect"])
 def test_flights_without_a_lidar_have_no_verdict(mode):
     assert encounter_chapter(numbers(**{mode: 3}), [], []).verdict is None
+
+
+def test_a_flight_that_is_not_rolled_has_no_ratio_of_rounding():
+    (answer,) = encounter_answer(numbers(off=1e-15, autopilot=1e-12, feedforward=0, perfect=1e-12))
+    assert answer.startswith("No flight rolls by more than 0.01 degrees")
