@@ -121,6 +121,9 @@ def retrieve(
             images[number] = scan["image"]
             if isinstance(level, xr.DataArray):
                 levels[number] = scan["image_stderr"]
+                if "image_resampling_std" in scan:
+                    added = scan["image_resampling_std"].fillna(0.0)
+                    levels[number] = (levels[number] ** 2 + added**2) ** 0.5
     seen = [when["beam_time"] for when in beams if when is not None and not when.frozen_air]
     timed = len(seen) == len(paths)
     options: dict[str, Any] = {

@@ -29,7 +29,7 @@ _ON_NODE, _RIM, _NEAR = 1e-3, 0.02, 1.5
 # Nodes solved for together.
 _CHUNK = 4096
 # Fields that winds are retrieved from.
-_IMAGES = ("Y", "Y_noisy")
+_IMAGES = ("Y", "Y_noisy", "image")
 _ERRORS = re.compile(r".*_(stderr|std)")
 
 
@@ -43,7 +43,8 @@ def on_nodes(scan: xr.Dataset) -> xr.Dataset:
     weights and independent errors of the beams; those of neighbouring nodes are correlated
     afterwards. What the weights leave of the structure of `Y` and `Y_noisy` becomes
     `Y_resampling_std` and `Y_noisy_resampling_std`, see `resampling_error`: the white noise that
-    counts as much as these errors, which are correlated between nodes. The `beam_time` is averaged
+    counts as much as these errors, which are correlated between nodes. So does what nodes share of
+    the beams' noise. The `beam_time` is averaged
     with the same weights, and is within those of the scan: where beams next to each other have
     very different times, a node's value mixes times.
 
@@ -118,7 +119,11 @@ def _resampling_error(
     changed: np.ndarray,
     weights: csr_array,
 ) -> xr.DataArray:
-    """Standard deviation of what the weights leave of an image's structure, of its nodes."""
+    """Standard deviation of what resampling adds to an image's white noise, of its nodes.
+
+    What the weights leave of the structure, and the sums of the noise's covariances with all other
+    nodes: sums of pixels vary by these, whatever the correlation.
+    """
     image = scan[name].transpose("z", "y")
     values = image.values.ravel().astype(float)
     known = np.isfinite(values)
@@ -139,6 +144,9 @@ def _resampling_error(
         error[changed[part]] = variance(found, factors[part], from_node, when[part])
     error[changed] *= ratio_at(places, local_strength(values, found, near), nodes[changed])
     error[changed] *= correlation_area(places, nodes[changed])
+    # what a node's noise shares with that of its neighbours, beyond its own
+    shared = weights @ weights.sum(0) - weights.power(2).sum(1)
+    error[changed] += found.noise * np.clip(shared, 0.0, None)
     about = {"long_name": f"standard deviation of {name} by resampling"}
     about |= {key: image.attrs[key] for key in ("units",) if key in image.attrs}
     return image.copy(data=np.sqrt(error).reshape(image.shape)).assign_attrs(about)
