@@ -129,7 +129,7 @@ def test_check_refuses_from_the_forecast_before_the_truth(changes, says, tmp_pat
     def computed(*_):
         pytest.fail("the truth was computed")
 
-    monkeypatch.setattr("lidar_mi.experiment.truth._extinction", computed)
+    monkeypatch.setattr("lidar_mi.experiment.truth.extinction_of", computed)
     data = small(**changes.get("wake", {})) | {k: v for k, v in changes.items() if k != "wake"}
     data["render"] = data["render"] | {"memory": "8 GB"}
     with pytest.raises(InputError, match=says):

@@ -349,7 +349,7 @@ def test_every_number_has_a_range_with_its_reason_and_extremes_are_refused(name,
         for section in sections:
             innermost = innermost.setdefault(section, {})
         pairs = ("scan.azimuth_half", "scan.elevation_half", "wake.centre", "doppler.camera.centre")
-        innermost[key] = [value] * 2 if name in pairs or key == "cycles" else value
+        innermost[key] = [value] * 2 if name in pairs or key in ("cycles", "tilt") else value
         if key in ("v_los", "averaged"):
             innermost[key] = [value]
         if name.startswith("scattering.parts"):
