@@ -146,6 +146,9 @@ def _resampling_error(
     error[changed] *= correlation_area(places, nodes[changed])
     # what a node's noise shares with that of its neighbours, beyond its own
     shared = weights @ weights.sum(0) - weights.power(2).sum(1)
+    # of sums, as the scatter from node to node is as often negative
+    _, around = KDTree(nodes[changed]).query(nodes[changed], min(_BEAMS, len(changed)))
+    shared = shared[around].reshape(len(changed), -1).mean(1)
     error[changed] += found.noise * np.clip(shared, 0.0, None)
     about = {"long_name": f"standard deviation of {name} by resampling"}
     about |= {key: image.attrs[key] for key in ("units",) if key in image.attrs}
