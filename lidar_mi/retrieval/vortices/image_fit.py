@@ -181,18 +181,19 @@ def fit_pixels(
         make = replace(make, times=_from_mid_time(times, make))
     limits = step_limits(y, z, profile, dt)
 
-    # steps need no more: places to 1e-5 m
-    single = make.single()
     if start is not None:
+        # steps need no more: places to 1e-5 m
+        single = make.single()
         near = fit_from(start, single, limits, _NOISE_LAGS)
         pair = near and replace(_checked(single, *near), from_start=True)
         if pair and pair.success and agrees(start, pair):
             return pair
-    found = _searched(single, limits)
+    # from nothing in double precision: what rounding changes would decide between solutions
+    found = _searched(make, limits)
     if found is None:
         return no_fit(profile, "no vortex signature")
-    near = fit_near(found.parameters, single, limits, _NOISE_LAGS, estimates=2)
-    pair = near and _checked(single, *near)
+    near = fit_near(found.parameters, make, limits, _NOISE_LAGS, estimates=2)
+    pair = near and _checked(make, *near)
     if pair and pair.success:
         return pair
     return _iterated(found, make, limits)
