@@ -1,0 +1,221 @@
+"""Speeds from many images of one instrument, fast: by the score function of a reference.
+
+A fit ends where the score J^T W (d - m) of the data d is 0, with the derivatives J of the mean m
+and the weights W at the fitted parameters. Here J and W are those of a reference, once for all
+images; only m is that of every image. The end of such a fit is consistent for any J and W (the
+estimating equations of Godambe, Ann. Math. Stat. 31, 1960), and as accurate as the fit's where the
+reference is near: rings that move by a tenth of their width lose 1 % of the information.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.rings.bound import fisher_matrix, free_names, prior_information
+from lidar_mi.retrieval.rings.likelihood_fit import MISFIT, RingFit, annular_waves
+from lidar_mi.retrieval.rings.mean_image import Waves, mean_and_jacobian, reach
+from lidar_mi.retrieval.rings.model import PARAMETERS, PixelNoise, RingModel
+from lidar_mi.retrieval.rings.scoring import cell_variance
+from lidar_mi.retrieval.threads import threads_for
+
+ITERATIONS = 8
+CLOSE = 0.01  # standard deviations, largest last step of an image that is read
+# Parameters whose derivatives do not grow with the light.
+_ADDED = ("level", "background")
+_PLACE = [PARAMETERS.index("x"), PARAMETERS.index("y")]
+_LEVEL, _BACKGROUND = PARAMETERS.index("level"), PARAMETERS.index("background")
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedScore:
+    """The score function of a reference.
+
+    Attributes
+    ----------
+    model : RingModel
+    noise : PixelNoise
+    names : list of str
+        Parameters that are fitted.
+    waves : Waves
+        Of the cells about the reference's centre.
+    values : torch.Tensor, shape (`PARAMETERS`,)
+        Of the reference; x and y from the top left pixel's centre.
+    score : torch.Tensor, shape (names, cells)
+        J^T W.
+    inverse : torch.Tensor, shape (names, names)
+        Of the Fisher matrix with the priors.
+    sensitivity, systematic : torch.Tensor
+        As of `RingFit`, of one image.
+    """
+
+    model: RingModel
+    noise: PixelNoise
+    names: list[str]
+    waves: Waves
+    values: torch.Tensor
+    score: torch.Tensor
+    inverse: torch.Tensor
+    sensitivity: torch.Tensor
+    systematic: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class MatchedRead:
+    """What was read, tensors of shape (images,) unless stated, float64.
+
+    Attributes
+    ----------
+    values, std : torch.Tensor, shape (images, `PARAMETERS`)
+        As of `RingFit`; infinite standard deviations where ``read`` is false.
+    chi_square : torch.Tensor
+    read : torch.Tensor
+        False where an image does not follow the model near the reference: fit it on its own.
+    sensitivity, systematic : torch.Tensor
+        As of `RingFit`.
+    """
+
+    values: torch.Tensor
+    std: torch.Tensor
+    chi_square: torch.Tensor
+    read: torch.Tensor
+    sensitivity: torch.Tensor
+    systematic: torch.Tensor
+
+    @property
+    def v_los(self) -> torch.Tensor:
+        """Speed along the line of sight, m/s, positive toward the instrument."""
+        return self.values[:, PARAMETERS.index("v_los")]
+
+    @property
+    def v_los_std(self) -> torch.Tensor:
+        """Random standard deviation of v_los, m/s."""
+        return self.std[:, PARAMETERS.index("v_los")]
+
+
+def matched_score(
+    fit: RingFit,
+    model: RingModel,
+    noise: PixelNoise | None = None,
+    *,
+    free: list[str] | None = None,
+    response: torch.Tensor | None = None,
+) -> MatchedScore:
+    """The score function at the mean of fitted images.
+
+    Parameters
+    ----------
+    fit : RingFit
+        By `fit_rings` with the same ``model``, ``noise``, ``free`` and ``response``.
+    """
+    noise, names = noise or PixelNoise(), free_names(model, free)
+    values = fit.values.mean(0)
+    centre = float(values[_PLACE[0]]), float(values[_PLACE[1]])
+    waves = annular_waves(model, centre, response, fit.values.device)
+    at = values[None].clone()
+    at[:, _PLACE] = 0
+    mean, jacobian = mean_and_jacobian(model, waves, at, names)
+    weight = waves.cells.count / cell_variance(mean, at, noise)
+    fisher = fisher_matrix(jacobian, weight)[0]
+    fisher = fisher + torch.diag(prior_information(model, names, at.device))
+    unit = fisher.diagonal().rsqrt()
+    inverse = torch.linalg.inv(fisher * unit[:, None] * unit) * unit[:, None] * unit
+    score = jacobian[0] * weight
+    sensitivity = fit.sensitivity.mean(0)
+    return MatchedScore(
+        model, noise, names, waves, values, score, inverse, sensitivity, fit.systematic
+    )
+
+
+def read_matched(
+    images: torch.Tensor,
+    score: MatchedScore,
+    start: torch.Tensor | None = None,
+) -> MatchedRead:
+    """Speeds and all other parameters of images near a reference.
+
+    Frames are summed up over the cells once, which takes most of the time. They are not searched
+    for hot pixels or saturated crests, as by `fit_rings`: an image that has some is not ``read``
+    once they show in chi-square.
+
+    Parameters
+    ----------
+    images : torch.Tensor, shape (images, height, width)
+        Electrons, as for `fit_rings`.
+    score : MatchedScore
+    start : torch.Tensor, shape (images, `PARAMETERS`), optional
+        Where each one starts, such as the values of the last images of the same lines of sight;
+        default: the reference, with the light of every image.
+
+    Returns
+    -------
+    MatchedRead
+
+    Raises
+    ------
+    InputError
+        Images of another size.
+    """
+    if images.ndim != 3 or tuple(images.shape[1:]) != tuple(score.model.shape):
+        height, width = score.model.shape
+        raise InputError(
+            f"images: shape {tuple(images.shape)} is not allowed; expected (images, {height}, "
+            f"{width}), as of the model"
+        )
+    with threads_for(0):
+        means = score.waves.cells.means(images)
+    model, names = score.model, score.names
+    columns = [PARAMETERS.index(name) for name in names]
+    at = _started(score, means, start)
+    information = prior_information(model, names, means.device)
+    middle = model.start(means.device)[:, columns]
+    influence = score.inverse @ score.score
+    # errors by noise, and of the priors
+    squares, kept = influence**2, score.inverse**2 @ information
+    added = torch.tensor([name in _ADDED for name in names], device=means.device)
+    for _ in range(ITERATIONS):
+        mean = mean_and_jacobian(model, score.waves, at)[0]
+        variance = cell_variance(mean, at, score.noise) / score.waves.cells.count
+        brighter = (at[:, _LEVEL] / score.values[_LEVEL]).clamp(0.1, 10)[:, None]
+        grown = torch.where(added, 1.0, brighter)
+        std = (variance @ squares.T + kept).sqrt() / grown
+        misfit = means - mean
+        total = misfit @ influence.T + (middle - at[:, columns]) * information @ score.inverse
+        step = total / grown
+        close = (step.abs() <= CLOSE * std).all(1)
+        if close.all():
+            break
+        at[:, columns] += torch.where(close[:, None], 0.0, step)
+    freedom = means.shape[1] - len(names)
+    chi_square = (misfit**2 / variance).sum(1) / freedom
+    values = at.clone()
+    values[:, _PLACE] += score.values[_PLACE]
+    read = close & (chi_square <= 1 + MISFIT * math.sqrt(2 / freedom))
+    read &= at[:, _PLACE].norm(dim=1) <= reach(model)
+    spread = torch.zeros_like(values)
+    spread[:, columns] = std
+    spread[~read] = math.inf
+    each = score.sensitivity.expand(len(values), -1)
+    return MatchedRead(values, spread, chi_square, read, each, score.systematic)
+
+
+def _started(score: MatchedScore, means: torch.Tensor, start: torch.Tensor | None) -> torch.Tensor:
+    """Parameters (images, `PARAMETERS`) with x and y from the cells' centre."""
+    if start is None:
+        at = score.values.repeat(len(means), 1)
+        count = score.waves.cells.count
+        light = means @ count / count.sum() - at[:, _BACKGROUND]
+        reference = at[:1].clone()
+        reference[:, _PLACE] = 0
+        own = mean_and_jacobian(score.model, score.waves, reference)[0] @ count / count.sum()
+        at[:, _LEVEL] *= (light / (own - at[:, _BACKGROUND])).clamp(0.1, 10)
+    elif start.shape == (len(means), len(PARAMETERS)):
+        at = start.double().clone()
+    else:
+        raise InputError(
+            f"start: shape {tuple(start.shape)} is not allowed; expected "
+            f"({len(means)}, {len(PARAMETERS)})"
+        )
+    at[:, _PLACE] -= score.values[_PLACE]
+    return at
