@@ -99,7 +99,8 @@ def expected(last: VortexPairFit) -> VortexPairFit:
 
 
 def timed(estimator: Estimator, images: Pair, start: VortexPairFit | None) -> Timed:
-    return Timed(*estimator.pair_of(images.first, images.second, DT, NOISE, start))
+    found = estimator.pair_of(images.first, images.second, DT, NOISE, start)
+    return Timed(found.wind, found.pair, found.seconds)
 
 
 def _latency(case: str, part: str, warm: list[float], cold: list[float]) -> list[Row]:

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from lidar_mi.encounter.aircraft import AircraftModel, loads_in_wind
+from lidar_mi.encounter.doppler import at_the_slabs
 from lidar_mi.encounter.flight import aircraft_of, duration
 from lidar_mi.encounter.slabs import Gates, gates_of
 from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
@@ -96,6 +97,8 @@ def _first_slab(experiment: Experiment) -> Experiment:
     )
     scan = experiment.scan.model_copy(update={"range": encounter.look_ahead})
     changes = {"encounter": None, "platform": platform, "scan": scan}
+    if experiment.sensor is not None:
+        changes["doppler"] = at_the_slabs(experiment.doppler, gates_of(experiment))
     return experiment.model_copy(update=changes).read_from(experiment.folder)
 
 

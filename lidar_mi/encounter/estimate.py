@@ -21,8 +21,9 @@ class Estimate:
     x : float
         Plane of the slab along the flight path, m.
     wind : xarray.Dataset or None, dims (z, y)
-        v, w (m/s) with v_stderr, w_stderr, vw_correlation and flag, and u with u_stderr where there
-        is a Doppler lidar. None before a second scan.
+        v, w (m/s) with v_stderr, w_stderr, vw_correlation and flag; where there is a Doppler lidar,
+        u, v, w and their covariance from both (`lidar_mi.retrieval.lines.combine`). None before a
+        second scan.
     pair : VortexPairFit or None
         The vortices in the slab's plane, at `time`; look at its `success` and `reasons` first.
     flags : tuple of str
@@ -30,6 +31,9 @@ class Estimate:
     seconds : mapping
         Time that each part of the estimate took, s, without the rendering. `total` is all of it;
         left out, it is their sum.
+    lines : xarray.Dataset or None, dim line
+        Speeds along the lines of sight, in the frame of the aircraft half way between both scans.
+        None without a Doppler lidar.
     """
 
     time: float
@@ -39,3 +43,4 @@ class Estimate:
     pair: VortexPairFit | None
     flags: tuple[str, ...]
     seconds: Mapping[str, float]
+    lines: xr.Dataset | None = None

@@ -3,15 +3,41 @@
 import time
 from collections.abc import Sequence
 from contextlib import contextmanager
+from typing import NamedTuple
 
 import xarray as xr
 
+from lidar_mi.encounter.doppler import LineFrames
+from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.slab_winds import InOwnProcess, SlabPair, SlabWinds
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
+
+
+class SlabEstimate(NamedTuple):
+    """What is estimated from the signals of a slab.
+
+    Attributes
+    ----------
+    wind : Dataset or None
+        As `retrieve_wind` gives it; None without a method of vectors. By "variational" its
+        attribute `from_start` says whether it was found from the last one.
+    pair : VortexPairFit
+        Its `from_start` says whether it was found from the expected one.
+    seconds : dict
+        Of the parts `vortices`, `wind` and `lines`, and of all, `total`: with two processes less
+        than their sum.
+    lines : Dataset or None
+        As `with_speeds` gives them; None without frames.
+    """
+
+    wind: xr.Dataset | None
+    pair: VortexPairFit
+    seconds: dict[str, float]
+    lines: xr.Dataset | None = None
 
 
 class Estimator:
@@ -28,17 +54,27 @@ class Estimator:
     vectors : bool
         Whether the wind is retrieved besides the vortices.
     processes : int
-        2: the wind is retrieved in a process of its own, while this one fits the vortices. The
-        numbers are the same but for rounding. It pays where a second core is idle.
+        2: the wind is retrieved in a process of its own, while this one fits the vortices and reads
+        the lines. The numbers are the same but for rounding. It pays where a second core is idle.
+    speeds : LineSpeeds, optional
+        Reads the frames of the Doppler lidar.
     """
 
-    def __init__(self, experiment: Experiment, *, vectors: bool = True, processes: int = 1):
+    def __init__(
+        self,
+        experiment: Experiment,
+        *,
+        vectors: bool = True,
+        processes: int = 1,
+        speeds: LineSpeeds | None = None,
+    ):
         settings = experiment.retrieval
         methods = [method for method in MOST_ACCURATE_FIRST if method in settings.methods]
         self._winds: SlabWinds | InOwnProcess | None = None
         if vectors and methods:
             form = SlabWinds if processes == 1 else InOwnProcess
             self._winds = form(methods[0], window_settings(settings))
+        self._speeds = speeds
         # the last slab's vortices, near which the next wind starts
         self._last: VortexPairFit | None = None
 
@@ -51,8 +87,9 @@ class Estimator:
         expected: VortexPairFit | None = None,
         *,
         times: Sequence[xr.DataArray] | None = None,
-    ) -> tuple[xr.Dataset | None, VortexPairFit, dict[str, float]]:
-        """Wind, vortices and the time that each took.
+        frames: LineFrames | None = None,
+    ) -> SlabEstimate:
+        """Wind, vortices, speeds along lines of sight, and the time that each took.
 
         Parameters
         ----------
@@ -65,29 +102,23 @@ class Estimator:
             The pair expected at mid-time, with its covariance.
         times : sequence of two DataArray, optional
             Of the pixels, as `fit_vortices` takes them.
-
-        Returns
-        -------
-        wind : Dataset or None
-            As `retrieve_wind` gives it; None without a method of vectors. By "variational" its
-            attribute `from_start` says whether it was found from the last one.
-        pair : VortexPairFit
-            Its `from_start` says whether it was found from the expected one.
-        seconds : dict
-            Of the parts `vortices` and `wind`, and of both, `total`: with two processes about the
-            longer one.
+        frames : LineFrames, optional
+            Of the Doppler lidar.
         """
         seconds: dict[str, float] = {}
         slab = SlabPair(image1, image2, dt, noise, times, expected)
-        wind = None
+        wind, lines = None, None
         with _timed(seconds, "total"):
             coming = self._winds and self._winds.begun(slab, self._last)
             with _timed(seconds, "vortices"):
                 pair = fit_vortices(image1, image2, dt, noise, times=times, start=expected)
+            if self._speeds and frames:
+                with _timed(seconds, "lines"):
+                    lines = self._speeds.read(frames)
             if coming is not None:
                 wind, seconds["wind"] = coming()
         self._last = pair if pair.success else None
-        return wind, pair, seconds
+        return SlabEstimate(wind, pair, seconds, lines)
 
 
 @contextmanager

@@ -148,6 +148,8 @@ _PER_SLAB = {
     "rejected": ("1", "slabs that the track refused"),
     "innovation": ("1", "normalised square of the innovation"),
     "innovation_dof": ("1", "its degrees of freedom"),
+    "error_v_los": ("m s-1", "rms error of the speeds along lines of sight"),
+    "error_u": ("m s-1", "rms error of u over the valid vectors"),
     "error_v": ("m s-1", "rms error of v over the valid vectors"),
     "error_w": ("m s-1", "rms error of w over the valid vectors"),
     "vectors": ("1", "number of valid vectors"),
@@ -170,6 +172,7 @@ def _row(slab: Slab, wake: WakeAlongPath) -> dict[Any, float]:
         "innovation": float(innovation[0]),
         "innovation_dof": float(innovation[1]),
         "seconds": float(estimate.seconds.get("total", sum(estimate.seconds.values()))),
+        "error_v_los": _line_error(estimate.lines),
         **_wind_errors(estimate.wind, wake, estimate.x, estimate.time),
     }
     tracked = track.pair_at(estimate.x, estimate.time) if track else None
@@ -198,15 +201,24 @@ def _numbers(pair: VortexPairFit | None) -> dict[str, float]:
     return found
 
 
+def _line_error(lines: xr.Dataset | None) -> float:
+    """Rms error of the lines that could be read; NaN: none."""
+    if lines is None:
+        return np.nan
+    return float(np.sqrt(((lines["v_los"] - lines["v_los_true"]) ** 2).mean()))
+
+
 def _wind_errors(wind: xr.Dataset | None, wake, x: float, time: float) -> dict[str, float]:
-    """Rms errors of the vectors that are valid."""
+    """Rms errors of the vectors that are valid; NaN where a component was not estimated."""
+    found = {"error_u": np.nan, "error_v": np.nan, "error_w": np.nan, "vectors": 0.0}
     if wind is None:
-        return {"error_v": np.nan, "error_w": np.nan, "vectors": 0.0}
+        return found
     y, z = np.meshgrid(wind["y"].values, wind["z"].values)
-    _, *truth = wake.wind(np.full(y.shape, x), y, z, time)
+    truth = wake.wind(np.full(y.shape, x), y, z, time)
     valid = (wind["flag"].transpose("z", "y") == 0).values
-    found = {"vectors": float(valid.sum())}
-    for name, true in zip("vw", truth, strict=True):
-        error = (wind[name].transpose("z", "y").values - true)[valid]
-        found[f"error_{name}"] = float(np.sqrt(np.mean(error**2))) if error.size else np.nan
+    found["vectors"] = float(valid.sum())
+    for name, true in zip("uvw", truth, strict=True):
+        if name in wind and valid.any():
+            error = (wind[name].transpose("z", "y").values - true)[valid]
+            found[f"error_{name}"] = float(np.sqrt(np.mean(error**2)))
     return found

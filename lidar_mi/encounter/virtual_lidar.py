@@ -1,5 +1,6 @@
 """The lidar as an object that is stepped: light, detector, and what is estimated from them."""
 
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -8,8 +9,11 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.encounter.combination import combined_in_flight
+from lidar_mi.encounter.doppler import LineFrames, Midway, doppler_scans
 from lidar_mi.encounter.estimate import Estimate
-from lidar_mi.encounter.estimator import Estimator
+from lidar_mi.encounter.estimator import Estimator, SlabEstimate
+from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.pointing import pointing_error
 from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.scan_store import Scan, ScanStore
@@ -55,7 +59,7 @@ class SlabImages:
 
 
 class VirtualLidar:
-    """The backscatter lidar of an encounter, stepped from scan to scan by any simulation.
+    """The lidars of an encounter, stepped from scan to scan by any simulation.
 
     Every step renders one scan of consecutive gates. The slab in the last gate of one scan is that
     in the first gate of the next, so every scan completes a pair of images of one slab; wind and
@@ -114,7 +118,10 @@ class VirtualLidar:
         self.gates: Gates = gates_of(experiment)
         self.air: Air = air_of(experiment, self.gates)
         self.images: SlabImages | None = None
-        self._estimator = Estimator(experiment, processes=processes)
+        self._doppler = doppler_scans(experiment, self.gates)
+        speeds = self._doppler and LineSpeeds(self._doppler)
+        self._estimator = Estimator(experiment, processes=processes, speeds=speeds)
+        self._poses: dict[int, AircraftPose] = {}
         self._renderer: ScanRenderer | None = None
         self._scans: dict[int, Scan] = {}
         self._store = scans
@@ -158,31 +165,64 @@ class VirtualLidar:
             scan = self._scanned(number, pose)
             if self._store:
                 self._store.keep(number, pose, scan)
-        before = self._scans.get(number - 1)
+        before, came_from = self._scans.get(number - 1), self._poses.get(number - 1)
         self._scans = {number: scan} | ({number - 1: before} if before else {})
+        self._poses = {number: pose} | ({number - 1: came_from} if came_from else {})
         period = self.gates.period
         delivered = number * period + self.encounter.control.latency
         valid, x = (number - 0.5) * period, self.gates.slab(number - 1)
-        if before is None:
+        if before is None or came_from is None:
             self.images = None
             return Estimate(valid, delivered, x, None, None, (NO_EARLIER_SCAN,), {})
         images, flags = _on_first_grid(before, scan)
         self.images = images
         if images is None:
             return Estimate(valid, delivered, x, None, None, flags, {})
-        wind, pair, seconds = self._estimator.pair_of(
-            images.first, images.second, period, images.noise, expected
+        midway = Midway.between(came_from, pose, period)
+        found = self._estimator.pair_of(
+            images.first,
+            images.second,
+            period,
+            images.noise,
+            expected,
+            frames=self._line_frames(number, x, valid, midway),
         )
-        pointing = self.experiment.retrieval.pointing
+        wind, pair = self._with_pointing(found, pose)
+        if not pair.success:
+            flags += tuple(f"vortices: {reason}" for reason in pair.reasons)
+        seconds = dict(found.seconds)
+        if wind is not None and found.lines is not None:
+            began, std = time.perf_counter(), self.experiment.sensor.crossflow_std
+            try:
+                wind = combined_in_flight(wind, found.lines, midway.place, x, std)
+            except InputError as error:
+                flags += (f"no wind from both lidars: {error}",)
+            seconds["combination"] = time.perf_counter() - began
+            seconds["total"] += seconds["combination"]
+        return Estimate(valid, delivered, x, wind, pair, flags, seconds, found.lines)
+
+    def _line_frames(
+        self, number: int, x: float, valid: float, midway: Midway
+    ) -> LineFrames | None:
+        """Of the Doppler lidar, if there is one."""
+        if self._doppler is None:
+            return None
+        turned = pointing_error(self.experiment, number, number * self.gates.period)
+        return self._doppler.frames(self.wake, number, x, valid, midway, turned)
+
+    def _with_pointing(
+        self, found: SlabEstimate, pose: AircraftPose
+    ) -> tuple[xr.Dataset | None, VortexPairFit]:
+        """Wind and vortices with the errors that unknown pointing gives to all of them."""
+        wind, pair = found.wind, found.pair
+        pointing, period = self.experiment.retrieval.pointing, self.gates.period
         common = pointing.stderr * (self.gates.look_ahead - self.gates.stride / 2) / period
         rotation, axis = pointing.roll / period, (pose.y, pose.z)
         if common or rotation:
             pair = pair.with_common_error(common, common, rotation, axis)
             if wind is not None:
                 wind = with_common_error(wind, common, pointing.offset, rotation, axis)
-        if not pair.success:
-            flags += tuple(f"vortices: {reason}" for reason in pair.reasons)
-        return Estimate(valid, delivered, x, wind, pair, flags, seconds)
+        return wind, pair
 
     def _number(self, t: float) -> int:
         number = round(t / self.gates.period) if np.isfinite(t) else -1

@@ -74,6 +74,41 @@ def drifts(
     return np.array(values), np.array(stds)
 
 
+def shared_covariance(
+    doppler: Doppler, averaged: int, laser_std: np.ndarray, key: str
+) -> np.ndarray | None:
+    """Covariance of the errors of averages of pulses, beyond each one's own, (m/s)^2.
+
+    Averages behind one frame of the laser share its noise, and the drifts before the earlier one.
+
+    Parameters
+    ----------
+    averaged : int
+        Pulses of an average.
+    laser_std : array (averages,)
+        Standard error of the laser's frame of each, m/s.
+    key : str
+        As of `reference_frames`.
+
+    Returns
+    -------
+    array (averages, averages) or None
+        0 on the diagonal; None where every average has frames of its own.
+    """
+    every = doppler.reference.every
+    _, sharing = reference_frames(averaged, every, key)
+    if sharing == 1:
+        return None
+    group, slot = np.divmod(np.arange(len(laser_std)), sharing)
+    pulses = slot[:, None] * averaged + np.arange(averaged)
+    steps = np.arange(every)
+    weight = np.stack([(own[:, None] >= steps).mean(0) for own in pulses])
+    found = np.outer(laser_std, laser_std) + step_speed(doppler) ** 2 * weight @ weight.T
+    found[group[:, None] != group] = 0
+    np.fill_diagonal(found, 0)
+    return found
+
+
 def reference_uncertainty(doppler: Doppler) -> ReferenceUncertainty:
     """Errors of a pulse, the middle one behind its frame of the laser, that no image shows."""
     known, etalon = doppler.reference, doppler.etalon

@@ -4,6 +4,7 @@ Line-of-sight velocities are positive toward the instrument, as in the paper's e
 """
 
 import math
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 import numpy as np
@@ -19,6 +20,9 @@ from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.motion import attitude, tilted
 from lidar_mi.instrument.scan import HalfAngle
 from lidar_mi.units import Angle, Speed, Within, quantity
+
+# Wind (..., 3) in m/s at points (..., 3) in m.
+WindAt = Callable[[np.ndarray], np.ndarray]
 
 # nodes of the quadrature over range bin, pulse and beam: exact for winds of degree 15, 5 and 5
 _BIN, _PULSE, _BEAM = 8, 3, 3
@@ -194,7 +198,7 @@ def wind_at(wind: xr.Dataset, points: np.ndarray) -> np.ndarray:
 
 
 def scan_wind(
-    wind: xr.Dataset,
+    wind: xr.Dataset | WindAt,
     scan: DopplerScan,
     lidar: DopplerLidar,
     v_los_std: float | np.ndarray,
@@ -211,8 +215,8 @@ def scan_wind(
 
     Parameters
     ----------
-    wind : xr.Dataset
-        As for `wind_at`, in the lidar's frame.
+    wind : xr.Dataset or callable
+        As for `wind_at`, in the lidar's frame; or u, v, w (..., 3) in m/s of points (..., 3) in m.
     v_los_std : float or (lines,) array
         Standard error of a measured velocity, m/s: what the fringe chain gives for as many pulses
         as a line has.
@@ -251,7 +255,8 @@ def scan_wind(
     if beams is not None:
         points = points + beams.origin[:, None]
         velocity, told = velocity + beams.velocity, told + beams.reported_velocity
-    mean = np.einsum("lp,lpc->lc", weights, wind_at(wind, points))
+    winds = wind_at(wind, points) if isinstance(wind, xr.Dataset) else wind(points)
+    mean = np.einsum("lp,lpc->lc", weights, winds)
     toward = velocity + np.array([errors.speed, 0.0, 0.0]) - mean
     true = np.einsum("lc,lc->l", actual, toward)
     noise = np.random.default_rng(int(noise_seed)).standard_normal(len(true))

@@ -21,9 +21,9 @@ def images():
 
 def test_vortices_from_nothing_and_from_the_last_fit(images):
     estimator = Estimator(load_experiment("wake_sensor"), vectors=False)
-    wind, cold, seconds = estimator.pair_of(images.first, images.second, DT, 0.03)
+    wind, cold, seconds, _ = estimator.pair_of(images.first, images.second, DT, 0.03)
     assert wind is None and cold.success and not cold.from_start
-    _, warm, _ = estimator.pair_of(images.first, images.second, DT, 0.03, cold)
+    warm = estimator.pair_of(images.first, images.second, DT, 0.03, cold).pair
     assert warm.success and warm.from_start
     stderr = np.sqrt(np.diag(cold.covariance))
     assert (np.abs(warm.parameters - cold.parameters) < 0.1 * stderr).all()
@@ -33,7 +33,7 @@ def test_vortices_from_nothing_and_from_the_last_fit(images):
 
 def test_the_wind_is_by_the_most_accurate_method(images):
     estimator = Estimator(load_experiment("wake_sensor"))
-    wind, _, seconds = estimator.pair_of(images.first, images.second, DT, 0.03)
+    wind, _, seconds, _ = estimator.pair_of(images.first, images.second, DT, 0.03)
     assert wind.attrs["method"] == "variational"
     valid = wind["flag"] == 0
     assert valid.mean() > 0.9
@@ -50,12 +50,12 @@ def test_the_next_slab_starts_from_the_last_one():
         vortices = [replace(v, y=v.y + y) for v in uneven()]
         slab = drifting_pair_images(vortices, (0.5, 0.0), 0.03, seed, columns=130, rows=90)
         found = near.pair_of(slab.first, slab.second, DT, 0.03, last)
-        last = replace(found[1], covariance=found[1].covariance + np.diag(UNFORESEEN**2))
-        for name, (wind, _, _) in {
+        last = replace(found.pair, covariance=found.pair.covariance + np.diag(UNFORESEEN**2))
+        for name, one in {
             "near": found,
             "far": far.pair_of(slab.first, slab.second, DT, 0.03),
         }.items():
-            off = wind["v"] - slab.v.interp(y=wind["y"], z=wind["z"])
+            off = one.wind["v"] - slab.v.interp(y=one.wind["y"], z=one.wind["z"])
             errors[name].append(float(off.std()))
-    assert found[0].attrs["from_start"] == 1 and found[1].from_start
+    assert found.wind.attrs["from_start"] == 1 and found.pair.from_start
     assert errors["near"][1] < 1.05 * errors["far"][1]

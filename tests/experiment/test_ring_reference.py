@@ -18,6 +18,7 @@ from lidar_mi.experiment.ring_reference import (
     reference_frames,
     reference_uncertainty,
     scrambling_needed,
+    shared_covariance,
     step_speed,
 )
 from lidar_mi.experiment.schema import Doppler
@@ -35,6 +36,27 @@ def test_a_step_of_laser_and_etalon():
     assert step_speed(lidar(laser_drift=1e6)) == pytest.approx(0.17735, rel=1e-4)
     found = step_speed(lidar(etalon_drift=2e-3))
     assert found == pytest.approx(speed_of_light / 2 * 1e-9, rel=1e-9)
+
+
+def test_averages_behind_one_frame_share_its_noise_and_the_drift_before():
+    """Pulses 1 to 4 behind a frame: the k-th and a later one share k steps; 5 has its own frame."""
+    doppler = lidar(every=4, laser_drift=1e6)
+    found = shared_covariance(doppler, 1, np.array([0.2, 0.2, 0.2, 0.2, 0.3]), KEY)
+    steps = np.array([[0, 1, 1, 1, 0], [1, 0, 2, 2, 0], [1, 2, 0, 3, 0], [1, 2, 3, 0, 0], [0] * 5])
+    np.testing.assert_allclose(
+        found, step_speed(doppler) ** 2 * steps + 0.04 * (steps > 0), rtol=1e-9
+    )
+    assert shared_covariance(doppler, 4, np.ones(2), KEY) is None
+
+
+def test_shared_drifts_are_as_stated():
+    """1500 series of three averages behind one frame: covariances are known to 5 %."""
+    doppler, number = lidar(every=6, laser_drift=1e6), 1500
+    drawn = np.array([drifts(doppler, 2, [9, k], range(3), KEY)[0] for k in range(number)])
+    _, std = drifts(doppler, 2, [9, 0], range(3), KEY)
+    stated = shared_covariance(doppler, 2, np.zeros(3), KEY) + np.diag(std**2)
+    spread = np.sqrt((np.outer(std, std) ** 2 + stated**2) / number)
+    assert (np.abs(drawn.T @ drawn / number - stated) < 4 * spread).all()
 
 
 @pytest.mark.parametrize(

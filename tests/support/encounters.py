@@ -29,3 +29,22 @@ def small_encounter(seed=1, path=None, wake=None, render=None, **changes):
         }
         | changes,
     )
+
+
+def both_lidars(seed=1, path=None, doppler=None, sensor=None, **changes):
+    """The same with a Doppler lidar: 12 lines of sight, a camera of 240 x 195 px."""
+    told = {
+        "camera": {"width": 240, "height": 195, "pixel": "29.6 um"},
+        "ccd": {"binning": 4},
+        "reference": {"every": 240},
+        "retrieval": {"methods": ["annular"], "averaged": [1]},
+    }
+    lines = {"columns": 4, "rows": 3, "azimuth_half": "9 deg", "elevation_half": "5 deg"}
+    return small_encounter(
+        seed,
+        path,
+        doppler=told | (doppler or {}),
+        sensor={"directions": lines, "pulses": 20, "method": "variational"} | (sensor or {}),
+        retrieval={"methods": ["variational"], "stride": 4},
+        **changes,
+    )

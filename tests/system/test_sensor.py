@@ -23,7 +23,6 @@ from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import measured
 from lidar_mi.experiment.run import prepare, run
-from lidar_mi.experiment.stages import lines as line_stage
 from lidar_mi.experiment.stages.sensor import doppler_alone, mean_squares_without, with_truth
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
@@ -267,14 +266,6 @@ def test_two_lines_give_no_vector_which_is_reported(whole, tmp_path, monkeypatch
     assert "Standard errors of the wind" not in report and '"beyond lines"' in report
     with xr.open_dataset(folder / "wind3d.nc", engine="h5netcdf") as wind:
         assert (wind["flag"].values != 0).all()
-
-
-def test_interpolation_is_exact_for_polynomials():
-    nodes = np.cos(np.pi * (np.arange(9) + 0.5) / 9)
-    places = np.array([-1.0, -0.3, nodes[4], 0.77])
-    weights = line_stage._lagrange(nodes, places)
-    for power in range(9):
-        np.testing.assert_allclose(weights @ nodes**power, places**power, atol=1e-12)
 
 
 def test_errors_of_a_known_field():

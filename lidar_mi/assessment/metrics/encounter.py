@@ -87,7 +87,8 @@ def measured_in_flight(
     """Rows of a requirement table as flown: range from the time from an estimate to its slab.
 
     The range is what the aircraft flies from the moment at which an estimate is there to its slab;
-    errors of v and w are those of valid vectors against the truth.
+    errors are those of valid vectors and of lines of sight against the truth; u and lines of sight
+    are left out without a Doppler lidar.
     """
     seen = track.where(track["vectors"] > 0, drop=True)
     speed = float(series["airspeed"].isel(time=0).mean())
@@ -98,8 +99,8 @@ def measured_in_flight(
         "slab_depth": slab_depth,
         "points_per_slab": float(seen["vectors"].median()) if seen.sizes["slab"] else 0.0,
     }
-    for name in "vw":
-        errors = seen[f"error_{name}"].values
+    for name in ("v_los", "u", "v", "w"):
+        errors = seen[f"error_{name}"].values if f"error_{name}" in seen else np.array([])
         errors = errors[np.isfinite(errors)]
         if errors.size:
             found[f"error_{name}"] = float(np.sqrt(np.mean(errors**2)))

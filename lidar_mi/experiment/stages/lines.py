@@ -3,11 +3,9 @@
 from collections.abc import Mapping
 
 import numpy as np
-import torch
 import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable, read_requirements
-from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.ring_instrument import pixel_noise
@@ -16,23 +14,21 @@ from lidar_mi.experiment.ring_reference import (
     plate_error,
     plate_uncertainty,
     reference_frames,
+    shared_covariance,
 )
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames, reference_photons
-from lidar_mi.experiment.stages.ring_velocities import FRAMES, REFERENCES, speeds_to_laser
+from lidar_mi.experiment.stages.line_frames import PULSES, line_frames, line_images
+from lidar_mi.experiment.stages.ring_images import Rings
+from lidar_mi.experiment.stages.ring_velocities import FRAMES, speeds_to_laser
 from lidar_mi.experiment.truth import Truth, find_file
 from lidar_mi.instrument.beams import Beams
-from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_at
-from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
+from lidar_mi.retrieval.rings.model import PixelNoise
 
-# Speeds at which noise-free images are rendered; those between are interpolated (Chebyshev).
-_NODES = 7
-# First number of the lines' images, which selects their random streams.
-_PULSES = "sensor.pulses"
-_STREAMS = 1 << 24
+# Selects the random streams of the drifts of the first scan.
+_DRIFTS = 1 << 24
 
 
 def requirement_tables(
@@ -69,7 +65,7 @@ def check_lines(
         Lidars that do not observe the same slab, lines that leave the wake, speeds beyond the
         unambiguous range.
     """
-    reference_frames(experiment.sensor.pulses, experiment.doppler.reference.every, _PULSES)
+    reference_frames(experiment.sensor.pulses, experiment.doppler.reference.every, PULSES)
     lidar = experiment.doppler.lidar
     middle = experiment.scan.range + experiment.scan.thickness / 2
     if abs(lidar.range - middle) > lidar.range_bin / 2:
@@ -109,9 +105,8 @@ def measure_lines(
 
     ``assumed`` has the models of the instrument that the retrieval assumes.
 
-    Images without noise are made at a few speeds and interpolated between them (their rings
-    move by far less than an order); each line's are drawn by the CCD and evaluated by the annular
-    fit, which states its standard error.
+    The frames of each line (`line_frames`) are evaluated by the annular fit, which states its
+    standard error.
 
     Returns
     -------
@@ -130,61 +125,67 @@ def measure_lines(
         sensor.errors,
         beams,
     )
-    true = lines["v_los_true"].values
+    true, ranges = (lines[name].values for name in ("v_los_true", "range"))
     log(f"measuring {len(true)} lines of sight, {sensor.pulses} pulses each")
-    middle, half = (true.max() + true.min()) / 2, max(np.ptp(true) / 2, 1e-3)
-    nodes = np.cos(np.pi * (np.arange(_NODES) + 0.5) / _NODES)
-    light, counted = photons(doppler.lidar), doppler.lidar.counted
-    images = torch.stack(
-        [
-            fringe_image(doppler.camera, doppler.etalon, rings.line, speed, light, counted)
-            for speed in middle + half * nodes
-        ]
-    )
-    line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
-    own = fringe_image(doppler.camera, doppler.etalon, line, 0.0, reference_photons(doppler, rings))
-    every = doppler.reference.every
-    frames_of_line, sharing = reference_frames(sensor.pulses, every, _PULSES)
-    noises = [pixel_noise(doppler.ccd, rings.modes, n) for n in (sensor.pulses, frames_of_line)]
-    weights = torch.from_numpy(_lagrange(nodes, (true - middle) / half)).to(images.dtype)
-    retrieved = np.empty((3, len(true)))
+    images = line_images(doppler, rings, true.min(), true.max())
+    noises = line_noises(experiment, rings)
+    retrieved = np.empty((4, len(true)))
     for start in range(0, len(true), FRAMES):
         log.bar(f"retrieving line of sight {start + 1} of {len(true)}", start / len(true))
-        chunk = range(start, min(start + FRAMES, len(true)))
-        frames, laser = [], []
-        for index in chunk:
-            farther = doppler.lidar.model_copy(update={"range": float(lines["range"][index])})
-            image = torch.tensordot(weights[index], images, 1) * (photons(farther) / light)
-            # random streams different from those of the images of the Doppler lidar's chapter
-            frames.append(
-                exposed_frames(
-                    doppler, rings, image, sensor.pulses, experiment.seed, [_STREAMS + index]
-                )
-            )
-            laser.append(
-                exposed_frames(
-                    doppler,
-                    rings,
-                    own,
-                    frames_of_line,
-                    experiment.seed,
-                    [REFERENCES + _STREAMS + index // sharing],
-                )
-            )
-        retrieved[:, start : chunk.stop] = speeds_to_laser(
-            torch.cat(frames),
-            torch.cat(laser),
+        chunk = slice(start, min(start + FRAMES, len(true)))
+        air, laser, own = line_frames(
             doppler,
-            assumed,
-            noises,
-            RingMethod.ANNULAR,
-            RingCentre.FREE,
+            rings,
+            images,
+            range(chunk.start, chunk.stop),
+            true[chunk],
+            ranges[chunk],
+            sensor.pulses,
+            experiment.seed,
         )
-    v_los, std, systematic = retrieved
-    drift, drift_std = drifts(
-        doppler, sensor.pulses, [experiment.seed, _STREAMS], range(len(true)), _PULSES
-    )
-    return lines.assign(
+        retrieved[:, chunk] = speeds_to_laser(
+            air, laser[own], doppler, assumed, noises, RingMethod.ANNULAR, RingCentre.FREE
+        )
+    return with_speeds(lines, *retrieved, experiment)
+
+
+def line_noises(experiment: Experiment, rings: Rings) -> list[PixelNoise]:
+    """Noise of the pixels of a line's frame, and of the frame of the laser."""
+    doppler, pulses = experiment.doppler, experiment.sensor.pulses
+    own, _ = reference_frames(pulses, doppler.reference.every, PULSES)
+    return [pixel_noise(doppler.ccd, rings.modes, number) for number in (pulses, own)]
+
+
+def with_speeds(
+    lines: xr.Dataset,
+    v_los: np.ndarray,
+    std: np.ndarray,
+    systematic: np.ndarray,
+    laser_std: np.ndarray,
+    experiment: Experiment,
+    scan: int = 0,
+) -> xr.Dataset:
+    """Lines with the speeds that were read, the drifts behind the laser's frames and their errors.
+
+    Parameters
+    ----------
+    lines : xr.Dataset
+        From `scan_wind`.
+    v_los, std, systematic, laser_std : arrays, shape (lines,)
+        From `speeds_to_laser`, m/s.
+    scan : int
+        Its number selects the drifts.
+
+    Returns
+    -------
+    xr.Dataset, dim (line)
+        With ``v_los_covariance`` (line, other_line), m^2 s^-2, where lines share a frame of the
+        laser.
+    """
+    doppler, pulses = experiment.doppler, experiment.sensor.pulses
+    seed = [experiment.seed, _DRIFTS + scan]
+    drift, drift_std = drifts(doppler, pulses, seed, range(len(v_los)), PULSES)
+    found = lines.assign(
         v_los=("line", v_los + drift + plate_error(doppler), lines["v_los"].attrs),
         v_los_std=("line", np.hypot(std, drift_std), lines["v_los_std"].attrs),
         v_los_systematic=(
@@ -193,15 +194,9 @@ def measure_lines(
             {"units": "m s-1", "long_name": "systematic standard error common to all lines"},
         ),
     )
-
-
-def _lagrange(nodes: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Weights (places, nodes) of values at the nodes in the polynomial through them, at places."""
-    others = ~np.eye(len(nodes), dtype=bool)
-    return np.stack(
-        [
-            ((places[:, None] - nodes[o]) / (node - nodes[o])).prod(1)
-            for node, o in zip(nodes, others, strict=True)
-        ],
-        axis=1,
-    )
+    shared = shared_covariance(doppler, pulses, laser_std, PULSES)
+    if shared is not None:
+        text = "covariance of the random errors of v_los by the laser's frames, beside v_los_std"
+        about = {"units": "m2 s-2", "long_name": text}
+        found["v_los_covariance"] = ("line", "other_line"), shared, about
+    return found

@@ -273,30 +273,31 @@ def velocities(
 
 
 def speeds_to_laser(frames, laser, doppler, rings, noises, method, centre) -> np.ndarray:
-    """v_LOS of frames less that of the laser's, random and systematic standard deviation.
+    """v_LOS of frames less that of the laser's, and its standard deviations.
 
     ``noises`` are of the pixels of both; the systematic part is what the calibration leaves.
 
     Returns
     -------
-    array (3, frames)
-        m/s; NaN for images that `fit_rings` refuses.
+    array (4, frames)
+        v_LOS, its random and systematic standard deviation, and the part of the random one by the
+        laser's frame, m/s; NaN for images that `fit_rings` refuses.
     """
     try:
         # the narrow rings of the laser need no 2-D fit: their error is a third of the air's
+        emitted = _fit(laser, doppler, rings.laser, rings.response, noises[1], "annular", centre)
         parts = difference(
-            _fit(frames, doppler, rings.model, rings.response, noises[0], method, centre),
-            _fit(laser, doppler, rings.laser, rings.response, noises[1], "annular", centre),
+            _fit(frames, doppler, rings.model, rings.response, noises[0], method, centre), emitted
         )
     except InputError:
         if len(frames) == 1:
-            return np.full((3, 1), np.nan)
+            return np.full((4, 1), np.nan)
         alone = [
             speeds_to_laser(one[None], own[None], doppler, rings, noises, method, centre)
             for one, own in zip(frames, laser, strict=True)
         ]
         return np.concatenate(alone, 1)
-    return np.stack([part.numpy() for part in parts])
+    return np.stack([part.numpy() for part in (*parts, emitted.v_los_std)])
 
 
 def _fit(frames, doppler, model, response, noise, method, centre):

@@ -226,6 +226,8 @@ def mean_squares_without(
         if "line_noise" in causes:
             noise, std = 0 * noise, xr.full_like(std, _SURE)
         changed = changed.assign(v_los=changed["v_los_true"] + noise, v_los_std=std)
+        if "v_los_covariance" in lines and "line_noise" not in causes:
+            changed["v_los_covariance"] = lines["v_los_covariance"]
         flow, settings = crossflow, _oblique_view(experiment)
         if "crossflow" in causes:
             flow, settings = known, {}

@@ -146,7 +146,7 @@ def combine(
     mean = np.einsum("lk,lkc->lc", lines.weight, field.value[lines.z, lines.y])
     residual = lines.along - (across * mean).sum(1)
     without_image = (lines.weight * ~field.valid[lines.z, lines.y]).sum(1)
-    fixed = np.diag(lines.variance + without_image**2 * (across**2 @ field.prior_std**2))
+    fixed = lines.covariance + np.diag(without_image**2 * (across**2 @ field.prior_std**2))
     fixed += _MEAN_STD**2 * np.outer(forward, forward)
     fixed += covariance_of_lines(lines, crossflow_weights(field, lines), *overlap).sum(0)
     # the lines' velocities per m/s of an error that all vectors share

@@ -8,7 +8,12 @@ from scipy import sparse
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.lines.crossflow import Crossflow
-from lidar_mi.retrieval.lines.vectors import line_origins, line_places, wind_along_lines
+from lidar_mi.retrieval.lines.vectors import (
+    line_origins,
+    line_places,
+    shared_covariance,
+    wind_along_lines,
+)
 
 # Points along a range bin: Gauss-Legendre, exact for winds of degree 9.
 _ALONG = 5
@@ -20,13 +25,13 @@ CHUNK_NUMBERS = 2e7
 class GridLines(NamedTuple):
     """Lines of sight as sums over nodes of the grid: of row z and column y with weight.
 
-    ``forward`` is the weight of u at the nodes: its projection on the line, and the part of it that
+    ``covariance`` is that of the lines' errors. ``forward`` is the weight of u at the nodes: its projection on the line, and the part of it that
     the images attribute to v and w.
     """
 
     direction: np.ndarray
     along: np.ndarray
-    variance: np.ndarray
+    covariance: np.ndarray
     z: np.ndarray
     y: np.ndarray
     weight: np.ndarray
@@ -74,11 +79,14 @@ def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridL
         for dy in (0, 1)
     ]
     row, column, weight = (np.concatenate(p, axis=1)[used] for p in zip(*parts, strict=True))
-    variance = scan["v_los_std"].values[used] ** 2
+    covariance = np.diag(scan["v_los_std"].values[used] ** 2)
+    shared = shared_covariance(scan)
+    if shared is not None:
+        covariance = covariance + shared[np.ix_(used, used)]
     direction = direction[used]
     forward = weight * direction[:, :1]
     middle = line_places(scan)[used, 1:]
-    return GridLines(direction, along[used], variance, row, column, weight, forward), middle
+    return GridLines(direction, along[used], covariance, row, column, weight, forward), middle
 
 
 def _part(fraction, side):

@@ -64,6 +64,13 @@ def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
     return scan["direction"].dot(scan["platform_velocity"], dim="axis") - scan["v_los"]
 
 
+def shared_covariance(scan: xr.Dataset) -> np.ndarray | None:
+    """Covariance (line, line) of the lines' errors beyond their variances, (m/s)^2; None: none."""
+    if "v_los_covariance" not in scan:
+        return None
+    return scan["v_los_covariance"].transpose("line", "other_line").values
+
+
 def line_origins(scan: xr.Dataset) -> np.ndarray:
     """Where lines of sight start, (line, 3), m from the telescope at the scan's reference time."""
     if "origin" not in scan:
@@ -78,7 +85,7 @@ def line_places(scan: xr.Dataset) -> np.ndarray:
 
 
 def solve_lines(
-    directions: np.ndarray, along: np.ndarray, std: np.ndarray
+    directions: np.ndarray, along: np.ndarray, std: np.ndarray, shared: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Least squares for one wind measured along several lines, many times at once.
 
@@ -90,12 +97,15 @@ def solve_lines(
         Wind along them, m/s.
     std : (n, k) array
         Standard errors, m/s.
+    shared : (n, k, k) array, optional
+        Covariance of the errors of different lines, (m/s)^2, 0 on the diagonal. It is not used for
+        the wind, but enters its covariance.
 
     Returns
     -------
     wind : (n, 3) array, m/s
     covariance : (n, 3, 3) array, (m/s)^2
-        (sum d d^T / s^2)^-1; infinite (and the wind NaN) where the lines lie in one plane.
+        (sum d d^T / s^2)^-1, and what is shared; infinite (and the wind NaN) where the lines lie in one plane.
     chi_square : (n,) array
         Squared misfit; of k - 3 degrees of freedom if the wind is uniform over the lines.
 
@@ -116,6 +126,9 @@ def solve_lines(
     wind = np.einsum("nij,nj->ni", root, np.einsum("nki,nk->ni", left, data))
     misfit = data - np.einsum("nki,ni->nk", matrix, wind)
     covariance = root @ root.swapaxes(-1, -2)
+    if shared is not None:
+        solution = root @ left.swapaxes(-1, -2) / std[:, None, :]
+        covariance = covariance + solution @ shared @ solution.swapaxes(-1, -2)
     covariance[flat] = np.inf
     return wind, covariance, (misfit**2).sum(1)
 
@@ -133,7 +146,8 @@ def wind_from_triples(scan: xr.Dataset) -> xr.Dataset:
     ----------
     scan : xr.Dataset, dim line
         `v_los`, `v_los_std`, `range`, `direction` (line, axis), `platform_velocity` (axis), as
-        from `lidar_mi.instrument.doppler_scan.scan_wind`; also `origin` (line, axis; m).
+        from `lidar_mi.instrument.doppler_scan.scan_wind`; also `origin` (line, axis; m) and
+        `v_los_covariance` (line, other_line; m2 s-2) of errors that lines share.
 
     Returns
     -------
@@ -211,9 +225,15 @@ def _vectors(scan, along, lines, method) -> xr.Dataset:
     directions = scan["direction"].transpose("line", "axis").values[lines]
     values, std = along.values[lines], scan["v_los_std"].values[lines]
     missing = ~np.isfinite(values).all(1)
+    shared = shared_covariance(scan)
+    if shared is not None:
+        shared = np.nan_to_num(shared[lines[:, :, None], lines[:, None]])
     # any number will do: the results are replaced by NaN below
     wind, covariance, chi_square = solve_lines(
-        directions, np.where(missing[:, None], 0.0, values), np.where(missing[:, None], 1.0, std)
+        directions,
+        np.where(missing[:, None], 0.0, values),
+        np.where(missing[:, None], 1.0, std),
+        shared,
     )
     flat = np.isinf(covariance[:, 0, 0])
     wind[missing], covariance[missing | flat] = np.nan, np.nan

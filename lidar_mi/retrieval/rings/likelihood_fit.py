@@ -15,7 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -117,8 +117,21 @@ class RingFit:
         return _systematic(self.sensitivity, self.systematic)
 
 
+class SpeedsOfRings(Protocol):
+    """Speeds read from images, by whatever method, as of `RingFit`."""
+
+    @property
+    def v_los(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def v_los_std(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def sensitivity(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def systematic(self) -> torch.Tensor: ...  # noqa: D102
+
+
 def difference(
-    received: RingFit, emitted: RingFit
+    received: SpeedsOfRings, emitted: SpeedsOfRings
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """v_LOS of received images less that of images of the laser itself, with standard deviations.
 

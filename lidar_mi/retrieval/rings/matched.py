@@ -8,7 +8,7 @@ reference is near: rings that move by a tenth of their width lose 1 % of the inf
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -83,6 +83,11 @@ class MatchedRead:
     sensitivity: torch.Tensor
     systematic: torch.Tensor
 
+    def of(self, which: torch.Tensor) -> "MatchedRead":
+        """Some of the images, in any order."""
+        each = ("values", "std", "chi_square", "read", "sensitivity")
+        return replace(self, **{name: getattr(self, name)[which] for name in each})
+
     @property
     def v_los(self) -> torch.Tensor:
         """Speed along the line of sight, m/s, positive toward the instrument."""
@@ -128,11 +133,7 @@ def matched_score(
     )
 
 
-def read_matched(
-    images: torch.Tensor,
-    score: MatchedScore,
-    start: torch.Tensor | None = None,
-) -> MatchedRead:
+def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
     """Speeds and all other parameters of images near a reference.
 
     Frames are summed up over the cells once, which takes most of the time. They are not searched
@@ -144,9 +145,6 @@ def read_matched(
     images : torch.Tensor, shape (images, height, width)
         Electrons, as for `fit_rings`.
     score : MatchedScore
-    start : torch.Tensor, shape (images, `PARAMETERS`), optional
-        Where each one starts, such as the values of the last images of the same lines of sight;
-        default: the reference, with the light of every image.
 
     Returns
     -------
@@ -167,7 +165,7 @@ def read_matched(
         means = score.waves.cells.means(images)
     model, names = score.model, score.names
     columns = [PARAMETERS.index(name) for name in names]
-    at = _started(score, means, start)
+    at = _started(score, means)
     information = prior_information(model, names, means.device)
     middle = model.start(means.device)[:, columns]
     influence = score.inverse @ score.score
@@ -200,22 +198,13 @@ def read_matched(
     return MatchedRead(values, spread, chi_square, read, each, score.systematic)
 
 
-def _started(score: MatchedScore, means: torch.Tensor, start: torch.Tensor | None) -> torch.Tensor:
-    """Parameters (images, `PARAMETERS`) with x and y from the cells' centre."""
-    if start is None:
-        at = score.values.repeat(len(means), 1)
-        count = score.waves.cells.count
-        light = means @ count / count.sum() - at[:, _BACKGROUND]
-        reference = at[:1].clone()
-        reference[:, _PLACE] = 0
-        own = mean_and_jacobian(score.model, score.waves, reference)[0] @ count / count.sum()
-        at[:, _LEVEL] *= (light / (own - at[:, _BACKGROUND])).clamp(0.1, 10)
-    elif start.shape == (len(means), len(PARAMETERS)):
-        at = start.double().clone()
-    else:
-        raise InputError(
-            f"start: shape {tuple(start.shape)} is not allowed; expected "
-            f"({len(means)}, {len(PARAMETERS)})"
-        )
-    at[:, _PLACE] -= score.values[_PLACE]
+def _started(score: MatchedScore, means: torch.Tensor) -> torch.Tensor:
+    """The reference with the light of every image; x and y from the cells' centre."""
+    at = score.values.repeat(len(means), 1)
+    at[:, _PLACE] = 0
+    count = score.waves.cells.count
+    own = mean_and_jacobian(score.model, score.waves, at[:1])[0]
+    background = score.values[_BACKGROUND]
+    light, reference = (part @ count / count.sum() - background for part in (means, own))
+    at[:, _LEVEL] *= (light / reference).clamp(0.1, 10)
     return at

@@ -622,3 +622,26 @@ def test_bad_input_is_named(call, start):
     with pytest.raises(InputError) as error:
         call()
     assert str(error.value).startswith(start) and "\n" not in str(error.value)
+
+
+def test_an_error_that_all_lines_share():
+    """One frame of the laser for all lines: u is off by its error all over, and says so.
+
+    60 draws of a uniform u: normalised errors have a variance of 1 +- 0.18; as if the errors were
+    independent it would be above 5.
+    """
+    rng, places = np.random.default_rng(8), [(y, z) for z in (-2, 0, 2) for y in (-3, -1, 1, 3)]
+    flow = crossflow(0.0, 0.0, 0.1)
+    own, common, number = 0.1, 0.4, 60
+    std = math.hypot(own, common)
+    normalised = {"told": [], "not told": []}
+    for _ in range(number):
+        error = own * rng.standard_normal(len(places)) + common * rng.standard_normal()
+        scan = lines(places, error, std, distance=100.0)
+        shared = common**2 * (1 - np.eye(len(places)))
+        told = scan.assign(v_los_covariance=(("line", "other_line"), shared))
+        for name, one in (("told", told), ("not told", scan)):
+            middle = combine(flow, one).sel(y=0, z=0)
+            normalised[name].append(float(middle["u"] / middle["u_stderr"]))
+    assert np.mean(np.square(normalised["told"])) == pytest.approx(1, abs=4 * np.sqrt(2 / number))
+    assert np.mean(np.square(normalised["not told"])) > 5

@@ -185,6 +185,21 @@ def test_the_papers_scan_cannot_tell_v_and_w():
     assert float(found.v_stderr.min()) == pytest.approx(0.5 * math.sqrt(2) / apart, rel=0.2)
 
 
+def test_errors_that_lines_share_enter_the_covariance():
+    """Three lines determine the wind alone: M^-1 C M^-T, with any C."""
+    scan = scanned(columns=3, rows=3)
+    shared = 0.3**2 * (1 - np.eye(9))
+    scan = scan.assign(v_los_covariance=(("line", "other_line"), shared))
+    found = wind_from_triples(scan)
+    lines = found["lines"].values[0]
+    inverse = np.linalg.inv(scan["direction"].values[lines])
+    expected = inverse @ (0.5**2 * np.eye(3) + shared[np.ix_(lines, lines)]) @ inverse.T
+    stderr = [float(found[f"{name}_stderr"][0]) for name in "uvw"]
+    np.testing.assert_allclose(stderr, np.sqrt(np.diag(expected)), rtol=1e-9)
+    correlation = expected[0, 1] / np.sqrt(expected[0, 0] * expected[1, 1])
+    assert float(found["uv_correlation"][0]) == pytest.approx(correlation, abs=1e-9)
+
+
 def test_data_set_repeats_the_covariance(tmp_path):
     found = wind_from_triples(scanned())
     _, covariance, _ = solve_lines(

@@ -1,0 +1,189 @@
+"""The Doppler lidar of a flight: frames of its lines of sight through the slab that is seen twice.
+
+All lines look at the middle of the time between both scans, from half way between their places.
+Their range bins are where the slab is.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+import xarray as xr
+from scipy.spatial.transform import Rotation
+
+from lidar_mi.atmosphere.wake_path import WakeAlongPath
+from lidar_mi.encounter.pose import AircraftPose
+from lidar_mi.encounter.slabs import Gates
+from lidar_mi.encounter.wake import encounter_of
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.ring_reference import reference_frames
+from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.experiment.stages.line_frames import PULSES, LineImages, line_frames, line_images
+from lidar_mi.experiment.stages.ring_images import Rings, ring_instrument
+from lidar_mi.instrument.beams import Beams
+from lidar_mi.instrument.doppler_scan import scan_wind
+
+# m/s by which the wind in a wake changes the speed along a line, at most: beyond, the images
+# without noise are not exact.
+_FASTEST_WIND = 60.0
+
+
+class Midway(NamedTuple):
+    """Where an aircraft is between two scans, and how fast it flies; path frame, m and m/s."""
+
+    place: np.ndarray
+    velocity: np.ndarray
+
+    @classmethod
+    def between(cls, before: AircraftPose, now: AircraftPose, period: float) -> "Midway":
+        """From the poses at both scans."""
+        first, last = (np.array([pose.x, pose.y, pose.z]) for pose in (before, now))
+        return cls((first + last) / 2, (last - first) / period)
+
+
+class LineFrames(NamedTuple):
+    """What the Doppler lidar records of a slab.
+
+    Attributes
+    ----------
+    lines : Dataset, dim line
+        From `scan_wind`, in the frame of the aircraft, with the true speeds.
+    air : torch.Tensor, shape (lines, height, width)
+        Photoelectrons.
+    laser : torch.Tensor, shape (frames, height, width)
+    own : list of int
+        The laser's frame of every line.
+    scan : int
+        Number of the scan that completes the slab.
+    """
+
+    lines: xr.Dataset
+    air: torch.Tensor
+    laser: torch.Tensor
+    own: list[int]
+    scan: int
+
+
+@dataclass(frozen=True, eq=False)
+class DopplerScans:
+    """The Doppler lidar as nature has it.
+
+    Attributes
+    ----------
+    experiment : Experiment
+        Its `doppler.lidar.range` is that of the slabs.
+    rings : Rings
+        The true instrument.
+    images : LineImages
+    """
+
+    experiment: Experiment
+    rings: Rings
+    images: LineImages
+
+    def frames(
+        self,
+        wake: WakeAlongPath,
+        number: int,
+        x: float,
+        time: float,
+        midway: Midway,
+        turned: Rotation | None = None,
+    ) -> LineFrames:
+        """Frames of all lines of sight of a slab.
+
+        Parameters
+        ----------
+        wake : WakeAlongPath
+        number : int
+            Of the scan that completes the slab.
+        x : float
+            Plane of the slab, m.
+        time : float
+            Half way between both scans, s.
+        midway : Midway
+        turned : Rotation, optional
+            True attitude of the lidar from the one that its beams are aimed by.
+        """
+        experiment, sensor = self.experiment, self.experiment.sensor
+        lidar = experiment.doppler.lidar.model_copy(update={"range": x - midway.place[0]})
+        told = sensor.directions.directions()
+        going = told if turned is None else turned.apply(told)
+        here = np.zeros_like(told)
+        drift = np.broadcast_to(midway.velocity * [0, 1, 1], told.shape)
+        beams = Beams(np.zeros(len(told)), here, going, here, told, drift, drift)
+
+        def wind(points: np.ndarray) -> np.ndarray:
+            places = np.moveaxis(points + midway.place, -1, 0)
+            return np.stack(wake.wind(*places, time), -1)
+
+        seed = int(np.random.SeedSequence([experiment.seed, number]).generate_state(1)[0])
+        lines = scan_wind(
+            wind,
+            sensor.directions,
+            lidar,
+            0.0,
+            seed,
+            float(midway.velocity[0]),
+            sensor.errors,
+            beams,
+        )
+        recorded = line_frames(
+            experiment.doppler,
+            self.rings,
+            self.images,
+            range(len(told)),
+            lines["v_los_true"].values,
+            lines["range"].values,
+            sensor.pulses,
+            experiment.seed,
+            number,
+        )
+        return LineFrames(lines, *recorded, number)
+
+
+def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
+    """The Doppler lidar of an encounter, checked; None where its experiment has no `sensor`.
+
+    Raises
+    ------
+    InputError
+        Times of lines, a range that is not that of the slabs, an aircraft too fast for the etalon.
+    """
+    if experiment.sensor is None:
+        return None
+    if experiment.sensor.timing is not None:
+        raise InputError("sensor.timing: not allowed in an encounter; expected none")
+    reference_frames(experiment.sensor.pulses, experiment.doppler.reference.every, PULSES)
+    doppler = at_the_slabs(experiment.doppler, gates)
+    rings = ring_instrument(doppler)
+    speed = encounter_of(experiment).path.speed
+    limit = rings.model.velocity_range / 2
+    if speed + _FASTEST_WIND > limit:
+        raise InputError(
+            f"encounter.path.speed: {speed:g} m/s is not allowed with sensor; expected less than "
+            f"{limit - _FASTEST_WIND:.0f} m/s, half an order of doppler.etalon less the wind"
+        )
+    slowest = speed * float(experiment.sensor.directions.directions()[:, 0].min())
+    images = line_images(doppler, rings, slowest - _FASTEST_WIND, speed + _FASTEST_WIND)
+    return DopplerScans(experiment.model_copy(update={"doppler": doppler}), rings, images)
+
+
+def at_the_slabs(doppler: Doppler, gates: Gates) -> Doppler:
+    """The Doppler lidar with the slabs' range.
+
+    Raises
+    ------
+    InputError
+        Its own range is another one.
+    """
+    middle = gates.look_ahead + (gates.depth - gates.stride) / 2
+    lidar = doppler.lidar
+    if "range" in lidar.model_fields_set and abs(lidar.range - middle) > lidar.range_bin / 2:
+        raise InputError(
+            f"doppler.lidar.range: {lidar.range:g} m is not allowed in an encounter; expected that "
+            f"of its slabs, {middle:.4g} m, or none"
+        )
+    lidar = lidar.model_copy(update={"range": middle})
+    return doppler.model_copy(update={"lidar": lidar})

@@ -1,0 +1,98 @@
+"""The speeds of the lines of sight of successive slabs, from their frames."""
+
+import numpy as np
+import torch
+import xarray as xr
+
+from lidar_mi.encounter.doppler import DopplerScans, LineFrames
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.log import Log, silent
+from lidar_mi.experiment.stages.lines import line_noises, with_speeds
+from lidar_mi.experiment.stages.ring_calibration import assumed_rings, calibration_file
+from lidar_mi.experiment.stages.ring_velocities import speeds_to_laser
+from lidar_mi.retrieval.method_names import RingCentre, RingMethod
+from lidar_mi.retrieval.rings.likelihood_fit import difference, fit_rings
+from lidar_mi.retrieval.rings.matched import MatchedScore, matched_score, read_matched
+
+# Frames of a slab whose fits are the reference of all.
+_REFERENCE = 8
+# Of the lines that have to follow the reference for the next slab.
+_ENOUGH = 0.5
+
+
+class LineSpeeds:
+    """Reads slab after slab by the score function of a reference.
+
+    The reference is the fit of some frames of the first slab, or of a later one once half of the
+    lines do not follow it any more. Frames that do not follow are fitted on their own.
+
+    Parameters
+    ----------
+    scans : DopplerScans
+        Whose frames are read; the instrument is the one that the experiment assumes.
+    """
+
+    def __init__(self, scans: DopplerScans):
+        experiment, rings, log = scans.experiment, scans.rings, Log(silent)
+        given = calibration_file(experiment, rings, experiment.folder, log=log)
+        self._experiment = experiment
+        self._assumed = assumed_rings(experiment, rings, given, log=log)
+        self._noises = line_noises(experiment, rings)
+        self._scores: list[MatchedScore] | None = None
+
+    def read(self, frames: LineFrames) -> xr.Dataset:
+        """The lines with their speeds and standard errors, as `with_speeds` gives them."""
+        self._scores = self._scores or self._learnt(frames)
+        if self._scores is None:
+            return self._with(frames, self._alone(frames, range(len(frames.air))))
+        air, laser = (
+            read_matched(part, score)
+            for part, score in zip((frames.air, frames.laser), self._scores, strict=True)
+        )
+        own = torch.tensor(frames.own)
+        emitted = laser.of(own)
+        found = torch.stack([*difference(air, emitted), emitted.v_los_std]).numpy()
+        missed = np.flatnonzero(~(air.read & laser.read[own]).numpy())
+        if missed.size:
+            found[:, missed] = self._alone(frames, missed)
+        if missed.size > _ENOUGH * len(frames.air):
+            self._scores = None
+        return self._with(frames, found)
+
+    def _learnt(self, frames: LineFrames) -> list[MatchedScore] | None:
+        """Score functions of air and laser; None where the frames do not fit the model."""
+        assumed, settings = self._assumed, self._experiment.doppler.retrieval
+        found = []
+        for part, model, noise in zip(
+            (frames.air, frames.laser), (assumed.model, assumed.laser), self._noises, strict=True
+        ):
+            some = torch.linspace(0, len(part) - 1, min(_REFERENCE, len(part))).round().long()
+            try:
+                fit = fit_rings(
+                    part[some],
+                    model,
+                    noise,
+                    response=assumed.response,
+                    max_chi_square=settings.max_chi_square,
+                )
+            except InputError:
+                return None
+            found.append(matched_score(fit, model, noise, response=assumed.response))
+        return found
+
+    def _alone(self, frames: LineFrames, lines) -> np.ndarray:
+        """Speeds (4, lines) of some lines by fits of their own; NaN where one is refused."""
+        lines = list(lines)
+        own = [frames.own[line] for line in lines]
+        return speeds_to_laser(
+            frames.air[lines],
+            frames.laser[own],
+            self._experiment.doppler,
+            self._assumed,
+            self._noises,
+            RingMethod.ANNULAR,
+            RingCentre.FREE,
+        )
+
+    def _with(self, frames: LineFrames, found: np.ndarray) -> xr.Dataset:
+        return with_speeds(frames.lines, *found, self._experiment, frames.scan)
