@@ -436,7 +436,7 @@ def _rings(model, waves, means, end: Scored, noise) -> torch.Tensor:
         for name in ("v_los", "x", "y", "level", "background")
     )
     mean = mean_and_jacobian(model, waves, parameters)[0]
-    order = orders(model, squared_radius(cells, dx, dy))[1] + v / model.velocity_range
+    order = orders(model, squared_radius(model, cells, dx, dy))[1] + v / model.velocity_range
     order = order.round().long()
     order -= order.min()
     ring = mean - background - level * light_on(model, cells, parameters)
