@@ -278,7 +278,8 @@ def _fit(images, task: _Task, number: int, method: str) -> RingFit:
     They have common cells, about the middle of their centres. An image without rings about that
     centre, or with its own centre too far from it, gets cells of its own.
     """
-    centre = task.centre or gradient_centre(images.mean(0, dtype=torch.float32))
+    mean = images.mean(0, dtype=torch.float32)
+    centre = task.centre or gradient_centre(mean, task.response)
     inside(*centre, task.model.shape, f"images[{number}]: centre")
     near = reach(task.model)
     try:

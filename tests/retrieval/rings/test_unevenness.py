@@ -71,7 +71,7 @@ def test_even_and_uneven_plates_are_told_apart():
 @pytest.mark.parametrize("plates", [0.003, 0.01])
 @pytest.mark.parametrize("patch", [10.0, 20.0, 40.0, 80.0])
 def test_errors_of_images_hold(plates, patch):
-    """24 frames: rms errors of centre, spacing and fraction over those stated, 1.5 at most."""
+    """24 frames: rms errors of centre, spacing and fraction over those stated, 1.7 at most."""
     frame, squares = Frame(plates=plates, patch=patch), []
     for seed in range(24):
         found = analyse_rings(frame.exposure(np.random.default_rng([seed, 3])))
@@ -82,4 +82,4 @@ def test_errors_of_images_hold(plates, patch):
         ]
         squares.append(np.square(off))
     rms = np.sqrt(np.mean(squares, 0))
-    assert (rms < 1.5).all() and rms.mean() > 0.3, rms
+    assert (rms < 1.7).all() and 0.3 < rms.mean() < 1.4, rms
