@@ -1,15 +1,17 @@
-"""``lidar-mi calibrate``: an etalon's instrument from frames of its laser."""
+"""``lidar-mi calibrate``: an etalon's instrument from frames of its laser, and of lamps."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, Electrons, NominalInstrument, Overwrite
+from lidar_mi.cli.options import Changes, Electrons, NominalInstrument, Overwrite, quantity
 from lidar_mi.cli.terminal import output, print_table
+from lidar_mi.errors import InputError
 
 EXAMPLES = (
     "Examples: `lidar-mi calibrate laser_*.tif --instrument my_etalon.yaml -o etalon.nc` - "
+    "`lidar-mi calibrate laser.tif --line '404.7708 nm=lamp.tif' --gap-tolerance '20 um'` - "
     "`lidar-mi calibrate laser.fits --flat white.fits --set doppler.camera.pixel='5.5 um'`"
 )
 
@@ -27,6 +29,21 @@ def calibrate(
     flat: Annotated[
         list[Path] | None, typer.Option(help="Frames of even white light, once per file.")
     ] = None,
+    line: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Frames of another narrow line, WAVELENGTH=FILE, once per file: gives the gap."
+        ),
+    ] = None,
+    gap_tolerance: Annotated[
+        str, typer.Option(help="What the gap may differ by from the nominal one.")
+    ] = "10 um",
+    wavelength_accuracy: Annotated[
+        float, typer.Option(help="Relative standard error of the lines' wavelengths.")
+    ] = 1e-8,
+    chromatic: Annotated[
+        bool, typer.Option("--chromatic", help="Focal length and blur differ from line to line.")
+    ] = False,
     electrons: Electrons = False,
     light_degree: Annotated[int, typer.Option(help="Degree of the illumination's polynomial.")] = 2,
     background_degree: Annotated[
@@ -38,6 +55,8 @@ def calibrate(
     overwrite: Overwrite = False,
 ) -> None:
     """Calibrate an etalon from frames of its laser: focal length, tilt, distortion, finesse, light.
+
+    Frames of a second known line (--line) give the gap, too.
 
     Writes the calibration (NetCDF) and, beside it, a figure of the misfit (PNG).
     """
@@ -51,7 +70,8 @@ def calibrate(
     from lidar_mi.io.target import check_target
 
     figure = out.with_suffix(".png")
-    given = [*frames, *(flat or [])]
+    lamps = _lines(line or [])
+    given = [*frames, *(flat or []), *(path for paths in lamps.values() for path in paths)]
     for path in (out, figure):
         check_target(path, given, overwrite=overwrite)
     experiment = load(experiment_file(instrument), list(changes or []))
@@ -64,6 +84,13 @@ def calibrate(
         values,
         experiment,
         flat=white,
+        lines={
+            wavelength: read_electrons(paths, ccd, counts=counts, layer=layer)
+            for wavelength, paths in lamps.items()
+        },
+        gap_tolerance=quantity("--gap-tolerance", gap_tolerance, "m", "10 um"),
+        wavelength_accuracy=wavelength_accuracy,
+        achromatic=not chromatic,
         light_degree=light_degree,
         background_degree=background_degree,
         max_chi_square=max_chi_square,
@@ -74,3 +101,17 @@ def calibrate(
         print_table(table)
     output.print(f"calibration {out}")
     output.print(f"figure      {figure}")
+
+
+def _lines(given: list[str]) -> dict[float, list[Path]]:
+    """Files by the wavelength (m) of their line."""
+    found: dict[float, list[Path]] = {}
+    for text in given:
+        wavelength, equals, path = text.partition("=")
+        if not (equals and path):
+            raise InputError(
+                f"--line: {text!r} is not allowed; expected WAVELENGTH=FILE, such as "
+                "'404.7708 nm=lamp.tif'"
+            )
+        found.setdefault(quantity("--line", wavelength, "m", "404.7708 nm"), []).append(Path(path))
+    return found

@@ -4,7 +4,7 @@ The nominal instrument, its air and its camera are those of an experiment's sect
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +16,17 @@ from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.reading import load_experiment
-from lidar_mi.experiment.ring_instrument import pixel_noise
+from lidar_mi.experiment.ring_instrument import laser_rings, pixel_noise
 from lidar_mi.experiment.schema import Doppler, Experiment
 from lidar_mi.experiment.stages.ring_images import ring_models
 from lidar_mi.instrument.ccd import CCD
+from lidar_mi.instrument.etalon import mirrors
 from lidar_mi.io.images import read_frames
 from lidar_mi.retrieval.rings.calibration import Calibration, calibrated
 from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
+from lidar_mi.retrieval.rings.calibration_lines import combined
 from lidar_mi.retrieval.rings.likelihood_fit import RingFit, difference, fit_rings
+from lidar_mi.retrieval.rings.model import RingModel
 
 
 def doppler_of(instrument: str | Path | Experiment, name: str = "instrument") -> Doppler:
@@ -80,11 +83,15 @@ def calibrate_etalon(
     instrument: str | Path | Experiment = "fringes_paper",
     *,
     flat: Any = None,
+    lines: Mapping[float, Any] | None = None,
+    gap_tolerance: float = 1e-5,
+    wavelength_accuracy: float = 1e-8,
+    achromatic: bool = True,
     light_degree: int = 2,
     background_degree: int = 4,
     max_chi_square: float = 2.0,
 ) -> Calibration:
-    """Calibrate a fringe-imaging etalon from frames of its laser.
+    """Calibrate a fringe-imaging etalon from frames of its laser, and of lamps.
 
     Parameters
     ----------
@@ -95,6 +102,16 @@ def calibrate_etalon(
         shipped one. Laser, etalon, camera and CCD are taken from it.
     flat : array, shape (height, width), optional
         Mean of frames of even white light, any scale; pixels of 0 are left out.
+    lines : mapping of float to array, optional
+        Frames of further narrow lines by their wavelengths (m; in vacuum, or in the gap's gas times
+        ``doppler.etalon.index``, as the laser's): they give the gap. All that does not depend on
+        the wavelength is shared.
+    gap_tolerance : float
+        What the nominal gap, times its index, may differ by, m.
+    wavelength_accuracy : float
+        Relative standard error of each of the wavelengths, the laser's included.
+    achromatic : bool
+        Whether all lines have one focal length and blur.
     light_degree, background_degree : int
         Of the polynomials of the illumination and of each frame's background, 0 to 8.
     max_chi_square : float
@@ -122,15 +139,54 @@ is determined
     """
     doppler = doppler_of(instrument)
     _, laser = ring_models(doppler)
-    return calibrate_rings(
-        _batch("frames", frames, doppler),
-        laser,
-        pixel_noise(doppler.ccd),
-        response=None if flat is None else _response(flat, doppler),
-        light_degree=light_degree,
-        background_degree=background_degree,
-        max_chi_square=max_chi_square,
+    response = None if flat is None else _response(flat, doppler)
+
+    def fitted(name: str, images: Any, model: RingModel) -> Calibration:
+        return calibrate_rings(
+            _batch(name, images, doppler),
+            model,
+            pixel_noise(doppler.ccd),
+            response=response,
+            light_degree=light_degree,
+            background_degree=background_degree,
+            max_chi_square=max_chi_square,
+        )
+
+    first = fitted("frames", frames, laser)
+    if not lines:
+        return first
+    etalon = doppler.assumed.of(doppler.etalon)
+    wavelength = doppler.lidar.wavelength
+    gap = etalon.tuned_gap(wavelength)
+    fixed = etalon.model_copy(update={"gap": gap, "order_fraction": None})
+    found = [first]
+    for one, images in lines.items():
+        name = f"line of {1e9 * one:.7g} nm"
+        _check_line(one, wavelength, name)
+        lamp = doppler.lidar.model_copy(update={"wavelength": one})
+        try:
+            model = laser_rings(lamp, fixed, doppler.assumed.of(doppler.camera))
+            found.append(fitted("frames", images, model))
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
+    return combined(
+        found,
+        etalon.index * gap,
+        gap_tolerance,
+        mirror_orders=[mirrors(fixed, one).order_shift for one in (wavelength, *lines)],
+        wavelength_accuracy=wavelength_accuracy,
+        achromatic=achromatic,
     )
+
+
+def _check_line(one: float, laser: float, name: str) -> None:
+    if not 0.5 * laser < one < 2 * laser:
+        raise InputError(
+            f"{name}: not allowed; expected {5e8 * laser:.4g} to {2e9 * laser:.4g} nm, half to "
+            "twice the laser's"
+        )
+    if math.isclose(one, laser, rel_tol=1e-9):
+        raise InputError(f"{name}: the laser's own; expected another line")
 
 
 @checked_arguments

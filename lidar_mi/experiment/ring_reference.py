@@ -17,6 +17,7 @@ from lidar_mi.experiment.schema import Doppler
 from lidar_mi.retrieval.rings.reference_error import Filling, ReferenceUncertainty
 
 DRIFTS = 2  # selects the random streams of drifts
+_CALIBRATION = 1 << 30  # group of pulses that no series has
 WANTED = 0.5  # m/s, error for which the required scrambling is stated
 
 
@@ -107,6 +108,16 @@ def shared_covariance(
     found[group[:, None] != group] = 0
     np.fill_diagonal(found, 0)
     return found
+
+
+def calibration_drift(doppler: Doppler, frames: int, seed: int) -> np.ndarray:
+    """Drift in the speed of frames of a calibration, one a pulse, (frames,), m/s.
+
+    The random walk is about its middle frame, to which laser and etalon are set.
+    """
+    steps = np.random.default_rng([seed, DRIFTS, _CALIBRATION]).standard_normal(frames)
+    walk = step_speed(doppler) * steps.cumsum()
+    return walk - walk[frames // 2]
 
 
 def reference_uncertainty(doppler: Doppler) -> ReferenceUncertainty:

@@ -29,6 +29,9 @@ class CCD(Description):
     heights g (F of 1.6 or more: Dussault and Hoess 2004, Proc. SPIE 5563, 195). Read noise and the
     digitiser's steps are numbers behind the gain.
 
+    Hot and dead pixels are fractions of those of the image. Their places, as the responses, are the
+    chip's, of ``response_seed``.
+
     ``nonlinearity`` a records q (1 - a q / q_full) of q electrons: positive where the response
     falls. q_full is ``register_well``, or without one what full wells of the chip become.
     """
@@ -73,6 +76,15 @@ class CCD(Description):
     )
     response_seed: Annotated[int, Within(0, 2**31 - 1, "what 32 bits hold")] = Field(
         0, description="selects the chip: its responses are the same in every image"
+    )
+    hot_pixels: Annotated[Number, Within(0, 0.1, "no camera is sold with more")] = Field(
+        0.0, description="fraction of pixels that have a dark current of their own"
+    )
+    hot_current: Annotated[Frequency, Within(0, 1e12, "as of the dark current")] = Field(
+        quantity("500 kHz"), description="photoelectrons per hot pixel in the dark"
+    )
+    dead_pixels: Annotated[Number, Within(0, 0.1, "no camera is sold with more")] = Field(
+        0.0, description="fraction of pixels that see no light"
     )
     nonlinearity: Annotated[Number, Within(-0.5, 0.5, "the response has to rise")] = Field(
         0.0, description="fraction of the electrons lost in the output at full well"
@@ -194,6 +206,10 @@ def expose(
     if ccd.response_rms > 0:
         response = _response(ccd, expected)
         means, light = means * response, light * response
+    if ccd.hot_pixels or ccd.dead_pixels:
+        hot, dead = _bad_pixels(ccd, expected)
+        means, light = means * ~dead, light * ~dead
+        dark = dark + ccd.hot_current * ccd.integration_time * hot
     floor = light + dark
     frames = expected.new_empty((len(numbers), *expected.shape[-2:]), dtype=torch.float32)
     # one image at a time, so that its noise depends only on its own number
@@ -240,6 +256,18 @@ def _response(ccd, expected):
     generator = torch.Generator().manual_seed(ccd.response_seed)
     drawn = torch.randn(expected.shape[-2:], generator=generator, dtype=torch.float64)
     return (1 + ccd.pixel_response_rms * drawn).clamp(min=0).to(expected.device)
+
+
+def _bad_pixels(ccd, expected):
+    """Whether pixels are hot, whether they are dead: those of the chip, no pixel both."""
+    height, width = expected.shape[-2:]
+    order = np.random.default_rng([ccd.response_seed, 1]).permutation(height * width)
+    rank = torch.from_numpy(np.argsort(order)).reshape(height, width).to(expected.device)
+    hot, bad = (
+        round(fraction * height * width)
+        for fraction in (ccd.hot_pixels, ccd.hot_pixels + ccd.dead_pixels)
+    )
+    return rank < hot, (rank >= hot) & (rank < bad)
 
 
 def _generator(seed, number, device):

@@ -14,6 +14,7 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.reading import check
 from lidar_mi.experiment.ring_instrument import pixel_noise
+from lidar_mi.experiment.ring_reference import calibration_drift
 from lidar_mi.experiment.stages.ring_calibration import assumed_rings, calibration_file
 from lidar_mi.experiment.stages.ring_images import exposed_frames, ring_instrument
 from lidar_mi.experiment.stages.ring_velocities import speeds_to_laser
@@ -94,6 +95,36 @@ def test_camera_that_is_tilted_out_of_focus_and_distorts():
     assert assumed.model.distortion == pytest.approx(0.002, rel=0.02)
     assert assumed.model.tilt == pytest.approx((math.radians(0.5), 0), abs=1e-3)
     assert assumed.model.blur == pytest.approx((25 / 29.6) ** 2, rel=0.05)
+
+
+def test_hot_and_dead_pixels_are_masked():
+    """0.1 % hot, 0.1 % dead: hot ones are left out, and speeds are right within their errors."""
+    ccd = {"full_well": 1e7, "hot_pixels": 0.001, "dead_pixels": 0.001}
+    after, assumed = retrieved(experiment(ccd=ccd, calibration={"frames": 8}))
+    total = math.hypot(np.sqrt((after[1] ** 2).mean() / PULSES), after[2].mean())
+    assert abs(after[0].mean() - SPEED) < 4 * total
+    assert total < 0.1
+    # dead pixels between rings are nearly as dark as their neighbours
+    left_out = int((assumed.response == 0).sum())
+    assert 47 + 10 <= left_out <= 2 * 47 + 5
+
+
+def test_frames_of_the_calibration_drift():
+    """Random walks of laser and etalon: found as drift, with its size in the systematic error."""
+    quiet, drifting = (
+        experiment(calibration={"frames": 8}, reference={"laser_drift": drift})
+        for drift in ("0 Hz", "30 MHz")
+    )
+    found = []
+    for asked in (quiet, drifting):
+        rings = assumed_rings(asked, ring_instrument(asked.doppler), None, log=QUIET)
+        found.append(math.sqrt(rings.laser.systematic[0, 0]))
+    walk = calibration_drift(drifting.doppler, 8, drifting.seed)
+    long = np.diff(calibration_drift(drifting.doppler, 1000, drifting.seed))
+    step = 354.7e-9 / 2 * 30e6
+    assert walk[4] == 0 and long.std() == pytest.approx(step, rel=4 / math.sqrt(2000))
+    assert found[0] < 0.3
+    assert found[1] == pytest.approx(walk.std(ddof=1) * math.sqrt(9 / 8), rel=0.1)
 
 
 def test_calibration_of_a_file(tmp_path):

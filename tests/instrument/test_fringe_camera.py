@@ -387,3 +387,24 @@ def test_a_lens_out_of_focus_spreads_every_point_over_a_disc():
     change = np.abs(mean / fringe_image(sharp, ETALON, AIR, 50.0, 1.0).numpy() - 1).max()
     assert change > 0.02
     np.testing.assert_allclose(found, mean, rtol=0.05 * change)
+
+
+def test_hot_and_dead_pixels():
+    """Their numbers are exact, their places the chip's; hot ones have the mean 500 kHz x 10 ms."""
+    ccd = CCD(hot_pixels=0.01, dead_pixels=0.02, read_noise=0.0, dark_current=0.0, bits=None)
+    light = torch.full((100, 120), 50.0)
+    one, other = (expose(light, ccd, 3, [number])[0] for number in (0, 1))
+    hot, dead = one > 1000, one == 0
+    assert (int(hot.sum()), int(dead.sum())) == (120, 240)
+    assert torch.equal(hot, other > 1000) and torch.equal(dead, other == 0)
+    # 240 Poisson numbers of mean 5050
+    mean = float(torch.cat([one[hot], other[hot]]).mean())
+    assert mean == pytest.approx(5050, abs=4 * math.sqrt(5050 / 240))
+    assert not torch.equal(
+        hot, expose(light, ccd.model_copy(update={"response_seed": 1}), 3)[0] > 1000
+    )
+    # what the others see is what they would without
+    whole = ccd.model_copy(update={"hot_pixels": 0.0, "dead_pixels": 0.0})
+    usual = ~(hot | dead)
+    assert float(one[usual].mean()) == pytest.approx(50, abs=4 * math.sqrt(50 / usual.sum()))
+    assert float(expose(light, whole, 3).max()) < 200

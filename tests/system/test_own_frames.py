@@ -9,6 +9,7 @@ its error, a calibration that does not survive its file, and bad input that ends
 import io
 import sys
 from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -130,6 +131,34 @@ def test_wrong_input_is_one_line(folder, calibration, arguments, message):
     paths = [folder / a if a.endswith((".tif", ".yaml")) else a for a in arguments]
     said = failed(*paths, "--instrument", folder / "mine.yaml")
     assert message in said and "Traceback" not in said
+
+
+MERCURY, GAP = 404.7708e-9, 13.7031234e-3
+
+
+def test_the_gap_from_two_lines(folder, tmp_path):
+    """Of 3 um more than the nominal one: the whole order is printed, and a wrong line refused."""
+    instrument = Instrument().binned(4)
+    for wavelength in (instrument.wavelength, MERCURY):
+        other = replace(instrument, wavelength=wavelength, gap=GAP, order=2 * GAP / wavelength)
+        mean = laser_frame(other, replace(DEFECTS, warming=0.0), 2.4e7)
+        pages = [
+            Image.fromarray((f + 100.5).clip(0, 65535).astype(np.uint16))
+            for f in exposures(mean, 3, 5, 5.0)
+        ]
+        path = tmp_path / f"{1e9 * wavelength:.0f}.tif"
+        pages[0].save(path, save_all=True, append_images=pages[1:])
+    given = "--instrument", folder / "mine.yaml", "--set", "doppler.etalon.order_fraction=null"
+    both = "calibrate", tmp_path / "355.tif", "--line", f"404.7708 nm={tmp_path / '405.tif'}"
+    said = printed(*both, *given, "-o", tmp_path / "etalon.nc")
+    assert f"centre {int(2 * GAP / instrument.wavelength)}" in said and "13.7031" in said
+    wrong = "--line", f"407.9 nm={tmp_path / '405.tif'}"
+    said = failed(*both[:2], *wrong, *given, "-o", tmp_path / "wrong.nc")
+    assert "line of 407.9 nm: its rings" in said and "Traceback" not in said
+    said = failed(*both[:2], "--line", "404 nm", *given)
+    assert "expected WAVELENGTH=FILE" in said
+    said = failed(*both[:2], "--line", f"354.7 nm={tmp_path / '355.tif'}", *given)
+    assert "the laser's own" in said
 
 
 def test_an_instrument_without_a_doppler_lidar():

@@ -146,7 +146,8 @@ def _cuts(doppler, exposure):
     return figure, (
         "As the paper's figure 4: a cut through the image of one pulse from the centre to the "
         "rim (red), and the same ring profile with less noise (blue). Left: 360 such cuts after a "
-        "Savitzky-Golay filter. Right: mean over circles."
+        "Savitzky-Golay filter of 31 pixels, which flattens rings that are not wider. Right: mean "
+        "over circles."
     )
 
 

@@ -8,6 +8,7 @@ from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.ring_instrument import pixel_noise
+from lidar_mi.experiment.ring_reference import calibration_drift
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.ring_images import (
     Rings,
@@ -68,6 +69,11 @@ def assumed_rings(
         light = reference_photons(doppler, rings)
         mean = fringe_image(doppler.camera, doppler.etalon, line, 0.0, light)
         numbers = range(_STREAMS, _STREAMS + asked.frames)
+        walk = calibration_drift(doppler, asked.frames, experiment.seed)
+        if walk.any():
+            mean = torch.stack(
+                [fringe_image(doppler.camera, doppler.etalon, line, v, light) for v in walk]
+            )
         frames = exposed_frames(doppler, rings, mean, 1, experiment.seed, numbers)
         try:
             found = calibrate_rings(

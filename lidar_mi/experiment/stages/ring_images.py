@@ -257,16 +257,17 @@ def expected_image(image: xr.Dataset, total: float) -> torch.Tensor:
 
 
 def exposed_frames(doppler, rings, expected, averaged, seed, numbers) -> torch.Tensor:
-    """Sums of so many noisy images each, photoelectrons."""
+    """Sums of so many noisy images each, photoelectrons; of one mean, or one each."""
     mean, ccd = averaged * expected, summed(doppler.ccd, averaged)
     modes, background = averaged * rings.modes, averaged * rings.background
 
-    def one(number: int) -> torch.Tensor:
-        return expose(mean, ccd, seed, [number], modes, background)
+    def one(number: int, light: torch.Tensor) -> torch.Tensor:
+        return expose(light, ccd, seed, [number], modes, background)
 
     # every image has its own random stream, so that it does not depend on the thread
+    each = mean if mean.ndim == 3 else [mean] * len(numbers)
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
-        return torch.cat(list(pool.map(one, numbers)))
+        return torch.cat(list(pool.map(one, numbers, each)))
 
 
 def summed(ccd: CCD, images: int) -> CCD:

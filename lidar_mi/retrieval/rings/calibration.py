@@ -22,6 +22,9 @@ _ARRAYS = {
 """Dimensions, units and names of the arrays in a file."""
 
 
+_LISTED = 6
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Calibration(Tabular):
     """What the frames of a line say of an instrument.
@@ -60,6 +63,14 @@ class Calibration(Tabular):
     block : int
     undetermined : tuple of str
         Of `INSTRUMENT`, what the frames do not tell beyond the tolerances.
+    lines : tuple of float
+        Wavelengths of two or more lines, where their frames gave the gap, m.
+    gaps : tuple of (float, float)
+        Gaps, times the refractive index, that agree with the lines' fractional orders, and standard
+        errors, m. Only one determines the order.
+    whole_orders : tuple of int
+        Whole numbers of the order at the centre that agree with one gap; several are neighbours,
+        and the gap's standard error holds them. Empty: the nominal one.
     """
 
     shape: tuple[int, int]
@@ -86,17 +97,22 @@ class Calibration(Tabular):
     misfit: np.ndarray
     block: int
     undetermined: tuple[str, ...]
+    lines: tuple[float, ...] = ()
+    gaps: tuple[tuple[float, float], ...] = ()
+    whole_orders: tuple[int, ...] = ()
 
     def tables(self) -> list[Table]:
         """The instrument, with standard errors, and how well the frames fit."""
         std, bad = self.std, int((self.response == 0).sum())
         x, y = self.centre
         tilt_x, tilt_y = (math.degrees(t) for t in self.tilt)
+        which = "this" if self.whole_orders else "the nominal"
         focal = with_error(self.focal_length * 1e3, std["focal_length"] * self.focal_length * 1e3)
         rows = [
             ("frames", str(len(self.frame_speed))),
-            ("focal length, for the nominal gap", f"{focal} mm"),
+            (f"focal length, for {which} gap", f"{focal} mm"),
             ("fractional order at the centre", f"{self.order_at_centre % 1:.5f}"),
+            *self._gap_rows(),
             ("finesse of the line's rings", f"{self.finesse:.3g}"),
             ("centre x, y", f"{with_error(x, std['x'])}, {with_error(y, std['y'])} px"),
             (
@@ -120,6 +136,25 @@ class Calibration(Tabular):
         if self.undetermined:
             note = f"Not determined by the frames: {', '.join(self.undetermined)}."
         return [Table("calibration", rows, note=note)]
+
+    def _gap_rows(self) -> list[tuple[str, str]]:
+        """The gap of several lines; that it is ambiguous where it is."""
+        many = len(self.gaps)
+        rows = [
+            (
+                "gap" if many == 1 else f"gap, {k} of {many} that agree",
+                with_error(1e3 * gap, 1e3 * std, "mm"),
+            )
+            for k, (gap, std) in enumerate(self.gaps[:_LISTED], 1)
+        ]
+        if many > 1:
+            more = f"ambiguous, {many} gaps agree: the nominal one is kept"
+            rows.append(("whole order at the centre", more))
+        elif self.whole_orders:
+            first, last = self.whole_orders[0], self.whole_orders[-1]
+            text = str(first) if first == last else f"{first} to {last}, ambiguous"
+            rows.append(("whole order at the centre", text))
+        return rows
 
     def to_dataset(self) -> xr.Dataset:
         """All of it, for a NetCDF file; numbers that are no arrays as JSON in ``calibration``."""
@@ -145,6 +180,9 @@ def calibration_of(data: xr.Dataset) -> Calibration:
         arrays = {name: data[name].transpose(*dims).values for name, (dims, *_) in _ARRAYS.items()}
         for name in ("shape", "centre", "tilt", "undetermined"):
             single[name] = tuple(single[name])
+        for name in ("lines", "whole_orders"):
+            single[name] = tuple(single.get(name, ()))
+        single["gaps"] = tuple((float(gap), float(std)) for gap, std in single.get("gaps", ()))
         found = Calibration(**single, **arrays)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(
@@ -177,8 +215,10 @@ def calibrated(model: RingModel, calibration: Calibration) -> RingModel:
         if not math.isclose(own, other, rel_tol=1e-3):
             raise InputError(f"calibration: {name} {own:g} m is not that of the model, {other:g} m")
     order = calibration.order_at_centre
-    # the nominal gap may be given to another fraction of an order
-    if abs(order - model.order_at_centre) > 2:
+    # the nominal gap may be given to another fraction of an order; one by two lines is absolute,
+    # and line widths in orders change in proportion
+    allowed = 0.01 * order if calibration.whole_orders else 2
+    if abs(order - model.order_at_centre) > allowed:
         raise InputError(
             f"calibration: order {order:.1f} at the centre is not that of the model, "
             f"{model.order_at_centre:.1f}: another gap"

@@ -6,8 +6,9 @@ and etalon drift). Maximum likelihood times normal priors, by Gauss-Newton steps
 pixels are put where the improved instrument has them.
 
 What frames of one line cannot tell: the gap (only focal length^2 / gap enters: a gap that is wrong
-by 1e-3 changes speeds by 1e-3), and defects of the plates together with the way in which the light
-fills the pupil, which differs between laser and air.
+by 1e-3 changes speeds by 1e-3; `calibration_lines` has it from several lines), and defects of the
+plates together with the way in which the light fills the pupil, which differs between laser and
+air.
 """
 
 import math

@@ -13,7 +13,7 @@ from lidar_mi.retrieval.rings.peak_fit import peak
 ROWS = 64  # of an image at once: what they need stays in the cache
 
 
-def gradient_centre(image) -> tuple[float, float]:
+def gradient_centre(image, response=None) -> tuple[float, float]:
     """Point that the lines along all gradients pass closest by, to about a pixel.
 
     The gradient of rings points to or from their centre at every pixel, so that no ring needs to be
@@ -26,6 +26,8 @@ def gradient_centre(image) -> tuple[float, float]:
     ----------
     image : array or tensor, shape (height, width)
         Finite.
+    response : tensor, shape (height, width), optional
+        Of the pixels; those of 0 are left out.
 
     Returns
     -------
@@ -40,11 +42,21 @@ def gradient_centre(image) -> tuple[float, float]:
     image = torch.as_tensor(image)
     block = max(1, min(image.shape) // 192)
     rows, columns = (size // block for size in image.shape)
-    coarse = image[: rows * block, : columns * block].reshape(rows, block, columns, block)
-    coarse = gaussian_filter(coarse.mean((1, 3)).cpu().numpy().astype(float), 2.0)
+
+    def coarse(part):
+        blocks = part[: rows * block, : columns * block].reshape(rows, block, columns, block)
+        return gaussian_filter(blocks.mean((1, 3)).cpu().numpy().astype(float), 2.0)
+
+    known = 1.0
+    if response is None:
+        smooth = coarse(image)
+    else:
+        weight = coarse(response.to(image))
+        known = weight > 0.5 * weight.max()
+        smooth = coarse(torch.where(response > 0, image, 0)) / np.maximum(weight, 1e-3)
     # the filter extrapolates beyond the edge
     rim = 5
-    slope_y, slope_x = (part[rim:-rim, rim:-rim] for part in np.gradient(coarse))
+    slope_y, slope_x = ((known * part)[rim:-rim, rim:-rim] for part in np.gradient(smooth))
     y, x = np.mgrid[rim : rows - rim, rim : columns - rim].astype(float)
     # n = (-slope_y, slope_x) is across the gradient: n . (p - c) = 0 on each line
     normal = np.stack([-slope_y.ravel(), slope_x.ravel()])

@@ -129,10 +129,14 @@ def gap_from_fractions(
     '0.885 +- 0.001 mm'
     """
     std = np.array(fraction_std, float)
-    return _gap(fraction, np.diag(std**2), wavelength, nominal, tolerance, refractive_index)
+    return gap_of_covariance(
+        fraction, np.diag(std**2), wavelength, nominal, tolerance, refractive_index
+    )
 
 
-def _gap(fraction, covariance, wavelength, nominal, tolerance, refractive_index=1.0) -> Gap:
+def gap_of_covariance(
+    fraction, covariance, wavelength, nominal, tolerance, refractive_index=1.0
+) -> Gap:
     """As `gap_from_fractions`, of fractions whose errors have a covariance."""
     e, length = np.array(fraction, float), np.array(wavelength, float)
     std = np.sqrt(np.diag(covariance))
@@ -275,7 +279,7 @@ def gap_from_lines(
         try:
             e = fractions_of(rings, np.asarray(wavelength, float), one)
             covariance = rings.fraction_covariance[np.ix_(one, one)]
-            found.append(_gap(e, covariance, wavelength, nominal, tolerance))
+            found.append(gap_of_covariance(e, covariance, wavelength, nominal, tolerance))
         except InputError as error:
             refused = error
     if not found:

@@ -49,7 +49,7 @@ class Geometry:
     distortion: float = 0.0
 
     def __post_init__(self):
-        if not max(map(abs, self.tilt)) < math.pi / 6:
+        if not all(abs(angle) < math.pi / 6 for angle in self.tilt):
             raise InputError(f"tilt: {self.tilt} rad is not allowed; expected less than 30 degrees")
         if not abs(self.distortion) < 0.1:
             raise InputError(

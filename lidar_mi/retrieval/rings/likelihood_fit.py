@@ -291,7 +291,8 @@ def _fit(images, task: _Task, number: int, method: str) -> RingFit:
     They have common cells, about the middle of their centres. An image without rings about that
     centre, or with its own centre too far from it, gets cells of its own.
     """
-    centre = task.centre or gradient_centre(images.mean(0, dtype=torch.float32))
+    mean = images.mean(0, dtype=torch.float32)
+    centre = task.centre or gradient_centre(mean, task.response)
     inside(*centre, task.model.shape, f"images[{number}]: centre")
     near = reach(task.model)
     try:
@@ -449,7 +450,7 @@ def _rings(model, waves, means, end: Scored, noise) -> torch.Tensor:
         for name in ("v_los", "x", "y", "level", "background")
     )
     mean = mean_and_jacobian(model, waves, parameters)[0]
-    order = orders(model, squared_radius(cells, dx, dy))[1] + v / model.velocity_range
+    order = orders(model, squared_radius(model, cells, dx, dy))[1] + v / model.velocity_range
     order = order.round().long()
     order -= order.min()
     ring = mean - background - level * light_on(model, cells, parameters)

@@ -11,7 +11,8 @@ line's characteristic function (Airy function convolved with the line). Only the
 its integer enters: m = m_0 (cos(theta) - 1) + ..., in float64 throughout. Averages over a pixel,
 and over all pixels of a cell, are taken to second order in the cell's spread of r^2: A_n falls by
 exp(-(2 pi n)^2 var(m) / 2). A point that is blurred to a disc of radius b lowers A_n by
-2 J_1(z) / z with z = 2 pi n b |grad m| (Born & Wolf 1999, Principles of Optics, section 8.8).
+2 J_1(z) / z with z = 2 pi n b |grad m| (Born & Wolf 1999, Principles of Optics, section 8.8), and
+adds b^2 / 2 to its mean r^2.
 
 The waves exp(2 pi i n m) of rings about the cells' own centre do not depend on speed, light or
 temperature. They are computed once for all images; then g is a product of matrices, and what a
@@ -72,7 +73,7 @@ def strongest(model: RingModel) -> int:
 
 def ring_waves(model: RingModel, cells: Cells, derivatives: bool = False) -> Waves:
     """Harmonics at rest over the cells; with those by the blur if ``derivatives``."""
-    r2 = cells.r2 + PIXEL_R2
+    r2 = cells.r2 + _area(model)
     variance = cells.r2 / 3  # of r2 over a pixel: (2 x)^2 / 12 + (2 y)^2 / 12
     if cells.spread is not None:
         variance = variance + cells.spread[:, 2, 2]
@@ -97,9 +98,16 @@ def ring_waves(model: RingModel, cells: Cells, derivatives: bool = False) -> Wav
     )
 
 
-def squared_radius(cells: Cells, dx: torch.Tensor, dy: torch.Tensor) -> torch.Tensor:
-    """Mean of r^2 about (dx, dy) from the cells' centre, over the pixels' areas, px^2."""
-    return cells.r2 - 2 * (cells.x * dx + cells.y * dy) + dx**2 + dy**2 + PIXEL_R2
+def squared_radius(
+    model: RingModel, cells: Cells, dx: torch.Tensor, dy: torch.Tensor
+) -> torch.Tensor:
+    """Mean of r^2 about (dx, dy) from the cells' centre, over pixels' areas and blur, px^2."""
+    return cells.r2 - 2 * (cells.x * dx + cells.y * dy) + dx**2 + dy**2 + _area(model)
+
+
+def _area(model: RingModel) -> float:
+    """Mean squared distance of the light on a pixel from its centre: pixel and disc, px^2."""
+    return PIXEL_R2 + model.blur / 2
 
 
 def orders(model: RingModel, r2: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -113,7 +121,7 @@ def orders(model: RingModel, r2: torch.Tensor) -> tuple[torch.Tensor, torch.Tens
 def light_on(model: RingModel, cells: Cells, parameters: torch.Tensor) -> torch.Tensor:
     """Light relative to the rings' centre, (images, cells)."""
     dx, dy = (parameters[:, PARAMETERS.index(name), None] for name in "xy")
-    return _light(model, cells, squared_radius(cells, dx, dy), parameters)
+    return _light(model, cells, squared_radius(model, cells, dx, dy), parameters)
 
 
 def mean_and_jacobian(
@@ -141,7 +149,7 @@ def mean_and_jacobian(
         parameters[:, k, None] for k in range(PARAMETERS.index("falloff") + 1)
     )
     area = model.half_diagonal**2
-    r2 = squared_radius(cells, dx, dy)
+    r2 = squared_radius(model, cells, dx, dy)
     light = _light(model, cells, r2, parameters)
     # more light at the inner end of a cell
     cosine, order = orders(model, r2 - falloff / area * waves.variance)
@@ -185,7 +193,7 @@ def mean_and_jacobian(
         elif name == "focal_length":
             row[:] = -2 * by_r2 * r2
         elif name == "blur":
-            row[:] = bright * _product(amplitudes * turned, waves.by_blur)
+            row[:] = bright * _product(amplitudes * turned, waves.by_blur) + by_r2 / 2
         else:
             changes = by_tilt_and_distortion(model.geometry, cells.centre, cells.x, cells.y)
             row[:] = by_r2 * changes[("tilt_x", "tilt_y", "distortion").index(name)]

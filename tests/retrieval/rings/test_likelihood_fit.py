@@ -14,7 +14,9 @@ from lidar_mi.retrieval.rings.bound import cramer_rao
 from lidar_mi.retrieval.rings.likelihood_fit import difference, fit_rings
 from lidar_mi.retrieval.rings.model import PixelNoise
 from tests.support import ring_reference as reference
+from tests.support.calibrations import SMALL, air_model
 from tests.support.ring_models import TABLE, ring_model
+from validation.fringe_reference import Defects, air_frame
 
 # The whole camera in sixteen times fewer pixels: as many photons, the same rings.
 COARSE = {"shape": (195, 240), "pixel": 4 * reference.PIXEL}
@@ -261,3 +263,84 @@ def test_arguments():
     refused(image[0], "shape .240,. is not allowed")
     refused(image, "'width' is not one of v_los", free=("v_los", "width"))
     refused(image, "max_chi_square: 0", max_chi_square=0)
+
+
+def test_outliers_are_left_out_and_counted():
+    """Cells of a bright spot: without them the speed is as before, and their fraction is told."""
+    images = exposures("read noise", 8, 21, **COARSE)
+    spoiled = images.clone()
+    spoiled[:, 60:64, 150:154] += 1500.0
+    given = ring_model(**COARSE), PixelNoise(5)
+    clean, fit = fit_rings(images, *given), fit_rings(spoiled, *given)
+    assert float(clean.outliers.max()) < 0.002
+    assert (fit.outliers > clean.outliers).all() and float(fit.outliers.max()) < 0.05
+    change = (fit.v_los - clean.v_los).double()
+    # the spot has 16 of 46800 pixels
+    assert float(change.abs().max()) < 0.5 * float(clean.v_los_std.mean())
+    assert abs(float(fit.v_los.mean()) - 20) < 4 * float(fit.v_los_std.mean()) / np.sqrt(8)
+
+
+def test_known_responses_and_a_mask():
+    """Pixels that differ by 5 %, a dead block: right with their responses, not as a plain chip."""
+    rng = np.random.default_rng(22)
+    response = 1 + 0.05 * rng.standard_normal(COARSE["shape"])
+    response[90:140, 20:80] = 0
+    mean = reference.ring_image(20.0, 2.4e7, **COARSE) * response
+    drawn = np.array([reference.noisy(mean, rng, 5.0) for _ in range(16)], np.float32)
+    # what a pixel shows that is left out does not matter
+    drawn[:, response == 0] = rng.uniform(0, 5000, (16, int((response == 0).sum())))
+    images, known = torch.as_tensor(drawn), torch.as_tensor(response)
+    fit = fit_rings(images, ring_model(**COARSE), PixelNoise(5), response=known)
+    error = (fit.v_los - 20).double() / fit.v_los_std
+    assert abs(float(error.mean())) < 4 / np.sqrt(16)
+    # 0.68 .. 1.32 of 16: four standard deviations
+    assert float((error**2).mean()) == pytest.approx(1, abs=4 * np.sqrt(2 / 16))
+    assert float(fit.chi_square.mean()) < 1.05
+    masked = (known > 0).double()
+    plain = fit_rings(
+        images, ring_model(**COARSE), PixelNoise(5), response=masked, max_chi_square=np.inf
+    )
+    assert float(plain.chi_square.mean()) > 1.3
+
+
+AEROSOL = (0.0, 0.05, 0.2, 0.5)
+
+
+@pytest.mark.parametrize(
+    "number", [pytest.param(16, id="few"), pytest.param(400, marks=pytest.mark.slow, id="many")]
+)
+@pytest.mark.parametrize("aerosol", AEROSOL)
+def test_aerosol_up_to_half_of_the_echo(aerosol, number):
+    """Unknown fraction, temperature known to 10 K: mean within 4 of its errors, coverage within 4
+    binomial standard deviations of 68 and 95 %."""
+    rng = np.random.default_rng([23, int(100 * aerosol), number])
+    mean = air_frame(SMALL, Defects(aerosol=aerosol), 20.0, 2.4e7).mean
+    drawn = [reference.noisy(mean, rng, 5.0) for _ in range(number)]
+    images = torch.as_tensor(np.array(drawn, np.float32))
+    fit = fit_rings(images, air_model(), PixelNoise(5))
+    error = ((fit.v_los - 20).double() / fit.v_los_std).numpy()
+    assert abs(error.mean()) < 4 / np.sqrt(number)
+    for limit, expected in ((1.0, 0.6827), (1.96, 0.95)):
+        allowed = 4 * np.sqrt(expected * (1 - expected) / number)
+        assert (np.abs(error) < limit).mean() == pytest.approx(expected, abs=allowed)
+    found = fit.of("aerosol").double() - aerosol
+    # pixels as large as here average the narrow line's rings to 0.002 of it
+    known = float(fit.std_of("aerosol").mean()) / np.sqrt(number)
+    assert abs(float(found.mean())) < 4 * known + 2e-3
+
+
+@pytest.mark.slow
+def test_rate_of_the_bound_over_a_thousand_frames():
+    """Rms error over 1008 frames in batches of 63: at most 1.05 of the bound (known to 2.2 %)."""
+    bound = bound_of("read noise", **COARSE)
+    errors = [
+        fit_rings(
+            exposures("read noise", 63, [24, part], **COARSE), ring_model(**COARSE), PixelNoise(5)
+        ).v_los
+        - 20
+        for part in range(16)
+    ]
+    rms = float(torch.cat(errors).square().mean().sqrt())
+    # within its own scatter of 1.05 at most, and not below what is possible
+    scatter = 1 / np.sqrt(2 * 1008)
+    assert 1 - 4 * scatter < rms / bound < 1.05 + 2 * scatter
