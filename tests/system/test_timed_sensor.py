@@ -14,6 +14,7 @@ from lidar_mi.experiment import reading as config
 from tests.support.experiments import without_figures
 
 DT = 0.1
+TEMPLATE, STRIDE = 8, 4
 PAIR = {"circulation": 150, "separation": 16, "core_radius": 2, "width": 30, "height": 20}
 SMALL = {
     "name": "small",
@@ -34,7 +35,8 @@ SMALL = {
     "render": {"samples_per_beam": 64, "max_order": 1},
     "retrieval": {
         "methods": ["multipass"],
-        "stride": 4,
+        "template": TEMPLATE,
+        "stride": STRIDE,
         "sources": "measured",
         "pointing": {"stderr": "30 urad"},
     },
@@ -64,7 +66,8 @@ SMALL = {
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("timed") / "run"
     with without_figures(), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("lidar_mi.assessment.figures.doppler.draw_all", lambda *_: [])
+        for chapter in ("doppler", "sensor", "vortices", "pointing"):
+            patch.setattr(f"lidar_mi.assessment.figures.{chapter}.draw_all", lambda *_: [])
         return folder, lm.run(config.check(SMALL, "test"), folder)
 
 
@@ -74,12 +77,13 @@ def normalised(found, name):
 
 
 def test_winds_within_their_stated_errors(whole):
-    """Of both lidars: mean square of 20 or so independent errors, 4 sigma, and none beyond 5."""
+    """Of both lidars: mean square of as many errors as windows that do not overlap, 4 sigma."""
     found = xr.open_dataset(whole[0] / "wind3d.nc")
-    assert (found["flag"] == 0).mean() > 0.5
+    assert (found["flag"] == 0).mean() > 0.25
     for name in "uvw":
         off = normalised(found, name)
-        assert (off**2).mean() < 1 + 4 * (2 / 20) ** 0.5, name
+        independent = off.size * (STRIDE / TEMPLATE) ** 2
+        assert (off**2).mean() < 1 + 4 * (2 / independent) ** 0.5, name
         assert np.abs(off).max() < 5, name
     # times of vectors and lines were brought to the middle of both images
     assert float(found["time"]) == pytest.approx(DT / 2)
@@ -87,7 +91,7 @@ def test_winds_within_their_stated_errors(whole):
 
 def test_lines_of_sight_within_their_stated_errors(whole):
     """Of 15 lines, each of its own time and pose: 4 sigma. The platform's velocity is reported."""
-    lines = xr.open_dataset(whole[0] / "lines.nc")
+    lines = xr.open_dataset(whole[0] / "lines_of_sight.nc")
     off = ((lines["v_los"] - lines["v_los_true"]) / lines["v_los_std"]).values
     assert (off**2).mean() < 1 + 4 * (2 / 15) ** 0.5
     assert np.ptp(lines["time"].values) == pytest.approx(0.09 * 14 / 15, rel=0.1)

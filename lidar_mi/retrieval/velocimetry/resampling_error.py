@@ -3,13 +3,19 @@
 from typing import NamedTuple
 
 import numpy as np
+import xarray as xr
+from scipy.ndimage import uniform_filter
 from scipy.optimize import least_squares, nnls
 from scipy.spatial import KDTree
+
+from lidar_mi.retrieval.velocimetry.quality import Flag
 
 # Neighbours of a beam whose differences make the variogram, and bins along distance and time.
 _NEIGHBOURS, _BINS = 12, 12
 # Beams over which the structure's strength is averaged at a place, and bins of the noise.
 _LOCAL, _NOISE_BINS = 75, 24
+# Mean square of what resampling lost over that of the noise, of a vector that is not flagged.
+_LOST = 4.0
 # Nearest beams that tell of their density.
 _AREA = 12
 # Length of the structure for which beams are weighted, in spacings.
@@ -92,6 +98,31 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
     return model(least_squares(misfit, start, bounds=(low, high), loss="soft_l1").x)
 
 
+def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray) -> xr.Dataset:
+    """The wind with vectors flagged where resampling lost more than stated errors can hold.
+
+    What is lost depends on the air and on the places of the beams, which are at rest: it is not
+    only noise, but also a bias. Flagged are templates over which its mean square exceeds 4 times
+    that of the noise.
+
+    Parameters
+    ----------
+    wind : xr.Dataset
+        From `retrieve_wind`, with `template` among its attributes.
+    noise, with_it : xr.DataArray, dims (z, y)
+        Noise of an image, and the same with what resampling adds.
+    """
+    template = int(wind.attrs["template"])
+    square = [field.fillna(0.0).transpose("z", "y").values ** 2 for field in (noise, with_it)]
+    known, both = (uniform_filter(part.astype(float), template) for part in square)
+    lost = noise.copy(data=(both > (1 + _LOST) * known).astype(float))
+    at = {axis: wind[axis] for axis in ("z", "y")}
+    bad = lost.interp(at, method="nearest").transpose(*wind["flag"].dims).values > 0.5
+    flag = wind["flag"]
+    found = flag.values | np.where(bad, Flag.RESAMPLED.value, 0)
+    return wind.assign(flag=flag.copy(data=found.astype(flag.dtype)))
+
+
 class LeftOut(NamedTuple):
     """Beams as their neighbours estimate them, (n,): places (n, 2), squared errors, and what these
     are for `structure` of strength 1; the noise of a beam and the strength in the mean."""
@@ -138,14 +169,14 @@ def strength_at(left: LeftOut, nodes: np.ndarray) -> np.ndarray:
 
 
 def correlation_area(places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Pixels per independent error about nodes (m,): an error for two beams, at least 2.
+    """Pixels per independent error about nodes (m,): an error for 1.5 beams, at least 1.5.
 
     Errors of neighbouring nodes are from the same beams. Sums of them over 7 px vary as those of
-    one error for 1 to 2 beams do, by the texture: the larger one is taken.
+    one error for 1 to 2 beams do, by the texture.
     """
     count = min(_AREA, len(places))
     distance, _ = KDTree(places).query(nodes, [count])
-    return 2 * np.clip(np.pi * distance[:, 0] ** 2 / count, 1.0, None)
+    return 1.5 * np.clip(np.pi * distance[:, 0] ** 2 / count, 1.0, None)
 
 
 def variance(
