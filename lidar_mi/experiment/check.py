@@ -13,12 +13,12 @@ from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.cost import cost
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.forecast import forecast
-from lidar_mi.experiment.truth_in_time import values_of_states
 from lidar_mi.experiment.light_budget import light_budget
 from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth import Truth
+from lidar_mi.experiment.truth_in_time import values_of_states
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.scan_timing import Schedule

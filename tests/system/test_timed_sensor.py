@@ -1,8 +1,8 @@
 """Both lidars in time, from the experiment to the files: beams and lines one after the other, from
 a platform that moves and reports its pose with errors.
 
-Detects a chain in which times or poses are lost, winds beyond their stated errors, and files without
-the time of each beam.
+Detects a chain in which times or poses are lost, winds beyond their stated errors, and files
+without the time of each beam.
 """
 
 import numpy as np
@@ -19,7 +19,11 @@ PAIR = {"circulation": 150, "separation": 16, "core_radius": 2, "width": 30, "he
 SMALL = {
     "name": "small",
     "seed": 3,
-    "wake": {"vortex_pair": PAIR, "spacing": "0.5 m", "texture": {"rms": 0.3, "outer_scale": "5 m"}},
+    "wake": {
+        "vortex_pair": PAIR,
+        "spacing": "0.5 m",
+        "texture": {"rms": 0.3, "outer_scale": "5 m"},
+    },
     "platform": {
         "speed": "70 m/s",
         "dt": f"{DT} s",

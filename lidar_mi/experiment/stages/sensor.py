@@ -194,7 +194,9 @@ def mean_squares_without(
 ) -> dict[str, float]:
     """Mean square error of u without each cause, and without all of them at once, m^2 s^-2.
 
-    The lines see ``states``, from `lines.states_of_wind`; by default the truth. Causes: `line_noise` (from the rings' noise), `range_bin` (averaging along it, here over
+    The lines see ``states``, from `lines.states_of_wind`; by default the truth.
+
+    Causes: `line_noise` (from the rings' noise), `range_bin` (averaging along it, here over
     `_SHORT`), `crossflow` (errors of v and w) and, where there are any, `pointing`
     (``sensor.errors``). Without all of them the sampling error remains (`sampling`). The estimate
     without a cause also assumes that it is absent, and the result is that of one draw: in

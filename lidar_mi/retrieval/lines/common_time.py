@@ -50,7 +50,8 @@ def estimated_drift(crossflow: xr.Dataset) -> tuple[float, float]:
             "crossflow: no vorticity is known, as no three valid vectors lie side by side; "
             "expected a drift in m/s"
         )
-    return tuple(float((weight * part)[known].sum()) / total for part in (v, w))
+    along, up = (float((weight * part)[known].sum()) / total for part in (v, w))
+    return along, up
 
 
 def at_common_time(
@@ -96,7 +97,9 @@ def at_common_time(
 def _lines(scan: xr.Dataset, time: float, drift: tuple[float, float]) -> xr.Dataset:
     when = scan["time"].values if "time" in scan else np.zeros(scan.sizes["line"])
     along = np.concatenate([[0.0], drift])
-    return scan.assign(origin=(("line", "axis"), line_origins(scan) + (time - when[:, None]) * along))
+    return scan.assign(
+        origin=(("line", "axis"), line_origins(scan) + (time - when[:, None]) * along)
+    )
 
 
 def _vectors(crossflow: xr.Dataset, time: float, drift: tuple[float, float]) -> xr.Dataset:

@@ -159,9 +159,7 @@ def _resampling_error(
     return image.copy(data=np.sqrt(error).reshape(image.shape)).assign_attrs(about)
 
 
-def _left_out(
-    places: np.ndarray, values: np.ndarray, times: np.ndarray, speed: float
-) -> LeftOut:
+def _left_out(places: np.ndarray, values: np.ndarray, times: np.ndarray, speed: float) -> LeftOut:
     """Beams estimated from those around them, in the way that nodes are."""
     chosen = np.arange(0, len(places), max(1, round(len(places) / _LEFT_OUT)))
     _, near = KDTree(places).query(places[chosen], min(_BEAMS, len(places) - 1) + 1)

@@ -124,8 +124,11 @@ def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray)
 
 
 class LeftOut(NamedTuple):
-    """Beams as their neighbours estimate them, (n,): places (n, 2), squared errors, and what these
-    are for `structure` of strength 1; the noise of a beam and the strength in the mean."""
+    """Beams as their neighbours estimate them.
+
+    Places (n, 2), squared errors without noise (n,), and what these are for `structure` of
+    strength 1 (n,); the noise of a beam and the strength in the mean.
+    """
 
     places: np.ndarray
     square: np.ndarray

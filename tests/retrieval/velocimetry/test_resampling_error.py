@@ -97,7 +97,9 @@ def test_error_of_beams_that_are_dense_in_calm_air_only():
     rough = grid[0] < np.median(y)
     # every second beam of rough air looks at smooth air
     away = rough & (random.random(rough.shape) < 0.5)
-    places[:, away] += np.array([[np.ptp(y) / 2], [0.0]]) + 0.05 * random.standard_normal((2, away.sum()))
+    places[:, away] += np.array([[np.ptp(y) / 2], [0.0]]) + 0.05 * random.standard_normal(
+        (2, away.sum())
+    )
 
     def air(y, z):
         return 1 + np.where(y < np.median(grid[0]), 1.0, 0.01) * (texture(waves, y, z) - 1)
