@@ -18,8 +18,8 @@ _LOCAL, _NOISE_BINS = 75, 24
 _LOST = 4.0
 # Nearest beams that tell of their density.
 _AREA = 12
-# Length of the structure, in spacings: rougher than what the weights are for.
-_LENGTH = 2.0
+# Length of the structure for which beams are weighted, in spacings.
+_LENGTH = 1.5
 # Exponent a: of lengths that differ much, and of nearly one.
 _MANY, _ONE = 1.0, 20.0
 
