@@ -18,6 +18,7 @@ from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth import Truth
+from lidar_mi.experiment.truth_in_time import values_of_states
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.scan_timing import Schedule
@@ -137,7 +138,9 @@ def _cost(asked: Experiment, ahead: Mapping) -> list[tuple[str, str]]:
     rows.append(("all, on one core", f"about {duration(found.total)}"))
     if asked.wake:
         plan = ahead["plans"][0]
-        expected, allowed = forecast(asked, plan.y.size * plan.z.size), ceiling(asked.render.memory)
+        in_states = values_of_states(asked, ahead["flows"], ahead["plans"])
+        expected = forecast(asked, plan.y.size * plan.z.size, in_states)
+        allowed = ceiling(asked.render.memory)
         rows.append(("memory", f"about {expected / 1e9:.2g} GB, at most {allowed / 1e9:.3g} GB"))
     return rows
 

@@ -33,12 +33,24 @@ CONTRIBUTIONS = 5
 """Contributing samples required per pixel, on average: 0.7 % of all pixels then have none."""
 
 
-def forecast(experiment: Experiment, beams: int) -> float:
-    """Memory of a run in bytes, to a factor of two."""
+PER_STATE = 34
+"""Bytes of a value of moving air's states: three arrays in double precision while they are made,
+two scans in single precision with what is mixed of them; measured, with molecules."""
+
+
+def forecast(experiment: Experiment, beams: int, in_states: int = 0) -> float:
+    """Memory of a run in bytes, to a factor of two.
+
+    Parameters
+    ----------
+    in_states : int
+        Values of all states of moving air in a scan, see `truth_in_time.values_of_states`.
+    """
     render, gates = experiment.render, experiment.scan.gate_count
     samples = beams * max(render.samples_per_beam, 2 * gates)
     at_once = samples_at_once(render.samples_per_pass, render.memory)
-    return PROGRAM + _per_beam(experiment, gates) * beams + PER_SAMPLE * min(samples, at_once)
+    air = PER_STATE * in_states
+    return PROGRAM + air + _per_beam(experiment, gates) * beams + PER_SAMPLE * min(samples, at_once)
 
 
 def _per_beam(experiment: Experiment, gates: int) -> float:
@@ -90,6 +102,22 @@ def check_size(experiment: Experiment, columns: int, rows: int) -> None:
         experiment.render.memory,
         f"scan: {columns} x {rows} beams x {gates} gates",
         "a larger wake.spacing, retrieval.stride or fewer gates",
+    )
+
+
+def check_states(experiment: Experiment, beams: int, in_states: int) -> None:
+    """Refuse air in more states than a run may have in memory; parameters as of `forecast`.
+
+    Raises
+    ------
+    InputError
+        With what it would take.
+    """
+    check_memory(
+        forecast(experiment, beams, in_states),
+        experiment.render.memory,
+        f"scan.air: moving, of {in_states:.2g} values in all states of a scan,",
+        "frozen air, a shorter scan or a larger wake.spacing",
     )
 
 

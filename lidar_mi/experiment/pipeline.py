@@ -13,6 +13,7 @@ from lidar_mi.experiment.stages.lines import (
     measure_lines,
     requirement_tables,
     slab_wind,
+    states_of_wind,
 )
 from lidar_mi.experiment.stages.pointing import beam_pointing
 from lidar_mi.experiment.stages.rendering import (
@@ -252,11 +253,12 @@ STAGES = (
     # both as one sensor
     Stage("requirements", _quiet(requirement_tables), ("beside",), has_sensor, ahead=True),
     Stage("slab_wind", _quiet(slab_wind), ("truth",), has_sensor, ahead=True),
+    Stage("states", _quiet(states_of_wind), ("slab_wind", "flows"), has_sensor, ahead=True),
     Stage("line_beams", _quiet(line_beams), ("beside",), has_sensor, ahead=True),
     Stage(
         "lines",
         measure_lines,
-        ("slab_wind", "rings", "line_beams", "assumed_rings"),
+        ("states", "rings", "line_beams", "assumed_rings"),
         has_sensor,
         check=check_lines,
         timing="sensor",
@@ -265,7 +267,7 @@ STAGES = (
     Stage(
         "u_limits",
         _quiet(limits_of_u),
-        ("slab_wind", "lines", "wind", "wind3d", "cores", "line_beams"),
+        ("slab_wind", "lines", "wind", "wind3d", "cores", "line_beams", "states"),
         has_sensor,
         timing="sensor",
     ),

@@ -64,5 +64,5 @@ def _of_the_pattern(experiment: Experiment) -> list[str]:
         return []
     return [
         f"scan.timing.pattern: beams of {timing.pattern} are resampled to the nodes of the image; "
-        "stated errors of the wind hold part of what this adds, and can be too small"
+        "stated errors of the wind can be 1.5 times too small where vectors are not flagged"
     ]

@@ -231,6 +231,10 @@ class Sensor(Section):
     crossflow_std: (
         Annotated[Speed, Within(1e-9, 1000, "from rounding errors to the fastest wind")] | None
     ) = Field(None, description="standard error of v and w; default: that of the method")
+    drift: Literal["none", "estimated"] = Field(
+        "none",
+        description="of the wind's pattern, by which vectors and lines are brought to mid-time",
+    )
     errors: PlatformErrors = PlatformErrors()
     requirements: str | None = Field(None, description="requirement table; default: the paper's")
     exposure: Annotated[

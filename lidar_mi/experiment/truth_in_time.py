@@ -1,6 +1,7 @@
 """The truth while a scan lasts: the extinction that beams meet at times of their own."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import xarray as xr
@@ -9,6 +10,7 @@ from lidar_mi.atmosphere.advection import advect_to
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import Flows, Truth, mean_flow, moves_along
+from lidar_mi.instrument.scan import ScanPlan
 
 LARGEST_STEP = 0.25
 """Node spacings by which air moves from one state to the next, at most.
@@ -17,7 +19,7 @@ Between states the renderer is linear in time. A wave of 4 nodes, the shortest t
 is then displaced by 0.63 * 0.25^3 / 4^2 = 0.0006 nodes at most, and its amplitude is 2 % smaller
 half way between two states.
 """
-MOST_VALUES = 2.5e8  # of all states of a scan: 1 GB
+MOST_VALUES = 2.5e8  # of all states of a scan: 1 GB in the renderer
 
 
 def state_times(experiment: Experiment, flows: Flows, times: np.ndarray) -> np.ndarray:
@@ -45,6 +47,21 @@ def state_times(experiment: Experiment, flows: Flows, times: np.ndarray) -> np.n
             f"at most {MOST_VALUES:g} (frozen air, a shorter scan or a coarser wake.spacing)"
         )
     return np.linspace(first, last, count)
+
+
+def values_of_states(experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan]) -> int:
+    """Values of all states of the scan that has most; 0 where air is frozen or beams have one time.
+
+    Raises
+    ------
+    InputError
+        As of `state_times`.
+    """
+    if experiment.scan.air != "moving":
+        return 0
+    timed = [plan.beams.time for plan in plans if plan.beams is not None]
+    counts = [state_times(experiment, flows, times).size for times in timed]
+    return max(counts, default=0) * flows[0]["v"].size
 
 
 def air_in_time(

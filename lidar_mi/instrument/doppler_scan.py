@@ -197,6 +197,28 @@ def wind_at(wind: xr.Dataset, points: np.ndarray) -> np.ndarray:
     return RegularGridInterpolator(grid, values, bounds_error=False, fill_value=None)(places)
 
 
+def wind_of_lines(
+    wind: xr.Dataset, points: np.ndarray, times: np.ndarray | None = None
+) -> np.ndarray:
+    """Wind (lines, points, 3) at points (lines, points, 3), each line at its own time.
+
+    Parameters
+    ----------
+    wind : xr.Dataset
+        As for `wind_at`; or two states of it, dims (time, ...), linear in time between and beyond
+        them.
+    times : (lines,) array, optional
+        s; 0 for all if left out.
+    """
+    if "time" not in wind.dims:
+        return wind_at(wind, points)
+    first, last = wind["time"].values
+    part = (np.zeros(len(points)) if times is None else times) - first
+    later = (part / (last - first))[:, None, None]
+    states = [wind_at(wind.isel(time=k, drop=True), points) for k in (0, 1)]
+    return (1 - later) * states[0] + later * states[1]
+
+
 def scan_wind(
     wind: xr.Dataset | WindAt,
     scan: DopplerScan,
@@ -216,7 +238,8 @@ def scan_wind(
     Parameters
     ----------
     wind : xr.Dataset or callable
-        As for `wind_at`, in the lidar's frame; or u, v, w (..., 3) in m/s of points (..., 3) in m.
+        As for `wind_of_lines`, in the lidar's frame; or u, v, w (..., 3) in m/s of points (..., 3)
+        in m.
     v_los_std : float or (lines,) array
         Standard error of a measured velocity, m/s: what the fringe chain gives for as many pulses
         as a line has.
@@ -255,8 +278,11 @@ def scan_wind(
     if beams is not None:
         points = points + beams.origin[:, None]
         velocity, told = velocity + beams.velocity, told + beams.reported_velocity
-    winds = wind_at(wind, points) if isinstance(wind, xr.Dataset) else wind(points)
-    mean = np.einsum("lp,lpc->lc", weights, winds)
+    if isinstance(wind, xr.Dataset):
+        met = wind_of_lines(wind, points, None if beams is None else beams.time)
+    else:
+        met = wind(points)
+    mean = np.einsum("lp,lpc->lc", weights, met)
     toward = velocity + np.array([errors.speed, 0.0, 0.0]) - mean
     true = np.einsum("lc,lc->l", actual, toward)
     noise = np.random.default_rng(int(noise_seed)).standard_normal(len(true))

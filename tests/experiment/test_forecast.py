@@ -4,14 +4,24 @@ Detects: a run that takes more than it may and starts, one that fits and is refu
 dark or undetermined after hours, an overlap of beam and field of view wrong by 1 %.
 """
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.check import duration, sections
-from lidar_mi.experiment.forecast import check_brightness, check_size, forecast, overlap
-from lidar_mi.experiment.truth import read_flows
+from lidar_mi.experiment.forecast import (
+    check_brightness,
+    check_size,
+    check_states,
+    forecast,
+    overlap,
+)
+from lidar_mi.experiment.timed_beams import timed_plans
+from lidar_mi.experiment.truth import make_truth, read_flows
+from lidar_mi.experiment.truth_in_time import air_in_time, values_of_states
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import plan_scans
 from lidar_mi.rendering.memory import PER_SAMPLE, samples_at_once
@@ -100,6 +110,39 @@ def test_memory_against_that_of_runs():
     }
     experiment = check(small() | changes)
     assert 1.02e9 / 1.5 < forecast(experiment, 110 * 70) < 1.02e9 * 1.5
+
+
+def moving(duration="95 ms", **render):
+    """Air that moves while 61 x 41 beams are sent, and what its states have in memory."""
+    scan = {"air": "moving", "timing": {"duration": duration}}
+    asked = check(small() | {"scan": scan, "render": small()["render"] | render})
+    flows = read_flows(asked, ".")
+    y, z = flows[0]["y"].values, flows[0]["z"].values
+    plans = timed_plans(asked, plan_scans(asked.scan, y, z, (0.0, 0.0)), ".")
+    return asked, flows, plans, values_of_states(asked, flows, plans)
+
+
+def test_states_of_moving_air_are_in_the_forecast():
+    """Peak of making the states of a scan, traced, and of both in single precision: a factor 2."""
+    asked, flows, plans, values = moving()
+    assert values > 5 * flows[0]["v"].size and moving("0 s")[3] == 0
+    truth = make_truth(asked, flows=flows)
+    tracemalloc.start()
+    states = air_in_time(asked, truth, flows, 0, plans[0].beams.time)
+    peak = tracemalloc.get_traced_memory()[1] + 2 * states.nbytes
+    tracemalloc.stop()
+    assert states.size == values
+    added = forecast(asked, 61 * 41, values) - forecast(asked, 61 * 41)
+    assert peak / 2 < added < 2 * peak
+
+
+def test_states_beyond_the_memory_are_refused():
+    """19 million values took 0.65 GB more than frozen air with molecules did, measured."""
+    asked = moving(memory="1.3 GB")[0]
+    check_states(asked, 315, 10_000_000)
+    assert forecast(asked, 315, 19_039_079) - forecast(asked, 315) == pytest.approx(0.65e9, rel=0.1)
+    with pytest.raises(InputError, match=r"scan.air: moving, of 4e\+07 values .*: frozen air"):
+        check_states(asked, 315, 40_000_000)
 
 
 @pytest.mark.parametrize(("gates", "fits"), [(1, True), (100, True), (2000, False)])

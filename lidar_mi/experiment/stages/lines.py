@@ -20,9 +20,9 @@ from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.line_frames import PULSES, line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import Rings
 from lidar_mi.experiment.stages.ring_velocities import FRAMES, speeds_to_laser
-from lidar_mi.experiment.truth import Truth, find_file
+from lidar_mi.experiment.truth import Flows, Truth, find_file, slab_mean
 from lidar_mi.instrument.beams import Beams
-from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_at
+from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_of_lines
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 from lidar_mi.retrieval.rings.model import PixelNoise
@@ -54,6 +54,22 @@ def slab_wind(experiment: Experiment, truth: Truth) -> xr.Dataset:
     return wind if "u" in wind else wind.assign(u=xr.zeros_like(wind["v"]))
 
 
+def states_of_wind(experiment: Experiment, wind: xr.Dataset, flows: Flows) -> xr.Dataset:
+    """The wind that lines of sight meet: that of `slab_wind`, or its states at both images' times.
+
+    Dims (time, z, y) with the times 0 and dt where a wake has a second state.
+    """
+    if flows[1] is None:
+        return wind
+    gates = wind.attrs["gates"]
+    states = [
+        xr.Dataset({n: slab_mean(flow[n], gates) for n in COMPONENTS if n in flow})
+        for flow in flows
+    ]
+    states = [s if "u" in s else s.assign(u=xr.zeros_like(s["v"])) for s in states]
+    return xr.concat(states, xr.Variable("time", [0.0, experiment.platform.dt]))
+
+
 def check_lines(
     experiment: Experiment, wind: xr.Dataset, rings: Rings, beams: Beams | None
 ) -> None:
@@ -78,7 +94,7 @@ def check_lines(
     try:
         going = directions.directions() if beams is None else beams.direction
         volumes = sight_volumes(going, directions.ranges(lidar, beams), lidar)[0]
-        wind_at(wind, volumes if beams is None else volumes + beams.origin[:, None])
+        wind_of_lines(wind, volumes if beams is None else volumes + beams.origin[:, None])
     except InputError as error:
         raise InputError(f"sensor.directions: {error}") from None
     fastest = experiment.platform.speed + float(

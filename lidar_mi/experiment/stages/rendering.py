@@ -7,13 +7,13 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.forecast import check_brightness, check_size
+from lidar_mi.experiment.forecast import check_brightness, check_size, check_states
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Keeper
 from lidar_mi.experiment.timed_beams import timed_plans
 from lidar_mi.experiment.truth import Flows, Truth, read_flows
-from lidar_mi.experiment.truth_in_time import air_in_time, state_times
+from lidar_mi.experiment.truth_in_time import air_in_time, values_of_states
 from lidar_mi.instrument.detector import gate_duration
 from lidar_mi.instrument.detector_noise import noise_budget, noisy_scan
 from lidar_mi.instrument.products import with_products
@@ -101,9 +101,8 @@ def check_light(
         largest medium, moving air in more states than the memory holds.
     """
     _media(experiment, truth.extinction, plans)
-    for plan in plans:
-        if plan.beams is not None and experiment.scan.air == "moving":
-            state_times(experiment, flows, plan.beams.time)
+    in_states = values_of_states(experiment, flows, plans)
+    check_states(experiment, len(plans[0].y) * len(plans[0].z), in_states)
     if experiment.detector:
         for plan in plans:
             duration = gate_duration(plan.gate_length())

@@ -5,6 +5,7 @@ the cross-flow wind together give (u, v, w).
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -21,6 +22,7 @@ from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
 from lidar_mi.retrieval.common_error import NAMES as COMMON_ERRORS
 from lidar_mi.retrieval.lines.combine import combine
+from lidar_mi.retrieval.lines.common_time import estimated_drift
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, wind_from_neighbours, wind_from_triples
 
 # Lines of sight per least-squares vector of the Doppler lidar alone: one and those around it.
@@ -125,11 +127,19 @@ def _oblique_view(experiment: Experiment) -> dict[str, float]:
     return {"distance": distance, "gate_speed": scan.follow}
 
 
+def _in_time(experiment: Experiment, crossflow: xr.Dataset) -> dict[str, Any]:
+    """Settings of `combine` for the time of the wind, half way between both images."""
+    drifts = experiment.sensor.drift == "estimated"
+    drift = estimated_drift(crossflow) if drifts else (0.0, 0.0)
+    return {"time": experiment.platform.dt / 2, "drift": drift}
+
+
 def with_truth(
     experiment: Experiment, truth: xr.Dataset, lines: xr.Dataset, crossflow: xr.Dataset
 ) -> xr.Dataset:
     """The wind of `combine` from lines and cross-flow wind, with the truth at its nodes."""
     settings = {"crossflow_std": experiment.sensor.crossflow_std, **_oblique_view(experiment)}
+    settings |= _in_time(experiment, crossflow)
     found, shifted = combine(crossflow, lines, **settings), _shifted(lines)
     if shifted is not None:
         found = with_systematic(found, combine(crossflow, shifted, **settings))
@@ -162,12 +172,13 @@ def limits_of_u(
     found: xr.Dataset | None,
     cores: Sequence[Core],
     beams: Beams | None,
+    states: xr.Dataset,
 ) -> dict[str, float]:
     """Error budget of u, see `mean_squares_without`. Empty without a wind from both lidars."""
     if found is None:
         return {}
     return mean_squares_without(
-        experiment, truth, lines, crossflow(experiment, wind), found, cores, beams
+        experiment, truth, lines, crossflow(experiment, wind), found, cores, beams, states
     )
 
 
@@ -179,8 +190,11 @@ def mean_squares_without(
     found: xr.Dataset,
     cores: Sequence[Core],
     beams: Beams | None = None,
+    states: xr.Dataset | None = None,
 ) -> dict[str, float]:
     """Mean square error of u without each cause, and without all of them at once, m^2 s^-2.
+
+    The lines see ``states``, from `lines.states_of_wind`; by default the truth.
 
     Causes: `line_noise` (from the rings' noise), `range_bin` (averaging along it, here over
     `_SHORT`), `crossflow` (errors of v and w) and, where there are any, `pointing`
@@ -212,7 +226,7 @@ def mean_squares_without(
         if "pointing" in causes:
             missed = PlatformErrors()
         changed = scan_wind(
-            truth,
+            truth if states is None else states,
             experiment.sensor.directions,
             lidar,
             0.0,
@@ -233,11 +247,13 @@ def mean_squares_without(
             flow, settings = known, {}
         else:
             settings["crossflow_std"] = experiment.sensor.crossflow_std
+        settings |= timed
         u = combine(flow, changed, **settings)["u"].transpose("z", "y").values
         return float(((u - true["u"])[chosen] ** 2).mean())
 
     if not chosen.any():
         return {}
+    timed = _in_time(experiment, crossflow)
     full = square(())
     if not full > 0:
         return {}

@@ -16,6 +16,7 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.common_error import with_common_error
 from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
 from lidar_mi.retrieval.velocimetry.methods import METHODS
+from lidar_mi.retrieval.velocimetry.resampling_error import flag_resampled
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind, wind_bound
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
@@ -56,6 +57,7 @@ def cross_flow_winds(
     _warn_of_wide_beams(experiment, truth, plans, log)
     settings, blur = experiment.retrieval, known_blur(experiment, plans[0])
     pairs, times = _image_pairs(experiment, truth, plans, scans), pixel_times(experiment, scans)
+    lost = resampled_noise(experiment, scans)
     sources = []
     for index, (source, (pair, noise)) in enumerate(pairs.items()):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
@@ -79,6 +81,8 @@ def cross_flow_winds(
                 log.remark(f"{source}: {wind.attrs['fixed_pattern']} in all images")
             if "illumination" in wind.attrs and not methods:
                 log.remark(f"{source}: {wind.attrs['illumination']} between the images")
+            if source in lost:
+                wind = flag_resampled(wind, *lost[source])
             if settings.pointing.stderr or settings.pointing.roll:
                 common = common_error(experiment, plans) if source in RENDERED else (0.0, 0.0)
                 wind = with_common_error(wind, common[0], settings.pointing.offset, common[1])
@@ -145,6 +149,19 @@ def rendered_pairs(
             for name, (pair, level) in pairs.items()
         }
     return pairs
+
+
+def resampled_noise(
+    experiment: Experiment, scans: Sequence[xr.Dataset]
+) -> dict[str, tuple[xr.DataArray, xr.DataArray]]:
+    """Noise of images of scattered beams without and with what resampling adds, by source."""
+    noise, found = attenuated_backscatter_stderr(scans[0]), {}
+    if "Y_resampling_std" in scans[0]:
+        found[Source.BACKSCATTER] = noise, with_resampling(noise, scans, "Y")
+    if "Y_noisy_resampling_std" in scans[0]:
+        noise = np.hypot(noise, scans[0]["Y_noise_std"])
+        found[Source.NOISY] = noise, with_resampling(noise, scans, "Y_noisy")
+    return found
 
 
 def with_resampling(noise: xr.DataArray, scans: Sequence[xr.Dataset], name: str) -> xr.DataArray:

@@ -9,10 +9,12 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.velocimetry.resampling_error import (
+    LeftOut,
     correlation_area,
-    local_strength,
+    left_out,
     pairs,
-    ratio_at,
+    strength_at,
+    structure,
     variance,
     variogram,
 )
@@ -26,6 +28,8 @@ _UNCORRELATED, _SLOPE = 1e-3, 1e-6
 # In spacings: offset of a beam that counts as on its node, distance beyond the hull that counts as
 # within, distance of a node that has no beam near.
 _ON_NODE, _RIM, _NEAR = 1e-3, 0.02, 1.5
+# Beams that are estimated from the others.
+_LEFT_OUT = 15000
 # Nodes solved for together.
 _CHUNK = 4096
 # Fields that winds are retrieved from.
@@ -131,8 +135,8 @@ def _resampling_error(
     times = np.zeros(len(values))
     if "beam_time" in scan:
         times = scan["beam_time"].transpose("z", "y").values.ravel().astype(float)
-    near = pairs(places, times)
-    found = variogram(values, near)
+    speed = variogram(values, pairs(places, times)).speed
+    left = _left_out(places, values, times, speed)
     beams = weights.indices.reshape(len(changed), -1)
     factors = weights.data.reshape(beams.shape)
     when = times[beams]
@@ -141,28 +145,51 @@ def _resampling_error(
     for start in range(0, len(changed), _CHUNK):
         part = slice(start, start + _CHUNK)
         from_node = places[beams[part]] - nodes[changed[part]][:, None]
-        error[changed[part]] = variance(found, factors[part], from_node, when[part])
-    error[changed] *= ratio_at(places, local_strength(values, found, near), nodes[changed])
+        error[changed[part]] = variance(structure(speed), factors[part], from_node, when[part])
+    error[changed] *= strength_at(left, nodes[changed])
     error[changed] *= correlation_area(places, nodes[changed])
     # what a node's noise shares with that of its neighbours, beyond its own
     shared = weights @ weights.sum(0) - weights.power(2).sum(1)
     # of sums, as the scatter from node to node is as often negative
     _, around = KDTree(nodes[changed]).query(nodes[changed], min(_BEAMS, len(changed)))
     shared = shared[around].reshape(len(changed), -1).mean(1)
-    error[changed] += found.noise * np.clip(shared, 0.0, None)
+    error[changed] += left.noise * np.clip(shared, 0.0, None)
     about = {"long_name": f"standard deviation of {name} by resampling"}
     about |= {key: image.attrs[key] for key in ("units",) if key in image.attrs}
     return image.copy(data=np.sqrt(error).reshape(image.shape)).assign_attrs(about)
 
 
+def _left_out(places: np.ndarray, values: np.ndarray, times: np.ndarray, speed: float) -> LeftOut:
+    """Beams estimated from those around them, in the way that nodes are."""
+    chosen = np.arange(0, len(places), max(1, round(len(places) / _LEFT_OUT)))
+    _, near = KDTree(places).query(places[chosen], min(_BEAMS, len(places) - 1) + 1)
+    near = near[:, 1:]
+    weights = _weights_of(places, places[chosen], near)
+    expected = np.zeros(len(chosen))
+    for start in range(0, len(chosen), _CHUNK):
+        part = slice(start, start + _CHUNK)
+        away = places[near[part]] - places[chosen[part]][:, None]
+        later = times[near[part]] - times[chosen[part]][:, None]
+        expected[part] = variance(structure(speed), weights[part], away, later)
+    square = ((weights * values[near]).sum(1) - values[chosen]) ** 2
+    return left_out(places[chosen], square, expected, 1 + (weights**2).sum(1))
+
+
 def _weights(places: np.ndarray, nodes: np.ndarray) -> csr_array:
     """Of every beam for the value at every node, (nodes, beams); places in spacings."""
-    tree = KDTree(places)
     beams = min(_BEAMS, len(places))
-    near, found = np.zeros((len(nodes), beams), int), np.zeros((len(nodes), beams))
+    _, near = KDTree(places).query(nodes, beams)
+    found = _weights_of(places, nodes, near.reshape(len(nodes), beams))
+    first = np.arange(len(nodes) + 1) * beams
+    return csr_array((found.ravel(), near.ravel(), first), shape=(len(nodes), len(places)))
+
+
+def _weights_of(places: np.ndarray, nodes: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Of the beams of numbers near (nodes, beams), for the value at every node."""
+    beams = near.shape[1]
+    found = np.zeros(near.shape)
     for start in range(0, len(nodes), _CHUNK):
         chosen = slice(start, start + _CHUNK)
-        _, near[chosen] = tree.query(nodes[chosen], beams)
         from_node = places[near[chosen]] - nodes[chosen][:, None]
         apart = from_node[:, :, None] - from_node[:, None]
         matrix = np.zeros((len(from_node), beams + 3, beams + 3))
@@ -174,8 +201,7 @@ def _weights(places: np.ndarray, nodes: np.ndarray) -> csr_array:
         right = np.zeros((len(from_node), beams + 3))
         right[:, :beams], right[:, beams] = _covariance(from_node), 1.0
         found[chosen] = np.linalg.solve(matrix, right[..., None])[:, :beams, 0]
-    first = np.arange(len(nodes) + 1) * beams
-    return csr_array((found.ravel(), near.ravel(), first), shape=(len(nodes), len(places)))
+    return found
 
 
 def _covariance(apart: np.ndarray) -> np.ndarray:

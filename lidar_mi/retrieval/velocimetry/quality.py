@@ -43,6 +43,8 @@ class Flag(enum.IntFlag):
     """The template holds structure at rest in moving air, or a pattern spoils all (`rest`)."""
     NO_SKILL = 2048
     """The standard error approaches the wind's own spread, or noise assumed decides the wind."""
+    RESAMPLED = 4096
+    """What resampling of scattered beams lost exceeds the noise (`resampling_error`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:

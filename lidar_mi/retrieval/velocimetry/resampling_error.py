@@ -3,15 +3,23 @@
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
+import xarray as xr
+from scipy.ndimage import uniform_filter
+from scipy.optimize import least_squares, nnls
 from scipy.spatial import KDTree
+
+from lidar_mi.retrieval.velocimetry.quality import Flag
 
 # Neighbours of a beam whose differences make the variogram, and bins along distance and time.
 _NEIGHBOURS, _BINS = 12, 12
-# Beams over which the structure's strength is averaged at a place.
-_LOCAL = 150
+# Beams over which the structure's strength is averaged at a place, and bins of the noise.
+_LOCAL, _NOISE_BINS = 75, 24
+# Mean square of what resampling lost over that of the noise, of a vector that is not flagged.
+_LOST = 4.0
 # Nearest beams that tell of their density.
 _AREA = 12
+# Length of the structure for which beams are weighted, in spacings.
+_LENGTH = 1.5
 # Exponent a: of lengths that differ much, and of nearly one.
 _MANY, _ONE = 1.0, 20.0
 
@@ -90,28 +98,88 @@ def variogram(values: np.ndarray, near: Pairs) -> Variogram:
     return model(least_squares(misfit, start, bounds=(low, high), loss="soft_l1").x)
 
 
-def local_strength(values: np.ndarray, found: Variogram, near: Pairs) -> np.ndarray:
-    """Half squared differences about each beam without noise, and by the variogram, (2, n)."""
-    half = ((values[near.near] - values[:, None]) ** 2 / 2).mean(1) - found.noise
-    return np.stack([half, found(near.apart, near.later).mean(1)])
+def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray) -> xr.Dataset:
+    """The wind with vectors flagged where resampling lost more than stated errors can hold.
+
+    What is lost depends on the air and on the places of the beams, which are at rest: it is not
+    only noise, but also a bias. Flagged are templates over which its mean square exceeds 4 times
+    that of the noise.
+
+    Parameters
+    ----------
+    wind : xr.Dataset
+        From `retrieve_wind`, with `template` among its attributes.
+    noise, with_it : xr.DataArray, dims (z, y)
+        Noise of an image, and the same with what resampling adds.
+    """
+    template = int(wind.attrs["template"])
+    square = [field.fillna(0.0).transpose("z", "y").values ** 2 for field in (noise, with_it)]
+    known, both = (uniform_filter(part.astype(float), template) for part in square)
+    lost = noise.copy(data=(both > (1 + _LOST) * known).astype(float))
+    at = {axis: wind[axis] for axis in ("z", "y")}
+    bad = lost.interp(at, method="nearest").transpose(*wind["flag"].dims).values > 0.5
+    flag = wind["flag"]
+    found = flag.values | np.where(bad, Flag.RESAMPLED.value, 0)
+    return wind.assign(flag=flag.copy(data=found.astype(flag.dtype)))
 
 
-def ratio_at(places: np.ndarray, sums: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Variance of the structure over the variogram's at nodes (m,), at least a hundredth."""
-    _, near = KDTree(places).query(nodes, min(_LOCAL, len(places)))
-    above, below = sums[:, near].mean(-1)
-    return np.clip(above / np.maximum(below, 1e-300), 0.01, None)
+class LeftOut(NamedTuple):
+    """Beams as their neighbours estimate them.
+
+    Places (n, 2), squared errors without noise (n,), and what these are for `structure` of
+    strength 1 (n,); the noise of a beam and the strength in the mean.
+    """
+
+    places: np.ndarray
+    square: np.ndarray
+    expected: np.ndarray
+    noise: float
+    strength: float
+
+
+def structure(speed: float) -> Variogram:
+    """Of strength 1 and the length for which beams are weighted, rough beyond it."""
+    return Variogram(1.0, _LENGTH, 1.0, speed, 0.0)
+
+
+def left_out(
+    places: np.ndarray, square: np.ndarray, expected: np.ndarray, noisy: np.ndarray
+) -> LeftOut:
+    """Beams with the noise that explains their squared errors, together with the structure.
+
+    A beam that its neighbours estimate errs by the structure between them and by the noise of all,
+    ``noisy`` times that of one. Both are fitted, not below 0, to means over bins of the structure's
+    part: where beams are close only the noise is left.
+    """
+    edges = np.quantile(expected, np.linspace(0, 1, _NOISE_BINS + 1)[1:-1])
+    index = np.searchsorted(edges, expected)
+    number = np.bincount(index)
+    means = [np.bincount(index, part) for part in (square, noisy, expected)]
+    seen, by_noise, by_air = (part[number > 0] / number[number > 0] for part in means)
+    seen = np.maximum(seen, 1e-300)
+    matrix = np.stack([by_noise / seen, by_air / seen], 1)
+    scale = np.maximum(matrix.max(0), 1e-300)
+    (noise, strength), _ = nnls(matrix / scale, np.ones(len(seen)))
+    noise, strength = noise / scale[0], strength / scale[1]
+    return LeftOut(places, square - noise * noisy, expected, float(noise), float(strength))
+
+
+def strength_at(left: LeftOut, nodes: np.ndarray) -> np.ndarray:
+    """The structure's strength about nodes (m,), at least a hundredth of the mean."""
+    _, near = KDTree(left.places).query(nodes, min(_LOCAL, len(left.places)))
+    above, below = left.square[near].mean(-1), left.expected[near].mean(-1)
+    return np.maximum(above / np.maximum(below, 1e-300), 0.01 * left.strength)
 
 
 def correlation_area(places: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-    """Pixels per independent error about nodes (m,): an error for two beams, at least 2.
+    """Pixels per independent error about nodes (m,): an error for 1.5 beams, at least 1.5.
 
     Errors of neighbouring nodes are from the same beams. Sums of them over 7 px vary as those of
-    one error for 1 to 2 beams do, by the texture: the larger one is taken.
+    one error for 1 to 2 beams do, by the texture.
     """
     count = min(_AREA, len(places))
     distance, _ = KDTree(places).query(nodes, [count])
-    return 2 * np.clip(np.pi * distance[:, 0] ** 2 / count, 1.0, None)
+    return 1.5 * np.clip(np.pi * distance[:, 0] ** 2 / count, 1.0, None)
 
 
 def variance(

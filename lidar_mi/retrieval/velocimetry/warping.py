@@ -16,6 +16,7 @@ from lidar_mi.retrieval.velocimetry.band_limit import (
     radii,
     shell_means,
 )
+from lidar_mi.retrieval.velocimetry.common_grid import nearest_filled
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.velocimetry.windows import stored
@@ -196,7 +197,8 @@ def band_limited(
     Parameters
     ----------
     images : torch.Tensor, shape (images, ...)
-        Non-finite pixels take the image's mean, and do not count in the power spectrum.
+        Non-finite pixels take the value of the nearest finite one, as a step to any other would
+        be structure at rest. They do not count in the power spectrum.
     noise : float, optional
         Standard deviation of the images' white noise. Left out: from the lowest shell of the
         power spectrum.
@@ -227,10 +229,18 @@ def band_limited(
     checked_noise(noise)
     settings = settings or FilterSettings()
     known = torch.stack([torch.isfinite(image) for image in images])
-    images = torch.stack([stored(filled(image)) for image in images])
+    images = torch.stack([stored(_continued(image)) for image in images])
     sizes = transform_sizes(images.shape[1:], settings)
     chosen = best_filter(images, sizes, settings, noise, mismatch, weight, blur, known)
     return filtered_spline(images, chosen, settings), chosen.level
+
+
+def _continued(image: torch.Tensor) -> torch.Tensor:
+    """The image with the value of the nearest finite pixel in place of non-finite ones."""
+    finite = torch.isfinite(image)
+    if bool(finite.all()) or not bool(finite.any()):
+        return filled(image)
+    return torch.as_tensor(nearest_filled(image.cpu().numpy())).to(image)
 
 
 def transform_sizes(shape: Sequence[int], settings: FilterSettings) -> list[int]:
