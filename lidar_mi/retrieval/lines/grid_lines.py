@@ -25,8 +25,8 @@ CHUNK_NUMBERS = 2e7
 class GridLines(NamedTuple):
     """Lines of sight as sums over nodes of the grid: of row z and column y with weight.
 
-    ``covariance`` is that of the lines' errors. ``forward`` is the weight of u at the nodes: its projection on the line, and the part of it that
-    the images attribute to v and w.
+    ``covariance`` is that of the lines' errors. ``forward`` is the weight of u at the nodes: its
+    projection on the line, and the part of it that the images attribute to v and w.
     """
 
     direction: np.ndarray

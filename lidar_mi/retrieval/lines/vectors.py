@@ -105,7 +105,8 @@ def solve_lines(
     -------
     wind : (n, 3) array, m/s
     covariance : (n, 3, 3) array, (m/s)^2
-        (sum d d^T / s^2)^-1, and what is shared; infinite (and the wind NaN) where the lines lie in one plane.
+        (sum d d^T / s^2)^-1, and what is shared; infinite (and the wind NaN) where the lines lie in
+        one plane.
     chi_square : (n,) array
         Squared misfit; of k - 3 degrees of freedom if the wind is uniform over the lines.
 

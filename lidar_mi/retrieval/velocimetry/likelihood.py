@@ -16,6 +16,9 @@ from lidar_mi.retrieval.velocimetry.windows import averaged, stored
 
 # Interpolation error of the splines over an image's rms structure: the least noise assumed.
 _INTERPOLATION = 1e-5
+# Misfit over white noise estimated from spectra below which that is not noise: of white noise the
+# flow absorbs a fifth at most.
+_OVERSTATED = 2 / 3
 
 
 class Images(NamedTuple):
@@ -43,6 +46,8 @@ class Images(NamedTuple):
         Whether noise and weight contain the local misfit already.
     through : float
         Mean square displacement through the plane that the misfit tells of, px^2.
+    given : bool
+        Whether the noise was given; else it is that of the images' spectra.
     """
 
     spline: Spline
@@ -55,6 +60,7 @@ class Images(NamedTuple):
     white: float
     noise_updated: bool = False
     through: float = 0.0
+    given: bool = True
 
     def single(self) -> "Images":
         """The same to be warped in single precision: places to 1e-5 px."""
@@ -108,7 +114,8 @@ def prepared(
     level = max(level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
     time = time - time.mean()
-    return Images(spline, known_at, time, level, weight, images, blur, level)
+    given = noise is not None
+    return Images(spline, known_at, time, level, weight, images, blur, level, given=given)
 
 
 def usable_and_weight(
@@ -134,9 +141,11 @@ def with_local_noise(
     """The images with the noise estimated from their misfit at each place and wavenumber.
 
     Warped images differ by more than their noise where structure moves through the plane, is
-    undersampled, or moves on scales smaller than the splines'. The known noise is the lower
-    limit, and in each wavenumber the motion through the plane that the waves shorter than two
-    `knots` (px) tell of: the flow absorbs part of the misfit of longer ones.
+    undersampled, or moves on scales smaller than the splines'. The noise is the lower limit. One
+    that was not given is of the spectra, where fine texture looks like noise: their misfit takes
+    its place if it is clearly less. In each wavenumber another lower limit is the motion through
+    the plane that the waves shorter than two `knots` (px) tell of: the flow absorbs part of the
+    misfit of longer ones.
     """
     residual = (linear.warped - linear.warped.mean(0)) * linear.valid
     free = (len(residual) - 1) * max(images.spline.passed, 1e-6)
@@ -144,8 +153,12 @@ def with_local_noise(
     # Econometrica 48, 817-838)
     steep = linear.slope.square().sum(0)
     steep = steep + 1e-3 * steep.mean() + 1e-30
-    local = averaged(residual.square().sum(0) * images.weight * steep / free, linear.valid, width)
-    local = local / averaged(steep, linear.valid, width)
+    power = residual.square().sum(0) * images.weight * steep / free
+    if not images.given and linear.valid.any():
+        whole = float(power[linear.valid].sum() / steep[linear.valid].sum())
+        if whole < _OVERSTATED * images.white**2:
+            images = images._replace(white=whole**0.5)
+    local = averaged(power, linear.valid, width) / averaged(steep, linear.valid, width)
     mean = float(local[linear.valid].mean()) if linear.valid.any() else 0.0
     level = max(images.white**2, mean, 1e-30)
     least = max(images.white**2, 0.5 * level)

@@ -12,6 +12,8 @@ _NEAR = 12.0
 # Side of the blocks (px) whose means are independent, fewer than which say too little, and standard
 # errors by which an increase between them is significant.
 _BLOCK, _FEW_BLOCKS, _SIGNIFICANT = 12, 12, 4.0
+# Least curvature of the misfit over that by the slopes, that of images with little in common.
+_LEAST_CURVATURE = 0.1
 
 
 def model_error_of(found: Solution, shortest: float, *, changes: bool = False) -> ModelError:
@@ -34,7 +36,10 @@ def model_error_of(found: Solution, shortest: float, *, changes: bool = False) -
 
 
 def parameter_covariance(found: Solution, error: ModelError, excess: float) -> np.ndarray:
-    """Covariance (10, 10): H^-1 M H^-1, M that of the force by noise and flow error."""
+    """Covariance (10, 10): H^-1 M H^-1, M that of the force by noise and flow error.
+
+    The part by noise is multiplied by `excess`: for H of noisy slopes, 1 / `curvature`^2.
+    """
     misfit, weight = found.misfit, found.weight
     spread = _noise_spread(found, error).double() * excess
     jacobian, slope = misfit.jacobian, misfit.slope
@@ -50,6 +55,39 @@ def parameter_covariance(found: Solution, error: ModelError, excess: float) -> n
         left = _remaining_step(found)
         covariance = covariance + torch.outer(left, left)
     return covariance.cpu().numpy()
+
+
+def curvature(found: Solution, spacing: tuple[float, float]) -> float:
+    """Curvature of the misfit of two images over that by the slopes alone, from 0 to 1.
+
+    The mean of both images' slopes has noise and change of its own, which are half of the slopes of
+    the residual: the second derivative of a residual r by a shift is a quarter of its own, and so
+    of the sum of r^2 it takes a quarter of the sum of its squared slopes. Images of nothing in
+    common have a slope of their mean, but no minimum.
+
+    Parameters
+    ----------
+    found : Solution
+        Of images (z, y).
+    spacing : (float, float)
+        Of the pixels along y and z, m.
+    """
+    residual, weight = found.misfit.residual, found.weight
+    steep = 0.0
+    for step, axis in zip(spacing, (1, 0), strict=True):
+        # half way between pixels, to the fourth order
+        r0, r1, r2, r3 = _neighbours(residual, axis)
+        change = (27 * (r2 - r1) - (r3 - r0)) / (24 * step)
+        least = torch.stack(_neighbours(weight, axis)).amin(0)
+        steep += float((least * change.square()).sum())
+    whole = float((weight * found.misfit.slope.square().sum(0)).sum())
+    return max(1 - steep / (4 * whole), _LEAST_CURVATURE) if whole > 0 else 1.0
+
+
+def _neighbours(field: torch.Tensor, axis: int) -> list[torch.Tensor]:
+    """Four successive values along an axis."""
+    number = field.shape[axis] - 3
+    return [field.narrow(axis, first, number) for first in range(4)]
 
 
 def _inverse(found: Solution) -> torch.Tensor:

@@ -29,6 +29,7 @@ from lidar_mi.retrieval.vortices.acceptance import (
 )
 from lidar_mi.retrieval.vortices.covariance import (
     change_by_flow,
+    curvature,
     model_error_of,
     parameter_covariance,
 )
@@ -39,7 +40,7 @@ from lidar_mi.retrieval.vortices.model_error import ModelError, mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.pixel_times import PixelTimes
 from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, fit, without_step
-from lidar_mi.retrieval.vortices.search import starting_points
+from lidar_mi.retrieval.vortices.search import condensed, starting_points
 
 # Coarse to fine: standard deviation of the blur and step between the pixels used, px.
 _LEVELS = ((3.0, 4), (1.5, 2), (0.0, 1))
@@ -47,6 +48,8 @@ _LEVELS = ((3.0, 4), (1.5, 2), (0.0, 1))
 _FIRST_MODEL_ERROR = 0.1
 # Fraction of the images' difference that may be change, for the search.
 _CHANGE = 0.25
+# Fraction of the images' variance that is other air from which finer images are searched, too.
+_REPLACED = 0.1
 # Lags (px) over which the noise of band-limited images correlates.
 _NOISE_LAGS = 4.0
 
@@ -200,20 +203,51 @@ def fit_pixels(
 
 
 def _searched(make: Builder, limits: Limits) -> Solution | None:
-    """The fit to blurred images from the best of all pairs of places, None if there is none."""
+    """The fit to blurred images from the best of all pairs of places, None if there is none.
+
+    Blurred differences of images are linear in displacements of several pixels. Where air changes
+    they are mostly change, and the pair is in the finer ones, of which there are more.
+    """
     spacing = (make.spacing[0] * make.spacing[1]) ** 0.5
-    best = None
     images = make(*_LEVELS[0])
     images = images.at_least(_CHANGE * float(images.differences().value.var()))
-    for start in starting_points(images.differences(), STARTS, make.profile):
-        parameters = torch.cat([start, start.new_tensor(SAME_BRIGHTNESS)]).double()
-        found = fit(images, parameters, limits, spacing**2, 12, TOLERANCE)
-        if best is None or found.cost < best.cost:
-            best = found
+    starts = starting_points(images.differences(), STARTS, make.profile)
+    best = _best(images, starts, limits, spacing**2)
     if best is None:
         return None
     variance = (_FIRST_MODEL_ERROR * spacing) ** 2
-    return _refitted(make(*_LEVELS[1]), best.parameters, variance, limits)[0]
+    white = make(*_LEVELS[1])
+    found, images = _refitted(white, best.parameters, variance, limits)
+    if _replaced(white.weighted(found.misfit)) < _REPLACED:
+        return found
+    observed = condensed(white.at_least(float(images.scatter.mean())).differences())
+    starts = starting_points(observed, STARTS, make.profile)
+    others = _best(images, starts, limits, variance)
+    return others if others and others.cost < found.cost else found
+
+
+def _best(images: Images, starts: torch.Tensor, limits: Limits, variance: float) -> Solution | None:
+    """The fit of the least cost from starting points (n, 10), None if there are none."""
+    found = [
+        fit(
+            images,
+            torch.cat([start, start.new_tensor(SAME_BRIGHTNESS)]).double(),
+            limits,
+            variance,
+            12,
+            TOLERANCE,
+        )
+        for start in starts
+    ]
+    return min(found, key=lambda solution: solution.cost, default=None)
+
+
+def _replaced(misfit: Misfit) -> float:
+    """Fraction of the variance of the images that is not the same air, beyond noise."""
+    valid = misfit.valid
+    left = (misfit.residual.square() - misfit.scatter)[valid].mean()
+    # the derivative by the gain is image 1
+    return float(left / misfit.jacobian[10][valid].var())
 
 
 def _refitted(
@@ -247,7 +281,8 @@ def _checked(
     make: Builder, best: Solution, images: Images, misfit: Misfit, error: ModelError
 ) -> VortexPairFit:
     """The pair of a solution in images, with its errors; `misfit` is that without whitening."""
-    covariance = parameter_covariance(best, error, images.whitening.excess)
+    q = curvature(best, make.spacing)
+    covariance = parameter_covariance(best, error, 1 / q**2)
     valid = misfit.valid
     # image 1 at its places, and image 2 at its own: the residual with image 1 times its gain
     first = -misfit.jacobian[10]

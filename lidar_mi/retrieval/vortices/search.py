@@ -53,9 +53,8 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
     Vortices rotate in opposite directions and are at least three core radii apart. Of each
     neighbourhood only the best pair is taken.
     """
-    low, high = torch.stack([observed.y, observed.z]).aminmax(dim=1)
+    low, high, step = _region(observed)
     sides = (high - low).tolist()
-    step = (sides[0] * sides[1] / _PLACES) ** 0.5
     axes = [
         torch.linspace(float(a), float(b), max(2, round(side / step))).to(observed.y)
         for a, b, side in zip(low, high, sides, strict=True)
@@ -95,6 +94,53 @@ def starting_points(observed: Observations, count: int, profile: Profile) -> tor
         if found
         else value.new_empty(0, 10)
     )
+
+
+def condensed(observed: Observations) -> Observations:
+    """Two observations for each block, as large as the places are apart, in place of all in it.
+
+    Of a wind u that is uniform over a block, observations a . u = d with weights w tell as much as
+    two of L^T u = L^-1 sum w a d, where L L^T = sum w a a^T (sufficient statistics of weighted
+    least squares). Brightness is fitted and subtracted before.
+    """
+    low, high, step = _region(observed)
+    root = observed.weight.sqrt()
+    value, along = observed.value * root, observed.along * root
+    if observed.brightness is not None:
+        columns = (observed.brightness * root).T
+        value = value - columns @ torch.linalg.lstsq(columns, value[:, None]).solution[:, 0]
+    number = ((high - low) / step).floor().long() + 1
+    place = torch.stack([observed.y, observed.z])
+    column, row = torch.minimum(((place - low[:, None]) / step).long(), number[:, None] - 1)
+    strength = along.square().sum(0)
+    parts = torch.stack(
+        [strength, along[0] ** 2, along[0] * along[1], *(along * value), *(strength * place)]
+    )
+    sums = parts.new_zeros(len(parts), int(number.prod()))
+    sums.index_add_(1, row * number[0] + column, parts)
+    sums = sums[:, sums[0] > 1e-6 * sums[0].max()]
+    total, first, mixed = sums[:3]
+    # a little stronger along y and z, as the observations of a block may all be along one line
+    little = 1e-6 * total
+    left = (first + little).sqrt()
+    lower = mixed / left
+    right = (total - first + little - lower**2).clamp(min=0).sqrt().clamp(min=little.sqrt())
+    one = sums[3] / left
+    two = (sums[4] - lower * one) / right
+    y, z = (torch.cat([part, part]) for part in sums[5:] / total)
+    return Observations(
+        y,
+        z,
+        torch.stack([torch.cat([left, torch.zeros_like(left)]), torch.cat([lower, right])]),
+        torch.cat([one, two]),
+        torch.ones_like(y),
+    )
+
+
+def _region(observed: Observations) -> tuple[torch.Tensor, torch.Tensor, float]:
+    """Least and largest y and z, and the distance between places."""
+    low, high = torch.stack([observed.y, observed.z]).aminmax(dim=1)
+    return low, high, float((high - low).prod() / _PLACES) ** 0.5
 
 
 def _swirls(

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
-from lidar_mi.retrieval.velocimetry.likelihood import linearised, path, prepared
+from lidar_mi.retrieval.velocimetry.likelihood import linearised, path, prepared, with_local_noise
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
 from tests.support.flows import plane_waves, texture
 from tests.support.volumes import nodes, random_waves
@@ -96,3 +96,31 @@ def test_gradient_is_that_of_the_misfit_of_volumes():
     assert gradient == pytest.approx((below - above) / 2 / 0.1, rel=0.05)
     at_truth, _ = about(moved)
     assert abs(at_truth) < 0.03 * gradient
+
+
+def noise_of_still_images(noise, given):
+    """Noise of two images of fine texture at rest, from their spectra and with their misfit."""
+    random = np.random.default_rng(4)
+    z, y = np.arange(80), np.arange(90)
+    still = texture(plane_waves(4, 1.2), *np.meshgrid(y, z))
+    stack = [torch.as_tensor(still + noise * random.standard_normal(still.shape)) for _ in "12"]
+    axes = [Axis(n, 8.0) for n in still.shape]
+    mesh = Mesh(axes, [torch.arange(n, dtype=torch.float64) for n in still.shape])
+    settings = VariationalSettings()
+    images = prepared(stack, given, 0.0, settings)
+    nothing = torch.zeros(2, *(axis.knots for axis in axes), dtype=torch.float64)
+    linear = linearised(images, mesh, nothing, settings)
+    return images.white, with_local_noise(images, linear, 6.0, True, 8.0).white
+
+
+def test_fine_texture_is_not_taken_for_noise():
+    """Its spectrum has no floor; warped images that agree have no noise."""
+    spectrum, after = noise_of_still_images(0.0, None)
+    assert after < 0.1 * spectrum
+
+
+def test_noise_that_is_there_or_given_stays():
+    spectrum, after = noise_of_still_images(0.3, None)
+    assert after == spectrum
+    spectrum, after = noise_of_still_images(0.0, 0.05)
+    assert after == spectrum

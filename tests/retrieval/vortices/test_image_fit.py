@@ -134,6 +134,15 @@ def test_air_that_changes_and_light_that_varies():
     assert 3 < stderr[0] < 10 and found.model_error == 0
 
 
+def test_a_third_of_the_texture_is_replaced():
+    """Differences of blurred images are mostly change here: finer ones have the pair."""
+    found = fit_vortices(*changed_pair(302, 0.33), DT, frozen=True)
+    assert found.success, found.reasons
+    stderr = np.sqrt(np.diag(found.covariance))
+    assert (np.abs(found.parameters - vector(*uneven())) < 4 * stderr).all()
+    assert stderr[0] < 12
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("fraction", [0.1, 0.33])
 def test_intervals_hold_where_texture_is_replaced(fraction):

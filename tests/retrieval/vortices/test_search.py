@@ -10,7 +10,7 @@ import torch
 
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.retrieval.vortices.model import PROFILES
-from lidar_mi.retrieval.vortices.search import Observations, starting_points
+from lidar_mi.retrieval.vortices.search import Observations, condensed, starting_points
 
 PAIR = Vortex(320.0, 3.5, 14.0, 3.0), Vortex(-280.0, 3.0, -15.0, -4.0)
 COLUMNS, ROWS = 61, 41
@@ -109,3 +109,24 @@ def test_brightness_is_no_wind():
     start = starting_points(changed, 1, "lamb_oseen")[0].numpy()
     np.testing.assert_allclose(start[[2, 3, 6, 7]], [14.0, 3.0, -15.0, -4.0], atol=1.9)
     np.testing.assert_allclose(start[[0, 4]], [320, -280], rtol=0.15)
+
+
+@pytest.mark.parametrize("angle", [None, 0.9], ids=["v and w", "one component"])
+def test_blocks_tell_as_much_as_all_that_is_in_them(angle):
+    """Winds that are uniform over each block have the same weighted least squares."""
+    data = observed(PAIR, (3.0, -2.0), 0.5, angle=angle)
+    random = np.random.default_rng(3)
+    data = data._replace(weight=torch.as_tensor(random.uniform(0.5, 2.0, len(data.y))))
+    few = condensed(data)
+    assert len(few.y) < 0.7 * len(data.y)
+
+    def mean_wind(part):
+        columns = (part.along * part.weight.sqrt()).T.numpy()
+        values = (part.value * part.weight.sqrt()).numpy()
+        return np.linalg.lstsq(columns, values, rcond=None)[0], columns.T @ columns
+
+    for one, other in zip(mean_wind(data), mean_wind(few), strict=True):
+        np.testing.assert_allclose(other, one, rtol=1e-3, atol=1e-3 * np.abs(one).max())
+    best, same = (starting_points(part, 1, "lamb_oseen")[0] for part in (data, few))
+    np.testing.assert_allclose(same[[2, 3, 6, 7]], best[[2, 3, 6, 7]], atol=2.0)
+    np.testing.assert_allclose(same[[0, 4]], best[[0, 4]], rtol=0.1)
