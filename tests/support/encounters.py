@@ -39,7 +39,7 @@ def both_lidars(seed=1, path=None, doppler=None, sensor=None, **changes):
         "reference": {"every": 240},
         "retrieval": {"methods": ["annular"], "averaged": [1]},
     }
-    lines = {"columns": 4, "rows": 3, "azimuth_half": "9 deg", "elevation_half": "5 deg"}
+    lines = {"columns": 4, "rows": 3, "azimuth_half": "7 deg", "elevation_half": "3.2 deg"}
     return small_encounter(
         seed,
         path,

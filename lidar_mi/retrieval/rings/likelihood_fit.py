@@ -15,7 +15,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -41,7 +41,13 @@ from lidar_mi.retrieval.rings.mean_image import (
     squared_radius,
     strongest,
 )
-from lidar_mi.retrieval.rings.model import INSTRUMENT, PARAMETERS, PixelNoise, RingModel
+from lidar_mi.retrieval.rings.model import (
+    INSTRUMENT,
+    PARAMETERS,
+    PixelNoise,
+    RingModel,
+    SpeedsOfRings,
+)
 from lidar_mi.retrieval.rings.scoring import POOR, Scored, cell_variance, robust_scoring
 from lidar_mi.retrieval.threads import mapped, threads_for
 
@@ -58,6 +64,7 @@ MOST_SPOTS = 0.02  # of the pixels may be hot or dead
 SIGNIFICANT = 5.0  # standard deviations, the least amplitude of rings
 # standard deviations of chi-square above 1 from which stated errors grow with its root
 MISFIT = 4.0
+_OF_IMAGES = ("values", "std", "chi_square", "rings", "outliers", "sensitivity")
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,22 +124,7 @@ class RingFit:
         return _systematic(self.sensitivity, self.systematic)
 
 
-class SpeedsOfRings(Protocol):
-    """Speeds read from images, by whatever method, as of `RingFit`."""
-
-    @property
-    def v_los(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def v_los_std(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def sensitivity(self) -> torch.Tensor: ...  # noqa: D102
-    @property
-    def systematic(self) -> torch.Tensor: ...  # noqa: D102
-
-
-def difference(
-    received: SpeedsOfRings, emitted: SpeedsOfRings
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+def difference(received: SpeedsOfRings, emitted: SpeedsOfRings) -> tuple[torch.Tensor, ...]:
     """v_LOS of received images less that of images of the laser itself, with standard deviations.
 
     An error of the order at the centre, by a drift of etalon or laser, cancels. So does what the
@@ -248,11 +240,8 @@ _waves = lru_cache(maxsize=4)(annular_waves)
 
 
 def _joined(parts: Sequence[RingFit]) -> RingFit:
-    def all_of(name):
-        return torch.cat([getattr(part, name) for part in parts])
-
-    each = ("values", "std", "chi_square", "rings", "outliers", "sensitivity")
-    return RingFit(**{name: all_of(name) for name in each}, systematic=parts[0].systematic)
+    joined = {name: torch.cat([getattr(part, name) for part in parts]) for name in _OF_IMAGES}
+    return RingFit(**joined, systematic=parts[0].systematic)
 
 
 def _systematic(sensitivity: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
@@ -336,8 +325,7 @@ def _without_spots(fit: RingFit, images, task: _Task, number: int) -> RingFit:
 
 
 def _part(fit: RingFit, which: slice) -> RingFit:
-    each = ("values", "std", "chi_square", "rings", "outliers", "sensitivity")
-    return replace(fit, **{name: getattr(fit, name)[which] for name in each})
+    return replace(fit, **{name: getattr(fit, name)[which] for name in _OF_IMAGES})
 
 
 def _check(fit: RingFit, task: _Task, number: int) -> None:

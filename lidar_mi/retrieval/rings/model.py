@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -329,3 +330,16 @@ class PixelNoise:
         score is then that of its first two moments.
         """
         return self.excess * mean + signal**2 / self.speckle_modes + self.read_noise**2
+
+
+class SpeedsOfRings(Protocol):
+    """Speeds read from images, by whatever method, as of `RingFit`."""
+
+    @property
+    def v_los(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def v_los_std(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def sensitivity(self) -> torch.Tensor: ...  # noqa: D102
+    @property
+    def systematic(self) -> torch.Tensor: ...  # noqa: D102
