@@ -5,8 +5,7 @@ its own, both smooth in r: illumination, vignetting and sloping light do not ent
 errors come from the residuals alone, sector by sector, so that nothing needs to be known of the
 camera: the sectors' scores are summed with their neighbours' in a window as wide as their
 correlation (Newey and West 1987, Econometrica 55, 703; Andrews 1991, Econometrica 59, 817), and
-scaled to be exact for white noise. Where neighbouring sectors deviate alike, as by uneven plates,
-what the fit takes up of that is added: `lidar_mi.retrieval.rings.unevenness`.
+scaled to be exact for white noise.
 """
 
 import warnings
@@ -19,7 +18,6 @@ from lidar_mi.retrieval.rings.alignment import ALL_AROUND, LEAST, shape_columns
 from lidar_mi.retrieval.rings.frames import inside
 from lidar_mi.retrieval.rings.pattern import Pattern, airy, blur
 from lidar_mi.retrieval.rings.sectors import SECTORS, RingCurves, Sectors
-from lidar_mi.retrieval.rings.unevenness import Scores, uneven_covariance
 
 OUTLIER = 6.0  # standard deviations of an annulus's cells
 ROUNDS = 6
@@ -45,8 +43,6 @@ class CurveFit:
         For white noise of variance 1, which gives the weights of the rings.
     roundness : float
         Rms deviation of the crests from the curves, px.
-    uneven : bool
-        Whether crests of neighbouring sectors deviate alike.
     """
 
     geometry: RingCurves
@@ -59,7 +55,6 @@ class CurveFit:
     geometry_covariance: np.ndarray
     model_covariance: np.ndarray
     roundness: float
-    uneven: bool
 
 
 def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: bool) -> CurveFit:
@@ -114,7 +109,6 @@ def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: boo
         geometry_covariance=whole,
         model_covariance=system.inverse[slots] * pattern.spacing**2,
         roundness=system.roundness(),
-        uneven=system.width() > 0,
     )
 
 
@@ -222,8 +216,7 @@ class _System:
         """Of all parameters, from the sectors' scores and their neighbours'."""
         lag = np.abs(np.arange(SECTORS)[:, None] - np.arange(SECTORS))
         lag = np.minimum(lag, SECTORS - lag)
-        width = self.width()
-        window = np.maximum(1 - lag / (1 + width), 0.0)
+        window = np.maximum(1 - lag / (1 + self._width()), 0.0)
         meat = self.score.T @ window @ self.score
         # what white noise of variance 1 would give, less what the fit takes from its residuals
         leverage = self.matrix @ self.inverse
@@ -231,14 +224,7 @@ class _System:
         white = white - np.einsum("st,sab,tcb->ac", window, leverage, self.matrix)
         expected = np.diag(self.inverse @ white @ self.inverse)
         scale = np.sqrt(np.diag(self.inverse) / np.maximum(expected, 1e-3 * np.diag(self.inverse)))
-        found = self.inverse @ meat @ self.inverse * np.outer(scale, scale)
-        return _at_least(uneven_covariance(self._scores()), found) if width else found
-
-    def _scores(self) -> Scores:
-        radius = np.sqrt((self.order + self.pattern.fraction[self.line]) * self.pattern.spacing)
-        angle = self.sectors.angle[:, None]
-        x, y = radius * np.cos(angle), radius * np.sin(angle)
-        return Scores(self.matrix, self.score, self.inverse, self.ring_slots, x, y)
+        return self.inverse @ meat @ self.inverse * np.outer(scale, scale)
 
     def _shifts(self):
         """Shift of every ring in every sector, orders, NaN where it has none; its information."""
@@ -248,7 +234,7 @@ class _System:
         shift = np.where(information > least, self.score[:, slots].T, np.nan)
         return shift / np.maximum(information, least), information
 
-    def width(self) -> float:
+    def _width(self) -> float:
         """Sectors over which errors are correlated: Andrews' rule for an autoregression."""
         shift, information = self._shifts()
         reduced = np.nan_to_num(shift * np.sqrt(information))
@@ -271,13 +257,6 @@ class _System:
         high = self.line == int(self.pattern.height.argmax())
         pixels = (shift * self.pattern.spacing / (2 * radius[:, None]))[high]
         return float(np.sqrt(np.nanmean(pixels**2)))
-
-
-def _at_least(covariance: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """A covariance whose standard errors are raised to another's where those are larger."""
-    own = np.maximum(np.diag(covariance), 1e-300)
-    scale = np.sqrt(np.maximum(1, np.diag(other) / own))
-    return covariance * np.outer(scale, scale)
 
 
 def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
