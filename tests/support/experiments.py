@@ -135,3 +135,14 @@ def without_figures():
     with pytest.MonkeyPatch.context() as patch:
         leave_out_figures(patch)
         yield
+
+
+QUICK_DOPPLER = {
+    "v_los": ["70 m/s"],
+    "camera": {"pixel": "29.6 um", "width": 240, "height": 195},
+    "ccd": {"full_well": 1e6},
+    "retrieval": {"methods": ["annular"], "averaged": [1], "images": 2, "slow_images": 0},
+    "path_samples": 0,
+    "render": {"samples_per_pixel": 16},
+}
+"""A Doppler lidar whose images take no time: as many photons on a sixteenth of the pixels."""

@@ -26,7 +26,12 @@ from lidar_mi.experiment.run import prepare, run
 from lidar_mi.experiment.stages.sensor import doppler_alone, mean_squares_without, with_truth
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
-from tests.support.experiments import leave_out_figures, replace_stages, without_figures
+from tests.support.experiments import (
+    QUICK_DOPPLER,
+    leave_out_figures,
+    replace_stages,
+    without_figures,
+)
 
 # a coarse wake, single scattering, a CCD of a sixteenth of the pixels
 SMALL = {
@@ -37,15 +42,7 @@ SMALL = {
     "scan": {"range": "148.75 m"},
     "render": {"samples_per_beam": 64, "max_order": 1},
     "retrieval": {"methods": ["cc"], "stride": 2},
-    "doppler": {
-        "lidar": {"range": "150 m"},
-        "v_los": ["70 m/s"],
-        "camera": {"pixel": "29.6 um", "width": 240, "height": 195},
-        "ccd": {"full_well": 1e6},
-        "retrieval": {"methods": ["annular"], "averaged": [1], "images": 2, "slow_images": 0},
-        "path_samples": 0,
-        "render": {"samples_per_pixel": 16},
-    },
+    "doppler": {"lidar": {"range": "150 m"}} | QUICK_DOPPLER,
     "sensor": {
         "directions": {
             "columns": 5,

@@ -11,7 +11,7 @@ import xarray as xr
 
 import lidar_mi as lm
 from lidar_mi.experiment import reading as config
-from tests.support.experiments import without_figures
+from tests.support.experiments import QUICK_DOPPLER, without_figures
 
 DT = 0.1
 TEMPLATE, STRIDE = 8, 4
@@ -44,15 +44,7 @@ SMALL = {
         "sources": "measured",
         "pointing": {"stderr": "30 urad"},
     },
-    "doppler": {
-        "lidar": {"range": "150 m", "range_bin": "5 m"},
-        "v_los": ["70 m/s"],
-        "camera": {"pixel": "29.6 um", "width": 240, "height": 195},
-        "ccd": {"full_well": 1e6},
-        "retrieval": {"methods": ["annular"], "averaged": [1], "images": 2, "slow_images": 0},
-        "path_samples": 0,
-        "render": {"samples_per_pixel": 16},
-    },
+    "doppler": {"lidar": {"range": "150 m", "range_bin": "5 m"}} | QUICK_DOPPLER,
     "sensor": {
         "directions": {
             "columns": 5,
