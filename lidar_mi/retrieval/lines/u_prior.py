@@ -99,7 +99,7 @@ def probable_statistics(
     exponents = _EXPONENTS if exponent is None else (float(exponent),)
     weight = np.stack([lines.forward * s[lines.z, lines.y] for s in relative_stds.values()], -1)
     pairs = list(itertools.product(exponents, lengths))
-    correlations = [[correlation(axis, size, a) for axis in (z, y)] for a, size in pairs]
+    correlations = [(correlation(z, size, a), correlation(y, size, a)) for a, size in pairs]
     shapes = np.concatenate(list(covariances_of_lines(lines, weight, correlations)))
     evidence, square = evidence_of(fixed, residual, shapes, stds)
     choices = [
