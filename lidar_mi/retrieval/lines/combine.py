@@ -250,10 +250,9 @@ def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, sh
         )
         along = _MEAN_STD**2 * lines.forward.sum(1) + along
         # the variance of u is the difference of much larger numbers: not by the inverse
-        whitened = solve_triangular(
-            choice.factor[0], along.reshape(-1, len(residual)).T, lower=True
-        )
-        gain = solve_triangular(root_of_s, whitened, lower=True, trans="T")
+        lower, columns = choice.factor[0], along.reshape(-1, len(residual)).T
+        whitened = solve_triangular(lower, columns, lower=True)
+        gain = solve_triangular(lower, whitened, lower=True, trans="T")
         gain = gain.T.reshape(along.shape)
         of_lines = cho_solve(choice.factor, np.column_stack([residual, shared]))
         wind[number, ..., 0] = gain @ residual
