@@ -25,7 +25,7 @@ def register_plugins_with_mitsuba() -> None:
 
 
 class _Finder:
-    """Finds Mitsuba and its variants as the finders behind this one do, and adds to their import."""
+    """Finds Mitsuba and its variants as the finders behind this one do, and adds to it."""
 
     searching = False
 
