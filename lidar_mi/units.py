@@ -198,15 +198,23 @@ _FEW, _MANY = 0.1, 1e4
 def usual_unit(number: float, unit: str) -> tuple[float, str]:
     """Factor from SI to the unit in which people write quantities of this size, and the unit.
 
-    Angles in degrees from 0.5 degrees on; lengths, times, energies, powers and frequencies with the
-    prefix that leaves few digits, below 0.1 and from 10000 on.
+    Angles in degrees or milliradians, whichever takes fewer digits, or else in degrees from 0.5
+    degrees on; lengths, times, energies, powers and frequencies with the prefix that leaves few
+    digits, below 0.1 and from 10000 on.
     """
-    if unit == "rad" and abs(number) >= 0.5 * math.pi / 180:
+    if unit == "rad" and _in_degrees(number):
         return 180 / math.pi, "deg"
     if number and (unit == "rad" or (unit in _PREFIXED and not _FEW <= abs(number) < _MANY)):
         found = UNITS.Quantity(number, unit).to_compact()
         return float(found.magnitude) / number, f"{found.units:~}"
     return 1.0, unit
+
+
+def _in_degrees(angle: float) -> bool:
+    """Whether an angle (rad) was given in degrees, as far as its digits tell."""
+    degrees = 180 / math.pi * angle
+    few, many = (len(f"{abs(value):.6g}".strip("0.")) for value in (degrees, 1e3 * angle))
+    return few < many or (few == many and abs(degrees) >= 0.5)
 
 
 def usual(number: float, unit: str) -> str:

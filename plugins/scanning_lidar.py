@@ -47,8 +47,8 @@ are ranges from each beam's own origin, shorter by x: the gates follow the air, 
 Files of tables are ``.npy``, or text with numbers separated by blanks or commas and ``#`` comments.
 The time of a beam is that of its light everywhere, in a :ref:`volume that changes with time
 <volume-moving_volume>` for instance; the pulse itself takes none. Directions, ``origins`` (x, y, z
-of every beam) and ``times``, gates, aperture and pose can be changed through ``mi.traverse``
-without recompilation.
+of every beam) and ``times``, gates, aperture, field of view, pose and the laser (as
+``laser.divergence_full_mrad``) can be changed through ``mi.traverse`` without recompilation.
 
 .. code-block:: xml
 
@@ -91,10 +91,7 @@ def define():
             self.gate_kind = choice(props, NAME, "gate_kind", "planar", ("planar", "spherical"))
             self.gate_count = whole(props, NAME, "gate_count", 1, 1)
             self.m_aperture = dr.opaque(mi.Float, positive(props, NAME, "aperture_radius", 0.5))
-            fov = positive(props, NAME, "fov_half_mrad", 5.0) * 1e-3
-            if fov >= np.pi / 2:
-                fail(NAME, "fov_half_mrad", fov * 1e3, "less than a half space, 1570.8 mrad")
-            self.m_fov_tan = dr.opaque(mi.Float, np.tan(fov))
+            self.m_fov = mi.Float(positive(props, NAME, "fov_half_mrad", 5.0))
             for field in ("gate_start", "gate_stop"):
                 if field not in props:
                     fail(NAME, field, "nothing", "a range in m")
@@ -191,7 +188,9 @@ def define():
             callback.put("gate_start", self.m_gate_start, kind)
             callback.put("gate_stop", self.m_gate_stop, kind)
             callback.put("aperture_radius", self.m_aperture, kind)
+            callback.put("fov_half_mrad", self.m_fov, kind)
             callback.put("to_world", self.m_pose, kind)
+            callback.put("laser", self.laser, kind)
 
         def parameters_changed(self, keys=()):
             dr.make_opaque(self.m_gate_start, self.m_gate_stop, self.m_aperture, self.m_pose)
@@ -201,6 +200,11 @@ def define():
             start, stop = self.m_gate_start[0], self.m_gate_stop[0]
             if not 0 < self.m_aperture[0] < np.inf:
                 fail(NAME, "aperture_radius", self.m_aperture[0], "a finite radius above 0 m")
+            fov = self.m_fov[0] * 1e-3
+            if not 0 < fov < np.pi / 2:
+                expected = "an angle above 0 and less than a half space, 1570.8 mrad"
+                fail(NAME, "fov_half_mrad", self.m_fov[0], expected)
+            self.m_fov_tan = dr.opaque(mi.Float, np.tan(fov))
             check_pose(self.m_pose, NAME)
             if not 0 < start < np.inf:
                 fail(NAME, "gate_start", start, "a range above 0 m")

@@ -6,6 +6,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.rendering.settings import VARIANTS
 from lidar_mi.system.llvm import require_llvm
+from lidar_mi.system.mitsuba_import import NO_CUDA
 
 
 @checked_arguments
@@ -47,10 +48,7 @@ cuda_ad_spectral
     try:
         mi.set_variant(name)
     except ImportError as error:
-        if name.startswith("cuda"):
-            reason = "no NVIDIA GPU with a driver that is new enough; expected an llvm_ad_* variant"
-        else:
-            reason = _first_line(error)
+        reason = NO_CUDA if name.startswith("cuda") else _first_line(error)
         raise InputError(f"variant: {name} cannot run here: {reason}") from None
     # Mitsuba's hint that a monochrome film is monochrome is of no use to anyone here
     mi.set_log_level(mi.LogLevel.Error)

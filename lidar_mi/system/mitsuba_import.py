@@ -1,32 +1,36 @@
 """Plugins that are there as soon as Mitsuba is, without loading it for those who do not need it.
 
 ``import lidar_mi`` and ``import mitsuba``, in either order, are enough for scenes that name the
-plugins. Mitsuba 3.10 and later do the same by entry points, without this module.
+plugins. Mitsuba 3.10 and later do the same by entry points, without this module. A CUDA variant
+that cannot be had says why, whoever asks for it.
 """
 
 import importlib
 import importlib.util
 import sys
+from collections.abc import Callable
 from importlib.machinery import ModuleSpec
 
 _MITSUBA = "mitsuba"
+_CUDA = "mitsuba.cuda_"
+NO_CUDA = "no NVIDIA GPU with a driver that is new enough; expected an llvm_ad_* variant"
+"""Why a CUDA variant cannot be set."""
 
 
 def register_plugins_with_mitsuba() -> None:
     """Register the plugins now if Mitsuba is imported, else when it will be."""
+    sys.meta_path.insert(0, _Finder())
     if _MITSUBA in sys.modules:
         _register()
-    else:
-        sys.meta_path.insert(0, _Finder())
 
 
 class _Finder:
-    """Finds Mitsuba as the finders behind this one do, and has the plugins follow its import."""
+    """Finds Mitsuba and its variants as the finders behind this one do, and adds to it."""
 
     searching = False
 
     def find_spec(self, name, path=None, target=None) -> ModuleSpec | None:
-        if name != _MITSUBA or self.searching:
+        if self.searching or not (name == _MITSUBA or name.startswith(_CUDA)):
             return None
         self.searching = True
         try:
@@ -35,14 +39,39 @@ class _Finder:
             self.searching = False
         if spec is None or spec.loader is None:
             return spec
-        execute = spec.loader.exec_module
-
-        def execute_and_register(module):
-            execute(module)
-            _register()
-
-        spec.loader.exec_module = execute_and_register  # type: ignore[method-assign]
+        if name == _MITSUBA:
+            spec.loader.exec_module = _with_plugins(spec.loader.exec_module)  # type: ignore[method-assign]
+        else:
+            loader = spec.loader
+            loader.create_module = _explained(loader.create_module, name)  # type: ignore[method-assign]
+            loader.exec_module = _explained(loader.exec_module, name)  # type: ignore[method-assign]
         return spec
+
+
+def _with_plugins(execute: Callable) -> Callable:
+    """The import of Mitsuba, which the plugins follow."""
+
+    def execute_and_register(module):
+        execute(module)
+        _register()
+
+    return execute_and_register
+
+
+def _explained(load: Callable, name: str) -> Callable:
+    """The import of a variant, whose error says what this machine lacks.
+
+    It stays an ImportError, by which ``mitsuba.set_variant`` goes on to the next of several names.
+    """
+
+    def load_or_explain(given):
+        try:
+            return load(given)
+        except ImportError as error:
+            variant = name.rpartition(".")[2]
+            raise ImportError(f"variant: {variant} cannot run here: {NO_CUDA}") from error
+
+    return load_or_explain
 
 
 def _register() -> None:

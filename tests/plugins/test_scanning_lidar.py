@@ -221,7 +221,9 @@ class TestUpdates:
         scene = self.slab(world, GATE, **angles)
         before, _ = world.render(scene, seed=1)
         other = {"azimuth_min_deg": -1.0, "azimuth_max_deg": 3.0, "elevation_max_deg": 1.0}
-        expected_scene = self.slab(world, (485.0, 490.0), 15.0, aperture_radius=0.3, **other)
+        wide = {"laser": {"type": "laser", "divergence_full_mrad": 20.0}, "fov_half_mrad": 7.0}
+        receiver = {"aperture_radius": 0.3, **wide}
+        expected_scene = self.slab(world, (485.0, 490.0), 15.0, **receiver, **other)
         expected, error = world.render(expected_scene, seed=1)
 
         parameters = mi.traverse(scene)
@@ -229,6 +231,8 @@ class TestUpdates:
         parameters["sensor.gate_start"] = 485.0
         parameters["sensor.gate_stop"] = 490.0
         parameters["sensor.aperture_radius"] = 0.3
+        parameters["sensor.fov_half_mrad"] = 7.0
+        parameters["sensor.laser.divergence_full_mrad"] = 20.0
         parameters["sensor.to_world"] = mi.Transform4f().translate([15, 0, 0])
         parameters.update()
         after, error_after = world.render(scene, seed=1)
@@ -260,6 +264,8 @@ class TestUpdates:
         [
             ("gate_start", -1.0, "scanning_lidar.gate_start: -1.0 is not allowed; expected"),
             ("gate_stop", 499.0, "scanning_lidar.gate_stop: 499.0 is not allowed; expected"),
+            ("fov_half_mrad", 0.0, "scanning_lidar.fov_half_mrad: 0.0 is not allowed; expected an"),
+            ("laser.beam_radius", -1.0, "laser.beam_radius: -1.0 is not allowed; expected"),
             ("directions", [1.0, 0, 0], "scanning_lidar.directions: 'shape (1, 3)' is not allowed"),
             ("directions", [1.0] * 7, "scanning_lidar.directions: 'shape (7,)' is not allowed"),
             ("directions", [0.0] * 6, "scanning_lidar.directions: 'a row of zero length or NaN'"),
@@ -299,7 +305,7 @@ ERRORS = [
     ({"fov_half_mrad": 0.0}, "scanning_lidar.fov_half_mrad: 0.0 is not allowed"),
     (
         {"fov_half_mrad": 1600.0},
-        "scanning_lidar.fov_half_mrad: 1600.0 is not allowed; expected less than a half space",
+        "scanning_lidar.fov_half_mrad: 1600.0 is not allowed; expected an angle above 0",
     ),
     ({"azimuth_max_deg": 0.0}, "scanning_lidar.azimuth_max_deg: 0.0 is not allowed; expected more"),
     ({"azimuth_max_deg": 90.0}, "scanning_lidar.azimuth_min_deg, azimuth_max_deg: (0.0, 90.0)"),

@@ -40,3 +40,15 @@ def test_a_variant_that_cannot_run_here_is_reported(variant):
         assert mi.variant() == variant
     else:
         assert mi.variant() == "cuda_ad_mono_polarized"
+
+
+def test_mitsuba_itself_reports_it_and_takes_the_next(variant):
+    try:
+        mi.set_variant("cuda_ad_rgb")
+    except ImportError as error:
+        assert str(error).startswith("variant: cuda_ad_rgb cannot run here: no NVIDIA GPU")
+        assert mi.variant() == variant
+        mi.set_variant("cuda_ad_rgb", "llvm_ad_rgb")
+        assert mi.variant() == "llvm_ad_rgb"
+    else:
+        assert mi.variant() == "cuda_ad_rgb"

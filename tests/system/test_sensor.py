@@ -281,11 +281,12 @@ def test_errors_of_a_known_field():
             "u_stderr": 0.51 * one,
             "v_stderr": one,
             "w_stderr": one,
-            "flag": (one * (one.y == 9)).astype(np.uint8),
+            "flag": (2 * one * (one.y == 9)).astype(np.uint8),
         }
     )
     metrics = vector_metrics(found, [Core(y=0.0, z=0.0, radius=0.3, circulation=400.0)])
     assert metrics["sensor.vectors"] == 9 and metrics["sensor.valid_fraction"] == 0.9
+    assert metrics["sensor.spanned_fraction"] == 0.9  # the last one is beyond the lines
     assert metrics["sensor.rmse_u"] == pytest.approx(0.5) == metrics["sensor.bias_u"]
     assert metrics["sensor.coverage_68_u"] == 1 and metrics["sensor.coverage_95_v"] == 0
     assert metrics["sensor.normalised_error_variance_v"] == pytest.approx(4)

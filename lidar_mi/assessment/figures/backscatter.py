@@ -191,8 +191,13 @@ def overview(truth, scans, found: xr.Dataset, cores: list[Core]) -> tuple[Figure
     return figure, (
         f"Left: the first backscatter image{noise}. Right: the cross-flow wind retrieved from "
         f"it and the second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are "
-        "flagged, red crosses mark the true cores."
+        f"flagged{_crosses(cores)}."
     )
+
+
+def _crosses(cores: list[Core]) -> str:
+    """What of the caption speaks of the vortices, where there are any."""
+    return ", red crosses mark the true cores" if cores else ""
 
 
 def _extinction(truth):
@@ -234,7 +239,7 @@ def _wind_and_truth(truth, found, source, cores, scale):
     _retrieved_into(axes[1], found, source, cores, scale)
     return figure, (
         "Above: the true cross-flow wind and its speed. Below: winds retrieved from the "
-        f"{SOURCE_NAMES[source]} pair. Grey vectors are flagged; red crosses mark the true cores."
+        f"{SOURCE_NAMES[source]} pair. Grey vectors are flagged{_crosses(cores)}."
     )
 
 
@@ -251,8 +256,8 @@ def _retrieved(found, source, cores, scale):
     figure, axes = sheet(1, max(2, found.sizes["algorithm"]))
     _retrieved_into(axes[0], found, source, cores, scale)
     return figure, (
-        f"Winds retrieved from the rendered {source} pair, unfiltered: grey vectors are flagged, "
-        "red crosses mark the true cores."
+        f"Winds retrieved from the rendered {source} pair, unfiltered: grey vectors are flagged"
+        f"{_crosses(cores)}."
     )
 
 

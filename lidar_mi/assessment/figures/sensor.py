@@ -86,8 +86,8 @@ def _scan(lines, cores):
     )
     panels[0].set_xlim(middle + half + 4, middle - half - 4)
     return figure, (
-        "Middles of the range bins; the velocity includes the aircraft's motion. Black crosses: "
-        "lines of sight whose rings gave no velocity. Red crosses: true cores."
+        "Middles of the range bins; the velocity includes the motion of the platform. Black "
+        f"crosses: lines of sight whose rings gave no velocity.{_crosses(cores, ' Red')}"
     )
 
 
@@ -129,8 +129,13 @@ def _maps(found, lines, cores):
         panel.set_ylabel("z / m")
     return figure, (
         "Rows: u from the lines of sight (dots: their middles), corrected for the cross-flow wind "
-        "of the images; v and w from the images. Valid vectors only; crosses: true cores."
+        f"of the images; v and w from the images. Valid vectors only.{_crosses(cores, ' Black')}"
     )
+
+
+def _crosses(cores, colour: str) -> str:
+    """What of a caption speaks of the vortices, where there are any."""
+    return f"{colour} crosses: true cores." if cores else ""
 
 
 def _uncertainty(found):

@@ -1,6 +1,7 @@
 """Names of metrics, defined only here: ``source.method.quantity`` and so on."""
 
 import re
+from collections.abc import Mapping
 from enum import StrEnum
 
 
@@ -19,6 +20,19 @@ EXACT = (Source.EXTINCTION, Source.WITHOUT_TEXTURE)
 
 RENDERED = (Source.BACKSCATTER, Source.NOISY)
 """Sources that are images of the lidar; the second one behind a detector."""
+
+
+OUTSIDE_CORES = "outside_cores."
+"""Of errors beyond two core radii, before the quantity."""
+
+
+def far_from_cores(metrics: Mapping[str, float], prefix: str, quantity: str) -> str:
+    """`OUTSIDE_CORES` where there are cores that it leaves out, of u, v or w; else nothing."""
+    for component in "uvw":
+        far = metrics.get(f"{prefix}{OUTSIDE_CORES}{quantity}{component}")
+        if far is not None and far != metrics.get(f"{prefix}{quantity}{component}"):
+            return OUTSIDE_CORES
+    return ""
 
 
 def wind_key(source: str, method: str, quantity: str) -> str:

@@ -10,6 +10,7 @@ import xarray as xr
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import error_statistics
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable
+from lidar_mi.retrieval.lines.combine import CombinedFlag
 
 COMPONENTS = ("u", "v", "w")
 
@@ -46,7 +47,7 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
 
     ``sensor.rmse_*``, ``bias_*`` (m/s), ``normalised_error_variance_*``, ``coverage_68_*``,
     ``coverage_95_*``; ``outside_cores.rmse_*`` beyond two core radii, and ``outside_cores.rms_*``
-    of the true wind there.
+    of the true wind there; ``spanned_fraction`` of all vectors, between lines of sight.
 
     Parameters
     ----------
@@ -59,7 +60,12 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
     valid = found["flag"].values == 0
     z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
     far = valid & outside_cores(y, z, list(cores))
-    metrics = {"sensor.valid_fraction": float(valid.mean()), "sensor.vectors": int(valid.sum())}
+    beyond_lines = (found["flag"].values & CombinedFlag.BEYOND_LINES) != 0
+    metrics = {
+        "sensor.valid_fraction": float(valid.mean()),
+        "sensor.vectors": int(valid.sum()),
+        "sensor.spanned_fraction": float(1 - beyond_lines.mean()),
+    }
     for name in COMPONENTS:
         true = found[f"{name}_true"].values
         error = found[name].values - true

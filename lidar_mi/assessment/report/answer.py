@@ -4,7 +4,14 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 from lidar_mi.assessment.labels import METHOD_NAMES
-from lidar_mi.assessment.metrics.names import Source, bound_key, ring_key, vortex_key, wind_key
+from lidar_mi.assessment.metrics.names import (
+    Source,
+    bound_key,
+    far_from_cores,
+    ring_key,
+    vortex_key,
+    wind_key,
+)
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, look_ahead
 from lidar_mi.assessment.metrics.velocities import READERS
 from lidar_mi.assessment.metrics.winds import has_no_skill
@@ -12,8 +19,6 @@ from lidar_mi.assessment.report.digits import whole_percent
 from lidar_mi.tables import with_error
 
 Judged = Sequence[tuple[RequirementTable, Sequence[Finding]]]
-
-_FAR = "outside_cores."
 
 
 def answer(experiment, metrics: Mapping[str, float], judged: Judged = ()) -> list[str]:
@@ -71,21 +76,22 @@ def _sensor(experiment, metrics) -> str:
     head = f"Both lidars, {_place(experiment)}"
     if not metrics["sensor.vectors"]:
         return f"{head}: no valid wind vector."
-    far = _FAR if f"sensor.{_FAR}rmse_u" in metrics else ""
+    far = far_from_cores(metrics, "sensor.", "rmse_")
     errors = _values(metrics, f"sensor.{far}rmse_", "uvw")
     true = _values(metrics, f"sensor.{far}rms_", "uvw")
     of_true = f" (true wind {true})" if true else ""
-    valid = whole_percent(metrics["sensor.valid_fraction"])
+    valid, spanned = metrics["sensor.valid_fraction"], metrics.get("sensor.spanned_fraction", 1.0)
+    between = " between the lines of sight" if spanned < 1 else ""
     return (
-        f"{head}: rms errors of u, v, w {errors} m/s{_beyond(far)}{of_true}; {valid} of the "
-        "vectors are valid."
+        f"{head}: rms errors of u, v, w {errors} m/s{_beyond(far)}{of_true}; "
+        f"{whole_percent(valid / spanned)} of the vectors{between} are valid."
     )
 
 
 def _images(experiment, metrics) -> str:
     source = Source.NOISY if experiment.detector else Source.BACKSCATTER
     components = "uvw" if "true_wind.rms_u" in metrics else "vw"
-    far = _FAR if f"true_wind.{_FAR}rms_v" in metrics else ""
+    far = far_from_cores(metrics, "true_wind.", "rms_")
     settings = experiment.volume or experiment.retrieval
     parts = []
     for method in settings.methods:

@@ -3,7 +3,14 @@
 from collections.abc import Mapping, Sequence
 from itertools import product
 
-from lidar_mi.assessment.metrics.names import Source, bound_key, ring_key, wind_key
+from lidar_mi.assessment.metrics.names import (
+    OUTSIDE_CORES,
+    Source,
+    bound_key,
+    far_from_cores,
+    ring_key,
+    wind_key,
+)
 from lidar_mi.assessment.metrics.winds import has_no_skill
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table, with_error
@@ -61,7 +68,8 @@ def _line_of_sight(metrics: Mapping[str, float], numbers: Sequence[int]) -> Tabl
 def _winds(metrics: Mapping[str, float]) -> Table:
     """Rms errors of the winds from every source, by every method."""
     components = "uvw" if "true_wind.rms_u" in metrics else "vw"
-    wanted = [(place, name) for place in ("", "outside_cores.") for name in components]
+    places = [""] + [OUTSIDE_CORES] * bool(far_from_cores(metrics, "true_wind.", "rms_"))
+    wanted = [(place, name) for place in places for name in components]
     rows = []
     for source, method in product(Source, _METHODS):
         valid = metrics.get(wind_key(source, method, "valid_fraction"))
@@ -72,18 +80,19 @@ def _winds(metrics: Mapping[str, float]) -> Table:
             shown = "no skill" if has_no_skill(metrics, source, method) else f"{valid:.0%}"
             rows.append((label, str(method), *errors, shown))
     strength = [_shown(metrics.get(f"true_wind.{place}rms_{name}")) for place, name in wanted]
+    heads = [f"far {name}" if place else name for place, name in wanted]
+    far = " (far: beyond two core radii)" if len(places) > 1 else ""
     return Table(
-        "rms error of the wind in m/s, valid vectors (far: beyond two core radii)",
+        f"rms error of the wind in m/s, valid vectors{far}",
         [*rows, ("true wind", "", *strength, "")],
-        ("winds from", "method", *components, *(f"far {name}" for name in components), "valid"),
+        ("winds from", "method", *heads, "valid"),
         "An error near the rms of the true wind (last row) means no skill: zero would be as good.",
     )
 
 
 def _sensor(metrics: Mapping[str, float]) -> Table:
     """Rms errors of the wind from both lidars, beyond two core radii where there are any."""
-    far = any(key.startswith("sensor.outside_cores.") for key in metrics)
-    place = "outside_cores." if far else ""
+    place = far_from_cores(metrics, "sensor.", "rmse_")
     rows = []
     for label, key in (
         ("both lidars", f"sensor.{place}rmse_"),
@@ -93,7 +102,7 @@ def _sensor(metrics: Mapping[str, float]) -> Table:
         values = [metrics.get(f"{key}{name}") for name in "uvw"]
         if any(value is not None for value in values):
             rows.append((label, *map(_shown, values)))
-    title = f"rms error of the wind from both lidars{', beyond cores' if far else ''}, m/s"
+    title = f"rms error of the wind from both lidars{', beyond cores' if place else ''}, m/s"
     return Table(title, rows, ("", "u", "v", "w"))
 
 

@@ -66,8 +66,8 @@ def read_truth(experiment: Experiment, beside: str | Path, *, log: Log) -> Flows
 
 
 def true_cores(experiment: Experiment, truth: Truth) -> list[Core]:
-    """The vortices of the true wind."""
-    return find_cores(truth.wind)
+    """The vortices of the true wind; none are looked for in the gusts behind a turbine."""
+    return [] if experiment.wake.turbine else find_cores(truth.wind)
 
 
 def scattering_air(experiment: Experiment, beside: str | Path, *, log: Log) -> Scatterer:

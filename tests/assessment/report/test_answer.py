@@ -49,6 +49,8 @@ def test_the_errors_of_both_lidars():
         "Both lidars, 150 m ahead (2.1 s at 70 m/s): rms errors of u, v, w 0.23, 0.48, 10 m/s "
         "beyond two core radii (true wind 0.24, 2.8, 3.7); 56 % of the vectors are valid."
     )
+    (line,) = answer(an_experiment(), SENSOR | {"sensor.spanned_fraction": 0.57})
+    assert line.endswith("; 99 % of the vectors between the lines of sight are valid.")
     (line,) = answer(an_experiment(), {"sensor.vectors": 0})
     assert line.endswith("no valid wind vector.")
     (line,) = answer(an_experiment(speed=0.0), SENSOR)
