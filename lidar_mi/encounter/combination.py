@@ -1,9 +1,63 @@
 """The wind of both lidars in a slab ahead of a flying aircraft."""
 
+from dataclasses import dataclass
+from typing import Literal
+
 import numpy as np
 import xarray as xr
 
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.common_error import with_common_error
 from lidar_mi.retrieval.lines.combine import combine
+
+
+@dataclass(frozen=True, eq=False)
+class Completion:
+    """From the wind of a slab's images to the wind that is delivered; call it.
+
+    Attributes
+    ----------
+    common : float
+        Standard error of v and w by unknown pointing, m/s.
+    rotation : float
+        By unknown roll, rad/s.
+    offset : {"known", "free"}
+        As `with_common_error` takes it.
+    place : array (3,)
+        Of the telescope of the lines of sight, m, path frame.
+    roll_axis : (float, float)
+        y and z of the axis of the roll, m.
+    x : float
+        Plane of the slab, m.
+    crossflow_std : float, optional
+        As `combine` takes it.
+    """
+
+    common: float
+    rotation: float
+    offset: Literal["known", "free"]
+    place: np.ndarray
+    roll_axis: tuple[float, float]
+    x: float
+    crossflow_std: float | None
+
+    @property
+    def by_pointing(self) -> bool:
+        """Whether unknown pointing adds to the errors of the wind."""
+        return bool(self.common or self.rotation)
+
+    def __call__(
+        self, wind: xr.Dataset, lines: xr.Dataset | None
+    ) -> tuple[xr.Dataset, tuple[str, ...]]:
+        """The wind with the errors of pointing, combined with lines; and why it is not."""
+        if self.by_pointing:
+            wind = with_common_error(wind, self.common, self.offset, self.rotation, self.roll_axis)
+        if lines is None:
+            return wind, ()
+        try:
+            return combined_in_flight(wind, lines, self.place, self.x, self.crossflow_std), ()
+        except InputError as error:
+            return wind, (f"no wind from both lidars: {error}",)
 
 
 def combined_in_flight(

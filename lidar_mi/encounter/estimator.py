@@ -3,10 +3,12 @@
 import time
 from collections.abc import Sequence
 from contextlib import contextmanager
+from functools import partial
 from typing import NamedTuple
 
 import xarray as xr
 
+from lidar_mi.encounter.combination import Completion
 from lidar_mi.encounter.doppler import LineFrames
 from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.slab_winds import InOwnProcess, SlabPair, SlabWinds
@@ -28,16 +30,20 @@ class SlabEstimate(NamedTuple):
     pair : VortexPairFit
         Its `from_start` says whether it was found from the expected one.
     seconds : dict
-        Of the parts `vortices`, `wind` and `lines`, and of all, `total`: with two processes less
-        than their sum.
+        Of the parts `vortices`, `wind`, `combination` and `lines`; and `total`, from the second
+        image to the end, with two processes less than their sum. Lines are read in the half period
+        before the second image; what they take beyond it is in `total`.
     lines : Dataset or None
         As `with_speeds` gives them; None without frames.
+    flags : tuple of str
+        Of the wind's completion.
     """
 
     wind: xr.Dataset | None
     pair: VortexPairFit
     seconds: dict[str, float]
     lines: xr.Dataset | None = None
+    flags: tuple[str, ...] = ()
 
 
 class Estimator:
@@ -54,8 +60,8 @@ class Estimator:
     vectors : bool
         Whether the wind is retrieved besides the vortices.
     processes : int
-        2: the wind is retrieved in a process of its own, while this one fits the vortices and reads
-        the lines. The numbers are the same but for rounding. It pays where a second core is idle.
+        2: the wind is retrieved and completed in a process of its own, while this one fits the
+        vortices. The numbers are the same but for rounding. It pays where a second core is idle.
     speeds : LineSpeeds, optional
         Reads the frames of the Doppler lidar.
     """
@@ -88,6 +94,7 @@ class Estimator:
         *,
         times: Sequence[xr.DataArray] | None = None,
         frames: LineFrames | None = None,
+        complete: Completion | None = None,
     ) -> SlabEstimate:
         """Wind, vortices, speeds along lines of sight, and the time that each took.
 
@@ -103,22 +110,27 @@ class Estimator:
         times : sequence of two DataArray, optional
             Of the pixels, as `fit_vortices` takes them.
         frames : LineFrames, optional
-            Of the Doppler lidar.
+            Of the Doppler lidar, half way between both images.
+        complete : Completion, optional
+            Completes the images' wind with the lines.
         """
         seconds: dict[str, float] = {}
         slab = SlabPair(image1, image2, dt, noise, times, expected)
-        wind, lines = None, None
+        wind, lines, flags = None, None, ()
+        if self._speeds and frames:
+            with _timed(seconds, "lines"):
+                lines = self._speeds.read(frames)
         with _timed(seconds, "total"):
-            coming = self._winds and self._winds.begun(slab, self._last)
+            then = complete and partial(complete, lines=lines)
+            coming = self._winds and self._winds.begun(slab, self._last, then)
             with _timed(seconds, "vortices"):
                 pair = fit_vortices(image1, image2, dt, noise, times=times, start=expected)
-            if self._speeds and frames:
-                with _timed(seconds, "lines"):
-                    lines = self._speeds.read(frames)
             if coming is not None:
-                wind, seconds["wind"] = coming()
+                wind, flags, parts = coming()
+                seconds |= parts
+        seconds["total"] += max(0.0, seconds.get("lines", 0.0) - dt / 2)
         self._last = pair if pair.success else None
-        return SlabEstimate(wind, pair, seconds, lines)
+        return SlabEstimate(wind, pair, seconds, lines, flags)
 
 
 @contextmanager

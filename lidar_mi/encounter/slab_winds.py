@@ -17,8 +17,8 @@ from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.vortices.model import wind as model_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
-# Wind and the time that it took, s.
-Found = tuple[xr.Dataset, float]
+Complete = Callable[[xr.Dataset], tuple[xr.Dataset, tuple[str, ...]]]
+"""From the images' wind to the wind that is delivered, and flags."""
 
 # Of both vortices, z and y, among the parameters of a pair.
 _PLACES = ([3, 7], [2, 6])
@@ -48,6 +48,23 @@ class SlabPair(NamedTuple):
     expected: VortexPairFit | None = None
 
 
+class Found(NamedTuple):
+    """The wind of a slab.
+
+    Attributes
+    ----------
+    wind : Dataset
+    flags : tuple of str
+        Of its completion.
+    seconds : dict
+        Of the parts `wind`, and `combination` if it was completed.
+    """
+
+    wind: xr.Dataset
+    flags: tuple[str, ...]
+    seconds: dict[str, float]
+
+
 class SlabWinds:
     """The winds of successive slabs by one method.
 
@@ -68,7 +85,9 @@ class SlabWinds:
         # the pair of the slab whose wind was found from nothing: prior and noise are known there
         self._learnt: VortexPairFit | None = None
 
-    def begun(self, slab: SlabPair, before: VortexPairFit | None) -> Callable[[], Found]:
+    def begun(
+        self, slab: SlabPair, before: VortexPairFit | None, complete: Complete | None = None
+    ) -> Callable[[], Found]:
         """The next slab's wind, retrieved when it is asked for.
 
         Parameters
@@ -76,18 +95,28 @@ class SlabWinds:
         slab : SlabPair
         before : VortexPairFit, optional
             Found in the last slab.
+        complete : callable, optional
+            Completes the images' wind. The next one starts from the images' wind alone.
 
         Returns
         -------
         callable
-            Gives the wind as `retrieve_wind` does, and the time that it took, s. By "variational"
-            the wind's attribute `from_start` says whether it was found from the last one.
+            Gives the wind as `retrieve_wind` does, completed, and the time that it took. By
+            "variational" the attribute `from_start` of the images' wind says whether it was found
+            from the last one.
         """
-        return partial(self._timed, slab, before)
+        return partial(self._timed, slab, before, complete)
 
-    def _timed(self, slab: SlabPair, before: VortexPairFit | None) -> Found:
+    def _timed(
+        self, slab: SlabPair, before: VortexPairFit | None, complete: Complete | None
+    ) -> Found:
         began = time.perf_counter()
-        return self._wind(slab, before), time.perf_counter() - began
+        wind, flags = self._wind(slab, before), ()
+        seconds = {"wind": time.perf_counter() - began}
+        if complete:
+            wind, flags = complete(wind)
+            seconds["combination"] = time.perf_counter() - began - seconds["wind"]
+        return Found(wind, flags, seconds)
 
     def _wind(self, slab: SlabPair, before: VortexPairFit | None) -> xr.Dataset:
         options = self._windows | {"noise": slab.noise, "times": slab.times}
@@ -146,9 +175,11 @@ class InOwnProcess:
         # what is imported once is not a part of the first wind
         self._pool.submit(_ready).result()
 
-    def begun(self, slab: SlabPair, before: VortexPairFit | None) -> Callable[[], Found]:
-        """As `SlabWinds.begun`; retrieved from now on."""
-        return self._pool.submit(_found, slab, before).result
+    def begun(
+        self, slab: SlabPair, before: VortexPairFit | None, complete: Complete | None = None
+    ) -> Callable[[], Found]:
+        """As `SlabWinds.begun`; retrieved and completed from now on."""
+        return self._pool.submit(_found, slab, before, complete).result
 
 
 _winds: SlabWinds
@@ -164,5 +195,5 @@ def _ready() -> None:
     """Nothing."""
 
 
-def _found(slab: SlabPair, before: VortexPairFit | None) -> Found:
-    return _winds.begun(slab, before)()
+def _found(slab: SlabPair, before: VortexPairFit | None, complete: Complete | None) -> Found:
+    return _winds.begun(slab, before, complete)()

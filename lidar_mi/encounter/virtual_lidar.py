@@ -1,6 +1,5 @@
 """The lidar as an object that is stepped: light, detector, and what is estimated from them."""
 
-import time
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,10 +8,10 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
-from lidar_mi.encounter.combination import combined_in_flight
+from lidar_mi.encounter.combination import Completion
 from lidar_mi.encounter.doppler import LineFrames, Midway, doppler_scans
 from lidar_mi.encounter.estimate import Estimate
-from lidar_mi.encounter.estimator import Estimator, SlabEstimate
+from lidar_mi.encounter.estimator import Estimator
 from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.pointing import pointing_error
 from lidar_mi.encounter.pose import AircraftPose
@@ -30,7 +29,6 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.backscatter import ScanRenderer
 from lidar_mi.rendering.phase import molecules, scatterer
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.common_error import with_common_error
 from lidar_mi.retrieval.velocimetry.common_grid import resample
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
@@ -179,6 +177,7 @@ class VirtualLidar:
         if images is None:
             return Estimate(valid, delivered, x, None, None, flags, {})
         midway = Midway.between(came_from, pose, period)
+        complete = self._completion(x, midway, pose)
         found = self._estimator.pair_of(
             images.first,
             images.second,
@@ -186,20 +185,15 @@ class VirtualLidar:
             images.noise,
             expected,
             frames=self._line_frames(number, x, valid, midway),
+            complete=complete if self._doppler or complete.by_pointing else None,
         )
-        wind, pair = self._with_pointing(found, pose)
+        pair = found.pair.with_common_error(
+            complete.common, complete.common, complete.rotation, complete.roll_axis
+        )
+        flags += found.flags
         if not pair.success:
             flags += tuple(f"vortices: {reason}" for reason in pair.reasons)
-        seconds = dict(found.seconds)
-        if wind is not None and found.lines is not None:
-            began, std = time.perf_counter(), self.experiment.sensor.crossflow_std
-            try:
-                wind = combined_in_flight(wind, found.lines, midway.place, x, std)
-            except InputError as error:
-                flags += (f"no wind from both lidars: {error}",)
-            seconds["combination"] = time.perf_counter() - began
-            seconds["total"] += seconds["combination"]
-        return Estimate(valid, delivered, x, wind, pair, flags, seconds, found.lines)
+        return Estimate(valid, delivered, x, found.wind, pair, flags, found.seconds, found.lines)
 
     def _line_frames(
         self, number: int, x: float, valid: float, midway: Midway
@@ -210,19 +204,18 @@ class VirtualLidar:
         turned = pointing_error(self.experiment, number, number * self.gates.period)
         return self._doppler.frames(self.wake, number, x, valid, midway, turned)
 
-    def _with_pointing(
-        self, found: SlabEstimate, pose: AircraftPose
-    ) -> tuple[xr.Dataset | None, VortexPairFit]:
-        """Wind and vortices with the errors that unknown pointing gives to all of them."""
-        wind, pair = found.wind, found.pair
+    def _completion(self, x: float, midway: Midway, pose: AircraftPose) -> Completion:
+        """What unknown pointing adds to a slab's wind, and where its lines of sight start."""
         pointing, period = self.experiment.retrieval.pointing, self.gates.period
-        common = pointing.stderr * (self.gates.look_ahead - self.gates.stride / 2) / period
-        rotation, axis = pointing.roll / period, (pose.y, pose.z)
-        if common or rotation:
-            pair = pair.with_common_error(common, common, rotation, axis)
-            if wind is not None:
-                wind = with_common_error(wind, common, pointing.offset, rotation, axis)
-        return wind, pair
+        return Completion(
+            pointing.stderr * (self.gates.look_ahead - self.gates.stride / 2) / period,
+            pointing.roll / period,
+            pointing.offset,
+            midway.place,
+            (pose.y, pose.z),
+            x,
+            self.experiment.sensor.crossflow_std if self.experiment.sensor else None,
+        )
 
     def _number(self, t: float) -> int:
         number = round(t / self.gates.period) if np.isfinite(t) else -1

@@ -122,7 +122,7 @@ class Control(Section):
         "feedforward", description="off: the wings are levelled; perfect: knows the truth"
     )
     latency: Annotated[Time, Within(0, 10, "seconds")] = Field(
-        0.02, description="from the second scan of a slab to its estimate"
+        0.12, description="from the second scan of a slab to its estimate"
     )
     levelling_time: Annotated[Time, Within(0.1, 1000, "a pilot")] | None = Field(
         3.0, description="in which the wings are levelled, in every mode; null: they are not"

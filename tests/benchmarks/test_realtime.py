@@ -19,9 +19,12 @@ def test_every_part_has_its_latency(monkeypatch):
     monkeypatch.setattr(realtime, "SEPARATION", 28.0)
     found = realtime.compare(1, 140, 110)
     names = {line.quantity for line in found.rows}
-    for part in ("vortices", "wind", "total"):
+    for part in realtime.PARTS:
         assert {f"{part}, median", f"{part}, 99 %"} <= names
     total = next(line for line in found.rows if line.quantity == "total, median")
     assert total.ratio > 2
     assert all(np.isfinite(line.ours) for line in found.rows)
     assert "100%" in found.notes[0]
+    (lines,) = (line for line in found.rows if line.quantity == "line error")
+    # 20 pulses: a quarter of the paper's 0.5 m/s
+    assert lines.ours < 0.12

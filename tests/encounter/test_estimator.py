@@ -21,7 +21,7 @@ def images():
 
 def test_vortices_from_nothing_and_from_the_last_fit(images):
     estimator = Estimator(load_experiment("wake_sensor"), vectors=False)
-    wind, cold, seconds, _ = estimator.pair_of(images.first, images.second, DT, 0.03)
+    wind, cold, seconds, *_ = estimator.pair_of(images.first, images.second, DT, 0.03)
     assert wind is None and cold.success and not cold.from_start
     warm = estimator.pair_of(images.first, images.second, DT, 0.03, cold).pair
     assert warm.success and warm.from_start
@@ -33,7 +33,7 @@ def test_vortices_from_nothing_and_from_the_last_fit(images):
 
 def test_the_wind_is_by_the_most_accurate_method(images):
     estimator = Estimator(load_experiment("wake_sensor"))
-    wind, _, seconds, _ = estimator.pair_of(images.first, images.second, DT, 0.03)
+    wind, _, seconds, *_ = estimator.pair_of(images.first, images.second, DT, 0.03)
     assert wind.attrs["method"] == "variational"
     valid = wind["flag"] == 0
     assert valid.mean() > 0.9

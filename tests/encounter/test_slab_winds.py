@@ -33,13 +33,13 @@ def drifting():
     return slabs, [fit_vortices(s.first, s.second, DT, NOISE) for s in slabs]
 
 
-def winds_of(winds, drifting):
+def winds_of(winds, drifting, complete=None):
     """One slab after the other, the pair expected where the last one was."""
     found, before = [], None
     for images, pair in zip(*drifting, strict=True):
         expected = before and replace(before, covariance=before.covariance + np.diag(UNFORESEEN**2))
         pair_of_images = SlabPair(images.first, images.second, DT, NOISE, expected=expected)
-        found.append(winds.begun(pair_of_images, before)())
+        found.append(winds.begun(pair_of_images, before, complete)())
         before = pair
     return found
 
@@ -52,27 +52,42 @@ def here(drifting):
 def test_each_wind_starts_from_the_last_one(here, drifting):
     """Over a drift of two core radii: errors as from nothing, known to 3 %."""
     near, far = [], []
-    for (wind, seconds), images in zip(here, drifting[0], strict=True):
-        assert seconds > 0
+    for (wind, flags, seconds), images in zip(here, drifting[0], strict=True):
+        assert not flags and set(seconds) == {"wind"} and seconds["wind"] > 0
         alone = SlabWinds(ImageMethod.VARIATIONAL, WINDOWS)
         nothing = alone.begun(SlabPair(images.first, images.second, DT, NOISE), None)()[0]
         for found, errors in ((wind, near), (nothing, far)):
             true = images.v.interp(y=found["y"], z=found["z"])
             errors.append(float(((found["v"] - true) ** 2).mean()))
-    assert [wind.attrs["from_start"] for wind, _ in here] == [0, 1, 1, 1, 1]
+    assert [found.wind.attrs["from_start"] for found in here] == [0, 1, 1, 1, 1]
     assert np.mean(near[1:]) < 1.06**2 * np.mean(far[1:])
 
 
 def test_a_process_of_its_own_finds_the_same(here, drifting):
     winds = InOwnProcess(ImageMethod.VARIATIONAL, WINDOWS)
-    for (one, _), (other, seconds) in zip(here, winds_of(winds, drifting), strict=True):
+    for (one, *_), (other, _, seconds) in zip(here, winds_of(winds, drifting), strict=True):
         # but for rounding in single precision
         for name in ("v", "w"):
             off = (one[name] - other[name]) / one[f"{name}_stderr"]
             assert float(abs(off).max()) < 0.01
         assert bool((one["flag"] == other["flag"]).mean() > 0.99)
         assert one.attrs["from_start"] == other.attrs["from_start"]
-        assert seconds > 0
+        assert seconds["wind"] > 0
+
+
+def doubled(wind):
+    """A completion of a wind."""
+    return wind.assign(v=2 * wind["v"]), ("doubled",)
+
+
+def test_a_wind_is_completed_where_it_is_found_and_the_next_starts_without(here, drifting):
+    """In a process of its own; the next slab starts from the images' wind."""
+    winds = InOwnProcess(ImageMethod.VARIATIONAL, WINDOWS)
+    found = winds_of(winds, [part[:2] for part in drifting], doubled)
+    for (wind, flags, seconds), alone in zip(found, here, strict=False):
+        assert flags == ("doubled",) and set(seconds) == {"wind", "combination"}
+        off = (wind["v"] / 2 - alone.wind["v"]) / alone.wind["v_stderr"]
+        assert float(abs(off).max()) < 0.01
 
 
 def test_other_methods_start_from_nothing(drifting):

@@ -48,7 +48,7 @@ def test_times_and_places(flight):
     estimates, _, _ = flight
     for number, estimate in enumerate(estimates):
         assert estimate.time == pytest.approx(0.1 * number - 0.05)
-        assert estimate.delivered == pytest.approx(0.1 * number + 0.02)
+        assert estimate.delivered == pytest.approx(0.1 * number + 0.12)
         assert estimate.x == pytest.approx(7.5 * (number - 1) + 151.25)
 
 

@@ -9,7 +9,7 @@ import enum
 
 import numpy as np
 import xarray as xr
-from scipy.linalg import solve_triangular
+from scipy.linalg import cho_solve, solve_triangular
 from scipy.spatial import ConvexHull, QhullError
 
 from lidar_mi.errors import InputError
@@ -237,9 +237,11 @@ def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, sh
     if field.estimated:
         across = across + (field.common**2 * shared).T[:, None, None, :]
         known = known + np.diag(field.common**2)
-    prior = np.concatenate([np.zeros((*field.value[rows].shape[:2], 1)), field.value[rows]], -1)
-    winds, covariances = [], []
-    for choice in choices:
+    shape = known.shape[:2]
+    wind, covariance = np.zeros((len(choices), *shape, 3)), np.zeros((*shape, 3, 3))
+    inverse = np.zeros((len(residual), len(residual)))
+    probability = np.array([choice.probability for choice in choices])
+    for number, choice in enumerate(choices):
         correlations = [correlation(axis, choice.length, choice.exponent) for axis in (z, y)]
         strength = choice.std * relative_stds[choice.power]
         weight = (lines.forward * strength[lines.z, lines.y])[..., None]
@@ -247,26 +249,31 @@ def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, sh
             rows, lines, weight, *correlations
         )
         along = _MEAN_STD**2 * lines.forward.sum(1) + along
-        both = np.concatenate([along[None], across])
-        shape = both.shape
-        whitened = solve_triangular(choice.factor[0], both.reshape(-1, shape[-1]).T, lower=True)
-        whitened = whitened.reshape(shape[-1], *shape[:-1])
-        data = solve_triangular(choice.factor[0], residual, lower=True)
-        winds.append(prior + np.einsum("lazy,l->zya", whitened, data))
-        covariance = -np.einsum("lazy,lbzy->zyab", whitened, whitened, optimize=True)
-        covariance[..., 0, 0] += _MEAN_STD**2 + strength[rows] ** 2
-        covariance[..., 1:, 1:] += known
+        # the variance of u is the difference of much larger numbers: not by the inverse
+        lower, columns = choice.factor[0], along.reshape(-1, len(residual)).T
+        whitened = solve_triangular(lower, columns, lower=True)
+        gain = solve_triangular(lower, whitened, lower=True, trans="T")
+        gain = gain.T.reshape(along.shape)
+        of_lines = cho_solve(choice.factor, np.column_stack([residual, shared]))
+        wind[number, ..., 0] = gain @ residual
+        wind[number, ..., 1:] = field.value[rows] + np.moveaxis(across @ of_lines[:, 0], 0, -1)
+        explained = (whitened**2).sum(0).reshape(shape)
+        mixed = -np.einsum("zyl,azyl->zya", gain, across)
+        covariance[..., 0, 0] += choice.probability * (
+            _MEAN_STD**2 + strength[rows] ** 2 - explained
+        )
+        covariance[..., 0, 1:] += choice.probability * mixed
+        covariance[..., 1:, 0] += choice.probability * mixed
+        inverse += choice.probability * cho_solve(choice.factor, np.eye(len(residual)))
         if field.common.any() and not field.estimated:
             # an error that the estimate does not allow for (Schmidt 1966)
-            seen = solve_triangular(choice.factor[0], shared, lower=True)
-            left = np.eye(3)[:, 1:] - np.einsum("lazy,lc->zyac", whitened, seen)
-            covariance += (left * field.common**2) @ left.swapaxes(-1, -2)
-        covariances.append(covariance)
-    probability = np.array([choice.probability for choice in choices])
-    wind = np.tensordot(probability, winds, 1)
-    apart = np.array(winds) - wind
-    spread = np.einsum("n,nzya,nzyb->zyab", probability, apart, apart)
-    return wind, np.tensordot(probability, covariances, 1) + spread
+            seen = np.concatenate([(gain @ shared)[None], across @ of_lines[:, 1:]])
+            left = np.eye(3)[:, 1:] - np.moveaxis(seen, 0, -2)
+            covariance += choice.probability * (left * field.common**2) @ left.swapaxes(-1, -2)
+    covariance[..., 1:, 1:] += known - np.einsum("azyl,bzyl->zyab", across @ inverse, across)
+    mean = np.tensordot(probability, wind, 1)
+    apart = wind - mean
+    return mean, covariance + np.einsum("n,nzya,nzyb->zyab", probability, apart, apart)
 
 
 def _common(field, choices, residual, shared) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,6 @@
 """Lines of sight as weighted sums over the nodes of a grid, and covariances of such sums."""
 
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -99,28 +100,38 @@ def crossflow_weights(field: Crossflow, lines: GridLines) -> np.ndarray:
     return lines.weight[..., None] * np.einsum("lkab,la->lkb", root, lines.direction[:, 1:])
 
 
-def covariance_of_lines(lines: GridLines, weight: np.ndarray, over_z, over_y) -> np.ndarray:
-    """Covariance (parts, lines, lines) of sums over correlated nodes.
+def covariances_of_lines(
+    lines: GridLines, weight: np.ndarray, correlations: Iterable[tuple[np.ndarray, np.ndarray]]
+) -> Iterator[np.ndarray]:
+    """Covariances (parts, lines, lines) of sums over correlated nodes, one for each correlation.
 
-    ``weight`` is (lines, nodes, parts); ``over_z`` and ``over_y`` are the correlations of the nodes
-    along each axis.
+    ``weight`` is (lines, nodes, parts); ``correlations`` are those of the nodes along z and y.
     """
-    place, node = np.unique(lines.z * len(over_y) + lines.y, return_inverse=True)
-    z, y = np.divmod(place, len(over_y))
+    columns = int(lines.y.max()) + 1
+    place, node = np.unique(lines.z * columns + lines.y, return_inverse=True)
+    z, y = np.divmod(place, columns)
     count, parts = len(weight), weight.shape[-1]
     row = np.repeat(np.arange(count), weight.shape[1])
     sums = [
         sparse.csr_array((weight[..., part].ravel(), (row, node.ravel())), (count, len(place)))
         for part in range(parts)
     ]
-    result = np.zeros((parts, count, count))
     step = max(1, int(CHUNK_NUMBERS / len(place)))
-    for start in range(0, len(place), step):
-        chunk = slice(start, start + step)
-        kernel = over_z[z][:, z[chunk]] * over_y[y][:, y[chunk]]
-        for part, matrix in enumerate(sums):
-            result[part] += (matrix[:, chunk] @ (matrix @ kernel).T).T
-    return result
+    chunks = [slice(start, start + step) for start in range(0, len(place), step)]
+    pieces = [[matrix[:, chunk] for matrix in sums] for chunk in chunks]
+    for over_z, over_y in correlations:
+        result = np.zeros((parts, count, count))
+        for chunk, some in zip(chunks, pieces, strict=True):
+            kernel = over_z[np.ix_(z, z[chunk])] * over_y[np.ix_(y, y[chunk])]
+            for part, (matrix, piece) in enumerate(zip(sums, some, strict=True)):
+                result[part] += (piece @ (matrix @ kernel).T).T
+        yield result
+
+
+def covariance_of_lines(lines: GridLines, weight: np.ndarray, over_z, over_y) -> np.ndarray:
+    """As `covariances_of_lines`, for one correlation."""
+    (found,) = covariances_of_lines(lines, weight, [(over_z, over_y)])
+    return found
 
 
 def covariance_with_nodes(

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor
 
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.lines.grid_lines import covariance_of_lines
+from lidar_mi.retrieval.lines.grid_lines import covariances_of_lines
 
 # Values of u's standard deviation, m/s, and number of lengths that the evidence is averaged over.
 _STDS = np.geomspace(0.05, 10, 16)
@@ -98,38 +98,59 @@ def probable_statistics(
     lengths = np.geomspace(spacing / 4, 2 * extent, _LENGTHS) if length is None else [length]
     exponents = _EXPONENTS if exponent is None else (float(exponent),)
     weight = np.stack([lines.forward * s[lines.z, lines.y] for s in relative_stds.values()], -1)
-    choices, shapes, evidence = [], [], []
-    for one_exponent, one_length in itertools.product(exponents, lengths):
-        correlations = [correlation(axis, one_length, one_exponent) for axis in (z, y)]
-        for power, shape in zip(
-            relative_stds, covariance_of_lines(lines, weight, *correlations), strict=True
-        ):
-            for one_std in stds:
-                factor = cho_factor(fixed + one_std**2 * shape, lower=True)
-                square = float(residual @ cho_solve(factor, residual))
-                evidence.append(-np.log(np.diag(factor[0])).sum() - square / 2)
-                shapes.append(shape)
-                choices.append(
-                    Statistics(
-                        float(one_std),
-                        float(one_length),
-                        float(power),
-                        one_exponent,
-                        0.0,
-                        (),
-                        square / len(residual),
-                    )
-                )
+    pairs = list(itertools.product(exponents, lengths))
+    correlations = [(correlation(z, size, a), correlation(y, size, a)) for a, size in pairs]
+    shapes = np.concatenate(list(covariances_of_lines(lines, weight, correlations)))
+    evidence, square = evidence_of(fixed, residual, shapes, stds)
+    choices = [
+        Statistics(float(one), float(size), float(power), a, 0.0, (), misfit / len(residual))
+        for ((a, size), power), squares in zip(
+            itertools.product(pairs, relative_stds), square, strict=True
+        )
+        for one, misfit in zip(stds, squares.tolist(), strict=True)
+    ]
     # steps of the standard deviation grow with it
-    probability = np.exp(np.array(evidence) - max(evidence)) * [choice.std for choice in choices]
+    evidence = evidence.ravel()
+    probability = np.exp(evidence - evidence.max()) * [choice.std for choice in choices]
     probability /= probability.sum()
     steps = (np.arange(_DRAWN) + 0.5) / _DRAWN
     drawn = np.searchsorted(np.cumsum(probability), steps).clip(max=len(choices) - 1)
     found = [
         choices[k]._replace(
             probability=times / _DRAWN,
-            factor=cho_factor(fixed + choices[k].std ** 2 * shapes[k], lower=True),
+            factor=cho_factor(fixed + choices[k].std ** 2 * shapes[k // len(stds)], lower=True),
         )
         for k, times in zip(*np.unique(drawn, return_counts=True), strict=True)
     ]
     return found, choices[int(np.argmax(evidence))]
+
+
+def evidence_of(
+    fixed: np.ndarray, residual: np.ndarray, shapes: np.ndarray, stds: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Evidence of standard deviations of u for several shapes of its covariance.
+
+    Where ``fixed`` is white, S = fixed + std^2 shape has the eigenvectors of the shape for all
+    standard deviations.
+
+    Parameters
+    ----------
+    fixed : array (lines, lines)
+        Covariance of the lines' velocities without u's, positive definite.
+    residual : array (lines,)
+        Velocities less their expectation.
+    shapes : array (shapes, lines, lines)
+    stds : array (stds,)
+
+    Returns
+    -------
+    evidence, square : array (shapes, stds)
+        Logarithm of the normal density of the residual, but for a constant of ``fixed``; and
+        residual^T S^-1 residual.
+    """
+    white = np.linalg.inv(np.linalg.cholesky(fixed))
+    values, vectors = np.linalg.eigh(white @ shapes @ white.T)
+    data = (white @ residual) @ vectors
+    variance = 1 + stds[:, None] ** 2 * values[:, None].clip(0)
+    square = (data[:, None] ** 2 / variance).sum(-1)
+    return -np.log(variance).sum(-1) / 2 - square / 2, square

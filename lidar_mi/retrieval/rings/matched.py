@@ -21,11 +21,13 @@ from lidar_mi.retrieval.rings.scoring import cell_variance
 from lidar_mi.retrieval.threads import threads_for
 
 ITERATIONS = 8
-CLOSE = 0.01  # standard deviations, largest last step of an image that is read
+# Standard deviations, largest last step of an image that is read: a further one would be a fifth of
+# it or less.
+CLOSE = 0.1
 # Parameters whose derivatives do not grow with the light.
 _ADDED = ("level", "background")
 _PLACE = [PARAMETERS.index("x"), PARAMETERS.index("y")]
-_LEVEL, _BACKGROUND = PARAMETERS.index("level"), PARAMETERS.index("background")
+_LEVEL = PARAMETERS.index("level")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +44,8 @@ class MatchedScore:
         Of the cells about the reference's centre.
     values : torch.Tensor, shape (`PARAMETERS`,)
         Of the reference; x and y from the top left pixel's centre.
+    mean, dark : torch.Tensor, shape (cells,)
+        Of the reference, and of the same without its light.
     score : torch.Tensor, shape (names, cells)
         J^T W.
     inverse : torch.Tensor, shape (names, names)
@@ -55,6 +59,8 @@ class MatchedScore:
     names: list[str]
     waves: Waves
     values: torch.Tensor
+    mean: torch.Tensor
+    dark: torch.Tensor
     score: torch.Tensor
     inverse: torch.Tensor
     sensitivity: torch.Tensor
@@ -126,10 +132,21 @@ def matched_score(
     fisher = fisher + torch.diag(prior_information(model, names, at.device))
     unit = fisher.diagonal().rsqrt()
     inverse = torch.linalg.inv(fisher * unit[:, None] * unit) * unit[:, None] * unit
-    score = jacobian[0] * weight
-    sensitivity = fit.sensitivity.mean(0)
+    unlit = at.clone()
+    unlit[:, _LEVEL] = 0
+    dark = mean_and_jacobian(model, waves, unlit)[0][0]
     return MatchedScore(
-        model, noise, names, waves, values, score, inverse, sensitivity, fit.systematic
+        model,
+        noise,
+        names,
+        waves,
+        values,
+        mean[0],
+        dark,
+        jacobian[0] * weight,
+        inverse,
+        fit.sensitivity.mean(0),
+        fit.systematic,
     )
 
 
@@ -165,15 +182,17 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
         means = score.waves.cells.means(images)
     model, names = score.model, score.names
     columns = [PARAMETERS.index(name) for name in names]
-    at = _started(score, means)
+    at, mean = _started(score, means)
     information = prior_information(model, names, means.device)
     middle = model.start(means.device)[:, columns]
     influence = score.inverse @ score.score
     # errors by noise, and of the priors
     squares, kept = influence**2, score.inverse**2 @ information
     added = torch.tensor([name in _ADDED for name in names], device=means.device)
-    for _ in range(ITERATIONS):
-        mean = mean_and_jacobian(model, score.waves, at)[0]
+    close = torch.zeros(len(at), dtype=torch.bool, device=at.device)
+    for number in range(ITERATIONS):
+        if number:
+            mean = mean_and_jacobian(model, score.waves, at)[0]
         variance = cell_variance(mean, at, score.noise) / score.waves.cells.count
         brighter = (at[:, _LEVEL] / score.values[_LEVEL]).clamp(0.1, 10)[:, None]
         grown = torch.where(added, 1.0, brighter)
@@ -181,10 +200,10 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
         misfit = means - mean
         total = misfit @ influence.T + (middle - at[:, columns]) * information @ score.inverse
         step = total / grown
-        close = (step.abs() <= CLOSE * std).all(1)
+        at[:, columns] += torch.where(close[:, None], 0.0, step)
+        close |= (step.abs() <= CLOSE * std).all(1)
         if close.all():
             break
-        at[:, columns] += torch.where(close[:, None], 0.0, step)
     freedom = means.shape[1] - len(names)
     chi_square = (misfit**2 / variance).sum(1) / freedom
     values = at.clone()
@@ -198,13 +217,12 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
     return MatchedRead(values, spread, chi_square, read, each, score.systematic)
 
 
-def _started(score: MatchedScore, means: torch.Tensor) -> torch.Tensor:
-    """The reference with the light of every image; x and y from the cells' centre."""
+def _started(score: MatchedScore, means: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """The reference with the light of every image, and its mean; x and y from the cells' centre."""
     at = score.values.repeat(len(means), 1)
     at[:, _PLACE] = 0
     count = score.waves.cells.count
-    own = mean_and_jacobian(score.model, score.waves, at[:1])[0]
-    background = score.values[_BACKGROUND]
-    light, reference = (part @ count / count.sum() - background for part in (means, own))
-    at[:, _LEVEL] *= (light / reference).clamp(0.1, 10)
-    return at
+    lit = score.mean - score.dark
+    brighter = (((means - score.dark) @ count) / (lit @ count)).clamp(0.1, 10)
+    at[:, _LEVEL] *= brighter
+    return at, score.dark + brighter[:, None] * lit
