@@ -4,10 +4,13 @@ Detects: digits that promise more or less than the standard error allows, column
 up, text of a user's that becomes HTML.
 """
 
+import io
 import math
 
 import pytest
 
+from lidar_mi.cli.terminal import print_table
+from lidar_mi.progress import Terminal
 from lidar_mi.tables import Table, as_html, as_text, with_error
 
 
@@ -49,3 +52,14 @@ def test_text_is_no_html():
     page = as_html(TABLES, b"\x89PNG")
     assert "<caption>fruit &lt;b&gt;</caption>" in page and "<td>apple &amp; pear</td>" in page
     assert page.count("<table>") == 2 and 'src="data:image/png;base64,iVBORw=="' in page
+
+
+def test_words_of_wide_tables_are_not_cut(monkeypatch):
+    """Nine columns as of winds in three dimensions, on a terminal of 80 columns."""
+    shown = Terminal(width=80, file=io.StringIO())
+    monkeypatch.setattr("lidar_mi.cli.terminal.output", shown)
+    heads = ("winds from", "method", *"uvw", "far u", "far v", "far w", "valid")
+    print_table(Table("title", [("backscatter", "variational", *["0.08"] * 6, "100%")], heads))
+    text = shown.file.getvalue()
+    assert "backscatter" in text and "variational" in text
+    assert max(map(len, text.splitlines())) <= 80

@@ -1,6 +1,6 @@
 """Advection of a scalar field by the wind: the field at other times from the field at one."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import xarray as xr
@@ -102,12 +102,35 @@ def advect(
     InputError
         Other dims, unequal grids, uneven axes, values or dt not finite.
     """
-    if not np.isfinite(dt):
-        raise InputError(f"advection.dt: {dt} s is not allowed; any finite time is")
-    if steps != int(steps) or steps < 1:
-        raise InputError(f"advection.steps: {steps} is not allowed; a whole number >= 1 is")
-    *_, last = _carried(field, v, w, u, [dt / int(steps)] * int(steps), [int(steps) - 1])
-    return last
+    _check_step(dt, steps)
+    _check_grid(field, v, w, u)  # whose fault it would be of the field, of the velocities else
+    return carrier(v, w, dt, steps, u)(field)
+
+
+def carrier(
+    v: xr.DataArray, w: xr.DataArray, dt: float, steps: int = 4, u: xr.DataArray | None = None
+) -> Callable[[xr.DataArray], xr.DataArray]:
+    """`advect` for many fields of one flow, whose trajectories are followed once.
+
+    Returns
+    -------
+    callable
+        From a field to the field after dt.
+    """
+    _check_step(dt, steps)
+    _check_grid(v, v, w, u)
+    speeds = _speeds(v, v, w, u)
+    durations = [dt / int(steps)] * int(steps)
+    places = []
+    for speed in zip(*speeds, strict=True):
+        *_, last = _departures(speed, durations)
+        places.append(last)
+
+    def carry(field: xr.DataArray) -> xr.DataArray:
+        _check_grid(field, v, w, u)
+        return _reader(field, u is not None)(places)
+
+    return carry
 
 
 def advect_to(
@@ -154,6 +177,28 @@ def advect_to(
 
 def _carried(field, v, w, u, steps, wanted) -> Iterator[xr.DataArray]:
     """The field after successive steps (s), after those of the ``wanted`` numbers."""
+    _check_grid(field, v, w, u)
+    read = _reader(field, u is not None)
+    paths = [_departures(speed, steps) for speed in zip(*_speeds(field, v, w, u), strict=True)]
+    for number, places in enumerate(zip(*paths, strict=True)):
+        if number in wanted:
+            yield read(places)
+
+
+def _check_step(dt: float, steps: int) -> None:
+    if not np.isfinite(dt):
+        raise InputError(f"advection.dt: {dt} s is not allowed; any finite time is")
+    if steps != int(steps) or steps < 1:
+        raise InputError(f"advection.steps: {steps} is not allowed; a whole number >= 1 is")
+
+
+def _velocity(v, w, u) -> dict[str, tuple[str, xr.DataArray]]:
+    """Names and components by the axis that they are along."""
+    along = {} if u is None else {"x": ("u", u)}
+    return {**along, "y": ("v", v), "z": ("w", w)}
+
+
+def _check_grid(field, v, w, u) -> None:
     dims = set(field.dims)
     if dims not in ({"y", "z"}, {"x", "y", "z"}) or len(field.dims) != len(dims):
         raise InputError(
@@ -163,14 +208,12 @@ def _carried(field, v, w, u, steps, wanted) -> Iterator[xr.DataArray]:
         raise InputError(
             "advection.u: not allowed for a plane (y, z); expected a field on (x, y, z)"
         )
-    velocity = {"y": ("v", v), "z": ("w", w)}
-    if u is not None:
-        velocity = {"x": ("u", u), **velocity}
-    spacing = {axis: _axis(field, axis)[1] for axis in velocity}
+    velocity = _velocity(v, w, u)
+    finest = min(_axis(field, axis)[1] for axis in velocity)
     for name, component in (("field", field), *velocity.values()):
         if set(component.dims) != dims or any(
             component.sizes[d] != field.sizes[d]
-            or not np.allclose(component[d], field[d], rtol=0, atol=1e-3 * min(spacing.values()))
+            or not np.allclose(component[d], field[d], rtol=0, atol=1e-3 * finest)
             for d in dims
         ):
             raise InputError(
@@ -184,20 +227,33 @@ def _carried(field, v, w, u, steps, wanted) -> Iterator[xr.DataArray]:
                 "nowhere"
             )
 
-    order = [d for d in ("x", "y", "z") if d in dims]
-    # what moves as one: the volume, or every plane by itself
-    shape = (-1, *(field.sizes[axis] for axis in velocity))
-    pieces = field.transpose(*order).values.astype(float).reshape(shape)
-    speeds = [
-        component.transpose(*order).values.astype(float).reshape(shape) / spacing[axis]
-        for axis, (_, component) in velocity.items()
+
+def _pieces(field, whole: bool) -> np.ndarray:
+    """What moves as one: the ``whole`` volume, or every plane by itself."""
+    order = [axis for axis in ("x", "y", "z") if axis in field.dims]
+    values = field.transpose(*order).values.astype(float)
+    return values.reshape(-1, *values.shape[-3 if whole else -2 :])
+
+
+def _speeds(grid, v, w, u) -> list[np.ndarray]:
+    """Components of the velocity of all `_pieces`, in nodes per second."""
+    return [
+        _pieces(component, u is not None) / _axis(grid, axis)[1]
+        for axis, (_, component) in _velocity(v, w, u).items()
     ]
+
+
+def _reader(field, whole: bool) -> Callable[[Sequence[np.ndarray]], xr.DataArray]:
+    """From places of the nodes of all `_pieces` (node indices) to the field there."""
+    pieces = _pieces(field, whole)
     samplers = [_sampler(piece) for piece in pieces]
-    paths = [_departures(speed, steps) for speed in zip(*speeds, strict=True)]
-    result = field.transpose(*order).astype(float)
-    for number, places in enumerate(zip(*paths, strict=True)):
-        if number in wanted:
-            moved = np.stack([sample(p) for sample, p in zip(samplers, places, strict=True)])
-            if pieces.min() >= 0:
-                moved = np.maximum(moved, 0.0)
-            yield result.copy(data=moved.reshape(result.shape)).transpose(*field.dims)
+    result = field.transpose(*(axis for axis in ("x", "y", "z") if axis in field.dims))
+    result = result.astype(float)
+
+    def read(places: Sequence[np.ndarray]) -> xr.DataArray:
+        moved = np.stack([sample(p) for sample, p in zip(samplers, places, strict=True)])
+        if pieces.min() >= 0:
+            moved = np.maximum(moved, 0.0)
+        return result.copy(data=moved.reshape(result.shape)).transpose(*field.dims)
+
+    return read

@@ -31,6 +31,9 @@ def print_table(table: Table) -> None:
         framed.add_column(head, justify="right" if k and table.heads else "left")
     for row in table.rows:
         framed.add_row(*row)
+    # two columns less, where words would be cut
+    wide = output.measure(framed, options=output.options.update(max_width=1000)).maximum
+    framed.pad_edge = not table.heads or wide <= output.width
     output.print(framed)
     if table.note:
         output.print(table.note)

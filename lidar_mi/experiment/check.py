@@ -1,6 +1,7 @@
 """Summary of an experiment before its run, with the checks of a run, in numbers."""
 
 import math
+import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -26,6 +27,9 @@ from lidar_mi.rendering.memory import ceiling
 from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
 
+LEAST_SHOWN = 0.5
+"""Seconds of a part of a run that is shown."""
+
 
 def sections(
     asked: Experiment, beside: str | Path = ".", notice: Notice = silent, *, timed: bool = False
@@ -47,8 +51,9 @@ def sections(
     InputError
         Anything that a run would refuse before it starts.
     """
+    start = time.process_time()
     prepared = experiment.prepare(asked, beside, notice)
-    ahead = prepared.results
+    preparation, ahead = time.process_time() - start, prepared.results
     if asked.wake:
         yield from _backscatter(asked, ahead["truth"], ahead["plans"][0], ahead["air"])
         if asked.scan.timing:
@@ -62,7 +67,7 @@ def sections(
             yield "scan of the Doppler lidar", _timing(asked, lines_schedule(asked, beside))
     if timed:
         notice("timing a few samples and a retrieval", None)
-        yield "cost of the run, to a factor of 2", _cost(asked, ahead)
+        yield "cost of the run, to a factor of 2", _cost(asked, ahead, preparation)
     if prepared.warnings:
         yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
 
@@ -74,7 +79,7 @@ def _backscatter(
     rows = [(axis, _span(wind[axis].values, "m")) for axis in ("y", "z")]
     rows += [(name, _span(wind[name].values, "m/s")) for name in ("u", "v", "w") if name in wind]
     if not asked.wake.turbine:
-        rows.append(("vortices", sense_of_rotation(find_cores(wind))))
+        rows.append(("vortices", sense_of_rotation(wind, find_cores(wind))))
     divergence = relative_divergence(wind)
     if divergence == divergence:
         rows.append(("divergence of v, w", f"{divergence:.2g} of the vorticity's rms"))
@@ -123,10 +128,11 @@ def _light(
     return rows
 
 
-def _cost(asked: Experiment, ahead: Mapping) -> list[tuple[str, str]]:
+def _cost(asked: Experiment, ahead: Mapping, preparation: float) -> list[tuple[str, str]]:
     """Time of the parts of a run on one core of this machine, and its memory."""
-    found = cost(asked, ahead)
+    found = cost(asked, ahead, preparation)
     names = {
+        "preparation": "reading, advection of the air",
         "rendering": "rendering (all cores share it)",
         "images": "wind from the images",
         "rings": "rings of the Doppler lidar",
@@ -134,14 +140,20 @@ def _cost(asked: Experiment, ahead: Mapping) -> list[tuple[str, str]]:
         "figures": "figures and report",
     }
     parts = found._asdict()
-    rows = [(text, f"about {duration(parts[key])}") for key, text in names.items() if parts[key]]
+    rows = [
+        (text, f"about {duration(parts[key])}")
+        for key, text in names.items()
+        if parts[key] >= LEAST_SHOWN
+    ]
     rows.append(("all, on one core", f"about {duration(found.total)}"))
+    beams = in_states = 0
     if asked.wake:
         plan = ahead["plans"][0]
+        beams = plan.y.size * plan.z.size
         in_states = values_of_states(asked, ahead["flows"], ahead["plans"])
-        expected = forecast(asked, plan.y.size * plan.z.size, in_states)
-        allowed = ceiling(asked.render.memory)
-        rows.append(("memory", f"about {expected / 1e9:.2g} GB, at most {allowed / 1e9:.3g} GB"))
+    expected = forecast(asked, beams, in_states) / 1e9
+    allowed = ceiling((asked.render if asked.wake else asked.doppler.render).memory) / 1e9
+    rows.append(("memory", f"about {expected:.2g} GB, at most {allowed:.3g} GB"))
     return rows
 
 

@@ -17,7 +17,7 @@ from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.pipeline import has_error_budget, has_vortices
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.rendering import IMAGES, render_images
-from lidar_mi.retrieval.method_names import ImageMethod, RingMethod
+from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMethod
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
 PROBE_SECONDS = 0.115
@@ -38,8 +38,8 @@ LEVEL = (0.08, 5e-6)
 """A level of the texture sweep beside its correlation."""
 CAUSES = 5
 """Retrievals of an error budget, per method."""
-VOXEL = 7e-5
-"""Seconds of a voxel of a volume, per method."""
+VOLUME_METHODS = {VolumeMethod.CORRELATION: (0.5, 1.1e-5), VolumeMethod.VARIATIONAL: (0.5, 3.4e-5)}
+"""Seconds of a retrieval from two volumes: fixed, and per voxel; strides do not matter."""
 RING_IMAGE = 1.3e-6
 """Seconds of a pixel of an image of rings, without noise, of 16 samples."""
 RING_CALIBRATION = 3e-6
@@ -55,6 +55,7 @@ RING_BOUND = 6e-6
 VORTICES = 2.5
 FIGURES = {"images": 8.0, "rings": 2.5, "sensor": 2.5}
 """Seconds of the figures of a chapter, and its part of the report."""
+_PROBES = 4
 _SAMPLES = 1.5e6
 """Samples of the render probe, times orders: half a second."""
 
@@ -62,6 +63,7 @@ _SAMPLES = 1.5e6
 class Cost(NamedTuple):
     """Processor time of the parts of a run, s."""
 
+    preparation: float
     rendering: float
     images: float
     rings: float
@@ -74,7 +76,7 @@ class Cost(NamedTuple):
         return START + sum(self)
 
 
-def cost(experiment: Experiment, ahead: Mapping[str, Any]) -> Cost:
+def cost(experiment: Experiment, ahead: Mapping[str, Any], preparation: float = 0.0) -> Cost:
     """Processor time of a run on this machine, to a factor of two.
 
     Parameters
@@ -82,10 +84,13 @@ def cost(experiment: Experiment, ahead: Mapping[str, Any]) -> Cost:
     experiment : Experiment
     ahead : mapping
         Results of the stages that `lidar_mi.experiment.run.prepare` has computed.
+    preparation : float
+        Processor time that it took, s.
     """
     here = slowness()
     rendering = 2 * render_seconds(experiment, ahead) if experiment.wake else 0.0
     return Cost(
+        preparation,
         rendering,
         here * _images(experiment, ahead),
         here * _rings(experiment),
@@ -99,8 +104,9 @@ def slowness() -> float:
     """Time of `probe` here over that beside which the costs were measured; once per process."""
     probe()  # loads libraries
     start = time.process_time()
-    probe()
-    return (time.process_time() - start) / PROBE_SECONDS
+    for _ in range(_PROBES):
+        probe()
+    return (time.process_time() - start) / (_PROBES * PROBE_SECONDS)
 
 
 def probe() -> None:
@@ -148,7 +154,7 @@ def _images(experiment: Experiment, ahead: Mapping[str, Any]) -> float:
     pixels = plan.y.size * plan.z.size
     if experiment.volume:
         voxels = pixels * experiment.scan.gate_count
-        return VOXEL * voxels * len(experiment.volume.methods)
+        return sum(_at(VOLUME_METHODS[method], voxels) for method in experiment.volume.methods)
     settings = experiment.retrieval
     each = sum(_at(IMAGE_METHODS[method], pixels) for method in settings.methods)
     everything = settings.sources == "all"

@@ -13,6 +13,7 @@ from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.io.exr import MOST_LAYERS
 from lidar_mi.rendering.memory import (
+    PER_PIXEL,
     PER_SAMPLE,
     PROGRAM,
     ceiling,
@@ -33,6 +34,8 @@ CONTRIBUTIONS = 5
 """Contributing samples required per pixel, on average: 0.7 % of all pixels then have none."""
 
 
+PER_SPEED = 160
+"""Bytes of a pixel of the fringe camera, for every speed but the first; measured: 157."""
 PER_STATE = 34
 """Bytes of a value of moving air's states: three arrays in double precision while they are made,
 two scans in single precision with what is mixed of them; measured, with molecules."""
@@ -43,14 +46,28 @@ def forecast(experiment: Experiment, beams: int, in_states: int = 0) -> float:
 
     Parameters
     ----------
+    beams : int
+        Of the backscatter lidar in an image; 0: there is none.
     in_states : int
         Values of all states of moving air in a scan, see `truth_in_time.values_of_states`.
     """
+    rings = _of_rings(experiment)
+    if not beams:
+        return PROGRAM + rings
     render, gates = experiment.render, experiment.scan.gate_count
     samples = beams * max(render.samples_per_beam, 2 * gates)
     at_once = samples_at_once(render.samples_per_pass, render.memory)
-    air = PER_STATE * in_states
-    return PROGRAM + air + _per_beam(experiment, gates) * beams + PER_SAMPLE * min(samples, at_once)
+    images = _per_beam(experiment, gates) * beams + PER_SAMPLE * min(samples, at_once)
+    return PROGRAM + PER_STATE * in_states + images + rings
+
+
+def _of_rings(experiment: Experiment) -> float:
+    """Bytes of the images of rings while they are fitted."""
+    doppler = experiment.doppler
+    if doppler is None:
+        return 0.0
+    pixels = doppler.camera.width * doppler.camera.height
+    return pixels * (PER_PIXEL + PER_SPEED * (len(doppler.v_los) - 1))
 
 
 def _per_beam(experiment: Experiment, gates: int) -> float:

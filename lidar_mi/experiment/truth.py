@@ -1,6 +1,8 @@
 """The truth of an experiment: flow and extinction at both times, in the lidar's frame."""
 
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -10,7 +12,7 @@ import xarray as xr
 from scipy import constants, integrate, stats
 
 from lidar_mi.arguments import checked_arguments
-from lidar_mi.atmosphere.advection import advect
+from lidar_mi.atmosphere.advection import carrier
 from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
 from lidar_mi.atmosphere.texture import corrsin_obukhov
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
@@ -23,6 +25,7 @@ from lidar_mi.experiment.schema_air import ExtinctionMapping, Wake
 from lidar_mi.io.wake_file import read_wake
 
 Flows = tuple[xr.Dataset, xr.Dataset | None]
+Advection = Callable[[xr.DataArray], xr.DataArray]
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,10 @@ class Truth:
 
 @checked_arguments
 def make_truth(
-    experiment: Experiment, beside: str | Path | None = None, flows: Flows | None = None
+    experiment: Experiment,
+    beside: str | Path | None = None,
+    flows: Flows | None = None,
+    advected: Advection | None = None,
 ) -> Truth:
     """The flow and the extinction at both times, on the scan's grid, in the lidar's frame.
 
@@ -56,6 +62,8 @@ def make_truth(
         Folder in which the wake's file is searched first. Default: the experiment's.
     flows : optional
         From `read_flows` of an experiment that differs in extinction and texture alone.
+    advected : callable, optional
+        From `advection_by` the same flows.
 
     Returns
     -------
@@ -83,8 +91,9 @@ def make_truth(
     mapping = experiment.wake.extinction
     smooth1 = extinction_of(first, mapping, first, second)
     flow = mean_flow((first, second))
+    advected = advected or advection_by(experiment, (first, second))
     if second is None:
-        smooth2 = _advected(smooth1, flow, experiment)
+        smooth2 = advected(smooth1)
     else:
         smooth2 = extinction_of(second, mapping, first, second)
     texture = experiment.wake.texture
@@ -103,10 +112,10 @@ def make_truth(
         factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
         if second is None:
             rough1 = smooth1 * factor
-            rough2 = _advected(rough1, flow, experiment)
+            rough2 = advected(rough1)
         else:
             rough1 = smooth1 * factor
-            rough2 = smooth2 * _advected(factor, flow, experiment)
+            rough2 = smooth2 * advected(factor)
     else:
         rough1, rough2 = smooth1, smooth2
     # winds are retrieved from the first gate
@@ -133,14 +142,22 @@ def moves_along(experiment: Experiment) -> bool:
     return experiment.wake.turbine is not None or experiment.volume is not None
 
 
-def _advected(field: xr.DataArray, flow: xr.Dataset, experiment: Experiment) -> xr.DataArray:
-    """A field after dt, in the frame of the gates."""
-    v, w, dt = flow["v"], flow["w"], experiment.platform.dt
-    if float(field.min()) == float(field.max()):
-        return field
-    if not moves_along(experiment):
-        return advect(field, v, w, dt)
-    return advect(field, v, w, dt, u=flow["u"] - experiment.scan.follow)
+def advection_by(experiment: Experiment, flows: Flows) -> Advection:
+    """From a field to the field after dt in the frame of the gates; trajectories are followed once.
+
+    They are followed when they are first needed: a field of one value stays.
+    """
+    flow, dt = mean_flow(flows), experiment.platform.dt
+
+    @functools.cache
+    def carry() -> Advection:
+        along = flow["u"] - experiment.scan.follow if moves_along(experiment) else None
+        return carrier(flow["v"], flow["w"], dt, u=along)
+
+    def advected(field: xr.DataArray) -> xr.DataArray:
+        return field if float(field.min()) == float(field.max()) else carry()(field)
+
+    return advected
 
 
 def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:

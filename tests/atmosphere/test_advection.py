@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.atmosphere.advection import advect, advect_to
+from lidar_mi.atmosphere.advection import advect, advect_to, carrier
 from lidar_mi.atmosphere.texture import corrsin_obukhov
 from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
 from lidar_mi.atmosphere.wake import resample
@@ -234,6 +234,15 @@ def test_simulated_wake_moves_to_its_next_computed_state():
         true = (second[name] - first[name]).isel(inner).values.ravel()
         assert np.corrcoef(ours, true)[0, 1] > lowest
         assert (ours @ true) / (true @ true) == pytest.approx(1, abs=0.1)
+
+
+def test_fields_of_one_flow_are_carried_one_by_one():
+    v, w = rotation(2.0)
+    carry = carrier(v, w, 0.3)
+    for field in (plane(blob), plane(lambda y, z: y * z)):
+        assert np.array_equal(carry(field), advect(field, v, w, 0.3))
+    with pytest.raises(InputError, match="grid"):
+        carry(plane(blob, n=61))
 
 
 def test_bad_input():

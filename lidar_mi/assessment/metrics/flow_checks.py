@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 import xarray as xr
 
-from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.metrics.cores import Core, ring_averages
 
 MOST_DIVERGENCE = 0.5
 """Of a cross-section, by `relative_divergence`. Sections of a simulated wake have 0.1, those of
@@ -45,14 +45,27 @@ def rises(cores: Sequence[Core]) -> bool:
     return port.circulation < 0 < starboard.circulation
 
 
-def sense_of_rotation(cores: Sequence[Core]) -> str:
-    """The vortices of a cross-flow in words, port first."""
+def sense_of_rotation(wind: xr.Dataset, cores: Sequence[Core]) -> str:
+    """The vortices of a cross-flow in words, port first.
+
+    Circulations are averages over rings of 5 to 15 m, or, where these leave the field or meet the
+    other vortex, those at the core radius, which are marked.
+    """
     if not cores:
         return "no vortices"
     found = sorted(cores, key=lambda core: -core.y)
     senses = ", ".join(
-        f"{core.circulation:+.0f} m²/s at y = {core.y:.1f} m, z = {core.z:.1f} m" for core in found
+        f"{_circulation(wind, core, [other for other in found if other is not core])} "
+        f"at y = {core.y:.1f} m, z = {core.z:.1f} m"
+        for core in found
     )
     if len(found) < 2:
         return senses
     return f"{senses}: the pair {'rises' if rises(found) else 'sinks'}"
+
+
+def _circulation(wind: xr.Dataset, core: Core, others: Sequence[Core]) -> str:
+    rings = ring_averages(wind, core, others)
+    if rings is None:
+        return f"{core.circulation:+.0f} m²/s (core of {core.radius:.1f} m)"
+    return f"{rings.circulation:+.0f} m²/s"

@@ -7,7 +7,7 @@ from lidar_mi.assessment.metrics.errors import error_statistics, truth_at_vector
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
-from lidar_mi.experiment.truth import Flows, make_truth
+from lidar_mi.experiment.truth import Flows, advection_by, make_truth
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
@@ -24,12 +24,14 @@ def texture_sweep(experiment: Experiment, flows: Flows, *, log: Log) -> xr.Datas
         ``rmse_v``, ``rmse_w`` (m s^-1) over every vector with a displacement, NaN where there is
         none; ``valid_fraction``.
     """
-    points = []
+    points, advected = [], advection_by(experiment, flows)
     for index, rms in enumerate(LEVELS):
         log.bar(f"retrieving winds at {rms:.0%} texture", index / len(LEVELS))
         texture = experiment.wake.texture.model_copy(update={"rms": rms})
         wake = experiment.wake.model_copy(update={"texture": texture})
-        truth = make_truth(experiment.model_copy(update={"wake": wake}), flows=flows)
+        truth = make_truth(
+            experiment.model_copy(update={"wake": wake}), flows=flows, advected=advected
+        )
         wind = retrieve_wind(
             truth.image(0),
             truth.image(1),
