@@ -14,6 +14,7 @@ from lidar_mi.retrieval.threads import mapped
 # square root of the depth.
 PLATEAU = 1e-3
 EXCESS = 4.0
+MOST_SPOTS = 0.02  # of the pixels may be hot, dead or in bright patches
 SPOT = 6.0  # standard deviations
 # Of the pixels those in every seventh run of so many are looked at first: whole lines of the cache,
 # and a prime, so that it follows no column.
@@ -114,6 +115,18 @@ def spots(image: torch.Tensor, noise: PixelNoise, count: int = 1) -> torch.Tenso
     high, low = high.clamp(min=0), low.clamp(min=0)
     std = [SPOT * (noise.variance(near, near) / count).sqrt() for near in (high, low)]
     return (image > 1.5 * high + std[0]) | (image < 0.5 * low - std[1])
+
+
+def patches(image: torch.Tensor) -> torch.Tensor:
+    """Pixels of bright patches, as of a reflection, and those within 2 px of one.
+
+    Brighter than the crests, taken as the brightest percent, by half of what these are above the
+    median. Where that is more than `MOST_SPOTS` of the pixels it is no patch, and none is.
+    """
+    low, high = np.quantile(image.cpu().numpy(), [0.5, 0.99])
+    bright = (image > high + 0.5 * (high - low)).float()[None, None]
+    wide = torch.nn.functional.max_pool2d(bright, 5, 1, 2)[0, 0] > 0
+    return wide & (wide.float().mean() < MOST_SPOTS)
 
 
 def inside(x: float, y: float, shape: tuple[int, int], name: str = "centre") -> None:

@@ -29,9 +29,10 @@ from lidar_mi.retrieval.rings.bound import (
 )
 from lidar_mi.retrieval.rings.cells import annular_sectors
 from lidar_mi.retrieval.rings.centre import gradient_centre
-from lidar_mi.retrieval.rings.frames import checked, inside, spots
+from lidar_mi.retrieval.rings.frames import MOST_SPOTS, checked, inside, patches, spots
 from lidar_mi.retrieval.rings.mean_image import (
     Waves,
+    images_at_once,
     light_on,
     mean_and_jacobian,
     orders,
@@ -58,9 +59,6 @@ METHODS = ("annular", "pixels")
 STEPS_PER_HARMONIC = 8
 SECTORS = 8
 MOVES = 12  # of the cells toward the rings' centre
-CHUNK_BYTES = 256e6
-AT_ONCE = 64  # images: what they need fits into the cache
-MOST_SPOTS = 0.02  # of the pixels may be hot or dead
 SIGNIFICANT = 5.0  # standard deviations, the least amplitude of rings
 # standard deviations of chi-square above 1 from which stated errors grow with its root
 MISFIT = 4.0
@@ -205,7 +203,8 @@ def fit_rings(
     elif not {"x", "y"} <= set(names):
         centre = model.centre
     task = _Task(model, noise or PixelNoise(), names, max_chi_square, centre, response)
-    size = _chunk(model, method)
+    steps = STEPS_PER_HARMONIC * strongest(model)
+    size = images_at_once(model, steps * SECTORS if method == "annular" else None)
     # many images: each thread has some of its own; few: all threads sum them up, one fits
     starts = range(0, len(images), size)
     with threads_for(0):
@@ -248,15 +247,6 @@ def _systematic(sensitivity: torch.Tensor, covariance: torch.Tensor) -> torch.Te
     return torch.einsum("bi,ij,bj->b", sensitivity, covariance, sensitivity).clamp(min=0).sqrt()
 
 
-def _chunk(model: RingModel, method: str) -> int:
-    """Images at once: about 300 bytes per cell for Jacobian and products."""
-    cells = math.prod(model.shape)
-    if method == "annular":
-        steps = STEPS_PER_HARMONIC * strongest(model)
-        cells = min(cells, steps * SECTORS * int(1 + cells // model.order_spacing))
-    return max(1, min(AT_ONCE, int(CHUNK_BYTES // (300 * cells))))
-
-
 class _Task(NamedTuple):
     """The settings common to all images of a call."""
 
@@ -273,30 +263,43 @@ class _Task(NamedTuple):
         """Whether the centre is fitted."""
         return "x" in self.free or "y" in self.free
 
+    def without(self, bad: torch.Tensor) -> "_Task":
+        given = torch.ones_like(bad).double() if self.response is None else self.response
+        return self._replace(response=torch.where(bad, 0.0, given))
+
 
 def _fit(images, task: _Task, number: int, method: str) -> RingFit:
     """`fit_rings` for some of the images, from the ``number``-th on.
 
-    They have common cells, about the middle of their centres. An image without rings about that
-    centre, or with its own centre too far from it, gets cells of its own.
+    If one is refused, each is fitted alone; what is refused then, without its bright patches.
     """
+    try:
+        return _fit_together(images, task, number, method)
+    except InputError:
+        if len(images) > 1:
+            each = enumerate(images[:, None], number)
+            return _joined([_fit(one, task, k, method) for k, one in each])
+        bright = patches(images[0])
+        if method != "annular" or task.spotless or not bright.any():
+            raise
+    fit = _fit_together(images, task.without(bright), number, method)
+    return replace(fit, outliers=fit.outliers + bright.double().mean())
+
+
+def _fit_together(images, task: _Task, number: int, method: str) -> RingFit:
+    """Cells are common, about the middle of the centres; an image far from it gets its own."""
     mean = images.mean(0, dtype=torch.float32)
     centre = task.centre or gradient_centre(mean, task.response)
     inside(*centre, task.model.shape, f"images[{number}]: centre")
     near = reach(task.model)
-    try:
-        for _ in range(MOVES):
-            fit = _fit_about(centre, images, task, number, method)
-            away = (fit.of("x") - centre[0], fit.of("y") - centre[1])
-            middle = [float(part.median()) for part in away]
-            if not task.moves or math.hypot(*middle) <= near:
-                break
-            centre = (centre[0] + middle[0], centre[1] + middle[1])
-            inside(*centre, task.model.shape, f"images[{number}]: centre")
-    except InputError:
-        if len(images) == 1:
-            raise
-        return _joined([_fit(one[None], task, number + k, method) for k, one in enumerate(images)])
+    for _ in range(MOVES):
+        fit = _fit_about(centre, images, task, number, method)
+        away = (fit.of("x") - centre[0], fit.of("y") - centre[1])
+        middle = [float(part.median()) for part in away]
+        if not task.moves or math.hypot(*middle) <= near:
+            break
+        centre = (centre[0] + middle[0], centre[1] + middle[1])
+        inside(*centre, task.model.shape, f"images[{number}]: centre")
     if task.moves and len(images) > 1:
         far = torch.hypot(*(part - shift for part, shift in zip(away, middle, strict=True))) > near
         for k in far.nonzero()[:, 0].tolist():
@@ -314,11 +317,8 @@ def _without_spots(fit: RingFit, images, task: _Task, number: int) -> RingFit:
     for k in (fit.chi_square > POOR).nonzero()[:, 0].tolist():
         bad = spots(images[k].double(), task.noise)
         if 0 < bad.sum() < MOST_SPOTS * bad.numel():
-            given = torch.ones_like(bad).double() if task.response is None else task.response
             place = float(fit.of("x")[k]), float(fit.of("y")[k])
-            clean = task._replace(
-                response=torch.where(bad, 0.0, given), spotless=True, centre=place
-            )
+            clean = task.without(bad)._replace(spotless=True, centre=place)
             alone = _fit(images[k, None], clean, number + k, "annular")
             fit = _joined([_part(fit, slice(0, k)), alone, _part(fit, slice(k + 1, None))])
     return fit

@@ -33,6 +33,8 @@ from lidar_mi.retrieval.rings.model import BACKGROUND, LIGHT, PARAMETERS, RingMo
 
 PIXEL_R2 = 1 / 6  # px^2, mean squared distance of a pixel's points from its centre
 BLOCK = 1 << 16  # cells at once, where every pixel is one
+CHUNK_BYTES = 256e6
+AT_ONCE = 64  # images: what they need fits into the cache
 SHAPE = ("temperature", "aerosol", "damping", "roughness")  # parameters of the profile of a ring
 
 
@@ -55,6 +57,17 @@ class Waves(NamedTuple):
     by_blur: torch.Tensor
     order: torch.Tensor
     variance: torch.Tensor
+
+
+def images_at_once(model: RingModel, per_order: int | None = None) -> int:
+    """Images in one batch: about 300 bytes a cell for Jacobian and products.
+
+    Cells are the pixels, or ``per_order`` in every order of interference.
+    """
+    cells = math.prod(model.shape)
+    if per_order:
+        cells = min(cells, per_order * int(1 + cells // model.order_spacing))
+    return max(1, min(AT_ONCE, int(CHUNK_BYTES // (300 * cells))))
 
 
 def reach(model: RingModel) -> float:

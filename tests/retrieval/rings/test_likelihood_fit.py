@@ -280,6 +280,21 @@ def test_outliers_are_left_out_and_counted():
     assert abs(float(fit.v_los.mean()) - 20) < 4 * float(fit.v_los_std.mean()) / np.sqrt(8)
 
 
+@pytest.mark.parametrize("size, level", [(6, 20000.0), (10, 1500.0), (16, 5000.0)])
+def test_bright_patches_are_left_out(size, level):
+    """A reflection that keeps the fit from converging: without it the speed is as before."""
+    images = exposures("read noise", 4, 21, **COARSE)
+    spoiled = images.clone()
+    spoiled[:, 60 : 60 + size, 150 : 150 + size] += level
+    given = ring_model(**COARSE), PixelNoise(5)
+    clean, fit = fit_rings(images, *given), fit_rings(spoiled, *given)
+    # (16 + 4)^2 of 46800 pixels are left out
+    change = (fit.v_los - clean.v_los).double()
+    assert float(change.abs().max()) < 0.5 * float(clean.v_los_std.mean())
+    left = (size + 4) ** 2 / images[0].numel()
+    assert left - 1e-3 < float(fit.outliers.min()) <= float(fit.outliers.max()) < left + 0.02
+
+
 def test_known_responses_and_a_mask():
     """Pixels that differ by 5 %, a dead block: right with their responses, not as a plain chip."""
     rng = np.random.default_rng(22)
@@ -295,7 +310,10 @@ def test_known_responses_and_a_mask():
     assert abs(float(error.mean())) < 4 / np.sqrt(16)
     # 0.68 .. 1.32 of 16: four standard deviations
     assert float((error**2).mean()) == pytest.approx(1, abs=4 * np.sqrt(2 / 16))
-    assert float(fit.chi_square.mean()) < 1.05
+    # each frame scatters by (2 / cells)^(1/2) = 0.05, here taken from the frames
+    scatter = float(fit.chi_square.std())
+    assert abs(float(fit.chi_square.mean()) - 1) < 4 * scatter / np.sqrt(16) < 0.06
+    assert float(fit.chi_square.max()) < 1 + 4 * scatter
     masked = (known > 0).double()
     plain = fit_rings(
         images, ring_model(**COARSE), PixelNoise(5), response=masked, max_chi_square=np.inf
@@ -324,23 +342,22 @@ def test_aerosol_up_to_half_of_the_echo(aerosol, number):
         allowed = 4 * np.sqrt(expected * (1 - expected) / number)
         assert (np.abs(error) < limit).mean() == pytest.approx(expected, abs=allowed)
     found = fit.of("aerosol").double() - aerosol
-    # pixels as large as here average the narrow line's rings to 0.002 of it
+    # pixels as large as here blur the narrow line's rings: 0.0014 too little of 0.5, without noise
+    plain = fit_rings(torch.as_tensor(mean[None]), air_model(), PixelNoise(5))
+    blurred = float(plain.of("aerosol")) - aerosol
+    assert -0.004 * aerosol - 1e-4 < blurred < 1e-4
     known = float(fit.std_of("aerosol").mean()) / np.sqrt(number)
-    assert abs(float(found.mean())) < 4 * known + 2e-3
+    assert abs(float(found.mean()) - blurred) < 4 * known
 
 
 @pytest.mark.slow
-def test_rate_of_the_bound_over_a_thousand_frames():
-    """Rms error over 1008 frames in batches of 63: at most 1.05 of the bound (known to 2.2 %)."""
-    bound = bound_of("read noise", **COARSE)
+def test_rate_of_the_bound_over_many_frames():
+    """Rms error over 4032 frames in batches of 63: at most 1.05 of the bound, known to 1.1 %."""
+    bound, given = bound_of("read noise", **COARSE), (ring_model(**COARSE), PixelNoise(5))
     errors = [
-        fit_rings(
-            exposures("read noise", 63, [24, part], **COARSE), ring_model(**COARSE), PixelNoise(5)
-        ).v_los
-        - 20
-        for part in range(16)
+        fit_rings(exposures("read noise", 63, [24, part], **COARSE), *given).v_los - 20
+        for part in range(64)
     ]
     rms = float(torch.cat(errors).square().mean().sqrt())
-    # within its own scatter of 1.05 at most, and not below what is possible
-    scatter = 1 / np.sqrt(2 * 1008)
-    assert 1 - 4 * scatter < rms / bound < 1.05 + 2 * scatter
+    # not below what is possible by more than its own scatter
+    assert 1 - 4 / np.sqrt(2 * 4032) < rms / bound < 1.05
