@@ -63,16 +63,18 @@ def drifts(
     every = doppler.reference.every
     frames, sharing = reference_frames(averaged, every, key)
     step = step_speed(doppler)
-    values, stds = [], []
-    for number in numbers:
-        group, slot = divmod(number, sharing)
-        # steps of the walks that the mean over the pulses contains
-        pulses = np.arange(averaged // frames) + slot * averaged
-        weight = (pulses[:, None] >= np.arange(every)).mean(0) / frames
-        steps = np.random.default_rng([*seed, DRIFTS, group]).standard_normal((frames, every))
-        values.append(step * float((steps @ weight).sum()))
-        stds.append(step * math.sqrt(frames * float(weight @ weight)))
-    return np.array(values), np.array(stds)
+    group, slot = np.divmod(np.asarray(numbers, dtype=int), sharing)
+    weight = _reached(slot, averaged, frames, every) / frames
+    walked = np.empty(len(weight))
+    for one in np.unique(group):
+        steps = np.random.default_rng([*seed, DRIFTS, int(one)]).standard_normal((frames, every))
+        walked[group == one] = weight[group == one] @ steps.sum(0)
+    return step * walked, step * np.sqrt(frames * (weight**2).sum(1))
+
+
+def _reached(slot: np.ndarray, averaged: int, frames: int, every: int) -> np.ndarray:
+    """Fraction of the pulses of an average that come after each step of the walks, (n, every)."""
+    return np.clip(1 + (slot[:, None] * averaged - np.arange(every)) * frames / averaged, 0, 1)
 
 
 def shared_covariance(
@@ -101,9 +103,7 @@ def shared_covariance(
     if sharing == 1:
         return None
     group, slot = np.divmod(np.arange(len(laser_std)), sharing)
-    pulses = slot[:, None] * averaged + np.arange(averaged)
-    steps = np.arange(every)
-    weight = np.stack([(own[:, None] >= steps).mean(0) for own in pulses])
+    weight = _reached(slot, averaged, 1, every)
     found = np.outer(laser_std, laser_std) + step_speed(doppler) ** 2 * weight @ weight.T
     found[group[:, None] != group] = 0
     np.fill_diagonal(found, 0)

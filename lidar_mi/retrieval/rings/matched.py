@@ -40,8 +40,8 @@ class MatchedScore:
     noise : PixelNoise
     names : list of str
         Parameters that are fitted.
-    waves : Waves
-        Of the cells about the reference's centre.
+    waves, single : Waves
+        Of the cells about the reference's centre, and the same in single precision.
     values : torch.Tensor, shape (`PARAMETERS`,)
         Of the reference; x and y from the top left pixel's centre.
     mean, dark : torch.Tensor, shape (cells,)
@@ -58,6 +58,7 @@ class MatchedScore:
     noise: PixelNoise
     names: list[str]
     waves: Waves
+    single: Waves
     values: torch.Tensor
     mean: torch.Tensor
     dark: torch.Tensor
@@ -140,6 +141,7 @@ def matched_score(
         noise,
         names,
         waves,
+        _in_single(waves),
         values,
         mean[0],
         dark,
@@ -192,7 +194,7 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
     close = torch.zeros(len(at), dtype=torch.bool, device=at.device)
     for number in range(ITERATIONS):
         if number:
-            mean = mean_and_jacobian(model, score.waves, at)[0]
+            mean = mean_and_jacobian(model, score.single, at.float())[0].double()
         variance = cell_variance(mean, at, score.noise) / score.waves.cells.count
         brighter = (at[:, _LEVEL] / score.values[_LEVEL]).clamp(0.1, 10)[:, None]
         grown = torch.where(added, 1.0, brighter)
@@ -226,3 +228,18 @@ def _started(score: MatchedScore, means: torch.Tensor) -> tuple[torch.Tensor, to
     brighter = (((means - score.dark) @ count) / (lit @ count)).clamp(0.1, 10)
     at[:, _LEVEL] *= brighter
     return at, score.dark + brighter[:, None] * lit
+
+
+def _in_single(waves: Waves) -> Waves:
+    """Waves in single precision: half of the time, 0.005 standard errors of a bright frame off."""
+    cells = waves.cells
+    spread = None if cells.spread is None else cells.spread.float()
+    cells = cells._replace(
+        x=cells.x.float(),
+        y=cells.y.float(),
+        r2=cells.r2.float(),
+        spread=spread,
+        terms=cells.terms.float(),
+    )
+    rest = (part.float() for part in waves[1:])
+    return Waves(cells, *rest)

@@ -317,7 +317,7 @@ def _by_r2(model, cosine) -> torch.Tensor:
 
 def _product(amplitudes: torch.Tensor, waves: torch.Tensor) -> torch.Tensor:
     """Real part of sums over harmonics: (images, K) complex and (2 K, cells) to (images, cells)."""
-    return torch.cat([amplitudes.real, -amplitudes.imag], 1) @ waves
+    return torch.cat([amplitudes.real, -amplitudes.imag], 1).to(waves) @ waves
 
 
 def _disc(square: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
