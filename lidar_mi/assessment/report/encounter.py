@@ -157,9 +157,9 @@ def encounter_answer(metrics: Mapping[str, float]) -> list[str]:
     verdict = "stays below" if bank <= ACCEPTED_BANK else "exceeds"
     answer += (
         f" {_FLIGHT[best]} {verdict} the {math.degrees(ACCEPTED_BANK):.0f} degrees of bank at "
-        "which an approach is called unstable. The wake's rolling moment is up to "
-        f"{three(ratio)} of the controls' largest; up to {ACCEPTED_RATIO:g} pilots find an "
-        "encounter uncritical."
+        "which an approach is called unstable. The wake's rolling moment reaches "
+        f"{three(ratio)} times the largest of the controls; pilots rate encounters of up to "
+        f"{ACCEPTED_RATIO:g} times as uncritical."
     )
     lead = [answer]
     if "encounter.lead_time" in metrics:
