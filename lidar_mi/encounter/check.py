@@ -117,9 +117,8 @@ def _first_slab(experiment: Experiment) -> Experiment:
     )
     scan = experiment.scan.model_copy(update={"range": encounter.look_ahead})
     changes = {"encounter": None, "platform": platform, "scan": scan}
-    if experiment.sensor is not None:
-        changes["doppler"] = at_the_slabs(experiment.doppler, gates_of(experiment))
-    return experiment.model_copy(update=changes).read_from(experiment.folder)
+    seen = at_the_slabs(experiment, gates_of(experiment))
+    return seen.model_copy(update=changes).read_from(experiment.folder)
 
 
 def _check_latency(experiment: Experiment, gates: Gates) -> None:

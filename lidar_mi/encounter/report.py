@@ -11,8 +11,10 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 from lidar_mi.assessment.report.answer import verdict
 from lidar_mi.assessment.report.encounter import encounter_answer, encounter_chapter
 from lidar_mi.assessment.report.page import Film, page
+from lidar_mi.encounter.doppler import at_the_slabs
 from lidar_mi.encounter.flight import Flown, aircraft_of
 from lidar_mi.encounter.folder import ANIMATION, FlightFolder
+from lidar_mi.encounter.slabs import gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.reading import dump
@@ -32,7 +34,7 @@ def write_report(
     )
     found = answer(experiment, flown, metrics)
     html = page(
-        experiment,
+        at_the_slabs(experiment, gates_of(experiment)),
         dump(experiment),
         kept.record["versions"],
         metrics,
