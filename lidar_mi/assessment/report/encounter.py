@@ -188,7 +188,7 @@ def _limits(metrics: Mapping[str, float]) -> list[str]:
 
 
 def _verdict(judged: Sequence[tuple[RequirementTable, Sequence[Finding]]]) -> Tables:
-    words = {True: "met", False: "not met", None: "not known"}
+    words = {True: "fulfilled", False: "not fulfilled", None: "undetermined"}
     tables = []
     for table, findings in judged:
         rows = [(row[0], "", list(row[1:])) for row in as_rows(list(findings))]
