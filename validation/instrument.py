@@ -399,8 +399,9 @@ def after_calibration(effort: Effort) -> Check:
     text = (
         f"{CALIBRATIONS} times the instrument is fitted to {CALIBRATION_FRAMES} frames of the "
         f"laser, and then reads {PULSES_OF_EACH} pulses. *Systematic*: standard error stated that "
-        "all of them share, of the calibration and of the reference shot. *Within 1*, *within 1.96*: of random and systematic error "
-        "together. For 0.5 m/s, light must be scrambled until it fills the pupil evenly but for "
+        "all of them share, of the calibration and of the reference shot. *Within 1*, *within "
+        "1.96*: of random and systematic error together. For 0.5 m/s, light must be scrambled "
+        "until it fills the pupil evenly but for "
         f"{1 - scrambling[BOW]:.1%} (bow) and {1 - scrambling[WEDGE]:.0%} (wedge) of what it does "
         "here."
     )
