@@ -102,10 +102,10 @@ def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray)
     """The wind with vectors flagged where resampling lost more than stated errors can hold.
 
     What is lost depends on the air and on the places of the beams, which are at rest: it is not
-    only noise, but also a bias. Flagged are vectors with a place, at most half a template away, over
+    only noise, but also a bias. Flagged are vectors with a place at most half a template away, over
     whose template its mean square exceeds 4 times that of the noise: a smooth field carries the
-    bias to its neighbours. Unflagged neighbours of Lissajous figures' flagged vectors erred by
-    1.5 to 1.7 times as much as stated.
+    bias to its neighbours. In Lissajous figures, vectors next to flagged ones err by 1.5 to 1.7
+    times as much as stated.
 
     Parameters
     ----------
