@@ -203,7 +203,7 @@ def test_lines_of_sight_have_times_of_their_own():
 
 
 def test_lines_meet_the_state_of_their_own_time(truth):
-    """Of a wake with a second state: its wind grows by (4, -6, 9) m/s in dt, from -45 to 45 ms."""
+    """Of a wake with a second state, whose wind grows by (4, -6, 9) m/s in dt."""
     narrow = {"azimuth_half": "3 deg", "elevation_half": "2 deg"}
     asked = both({"pattern": "raster", "duration": "90 ms"}, directions=narrow)
     growth, beams = np.array([4.0, -6.0, 9.0]), line_beams(asked, ".")
