@@ -18,12 +18,15 @@ EXAMPLES = (
 
 def v_los(
     frames: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
             help="Frames of the echo of air: EXR, PNG, TIFF (also of several pages) or FITS (also "
             "cubes)."
         ),
-    ],
+    ] = None,
+    signal: Annotated[
+        list[Path] | None, typer.Option(help="The same by name, once per file.")
+    ] = None,
     reference: Annotated[
         list[Path] | None,
         typer.Option(
@@ -55,6 +58,9 @@ def v_los(
     from lidar_mi.retrieval.rings.calibration import calibration_of
     from lidar_mi.tables import Table, with_error
 
+    frames = [*(frames or []), *(signal or [])]
+    if not frames:
+        raise InputError("frames: none is not allowed; expected files of the echo of air")
     given = [*frames, *(reference or []), *([calibration] if calibration else [])]
     if out is not None:
         check_target(out, given, overwrite=overwrite)

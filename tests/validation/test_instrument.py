@@ -81,3 +81,28 @@ def test_refused_frames_are_in_the_table():
 def test_bias_has_a_standard_error():
     error = np.random.default_rng(1).normal(size=400)
     assert Outcome(error, error, error, 1.0).bias_std == pytest.approx(1 / 20, rel=4 / np.sqrt(800))
+
+
+def test_coverage_has_a_standard_error():
+    """Pulses that share a calibration are no independent ones: two of four calibrations miss."""
+    error = np.repeat([0.5, 0.5, 2.0, 2.0], 100)
+    one, zero = np.ones(400), np.zeros(400)
+    assert Outcome(error, one, zero, 1.0).coverage_std(1) == pytest.approx(0.0233, abs=1e-4)
+    shared = Outcome(error, one, zero, 1.0, calibrations=4)
+    assert shared.coverage_std(1) == pytest.approx(np.sqrt(1 / 3) / 2)
+    assert shared.coverage(1) == 0.5 and shared.bias_std == 0
+
+
+def test_calibrations_have_frames_of_their_own():
+    seen = []
+
+    def guess(frames):
+        seen.append(frames)
+        v = instrument.SPEED + np.arange(2.0)
+        return {"guess": Retrieved(v, np.ones(2), np.zeros(2), np.ones(2))}
+
+    small = INSTRUMENT.binned(12)
+    found = instrument.measured(CASES["none"], 2, 3, guess, small, calibrations=2)["guess"]
+    assert found.calibrations == 2 and found.error.tolist() == [0, 1, 0, 1]
+    frames = [part[k] for one in seen for part in one for k in range(2)]
+    assert len({tuple(frame.flatten()[:50].tolist()) for frame in frames}) == len(frames)

@@ -96,6 +96,19 @@ def test_spread_of_z_scores(batches):
     assert repeated.std() == pytest.approx(sigma * math.sqrt(40), rel=0.5)
 
 
+def test_a_table_replaces_that_of_a_page_written_by_hand():
+    table = report.Comparison(("a", "b"), (("1", "2"),))
+    check = Check("a", "b", (), name="group.check", comparison=table)
+    marks = "<!-- table: group.check -->\n", "<!-- end: group.check -->"
+    page = f"before\n{marks[0]}\nold\n\n{marks[1]}\nafter\n"
+    new = report.with_table(page, check)
+    assert new == f"before\n{marks[0]}\n| a | b |\n| --- | --- |\n| 1 | 2 |\n\n{marks[1]}\nafter\n"
+    assert report.with_table(new, check) == new
+    other = replace(check, name="group.other")
+    assert report.with_table(page, other) == page
+    assert report.with_table(page, replace(check, comparison=None)) == page
+
+
 # --- checks that fail when they should
 
 
