@@ -103,7 +103,7 @@ def test_speeds_agree_within_their_errors(folder, calibration):
     for more in (["--reference", folder / "reference.tif"], []):
         out = folder / "v.nc"
         printed(
-            *("v_los", folder / "air.tif", "--calibration", calibration, *more),
+            *("v_los", "--signal", folder / "air.tif", "--calibration", calibration, *more),
             *("--instrument", folder / "mine.yaml", "-o", out),
         )
         with xr.open_dataset(out) as found:
