@@ -26,7 +26,7 @@ from lidar_mi.tables import Table, Tabular, with_error
 LAW = 0.02  # orders, largest rms deviation from equal steps of an etalon's pattern
 UNEXPLAINED = 0.2  # of the pattern's power, the most that may be left where noise does not leave it
 
-_UNEVEN = "neighbouring parts deviate alike; errors hold for patches of up to 1/6 of the image"
+_UNEVEN = "neighbouring parts deviate alike; errors hold for patches of up to 1/10 of the image"
 
 CREST = 0.3  # of the highest crest, the least height of one that no line may leave unexplained
 
@@ -62,7 +62,7 @@ class Rings(Tabular):
         Rms deviation of the crests from the curves fitted: circles, ellipses, tilted circles.
     uneven : bool
         Whether neighbouring parts of rings deviate alike, as by uneven plates. Standard errors then
-        are from six parts of the image, each known to a third. Patches wider than a sixth of the
+        are from six parts of the image, each known to a third. Patches wider than a tenth of the
         image, which the fit takes for another centre or spacing, may move it by more.
     ellipticity : (float, float)
         Cosine and sine part, over twice the angle, of a ring's radius over its mean; the size is
