@@ -74,7 +74,7 @@ def estimated_drift(crossflow: xr.Dataset, crossflow_std: float | None = None) -
             "expected a drift in m/s"
         )
     drift = [float((vorticity**2 * part).sum()) / total for part in (v, w)]
-    by_z, by_y = (_slope(axis) for axis in (z, y))
+    by_z, by_y = (np.asarray(np.gradient(np.eye(len(axis)), axis, axis=0)) for axis in (z, y))
     errors = _errors(crossflow, crossflow_std)
     # of the vorticity by errors of the vectors, which makes it count everywhere
     noise = known * (
@@ -106,11 +106,6 @@ def _between_signs(vorticity: np.ndarray, part: np.ndarray) -> float:
         for sign, weight in zip(signs, weights, strict=True)
     ]
     return weights[0] * weights[1] * (means[0] - means[1]) ** 2
-
-
-def _slope(axis: np.ndarray) -> np.ndarray:
-    """Matrix (n, n) of the derivative along an axis."""
-    return np.asarray(np.gradient(np.eye(len(axis)), axis, axis=0))
 
 
 class _Errors(NamedTuple):
