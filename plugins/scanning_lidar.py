@@ -45,6 +45,9 @@ is at x reaches these planes at ranges that are shorter by x over that cosine. `
 are ranges from each beam's own origin, shorter by x: the gates follow the air, not the lidar.
 
 Files of tables are ``.npy``, or text with numbers separated by blanks or commas and ``#`` comments.
+Integrators other than :ref:`gated_volpath <integrator-gated_volpath>` take it for a camera along
+the beams, without its laser.
+
 The time of a beam is that of its light everywhere, in a :ref:`volume that changes with time
 <volume-moving_volume>` for instance; the pulse itself takes none. Directions, ``origins`` (x, y, z
 of every beam) and ``times``, gates, aperture, field of view, pose and the laser (as

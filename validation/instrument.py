@@ -26,7 +26,8 @@ from lidar_mi.retrieval.rings.likelihood_fit import RingFit, difference, fit_rin
 from lidar_mi.retrieval.rings.reference_error import Filling, ReferenceUncertainty
 
 from .fringe_reference import LIGHT, Defects, Instrument, Light, air_frame, exposures, laser_frame
-from .report import Check, Row
+from .report import Check, Comparison, Row
+from .scenes import Effort
 
 TITLE = "Fringe imaging with defects"
 INTRODUCTION = (
@@ -44,7 +45,9 @@ INTRODUCTION = (
 )
 
 SPEED, PHOTONS, READ_NOISE = 50.0, 2.4e7, 5.0
-PAIRS, CALIBRATION_FRAMES = 20, 20
+PAIRS, CALIBRATION_FRAMES = 40, 20
+CALIBRATIONS, PULSES_OF_EACH = 5, 80
+"""After calibration: each with laser frames of its own, and the pulses read with it."""
 BACKGROUND_DEGREE = 8
 
 INSTRUMENT = Instrument()
@@ -179,17 +182,24 @@ def _both(air: RingFit, laser: RingFit) -> dict[str, Retrieved]:
     return {name: Retrieved(*(x.numpy() for x in values)) for name, values in both.items()}
 
 
+_Outcomes = Mapping[str, Mapping[str, "Outcome"]]
+"""By case and method."""
+
 RETRIEVALS: dict[str, Retrieval] = {"before": uncalibrated, "after": calibrated_first}
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Errors of one retrieval over the pulses of one case, m/s."""
+    """Errors of one retrieval over the pulses of one case, m/s.
+
+    Pulses of one calibration, all in a row and as many of each, share its systematic error.
+    """
 
     error: np.ndarray
     stated: np.ndarray
     systematic: np.ndarray
     chi_square: float
+    calibrations: int = 1
 
     @property
     def bias(self) -> float:
@@ -197,8 +207,10 @@ class Outcome:
 
     @property
     def bias_std(self) -> float:
-        """Standard error of the bias, of the pulses' scatter alone."""
-        return float(self.error.std(ddof=1) / math.sqrt(self.error.size))
+        """Standard error of the bias, of the pulses' scatter about their calibration's mean."""
+        left = self._by_calibration(self.error)
+        left = left - left.mean(1, keepdims=True)
+        return float(math.sqrt((left**2).sum() / (left.size - len(left)) / left.size))
 
     @property
     def normalised(self) -> np.ndarray:
@@ -209,6 +221,19 @@ class Outcome:
         """Fraction of errors within so many of the combined standard errors stated."""
         return float((np.abs(self.normalised) < limit).mean())
 
+    def coverage_std(self, limit: float) -> float:
+        """Standard error of the coverage if the stated errors hold, from the pulses and, where
+        that is more, from the scatter over the calibrations."""
+        expected = math.erf(limit / math.sqrt(2))
+        binomial = math.sqrt(expected * (1 - expected) / self.error.size)
+        if self.calibrations == 1:
+            return binomial
+        each = self._by_calibration(np.abs(self.normalised) < limit).mean(1)
+        return max(binomial, float(each.std(ddof=1)) / math.sqrt(len(each)))
+
+    def _by_calibration(self, values: np.ndarray) -> np.ndarray:
+        return values.reshape(self.calibrations, -1)
+
 
 def measured(
     defects: Defects,
@@ -217,11 +242,12 @@ def measured(
     retrieval: Retrieval,
     instrument: Instrument = INSTRUMENT,
     known: ReferenceUncertainty | None = None,
+    calibrations: int = 1,
 ) -> dict[str, Outcome]:
     """The retrieval's errors over ``pairs`` pulses of an instrument with the defects.
 
     Defects are those on the camera of `INSTRUMENT`. ``known`` is what is known of the reference
-    shot beside the frames.
+    shot beside the frames. Of several ``calibrations``, each has ``pairs`` pulses.
     """
     beside = 0.0 if known is None else known.total
     binning = INSTRUMENT.shape[0] // instrument.shape[0]
@@ -231,24 +257,31 @@ def measured(
         hot_pixels=defects.hot_pixels // binning**2,
         dead_pixels=defects.dead_pixels // binning**2,
     )
-    found = retrieval(_frames(defects, pairs, seed, instrument))
-    return {
-        name: Outcome(
-            one.v - SPEED, one.v_std, np.hypot(one.v_systematic, beside), one.chi_square.mean()
+    found = [
+        retrieval(_frames(defects, pairs, (seed, number), instrument))
+        for number in range(calibrations)
+    ]
+    outcomes = {}
+    for name in found[0]:
+        v, std, systematic, chi_square = map(
+            np.concatenate, zip(*(f[name] for f in found), strict=True)
         )
-        for name, one in found.items()
-    }
+        systematic = np.hypot(systematic, beside)
+        outcomes[name] = Outcome(v - SPEED, std, systematic, chi_square.mean(), calibrations)
+    return outcomes
 
 
 @lru_cache(maxsize=1)
-def _frames(defects: Defects, pairs: int, seed: int, instrument: Instrument) -> Frames:
+def _frames(defects: Defects, pairs: int, seed: tuple[int, int], instrument: Instrument) -> Frames:
     """The last ones stay, for the next retrieval."""
     laser = laser_frame(instrument, defects, PHOTONS)
     air = air_frame(instrument, defects, SPEED, PHOTONS)
     drawn = ((laser, CALIBRATION_FRAMES), (laser, pairs), (air, pairs))
     return Frames(
         *(
-            torch.from_numpy(exposures(mean, count, [seed, k], READ_NOISE).astype(np.float32))
+            torch.from_numpy(
+                exposures(mean, count, [seed[0], k, seed[1]], READ_NOISE).astype(np.float32)
+            )
             for k, (mean, count) in enumerate(drawn)
         )
     )
@@ -273,30 +306,29 @@ def closed_forms(instrument: Instrument = INSTRUMENT) -> dict[str, tuple[float, 
 
 
 @cache
-def _all_cases(pairs: int, binning: int) -> dict[str, dict[str, dict[str, Outcome]]]:
-    """Outcomes by retrieval, case and method."""
-    instrument = INSTRUMENT.binned(binning)
-    found = {when: {} for when in RETRIEVALS}
+def _all_cases(when: str, effort: Effort) -> dict[str, dict[str, Outcome]]:
+    """Outcomes by case and method; pulses of a few calibrations once the instrument is known."""
+    pairs, calibrations = (PAIRS, 1) if when == "before" else (PULSES_OF_EACH, CALIBRATIONS)
+    instrument = INSTRUMENT.binned(_binning(effort))
+    found = {}
     for number, (case, defects) in enumerate(CASES.items()):
-        for when, retrieval in RETRIEVALS.items():
-            known = KNOWN.get(case) if when == "after" else None
-            try:
-                one = measured(defects, pairs, 500 + number, retrieval, instrument, known)
-            except InputError:
-                one = {}  # refused
-            found[when][case] = one
+        known = KNOWN.get(case) if when == "after" else None
+        seed = 500 + number
+        settings = pairs, seed, RETRIEVALS[when], instrument, known, calibrations
+        try:
+            found[case] = measured(defects, *settings)
+        except InputError:
+            found[case] = {}  # refused
     return found
 
 
-def _size(effort) -> tuple[int, int]:
-    """Pulses, and binning of the frames."""
-    return (PAIRS, 1) if effort.scale > 1 else (2 * PAIRS, BINNED)
+def _binning(effort: Effort) -> int:
+    return 1 if effort.scale > 1 else BINNED
 
 
-def before_calibration(effort) -> Check:
+def before_calibration(effort: Effort) -> Check:
     """The table of defects, and rows where a closed form gives the bias."""
-    pairs, binning = _size(effort)
-    found = _all_cases(pairs, binning)["before"]
+    found = _all_cases("before", effort)
     rows = []
     for case, (*expected, source) in closed_forms().items():
         for (name, outcome), value in zip(found[case].items(), expected, strict=True):
@@ -311,9 +343,9 @@ def before_calibration(effort) -> Check:
                     "m/s",
                 )
             )
-    height, width = INSTRUMENT.binned(binning).shape
+    height, width = INSTRUMENT.binned(_binning(effort)).shape
     text = (
-        f"{pairs} pulses at {SPEED:g} m/s, {PHOTONS:.1e} photons in every frame of {width} x "
+        f"{PAIRS} pulses at {SPEED:g} m/s, {PHOTONS:.1e} photons in every frame of {width} x "
         f"{height} pixels, {READ_NOISE:g} electrons of read noise. *Random*: standard error "
         "stated. *Within 1*, *within 1.96*: fraction of the errors "
         "below so many standard errors stated (expected 68 and 95 %)."
@@ -321,20 +353,30 @@ def before_calibration(effort) -> Check:
     return Check("Before calibration", "\n".join([text, "", *table(found)]), tuple(rows))
 
 
-def after_calibration(effort) -> Check:
+def after_calibration(effort: Effort) -> Check:
     """The same with the calibrated instrument.
 
     A bias may differ from 0 by what is stated: the random error of the mean of the pulses, and the
     systematic one that they share.
     """
-    pairs, binning = _size(effort)
-    found = _all_cases(pairs, binning)["after"]
+    found = _all_cases("after", effort)
     rows = []
     for case in MENDED:
         for name, one in found[case].items():
-            mean = np.sqrt((one.stated**2).mean() / pairs + (one.systematic**2).mean())
+            shared = (one.systematic**2).mean() / CALIBRATIONS
+            mean = np.sqrt((one.stated**2).mean() / one.error.size + shared)
             row = f"{case}: {name} speed, bias"
             rows.append(Row(row, "none", 0.0, one.bias, mean, unit="m/s"))
+            for limit in (1, 1.96):
+                rows.append(
+                    Row(
+                        f"{case}: {name} speed, errors within {limit} standard errors",
+                        "normal distribution",
+                        math.erf(limit / math.sqrt(2)),
+                        one.coverage(limit),
+                        one.coverage_std(limit),
+                    )
+                )
     for name in next(iter(found.values())):
         z = np.concatenate([found[case][name].normalised for case in MENDED])
         for limit in (1, 1.96):
@@ -355,18 +397,45 @@ def after_calibration(effort) -> Check:
         rows.append(Row(row, source, known.total, abs(one.bias), one.bias_std, 0.05, "m/s"))
     scrambling = {case: KNOWN[case].scrambling_for(0.5) for case in (BOW, WEDGE)}
     text = (
-        f"The instrument is fitted to {CALIBRATION_FRAMES} frames of the laser with noise of their "
-        f"own. *Systematic*: standard error stated that all pulses share, of the calibration and "
-        "of the reference shot. *Within 1*, *within 1.96*: of random and systematic error "
-        "together. For 0.5 m/s, light must be scrambled until it fills the pupil evenly but for "
+        f"{CALIBRATIONS} times the instrument is fitted to {CALIBRATION_FRAMES} frames of the "
+        f"laser, and then reads {PULSES_OF_EACH} pulses. *Systematic*: standard error stated that "
+        "all of them share, of the calibration and of the reference shot. *Within 1*, *within "
+        "1.96*: of random and systematic error together. For 0.5 m/s, light must be scrambled "
+        "until it fills the pupil evenly but for "
         f"{1 - scrambling[BOW]:.1%} (bow) and {1 - scrambling[WEDGE]:.0%} (wedge) of what it does "
         "here."
     )
     lines = [text, "", *table(found, systematic=True)]
-    return Check("After calibration", "\n".join(lines), tuple(rows))
+    both = _in_short(_all_cases("before", effort), found)
+    return Check("After calibration", "\n".join(lines), tuple(rows), comparison=both)
 
 
-def table(found: Mapping[str, Mapping[str, Outcome]], systematic: bool = False) -> list[str]:
+def _in_short(before: _Outcomes, after: _Outcomes) -> Comparison:
+    """One line a defect: both methods' bias, and how well the stated errors hold afterwards."""
+    heads = ["defect", "before: absolute", "difference", "after: absolute", "difference"]
+    heads += ["random", "systematic"]
+    heads += [
+        f"{name}: within {limit}" for name in ("absolute", "difference") for limit in (1, 1.96)
+    ]
+    lines = []
+    for case in CASES:
+        cells = [case]
+        for found in (before[case], after[case]):
+            cells += [f"{one.bias:+.2f} ± {one.bias_std:.2f}" for one in found.values()] or [
+                "refused"
+            ] * 2
+        if absolute := after[case].get("absolute"):
+            both = absolute.stated, absolute.systematic
+            cells += [f"{np.sqrt((error**2).mean()):.2f}" for error in both]
+        for one in after[case].values():
+            for limit in (1, 1.96):
+                std = f" ± {100 * one.coverage_std(limit):.0f}" if case in MENDED else ""
+                cells.append(f"{100 * one.coverage(limit):.0f}{std} %")
+        lines.append(tuple(cells + [""] * (len(heads) - len(cells))))
+    return Comparison(tuple(heads), tuple(lines))
+
+
+def table(found: _Outcomes, systematic: bool = False) -> list[str]:
     """Markdown: one line a defect, five or six columns a method."""
     names = list(next(iter(found.values())))
     stated = ["random", "systematic"] if systematic else ["random"]

@@ -237,6 +237,19 @@ def _section(check: Check) -> list[str]:
     return lines
 
 
+def with_table(text: str, check: Check) -> str:
+    """A page written by hand, with the table of a check between its two marks.
+
+    A page that has no mark with the check's name stays as it is.
+    """
+    first, last = f"<!-- table: {check.name} -->\n", f"<!-- end: {check.name} -->"
+    if check.comparison is None or first not in text or last not in text:
+        return text
+    before, rest = text.split(first, 1)
+    after = rest.split(last, 1)[1]
+    return "\n".join([before + first, *_markdown(check.comparison), "", last + after])
+
+
 def _markdown(table: Comparison) -> list[str]:
     rules = ("---",) * len(table.heads)
     return [f"| {' | '.join(cells)} |" for cells in (table.heads, rules, *table.lines)]

@@ -3,10 +3,15 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from lidar_mi.assessment.report.campaign import page
+from lidar_mi.assessment.report.campaign import answer, page
 from lidar_mi.campaign.collect import open_campaign
 from lidar_mi.campaign.folder import RECORD, REPORT, open_folder
 from lidar_mi.io.text import read_text, write_text
+
+
+def campaign_answer(folder: str | Path) -> str:
+    """The first sentences of a campaign's report."""
+    return answer(open_campaign(open_folder(folder).path))
 
 
 def write_report(folder: str | Path, metrics: Sequence[str] | None = None) -> Path:

@@ -13,7 +13,7 @@ from rich.live import Live
 from rich.table import Table as RichTable
 
 from lidar_mi.cli.options import quantity
-from lidar_mi.cli.terminal import errors, output, print_table
+from lidar_mi.cli.terminal import errors, output, print_answer, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
 
@@ -128,7 +128,7 @@ def run(
             except BaseException as error:
                 error.add_note("start it again to do the points that are left")
                 raise
-    _conclude(folder)
+    print_answer([_conclude(folder)])
     for table in state.tables():
         print_table(table)
     if state.finished < state.total:
@@ -151,7 +151,7 @@ def collect(folder: Folder) -> None:
     """Collect the points that are done into campaign.nc, and write the report."""
     from lidar_mi.campaign.folder import open_folder
 
-    _conclude(open_folder(folder))
+    print_answer([_conclude(open_folder(folder))])
     output.print(f"data     {folder / 'campaign.nc'}")
     output.print(f"report   {folder / 'report.html'}")
 
@@ -173,15 +173,16 @@ def report(
     output.print(f"report   {path}")
 
 
-def _conclude(folder: "CampaignFolder") -> None:
-    """Collect a campaign and write its report."""
+def _conclude(folder: "CampaignFolder") -> str:
+    """Collect a campaign and write its report; its first sentences."""
     from lidar_mi.campaign.collect import collect
-    from lidar_mi.campaign.report import write_report
+    from lidar_mi.campaign.report import campaign_answer, write_report
 
     with progress() as notice:
         collect(folder, notice)
         notice("writing the report", None)
         write_report(folder.path)
+    return campaign_answer(folder.path)
 
 
 def _run_point(folder: "CampaignFolder", number: int) -> None:

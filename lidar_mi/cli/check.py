@@ -28,7 +28,7 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
             section
             for one in asked.values()
             for section in (
-                flight_sections(one.read_from(path.parent), notice)
+                flight_sections(one.read_from(path.parent), notice, timed=True)
                 if one.encounter
                 else sections(one, path.parent, notice, timed=True)
             )

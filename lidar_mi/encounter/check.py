@@ -11,8 +11,10 @@ from lidar_mi.encounter.slabs import Gates, gates_of
 from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import check as of_a_run
+from lidar_mi.experiment.cost import flight_seconds
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import Notice, silent
+from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.schema import Experiment
 
 # A path misses the wake where no rolling moment reaches this fraction of the ailerons'.
@@ -58,8 +60,18 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
     return found
 
 
-def sections(experiment: Experiment, notice: Notice = silent) -> Iterator[Section]:
+def sections(
+    experiment: Experiment, notice: Notice = silent, *, timed: bool = False
+) -> Iterator[Section]:
     """Titled tables of the flight and of the lidar's first slab; nothing is written.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    notice : callable
+        Called with the name of the running step.
+    timed : bool
+        With the time of the flight, which takes a probe of about two seconds.
 
     Raises
     ------
@@ -85,6 +97,14 @@ def sections(experiment: Experiment, notice: Notice = silent) -> Iterator[Sectio
         ),
     ]
     yield f"{experiment.name}: flight into the wake", rows
+    if timed:
+        notice("timing a few samples and a retrieval", None)
+        first = _first_slab(experiment)
+        steers = encounter.control.mode == "feedforward"
+        scans = duration(encounter) * encounter.rate if steers else 0.0
+        seconds = flight_seconds(first, prepare(first).results, scans)
+        text = f"about {of_a_run.duration(seconds)}"
+        yield "cost to a factor of 2", [("the flight, on one core", text)]
     if warnings:
         yield f"{experiment.name}: warnings of the flight", [(text,) for text in warnings]
 
@@ -97,9 +117,8 @@ def _first_slab(experiment: Experiment) -> Experiment:
     )
     scan = experiment.scan.model_copy(update={"range": encounter.look_ahead})
     changes = {"encounter": None, "platform": platform, "scan": scan}
-    if experiment.sensor is not None:
-        changes["doppler"] = at_the_slabs(experiment.doppler, gates_of(experiment))
-    return experiment.model_copy(update=changes).read_from(experiment.folder)
+    seen = at_the_slabs(experiment, gates_of(experiment))
+    return seen.model_copy(update=changes).read_from(experiment.folder)
 
 
 def _check_latency(experiment: Experiment, gates: Gates) -> None:

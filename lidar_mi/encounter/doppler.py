@@ -18,7 +18,7 @@ from lidar_mi.encounter.slabs import Gates
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.ring_reference import reference_frames
-from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.line_frames import PULSES, LineImages, line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import Rings, ring_instrument
 from lidar_mi.instrument.beams import Beams
@@ -156,7 +156,8 @@ def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
     if experiment.sensor.timing is not None:
         raise InputError("sensor.timing: not allowed in an encounter; expected none")
     reference_frames(experiment.sensor.pulses, experiment.doppler.reference.every, PULSES)
-    doppler = at_the_slabs(experiment.doppler, gates)
+    experiment = at_the_slabs(experiment, gates)
+    doppler = experiment.doppler
     rings = ring_instrument(doppler)
     speed = encounter_of(experiment).path.speed
     limit = rings.model.velocity_range / 2
@@ -167,23 +168,26 @@ def doppler_scans(experiment: Experiment, gates: Gates) -> DopplerScans | None:
         )
     slowest = speed * float(experiment.sensor.directions.directions()[:, 0].min())
     images = line_images(doppler, rings, slowest - _FASTEST_WIND, speed + _FASTEST_WIND)
-    return DopplerScans(experiment.model_copy(update={"doppler": doppler}), rings, images)
+    return DopplerScans(experiment, rings, images)
 
 
-def at_the_slabs(doppler: Doppler, gates: Gates) -> Doppler:
-    """The Doppler lidar with the slabs' range.
+def at_the_slabs(experiment: Experiment, gates: Gates) -> Experiment:
+    """An encounter whose Doppler lidar, if there is one, has the slabs' range.
 
     Raises
     ------
     InputError
         Its own range is another one.
     """
+    if experiment.sensor is None:
+        return experiment
     middle = gates.look_ahead + (gates.depth - gates.stride) / 2
-    lidar = doppler.lidar
+    doppler, lidar = experiment.doppler, experiment.doppler.lidar
     if "range" in lidar.model_fields_set and abs(lidar.range - middle) > lidar.range_bin / 2:
         raise InputError(
             f"doppler.lidar.range: {lidar.range:g} m is not allowed in an encounter; expected that "
             f"of its slabs, {middle:.4g} m, or none"
         )
     lidar = lidar.model_copy(update={"range": middle})
-    return doppler.model_copy(update={"lidar": lidar})
+    doppler = doppler.model_copy(update={"lidar": lidar})
+    return experiment.model_copy(update={"doppler": doppler})

@@ -11,11 +11,11 @@ import xarray as xr
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.encounter import encounter_metrics
-from lidar_mi.assessment.report.encounter import encounter_answer, encounter_summary
+from lidar_mi.assessment.report.encounter import encounter_summary
 from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.flight import Flown, fly_all
 from lidar_mi.encounter.folder import FlightFolder
-from lidar_mi.encounter.report import write_report
+from lidar_mi.encounter.report import answer, write_report
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError, is_interrupt
 from lidar_mi.experiment.log import Log
@@ -62,7 +62,7 @@ class Flight(Tabular):
     @property
     def answer(self) -> list[str]:
         """What a reader wants to know first, in sentences."""
-        return encounter_answer(self.metrics)
+        return answer(self.experiment, self.flown, self.metrics)
 
     def tables(self) -> list[Table]:
         """The flights and the lidar, in numbers."""

@@ -150,7 +150,7 @@ def _loaded(name) -> Any:
     except ImportError:
         raise InputError(
             f"encounter.aircraft.model: {name!r} needs JSBSim, which is not installed "
-            "(pip install lidar-mi[flight]); roll needs nothing"
+            "(pip install 'lidar-mi[flight]'); roll needs nothing"
         ) from None
     root = FilePath(jsbsim.__file__).parent
     names = shipped_aircraft(root)

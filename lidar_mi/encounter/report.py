@@ -7,12 +7,14 @@ import numpy as np
 from lidar_mi.assessment.figures.encounter import draw_all
 from lidar_mi.assessment.figures.encounter_film import MOST_FRAMES, film
 from lidar_mi.assessment.metrics.encounter import judged_in_flight, measured_in_flight
-from lidar_mi.assessment.metrics.requirements import read_requirements
+from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, read_requirements
 from lidar_mi.assessment.report.answer import verdict
 from lidar_mi.assessment.report.encounter import encounter_answer, encounter_chapter
 from lidar_mi.assessment.report.page import Film, page
+from lidar_mi.encounter.doppler import at_the_slabs
 from lidar_mi.encounter.flight import Flown, aircraft_of
 from lidar_mi.encounter.folder import ANIMATION, FlightFolder
+from lidar_mi.encounter.slabs import gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.reading import dump
@@ -27,26 +29,38 @@ def write_report(
     log("drawing figures")
     span = float(np.ptp(aircraft_of(encounter_of(experiment)).strips.places[:, 1]))
     drawn = draw_all(kept.figures, flown.series, flown.track, flown.seen, span, log)
-    judged = []
-    if flown.track is not None:
-        encounter = encounter_of(experiment)
-        stride = encounter.path.speed / encounter.rate
-        depth = stride / max(1, round(stride / experiment.scan.thickness))
-        measured = measured_in_flight(flown.series, flown.track, depth)
-        judged = judged_in_flight(read_requirements(), measured, encounter.path.speed)
-    chapter = encounter_chapter(metrics, judged, drawn, _film(kept, flown, span, log))
-    answer = [*encounter_answer(metrics), *(verdict(table, rows) for table, rows in judged)]
+    chapter = encounter_chapter(
+        metrics, judged(experiment, flown), drawn, _film(kept, flown, span, log)
+    )
+    found = answer(experiment, flown, metrics)
     html = page(
-        experiment,
+        at_the_slabs(experiment, gates_of(experiment)),
         dump(experiment),
         kept.record["versions"],
         metrics,
         [chapter],
         log.warnings,
-        answer,
+        found,
         kept.data_files(),
     )
-    kept.keep_verdict(metrics, html, answer)
+    kept.keep_verdict(metrics, html, found)
+
+
+def answer(experiment: Experiment, flown: Flown, metrics: Mapping[str, float]) -> list[str]:
+    """What a reader wants to know first, and the verdict on the lidar's wind, in sentences."""
+    verdicts = [verdict(table, rows) for table, rows in judged(experiment, flown)]
+    return [*encounter_answer(metrics), *verdicts]
+
+
+def judged(experiment: Experiment, flown: Flown) -> list[tuple[RequirementTable, list[Finding]]]:
+    """The lidar compared with the requirements as it measured in flight; empty without one."""
+    if flown.track is None:
+        return []
+    encounter = encounter_of(experiment)
+    stride = encounter.path.speed / encounter.rate
+    depth = stride / max(1, round(stride / experiment.scan.thickness))
+    measured = measured_in_flight(flown.series, flown.track, depth)
+    return judged_in_flight(read_requirements(), measured, encounter.path.speed)
 
 
 def _film(kept: FlightFolder, flown: Flown, span: float, log: Log) -> Film | None:

@@ -55,6 +55,12 @@ RING_BOUND = 6e-6
 VORTICES = 2.5
 FIGURES = {"images": 8.0, "rings": 2.5, "sensor": 2.5}
 """Seconds of the figures of a chapter, and its part of the report."""
+FLIGHT_SLAB = 0.3
+"""Seconds of the wind and the vortices of a slab in flight."""
+FLIGHT_LINES = 0.3
+"""Of the time of fits, for frames that are read by the score function in flight."""
+FLIGHT_FIGURES = 13.0
+"""Seconds of the figures, the animation and the report of a flight."""
 _PROBES = 4
 _SAMPLES = 1.5e6
 """Samples of the render probe, times orders: half a second."""
@@ -97,6 +103,24 @@ def cost(experiment: Experiment, ahead: Mapping[str, Any], preparation: float = 
         here * _lines(experiment),
         here * _figures(experiment),
     )
+
+
+def flight_seconds(first: Experiment, ahead: Mapping[str, Any], scans: float) -> float:
+    """Processor time of a flight on this machine, to a factor of two.
+
+    Parameters
+    ----------
+    first : Experiment
+        The images of one slab.
+    ahead : mapping
+        Results of the stages that `lidar_mi.experiment.run.prepare` has computed of it.
+    scans : float
+        Of the lidar; each is of two slabs. Flights without it take hardly any time.
+    """
+    here = slowness()
+    each = here * (FLIGHT_SLAB + FLIGHT_LINES * _lines(first))
+    lidar = scans * (2 * render_seconds(first, ahead) + each) if scans else 0.0
+    return START + lidar + here * FLIGHT_FIGURES
 
 
 @functools.cache

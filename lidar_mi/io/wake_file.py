@@ -101,7 +101,10 @@ def _pick_time(data, name, time, path):
     listing = ", ".join(f"{t:.10g}" for t in times[:20]) + (" ..." if times.size > 20 else "")
     if time is None:
         if times.size > 1:
-            raise InputError(f"{path}: time is not given; allowed: one of {listing} s")
+            raise InputError(
+                f"{path}: has {times.size} times, and none is chosen; expected wake.time: one of "
+                f"{listing} s"
+            )
         index = 0
     else:
         if not np.isfinite(time):
@@ -276,7 +279,8 @@ def _read(data, table, sign, asked, time, x, path):
         raise InputError(
             f"{path}: variable {table[odd[0]]!r} has the dimensions "
             f"({', '.join(map(str, data[table[odd[0]]].dims))}); allowed: {', '.join(spatial)} "
-            f"and, at choice, {table['time']}, in any order, one of them staggered"
+            f"and, at choice, {table['time']}, in any order, one of them staggered; expected "
+            "wake.names of the others, such as {x: its name there}"
         )
 
     data, seconds = _pick_time(data, table["time"], time, path)

@@ -46,6 +46,8 @@ def test_points_of_a_job_array_are_collected(tmp_path, command, capsys):
     for counted in (("campaign", "status"), ("info",)):
         assert command(*counted, out) == 0
         assert "│ done                   │ 1" in capsys.readouterr().out
+    assert command("campaign", "collect", out) == 0
+    assert ": 1 of 2 runs done, 0 failed, 1 missing." in capsys.readouterr().out
     assert command("campaign", "run", path, "-o", out, "--point", 2) == 2
     assert "--point: 2 is not allowed; expected 0 to 1" in capsys.readouterr().err
 

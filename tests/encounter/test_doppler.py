@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lidar_mi.encounter.doppler import Midway, doppler_scans
+from lidar_mi.encounter.doppler import Midway, at_the_slabs, doppler_scans
 from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.encounter.slabs import gates_of
 from lidar_mi.errors import InputError
@@ -66,6 +66,7 @@ def test_range_is_that_of_the_slab(scans):
 def test_without_a_sensor_there_is_none():
     experiment = small_encounter()
     assert doppler_scans(experiment, gates_of(experiment)) is None
+    assert at_the_slabs(experiment, gates_of(experiment)) is experiment
 
 
 @pytest.mark.parametrize(

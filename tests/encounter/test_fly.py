@@ -72,6 +72,8 @@ def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     monkeypatch.setattr("lidar_mi.assessment.figures.encounter_film.MOST_FRAMES", 2)
     one = experiment()
     flight = lm.fly(one, tmp_path, lidar=SyntheticLidar(wake_along_path(one)), notice=silent)
+    assert (tmp_path / "summary.txt").read_text().split("\n")[:-1] == flight.answer
+    assert flight.answer[-1].startswith("Landing, flight control, from wind vectors: ")
     page = (tmp_path / "report.html").read_text()
     assert "with the lidar by" in page and "meets the goal of 80 %" in page
     assert "Requirements, as measured in flight" in page

@@ -11,7 +11,7 @@ import pytest
 import lidar_mi as lm
 from lidar_mi.experiment import cost as costs
 from lidar_mi.experiment.check import sections
-from lidar_mi.experiment.cost import cost
+from lidar_mi.experiment.cost import cost, flight_seconds
 from lidar_mi.experiment.run import complete, prepare
 from tests.support.experiments import check, small, whole_figures
 
@@ -71,6 +71,15 @@ def test_volumes_and_rings_by_pixels():
     settings = {"methods": ["annular", "pixels"], "averaged": [1], "images": 4, "slow_images": 2}
     rings = lm.load_experiment("fringes_paper", doppler={"retrieval": settings})
     assert 66 / 2 < cost(rings, {}).rings < 66 * 2
+
+
+def test_flights(monkeypatch):
+    """Images of 0.45 s each were measured; two minutes of encounter, five of encounter_sensor."""
+    monkeypatch.setattr(costs, "slowness", lambda: 1.0)
+    monkeypatch.setattr(costs, "render_seconds", lambda *_: 0.45)
+    assert 120 / 2 < flight_seconds(lm.load_experiment("encounter"), {}, 104) < 120 * 2
+    assert 300 / 2 < flight_seconds(lm.load_experiment("encounter_sensor"), {}, 104) < 300 * 2
+    assert flight_seconds(lm.load_experiment("encounter"), {}, 0) < 30
 
 
 @pytest.mark.usefixtures("variant")

@@ -8,14 +8,17 @@ import re
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading
 from lidar_mi.experiment.check import sections
 from lidar_mi.experiment.resumable_folder import made_by, new_record
+from lidar_mi.experiment.stages.lines import slab_wind, states_of_wind
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.timed_beams import line_beams
-from lidar_mi.experiment.truth import make_truth
+from lidar_mi.experiment.truth import make_truth, read_flows
+from lidar_mi.instrument.doppler_scan import scan_wind
 from tests.support.experiments import small
 
 STILL = {"speed": "150 m/s", "dt": "0.1 s"}
@@ -178,10 +181,10 @@ def test_keys_that_make_no_sense_are_one_line(keys, message):
         experiment(**keys)
 
 
-def both(timing=None, motion=None, reported=None):
+def both(timing=None, motion=None, reported=None, **sensor):
     data = small(spacing="1 m") | {
         "doppler": {"lidar": {"range": "150 m"}},
-        "sensor": {"method": "cc", "crossflow_std": "1 m/s", "timing": timing},
+        "sensor": {"method": "cc", "crossflow_std": "1 m/s", "timing": timing} | sensor,
         "platform": STILL | {"motion": motion, "reported": reported},
     }
     return reading.check(data, "test")
@@ -197,6 +200,28 @@ def test_lines_of_sight_have_times_of_their_own():
     assert beams.direction == pytest.approx(both().sensor.directions.directions())
     moved = line_beams(both(motion={"scanner_jitter": "1 mrad"}), ".")
     assert not moved.time.any() and np.ptp(moved.direction - moved.reported_direction) > 1e-3
+
+
+def test_lines_meet_the_state_of_their_own_time(truth):
+    """Of a wake with a second state, whose wind grows by (4, -6, 9) m/s in dt."""
+    narrow = {"azimuth_half": "3 deg", "elevation_half": "2 deg"}
+    asked = both({"pattern": "raster", "duration": "90 ms"}, directions=narrow)
+    growth, beams = np.array([4.0, -6.0, 9.0]), line_beams(asked, ".")
+    first, _ = read_flows(asked, ".")
+    first = first if "u" in first else first.assign(u=0 * first["v"])
+    later = xr.Dataset({n: first[n] + d for n, d in zip("uvw", growth, strict=True)})
+    wind = slab_wind(asked, truth)
+
+    def speeds(flows):
+        states = states_of_wind(asked, wind, flows)
+        sensor = asked.sensor.directions, asked.doppler.lidar
+        return scan_wind(states, *sensor, 0.0, 1, 150.0, None, beams)["v_los_true"].values
+
+    steady = speeds((first, None))
+    # against the direction of the light
+    expected = -(beams.direction @ growth) * beams.time / asked.platform.dt
+    np.testing.assert_allclose(speeds((first, later)) - steady, expected, atol=1e-5)
+    assert np.abs(expected).max() > 1.5
 
 
 @pytest.mark.parametrize(

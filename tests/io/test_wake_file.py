@@ -137,7 +137,7 @@ def test_time_is_picked_by_value(write):
     path = write(example())
     assert float(read_wake(path, time=1.1 * (1 + 5e-7)).time) == pytest.approx(1.1)
     fails(path, "1.05", "1, 1.1 s", time=1.05)
-    fails(path, "time is not given", "1, 1.1 s")
+    fails(path, "has 2 times, and none is chosen", "wake.time: one of 1, 1.1 s")
     assert float(read_wake(write(example().isel(time=[1]))).time) == pytest.approx(1.1)
 
 

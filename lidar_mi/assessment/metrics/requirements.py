@@ -162,7 +162,7 @@ def as_rows(findings: list[Finding]) -> list[tuple[str, str, str, str, str]]:
     rows = []
     for finding in findings:
         name, unit = QUANTITIES[finding.quantity]
-        verdict = {True: "pass", False: "fail", None: "not known"}[finding.passed]
+        verdict = {True: "pass", False: "fail", None: "undetermined"}[finding.passed]
         margin = "" if math.isnan(finding.margin) else f"{100 * finding.margin:+.0f} %"
         # none has no sign
         margin = "0 %" if margin in ("+0 %", "-0 %") else margin

@@ -56,7 +56,7 @@ def verdict(table: RequirementTable, findings: Sequence[Finding]) -> str:
     for name, required, measured, _, state in rows:
         if state == "fail":
             reasons.append(f"{name} {measured} against {required}")
-    unknown = [name for name, *_, state in rows if state == "not known"]
+    unknown = [name for name, *_, state in rows if state == "undetermined"]
     if unknown:
         reasons.append(f"undetermined: {', '.join(unknown)}")
     return f"{_capital(table.phase)}, {table.title}: {'; '.join(reasons)}."

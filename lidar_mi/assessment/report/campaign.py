@@ -47,15 +47,7 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
     dataset = _in_usual_units(dataset)
     known = numbers.metrics_of(dataset)
     shown = numbers.chosen(known, metrics)
-    axes = {name: _axis(dataset, name) for name in numbers.knobs(dataset)}
-    points = _points(dataset)
-    margins = {
-        group: {
-            QUANTITIES.get(q, (q, ""))[0]: numbers.over_members(numbers.judged(dataset, known[k]))
-            for q, k in rows.items()
-        }
-        for group, rows in numbers.requirements(known).items()
-    }
+    axes, points, margins = _axes(dataset), _points(dataset), _margins(dataset)
     if SAMPLE in dataset.dims:
         blocks = list(sample_blocks(dataset, known, shown, axes, points))
         required = list(margin_blocks(dataset, margins, axes, points))
@@ -75,6 +67,28 @@ def page(dataset: xr.Dataset, resolved: str, metrics: Sequence[str] | None = Non
         points=_descriptions(dataset),
         script=Markup(files("lidar_mi.assessment.report").joinpath("campaign.js").read_text()),
     )
+
+
+def answer(dataset: xr.Dataset) -> str:
+    """What a campaign did, and at how many points the requirements are met: its report's lead."""
+    dataset = _in_usual_units(dataset)
+    return _lead(dataset, _axes(dataset), _margins(dataset))
+
+
+def _axes(dataset: xr.Dataset) -> dict[str, Axis]:
+    return {name: _axis(dataset, name) for name in numbers.knobs(dataset)}
+
+
+def _margins(dataset: xr.Dataset) -> dict:
+    """Margins over members of all rows, by requirement table."""
+    known = numbers.metrics_of(dataset)
+    return {
+        group: {
+            QUANTITIES.get(q, (q, ""))[0]: numbers.over_members(numbers.judged(dataset, known[k]))
+            for q, k in rows.items()
+        }
+        for group, rows in numbers.requirements(known).items()
+    }
 
 
 def _marked(blocks: Sequence[Block]) -> list[Block]:

@@ -157,9 +157,9 @@ def encounter_answer(metrics: Mapping[str, float]) -> list[str]:
     verdict = "stays below" if bank <= ACCEPTED_BANK else "exceeds"
     answer += (
         f" {_FLIGHT[best]} {verdict} the {math.degrees(ACCEPTED_BANK):.0f} degrees of bank at "
-        "which an approach is called unstable. The wake's rolling moment is up to "
-        f"{three(ratio)} of the controls' largest; up to {ACCEPTED_RATIO:g} pilots find an "
-        "encounter uncritical."
+        "which an approach is called unstable. The wake's rolling moment reaches "
+        f"{three(ratio)} times the largest of the controls; pilots rate encounters of up to "
+        f"{ACCEPTED_RATIO:g} times as uncritical."
     )
     lead = [answer]
     if "encounter.lead_time" in metrics:
@@ -188,7 +188,7 @@ def _limits(metrics: Mapping[str, float]) -> list[str]:
 
 
 def _verdict(judged: Sequence[tuple[RequirementTable, Sequence[Finding]]]) -> Tables:
-    words = {True: "met", False: "not met", None: "not known"}
+    words = {True: "fulfilled", False: "not fulfilled", None: "undetermined"}
     tables = []
     for table, findings in judged:
         rows = [(row[0], "", list(row[1:])) for row in as_rows(list(findings))]

@@ -179,8 +179,9 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
         wake, scan, lidar = experiment.wake, experiment.scan, experiment.lidar
         if wake.vortex_pair:
             pair = wake.vortex_pair
+            model = pair.model.replace("_", "-").title()
             flow = (
-                f"{pair.model.replace('_', ' ')} vortices, circulation {pair.circulation:g} m²/s, "
+                f"{model} vortices, circulation {pair.circulation:g} m²/s, "
                 f"separation {pair.separation:g} m, core radius {pair.core_radius:g} m"
             )
         elif wake.turbine:

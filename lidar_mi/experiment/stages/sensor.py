@@ -129,9 +129,11 @@ def _oblique_view(experiment: Experiment) -> dict[str, float]:
 
 def _in_time(experiment: Experiment, crossflow: xr.Dataset) -> dict[str, Any]:
     """Settings of `combine` for the time of the wind, half way between both images."""
-    drifts = experiment.sensor.drift == "estimated"
-    drift = estimated_drift(crossflow) if drifts else (0.0, 0.0)
-    return {"time": experiment.platform.dt / 2, "drift": drift}
+    settings: dict[str, Any] = {"time": experiment.platform.dt / 2}
+    if experiment.sensor.drift == "estimated":
+        drift = estimated_drift(crossflow, experiment.sensor.crossflow_std)
+        settings |= {"drift": drift.velocity, "drift_std": drift.std}
+    return settings
 
 
 def with_truth(

@@ -58,7 +58,7 @@ def cross_flow_winds(
     settings, blur = experiment.retrieval, known_blur(experiment, plans[0])
     pairs, times = _image_pairs(experiment, truth, plans, scans), pixel_times(experiment, scans)
     lost = resampled_noise(experiment, scans)
-    sources = []
+    sources, said = [], set()
     for index, (source, (pair, noise)) in enumerate(pairs.items()):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
         sizes = {name: getattr(settings, name) for name in ("template", "search", "stride")}
@@ -79,7 +79,10 @@ def cross_flow_winds(
             )
             if "fixed_pattern" in wind.attrs and not methods:
                 log.remark(f"{source}: {wind.attrs['fixed_pattern']} in all images")
-            if "illumination" in wind.attrs and not methods:
+            # once of the air itself and once of the lidar's images, not of every source
+            rendered = source in RENDERED
+            if "illumination" in wind.attrs and not methods and rendered not in said:
+                said.add(rendered)
                 log.remark(f"{source}: {wind.attrs['illumination']} between the images")
             if source in lost:
                 wind = flag_resampled(wind, *lost[source])

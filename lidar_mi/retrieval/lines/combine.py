@@ -60,6 +60,7 @@ def combine(
     gate_speed: float = 0.0,
     time: float | None = None,
     drift: tuple[float, float] = (0.0, 0.0),
+    drift_std: tuple[float, float] = (0.0, 0.0),
 ) -> xr.Dataset:
     """The wind (u, v, w) on the images' grid from both lidars.
 
@@ -106,8 +107,10 @@ def combine(
         to `time`, see `common_time.at_common_time`. Exact for a pattern that is frozen and drifts
         uniformly, except for the splines that read vectors between nodes (0.02 m/s in a core of
         three nodes). A drift that is wrong by dc leaves an error of |time - t| dc times the wind's
-        gradient: 0.1 m/s for 1 m/s, 50 ms and 2 /s. It is not in the standard errors. 0: a steady
-        wind, to which all times are one.
+        gradient: 0.1 m/s for 1 m/s, 50 ms and 2 /s. 0: a steady wind, to which all times are one.
+    drift_std : (float, float)
+        Standard errors of `drift`, m/s, see `common_time.estimated_drift`. They enter those of
+        vectors (not with ``crossflow_std``) and lines.
 
     Returns
     -------
@@ -145,7 +148,9 @@ def combine(
     """
     if time is None and "time" in crossflow:
         time = float(crossflow["time"].where(crossflow["flag"] == 0).mean())
-    crossflow, scan = at_common_time(crossflow, scan, 0.0 if time is None else time, drift)
+    crossflow, scan = at_common_time(
+        crossflow, scan, 0.0 if time is None else time, drift, drift_std
+    )
     field = checked_crossflow(crossflow, crossflow_std)
     z, y = (crossflow[axis].values.astype(float) for axis in ("z", "y"))
     lines, hull = lines_on_grid(scan, z, y)
@@ -209,7 +214,11 @@ def combine(
     if time is not None:
         about = {"long_name": "time of the wind from the first image's", "units": "s"}
         combined["time"] = (), time, about
-        combined.attrs |= {"drift": list(drift), "drift_units": "m s-1"}
+        combined.attrs |= {
+            "drift": list(drift),
+            "drift_std": list(drift_std),
+            "drift_units": "m s-1",
+        }
     if ROTATION in crossflow:
         combined[ROTATION] = crossflow[ROTATION]
     if field.common.any():

@@ -26,6 +26,8 @@ from lidar_mi.tables import Table, Tabular, with_error
 LAW = 0.02  # orders, largest rms deviation from equal steps of an etalon's pattern
 UNEXPLAINED = 0.2  # of the pattern's power, the most that may be left where noise does not leave it
 
+_UNEVEN = "neighbouring parts deviate alike; errors hold for patches of up to 1/6 of the image"
+
 CREST = 0.3  # of the highest crest, the least height of one that no line may leave unexplained
 
 
@@ -58,6 +60,10 @@ class Rings(Tabular):
         Rms deviation of r^2 from equal steps, in orders; NaN where two rings leave none.
     roundness : float
         Rms deviation of the crests from the curves fitted: circles, ellipses, tilted circles.
+    uneven : bool
+        Whether neighbouring parts of rings deviate alike, as by uneven plates. Standard errors then
+        are from six parts of the image, each known to a third. Patches wider than a sixth of the
+        image, which the fit takes for another centre or spacing, may move it by more.
     ellipticity : (float, float)
         Cosine and sine part, over twice the angle, of a ring's radius over its mean; the size is
         half the relative difference of its diameters.
@@ -86,6 +92,7 @@ class Rings(Tabular):
     height: np.ndarray
     misfit: float
     roundness: float
+    uneven: bool
     ellipticity: tuple[float, float]
     tilt: tuple[float, float]
     doubt: str
@@ -134,6 +141,7 @@ class Rings(Tabular):
         whole += [
             ("rms deviation from equal steps", steps),
             ("rms deviation of crests from the rings", f"{self.roundness:.2g} px"),
+            *([("uneven", _UNEVEN)] if self.uneven else []),
             (
                 "ellipticity, tilt",
                 (f"{math.hypot(*self.ellipticity):.2g}, {math.hypot(*self.tilt):.2g} / px"),
@@ -173,8 +181,8 @@ def analyse_rings(
     Returns
     -------
     Rings
-        Standard errors are from the residuals. Plates that are uneven in patches wider than a
-        sector (0.01 orders rms in patches of 40 px) make errors twice as large as stated.
+        Standard errors are from the residuals, and hold for plates that are uneven in patches;
+        see ``uneven``.
 
     Raises
     ------
@@ -224,6 +232,7 @@ def analyse_rings(
         height=fit.pattern.height,
         misfit=law.misfit,
         roundness=fit.roundness,
+        uneven=fit.uneven,
         ellipticity=fit.geometry.ellipticity,
         tilt=fit.geometry.tilt,
         doubt=doubt,

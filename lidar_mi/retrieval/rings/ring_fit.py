@@ -5,7 +5,9 @@ its own, both smooth in r: illumination, vignetting and sloping light do not ent
 errors come from the residuals alone, sector by sector, so that nothing needs to be known of the
 camera: the sectors' scores are summed with their neighbours' in a window as wide as their
 correlation (Newey and West 1987, Econometrica 55, 703; Andrews 1991, Econometrica 59, 817), and
-scaled to be exact for white noise.
+scaled to be exact for white noise. Where neighbouring sectors deviate alike, as by uneven plates,
+the fit takes up much of it. Then errors are by how the fit changes when a block of sectors is left
+out (jackknife: Bell and McCaffrey 2002, Survey Methodology 28, 169), each line of its own.
 """
 
 import warnings
@@ -19,6 +21,7 @@ from lidar_mi.retrieval.rings.frames import inside
 from lidar_mi.retrieval.rings.pattern import Pattern, airy, blur
 from lidar_mi.retrieval.rings.sectors import SECTORS, RingCurves, Sectors
 
+BLOCKS = 6  # of neighbouring sectors, one of which is left out
 OUTLIER = 6.0  # standard deviations of an annulus's cells
 ROUNDS = 6
 TWO_RINGS = 2.2  # orders, least extent of a sector whose height may change with r
@@ -43,6 +46,8 @@ class CurveFit:
         For white noise of variance 1, which gives the weights of the rings.
     roundness : float
         Rms deviation of the crests from the curves, px.
+    uneven : bool
+        Whether crests of neighbouring sectors deviate alike.
     """
 
     geometry: RingCurves
@@ -55,6 +60,7 @@ class CurveFit:
     geometry_covariance: np.ndarray
     model_covariance: np.ndarray
     roundness: float
+    uneven: bool
 
 
 def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: bool) -> CurveFit:
@@ -109,6 +115,7 @@ def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: boo
         geometry_covariance=whole,
         model_covariance=system.inverse[slots] * pattern.spacing**2,
         roundness=system.roundness(),
+        uneven=system.width > 0,
     )
 
 
@@ -186,6 +193,7 @@ class _System:
         self.inverse /= np.outer(size, size)
         cells = (keep * root > 0).sum() - 5 * SECTORS - len(size)
         self.variance = float((self.left**2).sum() / max(cells, 1))
+        self.width = self._width()
 
     def _bends(self, q):
         """What each ring's deviation adds to its line's order at every annulus: linear between."""
@@ -214,9 +222,12 @@ class _System:
 
     def covariance(self):
         """Of all parameters, from the sectors' scores and their neighbours'."""
+        return self._of_blocks() if self.width else self._of_neighbours()
+
+    def _of_neighbours(self):
         lag = np.abs(np.arange(SECTORS)[:, None] - np.arange(SECTORS))
         lag = np.minimum(lag, SECTORS - lag)
-        window = np.maximum(1 - lag / (1 + self._width()), 0.0)
+        window = np.maximum(1 - lag / (1 + self.width), 0.0)
         meat = self.score.T @ window @ self.score
         # what white noise of variance 1 would give, less what the fit takes from its residuals
         leverage = self.matrix @ self.inverse
@@ -225,6 +236,22 @@ class _System:
         expected = np.diag(self.inverse @ white @ self.inverse)
         scale = np.sqrt(np.diag(self.inverse) / np.maximum(expected, 1e-3 * np.diag(self.inverse)))
         return self.inverse @ meat @ self.inverse * np.outer(scale, scale)
+
+    def _of_blocks(self):
+        """Changes of the fit without a block, squared; mean over where blocks begin."""
+        whole = self.matrix.sum(0)
+        size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+        outer = np.outer(size, size)
+        total = np.zeros_like(whole)
+        length = SECTORS // BLOCKS
+        for first in range(length):
+            block = (np.arange(SECTORS) + first) // length % BLOCKS
+            for number in range(BLOCKS):
+                matrix = whole - self.matrix[block == number].sum(0)
+                inverse = np.linalg.pinv(matrix / outer, 1e-8, hermitian=True) / outer
+                change = inverse @ self.score[block == number].sum(0)
+                total += np.outer(change, change) / length
+        return total
 
     def _shifts(self):
         """Shift of every ring in every sector, orders, NaN where it has none; its information."""

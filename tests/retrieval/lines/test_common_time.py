@@ -122,9 +122,63 @@ def test_stated_errors_hold_at_another_time():
 @pytest.mark.parametrize("noise", [0.0, 0.2])
 def test_drift_from_the_wind(noise):
     """That of the pair in closed form, the mean wind and its descent of 2.1 m/s."""
-    v, w = estimated_drift(vectors(noise or 0.05, 1 if noise else None))
+    v, w = estimated_drift(vectors(noise or 0.05, 1 if noise else None)).velocity
     assert v == pytest.approx(DRIFT[0], abs=0.1)
     assert w == pytest.approx(DRIFT[1], abs=0.25)
+
+
+def test_drift_has_its_stated_error():
+    """Over 60 draws of noise: the mean square over the stated one to 4 sigma, 0.27 to 1.73.
+
+    Errors are independent, the stated ones the larger of two of this size: below 1 by up to 0.3.
+    """
+    exact = np.array(estimated_drift(vectors(1e-6)).velocity)
+    found = [estimated_drift(vectors(0.2, seed)) for seed in range(60)]
+    off = (np.array([one.velocity for one in found]) - exact) / [one.std for one in found]
+    four = 4 * (2 / 60) ** 0.5
+    assert np.all(1 - 0.3 - four < (off**2).mean(0)) and np.all((off**2).mean(0) < 1 + four)
+
+
+def test_vortices_that_drift_apart():
+    """One at rest, one that is carried with 2 m/s: a scatter of 1 m/s about the mean."""
+    flow = vectors(1e-6)
+    y = flow["y"]
+    single = [velocity(PAIR[n : n + 1], *np.meshgrid(Y, Z)) for n in (0, 1)]
+    weight = ((y > 0) * 2.0).broadcast_like(flow["v"]).values
+    flow["v"][:] = single[0][0] + single[1][0] + weight
+    flow["w"][:] = single[0][1] + single[1][1]
+    found = estimated_drift(flow)
+    assert found.velocity[0] == pytest.approx(1.0, abs=0.05)
+    assert found.std[0] == pytest.approx(1.0, abs=0.05) and found.std[1] < 0.3
+
+
+def test_a_drift_that_is_wrong_is_in_the_stated_errors():
+    """Wrong by its standard error of 1 m/s along y or z: errors of vectors and lines are 1 sigma.
+
+    To 10 %, where gradients are resolved. Without, the stated errors of 1 mm/s are those of the
+    vectors.
+    """
+    flow, scan = vectors(0.001), sights(1e-3)
+    scan["v_los"][:] = scan["v_los"] - 1e-3 * np.random.default_rng([1, 1]).standard_normal(63)
+    grid = np.meshgrid(Y, Z)
+    for axis in range(2):
+        wrong, std = np.array(DRIFT), np.zeros(2)
+        wrong[axis] += 1.0
+        std[axis] = 1.0
+        found, lines = at_common_time(flow, scan, 0.0, tuple(wrong), tuple(std))
+        valid = (found["flag"] == 0).values
+        for name, exact in zip("vw", wind(*grid, 0.0), strict=True):
+            off, stated = (found[name].values - exact)[valid], found[f"{name}_stderr"].values[valid]
+            large = stated > 0.05
+            assert large.sum() > 50
+            assert np.sqrt((off[large] ** 2).mean() / (stated[large] ** 2).mean()) == pytest.approx(
+                1, abs=0.1
+            )
+        direction = lines["direction"].values
+        places = lines["origin"].values + direction * lines["range"].values[:, None]
+        along = (direction[:, 1:] * np.transpose(wind(*places.T[1:], 0.0))).sum(1)
+        off, stated = lines["v_los"].values + along, lines["v_los_std"].values
+        assert np.sqrt((off**2).mean() / (stated**2).mean()) == pytest.approx(1, abs=0.1)
 
 
 def test_a_steady_wind_has_one_time():

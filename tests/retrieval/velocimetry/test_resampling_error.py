@@ -74,15 +74,15 @@ def test_error_stated_is_the_one_made(length, px):
 
 
 def test_vectors_are_flagged_where_more_is_lost_than_noise():
-    """Over templates of 4 px in one half of an image, and only there."""
+    """Over templates of 4 px in one half of an image, and half a template beside it."""
     y, z = axes(24, 16)
     noise = data_array(np.full((16, 24), 0.01), y, z)
     with_it = noise * np.where(np.arange(24) < 12, 1.1, 3.0)
-    count = np.zeros((4, 6), np.uint16)
-    wind = xr.Dataset({"flag": (("z", "y"), count)}, {"z": z[1::4], "y": y[1::4]}, {"template": 4})
+    count = np.zeros((8, 12), np.uint16)
+    wind = xr.Dataset({"flag": (("z", "y"), count)}, {"z": z[1::2], "y": y[1::2]}, {"template": 4})
     found = flag_resampled(wind, noise, with_it)["flag"]
     assert found.dtype == np.uint16
-    assert (found[:, :3] == 0).all() and (found[:, 3:] == Flag.RESAMPLED).all()
+    assert (found[:, :5] == 0).all() and (found[:, 5:] == Flag.RESAMPLED).all()
 
 
 def test_error_of_beams_that_are_dense_in_calm_air_only():
