@@ -14,7 +14,7 @@ receivers            analysers of the Doppler shift: published efficiencies, cos
 strips               loads of a wake on a wing: closed forms, a lattice of vortices
 track                track of a vortex pair: errors over simulated flights are as stated
 timing               winds of beams with times and poses: closed forms
-coverage             standard errors of winds where air changes; only by name, as some rows fail
+coverage             standard errors of winds where air changes; only by name: writes its section
 instrument           winds by an etalon with defects; only by name
 resolution           winds from fewer, larger pixels, against their bound; only by name
 """
@@ -35,7 +35,8 @@ GROUPS = (
     "timing",
 )
 OPEN = ("coverage", "instrument", "resolution")
-"""Run only by name. Some rows of ``coverage`` fail as long as the retrievals assume air that does
-not change; the page does not hold the others yet."""
+"""Run only by name: some of their rows fail."""
+SECTIONS = ("coverage",)
+"""Of those, groups whose text is a section of the page, between marks."""
 FORMER_NAMES = {"error_bars": "standard_errors"}
 """Groups by the names of earlier versions, which the command line still accepts."""

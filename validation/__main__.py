@@ -9,7 +9,7 @@ from rich.console import Console
 
 from benchmarks.measure import fresh_process
 
-from . import FORMER_NAMES, GROUPS, OPEN, report
+from . import FORMER_NAMES, GROUPS, OPEN, SECTIONS, report
 from . import __doc__ as description
 from .eradiate import provenance
 from .group import run
@@ -56,6 +56,10 @@ def main(arguments: list[str] | None = None) -> int:
         found.append(future.result())
         for check in found[-1][-1]:
             report.show(check, console)
+            if name in SECTIONS:
+                title, introduction, _ = found[-1]
+                text = "\n\n".join([f"## {title}", introduction, check.text])
+                report.write(report.with_section(_stored(options.out), name, text), options.out)
             if by_hand.exists():
                 text = by_hand.read_text(encoding="utf-8")
                 if (renewed := report.with_table(text, check)) != text:
@@ -70,11 +74,19 @@ def main(arguments: list[str] | None = None) -> int:
             ]
     if len(found) == len(GROUPS):
         command = "make validate" + (" ARGS=--slow" if options.slow else "")
-        report.write(report.page(found, command, [provenance(options.eradiate)]), options.out)
+        page = report.page(found, command, [provenance(options.eradiate)])
+        for name in SECTIONS:
+            if text := report.section_of(_stored(options.out), name):
+                page = report.with_section(page, name, text)
+        report.write(page, options.out)
         console.print(f"written: {options.out}", highlight=False)
     for line in failed:
         console.print(f"FAILS: {line}", style="red", highlight=False, soft_wrap=True)
     return int(bool(failed))
+
+
+def _stored(page: Path) -> str:
+    return page.read_text(encoding="utf-8") if page.exists() else ""
 
 
 if __name__ == "__main__":

@@ -204,6 +204,21 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
     return "\n".join(lines) + "\n"
 
 
+def with_section(page: str, name: str, text: str) -> str:
+    """A page with what stands between the marks of a name replaced; without them put at its end."""
+    begin, end = (f"<!-- {name}: {what} -->" for what in ("begin", "end"))
+    section = f"{begin}\n{text.strip()}\n{end}"
+    before, found, rest = page.partition(begin)
+    if not found:
+        return f"{page.rstrip()}\n\n{section}\n"
+    return before + section + rest.partition(end)[2]
+
+
+def section_of(page: str, name: str) -> str:
+    """What stands between the marks of a name on a page, empty if there is nothing."""
+    return page.partition(f"<!-- {name}: begin -->")[2].partition(f"<!-- {name}: end -->")[0]
+
+
 def _section(check: Check) -> list[str]:
     lines = [f"### {check.title}", "", f"<!-- {check.name} -->", "", check.text, ""]
     lines += [

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import loky
+import numpy as np
 import torch
 import xarray as xr
 
@@ -22,6 +23,8 @@ Complete = Callable[[xr.Dataset], tuple[xr.Dataset, tuple[str, ...]]]
 
 # Of both vortices, z and y, among the parameters of a pair.
 _PLACES = ([3, 7], [2, 6])
+# Fraction of the vectors whose flag limits the use of a slab's wind.
+_MOST = 0.5
 
 
 class SlabPair(NamedTuple):
@@ -55,7 +58,7 @@ class Found(NamedTuple):
     ----------
     wind : Dataset
     flags : tuple of str
-        Of its completion.
+        What limits the images' wind (`limits`), and those of its completion.
     seconds : dict
         Of the parts `wind`, and `combination` if it was completed.
     """
@@ -63,6 +66,18 @@ class Found(NamedTuple):
     wind: xr.Dataset
     flags: tuple[str, ...]
     seconds: dict[str, float]
+
+
+def limits(wind: xr.Dataset) -> tuple[str, ...]:
+    """What half of the vectors or more are flagged for, in words, such as "wind: no skill"."""
+    flag = wind["flag"]
+    return tuple(
+        f"wind: {name.replace('_', ' ')}"
+        for name, mask in zip(
+            flag.attrs["flag_meanings"].split(), np.ravel(flag.attrs["flag_masks"]), strict=True
+        )
+        if ((flag.values & mask) != 0).mean() >= _MOST
+    )
 
 
 class SlabWinds:
@@ -111,10 +126,12 @@ class SlabWinds:
         self, slab: SlabPair, before: VortexPairFit | None, complete: Complete | None
     ) -> Found:
         began = time.perf_counter()
-        wind, flags = self._wind(slab, before), ()
+        wind = self._wind(slab, before)
+        flags = limits(wind)
         seconds = {"wind": time.perf_counter() - began}
         if complete:
-            wind, flags = complete(wind)
+            wind, more = complete(wind)
+            flags += more
             seconds["combination"] = time.perf_counter() - began - seconds["wind"]
         return Found(wind, flags, seconds)
 

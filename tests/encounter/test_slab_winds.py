@@ -1,13 +1,14 @@
 """Winds of successive slabs, in this process and in one of its own.
 
 Detects winds that differ between both, structure learnt once that stays behind as a pair drifts,
-and a wind that waits for vortices it does not have.
+a wind that waits for vortices it does not have, and flags that the slab's estimate does not tell.
 """
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from benchmarks.cases import DT, drifting_pair_images
 from benchmarks.realtime import UNFORESEEN
@@ -88,6 +89,21 @@ def test_a_wind_is_completed_where_it_is_found_and_the_next_starts_without(here,
         assert flags == ("doubled",) and set(seconds) == {"wind", "combination"}
         off = (wind["v"] / 2 - alone.wind["v"]) / alone.wind["v_stderr"]
         assert float(abs(off).max()) < 0.01
+
+
+def test_what_limits_the_wind_of_most_vectors_is_said(drifting):
+    """A pattern at rest as strong as the texture, and unrelated images."""
+    images, random = drifting[0][0], np.random.default_rng(5)
+    fixed = gaussian_filter(random.standard_normal(images.first.shape), 1.5)
+    fixed = 1 + float(images.first.std()) * fixed / fixed.std()
+    other = images.first.copy(data=1 + 0.05 * random.standard_normal(images.first.shape))
+    pairs = {
+        "wind: at rest": (fixed * images.first, fixed * images.second),
+        "wind: unrelated": (images.first, other),
+    }
+    for reason, pair in pairs.items():
+        winds = SlabWinds(ImageMethod.VARIATIONAL, WINDOWS)
+        assert reason in winds.begun(SlabPair(*pair, DT, NOISE), None)().flags
 
 
 def test_other_methods_start_from_nothing(drifting):

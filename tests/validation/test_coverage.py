@@ -69,3 +69,16 @@ def test_a_row_of_the_table():
     assert 0.02 < found.rmse < 0.1 and 2 < found.wind < 4 and found.valid > 0.95
     assert 0.4 < found.coverage_68[0] < found.coverage_95[0] <= 1
     assert "gain of 5 %" in coverage._line(found)
+
+
+def row(covered, wide, variance, valid=1.0):
+    return coverage.Coverage("air", "cc", 0.1, 0.1, 3.0, covered, wide, variance, valid)
+
+
+def test_rows_that_miss_are_bold():
+    """Only by more than their own errors."""
+    held = row((0.65, 0.03), (0.94, 0.01), (1.28, 0.05))
+    assert "**" not in coverage._line(held)
+    missed = row((0.60, 0.02), (0.85, 0.02), (1.60, 0.20))
+    assert "| **60 ± 2** | **85 ± 2** | **1.60 ± 0.20** |" in coverage._line(missed)
+    assert coverage._line(row(*[(np.nan, np.nan)] * 3, valid=0.0)).endswith("| all flagged |")

@@ -284,6 +284,20 @@ def test_command_names_unknown_arguments(capsys):
     assert stop.value.code == 2 and "'speed' is none of" in capsys.readouterr().err
 
 
+def test_group_that_runs_by_name_writes_its_section_alone(quick, monkeypatch):
+    """Into a page that stays as it is; a new page keeps the section."""
+    begin, end = "<!-- coverage: begin -->", "<!-- coverage: end -->"
+    quick.write_text(f"before\n\n{begin}\nold\n{end}\n\nafter\n")
+    assert command.main(["coverage", "-o", str(quick)]) == 0
+    text = quick.read_text()
+    assert text.startswith(f"before\n\n{begin}\n## Title coverage\n") and "old" not in text
+    assert text.endswith(f"\n{end}\n\nafter\n")
+    monkeypatch.setattr(command, "GROUPS", ("lidar_equation",))
+    assert command.main(["-o", str(quick)]) == 0
+    section = report.section_of(text, "coverage")
+    assert "before" not in quick.read_text() and section in quick.read_text()
+
+
 # --- the page
 
 
