@@ -10,7 +10,6 @@ from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-import torch
 
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
@@ -20,6 +19,7 @@ from lidar_mi.encounter.estimator import Estimator
 from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.slabs import gates_of
 from lidar_mi.experiment.reading import load_experiment
+from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 from .cases import CIRCULATION, CORE_RADIUS, DT, SEPARATION, Pair, drifting_pair_images
@@ -64,9 +64,9 @@ class Still(NamedTuple):
         return 0 * v, v + MEAN_WIND[0], w + MEAN_WIND[1]
 
 
+@threads_for(0)  # threads of what makes the images would linger beside the estimator
 def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison:
     """Latency and errors over 20 times ``repeats`` slabs, after one that is not timed."""
-    torch.set_num_threads(1)
     number = SLABS_A_TURN * repeats
     # vectors as far apart as in the shipped flight, whose pixels are twice as large
     experiment = load_experiment("encounter_sensor", retrieval={"stride": 8})

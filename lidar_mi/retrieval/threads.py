@@ -10,9 +10,12 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import lru_cache
 from typing import TypeVar
 
+import scipy.linalg  # noqa: F401 its threads are limited, too
 import torch
+from threadpoolctl import ThreadpoolController
 
 SMALL = 1 << 18
 """Pixels up to which one thread is as fast as two on a quiet machine (`benchmarks threads`)."""
@@ -24,15 +27,25 @@ _AVAILABLE: ContextVar[int | None] = ContextVar("available", default=None)
 
 @contextmanager
 def threads_for(pixels: int) -> Iterator[None]:
-    """Work with one thread on so few pixels, with torch's own number on more."""
+    """Work with one thread on so few pixels, with torch's own number on more.
+
+    So does the linear algebra of numpy and scipy.
+    """
     before = torch.get_num_threads()
     available = _AVAILABLE.set(before)
     torch.set_num_threads(1 if pixels <= SMALL else before)
     try:
-        yield
+        with _libraries().limit(limits=1 if pixels <= SMALL else None, user_api="blas"):
+            yield
     finally:
         torch.set_num_threads(before)
         _AVAILABLE.reset(available)
+
+
+@lru_cache(maxsize=1)
+def _libraries() -> ThreadpoolController:
+    """Those that are loaded; to look for them takes a millisecond."""
+    return ThreadpoolController()
 
 
 def mapped(function: Callable[[_Part], _Result], parts: Iterable[_Part]) -> list[_Result]:

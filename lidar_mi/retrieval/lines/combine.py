@@ -32,6 +32,7 @@ from lidar_mi.retrieval.lines.grid_lines import (
 )
 from lidar_mi.retrieval.lines.u_prior import correlation, probable_statistics, relative_std
 from lidar_mi.retrieval.lines.vectors import COMPONENTS, error_variables, flag_attributes
+from lidar_mi.retrieval.threads import threads_for
 
 # Prior standard deviation of the mean of u, m/s.
 _MEAN_STD = 100.0
@@ -46,6 +47,7 @@ class CombinedFlag(enum.IntFlag):
     """Outside the lines of sight: u is extrapolated from the nearest."""
 
 
+@threads_for(0)
 def combine(
     crossflow: xr.Dataset,
     scan: xr.Dataset,
