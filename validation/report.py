@@ -207,7 +207,7 @@ def page(groups: Sequence[tuple[str, str, Sequence[Check]]], command: str, notes
 def with_section(page: str, name: str, text: str) -> str:
     """A page with what stands between the marks of a name replaced; without them put at its end."""
     begin, end = (f"<!-- {name}: {what} -->" for what in ("begin", "end"))
-    section = f"{begin}\n{text.strip()}\n{end}"
+    section = f"{begin}\n\n{text.strip()}\n\n{end}"
     before, found, rest = page.partition(begin)
     if not found:
         return f"{page.rstrip()}\n\n{section}\n"
@@ -238,16 +238,13 @@ def _section(check: Check) -> list[str]:
 
 
 def with_table(text: str, check: Check) -> str:
-    """A page written by hand, with the table of a check between its two marks.
+    """A page written by hand, with the table of a check between the marks of its name.
 
-    A page that has no mark with the check's name stays as it is.
+    A page that has no such marks stays as it is.
     """
-    first, last = f"<!-- table: {check.name} -->\n", f"<!-- end: {check.name} -->"
-    if check.comparison is None or first not in text or last not in text:
+    if check.comparison is None or not section_of(text, check.name):
         return text
-    before, rest = text.split(first, 1)
-    after = rest.split(last, 1)[1]
-    return "\n".join([before + first, *_markdown(check.comparison), "", last + after])
+    return with_section(text, check.name, "\n".join(_markdown(check.comparison)))
 
 
 def _markdown(table: Comparison) -> list[str]:

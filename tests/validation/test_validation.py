@@ -99,7 +99,7 @@ def test_spread_of_z_scores(batches):
 def test_a_table_replaces_that_of_a_page_written_by_hand():
     table = report.Comparison(("a", "b"), (("1", "2"),))
     check = Check("a", "b", (), name="group.check", comparison=table)
-    marks = "<!-- table: group.check -->\n", "<!-- end: group.check -->"
+    marks = "<!-- group.check: begin -->\n", "<!-- group.check: end -->"
     page = f"before\n{marks[0]}\nold\n\n{marks[1]}\nafter\n"
     new = report.with_table(page, check)
     assert new == f"before\n{marks[0]}\n| a | b |\n| --- | --- |\n| 1 | 2 |\n\n{marks[1]}\nafter\n"
@@ -290,7 +290,7 @@ def test_group_that_runs_by_name_writes_its_section_alone(quick, monkeypatch):
     quick.write_text(f"before\n\n{begin}\nold\n{end}\n\nafter\n")
     assert command.main(["coverage", "-o", str(quick)]) == 0
     text = quick.read_text()
-    assert text.startswith(f"before\n\n{begin}\n## Title coverage\n") and "old" not in text
+    assert text.startswith(f"before\n\n{begin}\n\n## Title coverage\n") and "old" not in text
     assert text.endswith(f"\n{end}\n\nafter\n")
     monkeypatch.setattr(command, "GROUPS", ("lidar_equation",))
     assert command.main(["-o", str(quick)]) == 0
