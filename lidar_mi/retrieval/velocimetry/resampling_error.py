@@ -104,8 +104,8 @@ def flag_resampled(wind: xr.Dataset, noise: xr.DataArray, with_it: xr.DataArray)
     What is lost depends on the air and on the places of the beams, which are at rest: it is not
     only noise, but also a bias. Flagged are vectors with a place at most half a template away, over
     whose template its mean square exceeds 4 times that of the noise: a smooth field carries the
-    bias to its neighbours. In Lissajous figures, vectors next to flagged ones err by 1.5 to 1.7
-    times as much as stated.
+    bias to its neighbours. With no place but those over the template, errors in the interior of
+    Lissajous figures are 1.5 to 1.7 times as large as stated.
 
     Parameters
     ----------
