@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import lidar_mi as lm
 from benchmarks.cases import vortex_pair_images
@@ -26,6 +27,19 @@ def test_one_for_small_images_torch_s_own_for_large_ones():
     assert torch.get_num_threads() == 2
     with threads_for(SMALL + 1):
         assert torch.get_num_threads() == 2
+
+
+def test_linear_algebra_of_numpy_and_scipy_likewise():
+    def numbers():
+        return [one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"]
+
+    with threadpool_limits(2, user_api="blas"):
+        before = numbers()
+        with threads_for(SMALL):
+            assert set(numbers()) == {1}
+        assert numbers() == before
+        with threads_for(SMALL + 1):
+            assert numbers() == before
 
 
 @pytest.mark.usefixtures("two_threads")
