@@ -38,7 +38,7 @@ def register_plugins() -> None:
     """Register the plugins of lidar-mi with Mitsuba, in the variant in force and every later one.
 
     May be called at any time and any number of times, before or after ``mi.set_variant``. In scalar
-    variants a scene with one of the plugins is refused, with the reason.
+    variants a scene with one of the plugins is refused, with the reason; volumes are not known there.
 
     Examples
     --------
@@ -57,8 +57,12 @@ def _register_now(name: str) -> None:
     if not variant:
         return
     kind, define = _known[name]
-    # Mitsuba 3.9 has no function for volumes; any registers what a class is derived from
-    kind = kind if hasattr(mi, f"register_{kind}") else "texture"
+    if not hasattr(mi, f"register_{kind}"):
+        # Mitsuba 3.9 has no function for volumes; any registers what a class is derived from. Its
+        # parser takes the kind of a plugin from scalar_rgb, and would refuse the volume ever after.
+        if variant.startswith("scalar"):
+            return
+        kind = "texture"
     # Python plugins handle arrays of rays, which scalar variants do not have.
     make = _refusal(name, variant) if variant.startswith("scalar") else define()
     getattr(mi, f"register_{kind}")(name, make)

@@ -159,6 +159,10 @@ def test_plugins_survive_every_change_of_variant():
             for plugin in ("laser", "rayleigh_polarized", "gated_volpath"):
                 with pytest.raises(RuntimeError, match=f"{plugin}: the variant {name} is not"):
                     mi.load_dict({"type": plugin})
+    # Mitsuba's parser takes the kinds of plugins from scalar_rgb
+    states = mi.TensorXf(np.ones((2, 2, 2, 2), np.float32))
+    moving = {"type": "moving_volume", "data": states, "time_start": 0.0, "time_stop": 1.0}
+    assert mi.load_dict({"type": "heterogeneous", "sigma_t": moving}) is not None
 
 
 # --- the scenes that ship --------------------------------------------------------------------
