@@ -38,7 +38,7 @@ def register_plugins() -> None:
     """Register the plugins of lidar-mi with Mitsuba, in the variant in force and every later one.
 
     May be called at any time and any number of times, before or after ``mi.set_variant``. In scalar
-    variants a scene with one of the plugins is refused, with the reason; volumes are not known there.
+    variants a scene with one of the plugins is refused, with the reason; volumes are unknown there.
 
     Examples
     --------
