@@ -51,9 +51,10 @@ def retrieve(
     method: Annotated[
         str,
         typer.Option(
-            help="cc (cross-correlation), ws (weight shift), multipass, variational or vortex_fit."
+            help="variational (a smooth flow), cc (cross-correlation), ws (weight shift), "
+            "multipass or vortex_fit."
         ),
-    ] = "cc",
+    ] = "variational",
     template: Annotated[int, typer.Option(help="Template size, pixels.")] = 8,
     search: Annotated[int, typer.Option(help="Search region, pixels.")] = 16,
     stride: Annotated[int, typer.Option(help="Step between vectors, pixels.")] = 1,

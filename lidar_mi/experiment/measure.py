@@ -58,7 +58,7 @@ def measure(
         metrics |= velocity_metrics(results["v_los"])
     if "lines" in results:
         metrics |= _sensor(results)
-        metrics |= margin_metrics(judged(experiment, results, metrics))
+        metrics |= margin_metrics(judged(experiment, results, metrics), experiment.platform.speed)
     if "vortices" in results:
         truth, pairs = results["truth"].wind, results["vortices"].pairs
         metrics |= vortex_metrics(pairs, truth, results["cores"])

@@ -21,7 +21,7 @@ from lidar_mi.experiment.schema import Doppler, Experiment
 from lidar_mi.experiment.stages.ring_images import ring_models
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.etalon import mirrors
-from lidar_mi.io.images import read_frames
+from lidar_mi.io.images import read_frames, stated_units
 from lidar_mi.retrieval.rings.calibration import Calibration, calibrated
 from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
 from lidar_mi.retrieval.rings.calibration_lines import combined
@@ -63,10 +63,16 @@ def read_electrons(
     Raises
     ------
     InputError
-        A file that is no image, frames of different sizes.
+        A file that is no image, frames of different sizes, a rendered image: its values are
+        relative energies, which no pulse and no noise can be told from.
     """
     found: list[np.ndarray] = []
     for path in paths:
+        if units := stated_units(path):
+            raise InputError(
+                f"{path}: a rendered image ({units.partition(';')[0]}) is not allowed; expected "
+                "counts or photoelectrons of a camera; `lidar-mi rings` measures its rings"
+            )
         for frame in read_frames(path, layer):
             if found and frame.shape != found[0].shape:
                 raise InputError(

@@ -10,7 +10,7 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.io.exr import axis_of, read_layers
+from lidar_mi.io.exr import axis_of, read_header, read_layers
 from lidar_mi.io.size import check_size
 
 FITS = (".fits", ".fit", ".fts")
@@ -68,6 +68,14 @@ def read_frames(path: str | Path, layer: str | None = None) -> np.ndarray:
     if path.is_file() and layer is None and path.suffix.lower() in TIFF:
         return _pages(path)
     return read_pixels(path, layer)[None]
+
+
+def stated_units(path: str | Path) -> str:
+    """Units of the values as the header of a rendered EXR file states them; empty otherwise."""
+    path = Path(path)
+    if not path.is_file() or not _is_exr(path):
+        return ""
+    return str(read_header(path).get("units", ""))
 
 
 @checked_arguments

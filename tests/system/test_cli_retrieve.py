@@ -93,7 +93,7 @@ def test_contradictions_are_said(here, lidar_mi):
     for files, words in (
         (("1.exr", "0.exr"), "images in the order of their times"),
         (("silent0.exr", "silent1.exr"), "--dt: missing"),
-        (("0.exr", "1.exr", "timed2.exr"), "expected two, --pairs all"),
+        (("0.exr", "1.exr", "timed2.exr", "--method", "cc"), "expected two, --pairs all"),
         (("0.exr", "1.exr", "0.exr", "--pairs", "all"), "images in the order of their times"),
     ):
         code, _, err = lidar_mi("retrieve", *files, *OPTIONS)
@@ -134,7 +134,7 @@ def test_many_images_pair_by_pair(here, lidar_mi):
 
 def test_thresholds_flag_more(here, lidar_mi):
     def valid(*more):
-        assert lidar_mi("retrieve", "0.exr", "1.exr", *OPTIONS, *more)[0] == 0
+        assert lidar_mi("retrieve", "0.exr", "1.exr", "--method", "cc", *OPTIONS, *more)[0] == 0
         return int((xr.load_dataset("w.nc")["flag"] == 0).sum())
 
     usual = valid()

@@ -19,6 +19,7 @@ from PIL import Image
 from lidar_mi.cli.app import main
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.own_frames import doppler_of
+from lidar_mi.io.exr import QUANTITIES, write_fringes
 from tests.support.command_line import words_of
 from validation.fringe_reference import (
     Defects,
@@ -131,6 +132,19 @@ def test_wrong_input_is_one_line(folder, calibration, arguments, message):
     paths = [folder / a if a.endswith((".tif", ".yaml")) else a for a in arguments]
     said = failed(*paths, "--instrument", folder / "mine.yaml")
     assert message in said and "Traceback" not in said
+
+
+def test_a_rendered_image_names_its_unit(folder, tmp_path):
+    """Relative energies instead of a camera's counts, which every fit would misread."""
+    image = xr.Dataset(
+        {name: (("y", "x"), np.zeros((195, 240), np.float32)) for name in QUANTITIES},
+        attrs={"units": "Stokes: received energy over the energy sent through the stop; m"},
+    )
+    write_fringes(tmp_path / "fringes.exr", image)
+    for command in ("v_los", "calibrate"):
+        said = failed(command, tmp_path / "fringes.exr", "--instrument", folder / "mine.yaml")
+        assert "received energy over the energy sent through the stop" in said
+        assert "expected counts or photoelectrons of a camera" in said
 
 
 MERCURY, GAP = 404.7708e-9, 13.7031234e-3

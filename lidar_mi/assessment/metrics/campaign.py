@@ -147,9 +147,15 @@ def requirements(metrics: Mapping[str, xr.DataArray]) -> dict[tuple[str, str], d
     return found
 
 
-def judged(dataset: xr.Dataset, margin: xr.DataArray) -> xr.DataArray:
-    """A margin, -1 (nothing of what is required) where a finished run gave nothing to be judged."""
+def judged(dataset: xr.Dataset, key: str) -> xr.DataArray:
+    """A margin, -1 (nothing of what is required) where a finished run gave nothing to be judged.
+
+    NaN where the run is of another phase of flight, whose speed its aircraft does not have.
+    """
+    margin, phase = dataset[key], key.rsplit(".", 2)[0]
     nothing = (dataset["status"] == 0) & margin.isnull()
+    if f"{phase}.applies" in dataset:
+        nothing &= dataset[f"{phase}.applies"] == 1
     return margin.where(~nothing, -1.0)
 
 

@@ -155,12 +155,29 @@ def cost_metrics(costs: Mapping[str, LidarCost]) -> dict[str, float]:
 
 
 def margin_metrics(
-    judged: Sequence[tuple[RequirementTable, Sequence[Finding]]],
+    judged: Sequence[tuple[RequirementTable, Sequence[Finding]]], speed: float
 ) -> dict[str, float]:
-    """Margins to the requirements, ``sensor.APPLICATION.PHASE.QUANTITY.margin``."""
-    return {
+    """Margins to the requirements of the phase that is flown.
+
+    Parameters
+    ----------
+    judged : sequence of (RequirementTable, sequence of Finding)
+    speed : float
+        Of the aircraft, m/s.
+
+    Returns
+    -------
+    dict of str to float
+        ``sensor.APPLICATION.PHASE.applies``, 1 or 0, of every table; of those that apply
+        ``sensor.APPLICATION.PHASE.QUANTITY.margin``.
+    """
+    applying = {
+        f"sensor.{table.application}.{table.phase}.applies": float(table.applies_at(speed))
+        for table, _ in judged
+    }
+    return applying | {
         f"sensor.{table.application}.{table.phase}.{row.quantity}.margin": row.margin
         for table, findings in judged
         for row in findings
-        if not math.isnan(row.margin)
+        if table.applies_at(speed) and not math.isnan(row.margin)
     }

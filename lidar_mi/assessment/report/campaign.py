@@ -84,7 +84,7 @@ def _margins(dataset: xr.Dataset) -> dict:
     known = numbers.metrics_of(dataset)
     return {
         group: {
-            QUANTITIES.get(q, (q, ""))[0]: numbers.over_members(numbers.judged(dataset, known[k]))
+            QUANTITIES.get(q, (q, ""))[0]: numbers.over_members(numbers.judged(dataset, k))
             for q, k in rows.items()
         }
         for group, rows in numbers.requirements(known).items()
@@ -380,6 +380,8 @@ def _requirement_maps(dataset, margins, axes, points) -> Iterator[Block]:
                 )
                 for row, one in rows.items()
             }
+            if not any(one.mean.notnull().any() for one in here.values()):
+                continue  # of another phase of flight
             spots = Points(*(p.isel(where) for p in flat))
             drawn.append(figures.draw_requirements(name, here, *at, spots))
         known = any(np.isfinite(one.low).any() for one in rows.values())

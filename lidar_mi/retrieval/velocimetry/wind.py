@@ -35,7 +35,7 @@ def retrieve_wind(
     image1: xr.DataArray,
     image2: xr.DataArray,
     dt: float,
-    method: str | Method = "cc",
+    method: str | Method = "variational",
     template: int = 8,
     search: int = 16,
     stride: int = 1,
@@ -67,6 +67,7 @@ def retrieve_wind(
     method : {"cc", "ws", "multipass", "variational", "vortex_fit"}
         Cross-correlation, weight shift, multi-pass correlation, a smooth flow or a vortex pair
         fitted to the images as a whole, see `methods.METHODS`. Or a `methods.Method` of one's own.
+        Default: "variational", the most accurate of a pair, with errors from its fit.
     template, search, stride : int
         Pixels: template n >= 2, search region >= n + 2, step from window to window >= 1. Winds
         beyond ((search - template) // 2 - 1/2) spacing / dt are out of range (17.5 m/s for 8 in 16

@@ -56,9 +56,14 @@ def test_boundaries_are_where_the_margin_is_zero(logarithmic):
 
 def test_a_run_that_delivers_nothing_does_not_meet_a_requirement():
     margin = xr.DataArray([0.2, np.nan, np.nan, 0.0], dims="range")
-    data = xr.Dataset({"status": ("range", [0, 0, 1, 0])})
-    found = met(over_members(judged(data, margin)))
+    key = "sensor.flight_control.cruise.error_w.margin"
+    data = xr.Dataset({"status": ("range", [0, 0, 1, 0]), key: margin})
+    found = met(over_members(judged(data, key)))
     np.testing.assert_array_equal(found, [1, 0, np.nan, 1])
+    # nor does one of another phase of flight, but of that nothing was asked
+    data["sensor.flight_control.cruise.applies"] = ("range", [1.0, 0, np.nan, 1])
+    found = met(over_members(judged(data, key)))
+    np.testing.assert_array_equal(found, [1, np.nan, np.nan, 1])
 
 
 def test_a_limit_in_the_interval_is_undecided():

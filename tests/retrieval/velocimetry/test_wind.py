@@ -109,7 +109,7 @@ def test_vortex_core_is_retrieved_at_its_position():
     first = texture(waves, *grid)
     advected = grid[0] - mean[0] * DT, grid[1] - mean[1] * DT  # frame that goes with the vortex
     second = texture(waves, *origin(swirl, *advected, DT))
-    dataset = retrieve_wind(*(data_array(i, y, z) for i in (first, second)), DT)
+    dataset = retrieve_wind(*(data_array(i, y, z) for i in (first, second)), DT, "cc")
     good = dataset.flag.values == 0
     v, w = dataset.v.values[good], dataset.w.values[good]
 
@@ -151,7 +151,7 @@ def test_unequal_spacings():
 
 
 def test_vectors_belong_half_their_displacement_further_on():
-    dataset = retrieve_wind(*moved(6.0, -3.0), DT)
+    dataset = retrieve_wind(*moved(6.0, -3.0), DT, "cc")
     np.testing.assert_allclose(dataset.y[0], 0.5 * (4 + 3.5))
     shift_y = (dataset.y_vector - dataset.y).transpose("z", "y")
     shift_z = (dataset.z_vector - dataset.z).transpose("z", "y")
@@ -219,7 +219,7 @@ def test_no_vector_is_good_without_a_number(method):
 
 def test_beyond_the_search_range_no_vector_is_valid():
     """22 m/s are 4.4 px; 8 in 16 sees up to 3.5 px."""
-    dataset = retrieve_wind(*moved(22.0, 0.0), DT)
+    dataset = retrieve_wind(*moved(22.0, 0.0), DT, "cc")
     assert float((dataset.flag & Flag.PEAK_ON_RIM.value > 0).mean()) > 0.8
     assert float((dataset.flag == 0).mean()) < 0.1
     assert not (np.abs(dataset.v) > 17.5).any()
@@ -259,9 +259,9 @@ def test_data_set_is_cf_and_survives_a_file(tmp_path):
 
 def test_transposed_and_single_precision_images():
     pair = moved(6.0, -3.0)
-    plain = retrieve_wind(*pair, DT)
-    xr.testing.assert_identical(retrieve_wind(pair[0].T, pair[1], DT), plain)
-    single = retrieve_wind(*(image.astype(np.float32) for image in pair), DT)
+    plain = retrieve_wind(*pair, DT, "cc")
+    xr.testing.assert_identical(retrieve_wind(pair[0].T, pair[1], DT, "cc"), plain)
+    single = retrieve_wind(*(image.astype(np.float32) for image in pair), DT, "cc")
     np.testing.assert_allclose(single.v, plain.v, atol=1e-3)
 
 
@@ -275,26 +275,26 @@ def test_bad_input_is_named():
         (lambda: retrieve_wind(one, two, DT, "piv"), "method: 'piv' is not one of cc, ws"),
         (lambda: retrieve_wind(one, two, 0), "dt: 0 s"),
         (lambda: retrieve_wind(one, two, "soon"), "dt: 'soon'"),
-        (lambda: retrieve_wind(one, two, DT, template=1), "template: 1 px"),
-        (lambda: retrieve_wind(one, two, DT, search=9), "search: 9 px"),
-        (lambda: retrieve_wind(one, two, DT, stride=0), "stride: 0 px"),
-        (lambda: retrieve_wind(one, two, DT, search=31), "search: 31 px does not fit"),
-        (lambda: retrieve_wind(one, two[:-1], DT), "image2: sizes 30 x 40 and 29 x 40"),
-        (lambda: retrieve_wind(one, bare, DT), "image2.y: units None"),
-        (lambda: retrieve_wind(one, off, DT), "image2.y: up to 0.2 m off"),
-        (lambda: retrieve_wind(one, uneven, DT), "image2.y: spacing from 0.3 to 0.7 m"),
-        (lambda: retrieve_wind(one[:, ::-1], two, DT), "image1.y: not at least two"),
-        (lambda: retrieve_wind(one, feet, DT), "image2.y: units 'ft'"),
-        (lambda: retrieve_wind(one.values, two, DT), "image1: ndarray"),
-        (lambda: retrieve_wind(one.expand_dims("gate"), two, DT), "image1: dims"),
-        (lambda: retrieve_wind(one.drop_vars("z"), two, DT), "image1.z: coordinate missing"),
-        (lambda: retrieve_wind(1e300 * one, two, DT), "image1: values up to"),
-        (lambda: retrieve_wind(one + 1j, two, DT), "image1: values of type complex128"),
-        (lambda: retrieve_wind(one, two, DT, device="abacus"), "device: 'abacus'"),
-        (lambda: retrieve_wind(one, two, DT, noise=one[1:]), "noise: sizes"),
-        (lambda: retrieve_wind(one, two, DT, min_texture=-1), "min_texture: -1"),
-        (lambda: retrieve_wind(one, two, DT, min_correlation=1.5), "min_correlation: 1.5"),
-        (lambda: retrieve_wind(one, two, DT, median_size=7), "median_size: 7"),
+        (lambda: retrieve_wind(one, two, DT, "cc", template=1), "template: 1 px"),
+        (lambda: retrieve_wind(one, two, DT, "cc", search=9), "search: 9 px"),
+        (lambda: retrieve_wind(one, two, DT, "cc", stride=0), "stride: 0 px"),
+        (lambda: retrieve_wind(one, two, DT, "cc", search=31), "search: 31 px does not fit"),
+        (lambda: retrieve_wind(one, two[:-1], DT, "cc"), "image2: sizes 30 x 40 and 29 x 40"),
+        (lambda: retrieve_wind(one, bare, DT, "cc"), "image2.y: units None"),
+        (lambda: retrieve_wind(one, off, DT, "cc"), "image2.y: up to 0.2 m off"),
+        (lambda: retrieve_wind(one, uneven, DT, "cc"), "image2.y: spacing from 0.3 to 0.7 m"),
+        (lambda: retrieve_wind(one[:, ::-1], two, DT, "cc"), "image1.y: not at least two"),
+        (lambda: retrieve_wind(one, feet, DT, "cc"), "image2.y: units 'ft'"),
+        (lambda: retrieve_wind(one.values, two, DT, "cc"), "image1: ndarray"),
+        (lambda: retrieve_wind(one.expand_dims("gate"), two, DT, "cc"), "image1: dims"),
+        (lambda: retrieve_wind(one.drop_vars("z"), two, DT, "cc"), "image1.z: coordinate missing"),
+        (lambda: retrieve_wind(1e300 * one, two, DT, "cc"), "image1: values up to"),
+        (lambda: retrieve_wind(one + 1j, two, DT, "cc"), "image1: values of type complex128"),
+        (lambda: retrieve_wind(one, two, DT, "cc", device="abacus"), "device: 'abacus'"),
+        (lambda: retrieve_wind(one, two, DT, "cc", noise=one[1:]), "noise: sizes"),
+        (lambda: retrieve_wind(one, two, DT, "cc", min_texture=-1), "min_texture: -1"),
+        (lambda: retrieve_wind(one, two, DT, "cc", min_correlation=1.5), "min_correlation: 1.5"),
+        (lambda: retrieve_wind(one, two, DT, "cc", median_size=7), "median_size: 7"),
     ):
         with pytest.raises(InputError) as error:
             call()
@@ -333,7 +333,7 @@ def test_more_images_of_a_burst_lower_the_error():
 def test_a_burst_needs_a_method_that_takes_it():
     first, second, third = burst(3, 0.0)
     with pytest.raises(InputError, match="more: 3 images are not allowed with method 'cc'"):
-        retrieve_wind(first, second, DT, more=[third])
+        retrieve_wind(first, second, DT, "cc", more=[third])
     with pytest.raises(InputError, match="differ"):
         retrieve_wind(first, second, DT, "variational", more=[third[:-1]])
 
