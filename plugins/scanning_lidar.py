@@ -46,7 +46,7 @@ are ranges from each beam's own origin, shorter by x: the gates follow the air, 
 
 Files of tables are ``.npy``, or text with numbers separated by blanks or commas and ``#`` comments.
 Integrators other than :ref:`gated_volpath <integrator-gated_volpath>` take it for a camera along
-the beams, without its laser.
+the beams, without its laser and its gates, and a warning says so.
 
 The time of a beam is that of its light everywhere, in a :ref:`volume that changes with time
 <volume-moving_volume>` for instance; the pulse itself takes none. Directions, ``origins`` (x, y, z
@@ -66,6 +66,8 @@ of every beam) and ``times``, gates, aperture, field of view, pose and the laser
     </sensor>
 """
 
+import warnings
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -76,6 +78,10 @@ from .polarization import horizontal_axis
 from .registration import register
 
 NAME, KIND = "scanning_lidar", "sensor"
+CAMERA = (
+    f"{NAME}: this integrator takes it for a camera along the beams, without its laser and its "
+    "gates; expected 'gated_volpath', or a 'laser' beside it that lights the scene"
+)
 
 
 def define():
@@ -168,7 +174,11 @@ def define():
             return self.m_pose
 
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
-            """The axis of the beam at a film position, for any other integrator."""
+            """The axis of the beam at a film position, for any other integrator.
+
+            Its laser lights nothing then, and it has no gates: a warning says so.
+            """
+            warnings.warn(CAMERA, stacklevel=2)
             width, height = self.film().size()
             column = dr.clip(mi.UInt32(sample2.x * width), 0, width - 1)
             row = dr.clip(mi.UInt32(sample2.y * height), 0, height - 1)

@@ -380,3 +380,17 @@ def test_a_backward_beam_needs_spherical_gates(world, kind):
     else:
         with pytest.raises(RuntimeError, match="does not point forward"):
             mi.load_dict(world.lidar((1, 1), GATE, **parameters))
+
+
+def test_other_integrators_say_that_the_laser_is_left_out(world):
+    """A wall in front of the lidar is dark under `path`: silence would let it pass for a result."""
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": world.lidar((1, 1), GATE),
+            "wall": {"type": "sphere", "center": [501.0, 0, 0], "radius": 0.5},
+        }
+    )
+    with pytest.warns(UserWarning, match="without its laser and its gates"):
+        image = mi.render(scene, integrator=mi.load_dict({"type": "path"}), spp=4)
+    assert not np.array(image).any()
