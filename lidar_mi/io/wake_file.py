@@ -184,7 +184,8 @@ def read_wake(
 
     The file's variables lie on (time, x, y, z) in any order; time and x may be missing (a slab
     gets one x plane, at its scalar coordinate or at 0). Descending axes are turned round, units
-    are converted. Stretched axes and staggered variables are interpolated to even nodes, see
+    are converted. The lowest levels are left out where a variable has no value at any of their
+    nodes (the ground). Stretched axes and staggered variables are interpolated to even nodes, see
     `lidar_mi.io.regrid`; the attribute ``interpolated`` then states with which error.
 
     Parameters
@@ -253,6 +254,15 @@ def _own_dims(data, table, name, spatial) -> dict[str, str]:
     return {d: spatial[staggered.get(d, d)] for d in dims}
 
 
+def _in_the_ground(variable, height, path) -> int:
+    """Number of lowest levels at which a variable has no value, as solvers mask the ground."""
+    last = variable.sizes[height] - 1
+    for level in range(last):
+        if np.isfinite(_numbers(variable.isel({height: level}), path)).any():
+            return level
+    return 0
+
+
 def _staggered(own, spatial) -> set[str]:
     """Axes that some variable has at nodes of its own."""
     return {ours for dims in own.values() for d, ours in dims.items() if d not in spatial}
@@ -291,8 +301,12 @@ def _read(data, table, sign, asked, time, x, path):
         found[theirs], turned = _axis(data, theirs, ours, path, sign[ours])
         if turned:
             reverse.append(theirs)
-    axes = {ours: found[theirs] for theirs, ours in spatial.items()}
     data = data.isel({theirs: slice(None, None, -1) for theirs in reverse})
+    for theirs in [d for d, ours in places.items() if ours == "z"]:
+        levels = [_in_the_ground(data[table[n]], theirs, path) for n in own if theirs in own[n]]
+        above = slice(max(levels, default=0), None)
+        data, found[theirs] = data.isel({theirs: above}), found[theirs][above]
+    axes = {ours: found[theirs] for theirs, ours in spatial.items()}
     for ours in spatial.values():
         ends = [found[d][[0, -1]] for dims in own.values() for d, o in dims.items() if o == ours]
         low, high = max(end[0] for end in ends), min(end[1] for end in ends)

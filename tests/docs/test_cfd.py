@@ -57,7 +57,9 @@ def test_palm(tmp_path):
     }
     axes = {"x": x, "y": y, "yv": yv, "zu_3d": zu, "zw_3d": zw}
     coordinates = {name: (name, values, {"units": "m"}) for name, values in axes.items()}
-    coordinates["time"] = "time", [600.0], {"units": "s"}
+    coordinates["time"] = "time", [600.0], {"units": "seconds since 2019-06-21 12:00:00 +00"}
+    for _, values, _ in fields.values():
+        values[:, 0] = np.nan  # the ground, which PALM masks by a fill value
     xr.Dataset(fields, coordinates).to_netcdf(tmp_path / "palm_3d.nc", engine="h5netcdf")
     said = yaml.safe_load(printed("palm.yaml"))["wake"]
     names = said["names"]
