@@ -47,7 +47,7 @@ def with_slopes(lines: GridLines, slope: np.ndarray) -> GridLines:
 
 def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridLines, np.ndarray]:
     """Lines on the grid, and the (y, z) of the middles of their bins."""
-    along = wind_along_lines(scan).values
+    along = wind_along_lines(scan)
     if "range_bin" not in scan:
         raise InputError("scan.range_bin: missing; expected the length of the range bins, m")
     direction = scan["direction"].transpose("line", "axis").values
