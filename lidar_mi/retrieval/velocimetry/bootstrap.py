@@ -32,6 +32,9 @@ _APART = ((2, 2), (-2, 2))
 # Standard deviations of Gaussian means over the template: of squared errors, of the residual's
 # level, of squared gradients.
 _REGION, _LEVEL, _SHEAR = 1.5, 3.0, 0.35
+# Independent windows of known error within those means (`_REGION`) that a variance needs: of the
+# two components of five windows, it is known to 45 %.
+_FEWEST = 5.0
 # Gradient, px per px, of a wind that is uniform.
 _UNIFORM = 0.01
 # Least standard error, px: splines do not carry an image more exactly.
@@ -100,7 +103,8 @@ def bootstrap_covariance(
     Returns
     -------
     torch.Tensor, shape (2, 2, *windows.count)
-        px^2; NaN if no vector of the known motion is valid.
+        px^2; NaN where fewer than five independent windows around (valid retrievals, within the
+        Gaussian of 1.5 templates) have a known error.
     """
     # vectors of windows that overlap by more than half would cost more and tell little
     every = max(1, windows.template // 2 // windows.stride)
@@ -123,7 +127,7 @@ def bootstrap_covariance(
     level = averaged(rest.square(), second.isfinite(), _LEVEL * windows.template).sqrt()
     level = level.clamp(min=torch.finfo(rest.dtype).tiny)
     scale = shear + shear.median().clamp(min=_UNIFORM**2)
-    means = []
+    means, number = [], torch.zeros_like(scale)
     for apart in _APART[:repeats]:
         moved = (rest / level).roll([windows.template * part for part in apart], (0, 1))
         moved = torch.where(second.isfinite(), level * moved, torch.nan)
@@ -136,7 +140,9 @@ def bootstrap_covariance(
             continue
         error = again.d - _read(wind, _places(again.d, coarse, centred))
         products = torch.einsum("i...,j...->ij...", error, error).flatten(0, 1) / scale
-        means += [torch.stack([averaged(p, use, _REGION * per_template) for p in products])]
+        width = _REGION * per_template
+        means += [torch.stack([averaged(p, use, width) for p in products])]
+        number += 2 * math.pi * _REGION**2 * averaged(use.to(number), everywhere, width)
     if not means:
         return torch.full_like(found.d[None].expand(2, -1, -1, -1), torch.nan)
     weights = [
@@ -144,6 +150,7 @@ def bootstrap_covariance(
         for axis in (0, 1)
     ]
     covariance = separable(torch.stack(means).mean(0) * scale, weights).unflatten(0, (2, 2))
+    covariance[:, :, separable(number, weights) < _FEWEST] = torch.nan
     return covariance + _LEAST**2 * torch.eye(2).to(d)[:, :, None, None]
 
 

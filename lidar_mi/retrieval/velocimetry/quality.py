@@ -45,6 +45,8 @@ class Flag(enum.IntFlag):
     """The standard error approaches the wind's own spread, or noise assumed decides the wind."""
     RESAMPLED = 4096
     """What resampling of scattered beams lost exceeds the noise (`resampling_error`)."""
+    ERROR_UNKNOWN = 8192
+    """Too few valid vectors around it to state a standard error (`bootstrap`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:

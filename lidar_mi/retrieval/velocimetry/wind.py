@@ -210,7 +210,10 @@ def retrieve_wind(
             )
             found = found._replace(covariance=covariance)
         if found.covariance is not None:
-            flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+            unknown = ~found.covariance.isfinite().all(0).all(0) & bool(chosen.repeats)
+            poor = uncertain(found.covariance) & ~unknown
+            both = Flag.LOW_TEXTURE * poor + Flag.ERROR_UNKNOWN * unknown
+            flag = flag | both.to(torch.int16)
         still = Standing()
         # a method that takes times by itself gives the displacement in dt
         by_itself = "times" in options

@@ -7,6 +7,7 @@ coverage that is off by more than 5 points in any case where the air is seen by 
 import numpy as np
 import pytest
 import torch
+from scipy.special import ndtri
 
 from lidar_mi.retrieval.velocimetry.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.velocimetry.methods import METHODS
@@ -112,6 +113,40 @@ def test_nothing_valid_means_that_errors_are_not_known():
 
     covariance = bootstrap_covariance([first, second], found, windows, nothing, False)
     assert covariance.shape == (2, 2, *windows.count) and bool(covariance.isnan().all())
+
+
+def test_errors_are_not_known_beyond_the_edge_of_valid_windows():
+    """Half a plane of valid windows: five windows are a fraction P(x / 1.5) = 5 / (2 pi 1.5^2)."""
+    first, second = torch.rand(2, 60, 200, generator=torch.Generator().manual_seed(1))
+    windows = Windows((60, 200), 8, 16, 4)
+    found = weight_shift(first, second, 8, 16, 4)
+    d = torch.zeros_like(found.d)
+    edge = windows.count[1] // 2
+
+    def right_half(*images, stride):
+        random = torch.randn(d.shape, generator=torch.Generator().manual_seed(2))
+        flag = torch.zeros_like(found.flag)
+        flag[:, :edge] = Flag.NO_MATCH.value
+        return found._replace(d=d + 0.1 * random, flag=flag)
+
+    still = found._replace(d=d, flag=torch.zeros_like(found.flag))
+    covariance = bootstrap_covariance([first, second], still, windows, right_half, False)
+    unknown = covariance.isnan().any(0).any(0).sum(1)
+    # windows 4 px apart, the edge half way between two of them
+    beyond = -1.5 * 8 / 4 * ndtri(5 / (2 * np.pi * 1.5**2)) + 0.5
+    assert (abs(unknown - (edge - beyond)) <= 1.0).all()
+    known = covariance[:, :, :, edge + 8 :]
+    assert 0.06 < float(known.diagonal().mean().sqrt()) < 0.14
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("second", ["advected", "true second state"])
+@pytest.mark.parametrize("method", ["cc", "multipass"])
+def test_smooth_smoke_leaves_few_vectors_and_these_hold(method, second):
+    """Without the flag their errors are 2 to 5 times as large as stated."""
+    seeds = range(51, 55)
+    found = measured(f"{second}, texture 0 %", method, seeds)
+    assert found.valid < 0.05 and found.variance[0] < 1.25 + 3 * found.variance[1]
 
 
 SEEN = [

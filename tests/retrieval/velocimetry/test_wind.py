@@ -161,7 +161,10 @@ def test_vectors_belong_half_their_displacement_further_on():
 
 
 def test_blob_moved_by_one_and_a_half_metres():
-    """+1 m in y and +0.5 m in z, to 0.05 px, with both methods."""
+    """+1 m in y and +0.5 m in z, to 0.05 px, with both methods.
+
+    One blob in an empty image tells no standard error.
+    """
     y, z = axes(64, 56)
     grid = np.meshgrid(y, z)
 
@@ -169,8 +172,12 @@ def test_blob_moved_by_one_and_a_half_metres():
         return floor + np.exp(-((grid[0] - cy) ** 2 + (grid[1] - cz) ** 2) / (2 * 0.5**2))
 
     for method, floor in (("cc", 0.1), ("ws", 0.0)):
-        pair = (data_array(blob(*c, floor), y, z) for c in ((0, 0), (1.0, 0.5)))
-        at_blob = retrieve_wind(*pair, DT, method).sel(y=0, z=0, method="nearest")
+        pair = [data_array(blob(*c, floor), y, z) for c in ((0, 0), (1.0, 0.5))]
+        alone, at_blob = (
+            retrieve_wind(*pair, DT, method, standard_errors=stated).sel(y=0, z=0, method="nearest")
+            for stated in (True, False)
+        )
+        assert int(alone.flag) == (Flag.ERROR_UNKNOWN if method == "cc" else 0)
         assert float(at_blob.displacement_y) == pytest.approx(1.0, abs=0.025)
         assert float(at_blob.displacement_z) == pytest.approx(0.5, abs=0.025)
         assert float(at_blob.v) == pytest.approx(10.0, abs=0.25)
