@@ -95,6 +95,7 @@ class Estimator:
         times: Sequence[xr.DataArray] | None = None,
         frames: LineFrames | None = None,
         complete: Completion | None = None,
+        telescope: tuple[float, float, float] | None = None,
     ) -> SlabEstimate:
         """Wind, vortices, speeds along lines of sight, and the time that each took.
 
@@ -106,13 +107,16 @@ class Estimator:
         noise : float or DataArray, optional
             As `fit_vortices` takes it.
         expected : VortexPairFit, optional
-            The pair expected at mid-time, with its covariance.
+            The pair expected at mid-time, with its covariance. With slopes and a telescope the fit
+            is corrected for what wind along x moves in oblique beams.
         times : sequence of two DataArray, optional
             Of the pixels, as `fit_vortices` takes them.
         frames : LineFrames, optional
             Of the Doppler lidar, half way between both images.
         complete : Completion, optional
             Completes the images' wind with the lines.
+        telescope : (float, float, float), optional
+            As `fit_vortices` takes it.
         """
         seconds: dict[str, float] = {}
         slab = SlabPair(image1, image2, dt, noise, times, expected)
@@ -124,7 +128,11 @@ class Estimator:
             then = complete and partial(complete, lines=lines)
             coming = self._winds and self._winds.begun(slab, self._last, then)
             with _timed(seconds, "vortices"):
-                pair = fit_vortices(image1, image2, dt, noise, times=times, start=expected)
+                pair = fit_vortices(
+                    image1, image2, dt, noise, times=times, start=expected, telescope=telescope
+                )
+                if expected and expected.slopes is not None and pair.inclined is not None:
+                    pair = pair.with_slopes(expected.slopes, expected.slope_covariance)
             if coming is not None:
                 wind, flags, parts = coming()
                 seconds |= parts

@@ -186,6 +186,7 @@ class VirtualLidar:
             expected,
             frames=self._line_frames(number, x, valid, midway),
             complete=complete if self._doppler or complete.by_pointing else None,
+            telescope=(midway.place[0] - x, midway.place[1], midway.place[2]),
         )
         pair = found.pair.with_common_error(
             complete.common, complete.common, complete.rotation, complete.roll_axis

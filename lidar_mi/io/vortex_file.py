@@ -157,5 +157,14 @@ def _from_data(data: dict, where: str) -> VortexPairFit:
                 f"{where}.covariance: not symmetric and finite; expected that of a fit"
             )
     return VortexPairFit(
-        parameters, covariance, profile, **numbers, reasons=reasons, from_start=False, turned=None
+        parameters,
+        covariance,
+        profile,
+        **numbers,
+        reasons=reasons,
+        from_start=False,
+        turned=None,
+        inclined=None,
+        slopes=None,
+        slope_covariance=None,
     )

@@ -74,10 +74,12 @@ def checked_image(name: str, image: xr.DataArray, axes: Sequence[str] = ("z", "y
     largest = float(np.abs(image.values[np.isfinite(image.values)]).max(initial=0))
     if largest > LARGEST:
         raise InputError(f"{name}: values up to {largest:g}; expected at most {LARGEST:g}")
+    # variables: a coordinate as a DataArray takes as long as all checks of it
+    coordinates = image.coords.variables
     for axis in axes:
-        if axis not in image.coords:
+        if axis not in coordinates:
             raise InputError(f"{name}.{axis}: coordinate missing; give it in m")
-        coordinate = image[axis]
+        coordinate = coordinates[axis]
         units = coordinate.attrs.get("units")
         if units not in _METRES:
             raise InputError(f"{name}.{axis}: units {units!r} are not 'm'")
@@ -89,7 +91,7 @@ def checked_image(name: str, image: xr.DataArray, axes: Sequence[str] = ("z", "y
                 f"{name}.{axis}: spacing from {steps.min():g} to {steps.max():g} m is not "
                 "uniform (to 0.1 %)"
             )
-    return image.transpose(*axes)
+    return image if image.dims == tuple(axes) else image.transpose(*axes)
 
 
 def same_grid(

@@ -31,6 +31,23 @@ def test_vortices_from_nothing_and_from_the_last_fit(images):
     assert set(seconds) == {"vortices", "total"} and seconds["vortices"] > 0
 
 
+def test_slopes_that_are_expected_correct_the_fit(images):
+    estimator = Estimator(load_experiment("wake_sensor"), vectors=False)
+    cold = estimator.pair_of(images.first, images.second, DT, 0.03).pair
+    slopes = np.array([0.4, 0.0])
+    told = replace(cold, slopes=slopes, slope_covariance=np.zeros((2, 2)))
+    given = images.first, images.second, DT, 0.03
+    plain = estimator.pair_of(*given, told).pair
+    telescope = (-148.75, 0.0, 0.0)
+    seen = estimator.pair_of(*given, cold, telescope=telescope).pair
+    assert plain.slopes is None and seen.slopes is None
+    np.testing.assert_array_equal(plain.parameters, seen.parameters)
+    found = estimator.pair_of(*given, told, telescope=telescope).pair
+    expected = seen.with_slopes(slopes, np.zeros((2, 2)))
+    np.testing.assert_allclose(found.parameters, expected.parameters)
+    np.testing.assert_allclose(found.covariance, expected.covariance)
+
+
 def test_the_wind_is_by_the_most_accurate_method(images):
     estimator = Estimator(load_experiment("wake_sensor"))
     wind, _, seconds, *_ = estimator.pair_of(images.first, images.second, DT, 0.03)

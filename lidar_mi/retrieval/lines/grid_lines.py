@@ -47,7 +47,7 @@ def with_slopes(lines: GridLines, slope: np.ndarray) -> GridLines:
 
 def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridLines, np.ndarray]:
     """Lines on the grid, and the (y, z) of the middles of their bins."""
-    along = wind_along_lines(scan).values
+    along = wind_along_lines(scan)
     if "range_bin" not in scan:
         raise InputError("scan.range_bin: missing; expected the length of the range bins, m")
     direction = scan["direction"].transpose("line", "axis").values
@@ -116,15 +116,19 @@ def covariances_of_lines(
         sparse.csr_array((weight[..., part].ravel(), (row, node.ravel())), (count, len(place)))
         for part in range(parts)
     ]
+    together = sparse.vstack(sums, "csr")
     step = max(1, int(CHUNK_NUMBERS / len(place)))
     chunks = [slice(start, start + step) for start in range(0, len(place), step)]
     pieces = [[matrix[:, chunk] for matrix in sums] for chunk in chunks]
     for over_z, over_y in correlations:
         result = np.zeros((parts, count, count))
         for chunk, some in zip(chunks, pieces, strict=True):
-            kernel = over_z[np.ix_(z, z[chunk])] * over_y[np.ix_(y, y[chunk])]
-            for part, (matrix, piece) in enumerate(zip(sums, some, strict=True)):
-                result[part] += (piece @ (matrix @ kernel).T).T
+            # rows and columns one after the other: a fourth of the time of pairs of indices
+            kernel = over_z.take(z, 0).take(z[chunk], 1)
+            kernel *= over_y.take(y, 0).take(y[chunk], 1)
+            across = (together @ kernel).reshape(parts, count, -1)
+            for part, piece in enumerate(some):
+                result[part] += (piece @ across[part].T).T
         yield result
 
 

@@ -26,8 +26,8 @@ class LineFlag(enum.IntFlag):
     """A line has no velocity. No vector."""
 
 
-def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
-    """The air's velocity along every line of sight, away from the instrument, m s-1.
+def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
+    """The air's velocity (line,) along every line of sight, away from the instrument, m s-1.
 
     Direction times wind: the platform's velocity along the line less the measured one, which is
     positive toward the instrument. That velocity is one for all lines, (axis), or each line's own.
@@ -54,14 +54,16 @@ def wind_along_lines(scan: xr.Dataset) -> xr.DataArray:
             raise InputError(f"scan.{name}: dims {scan[name].dims} are not {tuple(sorted(dims))}")
     if scan.sizes["axis"] != 3:
         raise InputError(f"scan.axis: {scan.sizes['axis']} components are not x, y, z")
-    length = np.linalg.norm(scan["direction"].transpose("line", "axis").values, axis=1)
+    direction = scan["direction"].transpose("line", "axis").values
+    length = np.linalg.norm(direction, axis=1)
     if not (np.abs(length - 1) < 1e-6).all():
         raise InputError("scan.direction: not of length 1; expected unit vectors")
     if not (scan["range"].values > 0).all() or not np.isfinite(scan["range"].values).all():
         raise InputError("scan.range: not > 0 m everywhere; every line needs its finite range")
     if not (scan["v_los_std"].values[np.isfinite(scan["v_los"].values)] > 0).all():
         raise InputError("scan.v_los_std: not > 0 m/s everywhere; every line needs its error")
-    return scan["direction"].dot(scan["platform_velocity"], dim="axis") - scan["v_los"]
+    platform = scan["platform_velocity"].transpose(..., "axis").values
+    return (direction * platform).sum(1) - scan["v_los"].values
 
 
 def shared_covariance(scan: xr.Dataset) -> np.ndarray | None:
@@ -224,7 +226,7 @@ def _tangents(scan: xr.Dataset) -> np.ndarray:
 
 def _vectors(scan, along, lines, method) -> xr.Dataset:
     directions = scan["direction"].transpose("line", "axis").values[lines]
-    values, std = along.values[lines], scan["v_los_std"].values[lines]
+    values, std = along[lines], scan["v_los_std"].values[lines]
     missing = ~np.isfinite(values).all(1)
     shared = shared_covariance(scan)
     if shared is not None:

@@ -57,7 +57,7 @@ def no_fit(profile: Profile, reason: str) -> VortexPairFit:
 
 
 def checked_fit(
-    found: Solution, covariance, profile, chi2, match, error, length, z, y, turned
+    found: Solution, covariance, profile, chi2, match, error, length, z, y, turned, inclined
 ) -> VortexPairFit:
     """The fit, with the reasons for which it is not accepted."""
     theta = found.parameters[:10].cpu().numpy()
@@ -80,7 +80,16 @@ def checked_fit(
         if not (y[0] <= at_y <= y[-1] and z[0] <= at_z <= z[-1]):
             reasons.append(f"{side} vortex at ({at_y:.1f}, {at_z:.1f}) m is outside")
     return VortexPairFit(
-        theta, covariance, profile, chi2, match, error, length, tuple(reasons), turned=turned
+        theta,
+        covariance,
+        profile,
+        chi2,
+        match,
+        error,
+        length,
+        tuple(reasons),
+        turned=turned,
+        inclined=inclined,
     )
 
 

@@ -35,7 +35,7 @@ from lidar_mi.retrieval.vortices.covariance import (
 )
 from lidar_mi.retrieval.vortices.from_start import Limits, agrees, fit_from, fit_near
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
-from lidar_mi.retrieval.vortices.model import Profile
+from lidar_mi.retrieval.vortices.model import Profile, wind
 from lidar_mi.retrieval.vortices.model_error import ModelError, mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.pixel_times import PixelTimes
@@ -65,6 +65,7 @@ def fit_vortices(
     frozen: bool = False,
     times: Sequence[xr.DataArray] | None = None,
     start: VortexPairFit | None = None,
+    telescope: tuple[float, float, float] | None = None,
     device: str | torch.device = "cpu",
 ) -> VortexPairFit:
     """Two vortices and a mean wind that advect image 1 into image 2.
@@ -98,6 +99,10 @@ def fit_vortices(
         The pair expected at mid-time, with its covariance. It is where the fit starts, and is not
         weighted in. A fit that is not accepted, or further from it than both errors allow, is
         replaced by that of a search: `from_start` says which.
+    telescope : (float, float, float), optional
+        x, y and z from the images' plane, m, of the telescope whose beams reach its pixels
+        obliquely, x < 0. The fit is that of a pair along x; with a telescope its
+        `VortexPairFit.with_slopes` corrects it for a pair that is inclined.
     device : str or torch.device
 
     Returns
@@ -138,13 +143,17 @@ def fit_vortices(
     check_profile(profile)
     if start is not None and start.profile != profile:
         raise InputError(f"start.profile: {start.profile!r} is not {profile!r}, that of the fit")
+    if telescope is not None and not (np.isfinite(telescope).all() and telescope[0] < 0):
+        raise InputError(
+            f"telescope: {telescope} m is not allowed; expected finite x, y and z with x < 0"
+        )
     tau = checked_times(times, [image1, image2], dt)
     axes = [image1[name].values.astype(float) for name in ("z", "y")]
     pixels = [on_device(image, device) for image in (image1, image2)]
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
     with threads_for(image1.size):
-        return fit_pixels(*pixels, *axes, dt, noise, profile, frozen, tau, start)
+        return fit_pixels(*pixels, *axes, dt, noise, profile, frozen, tau, start, telescope)
 
 
 def fit_pixels(
@@ -158,6 +167,7 @@ def fit_pixels(
     frozen: bool = False,
     times: Sequence[np.ndarray] | None = None,
     start: VortexPairFit | None = None,
+    telescope: tuple[float, float, float] | None = None,
 ) -> VortexPairFit:
     """`fit_vortices` on tensors (z, y) and axes in m, with times from `checked_times`."""
     finite = torch.isfinite(image1) & torch.isfinite(image2)
@@ -179,7 +189,7 @@ def fit_pixels(
         level /= float(contrast)
     bad = torch.nn.functional.max_pool2d((~finite)[None].double(), 5, 1, 2)[0] > 0
     given = noise if isinstance(noise, torch.Tensor) else None
-    make = Builder(pair, bad, z, y, dt, level, given, float(contrast), profile, frozen)
+    make = Builder(pair, bad, z, y, dt, level, given, float(contrast), profile, frozen, telescope)
     if times is not None:
         make = replace(make, times=_from_mid_time(times, make))
     limits = step_limits(y, z, profile, dt)
@@ -302,7 +312,21 @@ def _checked(
         make.z,
         make.y,
         change_by_flow(best, make.dt * torch.stack([-images.z, images.y])),
+        None if make.telescope is None else _change_by_slopes(make, best, images),
     )
+
+
+def _change_by_slopes(make: Builder, best: Solution, images: Images) -> np.ndarray:
+    """Change (10, 2) of the parameters per slope dy/dx and dz/dx of the pair's axis.
+
+    The swirl (u, v, w) is across the axis, so that u is minus the slopes times (v, w). Air that
+    moves along x in oblique beams moves by -(y, z) u / distance in the images.
+    """
+    x, y, z = make.telescope
+    swirl = wind(best.parameters[:10].to(images.y), images.y, images.z, make.profile)
+    swirl = swirl - best.parameters[8:10, None, None].to(swirl)
+    beams = torch.stack([images.y - y, images.z - z]) / -x
+    return np.stack([change_by_flow(best, make.dt * one * beams) for one in swirl], -1)
 
 
 def _from_mid_time(times: Sequence[np.ndarray], make: Builder) -> PixelTimes:

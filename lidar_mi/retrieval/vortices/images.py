@@ -181,6 +181,8 @@ class Builder:
         Of each pixel, in any unit.
     profile : {"lamb_oseen", "burnham_hallock"}
     frozen : bool
+    telescope : (float, float, float), optional
+        m, as `image_fit.fit_vortices` takes it.
     times : PixelTimes, optional
         Left out: -dt / 2 and dt / 2.
     """
@@ -195,6 +197,7 @@ class Builder:
     contrast: float
     profile: Profile
     frozen: bool
+    telescope: tuple[float, float, float] | None = None
     times: PixelTimes | None = None
 
     @property

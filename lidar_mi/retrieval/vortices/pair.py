@@ -47,6 +47,11 @@ class VortexPairFit(Tabular):
     turned : ndarray, shape (10,), optional
         Change of the parameters per rad/s by which the observations turn about y = z = 0 between
         the scans, from +y towards +z; of a roll that nobody knows.
+    inclined : ndarray, shape (10, 2), optional
+        Change of the parameters per slope dy/dx and dz/dx of the pair's axis, if all of the air's
+        motion along x showed in oblique beams; see `with_slopes`.
+    slopes, slope_covariance : ndarray, shapes (2,) and (2, 2), optional
+        Of the pair's axis, dy/dx and dz/dx, where more than one slab has told them.
     """
 
     parameters: np.ndarray
@@ -59,6 +64,9 @@ class VortexPairFit(Tabular):
     reasons: tuple[str, ...] = ()
     from_start: bool = False
     turned: np.ndarray | None = None
+    inclined: np.ndarray | None = None
+    slopes: np.ndarray | None = None
+    slope_covariance: np.ndarray | None = None
 
     @property
     def success(self) -> bool:
@@ -162,6 +170,36 @@ class VortexPairFit(Tabular):
             covariance = covariance + rotation_stderr**2 * np.outer(turned, turned)
         return replace(self, covariance=covariance)
 
+    def with_slopes(self, slopes: np.ndarray, covariance: np.ndarray) -> "VortexPairFit":
+        """The pair of images that look at an inclined pair with oblique beams.
+
+        Of the motion along x that a wholly resolved gate would show between none and all is seen:
+        none where the texture is the same throughout the depth of the gate, all where it is much
+        finer. This fraction is taken to be uniform over both, 1/2 with a standard error of
+        1/sqrt(12), which is added, as are the errors of the slopes.
+
+        Parameters
+        ----------
+        slopes, covariance : ndarray, shapes (2,) and (2, 2)
+            dy/dx and dz/dx of the axis.
+
+        Raises
+        ------
+        InputError
+            A pair that was fitted without a telescope, or to something else than images.
+        """
+        if self.inclined is None:
+            raise InputError("slopes: not allowed for a pair without `inclined`; give a telescope")
+        change, variance = self.inclined @ slopes, _SEEN_STD**2
+        by_slopes = (_SEEN**2 + variance) * self.inclined @ covariance @ self.inclined.T
+        return replace(
+            self,
+            parameters=self.parameters - _SEEN * change,
+            covariance=self.covariance + by_slopes + variance * np.outer(change, change),
+            slopes=slopes,
+            slope_covariance=covariance,
+        )
+
     def after(self, seconds: float) -> "VortexPairFit":
         """The pair after some time of drift, with its growing errors.
 
@@ -233,6 +271,8 @@ class VortexPairFit(Tabular):
         return wind(theta, *places, self.profile).numpy(), spread.numpy()
 
 
+# Fraction of the motion along x that oblique beams show, uniform from 0 to 1.
+_SEEN, _SEEN_STD = 1 / 2, 12**-0.5
 # Derivatives of the parameters by a shift of the pair along y and along z.
 _CENTRES = torch.zeros(2, 10)
 _CENTRES[0, [2, 6]] = _CENTRES[1, [3, 7]] = 1.0

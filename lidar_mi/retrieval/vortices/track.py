@@ -35,6 +35,8 @@ from lidar_mi.retrieval.vortices.track_motion import (
 )
 
 MEASURED = len(PARAMETERS)
+# Of port and starboard, along y and z.
+_MEAN_SLOPES = np.array([[0.5, 0, 0.5, 0], [0, 0.5, 0, 0.5]])
 
 
 @dataclass(frozen=True)
@@ -235,8 +237,8 @@ class Track:
         Returns
         -------
         VortexPairFit
-            Model error and correlation are those of the last fit that was used. Not a success where
-            the track is lost.
+            With the mean slopes of both vortices. Model error and correlation are those of the last
+            fit that was used. Not a success where the track is lost.
 
         Raises
         ------
@@ -257,6 +259,8 @@ class Track:
             self.fit,
             parameters=state[:MEASURED],
             covariance=covariance[:MEASURED, :MEASURED],
+            slopes=_MEAN_SLOPES @ state[MEASURED:],
+            slope_covariance=_MEAN_SLOPES @ covariance[MEASURED:, MEASURED:] @ _MEAN_SLOPES.T,
             reasons=(f"no update in {self.missed} slabs",) if self.lost else (),
         )
 
