@@ -9,6 +9,8 @@ from lidar_mi.experiment.ideal_images import ideal_scan
 from lidar_mi.instrument.beams import steered_beams
 from lidar_mi.instrument.motion import Pose, attitude
 from lidar_mi.instrument.scan import Scan, plan_scans
+from lidar_mi.instrument.scan_timing import ScanTiming
+from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
 from .report import Check, Row
@@ -26,6 +28,8 @@ DT, DURATION, STEP = 0.1, 0.09, 0.5
 Y, Z = (STEP * (np.arange(n) - (n - 1) / 2) for n in (90, 70))
 WIND = np.array([6.0, 12.0])  # along y and z, m/s
 TOLERANCE = 0.03
+CORRELATED = 16
+"""Px, over which vectors share their texture."""
 
 
 def air(times, wind):
@@ -42,13 +46,24 @@ def air(times, wind):
     return xr.DataArray(np.stack(states), {"time": times, **nodes}, ("time", "z", "y"))
 
 
-def wind_of(told, wind=WIND, duration=DURATION, missed=(0.0, 0.0, 0.0)):
-    """Vectors of two rasters; ``missed``: roll, pitch, yaw (rad) of scan 2 that nobody knows."""
+PATTERNS = {
+    "raster": {},
+    "serpentine": {},
+    "serpentine in columns": {"slow": "columns"},
+    "Lissajous": {"cycles": [57, 44]},
+    "Risley prisms": {"cycles": [50, -23]},
+}
+"""Patterns of `ScanTiming`."""
+
+
+def wind_of(told, wind=WIND, pattern="raster", duration=DURATION, missed=(0.0, 0.0, 0.0)):
+    """Vectors of two scans; ``missed``: roll, pitch, yaw (rad) of scan 2 that nobody knows."""
     plan = plan_scans(Scan(range="500 m"), Y, Z, [0.0])[0]
     count = Y.size * Z.size
-    lateral, vertical = np.meshgrid(Y[::-1], Z[::-1])
-    places = np.column_stack([lateral.ravel(), vertical.ravel()])
-    time = duration * (np.arange(count) / (count - 1) - 0.5)
+    name = pattern.split()[0].lower()
+    timing = ScanTiming(pattern=name, duration=duration, **PATTERNS[pattern])
+    schedule = timing.schedule(Y, Z, plan.centre)
+    time, places = schedule.time, schedule.places
     states = np.linspace(-DURATION / 2, DURATION / 2, 37)
     scans = []
     for number, angles in enumerate(((0.0, 0.0, 0.0), missed)):
@@ -59,7 +74,8 @@ def wind_of(told, wind=WIND, duration=DURATION, missed=(0.0, 0.0, 0.0)):
         )
         beams = steered_beams(time, places, plan.centre, 0.0, 0.0, true, level, body_fixed=False)
         seen = air(states + (number - 0.5) * DT, wind).assign_coords(time=states)
-        scans.append(ideal_scan(seen, replace(plan, beams=beams)))
+        scans.append(ideal_scan(seen, replace(plan, beams=beams), gridded=False))
+    scans = of_one_instant(scans, DT, "Y")
     return retrieve_wind(
         *(scan["Y"] for scan in scans),
         DT,
@@ -93,6 +109,23 @@ def duration(effort):
         "than image 1 says, and a photograph's retrieval finds it too slow."
     )
     return Check("Scan that lasts", text, tuple(rows))
+
+
+def patterns(effort):
+    """Every pattern: the wind of air that moves during its scan."""
+    rows = []
+    for pattern in PATTERNS:
+        found = wind_of(True, pattern=pattern)
+        independent = np.sqrt((found["flag"] == 0).sum() * found.stride**2 / CORRELATED**2)
+        for name, right, got in zip("vw", WIND, means(found), strict=True):
+            sigma = float(found[name].where(found["flag"] == 0).std() / independent)
+            rows.append(Row(f"{name}, {pattern}", "the wind", right, got, sigma, TOLERANCE, "m/s"))
+    text = (
+        "The same in other patterns, all in 0.09 s. Curves that cross themselves see a place at "
+        "several times, while the air moves by 2 px: their beams are carried with the air to one "
+        "instant. Without that, the Lissajous figure finds 7.1 m/s in place of 6."
+    )
+    return Check("Every pattern", text, tuple(rows))
 
 
 def pointing(effort):
@@ -133,4 +166,4 @@ def pointing(effort):
     return Check("Pose that nobody knows", text, tuple(rows))
 
 
-CHECKS = (duration, pointing)
+CHECKS = (duration, patterns, pointing)

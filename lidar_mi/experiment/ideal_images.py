@@ -33,7 +33,12 @@ def slab_images(
 
 
 def ideal_scan(
-    air: xr.DataArray, plan: ScanPlan, lidar: BackscatterLidar | None = None, depth: float = 0.0
+    air: xr.DataArray,
+    plan: ScanPlan,
+    lidar: BackscatterLidar | None = None,
+    depth: float = 0.0,
+    *,
+    gridded: bool = True,
 ) -> xr.Dataset:
     """The air as the beams of a scan see it, where they were reported to look, on the nodes.
 
@@ -48,12 +53,14 @@ def ideal_scan(
         Whose beams average the air, see `blur_by_beam`. Default: beams without width.
     depth : float
         Of the gate, m.
+    gridded : bool
+        Whether the beams are resampled to the nodes; else their places are given.
 
     Returns
     -------
     xr.Dataset, dims (z, y)
         ``Y``, unit of ``air``; with beams also their ``beam_time``, s. From
-        `lidar_mi.retrieval.velocimetry.gridding.on_nodes`.
+        `lidar_mi.retrieval.velocimetry.gridding.on_nodes`; as this takes it if not ``gridded``.
     """
     states = air if "time" in air.dims else air.expand_dims(time=[0.0])
     if lidar is not None:
@@ -75,7 +82,7 @@ def ideal_scan(
     scan = xr.Dataset(
         {name: (("z", "y"), plan.as_image(values)) for name, values in fields.items()}, nodes
     )
-    return on_nodes(scan)
+    return on_nodes(scan) if gridded else scan
 
 
 def _at_beams(states: xr.DataArray, time: np.ndarray, places: np.ndarray) -> np.ndarray:

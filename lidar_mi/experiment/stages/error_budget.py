@@ -31,6 +31,7 @@ from lidar_mi.instrument.motion import Motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
+from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
@@ -242,11 +243,12 @@ def _without_noise(
             ]
         return _on_grid(experiment, images, like), None
     scans = [
-        ideal_scan(image, plan, lidar, depth).assign_attrs(
+        ideal_scan(image, plan, lidar, depth, gridded=False).assign_attrs(
             frozen_air=int(experiment.scan.air == "frozen")
         )
         for image, plan in zip(air, plans, strict=True)
     ]
+    scans = of_one_instant(scans, experiment.platform.dt, "Y")
     images = [scan["Y"] for scan in scans]
     if experiment.scan.aim == "angles":
         images = list(resample_pair(*images, experiment.wake.spacing))

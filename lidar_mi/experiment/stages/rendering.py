@@ -23,7 +23,7 @@ from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.velocimetry.gridding import on_nodes
+from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
 
 IMAGES = ("image_t1", "image_t2")
 """Parts of the result of `render_images`."""
@@ -217,14 +217,14 @@ def detect_images(
 
 
 def gridded_scans(experiment: Experiment, detected: Sequence[xr.Dataset]) -> list[xr.Dataset]:
-    """The scans, on regular nodes where beams were reported beside them; see `on_nodes`."""
-    return [
-        # times in double precision, so that those of a node are not rounded twice
-        on_nodes(scan.assign(beam_time=scan["beam_time"].astype(float))).assign_attrs(gridded=1)
-        if "y_reported" in scan
-        else scan
-        for scan in detected
-    ]
+    """The scans, on regular nodes where beams were reported beside them; see `of_one_instant`."""
+    if any("y_reported" not in scan for scan in detected):
+        return list(detected)
+    # times in double precision, so that those of a node are not rounded twice
+    scans = [scan.assign(beam_time=scan["beam_time"].astype(float)) for scan in detected]
+    image = "Y_noisy" if "Y_noisy" in scans[0] else "Y"
+    found = of_one_instant(scans, experiment.platform.dt, image)
+    return [scan.assign_attrs(gridded=1) for scan in found]
 
 
 def detector_noise(experiment: Experiment, detected: Sequence[xr.Dataset]) -> dict[str, float]:

@@ -37,7 +37,7 @@ _IMAGES = ("Y", "Y_noisy", "image")
 _ERRORS = re.compile(r".*_(stderr|std)")
 
 
-def on_nodes(scan: xr.Dataset) -> xr.Dataset:
+def on_nodes(scan: xr.Dataset, *, errors: bool = True) -> xr.Dataset:
     """A scan with its fields on its nodes, from the places its beams were reported to look at.
 
     Every node's value is the best linear estimate from the 25 nearest beams (ordinary kriging with
@@ -50,13 +50,15 @@ def on_nodes(scan: xr.Dataset) -> xr.Dataset:
     counts as much as these errors, which are correlated between nodes. So does what nodes share of
     the beams' noise. The `beam_time` is averaged
     with the same weights, and is within those of the scan: where beams next to each other have
-    very different times, a node's value mixes times.
+    very different times, a node's value mixes times (see `one_instant`).
 
     Parameters
     ----------
     scan : xr.Dataset, dims (..., z, y)
         With the nodes as coordinates (m, ascending) and `y_reported`, `z_reported` (z, y), m: the
         beams in any order.
+    errors : bool
+        Whether to estimate what resampling adds to the noise, which takes most of the time.
 
     Returns
     -------
@@ -92,7 +94,8 @@ def on_nodes(scan: xr.Dataset) -> xr.Dataset:
     inside = _inside(places, nodes)
     changed = np.flatnonzero(off & inside)
     weights = _weights(places, nodes[changed])
-    for name in [name for name in _IMAGES if name in rest and rest[name].ndim == 2]:
+    images = [name for name in _IMAGES if name in rest and rest[name].ndim == 2]
+    for name in images if errors else []:
         rest[f"{name}_resampling_std"] = _resampling_error(
             rest, name, places, nodes, changed, weights
         )
