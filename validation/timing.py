@@ -75,7 +75,7 @@ def wind_of(told, wind=WIND, pattern="raster", duration=DURATION, missed=(0.0, 0
         beams = steered_beams(time, places, plan.centre, 0.0, 0.0, true, level, body_fixed=False)
         seen = air(states + (number - 0.5) * DT, wind).assign_coords(time=states)
         scans.append(ideal_scan(seen, replace(plan, beams=beams), gridded=False))
-    scans = of_one_instant(scans, DT, "Y")
+    scans = of_one_instant(scans, [DT], "Y")
     return retrieve_wind(
         *(scan["Y"] for scan in scans),
         DT,

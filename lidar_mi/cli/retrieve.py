@@ -94,6 +94,7 @@ def retrieve(
     from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
     from lidar_mi.retrieval.velocimetry.gridding import on_nodes
     from lidar_mi.retrieval.velocimetry.methods import METHODS
+    from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
     from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
     from lidar_mi.retrieval.velocimetry.wind_series import retrieve_winds
 
@@ -112,14 +113,21 @@ def retrieve(
         read_noise(path, layer, spacing) if noise is None else noise for path in noisy
     ]
     beams = [read_beams(path, spacing) for path in paths]
+    scans: dict[int, xr.Dataset] = {}
     for number, when in enumerate(beams):
         if when is not None and "y_reported" in when:
-            scan = when.assign(image=images[number])
+            scans[number] = when.assign(image=images[number])
             level = levels[number] if number < len(levels) else None
             if isinstance(level, xr.DataArray):
-                scan = scan.assign(image_stderr=level)
-            beams[number] = scan = on_nodes(scan)
-            images[number] = scan["image"]
+                scans[number] = scans[number].assign(image_stderr=level)
+    if scans:
+        if len(scans) == len(paths):
+            gridded = of_one_instant(list(scans.values()), steps, "image")
+        else:
+            gridded = [on_nodes(scan) for scan in scans.values()]
+        for number, scan in zip(scans, gridded, strict=True):
+            beams[number], images[number] = scan, scan["image"]
+            level = levels[number] if number < len(levels) else None
             if isinstance(level, xr.DataArray):
                 levels[number] = scan["image_stderr"]
                 if "image_resampling_std" in scan:

@@ -248,7 +248,7 @@ def _without_noise(
         )
         for image, plan in zip(air, plans, strict=True)
     ]
-    scans = of_one_instant(scans, experiment.platform.dt, "Y")
+    scans = of_one_instant(scans, [experiment.platform.dt], "Y")
     images = [scan["Y"] for scan in scans]
     if experiment.scan.aim == "angles":
         images = list(resample_pair(*images, experiment.wake.spacing))

@@ -223,7 +223,7 @@ def gridded_scans(experiment: Experiment, detected: Sequence[xr.Dataset]) -> lis
     # times in double precision, so that those of a node are not rounded twice
     scans = [scan.assign(beam_time=scan["beam_time"].astype(float)) for scan in detected]
     image = "Y_noisy" if "Y_noisy" in scans[0] else "Y"
-    found = of_one_instant(scans, experiment.platform.dt, image)
+    found = of_one_instant(scans, [experiment.platform.dt], image)
     return [scan.assign_attrs(gridded=1) for scan in found]
 
 

@@ -28,44 +28,53 @@ _ROUNDS = 2
 _TEMPLATE, _STRIDE = 16, 4
 
 
-def of_one_instant(scans: Sequence[xr.Dataset], dt: float, image: str) -> list[xr.Dataset]:
-    """Two scans on their nodes (`on_nodes`), at their reference times where nodes mix times.
+def of_one_instant(
+    scans: Sequence[xr.Dataset], steps: Sequence[float], image: str
+) -> list[xr.Dataset]:
+    """Scans on their nodes (`on_nodes`), each at one instant where nodes would mix times.
 
     A curve that crosses itself, such as a Lissajous figure, returns to the neighbourhood of a beam
     after up to the whole scan, and the air has moved by then: values of different air would be
-    averaged. Beams are therefore carried with the air to the reference time,
+    averaged. Beams are therefore carried with the air to the mean time m of all scans' beams,
 
-        place(0) = place(t) - integral of the wind along the path (midpoint rule),
+        place(m) = place(t) - integral of the wind from m to t along the path (midpoint rule),
 
-    and resampled from there. The wind is that of `multipass` between both images, resampled as they
-    are at first and then from carried beams, twice. An error of this wind counts with the time of
-    the beams over dt: 5 % of 12 m/s and 45 ms are 3 cm.
+    and resampled from there. The wind is that of `multipass` between two images in succession,
+    resampled as they are at first and then from carried beams, twice. An error of this wind counts
+    with the time of the beams over dt: 5 % of 12 m/s and 45 ms are 3 cm.
 
     Parameters
     ----------
-    scans : two xr.Dataset, dims (..., z, y)
-        As `gridding.on_nodes` takes them, with ``beam_time``, s from the reference time of each.
-    dt : float
-        From one reference time to the other, s.
+    scans : two or more xr.Dataset, dims (..., z, y)
+        As `gridding.on_nodes` takes them, with ``beam_time``, s from the reference time of each:
+        one that is the same in all, such as the middle of a scan.
+    steps : sequence of float
+        From each reference time to the next, s.
     image : str
         Field that the wind is retrieved from.
 
     Returns
     -------
     list of xr.Dataset
-        On their nodes. ``beam_time`` is 0 where beams were carried.
+        On their nodes. ``beam_time`` is m all over where beams were carried.
     """
-    if not any(mixes_times(scan, dt) for scan in scans):
+    if not any(mixes_times(scan, min(np.abs(steps))) for scan in scans):
         return [on_nodes(scan) for scan in scans]
+    middle = float(np.mean([scan["beam_time"].mean() for scan in scans]))
+    scans = [scan.assign(beam_time=scan["beam_time"] - middle) for scan in scans]
     needed = [scan[[image, "beam_time", *_PLACES]] for scan in scans]
     images = [on_nodes(scan, errors=False) for scan in needed]
     for _ in range(_ROUNDS - 1):
-        wind = _wind(images, dt, image)
+        winds = _winds(images, steps, image)
         images = [
-            _at_reference_time(on_nodes(carried(scan, wind), errors=False)) for scan in needed
+            _at_time(0.0, on_nodes(carried(scan, wind), errors=False))
+            for scan, wind in zip(needed, winds, strict=True)
         ]
-    wind = _wind(images, dt, image)
-    return [_at_reference_time(on_nodes(carried(scan, wind))) for scan in scans]
+    winds = _winds(images, steps, image)
+    return [
+        _at_time(middle, on_nodes(carried(scan, wind)))
+        for scan, wind in zip(scans, winds, strict=True)
+    ]
 
 
 def mixes_times(scan: xr.Dataset, dt: float) -> bool:
@@ -89,7 +98,7 @@ def mixes_times(scan: xr.Dataset, dt: float) -> bool:
 
 
 def carried(scan: xr.Dataset, wind: Wind) -> xr.Dataset:
-    """The scan with its beams at the places of their air at the reference time.
+    """The scan with its beams at the places of their air at the time 0.
 
     Parameters
     ----------
@@ -103,6 +112,13 @@ def carried(scan: xr.Dataset, wind: Wind) -> xr.Dataset:
     half = place - wind(place) * time / 2
     place = place - wind(half) * time
     return scan.assign({name: (("z", "y"), place[..., i]) for i, name in enumerate(_PLACES)})
+
+
+def _winds(images: Sequence[xr.Dataset], steps: Sequence[float], name: str) -> list[Wind]:
+    """Of every image: from it to the next one, of the last from the one before."""
+    pairs = zip(images[:-1], images[1:], steps, strict=True)
+    found = [_wind(pair, dt, name) for *pair, dt in pairs]
+    return [*found, found[-1]]
 
 
 def _wind(images: Sequence[xr.Dataset], dt: float, name: str) -> Wind:
@@ -134,5 +150,5 @@ def _without_gaps(image: xr.DataArray) -> xr.DataArray:
     return image.copy(data=nearest_filled(image.values))
 
 
-def _at_reference_time(scan: xr.Dataset) -> xr.Dataset:
-    return scan.assign(beam_time=0.0 * scan["beam_time"])
+def _at_time(time: float, scan: xr.Dataset) -> xr.Dataset:
+    return scan.assign(beam_time=0.0 * scan["beam_time"] + time)
