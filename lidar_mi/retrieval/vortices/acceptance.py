@@ -57,7 +57,7 @@ def no_fit(profile: Profile, reason: str) -> VortexPairFit:
 
 
 def checked_fit(
-    found: Solution, covariance, profile, chi2, match, error, length, z, y, turned, inclined
+    found: Solution, covariance, profile, chi2, match, error, length, z, y, turned, inclined=None
 ) -> VortexPairFit:
     """The fit, with the reasons for which it is not accepted."""
     theta = found.parameters[:10].cpu().numpy()
