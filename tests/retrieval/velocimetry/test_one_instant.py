@@ -40,7 +40,7 @@ def test_wind_of_a_curve_that_crosses_itself():
     """
     scans = [scan(*lissajous(0.09), at) for at in (0.0, DT)]
     images = of_one_instant(scans, [DT], "Y")
-    assert all(float(np.ptp(image["beam_time"].dropna("y"))) == 0.0 for image in images)
+    assert all(image["beam_time"].max() == image["beam_time"].min() for image in images)
     mixed = [on_nodes(one, errors=False) for one in scans]
     found, wrong = (
         retrieve_wind(*(i["Y"] for i in pair), DT, "multipass", stride=4, standard_errors=False)
@@ -60,7 +60,8 @@ def test_the_clock_does_not_matter():
     later = [one.assign(beam_time=one["beam_time"] + 100.0) for one in scans]
     for one, other in zip(*(of_one_instant(s, [DT], "Y") for s in (scans, later)), strict=True):
         np.testing.assert_allclose(one["Y"], other["Y"], atol=1e-4)
-        np.testing.assert_allclose(other["beam_time"] - one["beam_time"], 100.0)
+        later = float((other["beam_time"] - one["beam_time"]).mean())
+        assert later == pytest.approx(100.0)
 
 
 def test_times_that_are_linear_in_place_are_not_mixed():
