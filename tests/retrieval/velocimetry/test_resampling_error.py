@@ -80,10 +80,14 @@ def test_vectors_are_flagged_where_more_is_lost_than_noise():
     noise = data_array(np.full((16, 24), 0.01), y, z)
     with_it = noise * np.where(np.arange(24) < 12, 1.1, 3.0)
     count = np.zeros((8, 12), np.uint16)
-    wind = xr.Dataset({"flag": (("z", "y"), count)}, {"z": z[1::2], "y": y[1::2]}, {"template": 4})
+    fields = {"flag": (("z", "y"), count), "v": (("z", "y"), 0.0 * count)}
+    wind = xr.Dataset(fields, {"z": z[1::2], "y": y[1::2]}, {"template": 4})
     found = flag_resampled(wind, noise, with_it)["flag"]
     assert found.dtype == np.uint16
     assert (found[:, :5] == 0).all() and (found[:, 5:] == Flag.RESAMPLED).all()
+    # 7 of 12 columns; of those with a displacement 7 of 10, which is beyond two thirds
+    few = wind.assign(v=wind["v"].where(np.arange(12) >= 2))
+    assert (flag_resampled(few, noise, with_it)["flag"] == Flag.RESAMPLED).all()
 
 
 def test_error_of_beams_that_are_dense_in_calm_air_only():
