@@ -30,8 +30,9 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     message = fault["msg"].removeprefix("Value error, ")
     if fault["type"] == "extra_forbidden":
         allowed = _keys_at(model, fault["loc"][:-1])
-        close = difflib.get_close_matches(where[-1], allowed, 1)
-        hint = f"; did you mean {close[0]}?" if close else ""
+        longer = [key for key in allowed if key.startswith(f"{where[-1]}_")]
+        close = longer or difflib.get_close_matches(where[-1], allowed, 1)
+        hint = f"; did you mean {' or '.join(close)}?" if close else ""
         return f"{field}: unknown key{hint} (allowed: {', '.join(allowed)})"
     if fault["type"] == "missing":
         return f"{field}: missing"

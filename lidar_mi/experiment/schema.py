@@ -98,7 +98,10 @@ class Retrieval(Section):
     @model_validator(mode="after")
     def _budget_compares(self):
         if self.error_budget and self.sources != "all":
-            raise ValueError("sources: 'measured' is not allowed with error_budget; expected all")
+            raise ValueError(
+                "sources: 'measured' is not allowed with error_budget; expected all, or "
+                "retrieval.error_budget=false"
+            )
         return self
 
     @model_validator(mode="after")

@@ -87,7 +87,8 @@ def check_lines(
     if abs(lidar.range - middle) > lidar.range_bin / 2:
         raise InputError(
             f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected the slab "
-            f"of scan, {middle - lidar.range_bin / 2:g} to {middle + lidar.range_bin / 2:g} m"
+            f"of scan, {middle:g} m, to half a range bin: {middle - lidar.range_bin / 2:g} to "
+            f"{middle + lidar.range_bin / 2:g} m (set both, with scan.range)"
         )
     # lines that leave the wake, bins that reach the telescope
     directions = experiment.sensor.directions
