@@ -20,7 +20,6 @@ from lidar_mi.retrieval.velocimetry.resampling_error import flag_resampled
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind, wind_bound
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
-
 # Noise of the simulation over the signal of a pixel from which winds suffer.
 _SAMPLED = 0.02
 
