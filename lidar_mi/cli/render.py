@@ -37,9 +37,9 @@ def render(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the random numbers.")] = 0,
     overwrite: Overwrite = False,
 ) -> None:
-    """Render a Mitsuba scene with the project's plugins, like the `mitsuba` command.
+    """Render a Mitsuba scene of a `scanning_lidar` or a `ccd`, the plugins loaded.
 
-    Writes an EXR, and beside it a PNG of its brightness to look at.
+    Pictures by other cameras: lidar_mi.register_plugins() and mi.render in Python. Writes an EXR, and beside it a PNG of its brightness to look at.
     """
     from lidar_mi.experiment.shipped import scene_file
     from lidar_mi.io.images import read_pixels

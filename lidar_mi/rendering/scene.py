@@ -65,7 +65,8 @@ def render_file(
     scans, fringes = hasattr(sensor, "beam_frame"), hasattr(sensor, "sample_towards_scene")
     if not (scans or fringes):
         raise InputError(
-            f"{scene_path}: its first sensor is no 'scanning_lidar' and no 'ccd'; expected one"
+            f"{scene_path}: its first sensor is no 'scanning_lidar' and no 'ccd'; expected one, "
+            "or mi.render in Python, after lidar_mi.register_plugins(), for other cameras"
         )
     kind, name = ("GatedVolpath", "gated_volpath") if scans else ("Fringes", "fringes")
     if type(integrator).__name__ != kind:
