@@ -39,7 +39,8 @@ def render(
 ) -> None:
     """Render a Mitsuba scene of a `scanning_lidar` or a `ccd`, the plugins loaded.
 
-    Pictures by other cameras: lidar_mi.register_plugins() and mi.render in Python. Writes an EXR, and beside it a PNG of its brightness to look at.
+    Pictures by other cameras: lidar_mi.register_plugins() and mi.render in Python. Writes an EXR,
+    and beside it a PNG of its brightness to look at.
     """
     from lidar_mi.experiment.shipped import scene_file
     from lidar_mi.io.images import read_pixels
