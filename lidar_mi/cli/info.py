@@ -62,6 +62,9 @@ def info(
             )
         )
     folder = Path(what)
+    reason, metrics = failure(folder), read_metrics(folder) if folder.is_dir() else None
+    if folder.is_dir() and metrics is None and not reason:
+        output.print("unfinished: no metrics.json yet; run it again to resume")
     if folder.is_dir():
         for part, answer in answers(folder):
             if part:
@@ -70,12 +73,9 @@ def info(
     for title, rows in found:
         print_rows(title, rows)
     if folder.is_dir():
-        metrics = read_metrics(folder)
-        if reason := failure(folder):
+        if reason:
             output.print(f"failed: {reason}", soft_wrap=True)
-        elif metrics is None:
-            output.print("unfinished: no metrics.json yet; run it again to resume")
-        elif not (folder / RECORD).is_file():
+        elif metrics is not None and not (folder / RECORD).is_file():
             for table in _results(metrics, read_record(folder)["experiment"]):
                 print_table(table)
         if (folder / RECORD).is_file() and not reason:

@@ -175,6 +175,7 @@ def retrieve(
         _print_series(wind)
     else:
         _print_wind(wind)
+    output.print(f"method   {method}")
     output.print(f"winds    {out}")
 
 

@@ -286,11 +286,12 @@ def _read(data, table, sign, asked, time, x, path):
     own = {name: _own_dims(data, table, name, spatial) for name in present}
     odd = [name for name in present if not own[name]]
     if odd:
+        missing = next((n for n in ("time", "x", "y", "z") if table[n] not in data.dims), "x")
         raise InputError(
             f"{path}: variable {table[odd[0]]!r} has the dimensions "
             f"({', '.join(map(str, data[table[odd[0]]].dims))}); allowed: {', '.join(spatial)} "
             f"and, at choice, {table['time']}, in any order, one of them staggered; expected "
-            "wake.names of the others, such as {x: its name there}"
+            f"wake.names of the others, such as {{{missing}: its name there}}"
         )
 
     data, seconds = _pick_time(data, table["time"], time, path)
