@@ -59,8 +59,8 @@ def test_retrievals_of_images_work_on_one(call, monkeypatch):
         observed.append(torch.get_num_threads())
         raise RuntimeError("seen")
 
-    method = replace(methods.METHODS["cc"], find=watched)
-    monkeypatch.setitem(methods.METHODS, "cc", method)
+    method = replace(methods.METHODS["variational"], find=watched)
+    monkeypatch.setitem(methods.METHODS, "variational", method)
     monkeypatch.setattr("lidar_mi.retrieval.vortices.image_fit.fit_pixels", watched)
     with pytest.raises(RuntimeError, match="seen"):
         getattr(lm, call)(pair.first, pair.second, dt=0.1)

@@ -119,7 +119,8 @@ def retrieve_winds(
         [_of_pair(wind, winds[0], times[a]) for (a, _), wind in zip(chosen, found, strict=True)],
         "time",
         combine_attrs="drop_conflicts",
-        coords="different",
+        # also where all pairs have theirs at the windows' centres
+        coords=["y_vector", "z_vector"],
         compat="equals",
     )
     return whole.assign_attrs(

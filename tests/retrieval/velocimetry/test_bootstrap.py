@@ -92,10 +92,10 @@ def test_few_windows(method, rows, columns):
 def test_pixels_that_are_not_finite_take_part_in_nothing():
     """Standard errors far from a hole are those without it; near it there is no vector."""
     first, second = uniform(0.03, 9)
-    whole = retrieve_wind(first, second, DT, stride=4)
+    whole = retrieve_wind(first, second, DT, "cc", stride=4)
     second = second.copy()
     second[40:44, 50:54] = np.nan
-    holed = retrieve_wind(first, second, DT, stride=4)
+    holed = retrieve_wind(first, second, DT, "cc", stride=4)
     hole = (holed["flag"] & Flag.NON_FINITE_INPUT.value) != 0
     assert hole.any() and np.isnan(holed["v_stderr"]).where(hole, True).all()
     ratio = (holed["v_stderr"] / whole["v_stderr"]).where(holed["flag"] == 0)
