@@ -8,7 +8,7 @@ import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import KDTree
 
-from lidar_mi.retrieval.velocimetry.common_grid import nearest_filled
+from lidar_mi.retrieval.velocimetry.common_grid import nearest_filled, on_one_grid
 from lidar_mi.retrieval.velocimetry.gridding import on_nodes
 from lidar_mi.retrieval.velocimetry.outliers import validated
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
@@ -123,15 +123,17 @@ def _winds(images: Sequence[xr.Dataset], steps: Sequence[float], name: str) -> l
 
 def _wind(images: Sequence[xr.Dataset], dt: float, name: str) -> Wind:
     """v and w at places, with gaps and outliers filled from their neighbours."""
-    template = min(_TEMPLATE, min(images[0][name].shape) // 3)
+    # scans by angles have nodes of their own
+    pair = on_one_grid(*(_without_gaps(scan[name]) for scan in images))
+    template = min(_TEMPLATE, min(pair[0].shape) // 3)
     found = retrieve_wind(
-        *(_without_gaps(scan[name]) for scan in images),
+        *pair,
         dt,
         "multipass",
         template=template,
         search=2 * template,
         stride=_STRIDE,
-        times=[_without_gaps(scan["beam_time"]) for scan in images],
+        times=on_one_grid(*(_without_gaps(scan["beam_time"]) for scan in images)),
         standard_errors=False,
         checks=False,
     )

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
 from lidar_mi.retrieval.velocimetry.gridding import on_nodes
 from lidar_mi.retrieval.velocimetry.one_instant import carried, mixes_times, of_one_instant
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
@@ -52,6 +53,20 @@ def test_wind_of_a_curve_that_crosses_itself():
         assert float(valid.std()) < 0.1
     off = np.hypot(wrong["v"] - V, wrong["w"] - W).where(wrong["flag"] == 0)
     assert float(off.mean()) > 1.0
+
+
+def test_scans_by_angles_from_a_platform_that_moves():
+    """Nodes of the second scan are 3 % nearer to each other."""
+    first, second = scan(*lissajous(0.09), 0.0), scan(*lissajous(0.09), DT)
+    nearer = second.assign_coords({a: (a, 0.97 * second[a].values, {"units": "m"}) for a in "zy"})
+    images = of_one_instant([first, nearer], [DT], "Y")
+    np.testing.assert_array_equal(images[1]["y"], nearer["y"])
+    pair = on_one_grid(*(image["Y"] for image in images))
+    found = retrieve_wind(*pair, DT, "multipass", stride=4, standard_errors=False)
+    for name, true in (("v", V), ("w", W)):
+        valid = found[name].where(found["flag"] == 0)
+        independent = float(valid.count()) * 4**2 / 8**2
+        assert abs(float(valid.mean()) - true) < 3 * float(valid.std()) / np.sqrt(independent)
 
 
 def test_the_clock_does_not_matter():
