@@ -245,8 +245,8 @@ def _warn_of_few_samples(experiment, scan, log) -> None:
         detector = f", beside {instrument:.2g} of the detector" if instrument else ""
         log.remark(
             f"render.samples_per_beam: with {experiment.render.samples_per_beam} samples the "
-            f"simulation's own noise is {simulated:.2g} of a pixel's signal{detector}; raise it "
-            "for what the lidar itself can do"
+            f"noise of the simulation itself is {simulated:.2g} of the signal of a pixel"
+            f"{detector}; raise it for what the lidar can do"
         )
 
 
