@@ -71,12 +71,29 @@ def campaign_file(name: str | Path) -> Path:
 
 
 def scene_file(name: str | Path) -> Path:
-    """The same of a Mitsuba scene.
+    """The file of a Mitsuba scene of the package (``slab``), or of one's own (its path).
+
+    A file of that name in the working folder comes first.
+
+    Parameters
+    ----------
+    name : str or path
+
+    Returns
+    -------
+    Path
+        For ``mi.load_file``, as text: ``mi.load_file(str(path))``.
 
     Raises
     ------
     InputError
-        There is none.
+        Neither a file nor a scene of the package; the message lists these.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> lm.scene_file("slab").name
+    'slab.xml'
     """
     return _found(name, [_SCENE])
 
