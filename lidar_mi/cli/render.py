@@ -54,8 +54,10 @@ def render(
 
     source, definitions = scene_file(scene), _definitions(define or [])
     beside = source if Path(scene).is_file() else Path(source.name)
-    path = _image(out) if out else beside.with_suffix(".exr")
-    preview, read = path.with_suffix(".png"), files_of(source, definitions)
+    asked, read = out or beside.with_suffix(".exr"), files_of(source, definitions)
+    check_target(asked, read, overwrite=overwrite)
+    path = _image(asked)
+    preview = path.with_suffix(".png")
     check_target(path, read, overwrite=overwrite)
     # made from the image: it is replaced together with it
     check_target(preview, read, overwrite=overwrite or path.exists())

@@ -12,7 +12,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from lidar_mi.cli import options
-from lidar_mi.io.exr import label_scan, write_scan
+from lidar_mi.io.exr import label_scan, read_scan, write_scan
 from lidar_mi.io.image_times import steps_of
 from tests.support.command_line import shell, words_of
 
@@ -130,6 +130,21 @@ def test_many_images_pair_by_pair(here, lidar_mi):
     ):
         code, _, err = lidar_mi("retrieve", *timed, "--pairs", pairs, "--overwrite", *OPTIONS)
         assert code == 2 and words in err and len(err.splitlines()) == 1
+
+
+def test_images_of_a_detector_come_first(here, lidar_mi):
+    """Y_noisy before Y; which was taken is said; images of both kinds are not mixed unasked."""
+    for number in (0, 1):
+        scan = read_scan(f"{number}.exr")
+        noisy = {"S0_noisy": scan["S0"], "S0_noise_std": scan["S0_stderr"], "Y_noisy": scan["Y"]}
+        noisy["Y_noise_std"] = 0.02 * scan["Y"]
+        write_scan(here / f"noisy{number}.exr", scan.assign(noisy))
+    code, out, _ = lidar_mi("retrieve", "noisy0.exr", "noisy1.exr", *OPTIONS)
+    assert code == 0 and "layer    Y_noisy, with the detector's noise (--layer Y" in out
+    code, out, _ = lidar_mi("retrieve", "noisy0.exr", "noisy1.exr", "--layer", "Y", *OPTIONS)
+    assert code == 0 and "Y_noisy" not in out
+    code, _, err = lidar_mi("retrieve", "noisy0.exr", "1.exr", *OPTIONS)
+    assert code == 2 and "1.exr: without the layer Y_noisy" in err and "--layer Y" in err
 
 
 def test_thresholds_flag_more(here, lidar_mi):
