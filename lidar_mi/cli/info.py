@@ -76,20 +76,27 @@ def info(
         if reason:
             output.print(f"failed: {reason}", soft_wrap=True)
         elif metrics is not None and not (folder / RECORD).is_file():
-            for table in _results(metrics, read_record(folder)["experiment"]):
+            for table in _results(folder, metrics, read_record(folder)["experiment"]):
                 print_table(table)
         if (folder / RECORD).is_file() and not reason:
             output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)
 
 
-def _results(metrics: Mapping[str, float], experiment: Mapping[str, Any]) -> list[Table]:
+def _results(
+    folder: Path, metrics: Mapping[str, float], experiment: Mapping[str, Any]
+) -> list[Table]:
     """The numbers of a flight or of a run."""
+    from lidar_mi.assessment.metrics.encounter import CONTROLLER
     from lidar_mi.assessment.report.encounter import encounter_summary
     from lidar_mi.assessment.report.summary import summary
+    from lidar_mi.encounter.folder import FILES
     from lidar_mi.experiment.describe import value_at
+    from lidar_mi.io.netcdf import read_netcdf
 
     if value_at(experiment, "encounter") is not None:
-        return encounter_summary(metrics)
+        flights = folder / FILES["series"]
+        about = read_netcdf(flights).attrs if flights.is_file() else {}
+        return encounter_summary(metrics, about.get(CONTROLLER, ""))
     asked = value_at(experiment, "doppler.retrieval.averaged")
     averaged = [n for n in asked if isinstance(n, int)] if isinstance(asked, list) else ()
     return summary(metrics, averaged)

@@ -150,7 +150,9 @@ def _first_slab(experiment: Experiment) -> Experiment:
     platform = experiment.platform.model_copy(
         update={"speed": encounter.path.speed, "dt": 1 / encounter.rate}
     )
-    scan = experiment.scan.model_copy(update={"range": encounter.look_ahead, "thickness": gates.depth})
+    scan = experiment.scan.model_copy(
+        update={"range": encounter.look_ahead, "thickness": gates.depth}
+    )
     changes = {"encounter": None, "platform": platform, "scan": scan}
     seen = at_the_slabs(experiment, gates)
     return seen.model_copy(update=changes).read_from(experiment.folder)

@@ -26,8 +26,8 @@ def read_pixels(path: str | Path, layer: str | None = None) -> np.ndarray:
     Parameters
     ----------
     layer : str, optional
-        Of an EXR file. Default: Y_noisy (what a detector delivered), else Y, or the only one, or the
-        mean of R, G and B.
+        Of an EXR file. Default: Y_noisy (what a detector delivered), else Y, or the only one, or
+        the mean of R, G and B.
 
     Raises
     ------
@@ -118,8 +118,8 @@ def read_image(
     path : path
         EXR, PNG, TIFF, BMP, JPEG or FITS file. Colours are averaged.
     layer : str, optional
-        Of an EXR file. Default: Y_noisy (what a detector delivered), else Y, or the only one, or the
-        mean of R, G and B.
+        Of an EXR file. Default: Y_noisy (what a detector delivered), else Y, or the only one, or
+        the mean of R, G and B.
     spacing : float, optional
         From pixel to pixel, m; for files without axes.
 
