@@ -89,12 +89,12 @@ def _results(
     from lidar_mi.assessment.metrics.encounter import CONTROLLER
     from lidar_mi.assessment.report.encounter import encounter_summary
     from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.encounter.folder import FILES
     from lidar_mi.experiment.describe import value_at
+    from lidar_mi.experiment.export_flight import FLIGHT_FILES
     from lidar_mi.io.netcdf import read_netcdf
 
     if value_at(experiment, "encounter") is not None:
-        flights = folder / FILES["series"]
+        flights = folder / FLIGHT_FILES["series"]
         about = read_netcdf(flights).attrs if flights.is_file() else {}
         return encounter_summary(metrics, about.get(CONTROLLER, ""))
     asked = value_at(experiment, "doppler.retrieval.averaged")
