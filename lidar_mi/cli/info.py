@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from lidar_mi.cli.options import quantity
+from lidar_mi.cli.options import complete_contents, quantity
 from lidar_mi.cli.terminal import output, print_answer, print_rows, print_table
 from lidar_mi.progress import progress
 from lidar_mi.tables import Table
@@ -27,7 +27,8 @@ def info(
         typer.Argument(
             help="EXR, NetCDF or scattering-table file (.txt), folder of a run, of variants or of "
             "a campaign, or a name: molecules, spheroids, spheres, continental, sea_salt, dust, "
-            "droplets, soot."
+            "droplets, soot.",
+            autocompletion=complete_contents,
         ),
     ],
     wavelength: Annotated[

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Overwrite, Variant
+from lidar_mi.cli.options import Overwrite, Variant, complete_scene
 from lidar_mi.cli.terminal import output
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
@@ -15,7 +15,11 @@ EXAMPLES = "Example: `lidar-mi render slab.xml -s 256 -D range=485 -o slab.exr`"
 
 def render(
     scene: Annotated[
-        str, typer.Argument(help="Mitsuba scene (XML), or the name of one of the package: slab.")
+        str,
+        typer.Argument(
+            help="Mitsuba scene (XML), or the name of one of the package: slab.",
+            autocompletion=complete_scene,
+        ),
     ],
     variant: Variant = None,
     samples: Annotated[

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_mi.cli.options import Overwrite
+from lidar_mi.cli.options import Overwrite, complete_method
 from lidar_mi.cli.terminal import output, print_rows, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
@@ -52,7 +52,8 @@ def retrieve(
         str,
         typer.Option(
             help="variational (a smooth flow), cc (cross-correlation), ws (weight shift), "
-            "multipass or vortex_fit."
+            "multipass or vortex_fit.",
+            autocompletion=complete_method,
         ),
     ] = "variational",
     template: Annotated[int, typer.Option(help="Template size, pixels.")] = 8,

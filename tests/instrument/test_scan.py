@@ -137,6 +137,6 @@ def test_bad_values_are_refused(bad):
 
 
 def test_one_half_angle_is_that_of_both_scans():
-    both = Scan(azimuth_half="9 deg", elevation_half=0.1)
+    both = Scan(azimuth_half="9 deg", elevation_half="100 mrad")
     assert both.azimuth_half == pytest.approx((np.radians(9), np.radians(9)))
-    assert both.elevation_half == (0.1, 0.1)
+    assert both.elevation_half == pytest.approx((0.1, 0.1))

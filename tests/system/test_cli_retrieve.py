@@ -12,6 +12,7 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from lidar_mi.cli import options
+from lidar_mi.cli.export import complete_format
 from lidar_mi.io.exr import label_scan, read_scan, write_scan
 from lidar_mi.io.image_times import steps_of
 from tests.support.command_line import shell, words_of
@@ -164,6 +165,18 @@ def test_shells_complete_commands_and_experiments(here, monkeypatch):
     (here / "wake_mine.yaml").write_text("")
     (here / "sub").mkdir()
     (here / "sub" / "mine.yaml").write_text("")
-    assert {"wake_3d", "wake_sensor", "wake_mine.yaml"} <= set(options._complete("wake_"))
-    assert options._complete("su") == ["sub/"]
-    assert options._complete("sub/m") == ["sub/mine.yaml"]
+    (here / "puff_mine.xml").write_text("")
+    run = options.complete_run
+    assert {"wake_3d", "wake_sensor", "wake_mine.yaml"} <= set(run("wake_"))
+    assert run("su") == ["sub/"] and run("sub/m") == ["sub/mine.yaml"]
+    assert not run("enc") and options.complete_flight("") == [
+        "encounter",
+        "encounter_sensor",
+        "wake_mine.yaml",
+        "sub/",
+    ]
+    assert options.complete_campaign("design") == ["design_map"]
+    assert options.complete_scene("puff") == ["puff", "puff_mine.xml"]
+    assert options.complete_contents("so") == ["soot"] and "0.exr" in options.complete_contents("")
+    assert options.complete_method("v") == ["variational", "vortex_fit"]
+    assert complete_format("") == ["vtk", "csv", "mat"]
