@@ -14,6 +14,9 @@ from lidar_mi.tables import Table
 CAMPAIGN = "campaign.yaml"
 """Record in the folder of a campaign."""
 
+COLLECTED = "campaign.nc"
+"""Its data set."""
+
 EXAMPLES = (
     "Examples: `lidar-mi info outputs/wake_backscatter` - `lidar-mi info image_t1.exr` - "
     "`lidar-mi info spheroids` - `lidar-mi info molecules --wavelength '355 nm' "
@@ -52,6 +55,10 @@ def info(
 
         for table in campaign_status(what).tables():
             print_table(table)
+        if (Path(what) / COLLECTED).is_file():
+            from lidar_mi.campaign.report import campaign_answer
+
+            print_answer([campaign_answer(what)])
         return
     with progress() as notice:
         found = list(
