@@ -79,7 +79,8 @@ def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     page = (tmp_path / "report.html").read_text()
     assert "with the lidar by" in page and "meets the goal of 80 %" in page
     assert "Requirements, as measured in flight" in page
-    assert "slabs per second</td><td>at least 10 Hz</td><td>10 Hz" in page
+    row = 'data-head="required">at least 10 Hz</td><td data-head="in flight">10 Hz</td>'
+    assert f"slabs per second</td><td {row}" in page
     assert flight.metrics["encounter.normalised_innovation"] < 2
     shown = str(flight)
     assert "largest roll angle / degrees" in shown and "from the first usable track" in shown

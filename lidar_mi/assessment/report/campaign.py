@@ -151,7 +151,9 @@ def _place(dataset: xr.Dataset, at: Mapping) -> str:
         here = dataset[name].isel({dim: k for dim, k in at.items() if dim in dataset[name].dims})
         value = here.item()
         number = f"{value:.4g}" if isinstance(value, float) else str(value)
-        words.append(f"{name} = {number} {here.attrs.get('units', '')}".strip())
+        words.append(
+            f"{here.attrs.get('long_name', name)} = {number} {here.attrs.get('units', '')}".strip()
+        )
     return ", ".join(words)
 
 
