@@ -32,6 +32,9 @@ class Filter(NamedTuple):
     efficiency : float
         Fraction of the information in the slopes that is left: 1 unless blur is corrected, which
         amplifies the noise of short waves.
+    noisy_slopes : float
+        Mean square of the slopes that noise alone makes in the mean of two filtered images, summed
+        over the axes, per px^2.
     """
 
     gain: torch.Tensor
@@ -39,6 +42,7 @@ class Filter(NamedTuple):
     passed: float
     excess: float
     efficiency: float
+    noisy_slopes: float
 
 
 def best_filter(
@@ -96,9 +100,7 @@ def best_filter(
             max=settings.sharpening
         )
         response = torch.where(response > 0, (response * sharper).square(), 0.0)
-    passed = response[shell]
-    # of a real field's transform all but the first column stand for two waves
-    passed = float(passed[..., :1].sum() + 2 * passed[..., 1:].sum()) / math.prod(sizes)
+    passed = _mean(response[shell], sizes)
     white = level / floor if mismatch is not None else torch.ones_like(response)
     gain = (response * white).sqrt()
     # power of the filtered slopes with noise, the part of it from texture, and its variance
@@ -113,7 +115,14 @@ def best_filter(
         passed,
         power / informed if informed > 0 else 1.0,
         informed / spread if informed > 0 else 1.0,
+        (2 * math.pi) ** 2 * _mean(steep * (floor / 2).expand(len(gain))[shell], sizes),
     )
+
+
+def _mean(values: torch.Tensor, sizes: Sequence[int]) -> float:
+    """Over all waves, of values at those of a real Fourier transform."""
+    # all but the first column stand for two waves
+    return float(values[..., :1].sum() + 2 * values[..., 1:].sum()) / math.prod(sizes)
 
 
 def checked_noise(noise: float | None) -> None:

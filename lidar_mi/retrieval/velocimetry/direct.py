@@ -19,10 +19,15 @@ _ROUNDING = 1e-14
 _SINGLE = 1e-3
 
 
-class Posterior(NamedTuple):
-    """A flow after a Gauss-Newton step, and the factor of the second derivative there.
+# Least information over second derivative at which steps take the information: each then leaves less
+# than half of the distance.
+_ALIKE = 0.7
 
-    `stiff` is the prior's part of the second derivative, a band.
+
+class Posterior(NamedTuple):
+    """A flow after a Gauss-Newton step, and the factor of the posterior's precision there.
+
+    `stiff` is the prior's part of it, a band.
     """
 
     coefficients: torch.Tensor
@@ -60,7 +65,8 @@ def solved(
     band = Band(*(axis.knots for axis in mesh.axes))
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     root = band.factor(data_form(linear, mesh) + stiff)
-    return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
+    step = root if informative(linear) else band.factor(curvature(linear, mesh) + stiff)
+    return Posterior(coefficients + band.solve(step, gradient), band, root, prior, stiff)
 
 
 def solved_in_single(
@@ -77,6 +83,8 @@ def solved_in_single(
     band = Band(*(axis.knots for axis in mesh.axes))
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     whole = data_form(linear, mesh) + stiff
+    if not informative(linear):
+        return solved(linear, mesh, coefficients, prior, settings, 0)
     try:
         root = band.factor(whole.float())
     except torch.linalg.LinAlgError:
@@ -88,6 +96,11 @@ def solved_in_single(
             return Posterior(coefficients + step, band, root, prior, stiff)
     root = band.factor(whole)
     return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
+
+
+def informative(linear: Linear) -> bool:
+    """Whether information and second derivative are alike: steps by either converge."""
+    return bool((linear.information >= _ALIKE * linear.weight).all())
 
 
 def prior_and_gradient(
@@ -103,8 +116,13 @@ def prior_and_gradient(
 
 
 def data_form(linear: Linear, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
-    """The log-likelihood's quadratic form, of all cells along z or of some (`band.form`)."""
-    return form(linear.weight * linear.slope[:, None] * linear.slope, mesh, cells=cells)
+    """Quadratic form of what the images tell, of all cells along z or of some (`band.form`)."""
+    return form(linear.information * linear.slope[:, None] * linear.slope, mesh, cells=cells)
+
+
+def curvature(linear: Linear, mesh: Mesh) -> torch.Tensor:
+    """The log-likelihood's quadratic form: steps with less than it would overshoot."""
+    return form(linear.weight * linear.slope[:, None] * linear.slope, mesh)
 
 
 def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:

@@ -24,7 +24,7 @@ class Posterior(NamedTuple):
     ----------
     coefficients : torch.Tensor
     bend : torch.Tensor, shape (components, components, *prior.mesh.shape)
-        The log-likelihood's second derivative, lumped to the prior's mesh.
+        The information of the volumes, lumped to the prior's mesh.
     prior : Prior
     rough : Prior
         The same in the precision of the voxels, which is enough for draws.
@@ -117,7 +117,7 @@ def solved(
     dims = mesh.dims
     bend = coefficients.new_empty(dims, dims, *prior.mesh.shape)
     for a, b in combinations_with_replacement(range(dims), 2):
-        squares = linear.weight * linear.slope[a] * linear.slope[b]
+        squares = linear.information * linear.slope[a] * linear.slope[b]
         bend[a, b] = bend[b, a] = separable(squares, lumps)
     steep = linear.weight * linear.slope
 

@@ -200,9 +200,9 @@ def _prepared(
     """New images with the filter and the noise of those before."""
     last, settings = start.images, start.settings
     known, weight = usable_and_weight(stack, noise, settings)
-    gain = last.spline.gain.float()
+    used = last.spline
     chosen = Filter(
-        gain, last.noise, last.spline.passed, last.spline.excess, last.spline.efficiency
+        used.gain.float(), last.noise, used.passed, used.excess, used.efficiency, used.noisy_slopes
     )
     pair = normalised(stack)
     return last._replace(

@@ -13,7 +13,9 @@ from lidar_mi.retrieval.threads import mapped
 from lidar_mi.retrieval.velocimetry.band import Band, spread
 from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.direct import (
+    curvature,
     data_form,
+    informative,
     prior_and_gradient,
     prior_form,
     rounding,
@@ -46,9 +48,9 @@ class Strip(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """A flow after a Gauss-Newton step, with the second derivative there.
+    """A flow after a Gauss-Newton step, with the posterior's precision there.
 
-    `stiff` is the prior's part of the second derivative, `both` all of it: bands. `images` is the
+    `stiff` is the prior's part of it, `both` all of it: bands. `images` is the
     likelihood that they are of, and its mesh.
     """
 
@@ -156,9 +158,10 @@ def solved(
     whole = Band(*(axis.knots for axis in mesh.axes))
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     both = data_form(linear, mesh) + stiff
+    steep = both if informative(linear) else curvature(linear, mesh) + stiff
     cut = strips(mesh.axes[0].cells, solver.solved_core, solver.solved_overlap)
     some = _grouped(cut, solver.solved_at_once)
-    roots = mapped(lambda part: _root(both, part), some)
+    roots = mapped(lambda part: _root(steep, part), some)
 
     def inverse(part: tuple[list[Strip], Factor], right: torch.Tensor) -> torch.Tensor:
         members, root = part
@@ -175,7 +178,7 @@ def solved(
         return total
 
     (change,) = conjugate_gradients(
-        lambda c: whole.apply(both, c[0])[None],
+        lambda c: whole.apply(steep, c[0])[None],
         gradient[None],
         preconditioned,
         solver.tolerance,

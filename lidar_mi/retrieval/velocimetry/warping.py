@@ -36,7 +36,7 @@ class Spline(NamedTuple):
         Along each axis as many as there are nodes in the image and the margins around it.
     shape : tuple of int
         Of the images, (z, y), or (x, z, y) of volumes.
-    passed, excess, gain, efficiency
+    passed, excess, gain, efficiency, noisy_slopes
         As in `band_limit.Filter`.
     settings : FilterSettings
     """
@@ -47,6 +47,7 @@ class Spline(NamedTuple):
     excess: float
     gain: torch.Tensor
     efficiency: float
+    noisy_slopes: float
     settings: FilterSettings
 
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
@@ -270,6 +271,7 @@ def filtered_spline(images: torch.Tensor, chosen: Filter, settings: FilterSettin
         chosen.excess,
         chosen.gain,
         chosen.efficiency,
+        chosen.noisy_slopes,
         settings,
     )
 

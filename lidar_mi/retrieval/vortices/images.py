@@ -227,7 +227,7 @@ class Builder:
     @cached_property
     def unfiltered(self) -> Spline:
         """The images as they are."""
-        everything = Filter(torch.ones_like(self.sharp[0].gain), 0.0, 1.0, 1.0, 1.0)
+        everything = Filter(torch.ones_like(self.sharp[0].gain), 0.0, 1.0, 1.0, 1.0, 0.0)
         return filtered_spline(self.pair, everything, FilterSettings())
 
     @property
