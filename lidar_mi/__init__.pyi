@@ -12,7 +12,7 @@ from .experiment.reading import load_experiment
 from .experiment.results import Run
 from .experiment.run import run
 from .experiment.schema import Experiment
-from .experiment.shipped import campaigns, experiments
+from .experiment.shipped import campaigns, experiments, scene_file
 from .experiment.truth import make_truth
 from .io.exr import read_scan
 from .io.images import read_image, read_noise
@@ -73,6 +73,7 @@ __all__ = [
     "retrieve_winds",
     "run",
     "run_campaign",
+    "scene_file",
     "use_variant",
     "write_vortices",
 ]

@@ -116,6 +116,18 @@ def test_every_public_name_has_its_place_in_the_documentation():
     assert sorted([*named, "__version__"]) == sorted(lm.__all__)
 
 
+def test_table_of_calls_has_the_signatures():
+    """Every function, and what one makes by hand, with its parameters and their defaults."""
+    page = (Path(__file__).parents[1] / "docs" / "api.md").read_text()
+    calls = re.findall(r"^\| `lm\.(\w+)(\(.*?\))` \| ", page, re.MULTILINE)
+    functions = {name for name in lm.__all__ if inspect.isfunction(getattr(lm, name))}
+    assert {name for name, _ in calls} == functions | {"AircraftPose", "VirtualLidar"}
+    for name, call in calls:
+        whole = inspect.signature(getattr(lm, name))
+        bare = [one.replace(annotation=one.empty) for one in whole.parameters.values()]
+        assert call == str(whole.replace(parameters=bare, return_annotation=whole.empty))
+
+
 def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="nonsense"):
         lm.nonsense  # noqa: B018

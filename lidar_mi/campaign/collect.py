@@ -8,6 +8,7 @@ import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
+from lidar_mi.assessment.metrics.names import title_of
 from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.campaign.folder import DATA, CampaignFolder, open_folder
 from lidar_mi.campaign.points import MEMBER, tied
@@ -101,7 +102,7 @@ def _data_set(folder, values, status, messages, places) -> xr.Dataset:
     if campaign.sample:
         scales |= {tied(keys)[0]: span.scale for keys, span in campaign.sample.over.items()}
     for name, (dim, found) in points.coordinates().items():
-        about = {"long_name": name.replace(".", " ").replace("_", " ")}
+        about = {"long_name": knob_name(name)}
         if name in units:
             about["units"] = units[name]
         if scales.get(name):
@@ -135,8 +136,13 @@ def _data_set(folder, values, status, messages, places) -> xr.Dataset:
     return xr.Dataset(variables, coords, attributes)
 
 
+def knob_name(key: str) -> str:
+    """What a key of an experiment is called on an axis: ``doppler.lidar.range``, as words."""
+    words = key.replace("doppler.lidar.", "Doppler lidar ").replace("doppler.", "Doppler lidar's ")
+    return words.replace(".", " ").replace("_", " ")
+
+
 def _about(key: str) -> dict[str, str]:
     """Attributes of a metric."""
     unit = unit_of(key)
-    name = ", ".join(key.replace("_", " ").split("."))
-    return {"long_name": name, **({"units": unit} if unit else {})}
+    return {"long_name": title_of(key), **({"units": unit} if unit else {})}

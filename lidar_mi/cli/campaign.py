@@ -12,7 +12,7 @@ import typer
 from rich.live import Live
 from rich.table import Table as RichTable
 
-from lidar_mi.cli.options import quantity
+from lidar_mi.cli.options import complete_campaign, quantity
 from lidar_mi.cli.terminal import errors, output, print_answer, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
@@ -45,7 +45,10 @@ Folder = Annotated[Path, typer.Argument(help="Folder of the campaign.")]
 def run(
     campaign: Annotated[
         str,
-        typer.Argument(help="Campaign file, name of a shipped one, or experiment with variants."),
+        typer.Argument(
+            help="Campaign file, name of a shipped one, or experiment with variants.",
+            autocompletion=complete_campaign,
+        ),
     ],
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Folder. Default: outputs/NAME.")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, ExperimentName
+from lidar_mi.cli.options import Changes, FlightName
 from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.shipped import experiment_file
@@ -28,7 +28,7 @@ class Mode(StrEnum):
 
 
 def fly(
-    experiment: ExperimentName,
+    experiment: FlightName,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Folder. Default: outputs/NAME.")
     ] = None,

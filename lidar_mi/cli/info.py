@@ -6,13 +6,16 @@ from typing import Annotated, Any
 
 import typer
 
-from lidar_mi.cli.options import quantity
+from lidar_mi.cli.options import complete_contents, quantity
 from lidar_mi.cli.terminal import output, print_answer, print_rows, print_table
 from lidar_mi.progress import progress
 from lidar_mi.tables import Table
 
 CAMPAIGN = "campaign.yaml"
 """Record in the folder of a campaign."""
+
+COLLECTED = "campaign.nc"
+"""Its data set."""
 
 EXAMPLES = (
     "Examples: `lidar-mi info outputs/wake_backscatter` - `lidar-mi info image_t1.exr` - "
@@ -27,7 +30,8 @@ def info(
         typer.Argument(
             help="EXR, NetCDF or scattering-table file (.txt), folder of a run, of variants or of "
             "a campaign, or a name: molecules, spheroids, spheres, continental, sea_salt, dust, "
-            "droplets, soot."
+            "droplets, soot.",
+            autocompletion=complete_contents,
         ),
     ],
     wavelength: Annotated[
@@ -51,6 +55,10 @@ def info(
 
         for table in campaign_status(what).tables():
             print_table(table)
+        if (Path(what) / COLLECTED).is_file():
+            from lidar_mi.campaign.report import campaign_answer
+
+            print_answer([campaign_answer(what)])
         return
     with progress() as notice:
         found = list(
@@ -76,20 +84,27 @@ def info(
         if reason:
             output.print(f"failed: {reason}", soft_wrap=True)
         elif metrics is not None and not (folder / RECORD).is_file():
-            for table in _results(metrics, read_record(folder)["experiment"]):
+            for table in _results(folder, metrics, read_record(folder)["experiment"]):
                 print_table(table)
         if (folder / RECORD).is_file() and not reason:
             output.print(f"more of a variant: lidar-mi info {folder}/VARIANT", soft_wrap=True)
 
 
-def _results(metrics: Mapping[str, float], experiment: Mapping[str, Any]) -> list[Table]:
+def _results(
+    folder: Path, metrics: Mapping[str, float], experiment: Mapping[str, Any]
+) -> list[Table]:
     """The numbers of a flight or of a run."""
+    from lidar_mi.assessment.metrics.encounter import CONTROLLER
     from lidar_mi.assessment.report.encounter import encounter_summary
     from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment.describe import value_at
+    from lidar_mi.experiment.export_flight import FLIGHT_FILES
+    from lidar_mi.io.netcdf import read_netcdf
 
     if value_at(experiment, "encounter") is not None:
-        return encounter_summary(metrics)
+        flights = folder / FLIGHT_FILES["series"]
+        about = read_netcdf(flights).attrs if flights.is_file() else {}
+        return encounter_summary(metrics, about.get(CONTROLLER, ""))
     asked = value_at(experiment, "doppler.retrieval.averaged")
     averaged = [n for n in asked if isinstance(n, int)] if isinstance(asked, list) else ()
     return summary(metrics, averaged)

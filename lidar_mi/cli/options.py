@@ -1,5 +1,6 @@
 """Arguments and options common to several commands."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, overload
 
@@ -8,21 +9,68 @@ import typer
 from lidar_mi.errors import InputError
 
 
-def _complete(incomplete: str) -> list[str]:
-    """Experiments of the package and experiment files here, to a shell's completion."""
-    from lidar_mi.experiment.shipped import experiments
-
+def starting(incomplete: str, names: Iterable[str], *patterns: str) -> list[str]:
+    """What a shell may complete: names, then files of some patterns and folders here."""
     beside = incomplete.rpartition("/")[0]
     here = Path(beside or ("/" if incomplete.startswith("/") else "."))
-    found = sorted(here.glob("*.yaml")) + sorted(p for p in here.glob("*/") if p.is_dir())
-    names = [f"{path}/" if path.is_dir() else str(path) for path in found]
-    return [name for name in (*experiments(), *names) if name.startswith(incomplete)]
+    found = sorted(path for pattern in patterns for path in here.glob(pattern) if path.is_file())
+    found += sorted(p for p in here.glob("*/") if p.is_dir()) if patterns else []
+    files = [f"{path}/" if path.is_dir() else str(path) for path in found]
+    return [name for name in (*names, *files) if name.startswith(incomplete)]
 
 
-ExperimentName = Annotated[
-    str,
-    typer.Argument(help="Experiment file, or the name of a shipped one.", autocompletion=_complete),
-]
+def complete_run(incomplete: str) -> list[str]:
+    """Experiments of the package that are no flights, and experiment files here."""
+    from lidar_mi.experiment.shipped import experiments, flights
+
+    return starting(incomplete, sorted(set(experiments()) - set(flights())), "*.yaml")
+
+
+def complete_flight(incomplete: str) -> list[str]:
+    """Flights of the package, and experiment files here."""
+    from lidar_mi.experiment.shipped import flights
+
+    return starting(incomplete, flights(), "*.yaml")
+
+
+def _complete_experiment(incomplete: str) -> list[str]:
+    from lidar_mi.experiment.shipped import experiments
+
+    return starting(incomplete, experiments(), "*.yaml")
+
+
+def complete_campaign(incomplete: str) -> list[str]:
+    """Campaigns of the package, and files here."""
+    from lidar_mi.experiment.shipped import campaigns
+
+    return starting(incomplete, campaigns(), "*.yaml")
+
+
+def complete_scene(incomplete: str) -> list[str]:
+    """Mitsuba scenes of the package, and scenes here."""
+    from lidar_mi.experiment.shipped import scenes
+
+    return starting(incomplete, scenes(), "*.xml")
+
+
+def complete_contents(incomplete: str) -> list[str]:
+    """Files and folders that can be shown, and the names of scatterers."""
+    from lidar_mi.atmosphere.aerosols import AEROSOLS
+
+    return starting(incomplete, ("molecules", *AEROSOLS), "*.exr", "*.nc", "*.txt")
+
+
+def complete_method(incomplete: str) -> list[str]:
+    """Methods of wind from images."""
+    from lidar_mi.retrieval.method_names import ImageMethod
+
+    return starting(incomplete, (method.value for method in ImageMethod))
+
+
+_HELP = "Experiment file, or the name of a shipped one."
+ExperimentName = Annotated[str, typer.Argument(help=_HELP, autocompletion=_complete_experiment)]
+RunName = Annotated[str, typer.Argument(help=_HELP, autocompletion=complete_run)]
+FlightName = Annotated[str, typer.Argument(help=_HELP, autocompletion=complete_flight)]
 Changes = Annotated[
     list[str] | None,
     typer.Option(

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Overwrite, Variant
+from lidar_mi.cli.options import Overwrite, Variant, complete_scene
 from lidar_mi.cli.terminal import output
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
@@ -15,7 +15,11 @@ EXAMPLES = "Example: `lidar-mi render slab.xml -s 256 -D range=485 -o slab.exr`"
 
 def render(
     scene: Annotated[
-        str, typer.Argument(help="Mitsuba scene (XML), or the name of one of the package: slab.")
+        str,
+        typer.Argument(
+            help="Mitsuba scene (XML), or the name of one of the package: slab.",
+            autocompletion=complete_scene,
+        ),
     ],
     variant: Variant = None,
     samples: Annotated[
@@ -27,7 +31,10 @@ def render(
     out: Annotated[
         Path | None,
         typer.Option(
-            "-o", "--out", help="EXR file. Default: beside the scene; of a shipped one, here."
+            "-o",
+            "--out",
+            help="EXR or PNG file; the other is written beside it. Default: beside the scene; of a "
+            "shipped one, here.",
         ),
     ] = None,
     define: Annotated[
@@ -40,7 +47,8 @@ def render(
     """Render a Mitsuba scene of a `scanning_lidar` or a `ccd`, the plugins loaded.
 
     Pictures by other cameras: lidar_mi.register_plugins() and mi.render in Python. Writes an EXR,
-    and beside it a PNG of its brightness to look at.
+    and beside it a PNG of its brightness to look at, linear from black to white; which values these
+    are is said.
     """
     from lidar_mi.experiment.shipped import scene_file
     from lidar_mi.io.images import read_pixels
@@ -50,8 +58,10 @@ def render(
 
     source, definitions = scene_file(scene), _definitions(define or [])
     beside = source if Path(scene).is_file() else Path(source.name)
-    path = out or beside.with_suffix(".exr")
-    preview, read = path.with_suffix(".png"), files_of(source, definitions)
+    asked, read = out or beside.with_suffix(".exr"), files_of(source, definitions)
+    check_target(asked, read, overwrite=overwrite)
+    path = _image(asked)
+    preview = path.with_suffix(".png")
     check_target(path, read, overwrite=overwrite)
     # made from the image: it is replaced together with it
     check_target(preview, read, overwrite=overwrite or path.exists())
@@ -65,9 +75,16 @@ def render(
             definitions,
             lambda fraction: notice(f"rendering {source.name}", fraction),
         )
-    write_preview(preview, read_pixels(path))
+    black, white = write_preview(preview, read_pixels(path))
     output.print(f"image    {path}")
-    output.print(f"preview  {preview}")
+    output.print(f"preview  {preview}: black is {black:.4g}, white {white:.4g}", soft_wrap=True)
+
+
+def _image(out: Path) -> Path:
+    """The EXR file of a name that is an EXR's, a PNG's or has no ending."""
+    if out.suffix.lower() not in ("", ".exr", ".png"):
+        raise InputError(f"-o {out}: {out.suffix} is not allowed; expected .exr or .png")
+    return out if out.suffix.lower() == ".exr" else out.with_suffix(".exr")
 
 
 def _definitions(texts: list[str]) -> dict[str, str]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from lidar_mi.cli.options import Overwrite
+from lidar_mi.cli.options import Overwrite, complete_method
 from lidar_mi.cli.terminal import output, print_rows, print_table
 from lidar_mi.errors import InputError
 from lidar_mi.progress import progress
@@ -52,14 +52,19 @@ def retrieve(
         str,
         typer.Option(
             help="variational (a smooth flow), cc (cross-correlation), ws (weight shift), "
-            "multipass or vortex_fit."
+            "multipass or vortex_fit.",
+            autocompletion=complete_method,
         ),
     ] = "variational",
     template: Annotated[int, typer.Option(help="Template size, pixels.")] = 8,
     search: Annotated[int, typer.Option(help="Search region, pixels.")] = 16,
     stride: Annotated[int, typer.Option(help="Step between vectors, pixels.")] = 1,
     layer: Annotated[
-        str | None, typer.Option(help="Layer of the EXR files. Default: Y, or the only one.")
+        str | None,
+        typer.Option(
+            help="Layer of the EXR files. Default: Y_noisy (with the detector's noise), else Y, or "
+            "the only one."
+        ),
     ] = None,
     spacing: Annotated[
         float | None, typer.Option(help="Pixel spacing in m, for files without axes.")
@@ -106,6 +111,7 @@ def retrieve(
             "all (a wind from each pair), or --method variational (one wind from all)"
         )
     check_target(out, paths, overwrite=overwrite)
+    layer = layer or _layer(paths)
     images = [read_image(path, layer, spacing) for path in paths]
     steps = _time_steps(paths, dt, equal=chosen is None)
     noisy = paths if chosen is not None else paths[:1]
@@ -193,6 +199,26 @@ def _pairs(text: str, count: int) -> list[tuple[int, int]]:
             )
         found.append((int(numbers[0]), int(numbers[1])))
     return found
+
+
+def _layer(paths: Sequence[Path]) -> str | None:
+    """The layer that all files have by default, said; None: they have no names of layers."""
+    from lidar_mi.io.images import default_layer
+
+    found = {path: default_layer(path) for path in paths}
+    names = set(found.values())
+    if "Y_noisy" in names and len(names) > 1:
+        other = next(path for path, name in found.items() if name != "Y_noisy")
+        raise InputError(
+            f"{other}: without the layer Y_noisy, which other images have; expected --layer, such "
+            "as --layer Y for all"
+        )
+    (name,) = names if len(names) == 1 else (None,)
+    if name == "Y_noisy":
+        output.print("layer    Y_noisy, with the detector's noise (--layer Y: without it)")
+    elif name:
+        output.print(f"layer    {name}")
+    return name
 
 
 def _print_wind(wind: "xr.Dataset") -> None:

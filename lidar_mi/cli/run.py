@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from lidar_mi.cli.options import Changes, ExperimentName, Variant
+from lidar_mi.cli.options import Changes, RunName, Variant
 from lidar_mi.cli.terminal import output, print_answer, print_table
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.progress import progress
@@ -17,7 +17,7 @@ EXAMPLES = (
 
 
 def run(
-    experiment: ExperimentName,
+    experiment: RunName,
     variant: Variant = None,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", help="Run folder. Default: outputs/NAME.")

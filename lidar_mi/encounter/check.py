@@ -1,5 +1,6 @@
 """What is known of a flight before it: its geometry, and whether it can succeed."""
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -22,6 +23,7 @@ _MISSED = 0.01
 # Slabs with both vortices in the image that a track needs.
 _LEAST_SLABS = 3
 _INSTANTS = 400
+_UNITS = {"speed": "m/s", "dt": "s", "range": "m"}
 
 
 def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> list[str]:
@@ -44,7 +46,7 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
     if encounter.control.mode == "feedforward":
         _check_latency(experiment, gates)
     one = aircraft or aircraft_of(encounter)
-    found = []
+    found = _without_effect(experiment, gates)
     strength = _strongest(experiment, one)
     if strength < _MISSED:
         found.append(
@@ -109,15 +111,50 @@ def sections(
         yield f"{experiment.name}: warnings of the flight", [(text,) for text in warnings]
 
 
+def _without_effect(experiment: Experiment, gates: Gates) -> list[str]:
+    """Keys of the file whose values a flight does not take, and what says it instead."""
+    encounter, found = encounter_of(experiment), []
+    thickness = experiment.scan.thickness
+    if "thickness" in experiment.scan.model_fields_set and not _same(thickness, gates.depth):
+        near = gates.stride / thickness
+        counts = sorted({max(1, math.floor(near)), math.ceil(near)})
+        fitting = " or ".join(f"{gates.stride / count:.4g} m" for count in counts)
+        found.append(
+            f"scan.thickness: {thickness:g} m becomes {gates.depth:.4g} m: a whole number of gates "
+            f"fills the {gates.stride:.4g} m flown from scan to scan (expected {fitting}, or "
+            "another encounter.path.speed or encounter.rate)"
+        )
+    path = encounter.path
+    for section, key, instead, flown in (
+        ("platform", "speed", "path.speed", path.speed),
+        ("platform", "dt", "rate", 1 / encounter.rate),
+        ("scan", "range", "look_ahead", encounter.look_ahead),
+    ):
+        part = getattr(experiment, section)
+        value = getattr(part, key)
+        if key in part.model_fields_set and not _same(value, flown):
+            found.append(
+                f"{section}.{key}: {value:g} {_UNITS[key]} has no effect on a flight; "
+                f"encounter.{instead} makes it {flown:g} {_UNITS[key]}"
+            )
+    return found
+
+
+def _same(one: float, other: float) -> bool:
+    return abs(one - other) < 1e-3 * abs(other)
+
+
 def _first_slab(experiment: Experiment) -> Experiment:
     """The pair of images of one slab as an experiment without a flight."""
-    encounter = encounter_of(experiment)
+    encounter, gates = encounter_of(experiment), gates_of(experiment)
     platform = experiment.platform.model_copy(
         update={"speed": encounter.path.speed, "dt": 1 / encounter.rate}
     )
-    scan = experiment.scan.model_copy(update={"range": encounter.look_ahead})
+    scan = experiment.scan.model_copy(
+        update={"range": encounter.look_ahead, "thickness": gates.depth}
+    )
     changes = {"encounter": None, "platform": platform, "scan": scan}
-    seen = at_the_slabs(experiment, gates_of(experiment))
+    seen = at_the_slabs(experiment, gates)
     return seen.model_copy(update=changes).read_from(experiment.folder)
 
 

@@ -12,9 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import xarray as xr
 
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, flight_name
 from lidar_mi.atmosphere.wake_path import WakeAlongPath
 from lidar_mi.encounter.aircraft import AircraftModel, AircraftState, deflected, loads_in_wind
 from lidar_mi.encounter.control import Controller, Preview, feedforward, no_loads, wings_level
+from lidar_mi.encounter.own_controller import name_of, own_controller
 from lidar_mi.encounter.preview import Lidar, Lookout, preview_of
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.scan_store import ScanStore
@@ -32,13 +34,6 @@ FLOWN = {
     FEEDFORWARD: (OFF, AUTOPILOT, PERFECT, FEEDFORWARD),
 }
 """Flights of each mode of control: what it is compared with is flown, too."""
-
-TITLES = {
-    OFF: "without control",
-    AUTOPILOT: "autopilot",
-    PERFECT: "perfect preview",
-    FEEDFORWARD: "with the lidar",
-}
 
 # Longest step of a flight, s: below the time in which the wing crosses a core.
 _STEP = 0.01
@@ -105,11 +100,15 @@ def fly_all(
     wake = wake_along_path(experiment)
     levelling = encounter.control.levelling_time
     new = aircraft or (lambda: aircraft_of(encounter))
-    steers = controller or (lambda one: feedforward(one, levelling))
+    name = name_of(controller) if controller else ""
+
+    def steers(one: AircraftModel) -> Controller:
+        return own_controller(controller, one) if controller else feedforward(one, levelling)
+
     found: dict[str, xr.Dataset] = {}
     slabs, track = None, None
     for mode in FLOWN[encounter.control.mode]:
-        one, told = new(), _titled(notice, mode)
+        one, told = new(), _titled(notice, flight_name(mode, name))
         if mode == OFF:
             found[mode] = flown(one, wings_level(one, levelling), wake, encounter, told)
         elif mode == AUTOPILOT:
@@ -126,7 +125,8 @@ def fly_all(
             found[mode] = flown(one, steers(one), wake, encounter, told, ahead)
             track, slabs = track_dataset(lookout.slabs, wake), seen.dataset()
     order = [mode for mode in (OFF, AUTOPILOT, FEEDFORWARD, PERFECT) if mode in found]
-    return Flown(flights_dataset({mode: found[mode] for mode in order}), track, slabs)
+    series = flights_dataset({mode: found[mode] for mode in order})
+    return Flown(series.assign_attrs({CONTROLLER: name} if name else {}), track, slabs)
 
 
 def flown(
@@ -184,8 +184,8 @@ def _last_scan(encounter: Encounter) -> float:
     return max(0.0, duration(encounter) - encounter.look_ahead / encounter.path.speed)
 
 
-def _titled(notice: Notice, mode: str) -> Notice:
-    return lambda text, fraction: notice(f"{TITLES[mode]}: {text}", fraction)
+def _titled(notice: Notice, title: str) -> Notice:
+    return lambda text, fraction: notice(f"{title}: {text}", fraction)
 
 
 def _virtual_lidar(experiment: Experiment, processes: int, scans: ScanStore | None) -> Lidar:

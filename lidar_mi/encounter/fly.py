@@ -10,7 +10,7 @@ import xarray as xr
 
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
-from lidar_mi.assessment.metrics.encounter import encounter_metrics
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, encounter_metrics
 from lidar_mi.assessment.report.encounter import encounter_summary
 from lidar_mi.encounter.check import geometry
 from lidar_mi.encounter.flight import Flown, fly_all
@@ -70,7 +70,10 @@ class Flight(Tabular):
         if self.folder is not None:
             rows.append(("folder", str(self.folder)))
         rows += [("warning", text) for text in self.warnings]
-        return [Table("flight", rows), *encounter_summary(self.metrics)]
+        return [
+            Table("flight", rows),
+            *encounter_summary(self.metrics, self.series.attrs.get(CONTROLLER, "")),
+        ]
 
     def show(self) -> None:
         """Show the numbers, and the report in a browser."""

@@ -11,6 +11,7 @@ from lidar_mi.encounter.flight import Flown
 from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.export_flight import FLIGHT_FILES as FILES
 from lidar_mi.experiment.image_store import MADE_BY
 from lidar_mi.experiment.resumable_folder import (
     FIGURES,
@@ -31,9 +32,6 @@ from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 from lidar_mi.io.text import encoded
 from lidar_mi.io.yaml import to_yaml
-
-FILES = {"series": "flight.nc", "track": "track.nc", "seen": "slabs.nc"}
-"""File of each data set of `Flown`."""
 
 ANIMATION, SCANS = "approach.gif", "scans"
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidar_mi.assessment.figures.encounter import draw_all
 from lidar_mi.assessment.figures.encounter_film import MOST_FRAMES, film
-from lidar_mi.assessment.metrics.encounter import judged_in_flight, measured_in_flight
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, judged_in_flight, measured_in_flight
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, read_requirements
 from lidar_mi.assessment.report.answer import verdict
 from lidar_mi.assessment.report.encounter import encounter_answer, encounter_chapter
@@ -30,7 +30,11 @@ def write_report(
     span = float(np.ptp(aircraft_of(encounter_of(experiment)).strips.places[:, 1]))
     drawn = draw_all(kept.figures, flown.series, flown.track, flown.seen, span, log)
     chapter = encounter_chapter(
-        metrics, judged(experiment, flown), drawn, _film(kept, flown, span, log)
+        metrics,
+        judged(experiment, flown),
+        drawn,
+        _film(kept, flown, span, log),
+        flown.series.attrs.get(CONTROLLER, ""),
     )
     found = answer(experiment, flown, metrics)
     html = page(
@@ -49,7 +53,7 @@ def write_report(
 def answer(experiment: Experiment, flown: Flown, metrics: Mapping[str, float]) -> list[str]:
     """What a reader wants to know first, and the verdict on the lidar's wind, in sentences."""
     verdicts = [verdict(table, rows) for table, rows in judged(experiment, flown)]
-    return [*encounter_answer(metrics), *verdicts]
+    return [*encounter_answer(metrics, flown.series.attrs.get(CONTROLLER, "")), *verdicts]
 
 
 def judged(experiment: Experiment, flown: Flown) -> list[tuple[RequirementTable, list[Finding]]]:

@@ -20,7 +20,8 @@ from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth import Truth
 from lidar_mi.experiment.truth_in_time import values_of_states
-from lidar_mi.instrument.doppler import photons
+from lidar_mi.instrument.doppler import DopplerLidar, photons
+from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.scan_timing import Schedule
 from lidar_mi.rendering.memory import ceiling
@@ -91,7 +92,10 @@ def _backscatter(
     scan, lidar, platform = asked.scan, asked.lidar, asked.platform
     pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
     rows = [
-        ("wavelength", f"{1e9 * lidar.wavelength:g} nm"),
+        ("laser", _laser(lidar)),
+        ("beam's divergence", f"{1e3 * lidar.divergence_full:.4g} mrad, full angle at 1/e^2"),
+        ("field of view", f"{1e3 * lidar.fov_half:.4g} mrad, half angle"),
+        ("telescope's radius", f"{lidar.aperture_radius:g} m"),
         ("beams", f"{plan.y.size} x {plan.z.size}, {pixel:.3g} m apart"),
         ("beam's 1/e^2 radius there", f"{float(lidar.radius_at(plan.centre)):.3g} m"),
         ("gates", f"{scan.gate_count}, from {plan.gate_start:g} to {plan.gate_stop:g} m"),
@@ -182,11 +186,21 @@ def _displacements(asked: Experiment, wind, pixel: float) -> list[tuple[str, str
 def _doppler(asked: Experiment) -> Section:
     lidar = asked.doppler.lidar
     return "Doppler lidar", [
-        ("wavelength", f"{1e9 * lidar.wavelength:g} nm"),
+        ("laser", _laser(lidar)),
+        ("beam's divergence", f"{1e3 * lidar.divergence_full:.4g} mrad, full angle at 1/e^2"),
+        ("field of view", f"{1e3 * lidar.fov_half:.4g} mrad, half angle"),
         ("range bin", f"{lidar.range_bin:g} m about {lidar.range:g} m"),
         ("photons of a pulse", f"{photons(lidar):.3g}"),
         ("methods", ", ".join(asked.doppler.retrieval.methods)),
     ]
+
+
+def _laser(lidar: BackscatterLidar | DopplerLidar) -> str:
+    """Wavelength, energy and duration of a pulse."""
+    parts = [f"{1e9 * lidar.wavelength:g} nm", f"{1e3 * lidar.pulse_energy:.4g} mJ a pulse"]
+    if lidar.pulse_duration:
+        parts.append(f"{1e9 * lidar.pulse_duration:.4g} ns")
+    return ", ".join(parts)
 
 
 def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:

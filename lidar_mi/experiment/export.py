@@ -10,6 +10,7 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import value_at
+from lidar_mi.experiment.export_flight import FLIGHT_FILES, flight_results
 from lidar_mi.experiment.resumable_folder import RESULTS, read_record
 from lidar_mi.experiment.stages.rendering import IMAGES
 from lidar_mi.experiment.study import RECORD
@@ -35,14 +36,15 @@ def export(
 ) -> list[Path]:
     """Write the results of a run for ParaView, a spreadsheet or MATLAB.
 
-    Winds, volumes, both images, lines of sight and vortices, as far as the run has them. Values,
-    standard errors, flags and NaN are kept; places are x ahead, y to port, z up, m, from the
-    telescope at the first scan.
+    Winds, volumes, both images, lines of sight and vortices, as far as the run has them; of a
+    flight the aircraft's way in every flight, the vortices of its track, winds and images of the
+    slabs. Values, standard errors, flags and NaN are kept; places are x ahead, y to port, z up, m,
+    from the telescope at the first scan, of a flight from the start of its path.
 
     Parameters
     ----------
     folder : path
-        Of a run.
+        Of a run or of a flight.
     format : {"vtk", "csv", "mat"}
         VTK: a file for each source and method, ``.vti`` on uniform grids, ``.vts`` for images of
         several gates, whose beams spread, ``.vtu`` for lines of sight and vortices. CSV: a table
@@ -75,7 +77,15 @@ def export(
     if (folder / RECORD).is_file():
         raise InputError(f"{folder}: a folder of several runs; expected one of them, {folder}/...")
     record = read_record(folder)
-    results = dict(_results(folder, record))
+    if value_at(record["experiment"], "encounter") is not None:
+        results = dict(flight_results(folder, placed=format != "csv"))
+        if not results:
+            raise InputError(
+                f"{folder}: a flight without results yet; expected "
+                f"{', '.join(FLIGHT_FILES.values())}, which lidar-mi fly writes at its end"
+            )
+    else:
+        results = dict(_results(folder, record))
     if not results:
         raise InputError(f"{folder}: has no results yet; expected a run with images or winds")
     out = folder / format if out is None else Path(out)
@@ -109,7 +119,7 @@ def _files(
 
 def _one_by_one(name: str, data: xr.Dataset) -> Iterator[tuple[str, xr.Dataset]]:
     """A data set for each source, method or fit."""
-    labels = [dim for dim in ("source", "algorithm", "fit") if dim in data.dims]
+    labels = [dim for dim in ("source", "algorithm", "fit", "flight") if dim in data.dims]
     if not labels:
         yield name, data
         return

@@ -2,7 +2,7 @@
 
 import difflib
 import re
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel, ValidationError
 
@@ -62,7 +62,9 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     elif fault["type"] == "string_pattern_mismatch":
         expected = "at most 100 letters, digits, _, . and -, a letter or digit first"
     elif fault["type"] in ("tuple_type", "list_type"):
-        expected = "a list in brackets"
+        count = _length_at(model, fault["loc"])
+        example = ", ".join([str(value)] * count) if isinstance(value, str | int | float) else ""
+        expected = "a list in brackets" + (f": [{example}]" if example else "")
     elif fault["type"] == "too_short":
         expected = f"{fault['ctx']['min_length']} or more"
     else:
@@ -90,6 +92,19 @@ def _metadata_at(model: Any, location: tuple, kind: type) -> Any:
             return part
         pending += (*get_args(part), *getattr(part, "__metadata__", ()))
     return None
+
+
+def _length_at(model: Any, location: tuple) -> int:
+    """How many values a list at a location has; 1: any number."""
+    annotation: Any = None
+    for part in location:
+        if model and part in model.model_fields:
+            annotation = model.model_fields[part].annotation
+            model = _section(annotation)
+    for one in (annotation, *get_args(annotation)):
+        if get_origin(one) is tuple and Ellipsis not in get_args(one):
+            return len(get_args(one))
+    return 1
 
 
 def _keys_at(model: Any, location: tuple) -> list[str]:

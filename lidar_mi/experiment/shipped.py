@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from lidar_mi.errors import InputError
+from lidar_mi.io.yaml import read_yaml
 
 
 class _Kind(NamedTuple):
@@ -32,6 +33,27 @@ def experiments() -> list[str]:
     True
     """
     return _names(_EXPERIMENT)
+
+
+def flights() -> list[str]:
+    """Those of `experiments` that are flights: with the section ``encounter``, or on such a one."""
+    found: set[str] = set()
+    held = {
+        name: read_yaml(_folder(_EXPERIMENT) / f"{name}.yaml", "an experiment")
+        for name in experiments()
+    }
+    while more := {
+        name
+        for name, data in held.items()
+        if name not in found and ("encounter" in data or data.get("base") in found)
+    }:
+        found |= more
+    return sorted(found)
+
+
+def scenes() -> list[str]:
+    """Names of the Mitsuba scenes of the package, in alphabetical order."""
+    return _names(_SCENE)
 
 
 def campaigns() -> list[str]:
@@ -71,12 +93,29 @@ def campaign_file(name: str | Path) -> Path:
 
 
 def scene_file(name: str | Path) -> Path:
-    """The same of a Mitsuba scene.
+    """The file of a Mitsuba scene of the package (``slab``), or of one's own (its path).
+
+    A file of that name in the working folder comes first.
+
+    Parameters
+    ----------
+    name : str or path
+
+    Returns
+    -------
+    Path
+        For ``mi.load_file``, as text: ``mi.load_file(str(path))``.
 
     Raises
     ------
     InputError
-        There is none.
+        Neither a file nor a scene of the package; the message lists these.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> lm.scene_file("slab").name
+    'slab.xml'
     """
     return _found(name, [_SCENE])
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
@@ -62,6 +62,11 @@ class Scan(Description):
     timing: ScanTiming | None = Field(
         None, description="when each beam is sent; default: all at once"
     )
+
+    @field_validator("azimuth_half", "elevation_half", mode="before")
+    @classmethod
+    def _one_for_both_scans(cls, value: object) -> object:
+        return [value, value] if isinstance(value, str | int | float) else value
 
     @property
     def pulses_per_beam(self) -> int:

@@ -26,7 +26,8 @@ def read_pixels(path: str | Path, layer: str | None = None) -> np.ndarray:
     Parameters
     ----------
     layer : str, optional
-        Of an EXR file. Default: Y, or the only one, or the mean of R, G and B.
+        Of an EXR file. Default: Y_noisy (what a detector delivered), else Y, or the only one, or
+        the mean of R, G and B.
 
     Raises
     ------
@@ -70,6 +71,30 @@ def read_frames(path: str | Path, layer: str | None = None) -> np.ndarray:
     return read_pixels(path, layer)[None]
 
 
+def default_layer(path: str | Path) -> str | None:
+    """The layer that is read of an EXR file where none is named; None: it is no EXR, or colours.
+
+    What a detector delivered, ``Y_noisy``, comes before ``Y``, which is free of its noise; of any
+    other file it is the only layer.
+
+    Raises
+    ------
+    InputError
+        No such file, one that cannot be read, or several layers of which one has to be named.
+    """
+    if not _is_exr(path):
+        return None
+    layers = read_layers(path)[1]
+    for name in ("Y_noisy", "Y"):
+        if name in layers:
+            return name
+    if len(layers) == 1:
+        return next(iter(layers))
+    if {"R", "G", "B"} <= set(layers):
+        return None
+    raise InputError(f"{path}: expected a layer to be named, one of {', '.join(sorted(layers))}")
+
+
 def stated_units(path: str | Path) -> str:
     """Units of the values as the header of a rendered EXR file states them; empty otherwise."""
     path = Path(path)
@@ -93,7 +118,8 @@ def read_image(
     path : path
         EXR, PNG, TIFF, BMP, JPEG or FITS file. Colours are averaged.
     layer : str, optional
-        Of an EXR file. Default: Y, or the only one, or the mean of R, G and B.
+        Of an EXR file. Default: Y_noisy (what a detector delivered), else Y, or the only one, or
+        the mean of R, G and B.
     spacing : float, optional
         From pixel to pixel, m; for files without axes.
 
@@ -172,7 +198,7 @@ def read_noise(
     """
     if not _is_exr(path):
         return None
-    layers, layer = read_layers(path)[1], layer or "Y"
+    layers, layer = read_layers(path)[1], layer or default_layer(path)
     transport = {"gate000.S0", "gate000.S0_stderr", "Y"}
     if layer in ("Y", "Y_noisy") and transport <= set(layers):
         signal, stderr, scaled = (
@@ -244,11 +270,8 @@ def _exr(path, layer):
                 f"{path}: layer {layer!r} is not there; expected one of {', '.join(sorted(layers))}"
             )
         return layers[layer]
-    if "Y" in layers or len(layers) == 1:
-        return layers.get("Y", next(iter(layers.values())))
-    if {"R", "G", "B"} <= set(layers):
-        return np.mean([layers[name] for name in "RGB"], axis=0)
-    raise InputError(f"{path}: expected a layer to be named, one of {', '.join(sorted(layers))}")
+    named = default_layer(path)
+    return layers[named] if named else np.mean([layers[name] for name in "RGB"], axis=0)
 
 
 def _fits(path):

@@ -30,26 +30,36 @@ def png_bytes(figure: Figure) -> bytes:
     return _png(figure, dpi=70, bbox_inches="tight", pad_inches=0.1)
 
 
-def write_preview(path: str | Path, pixels: np.ndarray) -> None:
+def write_preview(path: str | Path, pixels: np.ndarray) -> tuple[float, float]:
     """Write an image of light as 8-bit grey, for viewers that know no EXR.
 
-    Black is 0 and white the value that 0.5 % of the pixels exceed; between them the display's
-    exponent of 2.2 is corrected. What is not finite is black.
+    Grey is linear between black, the value below which 0.5 % of the pixels are, and white, which
+    0.5 % exceed: what is there is seen, however faint its contrast. An image of one value is grey.
+    What is not finite is black.
 
     Parameters
     ----------
     path : str or Path
     pixels : (rows, columns) array
         Top row first.
+
+    Returns
+    -------
+    black, white : float
+        Values of the image, in its units.
     """
     from PIL import Image
 
-    light = np.nan_to_num(np.asarray(pixels, float), posinf=0.0, neginf=0.0)
-    white = np.quantile(light, 0.995) or light.max() or 1.0
-    grey = np.clip(light / white, 0, 1) ** (1 / 2.2)
+    light = np.asarray(pixels, float)
+    valid = np.isfinite(light)
+    black, white = np.quantile(light[valid], (0.005, 0.995)) if valid.any() else (0.0, 0.0)
+    spread = white - black
+    grey = (light - black) / spread if spread > 0 else np.where(light > black, 1.0, 0.5)
+    grey = np.clip(np.where(valid, grey, 0.0), 0, 1)
     buffer = BytesIO()
     Image.fromarray((255 * grey + 0.5).astype(np.uint8)).save(buffer, "PNG")
     write_atomically(path, buffer.getvalue())
+    return float(black), float(white)
 
 
 def _png(figure: Figure, **options: Any) -> bytes:

@@ -1,5 +1,6 @@
 """Wake flows from NetCDF files with CF units: read, checked, in SI units on ascending axes."""
 
+import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -232,10 +233,14 @@ def read_wake(
         return _read(data, table, sign, asked, time, x, path)
 
 
-def _hint(name, table):
-    """How to give the name in the file, where none has been given."""
+def _hint(name, table, there):
+    """How to give the name in the file, or the one there that is nearest to the name given."""
     if table[name] != name:
-        return ""
+        others = [str(one) for one in there]
+        close = difflib.get_close_matches(table[name], others, 1)
+        # a name that is nothing like those there: ours may be among them
+        close = close or ([name] if name in others else [])
+        return f"; did you mean {close[0]}?" if close else ""
     none = f", or wake.extinction.{name}: null" if name in ("tracer", "aerosol") else ""
     return f"; expected wake.names: {{{name}: its name there}}{none}"
 
@@ -273,13 +278,14 @@ def _read(data, table, sign, asked, time, x, path):
         if name in asked and table[name] not in data.data_vars:
             raise InputError(
                 f"{path}: variable {table[name]!r} ({name}) is missing; it has "
-                f"{', '.join(map(str, data.data_vars)) or 'none'}{_hint(name, table)}"
+                f"{', '.join(map(str, data.data_vars)) or 'none'}"
+                f"{_hint(name, table, data.data_vars)}"
             )
     for name in ("y", "z"):
         if table[name] not in data.dims:
             raise InputError(
                 f"{path}: dimension {table[name]!r} ({name}) is missing; it has "
-                f"{', '.join(map(str, data.dims)) or 'none'}{_hint(name, table)}"
+                f"{', '.join(map(str, data.dims)) or 'none'}{_hint(name, table, data.dims)}"
             )
     present = [name for name in _VARIABLES if table[name] in data.data_vars]
     spatial = {table[d]: d for d in ("x", "y", "z") if table[d] in data.dims}

@@ -6,6 +6,7 @@ slider, faults that are no one line, an experiment that the wrong command takes.
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 import xarray as xr
@@ -17,6 +18,7 @@ from lidar_mi.encounter.wake import wake_along_path
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import silent
 from lidar_mi.experiment.reading import check
+from lidar_mi.experiment.schema import Platform, Scan
 from tests.support.command_line import shell
 from tests.support.synthetic_lidar import SyntheticLidar, encounter_keys
 
@@ -77,7 +79,8 @@ def test_report_of_a_flight_with_a_lidar(tmp_path, monkeypatch):
     page = (tmp_path / "report.html").read_text()
     assert "with the lidar by" in page and "meets the goal of 80 %" in page
     assert "Requirements, as measured in flight" in page
-    assert "slabs per second</td><td>at least 10 Hz</td><td>10 Hz" in page
+    row = 'data-head="required">at least 10 Hz</td><td data-head="in flight">10 Hz</td>'
+    assert f"slabs per second</td><td {row}" in page
     assert flight.metrics["encounter.normalised_innovation"] < 2
     shown = str(flight)
     assert "largest roll angle / degrees" in shown and "from the first usable track" in shown
@@ -118,6 +121,18 @@ def test_path_that_misses_is_warned_of():
     assert text.startswith("encounter.path: the flight misses the wake")
     # beside the image, too
     assert len(geometry(experiment(path={"miss": {"z": "400 m"}}))) == 2
+
+
+def test_keys_without_effect_are_warned_of():
+    """A thickness that does not divide the 7.5 m from scan to scan, and a run's own speed."""
+    depth, speed = geometry(
+        experiment(control={"mode": "off"})
+        .model_copy(update={"scan": Scan(thickness="3 m"), "platform": Platform(speed="100 m/s")})
+        .read_from(Path())
+    )
+    assert depth.startswith("scan.thickness: 3 m becomes 3.75 m") and "2.5 m" in depth
+    assert speed.startswith("platform.speed: 100 m/s has no effect on a flight; encounter.path.s")
+    assert speed.endswith("makes it 75 m/s")
 
 
 def test_each_command_takes_its_own(tmp_path):

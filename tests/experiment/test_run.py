@@ -48,7 +48,7 @@ def test_it_shows_its_numbers(done):
     assert "windy" in output and "no skill" in output
     page = done._repr_html_()
     assert page.startswith('<img alt="" style="max-width: 100%" src="data:image/png;base64,iVBOR')
-    assert f"<td>{done.metrics['backscatter.cc.rmse_v']:.2f}</td>" in page
+    assert f">{done.metrics['backscatter.cc.rmse_v']:.2f}</td>" in page
 
 
 def test_show_prints_and_opens_the_report(done, monkeypatch, capsys, tmp_path):

@@ -281,6 +281,7 @@ FAULTS = [
     ("retrieval.blur=-1", "retrieval.blur: -1 m is not allowed; expected 'beam' or 0 to 1000 m"),
     ("retrieval.methods=[]", "retrieval.methods: [] is not allowed; expected 1 or more"),
     ("retrieval.methods=cc", "retrieval.methods: 'cc' is not allowed; expected a list in brackets"),
+    ("wake.centre=3 m", "wake.centre: '3 m' is not allowed; expected a list in brackets: [3 m, 3"),
     ("name=a/b", "name: 'a/b' is not allowed; expected at most 100 letters, digits"),
     ("name=..", "name: '..' is not allowed; expected at most 100 letters, digits"),
     # not the right kind

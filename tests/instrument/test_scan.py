@@ -134,3 +134,9 @@ def test_bad_values_are_refused(bad):
     with pytest.raises(ValidationError) as error:
         Scan(**bad)
     assert error.value.errors()[0]["loc"][0] == next(iter(bad))
+
+
+def test_one_half_angle_is_that_of_both_scans():
+    both = Scan(azimuth_half="9 deg", elevation_half="100 mrad")
+    assert both.azimuth_half == pytest.approx((np.radians(9), np.radians(9)))
+    assert both.elevation_half == pytest.approx((0.1, 0.1))

@@ -47,6 +47,7 @@ def test_every_kind_holds_the_same(tmp_path, values):
     Image.merge("RGBA", [grey, grey, grey, grey.point(lambda _: 9)]).save(tmp_path / "alpha.png")
     fits.PrimaryHDU(values.astype(np.float32)).writeto(tmp_path / "a.fits")
     write_exr(tmp_path / "a.exr", Y=values, noise=0 * values)
+    write_exr(tmp_path / "noisy.exr", Y=0 * values, Y_noisy=values)
     write_exr(tmp_path / "rgb.exr", R=values - 1, G=values, B=values + 1)
     for path in sorted(tmp_path.iterdir()):
         np.testing.assert_array_equal(read_pixels(path), values, err_msg=path.name)

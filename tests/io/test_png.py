@@ -23,13 +23,29 @@ def test_figures_are_written_whole_and_cropped_on_request(tmp_path):
 
 
 def test_a_preview_has_the_order_of_the_light(tmp_path):
-    """Rows as given, black at 0, half of the light at the display's 73 %; NaN is black."""
+    """Rows as given, linear from the 0.5 % quantile to the 99.5 %; NaN is black."""
     light = np.ones((20, 10))
     light[0], light[1], light[2, 0] = 0.0, 0.5, np.nan
-    write_preview(tmp_path / "a.png", 1e-6 * light)
-    with Image.open(tmp_path / "a.png") as image:
-        grey = np.asarray(image)
+    assert write_preview(tmp_path / "a.png", 1e-6 * light) == (0.0, 1e-6)
+    grey = _pixels(tmp_path / "a.png")
     assert grey.shape == (20, 10) and grey.dtype == np.uint8
     assert (grey[0] == 0).all() and (grey[3:] == 255).all() and grey[2, 0] == 0
-    assert (grey[1] == round(255 * 0.5 ** (1 / 2.2))).all()
-    write_preview(tmp_path / "dark.png", 0 * light)
+    assert (grey[1] == 128).all()
+
+
+def test_a_preview_shows_faint_contrast(tmp_path):
+    """2 % more light on one half of a bright image: black against white; none at all: grey."""
+    light = np.full((20, 10), 3e-8)
+    light[:, 5:] *= 1.02
+    write_preview(tmp_path / "faint.png", light)
+    grey = _pixels(tmp_path / "faint.png")
+    assert (grey[:, :5] == 0).all() and (grey[:, 5:] == 255).all()
+    for name, value in (("none", 0.0), ("one", 3e-8), ("nan", np.nan)):
+        write_preview(tmp_path / f"{name}.png", np.full((3, 4), value))
+    assert (_pixels(tmp_path / "one.png") == 128).all()
+    assert (_pixels(tmp_path / "nan.png") == 0).all()
+
+
+def _pixels(path):
+    with Image.open(path) as image:
+        return np.asarray(image)

@@ -68,7 +68,11 @@ def test_rendered_slab_obeys_the_lidar_equation(there, lidar_mi):
 
 
 def test_number_of_samples_is_the_scene_s_by_default(there, lidar_mi):
-    assert lidar_mi("render", "slab.xml", "-o", "a.exr")[0] == 0
+    """And the name of the preview, given, makes both files; its black and white are said."""
+    code, out, _ = lidar_mi("render", "slab.xml", "-o", "a.png")
+    assert code == 0 and "black is 0.0001" in out
+    with Image.open(there / "a.png") as preview:
+        assert np.asarray(preview).std() > 20
     assert read_scan(there / "a.exr").attrs["samples_per_beam"] == 64
 
 

@@ -77,6 +77,7 @@ def bad(*arguments, says):
         bad("render", "slab.xml", "-D", "range=far", says=["slab.xml", "far"]),
         bad("render", "slab.xml", "-D", "range=510", says=["gate_stop", "502.5", "510"]),
         bad("render", "slab.xml", "-o", "none/a.exr", says=["none is no folder"]),
+        bad("render", "slab.xml", "-o", "a.tif", says=["-o a.tif", ".exr or .png"]),
         bad("render", "radius.xml", says=["laser.beam_radius", "-0.1", "above 0"]),
         bad("render", "unknown.xml", says=["unknown.xml", "bean_radius"]),
         bad(

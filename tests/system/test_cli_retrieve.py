@@ -12,7 +12,8 @@ import xarray as xr
 from scipy.ndimage import gaussian_filter
 
 from lidar_mi.cli import options
-from lidar_mi.io.exr import label_scan, write_scan
+from lidar_mi.cli.export import complete_format
+from lidar_mi.io.exr import label_scan, read_scan, write_scan
 from lidar_mi.io.image_times import steps_of
 from tests.support.command_line import shell, words_of
 
@@ -132,6 +133,21 @@ def test_many_images_pair_by_pair(here, lidar_mi):
         assert code == 2 and words in err and len(err.splitlines()) == 1
 
 
+def test_images_of_a_detector_come_first(here, lidar_mi):
+    """Y_noisy before Y; which was taken is said; images of both kinds are not mixed unasked."""
+    for number in (0, 1):
+        scan = read_scan(f"{number}.exr")
+        noisy = {"S0_noisy": scan["S0"], "S0_noise_std": scan["S0_stderr"], "Y_noisy": scan["Y"]}
+        noisy["Y_noise_std"] = 0.02 * scan["Y"]
+        write_scan(here / f"noisy{number}.exr", scan.assign(noisy))
+    code, out, _ = lidar_mi("retrieve", "noisy0.exr", "noisy1.exr", *OPTIONS)
+    assert code == 0 and "layer    Y_noisy, with the detector's noise (--layer Y" in out
+    code, out, _ = lidar_mi("retrieve", "noisy0.exr", "noisy1.exr", "--layer", "Y", *OPTIONS)
+    assert code == 0 and "Y_noisy" not in out
+    code, _, err = lidar_mi("retrieve", "noisy0.exr", "1.exr", *OPTIONS)
+    assert code == 2 and "1.exr: without the layer Y_noisy" in err and "--layer Y" in err
+
+
 def test_thresholds_flag_more(here, lidar_mi):
     def valid(*more):
         assert lidar_mi("retrieve", "0.exr", "1.exr", "--method", "cc", *OPTIONS, *more)[0] == 0
@@ -149,6 +165,18 @@ def test_shells_complete_commands_and_experiments(here, monkeypatch):
     (here / "wake_mine.yaml").write_text("")
     (here / "sub").mkdir()
     (here / "sub" / "mine.yaml").write_text("")
-    assert {"wake_3d", "wake_sensor", "wake_mine.yaml"} <= set(options._complete("wake_"))
-    assert options._complete("su") == ["sub/"]
-    assert options._complete("sub/m") == ["sub/mine.yaml"]
+    (here / "puff_mine.xml").write_text("")
+    run = options.complete_run
+    assert {"wake_3d", "wake_sensor", "wake_mine.yaml"} <= set(run("wake_"))
+    assert run("su") == ["sub/"] and run("sub/m") == ["sub/mine.yaml"]
+    assert not run("enc") and options.complete_flight("") == [
+        "encounter",
+        "encounter_sensor",
+        "wake_mine.yaml",
+        "sub/",
+    ]
+    assert options.complete_campaign("design") == ["design_map"]
+    assert options.complete_scene("puff") == ["puff", "puff_mine.xml"]
+    assert options.complete_contents("so") == ["soot"] and "0.exr" in options.complete_contents("")
+    assert options.complete_method("v") == ["variational", "vortex_fit"]
+    assert complete_format("") == ["vtk", "csv", "mat"]

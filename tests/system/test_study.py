@@ -124,7 +124,8 @@ def test_all_run_and_are_compared(file, tmp_path, monkeypatch):
     assert '<a href="near/report.html">' in page and '<a href="far/report.html">' in page
     cells = dict(
         re.findall(
-            r"<tr><td>([^<]+)</td>(?:<td>[^<]*</td>)?<td>([^<]+)</td><td>[^<]+</td></tr>", page
+            r"<tr><td>([^<]+)</td>(?:<td[^>]*>[^<]*</td>)?<td[^>]*>([^<]+)</td><td[^>]*>[^<]+</td></tr>",
+            page,
         )
     )
     assert cells["scan.range"] == "150 m"

@@ -150,7 +150,10 @@ def _arrows(axes, wind: xr.Dataset, cores: list[Core], title: str, scale: Scale)
         "width": 0.0022,
     }
     flagged, valid = known & (flag != 0), known & (flag == 0)
-    if flagged.any():
+    if not valid.any():
+        # what is left of no retrieval are numbers by chance
+        axes.text(0.5, 0.5, "no valid vector", transform=axes.transAxes, ha="center", va="center")
+    elif flagged.any():
         axes.quiver(y[flagged], z[flagged], v[flagged], w[flagged], color="0.75", **style)
     arrows = axes.quiver(
         y[valid],
@@ -189,8 +192,8 @@ def overview(truth, scans, found: xr.Dataset, cores: list[Core]) -> tuple[Figure
     _arrows(axes[0, 1], wind, cores, "wind retrieved from two such images", scale)
     noise = " with photon, sky, dark and speckle noise of one pulse per beam" if detected else ""
     return figure, (
-        f"Left: the first backscatter image{noise}. Right: the cross-flow wind retrieved from "
-        f"it and the second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are "
+        f"The first backscatter image{noise}, and the cross-flow wind retrieved from it and the "
+        f"second one by {METHOD_NAMES[str(wind['algorithm'].values)]}; grey vectors are "
         f"flagged{_crosses(cores)}."
     )
 

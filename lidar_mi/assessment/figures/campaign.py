@@ -363,6 +363,9 @@ def _edges(places: np.ndarray, logarithmic: bool) -> np.ndarray:
     else:
         middle = (at[1:] + at[:-1]) / 2
         inner = np.concatenate([[2 * at[0] - middle[0]], middle, [2 * at[-1] - middle[-1]]])
+    if not logarithmic and np.min(places) > 0:
+        # no energies or ranges below 0
+        inner = np.maximum(inner, 0.0)
     return np.exp(inner) if logarithmic else inner
 
 

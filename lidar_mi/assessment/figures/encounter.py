@@ -9,13 +9,17 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from lidar_mi.assessment.figures.plates import Drawn, save_all
+from lidar_mi.assessment.metrics.encounter import CONTROLLER, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 
 FLIGHTS = {
-    "off": ("without control", "tab:red", "-"),
-    "autopilot": ("autopilot", "tab:purple", ":"),
-    "feedforward": ("with the lidar", "tab:blue", "-"),
-    "perfect": ("perfect preview", "0.35", "--"),
+    mode: (flight_name(mode), *style)
+    for mode, style in {
+        "off": ("tab:red", "-"),
+        "autopilot": ("tab:purple", ":"),
+        "feedforward": ("tab:blue", "-"),
+        "perfect": ("0.35", "--"),
+    }.items()
 }
 """Names, colours and lines of the flights."""
 
@@ -75,6 +79,11 @@ def draw_all(
     return save_all(folder, plates, log)
 
 
+def flight_style(mode: str, series: xr.Dataset) -> tuple[str, str, str]:
+    """Name, colour and line of a flight, with the name of a controller of one's own."""
+    return (flight_name(mode, series.attrs.get(CONTROLLER, "")), *FLIGHTS[mode][1:])
+
+
 def _flown(series: xr.Dataset):
     """Flights in the order in which they are drawn, the one with the lidar on top."""
     there = [str(mode) for mode in series["flight"].values]
@@ -87,7 +96,7 @@ def _flown(series: xr.Dataset):
 
 def _lines(axes, series, name, factor=1.0) -> None:
     for mode, one in _flown(series):
-        label, colour, style = FLIGHTS[mode]
+        label, colour, style = flight_style(mode, series)
         axes.plot(one["time"], factor * one[name], color=colour, ls=style, lw=1.8, label=label)
     axes.grid(alpha=0.3)
 

@@ -8,7 +8,7 @@ import xarray as xr
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from lidar_mi.assessment.figures.encounter import FLIGHTS, SIDES, draw_image, draw_vortices
+from lidar_mi.assessment.figures.encounter import SIDES, draw_image, draw_vortices, flight_style
 
 MOST_FRAMES = 40
 _SIZE, _DOTS = (7.2, 8.0), 90
@@ -57,7 +57,7 @@ def _frame(series, track, seen, span, time, limits) -> Frame:
         for mode in ("off", "feedforward")
     }
     for mode, angle in wings.items():
-        label, colour, _ = FLIGHTS[mode]
+        label, colour, _ = flight_style(mode, series)
         # rolled with the port wing, which is on the left, up
         ends = np.array([-1, 1]) * span / 2
         view.plot(
@@ -76,7 +76,9 @@ def _frame(series, track, seen, span, time, limits) -> Frame:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     pixels = np.asarray(canvas.buffer_rgba())[..., :3].copy()
-    words = ", ".join(f"{FLIGHTS[mode][0]} {np.degrees(a):+.1f}°" for mode, a in wings.items())
+    words = ", ".join(
+        f"{flight_style(mode, series)[0]} {np.degrees(a):+.1f}°" for mode, a in wings.items()
+    )
     return Frame(pixels, f"{time:.1f} s: roll angle {words}", time)
 
 
@@ -101,7 +103,7 @@ def _from_above(axes, series, track, seen, slab, one, time):
 
 def _rolled(axes, series, time):
     for mode in series["flight"].values:
-        label, colour, style = FLIGHTS[str(mode)]
+        label, colour, style = flight_style(str(mode), series)
         one = series.sel(flight=mode)
         done = one["time"].values <= time
         axes.plot(

@@ -13,6 +13,16 @@ import xarray as xr
 from lidar_mi.assessment.metrics.encounter_hazard import is_hazardous, roll_control_ratio
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, judge
 
+CONTROLLER = "controller"
+"""Attribute of the time series: the name of a controller of one's own."""
+
+_NAMES = {
+    "off": "without control",
+    "autopilot": "autopilot",
+    "feedforward": "with the lidar",
+    "perfect": "perfect preview",
+}
+
 AFTER = 5
 """Slabs after which the track is held against the truth."""
 
@@ -25,6 +35,13 @@ _FELT = 0.1
 _CIRCULATIONS = ("port_circulation", "starboard_circulation")
 _PLACES = ("port_y", "port_z", "starboard_y", "starboard_z")
 _SIGMAS = 2.0
+
+
+def flight_name(mode: str, controller: str = "") -> str:
+    """What a flight is called; without a preview, a controller of one's own by its own name."""
+    if controller and mode == "autopilot":
+        return f"{controller}, no preview"
+    return _NAMES[mode]
 
 
 def encounter_metrics(series: xr.Dataset, track: xr.Dataset | None) -> dict[str, float]:

@@ -21,6 +21,7 @@ from lidar_mi.assessment.report.sample import margin_blocks, sample_blocks
 from lidar_mi.units import usual_unit
 
 _PANELS = 16
+_FEW = 4
 _DONE, _FAILED = 0, 1
 
 
@@ -115,7 +116,7 @@ def _axis(dataset: xr.Dataset, name: str) -> Axis:
         return Axis(name, label_of(at, name), False, tuple(str(value) for value in at.values))
     values = at.values
     # without a word of it, by factors where values differ by some
-    guess = "log" if values.min() > 0 and values.max() > 20 * values.min() else "linear"
+    guess = "log" if values.min() > 0 and values.max() >= 8 * values.min() else "linear"
     return Axis(name, label_of(at, name), at.attrs.get("scale", guess) == "log")
 
 
@@ -150,7 +151,9 @@ def _place(dataset: xr.Dataset, at: Mapping) -> str:
         here = dataset[name].isel({dim: k for dim, k in at.items() if dim in dataset[name].dims})
         value = here.item()
         number = f"{value:.4g}" if isinstance(value, float) else str(value)
-        words.append(f"{name} = {number} {here.attrs.get('units', '')}".strip())
+        words.append(
+            f"{here.attrs.get('long_name', name)} = {number} {here.attrs.get('units', '')}".strip()
+        )
     return ", ".join(words)
 
 
@@ -201,7 +204,7 @@ def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Mapping) -> st
         return text
     if not margins:
         return text + " No requirement was judged: that needs both lidars as one sensor."
-    found = []
+    found, missed = [], []
     for (application, phase), rows in margins.items():
         each = [numbers.met(one) for one in rows.values()]
         every = xr.concat(each, "row", coords="minimal", compat="override").min("row", skipna=False)
@@ -209,7 +212,29 @@ def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Mapping) -> st
         found.append(
             f"{application.replace('_', ' ')}, {phase}: at {int(every.sum())} of {known} points"
         )
-    return f"{text} All rows of the requirements are met for {'; '.join(found)}."
+        missed += _missed(dataset, f"{application.replace('_', ' ')}, {phase}", rows, every)
+    text += f" All rows of the requirements are met for {'; '.join(found)}."
+    return " ".join([text, *missed])
+
+
+def _missed(dataset: xr.Dataset, phase: str, rows: Mapping, every: xr.DataArray) -> list[str]:
+    """Where a row is not met, and which by most: each point if they are few, else the counts."""
+    where = [at for at in _each(every) if float(every.isel(at)) == 0]
+    if not where:
+        return []
+    if len(where) <= _FEW:
+        texts = []
+        for at in where:
+            margins = {name: float(one.mean.isel(at)) for name, one in rows.items()}
+            known = {name: value for name, value in margins.items() if np.isfinite(value)}
+            worst = min(known, key=lambda name: known[name])
+            place = _place(dataset, at) or "the point"
+            texts.append(f"{place} ({worst}: margin {100 * known[worst]:+.0f} %)")
+        return [f"Not met for {phase}: {'; '.join(texts)}."]
+    counts = {name: int((numbers.met(one) == 0).sum()) for name, one in rows.items()}
+    most = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])
+    texts = [f"{name} at {counts[name]}" for name in most[:_FEW]]
+    return [f"Not met for {phase} at {len(where)} points, most often {', '.join(texts)}."]
 
 
 def _range(dataset: xr.Dataset, name: str) -> str:

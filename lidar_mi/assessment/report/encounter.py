@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 
 from lidar_mi.assessment.figures.encounter import FLIGHTS
 from lidar_mi.assessment.figures.plates import Drawn
-from lidar_mi.assessment.metrics.encounter import AFTER
+from lidar_mi.assessment.metrics.encounter import AFTER, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK, ACCEPTED_RATIO
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, fulfilled
 from lidar_mi.assessment.report.digits import fixed, percent, three
@@ -18,8 +18,8 @@ GOAL = 0.8
 _OF_A_FLIGHT = (
     ("largest_roll", "largest roll angle", "degrees", math.degrees(1)),
     ("largest_roll_rate", "largest roll rate", "degrees/s", math.degrees(1)),
-    ("residual_moment", "rolling moment felt, of the wake's (rms)", "%", 100.0),
-    ("roll_control_ratio", "largest moment of the wake, of the controls'", "%", 100.0),
+    ("residual_moment", "rolling moment felt over the wake's (rms)", "", 1.0),
+    ("roll_control_ratio", "largest moment of the wake over the controls'", "", 1.0),
 )
 _OF_THE_LIDAR = (
     ("lead_time", "from the first usable track to the wake", "s", 1.0),
@@ -50,19 +50,24 @@ _FLIGHT = {
     "perfect": "The flight with perfect preview",
 }
 
+_AUTOPILOT = "the autopilot is the controller of the flights with a preview"
+_FLIGHTS_OWN = "“{0}, no preview” is {0}, the controller of the flights with a preview"
+_DEPARTED = "banked beyond 90 degrees, or out of control; the flight ends with this state"
+
 # Roll that is no more than this is not worth an answer, rad.
 _NO_ROLL = math.radians(0.01)
 
 
-def encounter_summary(metrics: Mapping[str, float]) -> list[Table]:
-    """The main numbers for a terminal."""
+def encounter_summary(metrics: Mapping[str, float], controller: str = "") -> list[Table]:
+    """The main numbers for a terminal, with the name of a controller of one's own."""
     modes = [mode for mode in FLIGHTS if f"encounter.{mode}.largest_roll" in metrics]
     rows = [
-        (f"{label} / {unit}", *_values(metrics, modes, key, factor))
+        (f"{label} / {unit}" if unit else label, *_values(metrics, modes, key, factor))
         for key, label, unit, factor in _OF_A_FLIGHT
     ]
     rows.append(("departed", *("yes" if _departed(metrics, m) else "no" for m in modes)))
-    tables = [Table("flights into the wake", rows, ("", *(FLIGHTS[m][0] for m in modes)))]
+    heads = ("", *(flight_name(mode, controller) for mode in modes))
+    tables = [Table("flights into the wake", rows, heads, f"departed: {_DEPARTED}")]
     lidar = [
         (f"{label} / {unit}" if unit else label, _shown(metrics.get(f"encounter.{key}"), factor))
         for key, label, unit, factor in _OF_THE_LIDAR
@@ -78,6 +83,7 @@ def encounter_chapter(
     judged: Sequence[tuple[RequirementTable, Sequence[Finding]]],
     drawn: Sequence[Drawn],
     film: Film | None = None,
+    controller: str = "",
 ) -> Chapter:
     """Answer, figures and numbers of a flight.
 
@@ -89,6 +95,8 @@ def encounter_chapter(
         What was measured in flight against the requirements of flight control.
     drawn : sequence of Drawn
     film : Film, optional
+    controller : str
+        Name of a controller of one's own.
     """
     modes = [mode for mode in FLIGHTS if f"encounter.{mode}.largest_roll" in metrics]
     flights = [
@@ -98,7 +106,7 @@ def encounter_chapter(
     flights.append(
         ("departed", "", ["yes" if _departed(metrics, mode) else "no" for mode in modes])
     )
-    tables = [("The flights", [FLIGHTS[mode][0] for mode in modes], flights)]
+    tables = [("The flights", [flight_name(mode, controller) for mode in modes], flights)]
     lidar = [
         (label, unit, [_shown(metrics[f"encounter.{key}"], factor)])
         for key, label, unit, factor in _OF_THE_LIDAR
@@ -108,10 +116,10 @@ def encounter_chapter(
         tables.append(("The lidar and its track", ["value"], lidar))
     numbers = Tables(
         heading="Numbers of the flight",
-        legend="All flights meet the same wake. Without control, a pilot levels the wings; the "
-        "autopilot is the controller of the flights with a preview, told that there is no wake. "
-        "Rolling moment felt: that of wake and ailerons together. Errors are those of the track "
-        "against the truth, in the slab just seen.",
+        legend="All flights meet the same wake. Without control, a pilot levels the wings; "
+        f"{_FLIGHTS_OWN.format(controller) if controller else _AUTOPILOT}, told that there is no "
+        f"wake. Departed: {_DEPARTED}. Rolling moment felt: that of wake and ailerons together. "
+        "Errors are those of the track against the truth, in the slab just seen.",
         tables=tables,
     )
     return Chapter(
@@ -119,7 +127,7 @@ def encounter_chapter(
     )
 
 
-def encounter_answer(metrics: Mapping[str, float]) -> list[str]:
+def encounter_answer(metrics: Mapping[str, float], controller: str = "") -> list[str]:
     """What a reader wants to know first, in sentences.
 
     How far the aircraft rolls in every flight, how early the lidar sees the wake, what limits it.
@@ -137,7 +145,8 @@ def encounter_answer(metrics: Mapping[str, float]) -> list[str]:
     if _departed(metrics, "off"):
         answer = "Without control, the wake upsets the aircraft"
     if blind is not None:
-        answer += f"; with the same autopilot, but no preview, by {_degrees(blind)}"
+        steers = controller or "the same autopilot"
+        answer += f"; with {steers}, but no preview, by {_degrees(blind)}"
     if ours is not None:
         answer += f"; with the lidar by {_degrees(ours)}"
         if _departed(metrics, "feedforward"):
@@ -148,10 +157,10 @@ def encounter_answer(metrics: Mapping[str, float]) -> list[str]:
     removed = metrics.get("encounter.removed_of_perfect.largest_roll")
     if removed is not None:
         met = "meets" if removed >= GOAL else "misses"
-        answer += (
-            f" The lidar removes {percent(removed)} of the roll angle that perfect preview "
-            f"removes, and so {met} the goal of {percent(GOAL)}."
-        )
+        removes = f"{percent(removed)} of the roll angle that perfect preview removes"
+        if removed >= 1:
+            removes = "as much of the roll angle as perfect preview, or more"
+        answer += f" The lidar removes {removes}, and so {met} the goal of {percent(GOAL)}."
     best = "feedforward" if ours is not None else "perfect" if perfect is not None else "off"
     bank, ratio = (metrics[f"encounter.{best}.{k}"] for k in ("largest_roll", "roll_control_ratio"))
     verdict = "stays below" if bank <= ACCEPTED_BANK else "exceeds"
@@ -181,8 +190,8 @@ def _limits(metrics: Mapping[str, float]) -> list[str]:
     if perfect is None or ours is None:
         return []
     return [
-        f"Of the wake's rolling moment {percent(ours)} is felt with the lidar and "
-        f"{percent(perfect)} with perfect preview. What is left with perfect preview is beyond the "
+        f"The rolling moment felt is {three(ours)} times the wake's with the lidar and "
+        f"{three(perfect)} times with perfect preview (rms). What is left then is beyond the "
         "rate and the deflection of the ailerons; the difference to it is the lidar's."
     ]
 

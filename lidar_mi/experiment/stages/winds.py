@@ -14,6 +14,7 @@ from lidar_mi.experiment.schema import Experiment, Retrieval
 from lidar_mi.experiment.truth import Truth, blur_by_beam
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.common_error import with_common_error
+from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
 from lidar_mi.retrieval.velocimetry.methods import METHODS
 from lidar_mi.retrieval.velocimetry.resampling_error import flag_resampled
@@ -21,6 +22,10 @@ from lidar_mi.retrieval.velocimetry.wind import retrieve_wind, wind_bound
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
 # Noise of the simulation over the signal of a pixel from which winds suffer.
+_FEW_VALID = 0.25
+_OF_TEMPLATES = (ImageMethod.CC, ImageMethod.MULTIPASS)
+"""Methods that find each vector by itself; below that fraction, chance correlations are many."""
+
 _SAMPLED = 0.02
 
 
@@ -109,7 +114,8 @@ def cross_flow_winds(
     }
     found.attrs["title"] = f"Cross-flow wind of the experiment {experiment.name}"
     found.attrs["source"] = f"lidar-mi {__version__}"
-    _warn_of_no_vectors(found, log)
+    for text in vector_remarks(found):
+        log.remark(text)
     return found
 
 
@@ -250,12 +256,24 @@ def _warn_of_few_samples(experiment, scan, log) -> None:
         )
 
 
-def _warn_of_no_vectors(found: xr.Dataset, log) -> None:
-    """Sources of rendered images that gave no valid vector, and the flags of their vectors."""
-    for source in (name for name in found["source"].values if name in RENDERED):
-        for method in found["algorithm"].values:
+def vector_remarks(found: xr.Dataset) -> list[str]:
+    """Where rendered images gave no valid vector, and why, or too few for their stated errors."""
+    without: dict[tuple[str, str], list[str]] = {}
+    few = []
+    for source in (str(name) for name in found["source"].values if name in RENDERED):
+        for method in map(str, found["algorithm"].values):
             wind = found.sel(source=source, algorithm=method)
             valid = (wind["flag"] == 0) & np.isfinite(wind["v"]) & np.isfinite(wind["w"])
-            if not valid.any():
-                why = commonest_flag(wind["flag"])
-                log.remark(f"{source}, {method}: no vector is valid; {why}")
+            fraction = float(valid.mean())
+            if not fraction:
+                without.setdefault((method, commonest_flag(wind["flag"])), []).append(source)
+            elif fraction < _FEW_VALID and method in _OF_TEMPLATES:
+                few.append(
+                    f"{source}, {method}: {fraction:.0%} of the vectors are valid; where most are "
+                    "flagged, stated errors of the others were up to 2 times too small"
+                )
+    none = [
+        f"{' and '.join(sources)}, {method}: no vector is valid; {why}"
+        for (method, why), sources in without.items()
+    ]
+    return none + few

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from lidar_mi.assessment.metrics.names import current_name
+from lidar_mi.assessment.metrics.names import current_name, title_of
 from lidar_mi.experiment.resumable_folder import read_metrics
 
 # as 0.9 wrote them, in a run and (with a variant's name before it) in a study
@@ -56,3 +56,13 @@ def test_metrics_of_an_older_run_are_read_by_the_names_of_today(tmp_path):
     found = read_metrics(tmp_path)
     assert set(found.values()) == {0.5} and set(CURRENT) < set(found)
     assert found["sensor.valid_fraction"] == 0.5 and not set(FORMER) & set(found)
+
+
+def test_headings_begin_with_the_quantity():
+    for key, title in (
+        ("backscatter_noisy.variational.all.rmse_v", "rms error of v, backscatter noisy, variat"),
+        ("sensor.valid_fraction", "fraction of valid vectors, sensor"),
+        ("backscatter.depolarization_stderr", "standard error of depolarization, backscatter"),
+        ("encounter.perfect.largest_roll", "largest bank angle, encounter, perfect"),
+    ):
+        assert title_of(key).startswith(title)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.assessment.report.campaign import page
+from lidar_mi.assessment.report.campaign import answer, page
 from lidar_mi.errors import InputError
 
 RANGE, ENERGY = [75.0, 150.0, 300.0], [1e-4, 1e-3, 1e-2, 1e-1]
@@ -74,6 +74,23 @@ def test_the_boundary_of_a_requirement_is_stated_with_its_interval():
     value, low, high = (float(one) for one in stated.groups())
     # between two decades the margin is interpolated in the logarithm: not exactly 3.16 mJ
     assert 0.002 < low < value < high < 0.005
+
+
+def test_the_lead_says_where_requirements_are_not_met():
+    few = sweep().isel(range=[1], energy=[0, 3])
+    text = answer(few)
+    where = "Not met for flight control, landing: range = 150 m, energy = 0.0001 J"
+    assert f"at 1 of 2 points. {where}" in text
+    assert re.search(r"\(error of v: margin -\d+ %\)\.$", text)
+    many = answer(sweep())
+    assert "Not met for flight control, landing at 6 points, most often error of v at 6" in many
+
+
+def test_maps_of_positive_knobs_end_at_zero_or_above():
+    data = sweep().isel(energy=[2, 3])
+    del data["energy"].attrs["scale"]
+    html = page(data.assign_coords(range=[1.0, 150.0, 300.0]), "name: test")
+    assert "−" not in "".join(re.findall(r"<text[^>]*>([^<]*)</text>", html))
 
 
 def test_lines_of_named_sets():

@@ -1,0 +1,75 @@
+"""The data sets of a flight's folder, placed for other programs."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.io.netcdf import read_netcdf
+
+FLIGHT_FILES = {"series": "flight.nc", "track": "track.nc", "seen": "slabs.nc"}
+"""Of a flight's time series, of its lidar's track, of the slabs that it saw."""
+
+_SIDES = ("port", "starboard")
+
+
+def flight_results(folder: Path, *, placed: bool) -> Iterator[tuple[str, xr.Dataset]]:
+    """Flights, track, winds and images of the slabs, as far as there are any.
+
+    Places are those of the path frame: x along the path from where the flight starts, y to port, z
+    up, m.
+
+    Parameters
+    ----------
+    folder : Path
+        Of a flight.
+    placed : bool
+        The track as points in space, a vortex each; else a row for each slab and source, and
+        without images.
+    """
+    files = {name: folder / file for name, file in FLIGHT_FILES.items()}
+    if files["series"].is_file():
+        yield "flight", read_netcdf(files["series"]).set_coords(["x", "y", "z"])
+    if files["track"].is_file():
+        track = read_netcdf(files["track"])
+        if placed:
+            yield from ((f"vortices_{name}", _points(track, name)) for name in _sources(track))
+        else:
+            yield "track", track
+    if files["seen"].is_file():
+        seen = read_netcdf(files["seen"]).swap_dims(slab="x").set_coords("x")
+        yield "slab_winds", _of_slabs(seen, "y", "z")
+        if placed:
+            images = _of_slabs(seen, "image_y", "image_z")
+            yield "slab_images", images.rename(image_y="y", image_z="z")
+
+
+def _of_slabs(seen: xr.Dataset, *axes: str) -> xr.Dataset:
+    """Variables of all nodes of the slabs."""
+    names = [name for name, value in seen.data_vars.items() if {"x", *axes} == set(value.dims)]
+    kept = seen[names]
+    return kept.drop_vars([name for name in kept.coords if name not in ("x", *axes)])
+
+
+def _sources(track: xr.Dataset) -> list[str]:
+    return [str(name) for name in track["source"].values]
+
+
+def _points(track: xr.Dataset, source: str) -> xr.Dataset:
+    """The vortices that one source has, a point each."""
+    one = track.sel(source=source, drop=True)
+    names = [str(name).removeprefix("port_") for name in one if str(name).startswith("port_")]
+    shared = one[["x", "time"]].to_dataarray("name").values
+    found: dict[str, list] = {name: [] for name in names}
+    for side in _SIDES:
+        for name in names:
+            found[name].append(one[f"{side}_{name}"].values)
+    columns = {name: np.concatenate(parts) for name, parts in found.items()}
+    columns |= {"x": np.tile(shared[0], 2), "time": np.tile(shared[1], 2)}
+    columns["side"] = np.repeat([1.0, -1.0], one.sizes["slab"])
+    there = np.isfinite(columns["y"]) & np.isfinite(columns["z"])
+    units = {name: one[f"port_{name}"].attrs.get("units", "1") for name in names}
+    units |= {"x": "m", "time": "s", "side": "1"}
+    data = {name: ("point", v[there], {"units": units[name]}) for name, v in columns.items()}
+    return xr.Dataset(data).set_coords(["x", "y", "z"])
