@@ -2,17 +2,19 @@
 
 Each type here is a ``float`` for pydantic models that also reads text with a unit, such as
 ``"532 nm"``, ``"2 mrad"`` or ``"1.8 / km"``, and turns it into SI. Plain numbers are SI already,
-except angles, which must say their unit (degrees and radians are too easily confused).
+except angles, which must say their unit (degrees and radians are too easily confused). Quantities
+are shown to people as they wrote them (`Given`).
 """
 
 import math
 import re
 import tokenize
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, cast
 
 import pint
-from pydantic import GetCoreSchemaHandler
+from pydantic import GetCoreSchemaHandler, SerializationInfo
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 UNITS: pint.UnitRegistry[float] = pint.UnitRegistry()
@@ -95,6 +97,26 @@ def _bounded(text: str) -> str:
     return text
 
 
+class Given(float):
+    """A number in its SI unit that remembers the text it was given as, "9 deg".
+
+    Any arithmetic makes a plain float of it.
+    """
+
+    text: str
+
+    @classmethod
+    def of(cls, number: float, text: str) -> "Given":
+        """The number of a text."""
+        found = cls(number)
+        found.text = text
+        return found
+
+
+AS_GIVEN = {"as_given": True}
+"""Context of pydantic's ``model_dump`` in which JSON has quantities as they were given."""
+
+
 @dataclass(frozen=True)
 class Unit:
     """The SI unit of a key's values: its place is in the annotation of their type."""
@@ -106,13 +128,25 @@ class Unit:
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         """Reads quantities with ``to_si``; JSON has the unit beside the number."""
-        return core_schema.no_info_before_validator_function(
-            lambda value: to_si(value, self.symbol, self.example),
+        return core_schema.no_info_wrap_validator_function(
+            self._read,
             handler(source),
             serialization=core_schema.plain_serializer_function_ser_schema(
-                lambda value: f"{value!r} {self.symbol}" if self.symbol else value, when_used="json"
+                self._written, info_arg=True, when_used="json"
             ),
         )
+
+    def _read(self, value: Any, checked: Callable[[float], float]) -> float:
+        if isinstance(value, Given):
+            return value
+        number = checked(to_si(value, self.symbol, self.example))
+        has_unit = isinstance(value, str) and split_quantity(value)[1]
+        return Given.of(number, " ".join(value.split())) if has_unit else number
+
+    def _written(self, value: float, info: SerializationInfo) -> float | str:
+        if isinstance(value, Given) and (info.context or {}).get("as_given"):
+            return value.text
+        return f"{value!r} {self.symbol}" if self.symbol else value
 
 
 @dataclass(frozen=True)
@@ -218,15 +252,30 @@ def _in_degrees(angle: float) -> bool:
 
 
 def usual(number: float, unit: str) -> str:
-    """A quantity in SI units in its `usual_unit`, to six digits.
+    """A quantity in SI units as it was given, or in its `usual_unit`, to six digits.
 
     Examples
     --------
     >>> usual(5.32e-07, "m"), usual(0.17453292519943295, "rad"), usual(350.0, "m^2/s")
     ('532 nm', '10 deg', '350 m^2/s')
     """
+    if isinstance(number, Given):
+        return number.text
     factor, unit = usual_unit(number, unit)
     return f"{factor * number:.6g} {unit}".strip()
+
+
+def shown(number: float, unit: str) -> str:
+    """A quantity in SI units as it was given, or in a unit, to four digits.
+
+    Examples
+    --------
+    >>> shown(0.002, "mrad"), shown(Given.of(0.0017453292519943296, "0.1 deg"), "mrad")
+    ('2 mrad', '0.1 deg')
+    """
+    if isinstance(number, Given):
+        return number.text
+    return f"{number / UNITS.Quantity(1.0, unit).to_base_units().magnitude:.4g} {unit}"
 
 
 def parse_units(text: str) -> pint.Quantity[float]:

@@ -1,11 +1,24 @@
 """Quantities with units. Detects a wrong factor, and text that is silently misread."""
 
 import math
+import pickle
 
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from lidar_mi.units import Angle, Energy, Extinction, Length, Number, Speed, Time, to_si, usual
+from lidar_mi.units import (
+    AS_GIVEN,
+    Angle,
+    Energy,
+    Extinction,
+    Length,
+    Number,
+    Speed,
+    Time,
+    shown,
+    to_si,
+    usual,
+)
 
 
 class Quantities(BaseModel):
@@ -149,6 +162,21 @@ def test_written_quantities_are_read_again_exactly():
     text = one.model_dump(mode="json")
     assert text["angle"].endswith(" rad") and text["extinction"].endswith(" 1/m")
     assert Quantities(**text) == one
+
+
+def test_quantities_are_shown_as_they_were_given():
+    """The unit and the digits of the user, and bit for bit the same number when read again."""
+    one = Quantities(angle="9 deg", speed="140  knots", length=150)
+    text = one.model_dump(mode="json", context=AS_GIVEN)
+    assert (text["angle"], text["speed"], text["length"]) == ("9 deg", "140 knots", "150.0 m")
+    assert one.speed == 140 * 1852 / 3600
+    again = Quantities(**text)
+    assert again == one == pickle.loads(pickle.dumps(one))
+    assert (
+        usual(again.angle, "rad") == usual(pickle.loads(pickle.dumps(one)).angle, "rad") == "9 deg"
+    )
+    assert shown(one.speed, "m/s") == "140 knots" and shown(one.length, "km") == "0.15 km"
+    assert usual(2 * one.angle, "rad") == "18 deg"
 
 
 @pytest.mark.parametrize(

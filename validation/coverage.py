@@ -76,15 +76,25 @@ class Coverage:
     valid: float
 
 
-def shipped_wake(second: str, rms: float, seed: int) -> Pair:
-    """The extinction of the shipped wake: advected, or its true state 0.1 s later."""
+def shipped_wake(second: str, rms: float, seed: int, noise: float | None = None) -> Pair:
+    """The extinction of the shipped wake: advected, or its true state 0.1 s later.
+
+    With white noise of this fraction of the largest value, which is told, or without any, which is
+    not told.
+    """
     experiment = lm.load_experiment(
         SCENES / "wake_backscatter.yaml",
         seed=seed,
         wake={"second": second, "texture": {"rms": rms}},
     )
     truth = lm.make_truth(experiment)
-    return truth.image(0), truth.image(1), truth.wind, None
+    images = [truth.image(0), truth.image(1)]
+    if noise is None:
+        return *images, truth.wind, None
+    level = noise * float(images[0].max())
+    random = np.random.default_rng([seed, 1])
+    images = [image + level * random.standard_normal(image.shape) for image in images]
+    return *images, truth.wind, level
 
 
 def _vortex_wind(columns: int, rows: int):
@@ -153,6 +163,16 @@ CASES: dict[str, Callable[[int], Pair]] = {
     **{
         f"true second state, texture {100 * rms:.0f} %": partial(shipped_wake, "40.1 s", rms)
         for rms in (0.0, 0.02, 0.05, 0.1, 0.2)
+    },
+    **{
+        f"{words}, texture {100 * rms:.0f} %, noise {100 * noise:.0f} %": partial(
+            shipped_wake, second, rms, noise=noise
+        )
+        for words, second, rms, noise in (
+            ("advected", "advect", 0.05, 0.01),
+            ("advected", "advect", 0.2, 0.02),
+            ("true second state", "40.1 s", 0.1, 0.01),
+        )
     },
     **{
         f"{100 * fraction:.0f} % of the texture replaced": partial(replaced_texture, fraction)

@@ -140,7 +140,7 @@ class Points:
                 found |= {dimension.name: unit} if unit else {}
                 continue
             for key in dimension.changes[0]:
-                value = _at(reading.settings(self.experiment(0)), key)
+                value = _at(reading.settings(self.experiment(0), si=True), key)
                 if isinstance(value, str) and _number(value) is not None:
                     found[key] = value.partition(" ")[2]
         return found
@@ -149,7 +149,8 @@ class Points:
         """Values of a key along a dimension, as the experiments have them."""
         stride = math.prod(self.shape[axis + 1 :])
         found = [
-            _at(reading.settings(self.experiment(k * stride)), key) for k in range(self.shape[axis])
+            _at(reading.settings(self.experiment(k * stride), si=True), key)
+            for k in range(self.shape[axis])
         ]
         numbers = [_number(value) for value in found]
         if all(number is not None for number in numbers):

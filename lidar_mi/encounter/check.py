@@ -17,6 +17,7 @@ from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import Notice, silent
 from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.units import shown
 
 # A path misses the wake where no rolling moment reaches this fraction of the ailerons'.
 _MISSED = 0.01
@@ -87,7 +88,7 @@ def sections(
     ahead = (gates.look_ahead - gates.stride) / path.speed - encounter.control.latency
     rows = [
         ("aircraft", encounter.aircraft.model),
-        ("flight", f"{duration(encounter):.3g} s at {path.speed:g} m/s"),
+        ("flight", f"{duration(encounter):.3g} s at {shown(path.speed, 'm/s')}"),
         ("crossing and climb angle", _degrees(path.crossing_angle, path.climb_angle)),
         ("control", encounter.control.mode),
         ("slabs", f"{encounter.rate:g} a second, {gates.depth:.3g} m deep"),

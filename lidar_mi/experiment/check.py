@@ -16,6 +16,7 @@ from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.forecast import forecast
 from lidar_mi.experiment.light_budget import light_budget
 from lidar_mi.experiment.log import Notice, silent
+from lidar_mi.experiment.remarks import window_reach
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth import Truth
@@ -27,6 +28,7 @@ from lidar_mi.instrument.scan_timing import Schedule
 from lidar_mi.rendering.memory import ceiling
 from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.units import shown
 
 LEAST_SHOWN = 0.5
 """Seconds of a part of a run that is shown."""
@@ -93,8 +95,8 @@ def _backscatter(
     pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
     rows = [
         ("laser", _laser(lidar)),
-        ("beam's divergence", f"{1e3 * lidar.divergence_full:.4g} mrad, full angle at 1/e^2"),
-        ("field of view", f"{1e3 * lidar.fov_half:.4g} mrad, half angle"),
+        ("beam's divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
+        ("field of view", f"{shown(lidar.fov_half, 'mrad')}, half angle"),
         ("telescope's radius", f"{lidar.aperture_radius:g} m"),
         ("beams", f"{plan.y.size} x {plan.z.size}, {pixel:.3g} m apart"),
         ("beam's 1/e^2 radius there", f"{float(lidar.radius_at(plan.centre)):.3g} m"),
@@ -108,7 +110,7 @@ def _backscatter(
         *_light(asked, truth, plan, air),
     ]
     if not asked.volume:
-        rows += _displacements(asked, wind, pixel)
+        rows += _displacements(asked, wind, plan)
     yield "backscatter lidar", rows
 
 
@@ -169,17 +171,13 @@ def duration(seconds: float) -> str:
     return f"{max(seconds, 1):.0f} s"
 
 
-def _displacements(asked: Experiment, wind, pixel: float) -> list[tuple[str, str]]:
+def _displacements(asked: Experiment, wind, plan: ScanPlan) -> list[tuple[str, str]]:
     """The fastest wind and the fastest that windows of this size can follow, per axis."""
-    settings = asked.retrieval
-    reach = ((settings.search - settings.template) // 2 - 0.5) * pixel / asked.platform.dt
+    settings, reach = asked.retrieval, window_reach(asked, plan)
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
     rows = [("methods", ", ".join(settings.methods))]
     if {ImageMethod.CC, ImageMethod.WS} & set(settings.methods):
-        verdict = "" if fastest <= reach else "; larger retrieval.search or smaller platform.dt"
-        rows.append(
-            ("fastest wind windows follow", f"{reach:.3g} m/s, here {fastest:.3g}{verdict}")
-        )
+        rows.append(("fastest wind windows follow", f"{reach:.3g} m/s, here {fastest:.3g}"))
     return rows
 
 
@@ -187,8 +185,8 @@ def _doppler(asked: Experiment) -> Section:
     lidar = asked.doppler.lidar
     return "Doppler lidar", [
         ("laser", _laser(lidar)),
-        ("beam's divergence", f"{1e3 * lidar.divergence_full:.4g} mrad, full angle at 1/e^2"),
-        ("field of view", f"{1e3 * lidar.fov_half:.4g} mrad, half angle"),
+        ("beam's divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
+        ("field of view", f"{shown(lidar.fov_half, 'mrad')}, half angle"),
         ("range bin", f"{lidar.range_bin:g} m about {lidar.range:g} m"),
         ("photons of a pulse", f"{photons(lidar):.3g}"),
         ("methods", ", ".join(asked.doppler.retrieval.methods)),
@@ -197,9 +195,9 @@ def _doppler(asked: Experiment) -> Section:
 
 def _laser(lidar: BackscatterLidar | DopplerLidar) -> str:
     """Wavelength, energy and duration of a pulse."""
-    parts = [f"{1e9 * lidar.wavelength:g} nm", f"{1e3 * lidar.pulse_energy:.4g} mJ a pulse"]
+    parts = [shown(lidar.wavelength, "nm"), f"{shown(lidar.pulse_energy, 'mJ')} a pulse"]
     if lidar.pulse_duration:
-        parts.append(f"{1e9 * lidar.pulse_duration:.4g} ns")
+        parts.append(shown(lidar.pulse_duration, "ns"))
     return ", ".join(parts)
 
 
@@ -232,7 +230,7 @@ def _sensor(asked: Experiment, tables: Mapping) -> Section:
 
 
 def _warning(distance: float, speed: float) -> str:
-    return f"{look_ahead(distance, speed):.3g} s at {speed:g} m/s" if speed else "at rest"
+    return f"{look_ahead(distance, speed):.3g} s at {shown(speed, 'm/s')}" if speed else "at rest"
 
 
 def _span(values: np.ndarray, unit: str) -> str:

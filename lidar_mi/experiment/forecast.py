@@ -21,6 +21,7 @@ from lidar_mi.rendering.memory import (
     image_bytes,
     samples_at_once,
 )
+from lidar_mi.units import shown
 
 PER_NODE = 160
 """Bytes of a node of the wake: twenty fields in double precision."""
@@ -192,7 +193,7 @@ def check_brightness(
     else:
         key, value, fraction = (
             "lidar.fov_half",
-            f"{1e3 * lidar.fov_half:g} mrad",
+            shown(lidar.fov_half, "mrad"),
             seen / plan.gate_count,
         )
     bring = fraction * render.samples_per_beam

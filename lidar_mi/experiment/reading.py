@@ -1,6 +1,8 @@
 """Reading experiments: from a YAML file and its variants to a checked description."""
 
 import copy
+import functools
+import json
 import re
 from pathlib import Path
 from typing import Any
@@ -13,6 +15,7 @@ from lidar_mi.experiment.faults import first_fault
 from lidar_mi.experiment.schema import BACKSCATTER, NAME, Experiment
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.yaml import parse_yaml, read_yaml, to_yaml
+from lidar_mi.units import AS_GIVEN
 
 BESIDE_VARIANTS = (
     "study.yaml",
@@ -208,10 +211,10 @@ def dump(experiment: Experiment) -> str:
     return to_yaml(settings(experiment))
 
 
-def settings(experiment: Experiment) -> dict[str, Any]:
-    """The resolved experiment as nested sections, quantities as text with their SI units.
+def settings(experiment: Experiment, *, si: bool = False) -> dict[str, Any]:
+    """The resolved experiment as nested sections, without those of a lidar that it does not have.
 
-    Without the sections of a lidar that it does not have.
+    Quantities are text as they were given, or with their SI units.
     """
     unused = {"wake", *BACKSCATTER} if experiment.wake is None else set()
     unused |= {
@@ -219,7 +222,23 @@ def settings(experiment: Experiment) -> dict[str, Any]:
         for name in ("doppler", "sensor", "volume", "encounter")
         if getattr(experiment, name) is None
     }
-    return experiment.model_dump(mode="json", exclude=unused)
+    context = None if si else AS_GIVEN
+    return experiment.model_dump(mode="json", exclude=unused, context=context)
+
+
+def in_si(given: dict[str, Any]) -> dict[str, Any]:
+    """The `settings` of an experiment in SI units: equal for equal experiments."""
+    return copy.deepcopy(_in_si(json.dumps(given)))
+
+
+@functools.lru_cache(64)
+def _in_si(text: str) -> dict[str, Any]:
+    """The same of their JSON: a run asks once for each of its stages."""
+    given = json.loads(text)
+    try:
+        return settings(check(given, ""), si=True)
+    except InputError:  # of a version that knew other keys
+        return given
 
 
 def _override(data: dict, text: str) -> None:

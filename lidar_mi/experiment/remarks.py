@@ -12,6 +12,11 @@ from lidar_mi.experiment.light_budget import LEAST_OVERLAP
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.truth import Flows, Truth
 from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.units import shown
+
+MOST_WIND = 150.0
+"""Winds across the path, m/s, beyond those of wakes: of a heavy aircraft's cores some 50 m/s."""
 
 
 def image_remarks(
@@ -25,7 +30,13 @@ def image_remarks(
     flow = _of_the_flow(truth.wind) if experiment.wake.file else []
     said = flows[0].attrs.get("interpolated") if flows else None
     grid = [f"wake.file: {said}"] if said else []
-    return [*grid, *flow, *_of_the_light(experiment, plans[0]), *_of_the_pattern(experiment)]
+    return [
+        *grid,
+        *flow,
+        *_of_the_speed(experiment, truth.wind, plans[0]),
+        *_of_the_light(experiment, plans[0]),
+        *_of_the_pattern(experiment),
+    ]
 
 
 def _of_the_flow(wind: xr.Dataset) -> list[str]:
@@ -46,13 +57,40 @@ def _of_the_flow(wind: xr.Dataset) -> list[str]:
     return []
 
 
+def _of_the_speed(experiment: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[str]:
+    """Winds that no wake has, or that windows of this size cannot follow."""
+    fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
+    if fastest > MOST_WIND:
+        return [
+            f"wake: winds across the path reach {fastest:.3g} m/s; those of wakes of aircraft and "
+            f"turbines stay below {MOST_WIND:g} m/s: is the unit of v and w in the file right "
+            "(attribute units)?"
+        ]
+    reach = window_reach(experiment, plan)
+    taken = () if experiment.volume else experiment.retrieval.methods
+    methods = [method for method in (ImageMethod.CC, ImageMethod.WS) if method in taken]
+    if not methods or fastest <= reach:
+        return []
+    return [
+        f"retrieval.search: windows of {' and '.join(methods)} follow {reach:.3g} m/s, the wind "
+        f"reaches {fastest:.3g} m/s; expected a larger retrieval.search or a smaller platform.dt"
+    ]
+
+
+def window_reach(experiment: Experiment, plan: ScanPlan) -> float:
+    """Fastest wind that a window's search region holds, m/s; NaN for a single column of beams."""
+    settings = experiment.retrieval
+    pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
+    return ((settings.search - settings.template) // 2 - 0.5) * pixel / experiment.platform.dt
+
+
 def _of_the_light(experiment: Experiment, plan: ScanPlan) -> list[str]:
     """Light that the telescope does not see."""
     seen = overlap(experiment.lidar, float(np.median(plan.ranges()[0])))
     if seen >= LEAST_OVERLAP:
         return []
     return [
-        f"lidar.fov_half: {1e3 * experiment.lidar.fov_half:.3g} mrad sees {seen:.0%} of "
+        f"lidar.fov_half: {shown(experiment.lidar.fov_half, 'mrad')} sees {seen:.0%} of "
         f"the light from {plan.centre:.0f} m (overlap of beam, telescope and field of view)"
     ]
 

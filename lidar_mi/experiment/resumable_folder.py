@@ -328,7 +328,7 @@ def made_by(record: dict, indifferent_to: Sequence[str] = ()) -> str:
         Dotted keys of settings that have no influence; files that they name have none either.
     """
     decisive = {
-        "experiment": _without(record["experiment"], indifferent_to),
+        "experiment": _without(reading.in_si(record["experiment"]), indifferent_to),
         "files": _without(record["files"], indifferent_to),
         "versions": {name: record["versions"][name] for name in _RENDERED_BY},
     }
@@ -348,7 +348,8 @@ def _without(settings: dict, keys: Sequence[str], above: str = "") -> dict:
 
 def _difference(before: dict, now: dict) -> str | None:
     """The first difference to an earlier run that affects its images; None: there is none."""
-    if any(before.get(key) != now[key] for key in ("experiment", "files")):
+    changed = reading.in_si(before["experiment"]) != reading.in_si(now["experiment"])
+    if changed or before.get("files") != now["files"]:
         return "another experiment"
     for name in _RENDERED_BY:
         earlier = before["versions"].get(name)

@@ -27,7 +27,18 @@ from lidar_mi.instrument.scan_timing import ScanTiming
 from lidar_mi.rendering.settings import FringeSettings, RenderSettings
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod
 from lidar_mi.tables import Table, Tabular
-from lidar_mi.units import Angle, Frequency, Length, Number, Speed, Temperature, Time, Within, to_si
+from lidar_mi.units import (
+    AS_GIVEN,
+    Angle,
+    Frequency,
+    Length,
+    Number,
+    Speed,
+    Temperature,
+    Time,
+    Within,
+    to_si,
+)
 
 
 def _once(key: str, values: tuple) -> None:
@@ -310,8 +321,10 @@ class Experiment(Tabular, Section):
         return self._folder
 
     def tables(self) -> list[Table]:
-        """Keys that differ from their defaults, in SI units."""
-        given = self.model_dump(mode="json", exclude_defaults=True, exclude={"name"})
+        """Keys that differ from their defaults, as they were given."""
+        given = self.model_dump(
+            mode="json", exclude_defaults=True, exclude={"name"}, context=AS_GIVEN
+        )
         return [Table(f"experiment {self.name}; keys without their default", _rows(given))]
 
     def read_from(self, folder: str | Path) -> "Experiment":

@@ -72,7 +72,7 @@ def read_frames(path: str | Path, layer: str | None = None) -> np.ndarray:
 
 
 def default_layer(path: str | Path) -> str | None:
-    """The layer that is read of an EXR file where none is named; None: it is no EXR, or colours.
+    """The layer that is read of an EXR file where none is named; None: it has none, or colours.
 
     What a detector delivered, ``Y_noisy``, comes before ``Y``, which is free of its noise; of any
     other file it is the only layer.
@@ -80,9 +80,9 @@ def default_layer(path: str | Path) -> str | None:
     Raises
     ------
     InputError
-        No such file, one that cannot be read, or several layers of which one has to be named.
+        One that cannot be read, or several layers of which one has to be named.
     """
-    if not _is_exr(path):
+    if not Path(path).is_file() or not _is_exr(path):
         return None
     layers = read_layers(path)[1]
     for name in ("Y_noisy", "Y"):

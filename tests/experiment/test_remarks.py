@@ -37,6 +37,15 @@ def prepared(**changes):
             "beams of lissajous are resampled",
         ),
         ({"scan": {"timing": {"pattern": "raster", "duration": "50 ms"}}}, None),
+        (
+            {"lidar": {"fov_half": "0.2 deg"}, "scan": {"range": "90 m"}},
+            "lidar.fov_half: 0.2 deg sees",
+        ),
+        (
+            {"wake": {"vortex_pair": {"circulation": "9e3 m^2/s"}, "file": None, "time": None}},
+            "is the unit of",
+        ),
+        ({"platform": {"dt": "0.5 s"}}, "windows of cc follow"),
         ({}, None),
     ],
 )

@@ -17,6 +17,14 @@ from lidar_mi.assessment.metrics.velocities import READERS
 from lidar_mi.assessment.metrics.winds import has_no_skill
 from lidar_mi.assessment.report.digits import whole_percent
 from lidar_mi.tables import with_error
+from lidar_mi.units import shown
+
+# Fraction of errors within 1.96 standard errors below which, and within 1 above which, they are
+# said not to hold: four standard errors of these fractions for the eighty independent windows of an
+# image of 219 x 139 pixels, from a fifth of valid vectors on.
+_HOLDS, _ENOUGH = (0.85, 0.89), 0.2
+# Standard errors of a circulation from which its error is named.
+_FAR_OFF = 3.0
 
 Judged = Sequence[tuple[RequirementTable, Sequence[Finding]]]
 
@@ -38,12 +46,12 @@ def answer(experiment, metrics: Mapping[str, float], judged: Judged = ()) -> lis
         Sentences: errors of the wind, vortices, and one verdict per requirement table. Tables of
         phases of flight at another air speed are named and not judged.
     """
-    lines = [*_wind(experiment, metrics), *_vortices(metrics)]
+    lines = [*_wind(experiment, metrics), *_stated(experiment, metrics), *_vortices(metrics)]
     speed = experiment.platform.speed if experiment.wake else 0.0
     lines += [verdict(table, findings) for table, findings in judged if table.applies_at(speed)]
     others = [table for table, _ in judged if not table.applies_at(speed)]
     phases = dict.fromkeys(f"{table.phase} ({_speeds(table)})" for table in others)
-    lines += [f"{_capital(phase)}: not assessed at {speed:g} m/s." for phase in phases]
+    lines += [f"{_capital(phase)}: not assessed at {shown(speed, 'm/s')}." for phase in phases]
     return lines
 
 
@@ -99,9 +107,9 @@ def _images(experiment, metrics) -> str:
         errors = _values(metrics, wind_key(source, method, f"{far}rmse_"), components)
         if valid is None:
             continue
-        shown = f"{errors} m/s ({whole_percent(valid)} valid)" if errors else "no valid vector"
-        shown = "no skill" if has_no_skill(metrics, source, method) else shown
-        parts.append(f"{METHOD_NAMES[method]} {shown}")
+        found = f"{errors} m/s ({whole_percent(valid)} valid)" if errors else "no valid vector"
+        found = "no skill" if has_no_skill(metrics, source, method) else found
+        parts.append(f"{METHOD_NAMES[method]} {found}")
     true = _values(metrics, f"true_wind.{far}rms_", components)
     return (
         f"Backscatter lidar, {_place(experiment)}: rms errors of {', '.join(components)}"
@@ -132,6 +140,36 @@ def _rings(experiment, metrics) -> Iterator[str]:
         )
 
 
+def _stated(experiment, metrics) -> Iterator[str]:
+    """Standard errors that do not hold here, of the winds that the answer names."""
+    if "sensor.vectors" in metrics:
+        yield from _misstated("both lidars", metrics, "sensor.", "uvw")
+    elif experiment.wake:
+        source = Source.NOISY if experiment.detector else Source.BACKSCATTER
+        settings = experiment.volume or experiment.retrieval
+        for method in settings.methods:
+            head = wind_key(source, method, "")
+            yield from _misstated(METHOD_NAMES[method], metrics, head, "uvw")
+
+
+def _misstated(name: str, metrics, head: str, components: str) -> Iterator[str]:
+    known = [one for one in components if f"{head}coverage_95_{one}" in metrics]
+    if not known or metrics.get(f"{head}valid_fraction", 1.0) < _ENOUGH:
+        return
+    inner, outer = (
+        sum(metrics[f"{head}coverage_{level}_{one}"] for one in known) / len(known)
+        for level in (68, 95)
+    )
+    low, high = _HOLDS
+    if outer < low:
+        size, seen = "small", f"{whole_percent(outer)} of the errors are within 1.96 of them (95 %)"
+    elif inner > high:
+        size, seen = "large", f"{whole_percent(inner)} of the errors are within 1 of them (68 %)"
+    else:
+        return
+    yield f"Standard errors stated by {name} are too {size} here: {seen}."
+
+
 def _vortices(metrics) -> Iterator[str]:
     """The fit to the wind vectors, or else to the images, where there is a true pair."""
     sides = ("port", "starboard")
@@ -141,9 +179,14 @@ def _vortices(metrics) -> Iterator[str]:
         if any(key not in metrics for key in keys) or any(value is None for value in true):
             continue
         found = [with_error(metrics[key], metrics.get(f"{key}_stderr", math.nan)) for key in keys]
+        off = max(
+            abs(metrics[key] - one) / metrics.get(f"{key}_stderr", math.inf)
+            for key, one in zip(keys, true, strict=True)
+        )
+        beyond = f", off by up to {off:.2g} standard errors" if off > _FAR_OFF else ""
         yield (
             f"Vortex pair: circulations {found[0]} and {found[1]} m²/s, true "
-            f"{true[0]:.0f} and {true[1]:.0f} m²/s."
+            f"{true[0]:.0f} and {true[1]:.0f} m²/s{beyond}."
         )
         return
 
@@ -154,7 +197,7 @@ def _place(experiment) -> str:
     distance = scan.range + scan.thickness / 2
     if not speed:
         return f"{distance:.4g} m ahead"
-    return f"{distance:.4g} m ahead ({look_ahead(distance, speed):.2g} s at {speed:g} m/s)"
+    return f"{distance:.4g} m ahead ({look_ahead(distance, speed):.2g} s at {shown(speed, 'm/s')})"
 
 
 def _values(metrics, key: str, components: str) -> str:

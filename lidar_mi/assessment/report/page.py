@@ -15,6 +15,7 @@ from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.assessment.report.digits import percent
 from lidar_mi.io.images import as_webp, panel_cuts
+from lidar_mi.units import shown
 
 
 class Tables(NamedTuple):
@@ -202,8 +203,9 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
         rows.append(_flight(experiment) if experiment.encounter else _platform(experiment))
         distance = experiment.encounter.look_ahead if experiment.encounter else scan.range
         beam = (
-            f"{lidar.wavelength * 1e9:.5g} nm, {lidar.pulse_energy * 1e3:g} mJ, divergence "
-            f"{lidar.divergence_full * 1e3:g} mrad, telescope of {2 * lidar.aperture_radius:g} m; "
+            f"{shown(lidar.wavelength, 'nm')}, {shown(lidar.pulse_energy, 'mJ')}, "
+            f"divergence {shown(lidar.divergence_full, 'mrad')}, "
+            f"telescope of {2 * lidar.aperture_radius:g} m; "
             f"slab of {scan.thickness:g} m from {distance:g} m"
         )
         detector = "with the noise of a detector" if experiment.detector else "no detector"
@@ -220,7 +222,7 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
     if experiment.doppler:
         lidar = experiment.doppler.lidar
         beam = (
-            f"{lidar.wavelength * 1e9:.5g} nm, {lidar.pulse_energy * 1e3:g} mJ, "
+            f"{shown(lidar.wavelength, 'nm')}, {shown(lidar.pulse_energy, 'mJ')}, "
             f"{lidar.range_bin:g} m at {lidar.range:g} m, in air of {lidar.altitude:g} m altitude"
         )
         rows.append(("Doppler lidar", beam))
@@ -238,7 +240,7 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
 
 def _platform(experiment) -> tuple[str, str]:
     platform = experiment.platform
-    return "platform", f"{platform.speed:g} m/s, images {platform.dt:g} s apart"
+    return "platform", f"{shown(platform.speed, 'm/s')}, images {shown(platform.dt, 's')} apart"
 
 
 def _flight(experiment) -> tuple[str, str]:
@@ -248,7 +250,7 @@ def _flight(experiment) -> tuple[str, str]:
         "a rigid aircraft that rolls" if aircraft.model == "roll" else f"JSBSim's {aircraft.model}"
     )
     return "flight", (
-        f"{kind} at {path.speed:g} m/s, crossing the wake at "
+        f"{kind} at {shown(path.speed, 'm/s')}, crossing the wake at "
         f"{math.degrees(path.crossing_angle):.3g} degrees on a path of "
         f"{math.degrees(path.climb_angle):+.3g} degrees; {encounter.rate:g} slabs a second"
     )

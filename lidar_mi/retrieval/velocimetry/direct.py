@@ -19,8 +19,8 @@ _ROUNDING = 1e-14
 _SINGLE = 1e-3
 
 
-# Least information over second derivative at which steps take the information: each then leaves less
-# than half of the distance.
+# Least information over second derivative at which steps take the information: each then leaves
+# less than half of the distance.
 _ALIKE = 0.7
 
 

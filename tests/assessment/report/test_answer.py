@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from lidar_mi.assessment.metrics.names import vortex_key
 from lidar_mi.assessment.metrics.requirements import judge, read_requirements
 from lidar_mi.assessment.report.answer import answer, verdict
 from lidar_mi.assessment.report.summary import summary
@@ -111,7 +112,8 @@ def test_the_vortices_with_their_errors():
     }
     line = answer(an_experiment(), metrics)[1]
     assert line == (
-        "Vortex pair: circulations 412.3 ± 8.5 and -416.3 ± 8.3 m²/s, true 440 and -439 m²/s."
+        "Vortex pair: circulations 412.3 ± 8.5 and -416.3 ± 8.3 m²/s, true 440 and -439 m²/s, "
+        "off by up to 3.3 standard errors."
     )
 
 
@@ -141,3 +143,32 @@ def test_a_statistic_has_its_error_bar():
     (table,) = summary(metrics, [20])
     assert ("annular", "free", "0.119 ± 0.021", "0.024 ± 0.030") in table.rows
     assert ("(bound)", "free", "0.136", "-") in table.rows
+
+
+@pytest.mark.parametrize(
+    ("inner", "outer", "valid", "words"),
+    [
+        (0.45, 0.71, 0.9, "too small here: 71 % of the errors are within 1.96 of them (95 %)"),
+        (0.95, 1.0, 0.9, "too large here: 95 % of the errors are within 1 of them (68 %)"),
+        (0.66, 0.94, 0.9, None),
+        (0.45, 0.71, 0.1, None),
+    ],
+)
+def test_standard_errors_that_do_not_hold_are_said(inner, outer, valid, words):
+    head = "backscatter.variational."
+    metrics = {f"{head}coverage_68_{n}": inner for n in "vw"}
+    metrics |= {f"{head}coverage_95_{n}": outer for n in "vw"} | {f"{head}valid_fraction": valid}
+    said = [line for line in answer(an_experiment(sensor=None), metrics) if "stated" in line]
+    assert len(said) == bool(words)
+    assert words is None or words in said[0]
+
+
+@pytest.mark.parametrize(("found", "words"), [(424.7, "3.3 standard errors"), (431.0, None)])
+def test_a_circulation_off_by_many_standard_errors_is_said(found, words):
+    metrics = {}
+    for side in ("port", "starboard"):
+        metrics[vortex_key("truth", f"{side}_circulation_5_15")] = 440.0
+        key = vortex_key("vectors", f"{side}_circulation_5_15")
+        metrics |= {key: found if side == "port" else 440.0, f"{key}_stderr": 4.6}
+    (line,) = answer(an_experiment(sensor=None), metrics)
+    assert (words in line) if words else ("standard errors" not in line)
