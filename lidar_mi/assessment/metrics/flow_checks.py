@@ -56,7 +56,7 @@ def sense_of_rotation(wind: xr.Dataset, cores: Sequence[Core]) -> str:
     found = sorted(cores, key=lambda core: -core.y)
     senses = ", ".join(
         f"{_circulation(wind, core, [other for other in found if other is not core])} "
-        f"at y = {core.y:.1f} m, z = {core.z:.1f} m"
+        f"at y = {core.y:z.1f} m, z = {core.z:z.1f} m"
         for core in found
     )
     if len(found) < 2:

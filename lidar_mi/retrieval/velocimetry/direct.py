@@ -76,19 +76,15 @@ def solved_in_single(
     prior: Prior,
     settings: VariationalSettings,
 ) -> Posterior:
-    """`solved` with a factor in single precision; its residual is looked at in double precision.
+    """A step with a factor in single precision; its residual is looked at in double precision.
 
-    Where there is no such factor, or the residual is not small, all is in double precision.
+    Where there is no such factor, or the residual is not small, all is in double precision. The
+    factor is that of the step: `informed` gives that of the precision.
     """
     band = Band(*(axis.knots for axis in mesh.axes))
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
-    whole = data_form(linear, mesh) + stiff
-    if not informative(linear):
-        return solved(linear, mesh, coefficients, prior, settings, 0)
-    try:
-        root = band.factor(whole.float())
-    except torch.linalg.LinAlgError:
-        root = None
+    whole = (data_form if informative(linear) else curvature)(linear, mesh) + stiff
+    root = in_single(band, whole)
     if root is not None:
         step = band.solve(root, gradient.float()).to(coefficients)
         left = gradient - band.apply(whole, step)
@@ -96,6 +92,23 @@ def solved_in_single(
             return Posterior(coefficients + step, band, root, prior, stiff)
     root = band.factor(whole)
     return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
+
+
+def informed(posterior: Posterior, linear: Linear, mesh: Mesh) -> Posterior:
+    """The posterior after `solved_in_single` with the factor of its precision."""
+    if informative(linear):
+        return posterior
+    whole = data_form(linear, mesh) + posterior.stiff
+    root = in_single(posterior.band, whole)
+    return posterior._replace(root=root or posterior.band.factor(whole))
+
+
+def in_single(band: Band, form: torch.Tensor) -> Factor | None:
+    """A factor in single precision, if there is one."""
+    try:
+        return band.factor(form.float())
+    except torch.linalg.LinAlgError:
+        return None
 
 
 def informative(linear: Linear) -> bool:

@@ -10,7 +10,7 @@ from lidar_mi.retrieval.velocimetry.band import spread
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.direct import Posterior, solved_in_single
+from lidar_mi.retrieval.velocimetry.direct import Posterior, informed, solved_in_single
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh, interpolated
 from lidar_mi.retrieval.velocimetry.likelihood import Images, Linear, linearised, usable_and_weight
@@ -167,6 +167,7 @@ def next_flow(
     more = _energy(prior, coefficients) / start.energy
     if not (far < _SMALL and 1 / _MISFIT < worse < _MISFIT and 1 / _ENERGY < more < _ENERGY):
         return None
+    posterior = informed(posterior, linear, mesh)
     at_centres = Mesh(prior.mesh.axes, _centres(windows, coefficients))
     # the recursion for the inverse damps rounding: 1e-5 in single precision
     root = Factor(*(part.float() for part in posterior.root))

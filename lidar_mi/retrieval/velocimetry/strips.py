@@ -15,6 +15,7 @@ from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.direct import (
     curvature,
     data_form,
+    in_single,
     informative,
     prior_and_gradient,
     prior_form,
@@ -191,10 +192,7 @@ def _root(both: torch.Tensor, part: list[Strip]) -> Factor:
     """Factor of the matrices of some strips, in single precision if there is one."""
     forms = torch.stack([both[:, :, :, strip.knots] for strip in part])
     band = Band(forms.shape[-3], forms.shape[-1])
-    try:
-        return band.factor(forms.float())
-    except torch.linalg.LinAlgError:
-        return band.factor(forms)
+    return in_single(band, forms) or band.factor(forms)
 
 
 def _before(mesh: Mesh, prior: Prior, settings: VariationalSettings) -> torch.Tensor:

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 import torch
 
+from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import linearised, path, prepared, with_local_noise
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
+from lidar_mi.retrieval.velocimetry.warping import filtered_spline
 from tests.support.flows import plane_waves, texture
 from tests.support.volumes import nodes, random_waves
 
@@ -124,3 +126,47 @@ def test_noise_that_is_there_or_given_stays():
     assert after == spectrum
     spectrum, after = noise_of_still_images(0.0, 0.05)
     assert after == spectrum
+
+
+def test_slopes_of_noise_are_those_of_filtered_noise():
+    """Mean square over 8 pairs of images of noise alone, to 4 of its standard errors."""
+    random = np.random.default_rng(6)
+    z, y = np.arange(90), np.arange(100)
+    still = texture(plane_waves(6, 3.0), *np.meshgrid(y, z))
+
+    def stack(level):
+        return [
+            torch.as_tensor(level * still + 0.1 * random.standard_normal(still.shape))
+            for _ in range(2)
+        ]
+
+    images = prepared(stack(1.0), 0.1, 0.0, VariationalSettings())
+    spline = images.spline
+    chosen = Filter(spline.gain, 0.1, spline.passed, 1.0, 1.0, spline.noisy_slopes)
+    place = torch.meshgrid(*(torch.arange(8.0, n - 8) for n in still.shape), indexing="ij")
+    place = [axis.double().expand(2, -1, -1) for axis in place]
+    found = []
+    for _ in range(8):
+        noise = filtered_spline(torch.stack(stack(0.0)), chosen, spline.settings)
+        _, *slopes = noise.sample(*place)
+        found.append(sum(float(slope.mean(0).square().mean()) for slope in slopes))
+    mean, error = np.mean(found), np.std(found, ddof=1) / len(found) ** 0.5
+    assert abs(mean - spline.noisy_slopes) < 4 * error + 0.01 * mean
+
+
+def test_where_there_is_no_texture_images_tell_nothing():
+    """A half of the image is dark: its information is that of noise taken for texture, a tenth."""
+    random = np.random.default_rng(7)
+    z, y = np.arange(80), np.arange(120)
+    still = (y > 60) * (texture(plane_waves(7, 3.0), *np.meshgrid(y, z), 0.3) - 1)
+    stack = [torch.as_tensor(still + 0.05 * random.standard_normal(still.shape)) for _ in "12"]
+    images = prepared(stack, 0.05, 0.0, VariationalSettings())
+    axes = [Axis(n, 4.0) for n in still.shape]
+    mesh = Mesh(axes, [torch.arange(n, dtype=torch.float64) for n in still.shape])
+    nothing = torch.zeros(2, *(axis.knots for axis in axes), dtype=torch.float64)
+    found = linearised(images, mesh, nothing, VariationalSettings())
+    told = found.information * found.slope.square().sum(0)
+    seems = found.weight * found.slope.square().sum(0)
+    dark, bright = np.s_[10:-10, 10:45], np.s_[10:-10, 75:-10]
+    assert float(told[dark].sum()) < 0.1 * float(seems[dark].sum())
+    assert float(told[bright].sum()) > 0.5 * float(seems[bright].sum())
