@@ -89,8 +89,8 @@ def combined_in_flight(
     InputError
         No valid vector or no line of sight on the grid.
     """
-    told = {axis: wind[axis] for axis in ("z", "y")}
-    seen = {axis: told[axis] - at for axis, at in (("y", place[1]), ("z", place[2]))}
-    local = wind.assign_coords({axis: c.assign_attrs(told[axis].attrs) for axis, c in seen.items()})
+    told = {axis: wind.variables[axis] for axis in ("z", "y")}
+    seen = {axis: told[axis].values - at for axis, at in (("y", place[1]), ("z", place[2]))}
+    local = wind.assign_coords({axis: (axis, c, told[axis].attrs) for axis, c in seen.items()})
     found = combine(local, lines, crossflow_std=crossflow_std, distance=x - place[0])
     return found.assign_coords(told)

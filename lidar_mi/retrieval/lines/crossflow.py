@@ -54,7 +54,7 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
         if name not in wind:
             raise InputError(f"crossflow.{name}: missing; expected v, w and flag on (z, y)")
         checked_image(f"crossflow.{name}", wind[name])
-    value = np.stack([wind[n].transpose("z", "y").values.astype(float) for n in ("v", "w")], -1)
+    value = np.stack([_values(wind, name) for name in ("v", "w")], -1)
     common = common_stderr(wind)
     if std is not None:
         if not std > 0:
@@ -63,14 +63,14 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
         correlation = np.zeros_like(first)
     else:
         names = ("v_stderr", "w_stderr", "vw_correlation")
-        if any(n not in wind or not np.isfinite(wind[n]).any() for n in names):
+        if any(n not in wind or not np.isfinite(wind.variables[n].values).any() for n in names):
             method = wind.attrs.get("method", "unknown")
             raise InputError(
                 f"crossflow.v_stderr: not known by method {method!r}; give crossflow_std"
             )
-        *stderr, correlation = (wind[n].transpose("z", "y").values.astype(float) for n in names)
+        *stderr, correlation = (_values(wind, name) for name in names)
         (first, second), correlation = own_errors(np.stack(stderr), correlation, common)
-    valid = (wind["flag"].transpose("z", "y").values == 0) & np.isfinite(value).all(-1)
+    valid = (_values(wind, "flag") == 0) & np.isfinite(value).all(-1)
     valid &= (first > 0) & (second > 0) & (abs(correlation) < 1)
     if not valid.any():
         raise InputError("crossflow.flag: every vector is flagged; expected some valid ones")
@@ -83,6 +83,11 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
     value = np.where(valid[..., None], value, mean)
     free = bool(common.any()) and wind.attrs.get("pointing_offset") == "free"
     return Crossflow(value, root, valid, prior_std, common, free)
+
+
+def _values(wind: xr.Dataset, name: str) -> np.ndarray:
+    """Of a variable (z, y); without its coordinates, which take longer to attach than all else."""
+    return wind.variables[name].transpose("z", "y").values.astype(float)
 
 
 def window_size(crossflow: xr.Dataset) -> float:

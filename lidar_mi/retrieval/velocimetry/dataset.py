@@ -136,5 +136,5 @@ def dataset(
     result = xr.Dataset(variables | scalars, coords, attrs)
     result.attrs |= found.attributes
     for axis in result.dims:
-        result[axis].encoding["_FillValue"] = None
+        result.variables[axis].encoding["_FillValue"] = None
     return result
