@@ -61,10 +61,12 @@ def _of_the_speed(experiment: Experiment, wind: xr.Dataset, plan: ScanPlan) -> l
     """Winds that no wake has, or that windows of this size cannot follow."""
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
     if fastest > MOST_WIND:
+        doubt = "is the unit of v and w in the file right (attribute units)"
+        if not experiment.wake.file:
+            doubt = "are circulation and core radius right"
         return [
             f"wake: winds across the path reach {fastest:.3g} m/s; those of wakes of aircraft and "
-            f"turbines stay below {MOST_WIND:g} m/s: is the unit of v and w in the file right "
-            "(attribute units)?"
+            f"turbines stay below {MOST_WIND:g} m/s: {doubt}?"
         ]
     reach = window_reach(experiment, plan)
     taken = () if experiment.volume else experiment.retrieval.methods

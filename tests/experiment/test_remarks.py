@@ -43,7 +43,7 @@ def prepared(**changes):
         ),
         (
             {"wake": {"vortex_pair": {"circulation": "9e3 m^2/s"}, "file": None, "time": None}},
-            "is the unit of",
+            "are circulation and core radius right?",
         ),
         ({"platform": {"dt": "0.5 s"}}, "windows of cc follow"),
         ({}, None),

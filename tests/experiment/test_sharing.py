@@ -4,6 +4,8 @@ Detects: a setting that changes an image and is said not to, with which a campai
 image of another experiment.
 """
 
+import math
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from lidar_mi.experiment.pipeline import (
     stages_of,
     storing_stages,
 )
+from lidar_mi.experiment.reading import load_experiment
 from lidar_mi.experiment.resumable_folder import made_by, new_record
 from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.stage import result_of
@@ -156,3 +159,12 @@ def test_what_changes_an_image_changes_its_signature(key, value, unchanged):
     assert not (
         equal(two["image_t1"], four["image_t1"]) and equal(two["image_t2"], four["image_t2"])
     )
+
+
+def test_images_of_equal_experiments_are_shared_whatever_their_units():
+    """The same field of view in degrees and in radians, bit for bit; another one is another."""
+    degrees, radians, other = (
+        made_by(new_record(load_experiment("wake_backscatter", lidar={"fov_half": text}), "."))
+        for text in ("0.5 deg", f"{math.radians(0.5)!r} rad", "0.51 deg")
+    )
+    assert degrees == radians != other

@@ -50,7 +50,8 @@ def backscatter_chapter(
         lead.append("The wake is that of a turbine; most of its wind is u, along the axis.")
     elif cores:
         places = ", ".join(
-            f"a vortex at y = {core.y:.1f} m, z = {core.z:.1f} m (core radius {core.radius:.1f} m)"
+            f"a vortex at y = {core.y:z.1f} m, z = {core.z:z.1f} m "
+            f"(core radius {core.radius:.1f} m)"
             for core in cores
         )
         lead.append(f"The true flow has {places}.")
