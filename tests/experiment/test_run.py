@@ -95,3 +95,15 @@ def test_an_experiment_shows_changed_keys():
     assert keys["render.samples_per_beam"] == "8"
     assert not any(key.startswith(("scan.", "platform.")) for key in keys)
     assert "name: shown" in dump(experiment)
+
+
+def test_nodes_that_single_precision_cannot_hold(tmp_path):
+    """Nodes 0.3 m apart: images read from their files are on those of the truth all the same."""
+    data = small(spacing="0.3 m")
+    data["wake"]["vortex_pair"] |= {"height": 21}
+    data["retrieval"] |= {"stride": 8}
+    found = lm.run(check(data), tmp_path / "out", notice=lambda text, fraction: None)
+    assert found.wind["flag"].dtype.kind == "u"
+    true = found.wind["v_true"].sel(source=["extinction", "backscatter"])
+    assert true.notnull().all()
+    assert (found.scans[1]["y"] == found.truth.wind["y"].values).all()

@@ -202,7 +202,10 @@ def detect_images(
     """The images of all beams, with noisy ones in addition if there is a detector."""
     # images are per emitted energy: those of another pulse energy are the same
     energy = experiment.lidar.pulse_energy
-    scans = [images[name].assign_attrs(pulse_energy=energy) for name in IMAGES]
+    scans = [
+        _on_nodes(images[name].assign_attrs(pulse_energy=energy), plan)
+        for name, plan in zip(IMAGES, plans, strict=True)
+    ]
     if experiment.detector is None:
         return scans
     lidar, detector, seed = experiment.lidar, experiment.detector, experiment.seed
@@ -214,6 +217,12 @@ def detect_images(
         noisy_scan(scan.assign_attrs(air), lidar, detector, [seed, index, 1], plan, pulses)
         for index, (scan, plan) in enumerate(zip(scans, plans, strict=True))
     ]
+
+
+def _on_nodes(scan: xr.Dataset, plan: ScanPlan) -> xr.Dataset:
+    """A scan on its plan's nodes, which a file has in single precision: those of the truth."""
+    nodes = {axis: (axis, getattr(plan, axis), scan[axis].attrs) for axis in ("y", "z")}
+    return scan.assign_coords(nodes)
 
 
 def gridded_scans(experiment: Experiment, detected: Sequence[xr.Dataset]) -> list[xr.Dataset]:
