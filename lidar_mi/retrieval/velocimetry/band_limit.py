@@ -45,15 +45,50 @@ class Filter(NamedTuple):
     noisy_slopes: float
 
 
-def best_filter(
+class PowerSpectrum(NamedTuple):
+    """Power spectral density by shells of wavenumber, and its relative standard errors.
+
+    `shape` is that of the images, `sizes` are the odd lengths of their Fourier transforms.
+    """
+
+    density: torch.Tensor
+    uncertainty: torch.Tensor
+    shape: tuple[int, ...]
+    sizes: tuple[int, ...]
+
+
+def power_spectrum(
     images: torch.Tensor,
     sizes: Sequence[int],
     settings: FilterSettings,
+    weight: torch.Tensor | None = None,
+    known: torch.Tensor | None = None,
+) -> PowerSpectrum:
+    """The power spectrum of finite images (images, ...) that `best_filter` takes.
+
+    Parameters
+    ----------
+    images : torch.Tensor, shape (images, ...)
+        Finite.
+    sizes : sequence of int
+        Odd lengths of the Fourier transforms.
+    settings : FilterSettings
+    weight, known
+        See `warping.band_limited`.
+    """
+    shape = tuple(images.shape[1:])
+    _, shell = radii(tuple(sizes), shape, images.dtype, images.device)
+    weighted = images if weight is None else images * weight
+    means = shell_means(weighted, shell, sizes, settings.smoothing, known)
+    return PowerSpectrum(*means, shape, tuple(sizes))
+
+
+def best_filter(
+    spectrum: PowerSpectrum,
+    settings: FilterSettings,
     noise: float | None = None,
     mismatch: torch.Tensor | None = None,
-    weight: torch.Tensor | None = None,
     blur: float = 0.0,
-    known: torch.Tensor | None = None,
 ) -> Filter:
     """The filter of least variance of a displacement between images.
 
@@ -64,19 +99,14 @@ def best_filter(
 
     Parameters
     ----------
-    images : torch.Tensor, shape (images, ...)
-        Finite.
-    sizes : sequence of int
-        Odd lengths of the Fourier transforms.
+    spectrum : PowerSpectrum
+        Of the images.
     settings : FilterSettings
-    noise, mismatch, weight, blur, known
+    noise, mismatch, blur
         See `warping.band_limited`.
     """
-    shape = images.shape[1:]
-    radius, shell = radii(tuple(sizes), tuple(shape), images.dtype, images.device)
-    density, uncertainty = shell_means(
-        images if weight is None else images * weight, shell, sizes, settings.smoothing, known
-    )
+    density, uncertainty, shape, sizes = spectrum
+    radius, shell = radii(sizes, shape, density.dtype, density.device)
     below = 1 + settings.threshold * uncertainty
     if mismatch is not None:
         # shells that were stopped before stay stopped
@@ -88,10 +118,10 @@ def best_filter(
         fraction = uncertainty**-2 * (density <= floor * below)
         floor = (fraction * density).sum() / fraction.sum()
     else:
-        floor = torch.as_tensor(noise**2, dtype=images.dtype, device=images.device)
+        floor = torch.as_tensor(noise**2, dtype=density.dtype, device=density.device)
     # shells of noise alone must not pass because their mean happens to be a little higher
     texture = torch.where(density > floor * below, density - floor, 0.0)
-    tiny = torch.finfo(images.dtype).tiny
+    tiny = torch.finfo(density.dtype).tiny
     response = texture / (texture + floor / 2 + tiny)
     # as if all noise were white and of this variance
     level = floor if mismatch is None else torch.as_tensor(noise**2).to(floor)

@@ -13,6 +13,7 @@ from lidar_mi.retrieval.velocimetry.band_limit import (
     faded,
     frequencies,
     odd_fast_len,
+    power_spectrum,
     radii,
     shell_means,
 )
@@ -82,33 +83,47 @@ class Spline(NamedTuple):
         -------
         value, *slopes : torch.Tensor, shape (images, ...)
         """
+        read = _read_images if len(place) == 2 else _read_volumes
+        value, *slopes = read(self.coefficients, *self._in_nodes(place))
+        return value, *(self.settings.nodes * slope for slope in slopes)
+
+    def values(self, z: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """The first of `sample` alone, of images."""
+        (value,) = _read_images(self.coefficients, *self._in_nodes((z, y)), slopes=False)
+        return value
+
+    def _in_nodes(self, place: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """Places on the images, counted in nodes."""
         finer, margin = self.settings.nodes, self.settings.margin
-        at = [
+        return [
             finer * (p.clamp(0, size - 1) + margin) - 1
             for p, size in zip(place, self.shape, strict=True)
         ]
-        read = _read_images if len(at) == 2 else _read_volumes
-        value, *slopes = read(self.coefficients, *at)
-        return value, *(finer * slope for slope in slopes)
 
 
-def _read_images(coefficients: torch.Tensor, z: torch.Tensor, y: torch.Tensor):
-    """Values and slopes, per node, at places counted in nodes: two dimensions."""
+def _read_images(
+    coefficients: torch.Tensor, z: torch.Tensor, y: torch.Tensor, slopes: bool = True
+) -> list[torch.Tensor]:
+    """Values, and slopes per node, at places counted in nodes: two dimensions."""
     images, height, width = coefficients.shape
     if images > 1 and z.numel() > _TOGETHER:
         parts = [
-            _read_images(coefficients[k : k + 1], z[k : k + 1], y[k : k + 1]) for k in range(images)
+            _read_images(coefficients[k : k + 1], z[k : k + 1], y[k : k + 1], slopes)
+            for k in range(images)
         ]
         return [torch.cat(part) for part in zip(*parts, strict=True)]
     row, column = z.floor(), y.floor()
-    weight_z, weight_y = spline_weights(z - row), spline_weights(y - column)
+    form = spline_weights if slopes else _value_weights
+    weight_z, weight_y = form(z - row), form(y - column)
     first = torch.arange(images, device=z.device).view(-1, *[1] * (z.ndim - 1)) * height
     # whole numbers of half the size, and no new memory, take half the time
     kind = torch.int32 if coefficients.numel() < 2**31 else torch.int64
     corner = ((first + row.to(kind)) * width + column.to(kind)).reshape(-1)
     flat = coefficients.reshape(-1)
-    total = [torch.zeros_like(z) for _ in range(3)]
-    along, knot = [torch.zeros_like(z) for _ in range(2)], torch.empty_like(z)
+    # derivatives along z and y
+    orders = [(0, 0), (1, 0), (0, 1)] if slopes else [(0, 0)]
+    total, along = ([torch.zeros_like(z) for _ in kind] for kind in (orders, weight_y))
+    knot = torch.empty_like(z)
     for i in range(4):
         for part in along:
             part.zero_()
@@ -116,11 +131,10 @@ def _read_images(coefficients: torch.Tensor, z: torch.Tensor, y: torch.Tensor):
         for j in range(4):
             torch.index_select(flat, 0, number, out=knot.view(-1))
             number += 1
-            along[0].addcmul_(knot, weight_y[0][j])
-            along[1].addcmul_(knot, weight_y[1][j])
-        total[0].addcmul_(along[0], weight_z[0][i])
-        total[1].addcmul_(along[0], weight_z[1][i])
-        total[2].addcmul_(along[1], weight_z[0][i])
+            for part, weight in zip(along, weight_y, strict=True):
+                part.addcmul_(knot, weight[j])
+        for part, (by_z, by_y) in zip(total, orders, strict=True):
+            part.addcmul_(along[by_y], weight_z[by_z][i])
     return total
 
 
@@ -178,11 +192,15 @@ def nearest(mask: torch.Tensor, place: Sequence[torch.Tensor]) -> torch.Tensor:
 
 def spline_weights(t: torch.Tensor) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """The four cubic B-splines over a cell, and their slopes, at the fraction t of the cell."""
+    s = 1 - t
+    slope = [s * s / -2, t * (1.5 * t - 2), s * (2 - 1.5 * s), t * t / 2]
+    return *_value_weights(t), slope
+
+
+def _value_weights(t: torch.Tensor) -> tuple[list[torch.Tensor]]:
     s, t2 = 1 - t, t * t
     s2 = s * s
-    value = [s2 * s / 6, 2 / 3 - t2 + t2 * t / 2, 2 / 3 - s2 + s2 * s / 2, t2 * t / 6]
-    slope = [-s2 / 2, t * (1.5 * t - 2), s * (2 - 1.5 * s), t2 / 2]
-    return value, slope
+    return ([s2 * s / 6, 2 / 3 - t2 + t2 * t / 2, 2 / 3 - s2 + s2 * s / 2, t2 * t / 6],)
 
 
 def band_limited(
@@ -232,7 +250,8 @@ def band_limited(
     known = torch.stack([torch.isfinite(image) for image in images])
     images = torch.stack([stored(_continued(image)) for image in images])
     sizes = transform_sizes(images.shape[1:], settings)
-    chosen = best_filter(images, sizes, settings, noise, mismatch, weight, blur, known)
+    spectrum = power_spectrum(images, sizes, settings, weight, known)
+    chosen = best_filter(spectrum, settings, noise, mismatch, blur)
     return filtered_spline(images, chosen, settings), chosen.level
 
 
@@ -276,7 +295,7 @@ def filtered_spline(images: torch.Tensor, chosen: Filter, settings: FilterSettin
     )
 
 
-def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
+def mismatch(spline: Spline, rest: torch.Tensor, number: int | None = None) -> torch.Tensor:
     """Spectral density, by shells, of the differences of warped images, before their filter.
 
     Parameters
@@ -285,6 +304,8 @@ def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
         That the warped images were sampled from.
     rest : torch.Tensor, shape (images, ...)
         Each warped image less the mean of all; zero where not all are valid.
+    number : int, optional
+        Of warped images, where `rest` is only some. Left out: as many as `rest`.
 
     Returns
     -------
@@ -293,7 +314,7 @@ def mismatch(spline: Spline, rest: torch.Tensor) -> torch.Tensor:
     """
     sizes = [odd_fast_len(n + 2 * spline.settings.margin) for n in spline.shape]
     _, shell = radii(tuple(sizes), spline.shape, rest.dtype, rest.device)
-    number = len(rest)
+    number = number or len(rest)
     rest = rest * (number / (number - 1)) ** 0.5
     density, _ = shell_means(rest, shell, sizes, spline.settings.smoothing)
     passed = spline.gain.square()

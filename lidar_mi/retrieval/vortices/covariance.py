@@ -124,13 +124,14 @@ def _noise_spread(found: Solution, error: ModelError) -> torch.Tensor:
     ratio = (misfit.residual.square() / (misfit.scatter + moved)).where(misfit.valid, 0.0)
     if ratio.ndim == 2:
         ratio = averaged(ratio, misfit.valid, _NEAR)
+        return (columns * (weight**2 * misfit.variance * ratio).flatten()) @ columns.T
     stated, observed = (
         (columns * (weight**2 * part).flatten()) @ columns.T
         for part in (misfit.variance, misfit.variance * ratio)
     )
     scale = found.normal.diagonal()
     excess = float((observed.diagonal() / scale).sum() / (stated.diagonal() / scale).sum())
-    return observed if excess > 1 or ratio.ndim == 2 else stated
+    return observed if excess > 1 else stated
 
 
 def _remaining_step(found: Solution) -> torch.Tensor:

@@ -7,7 +7,13 @@ import numpy as np
 import torch
 from kornia.filters import gaussian_blur2d
 
-from lidar_mi.retrieval.velocimetry.band_limit import Filter, best_filter, checked_noise
+from lidar_mi.retrieval.velocimetry.band_limit import (
+    Filter,
+    PowerSpectrum,
+    best_filter,
+    checked_noise,
+    power_spectrum,
+)
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.velocimetry.warping import (
@@ -17,7 +23,7 @@ from lidar_mi.retrieval.velocimetry.warping import (
     mismatch,
     transform_sizes,
 )
-from lidar_mi.retrieval.vortices.model import Profile, advected, drift, path_sensitivity
+from lidar_mi.retrieval.vortices.model import Profile, advected, drift, path_sensitivity, wind
 from lidar_mi.retrieval.vortices.pixel_times import PixelTimes, seen
 from lidar_mi.retrieval.vortices.robust_fit import Misfit
 from lidar_mi.retrieval.vortices.search import Observations
@@ -79,8 +85,12 @@ class Images:
         # the flow is steady in the frame that moves with the pair
         steady = torch.cat([theta[:8], theta[8:] - moving])
         if self.times is None:
+            began = wind(steady, self.y, self.z, self.profile)
             middle, place = zip(
-                *(advected(steady, self.y, self.z, time, self.profile) for time in (-half, half)),
+                *(
+                    advected(steady, self.y, self.z, time, self.profile, began)
+                    for time in (-half, half)
+                ),
                 strict=True,
             )
             shift = moving[:, None, None] * half
@@ -120,7 +130,7 @@ class Images:
         )
         jacobian[10:13], jacobian[13:16] = -value[0] * self.linear, -self.linear
         if self.whole is not self.spline:
-            value, _, _ = self.whole.sample(rows, columns)
+            value = self.whole.values(rows, columns)
         residual = valid * (value[1] - gain * value[0] - offset)
         if self.whole is not self.spline:
             residual = self.spline.filtered(residual)
@@ -220,9 +230,13 @@ class Builder:
     def filter(self, noise: float | None, mismatch: torch.Tensor | None = None) -> Filter:
         """The filter of both images, as `warping.band_limited` chooses it."""
         checked_noise(noise)
+        return best_filter(self.spectrum, FilterSettings(), noise, mismatch)
+
+    @cached_property
+    def spectrum(self) -> PowerSpectrum:
+        """Of both images."""
         settings = FilterSettings()
-        sizes = transform_sizes(self.pair.shape[1:], settings)
-        return best_filter(self.pair, sizes, settings, noise, mismatch)
+        return power_spectrum(self.pair, transform_sizes(self.pair.shape[1:], settings), settings)
 
     @cached_property
     def unfiltered(self) -> Spline:
@@ -296,7 +310,8 @@ class Builder:
         gain = white.spline.gain * (1.0 if images.whitening is None else images.whitening.gain)
         before = images.spline._replace(gain=gain)
         rest = valid * misfit.residual / shape.sqrt() / 2
-        density = mismatch(before, torch.stack([-rest, rest]))
+        # the other image's rest is the same with the other sign
+        density = mismatch(before, rest[None], number=2)
         density = density.clamp(min=max(least, fraction * level) / 2)
         level = max(least, level)
         chosen = self.filter((level / 2) ** 0.5, density)

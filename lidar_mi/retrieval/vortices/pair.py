@@ -11,7 +11,14 @@ import xarray as xr
 from lidar_mi.atmosphere.vortex import Vortex
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.quantity import Quantity
-from lidar_mi.retrieval.vortices.model import Profile, angular_velocity, drift, sensitivity, wind
+from lidar_mi.retrieval.vortices.model import (
+    Profile,
+    angular_velocity,
+    drift,
+    rotations,
+    sensitivity,
+    wind,
+)
 from lidar_mi.tables import Table, Tabular, with_error
 
 
@@ -258,10 +265,8 @@ class VortexPairFit(Tabular):
         theta = torch.as_tensor(self.parameters)
         places = [torch.as_tensor(np.array(axis, dtype=float)) for axis in (y, z)]
         unit = torch.eye(2, dtype=theta.dtype)
-        slope = [
-            sensitivity(theta, *places, direction.view(2, *[1] * places[0].ndim), self.profile)
-            for direction in unit
-        ]
+        about = rotations(theta, *places, self.profile)
+        slope = [sensitivity(about, direction.view(2, *[1] * places[0].ndim)) for direction in unit]
         covariance = torch.as_tensor(self.covariance)
         v, w = (torch.tensordot(covariance, part, 1) for part in slope)
         model = self.model_error**2

@@ -80,12 +80,13 @@ def seen(
     moving : torch.Tensor, shape (2,)
         Velocity of that frame, m/s.
     """
-    speed = wind(steady, y, z, profile) + moving[:, None, None]
+    began = wind(steady, y, z, profile)
+    speed = began + moving[:, None, None]
     time, _ = times.at(number, y, z)
     time, _ = times.at(number, y + time * speed[0], z + time * speed[1])
     for _ in range(_ROUNDS):
         used = time
-        middle, within = advected(steady, y, z, used, profile)
+        middle, within = advected(steady, y, z, used, profile, began)
         place = within + moving[:, None, None] * used
         time, gradient = times.at(number, *place)
     speed = wind(steady, *within, profile) + moving[:, None, None]

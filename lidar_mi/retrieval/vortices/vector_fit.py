@@ -22,7 +22,7 @@ from lidar_mi.retrieval.vortices.covariance import (
     model_error_of,
     parameter_covariance,
 )
-from lidar_mi.retrieval.vortices.model import Profile, sensitivity, wind
+from lidar_mi.retrieval.vortices.model import Profile, rotations, sensitivity, wind
 from lidar_mi.retrieval.vortices.model_error import mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.robust_fit import Misfit, fit
@@ -44,10 +44,8 @@ class _Vectors:
     def __call__(self, parameters: torch.Tensor) -> Misfit:
         off = self.value - wind(parameters, self.y, self.z, self.profile)
         residual = (self.root * off).sum(1)
-        jacobian = torch.stack(
-            [-sensitivity(parameters, self.y, self.z, along, self.profile) for along in self.root],
-            1,
-        )
+        about = rotations(parameters, self.y, self.z, self.profile)
+        jacobian = torch.stack([-sensitivity(about, along) for along in self.root], 1)
         one = torch.ones_like(residual)
         valid = self.valid.expand_as(residual)
         return Misfit(residual, jacobian, -self.root.transpose(0, 1), valid, one, one)

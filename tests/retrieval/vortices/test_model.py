@@ -13,6 +13,7 @@ from lidar_mi.retrieval.vortices.model import (
     drift,
     gradient,
     path_sensitivity,
+    rotations,
     sensitivity,
     wind,
 )
@@ -50,12 +51,12 @@ def test_derivatives_by_differences(profile):
         / (2 * step)
         for a, b in ((1, 0), (0, 1))
     )
-    v_y, v_z, w_y = gradient(theta, y, z, profile)
+    v_y, v_z, w_y = gradient(rotations(theta, y, z, profile))
     for ours, expected in ((v_y, along_y[0]), (v_z, along_z[0]), (w_y, along_y[1])):
         np.testing.assert_allclose(ours, expected, atol=1e-6)
     np.testing.assert_allclose(along_z[1], -v_y, atol=1e-6)
     along = torch.as_tensor(np.random.default_rng(1).standard_normal((2, *y.shape)))
-    columns = sensitivity(theta, y, z, along, profile)
+    columns = sensitivity(rotations(theta, y, z, profile), along)
     for index, name in enumerate(PARAMETERS):
         push = step * torch.eye(10, dtype=theta.dtype)[index]
         change = wind(theta + push, y, z, profile) - wind(theta - push, y, z, profile)
