@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from scipy.linalg import cho_solve, solve_triangular
 from scipy.spatial import ConvexHull, QhullError
 
 from lidar_mi.errors import InputError
@@ -255,12 +254,10 @@ def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, sh
             rows, lines, weight, *correlations
         )
         along = _MEAN_STD**2 * lines.forward.sum(1) + along
-        # the variance of u is the difference of much larger numbers: not by the inverse
-        lower, columns = choice.factor[0], along.reshape(-1, len(residual)).T
-        whitened = solve_triangular(lower, columns, lower=True)
-        gain = solve_triangular(lower, whitened, lower=True, trans="T")
-        gain = gain.T.reshape(along.shape)
-        of_lines = cho_solve(choice.factor, np.column_stack([residual, shared]))
+        # the variance of u is the difference of much larger numbers: not by the inverse of S
+        whitened = choice.white @ along.reshape(-1, len(residual)).T
+        gain = (whitened.T @ choice.white).reshape(along.shape)
+        of_lines = choice.white.T @ (choice.white @ np.column_stack([residual, shared]))
         wind[number, ..., 0] = gain @ residual
         wind[number, ..., 1:] = field.value[rows] + np.moveaxis(across @ of_lines[:, 0], 0, -1)
         explained = (whitened**2).sum(0).reshape(shape)
@@ -270,7 +267,7 @@ def _posterior(rows, field, lines, overlap, choices, relative_stds, residual, sh
         )
         covariance[..., 0, 1:] += choice.probability * mixed
         covariance[..., 1:, 0] += choice.probability * mixed
-        inverse += choice.probability * cho_solve(choice.factor, np.eye(len(residual)))
+        inverse += choice.probability * choice.white.T @ choice.white
         if field.common.any() and not field.estimated:
             # an error that the estimate does not allow for (Schmidt 1966)
             seen = np.concatenate([(gain @ shared)[None], across @ of_lines[:, 1:]])
@@ -288,9 +285,7 @@ def _common(field, choices, residual, shared) -> tuple[np.ndarray, np.ndarray]:
         return np.zeros(2), field.common
     means, squares = [], []
     for choice in choices:
-        seen, data = (
-            solve_triangular(choice.factor[0], part, lower=True) for part in (shared, residual)
-        )
+        seen, data = (choice.white @ part for part in (shared, residual))
         gain = field.common[:, None] ** 2 * seen.T
         means.append(-gain @ data)
         squares.append(field.common**2 - (gain @ seen).diagonal() * field.common**2)

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
-from scipy.linalg import cho_factor
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.lines.grid_lines import covariances_of_lines
@@ -27,8 +26,8 @@ _DRAWN = 16
 class Statistics(NamedTuple):
     """One set of statistics of u.
 
-    ``probability`` is its fraction of the evidence, ``factor`` the Cholesky factor of the
-    covariance S of the lines' velocities, ``misfit`` their mean squared normalised residual.
+    ``probability`` is its fraction of the evidence, ``white`` the inverse of the Cholesky factor of
+    the covariance S of the lines' velocities, ``misfit`` their mean squared normalised residual.
     """
 
     std: float
@@ -36,7 +35,7 @@ class Statistics(NamedTuple):
     power: float
     exponent: float
     probability: float
-    factor: tuple
+    white: np.ndarray
     misfit: float
 
 
@@ -102,27 +101,25 @@ def probable_statistics(
     correlations = [(correlation(z, size, a), correlation(y, size, a)) for a, size in pairs]
     shapes = np.concatenate(list(covariances_of_lines(lines, weight, correlations)))
     evidence, square = evidence_of(fixed, residual, shapes, stds)
-    choices = [
-        Statistics(float(one), float(size), float(power), a, 0.0, (), misfit / len(residual))
-        for ((a, size), power), squares in zip(
-            itertools.product(pairs, relative_stds), square, strict=True
-        )
-        for one, misfit in zip(stds, squares.tolist(), strict=True)
-    ]
     # steps of the standard deviation grow with it
-    evidence = evidence.ravel()
-    probability = np.exp(evidence - evidence.max()) * [choice.std for choice in choices]
+    probability = np.exp(evidence - evidence.max()) * stds
     probability /= probability.sum()
     steps = (np.arange(_DRAWN) + 0.5) / _DRAWN
-    drawn = np.searchsorted(np.cumsum(probability), steps).clip(max=len(choices) - 1)
-    found = [
-        choices[k]._replace(
-            probability=times / _DRAWN,
-            factor=cho_factor(fixed + choices[k].std ** 2 * shapes[k // len(stds)], lower=True),
-        )
-        for k, times in zip(*np.unique(drawn, return_counts=True), strict=True)
-    ]
-    return found, choices[int(np.argmax(evidence))]
+    drawn = np.searchsorted(np.cumsum(probability), steps).clip(max=probability.size - 1)
+    drawn, times = np.unique([*drawn, np.argmax(evidence)], return_counts=True)
+    of_shape, of_std = np.unravel_index(drawn, evidence.shape)
+    variance = stds[of_std, None, None] ** 2
+    white = np.linalg.inv(np.linalg.cholesky(fixed + variance * shapes[of_shape]))
+    kinds = list(itertools.product(pairs, relative_stds))
+    # the one of largest evidence is there once more than it was drawn
+    best = int(np.searchsorted(drawn, np.argmax(evidence)))
+    times[best] -= 1
+    choices = []
+    for k, s, often, one in zip(of_shape, of_std, times, white, strict=True):
+        (a, size), power = kinds[k]
+        known = float(stds[s]), float(size), float(power), a, float(often) / _DRAWN, one
+        choices.append(Statistics(*known, float(square[k, s]) / len(residual)))
+    return [choice for choice in choices if choice.probability], choices[best]
 
 
 def evidence_of(
