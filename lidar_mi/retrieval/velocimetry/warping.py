@@ -122,7 +122,7 @@ def _read_images(
     flat = coefficients.reshape(-1)
     # derivatives along z and y
     orders = [(0, 0), (1, 0), (0, 1)] if slopes else [(0, 0)]
-    total, along = ([torch.zeros_like(z) for _ in kind] for kind in (orders, weight_y))
+    total, along = ([torch.zeros_like(z) for _ in of] for of in (orders, weight_y))
     knot = torch.empty_like(z)
     for i in range(4):
         for part in along:
