@@ -310,6 +310,15 @@ def test_a_stopped_run_resumes_with_its_images(tmp_path, quick):
     assert "using 2 of 3 ring images" in (tmp_path / "run" / "log.txt").read_text()
 
 
+def test_images_that_the_fit_refuses_are_counted_and_it_says_why(tmp_path, quick):
+    retrieval = QUICK["retrieval"] | {"images": 2, "max_chi_square": 1}
+    metrics = run(check(**QUICK | {"retrieval": retrieval}), tmp_path).metrics
+    assert metrics["doppler.annular.centre_known.averaged_1.retrieved_fraction"] == 0
+    said = (tmp_path / "log.txt").read_text()
+    assert "warning: annular: no wind from 2 of 2 images; chi-square" in said
+    assert "expected at most 1:" in said
+
+
 @pytest.mark.slow
 def test_another_experiment_is_refused_or_replaces(tmp_path, quick):
     run(check(**QUICK), tmp_path)

@@ -121,6 +121,7 @@ def test_volume_image_is_the_mean_over_the_gate(tmp_path, quick):
     name = write_wake(tmp_path / "v.nc", lambda x, y, z: y * 0 + 1, x=np.arange(0.5, 8))
     data = small() | {"render": {"samples_per_beam": 256, "max_order": 1}}
     data["wake"] = {"file": name, "depth": "volume", "texture": {"rms": 0.2, "outer_scale": "4 m"}}
+    data["scattering"] = {"phase": "rayleigh"}
     run(check(data), tmp_path / "run", beside=tmp_path)
     truth = make_truth(check(data), tmp_path)
     scan = read_scan(tmp_path / "run" / IMAGES[0])

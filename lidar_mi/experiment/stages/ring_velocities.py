@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -71,7 +72,6 @@ def line_of_sight_winds(
         "title": f"Line-of-sight wind of the experiment {experiment.name}",
         "source": f"lidar-mi {__version__}",
     }
-    _warn_of_failures(found, log)
     return found
 
 
@@ -174,6 +174,7 @@ def velocities(
         for m in settings.methods
     ]
     done, total = 0, math.prod(shape[2:])
+    reasons: dict[str, str] = {}
     for j, n in enumerate(settings.averaged):
         own, sharing = reference_frames(n, doppler.reference.every, "doppler.retrieval.averaged")
         noises = [pixel_noise(doppler.ccd, rings.modes, number) for number in (n, own)]
@@ -206,7 +207,14 @@ def velocities(
                         if count:
                             place = places[name], c, j, k, slice(first, first + count)
                             found = speeds_to_laser(
-                                frames[:count], laser[:count], doppler, rings, noises, name, centre
+                                frames[:count],
+                                laser[:count],
+                                doppler,
+                                rings,
+                                noises,
+                                name,
+                                centre,
+                                refused=partial(reasons.setdefault, name),
                             )
                             v[place] = found[0] + drifted[:count] + shift
                             v_std[place] = np.hypot(found[1], drift_std[:count])
@@ -225,6 +233,8 @@ def velocities(
                             v[places[name], c, j, k, first + i] = speed + drifted[i] + shift
                 done += len(images)
     dims = ("algorithm", "centre", "averaged", "v_los", "image")
+    for name, count in zip(settings.methods, tried, strict=True):
+        _warn_of_failures(name, v[places[name], ..., :count], reasons.get(name), log)
     return xr.Dataset(
         {
             "v": (dims, v, {"units": "m s-1", "long_name": "retrieved line-of-sight wind"}),
@@ -272,10 +282,13 @@ def velocities(
     )
 
 
-def speeds_to_laser(frames, laser, doppler, rings, noises, method, centre) -> np.ndarray:
+def speeds_to_laser(
+    frames, laser, doppler, rings, noises, method, centre, *, refused=None
+) -> np.ndarray:
     """v_LOS of frames less that of the laser's, and its standard deviations.
 
-    ``noises`` are of the pixels of both; the systematic part is what the calibration leaves.
+    ``noises`` are of the pixels of both; the systematic part is what the calibration leaves;
+    ``refused``, if given, is called with the reason for each frame without a speed.
 
     Returns
     -------
@@ -289,11 +302,15 @@ def speeds_to_laser(frames, laser, doppler, rings, noises, method, centre) -> np
         parts = difference(
             _fit(frames, doppler, rings.model, rings.response, noises[0], method, centre), emitted
         )
-    except InputError:
+    except InputError as error:
         if len(frames) == 1:
+            if refused:
+                refused(str(error).removeprefix("images[0]: "))
             return np.full((4, 1), np.nan)
         alone = [
-            speeds_to_laser(one[None], own[None], doppler, rings, noises, method, centre)
+            speeds_to_laser(
+                one[None], own[None], doppler, rings, noises, method, centre, refused=refused
+            )
             for one, own in zip(frames, laser, strict=True)
         ]
         return np.concatenate(alone, 1)
@@ -360,10 +377,9 @@ def _peak_bias(doppler: Doppler, rendered: RingImages) -> np.ndarray:
     return np.array([[error(c, p) for p in PIECES] for c in COORDINATES])
 
 
-def _warn_of_failures(found: xr.Dataset, log: Log) -> None:
-    for name in found["algorithm"].values:
-        one = found.sel(algorithm=name)
-        tried = int(one["tried"]) * one["v"][..., 0].size
-        missing = tried - int(one["v"].count())
-        if missing:
-            log.remark(f"{name}: no wind from {missing} of {tried} images")
+def _warn_of_failures(name: str, v: np.ndarray, reason: str | None, log: Log) -> None:
+    """The number of images without a speed, and why the first of them has none."""
+    missing = int(np.isnan(v).sum())
+    if missing:
+        why = f"; {reason}" if reason else ""
+        log.remark(f"{name}: no wind from {missing} of {v.size} images{why}")
