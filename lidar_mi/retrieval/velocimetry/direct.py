@@ -43,6 +43,10 @@ class Posterior(NamedTuple):
         energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
         return variances(removed, self.prior), energy
 
+    def response(self, gradient: torch.Tensor) -> torch.Tensor:
+        """Change of the coefficients by a gradient (components, knots) of the log-likelihood."""
+        return self.band.solve(self.root, gradient)
+
     def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
         """Of the flow (components, components, ...) at a mesh, after the images and before."""
         mesh = Mesh(self.prior.mesh.axes, places)

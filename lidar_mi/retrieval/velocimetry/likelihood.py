@@ -7,23 +7,19 @@ from typing import NamedTuple
 import torch
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised, of_one_brightness, rms
-from lidar_mi.retrieval.velocimetry.change import displaced, unexplained
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
 from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
-from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, mismatch, nearest
+from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, nearest
 from lidar_mi.retrieval.velocimetry.windows import averaged, stored
 
 # Interpolation error of the splines over an image's rms structure: the least noise assumed.
 _INTERPOLATION = 1e-5
-# Misfit over white noise estimated from spectra below which that is not noise: of white noise the
-# flow absorbs a fifth at most.
-_OVERSTATED = 2 / 3
-
-
 # Width of the means that tell texture from noise, in cells between knots: at 0.8 too few pixels,
 # at 3 the rim of smoke counts as texture beside it.
 _SHARE_WIDTH = 1.5
+# Standard deviation, px, of the Gaussian mean of slopes that are structure and not texture.
+STRUCTURE = 3.0
 
 
 class Images(NamedTuple):
@@ -53,6 +49,9 @@ class Images(NamedTuple):
         Mean square displacement through the plane that the misfit tells of, px^2.
     given : bool
         Whether the noise was given; else it is that of the images' spectra.
+    coherent : float
+        Variance of the displacement by which structure as a whole moves otherwise than the air in
+        the plane, times the area over which it does so alike, px^4.
     """
 
     spline: Spline
@@ -66,6 +65,7 @@ class Images(NamedTuple):
     noise_updated: bool = False
     through: float = 0.0
     given: bool = True
+    coherent: float = 0.0
 
     def single(self) -> "Images":
         """The same to be warped in single precision: places to 1e-5 px."""
@@ -143,48 +143,6 @@ def usable_and_weight(
     return known_at, weight
 
 
-def with_local_noise(
-    images: Images, linear: Linear, width: float, coloured: bool, knots: float
-) -> Images:
-    """The images with the noise estimated from their misfit at each place and wavenumber.
-
-    Warped images differ by more than their noise where structure moves through the plane, is
-    undersampled, or moves on scales smaller than the splines'. The noise is the lower limit. One
-    that was not given is of the spectra, where fine texture looks like noise: their misfit takes
-    its place if it is clearly less. In each wavenumber another lower limit is the motion through
-    the plane that the waves shorter than two `knots` (px) tell of: the flow absorbs part of the
-    misfit of longer ones.
-    """
-    residual = (linear.warped - linear.warped.mean(0)) * linear.valid
-    free = (len(residual) - 1) * max(images.spline.passed, 1e-6)
-    # what counts is the misfit where slopes are steep, and there it is largest (White 1980,
-    # Econometrica 48, 817-838)
-    steep = linear.slope.square().sum(0)
-    steep = steep + 1e-3 * steep.mean() + 1e-30
-    power = residual.square().sum(0) * images.weight * steep / free
-    if not images.given and linear.valid.any():
-        whole = float(power[linear.valid].sum() / steep[linear.valid].sum())
-        if whole < _OVERSTATED * images.white**2:
-            images = images._replace(white=whole**0.5)
-    local = averaged(power, linear.valid, width) / averaged(steep, linear.valid, width)
-    mean = float(local[linear.valid].mean()) if linear.valid.any() else 0.0
-    level = max(images.white**2, mean, 1e-30)
-    least = max(images.white**2, 0.5 * level)
-    weight = images.weight * (level / local.clamp(min=least))
-    density, square = None, 0.0
-    if coloured:
-        density = mismatch(images.spline, residual * weight.sqrt()).clamp(min=least)
-        through = displaced(images.spline, images.stack, images.white)
-        square = unexplained(images.spline, mismatch(images.spline, residual), through, knots)
-        density = torch.maximum(density, square * through)
-    spline, noise = band_limited(
-        images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
-    )
-    return images._replace(
-        spline=spline, noise=noise, weight=weight, noise_updated=True, through=square
-    )
-
-
 def linearised(
     images: Images, mesh: Mesh, coefficients: torch.Tensor, settings: VariationalSettings
 ) -> Linear:
@@ -206,6 +164,11 @@ def linearised(
     time = images.time.reshape(-1, *[1] * mesh.dims)
     downhill = -(time * (value - value.mean(0))).sum(0) * slope
     informed = images.spline.efficiency * weight / variance
+    if images.coherent:
+        # changes in proportion to the structure's slope s: v = variance + coherent s^2 a pixel
+        structure = torch.stack([averaged(part, valid, STRUCTURE) for part in slope])
+        change = images.coherent * structure.square().sum(0)
+        informed = informed / (1 + change * images.weight / variance)
     second = images.time.square().sum() * informed
     information = second / images.spline.excess
     if mesh.dims == 2:

@@ -4,7 +4,7 @@ Images inform the flow within a few knots. What a strip of the image says about 
 hardly depends on what lies beyond the strip. Strips extend along y over the whole image.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -52,7 +52,8 @@ class Posterior(NamedTuple):
     """A flow after a Gauss-Newton step, with the posterior's precision there.
 
     `stiff` is the prior's part of it, `both` all of it: bands. `images` is the
-    likelihood that they are of, and its mesh.
+    likelihood that they are of, and its mesh. `response` gives the change of the coefficients by a
+    gradient (components, knots) of the log-likelihood.
     """
 
     coefficients: torch.Tensor
@@ -61,6 +62,7 @@ class Posterior(NamedTuple):
     prior: Prior
     images: tuple[Linear, Mesh]
     settings: VariationalSettings
+    response: Callable[[torch.Tensor], torch.Tensor]
 
     def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
         """By kind of motion: the variance removed by the images, and its square in the flow.
@@ -178,14 +180,18 @@ def solved(
                 total[0, :, strip.knots] += part
         return total
 
-    (change,) = conjugate_gradients(
-        lambda c: whole.apply(steep, c[0])[None],
-        gradient[None],
-        preconditioned,
-        solver.tolerance,
-        solver.steps,
-    )
-    return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings)
+    def response(right: torch.Tensor) -> torch.Tensor:
+        (change,) = conjugate_gradients(
+            lambda c: whole.apply(steep, c[0])[None],
+            right[None],
+            preconditioned,
+            solver.tolerance,
+            solver.steps,
+        )
+        return change
+
+    change = response(gradient)
+    return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings, response)
 
 
 def _root(both: torch.Tensor, part: list[Strip]) -> Factor:

@@ -11,10 +11,12 @@ import torch
 
 from lidar_mi.retrieval.velocimetry import direct, iterative, strips
 from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
+from lidar_mi.retrieval.velocimetry.coherent_change import what_is_left
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
-from lidar_mi.retrieval.velocimetry.likelihood import linearised, prepared, with_local_noise
+from lidar_mi.retrieval.velocimetry.likelihood import linearised, prepared
+from lidar_mi.retrieval.velocimetry.misfit import with_local_noise
 from lidar_mi.retrieval.velocimetry.next_flow import Flow, flow_of
 from lidar_mi.retrieval.velocimetry.prior import first_prior, refined
 from lidar_mi.retrieval.velocimetry.quality import Flag, check_between
@@ -131,7 +133,7 @@ def variational_and_flow(
     like = images.spline.coefficients[:0]
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
-    last, prior, displaced_only = len(settings.knots) - 1, None, flow
+    last, prior, displaced_only, posterior = len(settings.knots) - 1, None, flow, None
     for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
         apart = max(2.0, knots * windows.template)
         axes = [Axis(n, apart) for n in windows.shape]
@@ -150,7 +152,10 @@ def variational_and_flow(
                 linear = linearised(images, mesh, coefficients, settings)
                 displaced_only = displaced_only if turn == rounds else mesh.field(coefficients)
                 width = settings.misfit_width * windows.template
-                images = with_local_noise(images, linear, width, settings.coloured, apart)
+                left = None
+                if windows.dims == 2 and posterior is not None:
+                    left = what_is_left(linear, mesh, posterior.response)
+                images = with_local_noise(images, linear, width, settings.coloured, apart, left)
                 rough = images.single()
             linear = linearised(rough, single, coefficients.float(), settings)
             posterior = solve(linear, single, coefficients, prior, settings, turn)

@@ -10,7 +10,8 @@ import torch
 
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
-from lidar_mi.retrieval.velocimetry.likelihood import linearised, path, prepared, with_local_noise
+from lidar_mi.retrieval.velocimetry.likelihood import linearised, path, prepared
+from lidar_mi.retrieval.velocimetry.misfit import with_local_noise
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.velocimetry.warping import filtered_spline
 from tests.support.flows import plane_waves, texture

@@ -1,0 +1,112 @@
+"""Structure that moves otherwise than the air in the plane.
+
+Detects a displacement of smoke that the flow absorbs and nobody states, one that is seen in air
+that is carried exactly or in noise, and standard errors that do not hold in such smoke.
+"""
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from lidar_mi.retrieval.velocimetry import direct
+from lidar_mi.retrieval.velocimetry.coherent_change import mean_square_displacement, what_is_left
+from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
+from lidar_mi.retrieval.velocimetry.likelihood import linearised, prepared
+from lidar_mi.retrieval.velocimetry.prior import first_prior
+from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
+from tests.support.flows import plane_waves, texture
+from validation.coverage import measured
+
+SHAPE = 100, 130
+Z, Y = np.meshgrid(*(np.arange(n, dtype=float) for n in SHAPE), indexing="ij")
+
+
+def smoke(z, y):
+    """Two rings with rims some pixels wide."""
+    rings = ((50, 40, 22, 4.0), (48, 92, 18, 5.0))
+    return 1 + sum(
+        3 * np.exp(-(((np.hypot(z - z0, y - y0) - radius) / width) ** 2))
+        for z0, y0, radius, width in rings
+    )
+
+
+def displacement(seed, rms):
+    """A smooth random displacement along z and y, px, which varies over 8 px."""
+    random = np.random.default_rng(seed)
+    fields = [gaussian_filter(random.standard_normal(SHAPE), 8.0, mode="wrap") for _ in "zy"]
+    return [rms / np.sqrt(2) * field / field.std() for field in fields]
+
+
+def pair(seed, rms, fine=0.05, noise=0.0, flow=(0.0, 0.0)):
+    """Texture that moves by `flow`, on smoke that moves by a random displacement besides it."""
+    waves = plane_waves(seed, 3.0)
+    random = np.random.default_rng([seed, 1])
+    extra = displacement(seed, rms)
+    images = []
+    for t in (-0.5, 0.5):
+        z, y = Z - t * flow[0], Y - t * flow[1]
+        bright = smoke(*(a - t * e for a, e in zip((z, y), extra, strict=True)))
+        image = bright * (1 + fine * (texture(waves, y, z, contrast=1.0) - 1))
+        images.append(torch.as_tensor(image + noise * random.standard_normal(SHAPE)))
+    return images
+
+
+def estimated(images, noise=None):
+    """Rms displacement of structure, px, about the flow after one step from rest."""
+    settings = VariationalSettings()
+    axes = [Axis(n, 5.0) for n in SHAPE]
+    mesh = Mesh(axes, [torch.arange(n, dtype=torch.float64) for n in SHAPE])
+    prior = first_prior(
+        axes, mesh.fitted(torch.full((2, *SHAPE), 0.0).double()), 4.0, (1, 1), settings
+    )
+    of_images = prepared(images, noise, 0.0, settings)
+    coefficients = torch.zeros(2, *(axis.knots for axis in axes), dtype=torch.float64)
+    for _ in range(2):
+        linear = linearised(of_images, mesh, coefficients, settings)
+        posterior = direct.solved(linear, mesh, coefficients, prior, settings, 0)
+        coefficients = posterior.coefficients
+    linear = linearised(of_images, mesh, coefficients, settings)
+    left = what_is_left(linear, mesh, posterior.response)
+    return np.sqrt(mean_square_displacement(of_images, linear, left))
+
+
+def test_the_displacement_of_smoke_is_found():
+    """Of six random ones of 0.15 px, of which a rim shows the component across it.
+
+    They vary over twice the distance that the estimate assumes, and the flow follows them better:
+    the mean may be too small by 40 %.
+    """
+    rms = 0.15
+    found = np.array([estimated(pair(seed, rms)) for seed in range(11, 17)])
+    across = rms / np.sqrt(2)
+    assert 0.6 * across < found.mean() < 1.2 * across
+    assert (found > 0.4 * across).all() and (found < 1.6 * across).all()
+
+
+@pytest.mark.parametrize(("noise", "told"), [(0.0, None), (0.05, None), (0.05, 0.05)])
+def test_air_that_is_carried_has_none(noise, told):
+    found = [estimated(pair(seed, 0.0, noise=noise), told) for seed in range(21, 25)]
+    assert found == [0.0] * 4
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "advected, texture 10 %",
+        "true second state, texture 5 %",
+        pytest.param("advected, texture 5 %", marks=pytest.mark.slow),
+        pytest.param("true second state, texture 10 %", marks=pytest.mark.slow),
+    ],
+)
+def test_standard_errors_hold_in_smoke_whose_noise_is_not_given(case):
+    """Seed 51, none of those that numbers were chosen on.
+
+    They were 1.3 times too large in the first case, as fine texture looks like noise (variance
+    0.56 +- 0.07), and 1.4 times too small in the second (1.9 +- 0.3, 87 % within 1.96).
+    """
+    found = measured(case, "variational", (51,))
+    variance, error = found.variance
+    assert 0.8 < variance + 2 * error and variance - 2 * error < 1.25
+    assert found.coverage_95[0] > 0.89
+    assert found.valid > 0.98
