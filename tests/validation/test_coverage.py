@@ -25,6 +25,23 @@ def test_standard_error_of_uniform_blocks():
     assert coverage._mean_and_error(values)[1] == pytest.approx(1 / np.sqrt(blocks.size), rel=0.3)
 
 
+@pytest.mark.parametrize(("alike", "expected"), [(0.0, 12.0), (1.0, 1.0), (0.5, 12 / 6.5)])
+def test_pairs_with_a_common_error_are_few(alike, expected):
+    """Correlation between any two pairs; 4800 places leave 2 % of uncertainty."""
+    random = np.random.default_rng(3)
+    common = np.tile(random.normal(size=(1, 2, 60, 80)), (12, 1, 1, 1))
+    error = np.sqrt(alike) * common + np.sqrt(1 - alike) * random.normal(size=common.shape)
+    error[:, :, :5] = np.nan
+    found = coverage.independent_pairs(error.reshape(24, 60, 80))
+    assert found == pytest.approx(expected, rel=0.08)
+
+
+def test_errors_that_are_alike_in_all_pairs_are_not_averaged_out():
+    one = np.random.default_rng(4).normal(size=(2, 60, 80))
+    error = coverage._mean_and_error(one)[1]
+    assert coverage._mean_and_error(np.tile(one, (12, 1, 1)))[1] == pytest.approx(error)
+
+
 def test_values_that_are_not_known_do_not_count():
     values = np.full((2, 20, 20), np.nan)
     assert np.isnan(coverage._mean_and_error(values)).all()
