@@ -25,8 +25,9 @@ INTRODUCTION = (
     "should be 68 and 95 % of the errors of valid vectors, and the normalised errors should have "
     "the variance 1. The uncertainty of each number is from its scatter over blocks of the image, "
     "each with all seeds, since the wind is that of one wake; the errors of one `vortex_fit` have "
-    "ten parameters in common, and those of all seeds as much as they are alike. Bold: more than 5 points or outside 0.8 to 1.25, by more than "
-    "the uncertainty. Cases and reasons: [accuracy](accuracy.md#standard-errors-where-air-changes)."
+    "ten parameters in common, and those of all seeds as much as they are alike. Bold: more than 5 "
+    "points or outside 0.8 to 1.25, by more than the uncertainty. Cases and reasons: "
+    "[accuracy](accuracy.md#standard-errors-where-air-changes)."
 )
 
 SCENES = Path(str(files("lidar_mi.scenes")))
@@ -324,8 +325,8 @@ def independent_pairs(error: np.ndarray) -> float:
 def _mean_and_error(values: np.ndarray, most: float | None = None) -> tuple[float, float]:
     """Mean, and its standard error from the scatter of the sums over blocks.
 
-    Both components of a block in all images count as one: (images, z, y), images of v and w in turn.
-    The standard error is at least that of ``most`` independent values.
+    Both components of a block in all images count as one: (images, z, y), images of v and w in
+    turn. The standard error is at least that of ``most`` independent values.
     """
     rows, columns = (n // BLOCK * BLOCK for n in values.shape[1:])
     parts = values[:, :rows, :columns]
