@@ -209,15 +209,15 @@ def test_a_patch_of_texture_in_the_dark_is_not_there_by_chance(method):
         off = np.hypot(grid[0] - y.mean(), grid[1] - z.mean())
         puff = texture(waves, *grid) / (1 + np.exp((off - 12.5) / 1.0))
         images.append(data_array(puff + 0.01 * random.standard_normal(puff.shape), y, z))
-    wind = retrieve_wind(*images, DT, method, stride=4, noise=0.01)
+    wind = retrieve_wind(*images, DT, method, stride=4, noise=0.01, checks=False)
     valid = (wind["flag"] == 0).values
     off = np.hypot(wind["y"] - y.mean(), wind["z"] - z.mean()).transpose("z", "y").values
     assert valid[off < 8].mean() > 0.8 and not valid[off > 20].any()
     score = np.stack(
         [(wind[n] - true) / wind[f"{n}_stderr"] for n, true in (("v", 4), ("w", -3))]
     )
-    # some 20 templates that do not overlap, two components
-    assert np.mean(score[:, valid] ** 2) < 1 + 4 * np.sqrt(2 / 40)
+    # some 30 templates that do not overlap, two components
+    assert np.mean(score[:, valid] ** 2) < 1 + 4 * np.sqrt(2 / 60)
 
 
 def test_texture_behind_noise_is_not_there_by_chance():
