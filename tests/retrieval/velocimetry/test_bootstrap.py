@@ -213,9 +213,7 @@ def test_a_patch_of_texture_in_the_dark_is_not_there_by_chance(method):
     valid = (wind["flag"] == 0).values
     off = np.hypot(wind["y"] - y.mean(), wind["z"] - z.mean()).transpose("z", "y").values
     assert valid[off < 8].mean() > 0.8 and not valid[off > 20].any()
-    score = np.stack(
-        [(wind[n] - true) / wind[f"{n}_stderr"] for n, true in (("v", 4), ("w", -3))]
-    )
+    score = np.stack([(wind[n] - true) / wind[f"{n}_stderr"] for n, true in (("v", 4), ("w", -3))])
     # some 30 templates that do not overlap, two components
     assert np.mean(score[:, valid] ** 2) < 1 + 4 * np.sqrt(2 / 60)
 
