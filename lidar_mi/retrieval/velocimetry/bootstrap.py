@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
-from torch.nn.functional import grid_sample
+from torch.nn.functional import grid_sample, pad
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
@@ -30,13 +30,15 @@ from lidar_mi.retrieval.velocimetry.windows import (
 # Templates by which the residual is moved along z and y, away from the texture that it is of.
 _APART = ((2, 2), (-2, 2))
 # Standard deviations of Gaussian means over the template: of squared errors, of the residual's
-# level, of squared gradients.
-_REGION, _LEVEL, _SHEAR = 1.5, 3.0, 0.35
+# level, of squared gradients, of squared second differences, of the share of clear texture.
+_REGION, _LEVEL, _SHEAR, _ROUGH, _AROUND = 1.5, 1.25, 0.35, 0.7, 4.5
 # Independent windows of known error within those means (`_REGION`) that a variance needs: of the
 # two components of five windows, it is known to 45 %.
 _FEWEST = 5.0
-# Gradient, px per px, of a wind that is uniform.
-_UNIFORM = 0.01
+# Share of textured windows that must be clearly so: else most of them are by chance.
+_CLEAR = 0.5
+# Steps to the largest likelihood of the variances; more change no standard error by 1 %.
+_ITERATIONS = 50
 # Least standard error, px: splines do not carry an image more exactly.
 _LEAST = 1e-3
 # Times that what a window's average takes away is added.
@@ -53,6 +55,7 @@ def bootstrap_covariance(
     centred: bool,
     repeats: int = 1,
     textured: torch.Tensor | None = None,
+    clear: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Covariance of the displacements' errors, from further retrievals of a known motion.
 
@@ -68,22 +71,40 @@ def bootstrap_covariance(
       69, 298-308).
     - Image 1 is carried along paths in that wind.
     - The residual, image 2 less image 1 so carried, is moved by two templates along both axes,
-      scaled to the level (over Gaussians of 3 templates) at its new place, and added. So noise and
-      changes keep their size and correlation length, but are independent of the texture.
+      scaled to the level (over Gaussians of 1.25 templates) at its new place, and added. So noise
+      and changes keep their size and correlation length, but are independent of the texture.
 
     With e the error of a vector retrieved from this pair, where it is valid, the covariance is
 
-        C = p^2 <e e^T / p^2>,  p^2 = |grad d|^2 + median(|grad d|^2),
+        C_ij = p_i p_j <e_i e_j / (p_i p_j)>,  p_i^2 = sum_k a_k x_ki,  a_k >= 0,
 
-    <> being the mean over a Gaussian of 1.5 templates, and |grad d|^2 that over one of 0.35: shear
-    varies over shorter distances than the mean needs for enough independent errors.
+    <> being the mean over a Gaussian of 1.5 templates. That mean needs many errors, and errors vary
+    over shorter distances, as in vortex cores: that is what the variances p^2 are for. They are the
+    sum of these that makes the errors of this very pair most likely (`_most_likely`):
 
-    These numbers were chosen on seeds 41 to 43 of the cases of ``validation/coverage.py``. With one
-    iterate, the standard errors of "cc" are 7 % smaller; with a mean over 1 template the variance
-    of normalised errors is 10 to 15 % larger. The wind is not known better than its vectors: in
-    vortex cores smaller than a window, standard errors are too small. Beside a steep edge of
-    brightness that stands still (from 1 to 0.2 within 4 px) they are 3 to 6 times too large up to
-    three templates away, as what is left at the edge counts as noise there.
+    - x = 1;
+    - x = (J^-1)_ii, J the mean over the window of the products of image 1's slopes: differences of
+      the images displace a vector by J^-1 (Cramer-Rao);
+    - windows that are not deformed: (flow - d)_i^2, which the window's average takes away;
+    - windows that are (`centred`): |grad d|^4 over a Gaussian of 0.35 template, as their fit leaves
+      errors of second order in the gradient; and |D d|^2 over one of 0.7, D the sum of the
+      second differences along both axes. Of the errors e it is |D (e + G d)|^2. So errors as rough
+      as the vectors are not stated smaller than the vectors show them.
+
+    Where most windows around (Gaussian of 4.5 templates) that are textured are not `clear`, the few
+    that are passed the tests of texture by chance, and their errors tell nothing.
+
+    These predictors and numbers were chosen on seeds 41 to 46 of the cases of
+    ``validation/coverage.py``. With one iterate of the sharpening, the standard errors of "cc" are
+    4 to 7 % smaller. Where air is carried exactly, with <> over 1 template the variance of
+    normalised errors is 10 to 15 % larger, and with the level over 3 templates "multipass" has 2 to
+    3 points more errors within one standard error.
+
+    The wind is not known better than its vectors: in vortex cores smaller than a window, standard
+    errors are too small, and so they are where air changes as if it moved. On a steep edge of
+    brightness that stands still (from 1 to 0.2 within 4 px) vectors of "multipass" err by three
+    standard errors; on its bright side, up to three templates away, errors are stated 1.5 to 2
+    times too large.
 
     Parameters
     ----------
@@ -101,23 +122,27 @@ def bootstrap_covariance(
     textured : torch.Tensor of bool, shape windows.count, optional
         Windows whose errors count; left out: all. Errors of windows that hold nothing say nothing
         of their neighbours.
+    clear : torch.Tensor of bool, shape windows.count, optional
+        Windows that pass thresholds of texture half as high again; left out: all.
 
     Returns
     -------
     torch.Tensor, shape (2, 2, *windows.count)
         px^2; NaN where fewer than five independent windows around (valid retrievals, within the
-        Gaussian of 1.5 templates) have a known error.
+        Gaussian of 1.5 templates) have a known error, and where fewer than half of the textured
+        windows around are clear.
     """
     # vectors of windows that overlap by more than half would cost more and tell little
     every = max(1, windows.template // 2 // windows.stride)
     coarse = replace(windows, stride=every * windows.stride)
     d = working(found.d)[:, ::every, ::every]
     per_template = windows.template / coarse.stride
-    flow, _ = validated(d, max(1, round(per_template / 2)))
+    flow, replaced = validated(d, max(1, round(per_template / 2)))
     window = per_template / math.sqrt(12)
     everywhere = torch.ones_like(flow[0], dtype=torch.bool)
-    shear = averaged(_squared_gradient(flow) / coarse.stride**2, everywhere, _SHEAR * per_template)
-    lost = flow
+    known = everywhere if textured is None else textured[::every, ::every]
+    smooth = torch.stack([averaged(part, everywhere, window) for part in flow])
+    vectors, lost = flow, flow
     for _ in range(_SHARPENINGS):
         lost = lost - torch.stack([averaged(part, everywhere, window) for part in lost])
         flow = flow + lost
@@ -128,41 +153,113 @@ def bootstrap_covariance(
     rest = torch.where(second.isfinite(), second - carried, 0.0)
     level = averaged(rest.square(), second.isfinite(), _LEVEL * windows.template).sqrt()
     level = level.clamp(min=torch.finfo(rest.dtype).tiny)
-    scale = shear + shear.median().clamp(min=_UNIFORM**2)
-    means, number = [], torch.zeros_like(scale)
+    same = [torch.ones_like(flow), _inverse_texture(filled(first), coarse)]
+    if centred:
+        shear = averaged(_squared_gradient(vectors), everywhere, _SHEAR * per_template)
+        same.append(shear.square().expand_as(flow))
+        valid = known & ~replaced & (found.flag[::every, ::every] == 0)
+        own = [_roughness(vectors, valid, _ROUGH * per_template)]
+    else:
+        same.append((flow - vectors).square())
+        own = []
+    predictors = torch.stack([*same, *own])
+    tried, number = [], torch.zeros_like(flow[0])
+    width = _REGION * per_template
     for apart in _APART[:repeats]:
         moved = (rest / level).roll([windows.template * part for part in apart], (0, 1))
         moved = torch.where(second.isfinite(), level * moved, torch.nan)
         again = retrieve(first, carried + moved, stride=coarse.stride)
         outlier = median_outliers(again.d, 3, max(1, round(per_template / 2)))
-        use = (again.flag == 0) & ~outlier
-        if textured is not None:
-            use &= textured[::every, ::every]
+        use = (again.flag == 0) & ~outlier & known
         if not bool(use.any()):
             continue
         error = again.d - _read(wind, _places(again.d, coarse, centred))
-        products = torch.einsum("i...,j...->ij...", error, error).flatten(0, 1) / scale
-        width = _REGION * per_template
-        means += [torch.stack([averaged(p, use, width) for p in products])]
+        # the wind carried is as rough as the vectors: their mean stands for the true one
+        rough = [_roughness(_continued(error, use) + smooth, use, _ROUGH * per_template)] * len(own)
+        tried.append((error, use, torch.stack([*same, *rough])))
         number += 2 * math.pi * _REGION**2 * averaged(use.to(number), everywhere, width)
-    if not means:
+    if not tried:
         return torch.full_like(found.d[None].expand(2, -1, -1, -1), torch.nan)
+    factors = _most_likely(
+        torch.cat([x[:, :, use].flatten(1) for _, use, x in tried], 1),
+        torch.cat([error[:, use].flatten() for error, use, _ in tried]).square() + _LEAST**2,
+    )
+    means = []
+    for error, use, x in tried:
+        scaled = error / torch.tensordot(factors, x, 1).sqrt()
+        products = torch.einsum("i...,j...->ij...", scaled, scaled).flatten(0, 1)
+        means.append(torch.stack([averaged(p, use, width) for p in products]))
+    scale = torch.tensordot(factors, predictors, 1).sqrt()
+    covariance = torch.stack(means).mean(0).unflatten(0, (2, 2)) * scale[:, None] * scale[None]
+    if clear is not None:
+        part = averaged(clear[::every, ::every].to(scale), known, _AROUND * per_template)
+        number = torch.where(part < _CLEAR, 0.0, number)
     weights = [
         linear_weights(*(frame.centres(axis).to(d) for frame in (coarse, windows)))
         for axis in (0, 1)
     ]
-    covariance = separable(torch.stack(means).mean(0) * scale, weights).unflatten(0, (2, 2))
+    covariance = separable(covariance, weights)
     covariance[:, :, separable(number, weights) < _FEWEST] = torch.nan
     return covariance + _LEAST**2 * torch.eye(2).to(d)[:, :, None, None]
 
 
+def _most_likely(predictors: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
+    """Factors a >= 0 by which the variances a x make squared errors of normal errors most likely.
+
+    Of predictors x (k, n) and squares e^2 (n,): the minimum of sum(ln s + e^2 / s), s = sum a_k
+    x_k, by multiplicative steps that never increase it (Févotte & Idier 2011, Neural Comput. 23,
+    2421-2456, majorisation and minimisation for beta = 0).
+    """
+    tiny = torch.finfo(predictors.dtype).tiny ** 0.25
+    unit = predictors.mean(1).clamp(min=tiny)
+    size = squares.mean().clamp(min=tiny)
+    x, y = predictors / unit[:, None], squares / size
+    a = torch.full_like(unit, 1 / len(unit))
+    for _ in range(_ITERATIONS):
+        s = (a @ x).clamp(min=tiny)
+        a = a * ((x @ (y / s.square())) / (x @ (1 / s)).clamp(min=tiny)).sqrt()
+    return a * size / unit
+
+
+def _inverse_texture(image: torch.Tensor, windows: Windows) -> torch.Tensor:
+    """Diagonal (2, *windows.count) of the inverse mean product of an image's slopes, px^2."""
+    slopes = torch.stack(torch.gradient(image))
+    j = torch.einsum("i...,j...->...ij", *[slopes] * 2).movedim((-2, -1), (0, 1))
+    j = windows.of_templates(j).movedim((0, 1), (-2, -1))
+    # windows with nothing in them are in no mean, but must not be infinite
+    least = 1e-6 * j.diagonal(dim1=-2, dim2=-1).mean().clamp(min=torch.finfo(j.dtype).tiny ** 0.25)
+    inverse = torch.linalg.inv(j + least * torch.eye(2).to(j))
+    return inverse.diagonal(dim1=-2, dim2=-1).movedim(-1, 0)
+
+
 def _squared_gradient(flow: torch.Tensor) -> torch.Tensor:
     """Sum of the squared differences per vector of all components along both axes."""
-    total = torch.zeros_like(flow[0])
-    for axis in (1, 2):
-        if flow.shape[axis] > 1:
-            total += torch.gradient(flow, dim=axis)[0].square().sum(0)
-    return total
+    return torch.stack([_slope(flow, axis).square().sum(0) for axis in (1, 2)]).sum(0)
+
+
+def _roughness(flow: torch.Tensor, use: torch.Tensor, width: float) -> torch.Tensor:
+    """Gaussian mean of the squared second differences, the same for both components (2, z, y).
+
+    Of vectors that are in use with their neighbours two vectors away, which have pixels of their
+    own.
+    """
+    bend = torch.stack([_slope(_slope(flow, axis), axis) for axis in (1, 2)]).sum(0)
+    wide = pad(use, (2, 2, 2, 2), value=True)
+    around = [wide[4:, 2:-2], wide[:-4, 2:-2], wide[2:-2, 4:], wide[2:-2, :-4]]
+    mean = averaged(bend.square().mean(0), torch.stack([use, *around]).all(0), width)
+    return mean.expand_as(flow)
+
+
+def _continued(field: torch.Tensor, use: torch.Tensor) -> torch.Tensor:
+    """A field (n, z, y) with the mean of what is around where it is not in use."""
+    return torch.stack([torch.where(use, part, averaged(part, use, 1.0)) for part in field])
+
+
+def _slope(field: torch.Tensor, axis: int) -> torch.Tensor:
+    """Differences per vector, zero along an axis with a single one."""
+    if field.shape[axis] < 2:
+        return torch.zeros_like(field)
+    return torch.gradient(field, dim=axis)[0]
 
 
 def _at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Tensor:

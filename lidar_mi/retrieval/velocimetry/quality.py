@@ -46,7 +46,7 @@ class Flag(enum.IntFlag):
     RESAMPLED = 4096
     """What resampling of scattered beams lost exceeds the noise (`resampling_error`)."""
     ERROR_UNKNOWN = 8192
-    """Too few valid vectors around it to state a standard error (`bootstrap`)."""
+    """Too few valid vectors around it, or too few clearly textured, to state one (`bootstrap`)."""
 
 
 def check_between(name: str, value: float, low: float, high: float) -> None:
@@ -58,6 +58,8 @@ def check_between(name: str, value: float, low: float, high: float) -> None:
 # A Sobel derivative, scaled to give the slope of a ramp, passes 3/16 of the variance of white
 # noise: (1/2) from the difference times (1 + 4 + 1) / 16 from the smoothing across it.
 _SOBEL_NOISE = 3 / 16
+# By which texture exceeds its thresholds that exceeds them clearly.
+_MARGIN = 1.5
 # Standard error, px, that is no reason to reject a vector in any wind.
 _SMALL = 0.05
 
@@ -174,6 +176,20 @@ def low_texture(
         | (squared < 2 * _SOBEL_NOISE * variance)
     )
     return found, low
+
+
+def clearly_textured(
+    texture: Texture, min_texture: float, min_isotropy: float = 0.0
+) -> torch.Tensor:
+    """Where the texture passes thresholds half as high again, bool of shape `windows.count`.
+
+    Slope and isotropy of a template are estimates from a few correlation lengths. Where the air's
+    own are below the thresholds, some templates pass by chance, and most of these by little. Their
+    errors are not those of templates whose texture is as good as it seems. An isotropy above 1/2
+    counts half way to 1. The noise, which is known, needs no margin.
+    """
+    isotropy = min(_MARGIN * min_isotropy, (1 + min_isotropy) / 2)
+    return (texture.slope > _MARGIN * min_texture) & (texture.isotropy >= isotropy)
 
 
 def uncertain(covariance: torch.Tensor, limit: float = 0.5) -> torch.Tensor:

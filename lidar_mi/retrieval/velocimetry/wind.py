@@ -22,7 +22,14 @@ from lidar_mi.retrieval.velocimetry.outliers import (
     MEDIAN_THRESHOLD,
     median_outliers,
 )
-from lidar_mi.retrieval.velocimetry.quality import Flag, filled, low_texture, non_finite, uncertain
+from lidar_mi.retrieval.velocimetry.quality import (
+    Flag,
+    clearly_textured,
+    filled,
+    low_texture,
+    non_finite,
+    uncertain,
+)
 from lidar_mi.retrieval.velocimetry.relation import unrelated
 from lidar_mi.retrieval.velocimetry.rest import all_at_rest, nothing_at_rest
 from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
@@ -202,9 +209,10 @@ def retrieve_wind(
             if found.covariance is not None:
                 flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
             pair = [first, second]
+            clear = clearly_textured(texture, min_texture, min_isotropy)
             covariance = (
                 bootstrap_covariance(
-                    pair, found, windows, find, chosen.centred, chosen.repeats, ~low
+                    pair, found, windows, find, chosen.centred, chosen.repeats, ~low, clear
                 )
                 if standard_errors
                 else None

@@ -10,6 +10,7 @@ import torch
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.velocimetry.quality import (
     Flag,
+    clearly_textured,
     low_texture,
     non_finite,
     texture,
@@ -43,6 +44,19 @@ def test_diagonal_stripes_have_no_texture():
     y, z = np.meshgrid(np.arange(64.0), np.arange(48.0))
     found = texture(torch.as_tensor(1 + 0.3 * np.cos(0.6 * (y + z))), WINDOWS)
     assert found.slope.max() < 1e-6 and found.isotropy.max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("isotropy", "clear"), [(0.0, True), (0.3, True), (0.4, False), (0.6, False), (1.0, False)]
+)
+def test_clear_texture_passes_thresholds_half_as_high_again(isotropy, clear):
+    """Isotropy 0.5 is 1.5 times 0.33; of thresholds above 1/2 it is half way to 1."""
+    found = texture(crossed(0.2, 0.1), WINDOWS)
+    slope = float(found.slope.min())
+    assert bool((clearly_textured(found, slope / 1.6, isotropy) == clear).all())
+    assert not bool(clearly_textured(found, slope / 1.4, isotropy).any())
+    even = texture(crossed(0.1, 0.1), WINDOWS)._replace(isotropy=torch.tensor([0.79, 0.81]))
+    assert clearly_textured(even._replace(slope=torch.ones(2)), 0.0, 0.6).tolist() == [False, True]
 
 
 def test_noise_passes_three_sixteenths():
