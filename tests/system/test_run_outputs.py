@@ -144,6 +144,11 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
     }
     expected |= {f"true_wind.{part}rms_{q}" for part in ("", "outside_cores.") for q in "vw"}
     expected |= {f"timing.{step}_s" for step in ("truth", "render", "retrieve", "figures")}
+    # no vector of smooth smoke is valid: what is of valid vectors is left out
+    smooth = "extinction_without_texture.cc."
+    assert metrics[f"{smooth}valid_fraction"] == 0
+    expected -= {f"{smooth}{part}{s}" for part in ("", "outside_cores.") for s in STATISTICS}
+    expected -= {f"{smooth}{q}" for q in ("stderr_v", "stderr_w", "no_skill_fraction")}
     assert set(metrics) == expected
 
 

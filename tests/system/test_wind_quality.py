@@ -56,6 +56,9 @@ def test_the_readme_states_the_demo_s_numbers(demo):
         source, _, statistic = rows[cells[0]].rpartition(".")
         keys = [f"{source}.{part}{statistic}_{q}" for part in ("", "outside_cores.") for q in "vw"]
         for key, cell in zip(keys, cells[1:5], strict=True):
+            if cell == "-":
+                assert key not in demo.metrics, key
+                continue
             rounding = 0.5 * 10.0 ** -len(cell.partition(".")[2])
             assert float(cell) == pytest.approx(demo.metrics[key], abs=0.02 + rounding), key
         if cells[5]:
@@ -80,7 +83,10 @@ def test_more_texture_never_makes_winds_worse(demo):
     levels = (0, 2, 5, 10, 20, 40)
     for name, sign in (("rmse_v", -1), ("rmse_w", -1), ("valid_fraction", 1)):
         values = [demo.metrics[f"texture_sweep.{level}_percent.{name}"] for level in levels]
-        assert (sign * np.diff(values) > 0).all(), (name, values)
+        # no vector of smooth smoke is valid
+        first = 1 if name == "valid_fraction" else 0
+        assert (sign * np.diff(values[first:]) > 0).all(), (name, values)
+    assert values[:2] == [0.0, 0.0]
 
 
 def test_winds_from_backscatter(demo):

@@ -37,7 +37,8 @@ _REGION, _LEVEL, _SHEAR, _ROUGH, _AROUND = 1.5, 1.25, 0.35, 0.7, 4.5
 _FEWEST = 5.0
 # Share of textured windows that must be clearly so: else most of them are by chance.
 _CLEAR = 0.5
-# Steps to the largest likelihood of the variances; more change no standard error by 1 %.
+# Steps to the largest likelihood of the variances. A thousand change standard errors by 3 % or less
+# in the median, of single vectors by up to a quarter: of factors that vanish, slowly.
 _ITERATIONS = 50
 # Least standard error, px: splines do not carry an image more exactly.
 _LEAST = 1e-3
@@ -86,10 +87,10 @@ def bootstrap_covariance(
     - x = (J^-1)_ii, J the mean over the window of the products of image 1's slopes: differences of
       the images displace a vector by J^-1 (Cramer-Rao);
     - windows that are not deformed: (flow - d)_i^2, which the window's average takes away;
-    - windows that are (`centred`): |grad d|^4 over a Gaussian of 0.35 template, as their fit leaves
-      errors of second order in the gradient; and |D d|^2 over one of 0.7, D the sum of the
-      second differences along both axes. Of the errors e it is |D (e + G d)|^2. So errors as rough
-      as the vectors are not stated smaller than the vectors show them.
+    - windows that are (`centred`): the square of |grad d|^2 over a Gaussian of 0.35 template, as
+      their fit leaves errors of second order in the gradient; and |D d|^2 over one of 0.7, D the
+      sum of the second differences along both axes. Of the errors e it is |D (e + G d)|^2: where
+      vectors are rougher than the errors of the known motion, larger errors are stated.
 
     Where most windows around (Gaussian of 4.5 templates) that are textured are not `clear`, the few
     that are passed the tests of texture by chance, and their errors tell nothing.
