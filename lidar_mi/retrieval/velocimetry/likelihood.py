@@ -190,7 +190,18 @@ def linearised(
 ) -> Linear:
     """The log-likelihood about a flow; `mesh` is that of the pixels."""
     places = path(mesh, coefficients, images.time, settings.path_order)
-    value, *slopes = images.spline.sample(*places)
+    return linearised_there(images, mesh, places, images.spline.sample(*places), settings)
+
+
+def linearised_there(
+    images: Images,
+    mesh: Mesh,
+    places: torch.Tensor,
+    sampled: Sequence[torch.Tensor],
+    settings: VariationalSettings,
+) -> Linear:
+    """`linearised`, with the images' values and slopes at the places of `path`."""
+    value, *slopes = sampled
     valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
     value, gain = of_one_brightness(value, images.weight * valid)
     slope = torch.stack([(gain * part).mean(0) for part in slopes])

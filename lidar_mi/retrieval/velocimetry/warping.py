@@ -51,6 +51,14 @@ class Spline(NamedTuple):
     noisy_slopes: float
     settings: FilterSettings
 
+    def only(self, number: int) -> "Spline":
+        """That of one of the images."""
+        return self._replace(coefficients=self.coefficients[number : number + 1])
+
+    def beside(self, other: "Spline") -> "Spline":
+        """With the images of another one after the same filter."""
+        return self._replace(coefficients=torch.cat([self.coefficients, other.coefficients]))
+
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
         """A field on the images' pixels after the images' filter; it is zero beyond them."""
         margin = self.settings.margin

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from benchmarks.cases import DT, SPACING, drifting_pair_images
-from lidar_mi.retrieval.velocimetry.direct import solved, solved_in_single
+from lidar_mi.retrieval.velocimetry.direct import pull_of, solved, solved_in_single
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import linearised
 from lidar_mi.retrieval.velocimetry.next_flow import next_flow
@@ -62,17 +62,17 @@ def test_a_step_with_a_factor_in_single_precision(slabs, learnt):
     start = 0.9 * flow.coefficients
     linear = linearised(flow.images, mesh, start, flow.settings)
     exact = solved(linear, mesh, start, flow.prior, flow.settings, 0)
-    found = solved_in_single(linear, mesh, start, flow.prior, flow.settings)
-    assert found.root.root.dtype == torch.float32
+    pull = pull_of(flow.prior, start, flow.settings.ridge)
+    found = solved_in_single(linear, mesh, start, pull)
+    assert found.root.lower.dtype == np.float32
     stderr = learnt[0].covariance.diagonal().sqrt().median()
     off = mesh.field(found.coefficients - exact.coefficients)
     assert float(off.abs().max()) < 0.05 * float(stderr)
     assert float(off.square().mean().sqrt()) < 0.01 * float(stderr)
     # stronger by far than single precision resolves beside the data
     stiff = flow.prior._replace(local=1e12 * flow.prior.local)
-    assert (
-        solved_in_single(linear, mesh, start, stiff, flow.settings).root.root.dtype == torch.float64
-    )
+    pull = pull_of(stiff, start, flow.settings.ridge)
+    assert solved_in_single(linear, mesh, start, pull).root.lower.dtype == np.float64
 
 
 def test_the_same_images_again_give_the_same_flow(slabs, learnt):
