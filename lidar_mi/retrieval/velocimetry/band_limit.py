@@ -163,10 +163,15 @@ def checked_noise(noise: float | None) -> None:
 
 def odd_fast_len(least: int) -> int:
     """A length, fast to transform, at which no wave is its own mirror image."""
-    size = scipy.fft.next_fast_len(least, real=True)
+    size = scipy.fft.next_fast_len(least)
     while size % 2 == 0:
-        size = scipy.fft.next_fast_len(size + 1, real=True)
+        size = scipy.fft.next_fast_len(size + 1)
     return size
+
+
+def even_fast_len(least: int) -> int:
+    """A length of the fastest transforms: a multiple of 16."""
+    return 16 * scipy.fft.next_fast_len(-(-least // 16))
 
 
 def frequencies(sizes: Sequence[int], like: torch.Tensor) -> list[torch.Tensor]:
