@@ -56,7 +56,7 @@ def test_the_wind_is_by_the_most_accurate_method(images):
     assert valid.mean() > 0.9
     off = wind["v"] - images.v.interp(y=wind["y"], z=wind["z"])
     assert float(off.where(valid).std()) < 0.5
-    assert set(seconds) == {"vortices", "wind", "total"}
+    assert set(seconds) == {"vortices", "wind_before", "wind", "total"}
 
 
 def test_the_next_slab_starts_from_the_last_one():
