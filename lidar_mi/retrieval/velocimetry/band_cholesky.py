@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.flow_spline import REACH, Mesh
@@ -61,17 +61,64 @@ class BandCholesky(NamedTuple):
         return found.reshape(there.shape)
 
 
-def cholesky(form: torch.Tensor) -> BandCholesky | None:
-    """Factor of a form, a band of shape (2, 2, 7, Z, 4, Y); None if it is not positive definite."""
+def packed(form: torch.Tensor) -> np.ndarray:
+    """A form (2, 2, 7, Z, 4, Y) as LAPACK stores a band matrix: lower diagonals, in its precision.
+
+    Of shape (1 + bandwidth, coefficients).
+    """
     rows, columns = form.shape[3], form.shape[5]
     values = form.detach().cpu().numpy()
-    (factor,) = get_lapack_funcs(("pbtrf",), (values,))
     _, (source, target) = _places(rows, columns)
-    below = _bandwidth(rows)
-    lower = np.zeros((2 * rows * columns, below + 1), values.dtype)
+    lower = np.zeros((2 * rows * columns, _bandwidth(rows) + 1), values.dtype)
     lower.reshape(-1)[target] = values.reshape(-1)[source]
-    lower, info = factor(lower.T, lower=True, overwrite_ab=True)
-    return None if info else BandCholesky(lower, rows, columns)
+    return lower.T
+
+
+def cholesky(form: torch.Tensor) -> BandCholesky | None:
+    """Factor of a form, a band of shape (2, 2, 7, Z, 4, Y); None if it is not positive definite."""
+    lower = packed(form)
+    (factor,) = get_lapack_funcs(("pbtrf",), (lower,))
+    lower, info = factor(lower, lower=True, overwrite_ab=True)
+    return None if info else BandCholesky(lower, form.shape[3], form.shape[5])
+
+
+def solved_near(
+    root: BandCholesky, form: torch.Tensor, right: torch.Tensor, left: float, most: int
+) -> torch.Tensor | None:
+    """Solution for a form near that of a factor, by conjugate gradients from that of the factor.
+
+    Parameters
+    ----------
+    root : BandCholesky
+        Of a similar form: the preconditioner.
+    form : torch.Tensor
+        A band (2, 2, 7, Z, 4, Y); products with it are in the factor's precision.
+    right : torch.Tensor, shape (2, Z, Y)
+    left : float
+        Of the right hand side, how much the residual may be.
+    most : int
+        Products with the form; None if these leave more.
+    """
+    kind = root.lower.dtype
+    lower = packed(form).astype(kind, copy=False)
+    (product,) = get_blas_funcs(("sbmv",), (lower,))
+    (solve,) = get_lapack_funcs(("pbtrs",), (lower,))
+    rest = right.detach().cpu().permute(2, 1, 0).reshape(-1).numpy().astype(kind)
+    enough = left * np.linalg.norm(rest)
+    found, along, before = np.zeros_like(rest), None, 0.0
+    for _ in range(most):
+        nearer, _ = solve(root.lower, rest, lower=True)
+        energy = float(rest @ nearer)
+        along = nearer if along is None else nearer + energy / before * along
+        pushed = product(len(lower) - 1, 1.0, lower, along, lower=True)
+        part = energy / float(along @ pushed)
+        found += part * along
+        rest -= part * pushed
+        before = energy
+        if not np.linalg.norm(rest) > enough:
+            shape = root.columns, root.rows, 2
+            return torch.as_tensor(found).reshape(shape).permute(2, 1, 0).to(right)
+    return None
 
 
 def spread_half(band: torch.Tensor, mesh: Mesh) -> torch.Tensor:

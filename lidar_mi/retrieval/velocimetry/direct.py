@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 
 from lidar_mi.retrieval.velocimetry.band import Band, form, spread
-from lidar_mi.retrieval.velocimetry.band_cholesky import BandCholesky, cholesky
+from lidar_mi.retrieval.velocimetry.band_cholesky import BandCholesky, cholesky, solved_near
 from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.flow_spline import REACH, Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import Linear
@@ -18,6 +18,8 @@ _ROUNDING = 1e-14
 
 # Residual over the right hand side that a step with a factor in single precision may leave.
 _SINGLE = 1e-3
+# Products with a form until conjugate gradients from a similar one are given up.
+_TURNS = 12
 
 
 # Least information over second derivative at which steps take the information: each then leaves
@@ -94,40 +96,37 @@ def pull_of(prior: Prior, coefficients: torch.Tensor, ridge: float) -> Pull:
     return Pull(stiff, whole, stiff).at(prior, coefficients)
 
 
-class SingleStep(NamedTuple):
-    """A flow after a step by `solved_in_single`, the factor of the step, and the prior's form."""
-
-    coefficients: torch.Tensor
-    root: BandCholesky
-    stiff: torch.Tensor
-
-
 def solved_in_single(
-    linear: Linear, mesh: Mesh, coefficients: torch.Tensor, pull: Pull
-) -> SingleStep:
-    """A step with a factor in single precision; its residual is looked at in double precision.
+    linear: Linear,
+    mesh: Mesh,
+    coefficients: torch.Tensor,
+    pull: Pull,
+    near: BandCholesky | None = None,
+) -> torch.Tensor:
+    """Coefficients after a step in single precision; its residual is looked at in double precision.
 
-    Where there is no such factor, or the residual is not small, all is in double precision. The
-    factor is that of the step: `informed` gives that of the precision.
+    By conjugate gradients from the factor of a form that is `near` the step's own, or by the factor
+    of that. Where there is no such factor, or the residual is not small, all is in double
+    precision.
     """
     gradient = mesh.transposed(linear.gradient) + pull.gradient
     whole = (data_form if informative(linear) else curvature)(linear, mesh) + pull.whole
+    if near is not None:
+        step = solved_near(near, whole, gradient, _SINGLE, _TURNS)
+        if step is not None:
+            return coefficients + step
     root = cholesky(whole.float())
     if root is not None:
         step = root.solve(gradient)
         left = gradient - _band(mesh).apply(whole, step)
         if bool(left.norm() <= _SINGLE * gradient.norm()):
-            return SingleStep(coefficients + step, root, pull.whole)
-    root = _in_double(whole)
-    return SingleStep(coefficients + root.solve(gradient), root, pull.whole)
+            return coefficients + step
+    return coefficients + _in_double(whole).solve(gradient)
 
 
-def informed(step: SingleStep, linear: Linear, mesh: Mesh) -> SingleStep:
-    """The same with the factor of the precision."""
-    if informative(linear):
-        return step
-    whole = data_form(linear, mesh) + step.stiff
-    return step._replace(root=cholesky(whole.float()) or _in_double(whole))
+def factor_in_single(form: torch.Tensor) -> BandCholesky:
+    """Factor of a form in single precision, or in double where there is none."""
+    return cholesky(form.float()) or _in_double(form)
 
 
 def _in_double(form: torch.Tensor) -> BandCholesky:

@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 import torch
 
 from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
-from lidar_mi.retrieval.velocimetry.band_cholesky import spread_half
+from lidar_mi.retrieval.velocimetry.band_cholesky import BandCholesky, spread_half
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.brightness import normalised
+from lidar_mi.retrieval.velocimetry.band import form
 from lidar_mi.retrieval.velocimetry.direct import (
     Posterior,
     Pull,
-    informed,
+    factor_in_single,
     pull_of,
     solved_in_single,
 )
@@ -21,9 +22,11 @@ from lidar_mi.retrieval.velocimetry.flow_spline import Mesh, interpolated
 from lidar_mi.retrieval.velocimetry.likelihood import (
     Images,
     Linear,
+    information_near,
     linearised,
     linearised_there,
     path,
+    told_by_first,
     usable_and_weight,
 )
 from lidar_mi.retrieval.velocimetry.prior import Prior
@@ -158,6 +161,12 @@ class Awaited:
     first : tuple of torch.Tensor, shape (1, z, y)
         Value and slopes of the first image there.
     pull : Pull
+    root : BandCholesky
+        Factor of the precision of the flow, by the information that the first image shows.
+    covariance : torch.Tensor, shape (2, 2, *windows.count)
+        Of the flow by it, px^2.
+    information : torch.Tensor, shape (z, y)
+        On both components, see `information_near`.
     """
 
     start: Flow
@@ -167,6 +176,9 @@ class Awaited:
     places: torch.Tensor
     first: tuple[torch.Tensor, ...]
     pull: Pull
+    root: BandCholesky
+    covariance: torch.Tensor
+    information: torch.Tensor
 
 
 def awaited(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None) -> Awaited:
@@ -175,15 +187,16 @@ def awaited(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None
     images = _prepared(placed, first, noise)
     mesh = Mesh(placed.prior.mesh.axes, _pixels(start.windows, images.spline.coefficients))
     places = path(mesh, start.coefficients.float(), images.time, start.settings.path_order)
-    return Awaited(
-        start,
-        placed,
-        mesh,
-        images,
-        places,
-        images.spline.sample(*places[:, :1]),
-        pull_of(placed.prior, start.coefficients, start.settings.ridge),
-    )
+    sampled = images.spline.sample(*places[:, :1])
+    slope, told = told_by_first(images, mesh, places, sampled, len(images.time))
+    pull = pull_of(placed.prior, start.coefficients, start.settings.ridge)
+    root = factor_in_single(form(told * slope[:, None] * slope, mesh) + pull.whole)
+    # the recursion for the inverse damps rounding: 1e-5 in single precision
+    inverse = root.covariance().float()
+    in_single = Mesh(placed.prior.mesh.axes, _centres(start.windows, inverse))
+    covariance = spread_half(inverse, in_single).to(start.coefficients)
+    near = information_near(slope, told, mesh)
+    return Awaited(start, placed, mesh, images, places, sampled, pull, root, covariance, near)
 
 
 def next_flow(
@@ -219,9 +232,9 @@ def next_flow(
         if turn:
             linear = linearised(images, mesh, coefficients.float(), settings)
             pull = pull.at(prior, coefficients)
-        posterior = solved_in_single(linear, mesh, coefficients, pull)
-        step = mesh.field((posterior.coefficients - coefficients).float())
-        coefficients = posterior.coefficients
+        after = solved_in_single(linear, mesh, coefficients, pull, ready.root)
+        step = mesh.field((after - coefficients).float())
+        coefficients = after
         far = float(step.abs().flatten().kthvalue(int(0.99 * step.numel())).values)
         if far < _SMALL:
             break
@@ -229,16 +242,28 @@ def next_flow(
     more = _energy(prior, coefficients) / start.energy
     if not (far < _SMALL and 1 / _MISFIT < worse < _MISFIT and 1 / _ENERGY < more < _ENERGY):
         return None
-    root = informed(posterior, linear, mesh).root
     at_centres = Mesh(prior.mesh.axes, _centres(windows, coefficients))
-    # the recursion for the inverse damps rounding: 1e-5 in single precision
-    inverse = root.covariance().float()
-    in_single = Mesh(prior.mesh.axes, _centres(windows, inverse))
-    covariance = worse * spread_half(inverse, in_single).to(coefficients)
+    covariance = worse * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
     found = found._replace(flag=found.flag | unskilled(found.d, covariance))
     return found, replace(start, coefficients=coefficients)
+
+
+def _as_informed(ready: Awaited, linear: Linear) -> torch.Tensor:
+    """The covariance (2, 2, *windows.count) by the information of all images.
+
+    That by the first one, changed as the information near each window differs. With a fraction f of
+    the variance before that the images removed, and r times the information, it changes by
+    1 / (1 + f (r - 1)).
+    """
+    found, before, windows = ready.covariance, ready.placed.before, ready.start.windows
+    known = information_near(linear.slope, linear.information, ready.mesh)
+    ratio = (known / ready.information.clamp(min=1e-30)).to(found)
+    pixels, centres = _pixels(windows, found), _centres(windows, found)
+    ratio = interpolated(ratio, pixels, centres)
+    removed = 1 - found.diagonal().sum(-1) / before.diagonal().sum(-1)
+    return found / (1 + removed.clamp(0, 1) * (ratio - 1))
 
 
 def _pixels(windows: Windows, like: torch.Tensor) -> list[torch.Tensor]:
