@@ -1,7 +1,7 @@
 """From two images of a slab of air to its wind and its vortices, fast enough to be flown with."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import NamedTuple

@@ -118,9 +118,7 @@ class SlabWinds:
         """
         return partial(self._awaits, slab, before)
 
-    def begun(
-        self, second: xr.DataArray, complete: Complete | None = None
-    ) -> Callable[[], Found]:
+    def begun(self, second: xr.DataArray, complete: Complete | None = None) -> Callable[[], Found]:
         """The wind of the slab that is awaited, retrieved when it is asked for.
 
         Parameters
@@ -189,11 +187,13 @@ def _moved(flow: Flow, slab: FirstImage, before: VortexPairFit, learnt: VortexPa
     moved = then.clone()
     for places, by in zip(_PLACES, shift, strict=True):
         moved[places] += by
-    nodes = torch.meshgrid(z, y, indexing="ij")[::-1]
+    # displacements to 1e-5 px
+    nodes = torch.meshgrid(z.float(), y.float(), indexing="ij")[::-1]
     v, w = (
         a - b
         for a, b in zip(
-            *(model_wind(theta, *nodes, pair.profile) for theta in (now, moved)), strict=True
+            *(model_wind(theta.float(), *nodes, pair.profile) for theta in (now, moved)),
+            strict=True,
         )
     )
     change = torch.stack([w * slab.dt / step[0], v * slab.dt / step[1]])
@@ -218,9 +218,7 @@ class InOwnProcess:
         """As `SlabWinds.awaits`; done from now on."""
         return self._pool.submit(_awaits, slab, before).result
 
-    def begun(
-        self, second: xr.DataArray, complete: Complete | None = None
-    ) -> Callable[[], Found]:
+    def begun(self, second: xr.DataArray, complete: Complete | None = None) -> Callable[[], Found]:
         """As `SlabWinds.begun`; retrieved and completed from now on."""
         return self._pool.submit(_found, second, complete).result
 

@@ -262,9 +262,7 @@ def told_by_first(
     return slope, second * share.square() * images.spline.excess
 
 
-def information_near(
-    slope: torch.Tensor, information: torch.Tensor, mesh: Mesh
-) -> torch.Tensor:
+def information_near(slope: torch.Tensor, information: torch.Tensor, mesh: Mesh) -> torch.Tensor:
     """Information on both components about each pixel: the mean that the flow's splines see."""
     told = information * slope.square().sum(0)
     return averaged(told, torch.ones_like(told, dtype=torch.bool), _width(mesh))

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import torch
 
 from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
+from lidar_mi.retrieval.velocimetry.band import form
 from lidar_mi.retrieval.velocimetry.band_cholesky import BandCholesky, spread_half
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.band import form
 from lidar_mi.retrieval.velocimetry.direct import (
     Posterior,
     Pull,

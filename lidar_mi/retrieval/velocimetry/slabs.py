@@ -47,9 +47,10 @@ def wind_of_slab(
     dt : float
         s.
     start : Flow or Awaited, optional
-        The flow expected, see `Flow.moved`, or what `awaited_wind` made of it and of image 1: the retrieval starts there, with the prior and the
-        noise learnt before, and from scratch only where the images do not fit to these. They are
-        not searched again for structure at rest, changes of illumination and unrelated air.
+        The flow expected, see `Flow.moved`, or what `awaited_wind` made of it and of image 1: the
+        retrieval starts there, with the prior and the noise learnt before, and from scratch only
+        where the images do not fit to these. They are not searched again for structure at rest,
+        changes of illumination and unrelated air.
     **options
         Of `retrieve_wind`.
 

@@ -16,8 +16,8 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
-from lidar_mi.retrieval.velocimetry.beam_times import checked_times
 from lidar_mi.retrieval.velocimetry.band_limit import best_filter
+from lidar_mi.retrieval.velocimetry.beam_times import checked_times
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
@@ -307,9 +307,7 @@ def _begun(
     return begun(start, make.single(), step_limits(y, z, profile, dt))
 
 
-def _completed(
-    ready: Begun, image1: torch.Tensor, image2: torch.Tensor
-) -> VortexPairFit | None:
+def _completed(ready: Begun, image1: torch.Tensor, image2: torch.Tensor) -> VortexPairFit | None:
     """The fit near the expected pair; None if it is not accepted or does not agree with it."""
     finite, make = torch.isfinite(image2), ready.make
     second = normalised([image1, image2])[1].nan_to_num(0.0) / make.contrast

@@ -35,7 +35,7 @@ _INTERPOLATION = 1e-4
 # Width (px) of the Gaussian over which the misfit is averaged to the variance at a place.
 _LOCAL = 6.0
 # Core radii about the cores within which a change of the pair bends paths.
-_NEAR_CORES = 3.0
+_NEAR_CORES = 2.0
 # Gain 1 and offset 0 of image 2 over image 1, no change of either along y and z.
 SAME_BRIGHTNESS = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 

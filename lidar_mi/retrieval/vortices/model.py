@@ -204,7 +204,9 @@ def _turning(theta, y, z) -> torch.Tensor:
     for first in (0, 4):
         dy, dz = y - theta[first + 2], z - theta[first + 3]
         # that of a vortex without a core, and in the core's middle
-        square = torch.addcmul(dy * dy, dz, dz).clamp(min=(2 * theta[first + 1]).exp() / _LAMB_OSEEN)
+        square = torch.addcmul(dy * dy, dz, dz).clamp(
+            min=(2 * theta[first + 1]).exp() / _LAMB_OSEEN
+        )
         total = total + theta[first].abs() / (2 * torch.pi) / square
     return total
 
