@@ -142,9 +142,9 @@ def fit_near(
                 return None
             far = _displaced(found.parameters - theta, misfit, make)
             theta = found.parameters
-            if far < max(_CLOSE, blur):
+            if far < _CLOSE * max(1.0, 2 * blur):
                 break
-    white = make(*_WHITE)
+    white, close = make(*_WHITE), False
     for _ in range(_ROUNDS):
         views = [known[0], white.view(1, known[1])] if known else white.views(theta)
         misfit, known = white.misfit(theta, views), None
@@ -152,9 +152,11 @@ def fit_near(
         plain = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
         if plain is None:
             return None
-        if _leaves(plain, theta, misfit, make) > _LEFT:
+        # where air changes, the weights of the estimates below lead elsewhere
+        if not close and _leaves(plain, theta, misfit, make) > _LEFT:
             theta = plain.parameters
             continue
+        close = True
         beyond = white.curved(misfit, views, theta, plain.parameters)
         misfit = misfit._replace(residual=misfit.residual + beyond)
         left = plain.misfit._replace(residual=plain.misfit.residual + beyond)
