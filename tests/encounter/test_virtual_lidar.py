@@ -223,7 +223,14 @@ def test_both_lidars_give_three_components():
             off = (wind[name].values - true) / wind[f"{name}_stderr"].values
             squares[name].append(np.mean(off[valid] ** 2))
             np.testing.assert_array_equal(wind[name], same.wind[name])
-        assert set(estimate.seconds) == {"vortices", "wind", "lines", "combination", "total"}
+        assert set(estimate.seconds) == {
+            "lines",
+            "wind_before",
+            "vortices",
+            "wind",
+            "combination",
+            "total",
+        }
         assert estimate.lines.sizes["line"] == 12
     for name, found in squares.items():
         assert 0.1 < np.mean(found) < 1 + 4 * 0.35, name
