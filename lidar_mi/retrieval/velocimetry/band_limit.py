@@ -163,9 +163,9 @@ def checked_noise(noise: float | None) -> None:
 
 def odd_fast_len(least: int) -> int:
     """A length, fast to transform, at which no wave is its own mirror image."""
-    size = scipy.fft.next_fast_len(least)
+    size = scipy.fft.next_fast_len(least, real=True)
     while size % 2 == 0:
-        size = scipy.fft.next_fast_len(size + 1)
+        size = scipy.fft.next_fast_len(size + 1, real=True)
     return size
 
 

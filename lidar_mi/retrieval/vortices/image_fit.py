@@ -16,11 +16,8 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
-from lidar_mi.retrieval.velocimetry.band_limit import best_filter
 from lidar_mi.retrieval.velocimetry.beam_times import checked_times
 from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.quality import filled
-from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
     TOLERANCE,
@@ -36,11 +33,11 @@ from lidar_mi.retrieval.vortices.covariance import (
     parameter_covariance,
 )
 from lidar_mi.retrieval.vortices.from_start import Begun, Limits, agrees, begun, fit_from, fit_near
-from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images, spectrum_of
+from lidar_mi.retrieval.vortices.image_builder import builder_of, near_to
+from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
 from lidar_mi.retrieval.vortices.model import Profile, wind
 from lidar_mi.retrieval.vortices.model_error import ModelError, mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
-from lidar_mi.retrieval.vortices.pixel_times import PixelTimes
 from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, fit, without_step
 from lidar_mi.retrieval.vortices.search import condensed, starting_points
 
@@ -230,7 +227,7 @@ def fit_pixels(
         if near:
             return near
     # from nothing in double precision: what rounding changes would decide between solutions
-    make = _builder([image1, image2], *given, telescope)
+    make = builder_of([image1, image2], *given, telescope)
     if isinstance(make, str):
         return no_fit(profile, make)
     limits = step_limits(y, z, profile, dt)
@@ -242,49 +239,6 @@ def fit_pixels(
     if pair and pair.success:
         return pair
     return _iterated(found, make, limits)
-
-
-def _builder(
-    stack: Sequence[torch.Tensor],
-    z: np.ndarray,
-    y: np.ndarray,
-    dt: float,
-    noise: float | torch.Tensor | None,
-    profile: Profile,
-    frozen: bool,
-    times: Sequence[np.ndarray] | None,
-    telescope: tuple[float, float, float] | None,
-) -> Builder | str:
-    """Of both images or of the first one; or the reason for which there is no fit."""
-    finite = torch.stack([torch.isfinite(image) for image in stack]).all(0)
-    if float(finite.double().mean()) < 0.5:
-        return f"{float(finite.double().mean()):.0%} of the pixels are finite"
-    # in units of image 1's own structure, so that no constant depends on the images' unit
-    images = normalised([image.double() for image in stack]).nan_to_num(0.0)
-    contrast = images[0][finite].std()
-    scale = filled(stack[0].double()).abs().max()
-    if not bool(contrast > 1e-9 * scale) or not bool(images[-1][finite].std() > 0):
-        return "an image is constant"
-    images = images / contrast
-    if isinstance(noise, torch.Tensor) and not bool((noise > 0).any()):
-        noise = None  # no pixel's noise is known: a fit that took it for 0 would follow it for long
-    if isinstance(noise, torch.Tensor):
-        noise = noise.double() * _understated(noise / contrast, images)
-    level = _typical(noise, images[0].square())
-    if level is not None:
-        level /= float(contrast)
-    given = noise if isinstance(noise, torch.Tensor) else None
-    make = Builder(
-        images, _near(~finite), z, y, dt, level, given, float(contrast), profile, frozen, telescope
-    )
-    return make if times is None else replace(make, times=_from_mid_time(times, make))
-
-
-def _near(bad: torch.Tensor) -> torch.Tensor:
-    """Pixels that are two or less away from others."""
-    if not bool(bad.any()):
-        return bad
-    return torch.nn.functional.max_pool2d(bad[None].double(), 5, 1, 2)[0] > 0
 
 
 def _begun(
@@ -300,7 +254,7 @@ def _begun(
     telescope: tuple[float, float, float] | None,
 ) -> Begun | None:
     """The fit near an expected pair before image 2 is there; None if there is none."""
-    make = _builder([image1], z, y, dt, noise, profile, frozen, times, telescope)
+    make = builder_of([image1], z, y, dt, noise, profile, frozen, times, telescope)
     if isinstance(make, str):
         return None
     # steps need no more: places to 1e-5 m
@@ -314,7 +268,7 @@ def _completed(ready: Begun, image1: torch.Tensor, image2: torch.Tensor) -> Vort
     if float((finite & ~make.bad).double().mean()) < 0.5 or not bool(second.std() > 0):
         return None
     both = torch.cat([make.pair, second[None].to(make.pair)])
-    make = replace(make, pair=both, bad=make.bad | _near(~finite))
+    make = replace(make, pair=both, bad=make.bad | near_to(~finite))
     limits = step_limits(make.y, make.z, make.profile, make.dt)
     near = fit_from(ready, make, limits, _NOISE_LAGS)
     pair = near and replace(_checked(make, *near), from_start=True)
@@ -436,36 +390,3 @@ def _change_by_slopes(make: Builder, best: Solution, images: Images) -> np.ndarr
     swirl = swirl - best.parameters[8:10, None, None].to(swirl)
     beams = torch.stack([images.y - y, images.z - z]) / -x
     return np.stack([change_by_flow(best, make.dt * one * beams) for one in swirl], -1)
-
-
-def _from_mid_time(times: Sequence[np.ndarray], make: Builder) -> PixelTimes:
-    """Times of the pixels of both images from half way between their reference times."""
-    first, second = (torch.as_tensor(part, device=make.pair.device) for part in times)
-    values = torch.stack([first - make.dt / 2, second + make.dt / 2])
-    return PixelTimes(values, (float(make.y[0]), float(make.z[0])), make.spacing)
-
-
-def _understated(noise: torch.Tensor, pair: torch.Tensor) -> float:
-    """Factor by which the images vary more from pixel to pixel than a map states, at least 1.
-
-    Errors estimated from a few Monte Carlo samples miss the rare bright ones. With too low a noise
-    the filter mistakes the excess for texture and passes all of it. Texture down to single pixels
-    counts as noise here, with little effect: in images 150 m ahead the noise is overestimated by
-    1.5 and chi2 is 0.4, with the errors of the parameters unchanged.
-    """
-    stated = float(noise[torch.isfinite(noise)].double().square().mean().sqrt())
-    observed = best_filter(spectrum_of(pair), FilterSettings()).level
-    return max(1.0, observed / stated) if stated > 0 else 1.0
-
-
-def _typical(noise: float | torch.Tensor | None, contrast: torch.Tensor) -> float | None:
-    """One standard deviation for the filter: of a noise map the rms weighted by image contrast.
-
-    That of most pixels is not enough: where bright air is noisiest the filter would pass too
-    much noise, and circulations would be up to 10 % too large.
-    """
-    if not isinstance(noise, torch.Tensor):
-        return noise
-    known = torch.isfinite(noise)
-    variance = noise[known].double().square()
-    return float(((variance * contrast[known]).sum() / contrast[known].sum()).sqrt())
