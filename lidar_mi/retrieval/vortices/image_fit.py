@@ -159,8 +159,8 @@ def begun_fit(
     """`fit_vortices` near an expected pair, begun before the second image is there.
 
     What concerns the expected pair and the first image alone is done at once: its filter, its
-    splines, and the paths of the air. It is a quarter of the work. The filter of both images is that
-    of the first one's spectrum.
+    splines, and the paths of the air. It is a quarter of the work. The filter of both images is
+    that of the first one's spectrum.
 
     Returns
     -------
