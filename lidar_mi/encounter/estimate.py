@@ -30,7 +30,8 @@ class Estimate:
         What limits the use of the estimate; empty if nothing does.
     seconds : mapping
         Time that each part of the estimate took, s, without the rendering. `total` is what it took
-        from the second scan on: lines of sight are read before. Left out, it is their sum.
+        from the second scan on: lines of sight and the first image come before. Left out, it is
+        their sum.
     lines : xarray.Dataset or None, dim line
         Speeds along the lines of sight, in the frame of the aircraft half way between both scans.
         None without a Doppler lidar.

@@ -1,7 +1,7 @@
 """From two images of a slab of air to its wind and its vortices, fast enough to be flown with."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import NamedTuple
@@ -11,11 +11,11 @@ import xarray as xr
 from lidar_mi.encounter.combination import Completion
 from lidar_mi.encounter.doppler import LineFrames
 from lidar_mi.encounter.line_speeds import LineSpeeds
-from lidar_mi.encounter.slab_winds import InOwnProcess, SlabPair, SlabWinds
+from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, SlabWinds
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
-from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.vortices.image_fit import begun_fit, fit_vortices
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 
@@ -30,9 +30,11 @@ class SlabEstimate(NamedTuple):
     pair : VortexPairFit
         Its `from_start` says whether it was found from the expected one.
     seconds : dict
-        Of the parts `vortices`, `wind`, `combination` and `lines`; and `total`, from the second
-        image to the end, with two processes less than their sum. Lines are read in the half period
-        before the second image; what they take beyond it is in `total`.
+        Of the parts `vortices`, `wind` and `combination` after the second image; `lines`,
+        `vortices_before` and `wind_before`, as far as lines, the first image and the expected pair
+        are concerned, before it; and `total`, from the second image to the end, with two processes
+        less than the sum. What has no time before the second image is in `total`: lines beyond the
+        half period before it, and of each process what the rest of its work leaves of a period.
     lines : Dataset or None
         As `with_speeds` gives them; None without frames.
     flags : tuple of str
@@ -80,7 +82,7 @@ class Estimator:
         if vectors and methods:
             form = SlabWinds if processes == 1 else InOwnProcess
             self._winds = form(methods[0], window_settings(settings))
-        self._speeds = speeds
+        self._speeds, self._processes = speeds, processes
         # the last slab's vortices, near which the next wind starts
         self._last: VortexPairFit | None = None
 
@@ -119,26 +121,48 @@ class Estimator:
             As `fit_vortices` takes it.
         """
         seconds: dict[str, float] = {}
-        slab = SlabPair(image1, image2, dt, noise, times, expected)
+        first = FirstImage(image1, dt, noise, times, expected)
         wind, lines, flags = None, None, ()
         if self._speeds and frames:
             with _timed(seconds, "lines"):
                 lines = self._speeds.read(frames)
+        ready = self._winds and self._winds.awaits(first, self._last)
+        given = {"times": times, "telescope": telescope}
+        fit = partial(fit_vortices, image1, dt=dt, noise=noise, **given)
+        if expected:
+            with _timed(seconds, "vortices_before"):
+                fit = begun_fit(image1, dt, noise, start=expected, **given)
+        if ready:
+            seconds["wind_before"] = ready()
         with _timed(seconds, "total"):
             then = complete and partial(complete, lines=lines)
-            coming = self._winds and self._winds.begun(slab, self._last, then)
+            coming = self._winds and self._winds.begun(image2, then)
             with _timed(seconds, "vortices"):
-                pair = fit_vortices(
-                    image1, image2, dt, noise, times=times, start=expected, telescope=telescope
-                )
+                pair = fit(image2)
                 if expected and expected.slopes is not None and pair.inclined is not None:
                     pair = pair.with_slopes(expected.slopes, expected.slope_covariance)
             if coming is not None:
                 wind, flags, parts = coming()
                 seconds |= parts
-        seconds["total"] += max(0.0, seconds.get("lines", 0.0) - dt / 2)
+        seconds["total"] += _too_late(seconds, dt, self._processes)
         self._last = pair if pair.success else None
         return SlabEstimate(wind, pair, seconds, lines, flags)
+
+
+def _too_late(seconds: Mapping[str, float], dt: float, processes: int) -> float:
+    """Time (s) by which what precedes the second image outlasts it, from slab to slab."""
+
+    def of(*parts: str) -> float:
+        return sum(seconds.get(part, 0.0) for part in parts)
+
+    work = [
+        (of("lines", "vortices_before"), of("vortices")),
+        (of("wind_before"), of("wind", "combination")),
+    ]
+    if processes == 1:
+        work = [tuple(map(sum, zip(*work, strict=True)))]
+    late = [before - max(0.0, dt - after) for before, after in work]
+    return max(0.0, of("lines") - dt / 2, *late)
 
 
 @contextmanager

@@ -12,8 +12,8 @@ import torch
 import xarray as xr
 
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.velocimetry.next_flow import Flow
-from lidar_mi.retrieval.velocimetry.slabs import wind_of_slab
+from lidar_mi.retrieval.velocimetry.next_flow import Awaited, Flow
+from lidar_mi.retrieval.velocimetry.slabs import awaited_wind, wind_of_slab
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.vortices.model import wind as model_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
@@ -27,14 +27,14 @@ _PLACES = ([3, 7], [2, 6])
 _MOST = 0.5
 
 
-class SlabPair(NamedTuple):
-    """Two images of a slab, and the pair of vortices that is expected there.
+class FirstImage(NamedTuple):
+    """The first image of a slab, and the pair of vortices that is expected there.
 
     Attributes
     ----------
-    first, second : DataArray, dims (z, y)
+    image : DataArray, dims (z, y)
     dt : float
-        s.
+        To the second image, s.
     noise : float or DataArray, optional
         As `retrieve_wind` takes it.
     times : sequence of two DataArray, optional
@@ -43,8 +43,7 @@ class SlabPair(NamedTuple):
         At mid-time.
     """
 
-    first: xr.DataArray
-    second: xr.DataArray
+    image: xr.DataArray
     dt: float
     noise: float | xr.DataArray | None = None
     times: Sequence[xr.DataArray] | None = None
@@ -99,17 +98,33 @@ class SlabWinds:
         self._flow: Flow | None = None
         # the pair of the slab whose wind was found from nothing: prior and noise are known there
         self._learnt: VortexPairFit | None = None
+        self._slab: FirstImage
+        self._awaited: Awaited | None = None
 
-    def begun(
-        self, slab: SlabPair, before: VortexPairFit | None, complete: Complete | None = None
-    ) -> Callable[[], Found]:
-        """The next slab's wind, retrieved when it is asked for.
+    def awaits(self, slab: FirstImage, before: VortexPairFit | None) -> Callable[[], float]:
+        """Take the first image of the next slab, before the second one is there.
 
         Parameters
         ----------
-        slab : SlabPair
+        slab : FirstImage
         before : VortexPairFit, optional
             Found in the last slab.
+
+        Returns
+        -------
+        callable
+            Does what can be done of the wind without the second image, and gives the time (s) that
+            it took.
+        """
+        return partial(self._awaits, slab, before)
+
+    def begun(self, second: xr.DataArray, complete: Complete | None = None) -> Callable[[], Found]:
+        """The wind of the slab that is awaited, retrieved when it is asked for.
+
+        Parameters
+        ----------
+        second : DataArray, dims (z, y)
+            The slab's second image.
         complete : callable, optional
             Completes the images' wind. The next one starts from the images' wind alone.
 
@@ -120,13 +135,17 @@ class SlabWinds:
             "variational" the attribute `from_start` of the images' wind says whether it was found
             from the last one.
         """
-        return partial(self._timed, slab, before, complete)
+        return partial(self._timed, second, complete)
 
-    def _timed(
-        self, slab: SlabPair, before: VortexPairFit | None, complete: Complete | None
-    ) -> Found:
+    def _awaits(self, slab: FirstImage, before: VortexPairFit | None) -> float:
         began = time.perf_counter()
-        wind = self._wind(slab, before)
+        self._slab, start = slab, self._start(slab, before)
+        self._awaited = start and awaited_wind(slab.image, start, slab.noise)
+        return time.perf_counter() - began
+
+    def _timed(self, second: xr.DataArray, complete: Complete | None) -> Found:
+        began = time.perf_counter()
+        wind = self._wind(second)
         flags = limits(wind)
         seconds = {"wind": time.perf_counter() - began}
         if complete:
@@ -135,29 +154,30 @@ class SlabWinds:
             seconds["combination"] = time.perf_counter() - began - seconds["wind"]
         return Found(wind, flags, seconds)
 
-    def _wind(self, slab: SlabPair, before: VortexPairFit | None) -> xr.Dataset:
+    def _wind(self, second: xr.DataArray) -> xr.Dataset:
+        slab = self._slab
         options = self._windows | {"noise": slab.noise, "times": slab.times}
-        images = slab.first, slab.second, slab.dt
+        images = slab.image, second, slab.dt
         if self._method != ImageMethod.VARIATIONAL:
             return retrieve_wind(*images, str(self._method), **options)
-        wind, self._flow = wind_of_slab(*images, self._start(slab, before), **options)
+        wind, self._flow = wind_of_slab(*images, self._awaited, **options)
         if not wind.attrs["from_start"]:
             self._learnt = None
         return wind
 
-    def _start(self, slab: SlabPair, before: VortexPairFit | None) -> Flow | None:
+    def _start(self, slab: FirstImage, before: VortexPairFit | None) -> Flow | None:
         flow, expected = self._flow, slab.expected
         if flow is None or expected is None or before is None:
             return None
-        if slab.first.shape != flow.windows.shape:
+        if slab.image.shape != flow.windows.shape:
             return None
         self._learnt = self._learnt or before
         return _moved(flow, slab, before, self._learnt)
 
 
-def _moved(flow: Flow, slab: SlabPair, before: VortexPairFit, learnt: VortexPairFit) -> Flow:
+def _moved(flow: Flow, slab: FirstImage, before: VortexPairFit, learnt: VortexPairFit) -> Flow:
     """The flow in the last slab's pair, where the next one is expected."""
-    z, y = (torch.as_tensor(slab.first[name].values.astype(float)) for name in ("z", "y"))
+    z, y = (torch.as_tensor(slab.image[name].values.astype(float)) for name in ("z", "y"))
     step = [float(axis[-1] - axis[0]) / (len(axis) - 1) for axis in (z, y)]
     pair = slab.expected
     now, then, first = (torch.as_tensor(fit.parameters) for fit in (pair, before, learnt))
@@ -167,11 +187,13 @@ def _moved(flow: Flow, slab: SlabPair, before: VortexPairFit, learnt: VortexPair
     moved = then.clone()
     for places, by in zip(_PLACES, shift, strict=True):
         moved[places] += by
-    nodes = torch.meshgrid(z, y, indexing="ij")[::-1]
+    # displacements to 1e-5 px
+    nodes = torch.meshgrid(z.float(), y.float(), indexing="ij")[::-1]
     v, w = (
         a - b
         for a, b in zip(
-            *(model_wind(theta, *nodes, pair.profile) for theta in (now, moved)), strict=True
+            *(model_wind(theta.float(), *nodes, pair.profile) for theta in (now, moved)),
+            strict=True,
         )
     )
     change = torch.stack([w * slab.dt / step[0], v * slab.dt / step[1]])
@@ -192,11 +214,13 @@ class InOwnProcess:
         # what is imported once is not a part of the first wind
         self._pool.submit(_ready).result()
 
-    def begun(
-        self, slab: SlabPair, before: VortexPairFit | None, complete: Complete | None = None
-    ) -> Callable[[], Found]:
+    def awaits(self, slab: FirstImage, before: VortexPairFit | None) -> Callable[[], float]:
+        """As `SlabWinds.awaits`; done from now on."""
+        return self._pool.submit(_awaits, slab, before).result
+
+    def begun(self, second: xr.DataArray, complete: Complete | None = None) -> Callable[[], Found]:
         """As `SlabWinds.begun`; retrieved and completed from now on."""
-        return self._pool.submit(_found, slab, before, complete).result
+        return self._pool.submit(_found, second, complete).result
 
 
 _winds: SlabWinds
@@ -212,5 +236,9 @@ def _ready() -> None:
     """Nothing."""
 
 
-def _found(slab: SlabPair, before: VortexPairFit | None, complete: Complete | None) -> Found:
-    return _winds.begun(slab, before, complete)()
+def _awaits(slab: FirstImage, before: VortexPairFit | None) -> float:
+    return _winds.awaits(slab, before)()
+
+
+def _found(second: xr.DataArray, complete: Complete | None) -> Found:
+    return _winds.begun(second, complete)()

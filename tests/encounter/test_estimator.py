@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.cases import drifting_pair_images, vortex_pair_images
 from benchmarks.realtime import UNFORESEEN
-from lidar_mi.encounter.estimator import Estimator
+from lidar_mi.encounter.estimator import Estimator, _too_late
 from lidar_mi.experiment.reading import load_experiment
 from tests.support.vortex_pairs import uneven, vector
 
@@ -29,6 +29,20 @@ def test_vortices_from_nothing_and_from_the_last_fit(images):
     assert (np.abs(warm.parameters - cold.parameters) < 0.1 * stderr).all()
     assert (np.abs(warm.parameters - vector(*images.vortices)) < 4 * stderr).all()
     assert set(seconds) == {"vortices", "total"} and seconds["vortices"] > 0
+    warm = estimator.pair_of(images.first, images.second, DT, 0.03, cold)
+    assert set(warm.seconds) == {"vortices_before", "vortices", "total"}
+
+
+def test_what_has_no_time_before_the_second_image_is_in_the_total():
+    """Lines in half a period; the work of each process in a period."""
+    enough = {"lines": 0.03, "vortices_before": 0.01, "vortices": 0.06, "wind_before": 0.04}
+    enough |= {"wind": 0.04, "combination": 0.02}
+    assert _too_late(enough, DT, 2) == 0
+    assert _too_late(enough | {"lines": 0.035}, DT, 2) == pytest.approx(0.005)
+    assert _too_late({"lines": 0.055, "vortices": 0.01}, DT, 2) == pytest.approx(0.005)
+    assert _too_late(enough | {"combination": 0.03}, DT, 2) == pytest.approx(0.01)
+    # one process that has more to do than a period after the second image alone
+    assert _too_late(enough, DT, 1) == pytest.approx(0.08)
 
 
 def test_slopes_that_are_expected_correct_the_fit(images):
@@ -56,7 +70,7 @@ def test_the_wind_is_by_the_most_accurate_method(images):
     assert valid.mean() > 0.9
     off = wind["v"] - images.v.interp(y=wind["y"], z=wind["z"])
     assert float(off.where(valid).std()) < 0.5
-    assert set(seconds) == {"vortices", "wind", "total"}
+    assert set(seconds) == {"vortices", "wind_before", "wind", "total"}
 
 
 def test_the_next_slab_starts_from_the_last_one():

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.cases import DT, drifting_pair_images
 from benchmarks.realtime import UNFORESEEN
-from lidar_mi.encounter.slab_winds import InOwnProcess, SlabPair, SlabWinds
+from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, SlabWinds
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from tests.support.vortex_pairs import uneven
@@ -34,13 +34,19 @@ def drifting():
     return slabs, [fit_vortices(s.first, s.second, DT, NOISE) for s in slabs]
 
 
+def wind_of(winds, images, expected=None, before=None, complete=None):
+    """A slab's wind, begun with its first image."""
+    first = FirstImage(images.first, DT, NOISE, expected=expected)
+    assert winds.awaits(first, before)() > 0
+    return winds.begun(images.second, complete)()
+
+
 def winds_of(winds, drifting, complete=None):
     """One slab after the other, the pair expected where the last one was."""
     found, before = [], None
     for images, pair in zip(*drifting, strict=True):
         expected = before and replace(before, covariance=before.covariance + np.diag(UNFORESEEN**2))
-        pair_of_images = SlabPair(images.first, images.second, DT, NOISE, expected=expected)
-        found.append(winds.begun(pair_of_images, before, complete)())
+        found.append(wind_of(winds, images, expected, before, complete))
         before = pair
     return found
 
@@ -56,7 +62,7 @@ def test_each_wind_starts_from_the_last_one(here, drifting):
     for (wind, flags, seconds), images in zip(here, drifting[0], strict=True):
         assert not flags and set(seconds) == {"wind"} and seconds["wind"] > 0
         alone = SlabWinds(ImageMethod.VARIATIONAL, WINDOWS)
-        nothing = alone.begun(SlabPair(images.first, images.second, DT, NOISE), None)()[0]
+        nothing = wind_of(alone, images).wind
         for found, errors in ((wind, near), (nothing, far)):
             true = images.v.interp(y=found["y"], z=found["z"])
             errors.append(float(((found["v"] - true) ** 2).mean()))
@@ -103,12 +109,10 @@ def test_what_limits_the_wind_of_most_vectors_is_said(drifting):
     }
     for reason, pair in pairs.items():
         winds = SlabWinds(ImageMethod.VARIATIONAL, WINDOWS)
-        assert reason in winds.begun(SlabPair(*pair, DT, NOISE), None)().flags
+        seen = replace(images, first=pair[0], second=pair[1])
+        assert reason in wind_of(winds, seen).flags
 
 
 def test_other_methods_start_from_nothing(drifting):
     images = drifting[0][0]
-    found = SlabWinds(ImageMethod.CC, WINDOWS).begun(
-        SlabPair(images.first, images.second, DT), None
-    )
-    assert found()[0].attrs["method"] == "cc"
+    assert wind_of(SlabWinds(ImageMethod.CC, WINDOWS), images).wind.attrs["method"] == "cc"

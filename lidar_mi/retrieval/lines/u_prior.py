@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
+from scipy.linalg import lapack
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.lines.grid_lines import covariances_of_lines
@@ -127,7 +128,7 @@ def evidence_of(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Evidence of standard deviations of u for several shapes of its covariance.
 
-    Where ``fixed`` is white, S = fixed + std^2 shape has the eigenvectors of the shape for all
+    Where ``fixed`` is white, one rotation makes S = fixed + std^2 shape tridiagonal for all
     standard deviations.
 
     Parameters
@@ -146,8 +147,45 @@ def evidence_of(
         residual^T S^-1 residual.
     """
     white = np.linalg.inv(np.linalg.cholesky(fixed))
-    values, vectors = np.linalg.eigh(white @ shapes @ white.T)
-    data = (white @ residual) @ vectors
-    variance = 1 + stds[:, None] ** 2 * values[:, None].clip(0)
-    square = (data[:, None] ** 2 / variance).sum(-1)
-    return -np.log(variance).sum(-1) / 2 - square / 2, square
+    data = np.tile(white @ residual, (len(shapes), 1))
+    middle, side, data = _tridiagonal(white @ shapes @ white.T, data)
+    # factors L D L^T of 1 + std^2 T, one line after the other, of all shapes and deviations
+    variance = stds**2
+    pivot, rest = 1 + variance * middle[:, :1], data[:, :1] + 0 * variance
+    logarithm, square = np.log(pivot), rest**2 / pivot
+    for k in range(1, len(residual)):
+        below = variance * side[:, k - 1 : k]
+        rest = data[:, k : k + 1] - below / pivot * rest
+        pivot = 1 + variance * middle[:, k : k + 1] - below**2 / pivot
+        logarithm += np.log(pivot)
+        square += rest**2 / pivot
+    return -logarithm / 2 - square / 2, square
+
+
+def _tridiagonal(
+    matrices: np.ndarray, vectors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Diagonals T of symmetric matrices A = Q T Q^T, by Householder's reflections, and Q^T vectors.
+
+    It takes a third of the time of eigenvectors, which the evidence does not need.
+
+    Parameters
+    ----------
+    matrices : array (number, n, n)
+    vectors : array (number, n)
+
+    Returns
+    -------
+    middle, side, turned : arrays (number, n), (number, n - 1) and (number, n)
+    """
+    if matrices.shape[1] == 1:
+        return matrices[:, 0], matrices[:, 0, :0], vectors
+    parts = [lapack.dsytrd(matrix, lower=1) for matrix in matrices]
+    reflectors, middle, side, scale = (np.stack([part[k] for part in parts]) for k in range(4))
+    turned = vectors.copy()
+    for k in range(matrices.shape[1] - 1):
+        across = reflectors[:, k + 1 :, k].copy()
+        across[:, 0] = 1
+        part = turned[:, k + 1 :]
+        part -= (scale[:, k] * (across * part).sum(1))[:, None] * across
+    return middle, side, turned

@@ -174,15 +174,17 @@ def mean_and_jacobian(
         _product(amplitudes * turned * (2j * math.pi * n) ** k, waves.waves) for k in range(4)
     )
     profile = 1 + profile + moved * (slope + moved / 2 * (curvature + moved / 3 * third))
-    slope = slope + moved * (curvature + moved / 2 * third)
     lit = light * profile
     mean = level * lit + background
     uneven = [name for name in model.smooth if name in BACKGROUND]
     if uneven:
         mean = mean + _smooth(model, cells, parameters, uneven)
+    jacobian = mean.new_empty((len(mean), len(names), mean.shape[1]))
+    if not names:
+        return mean, jacobian
+    slope = slope + moved * (curvature + moved / 2 * third)
     bright = level * light
     by_r2 = bright * slope * _by_r2(model, cosine)
-    jacobian = mean.new_empty((len(mean), len(names), mean.shape[1]))
     for row, name in zip(jacobian.unbind(1), names, strict=True):
         if name == "v_los":
             row[:] = bright * slope * (cosine / model.velocity_range)

@@ -41,7 +41,8 @@ def agreement(linear: Linear, windows: Windows) -> torch.Tensor:
     warped, valid = working(linear.warped), linear.valid
     box = [torch.ones(windows.template, dtype=warped.dtype, device=warped.device)]
     scores = []
-    for image in warped:
+    # of two each is the other's mean
+    for image in warped if len(warped) > 2 else warped[:1]:
         others = (warped.sum(0) - image) / (len(warped) - 1)
         sums = torch.stack(
             [torch.ones_like(image), image, others, image**2, others**2, image * others]

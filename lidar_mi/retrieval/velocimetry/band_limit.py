@@ -169,6 +169,11 @@ def odd_fast_len(least: int) -> int:
     return size
 
 
+def even_fast_len(least: int) -> int:
+    """A length of the fastest transforms: a multiple of 16."""
+    return 16 * scipy.fft.next_fast_len(-(-least // 16))
+
+
 def frequencies(sizes: Sequence[int], like: torch.Tensor) -> list[torch.Tensor]:
     """Cycles per pixel along the axes of a real Fourier transform, as they broadcast."""
     *others, last = sizes

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 
 from lidar_mi.retrieval.velocimetry.band import Band, form, spread
+from lidar_mi.retrieval.velocimetry.band_cholesky import BandCholesky, cholesky, solved_near
 from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.flow_spline import REACH, Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import Linear
@@ -17,6 +18,8 @@ _ROUNDING = 1e-14
 
 # Residual over the right hand side that a step with a factor in single precision may leave.
 _SINGLE = 1e-3
+# Products with a form until conjugate gradients from a similar one are given up.
+_TURNS = 12
 
 
 # Least information over second derivative at which steps take the information: each then leaves
@@ -66,45 +69,79 @@ def solved(
     turn: int,
 ) -> Posterior:
     """One Gauss-Newton step; `turn` is for `iterative` only."""
-    band = Band(*(axis.knots for axis in mesh.axes))
+    band = _band(mesh)
     stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
     root = band.factor(data_form(linear, mesh) + stiff)
     step = root if informative(linear) else band.factor(curvature(linear, mesh) + stiff)
     return Posterior(coefficients + band.solve(step, gradient), band, root, prior, stiff)
 
 
+class Pull(NamedTuple):
+    """The prior of a flow: its quadratic form with the ridge, and its gradient there.
+
+    `whole` also has what keeps the form positive in spite of rounding.
+    """
+
+    stiff: torch.Tensor
+    whole: torch.Tensor
+    gradient: torch.Tensor
+
+    def at(self, prior: Prior, coefficients: torch.Tensor) -> "Pull":
+        """The same of another flow."""
+        return self._replace(gradient=-_band(prior.mesh).apply(self.stiff, coefficients))
+
+
+def pull_of(prior: Prior, coefficients: torch.Tensor, ridge: float) -> Pull:
+    """That of a prior at a flow."""
+    stiff = prior_form(prior)
+    with_diagonal(stiff, ridge)
+    whole = stiff.clone()
+    with_diagonal(whole, rounding(stiff))
+    return Pull(stiff, whole, stiff).at(prior, coefficients)
+
+
 def solved_in_single(
     linear: Linear,
     mesh: Mesh,
     coefficients: torch.Tensor,
-    prior: Prior,
-    settings: VariationalSettings,
-) -> Posterior:
-    """A step with a factor in single precision; its residual is looked at in double precision.
+    pull: Pull,
+    near: BandCholesky | None = None,
+) -> torch.Tensor:
+    """Coefficients after a step in single precision; its residual is looked at in double precision.
 
-    Where there is no such factor, or the residual is not small, all is in double precision. The
-    factor is that of the step: `informed` gives that of the precision.
+    By conjugate gradients from the factor of a form that is `near` the step's own, or by the factor
+    of that. Where there is no such factor, or the residual is not small, all is in double
+    precision.
     """
-    band = Band(*(axis.knots for axis in mesh.axes))
-    stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
-    whole = (data_form if informative(linear) else curvature)(linear, mesh) + stiff
-    root = in_single(band, whole)
+    gradient = mesh.transposed(linear.gradient) + pull.gradient
+    whole = (data_form if informative(linear) else curvature)(linear, mesh) + pull.whole
+    if near is not None:
+        step = solved_near(near, whole, gradient, _SINGLE, _TURNS)
+        if step is not None:
+            return coefficients + step
+    root = cholesky(whole.float())
     if root is not None:
-        step = band.solve(root, gradient.float()).to(coefficients)
-        left = gradient - band.apply(whole, step)
+        step = root.solve(gradient)
+        left = gradient - _band(mesh).apply(whole, step)
         if bool(left.norm() <= _SINGLE * gradient.norm()):
-            return Posterior(coefficients + step, band, root, prior, stiff)
-    root = band.factor(whole)
-    return Posterior(coefficients + band.solve(root, gradient), band, root, prior, stiff)
+            return coefficients + step
+    return coefficients + _in_double(whole).solve(gradient)
 
 
-def informed(posterior: Posterior, linear: Linear, mesh: Mesh) -> Posterior:
-    """The posterior after `solved_in_single` with the factor of its precision."""
-    if informative(linear):
-        return posterior
-    whole = data_form(linear, mesh) + posterior.stiff
-    root = in_single(posterior.band, whole)
-    return posterior._replace(root=root or posterior.band.factor(whole))
+def factor_in_single(form: torch.Tensor) -> BandCholesky:
+    """Factor of a form in single precision, or in double where there is none."""
+    return cholesky(form.float()) or _in_double(form)
+
+
+def _in_double(form: torch.Tensor) -> BandCholesky:
+    root = cholesky(form.double())
+    if root is None:
+        raise torch.linalg.LinAlgError("the quadratic form of a flow is not positive definite")
+    return root
+
+
+def _band(mesh: Mesh) -> Band:
+    return Band(*(axis.knots for axis in mesh.axes))
 
 
 def in_single(band: Band, form: torch.Tensor) -> Factor | None:
@@ -126,7 +163,7 @@ def prior_and_gradient(
     """The prior's quadratic form with its ridge, and the gradient of the log-posterior."""
     stiff = prior_form(prior)
     with_diagonal(stiff, ridge)
-    band = Band(*(axis.knots for axis in mesh.axes))
+    band = _band(mesh)
     gradient = mesh.transposed(linear.gradient) - band.apply(stiff, coefficients)
     with_diagonal(stiff, rounding(stiff))
     return stiff, gradient

@@ -148,7 +148,18 @@ def linearised(
 ) -> Linear:
     """The log-likelihood about a flow; `mesh` is that of the pixels."""
     places = path(mesh, coefficients, images.time, settings.path_order)
-    value, *slopes = images.spline.sample(*places)
+    return linearised_there(images, mesh, places, images.spline.sample(*places), settings)
+
+
+def linearised_there(
+    images: Images,
+    mesh: Mesh,
+    places: torch.Tensor,
+    sampled: Sequence[torch.Tensor],
+    settings: VariationalSettings,
+) -> Linear:
+    """`linearised`, with the images' values and slopes at the places of `path`."""
+    value, *slopes = sampled
     valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
     value, gain = of_one_brightness(value, images.weight * valid)
     slope = torch.stack([(gain * part).mean(0) for part in slopes])
@@ -178,8 +189,60 @@ def linearised(
     return Linear(slope, informed * downhill, second, information, variance, value, valid)
 
 
+def told_by_first(
+    images: Images, mesh: Mesh, places: torch.Tensor, sampled: Sequence[torch.Tensor], number: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What images in a plane will tell of a flow, as far as the first of them shows.
+
+    Parameters
+    ----------
+    images : Images
+        The first one, with the noise that is known of all.
+    mesh : Mesh
+        Of the pixels.
+    places : torch.Tensor, shape (2, number, z, y)
+        Of `path`, to all of the images.
+    sampled : sequence of torch.Tensor, shape (1, z, y)
+        Value and slopes of the first one there.
+    number : int
+        Of images.
+
+    Returns
+    -------
+    slope : torch.Tensor, shape (2, z, y)
+    information : torch.Tensor, shape (z, y)
+        As in `Linear`, of texture that all images show alike. Outliers are not known.
+    """
+    _, *slopes = sampled
+    # as of the image warped to mid-time: the means of all images' own slopes need no turning
+    turned = torch.gradient(places[:, 0], dim=(1, 2))
+    slope = torch.stack([(torch.cat(slopes) * along).sum(0) for along in turned])
+    valid = nearest(images.usable, places[:, :1])[0] & images.spline.holds(*places).all(0)
+    # one image has more noise than the mean of them
+    share = _share_of_texture(images, slope, None, valid, mesh, number)
+    informed = images.spline.efficiency * images.weight * valid / max(images.noise**2, 1e-30)
+    second = images.time.square().sum() * informed
+    return slope, second * share.square() * images.spline.excess
+
+
+def information_near(slope: torch.Tensor, information: torch.Tensor, mesh: Mesh) -> torch.Tensor:
+    """Information on both components about each pixel: the mean that the flow's splines see."""
+    told = information * slope.square().sum(0)
+    return averaged(told, torch.ones_like(told, dtype=torch.bool), _width(mesh))
+
+
+def _width(mesh: Mesh) -> float:
+    axis = mesh.axes[0]
+    return _SHARE_WIDTH * (axis.size - 1) / axis.cells
+
+
 def _share_of_texture(
-    images: Images, slope: torch.Tensor, noise: torch.Tensor, valid: torch.Tensor, mesh: Mesh
+    images: Images,
+    slope: torch.Tensor,
+    noise: torch.Tensor | None,
+    valid: torch.Tensor,
+    mesh: Mesh,
+    more: float = 1.0,
 ) -> torch.Tensor:
     """Share of texture in the mean square of the slopes at each pixel of a plane, 0 to 1.
 
@@ -188,13 +251,13 @@ def _share_of_texture(
     s^2 J^2. Their information on it is (T J)^2 / (s^2 J^2), on average the square of this share
     times J^2 / s^2. Both mean squares are Gaussian means over 1.5 cells of the flow's splines.
     Where the noise was not told, `noise`, the square of the misfit over that assumed, is its
-    upper limit: texture down to single pixels looks like noise in the spectrum.
+    upper limit: texture down to single pixels looks like noise in the spectrum. Slopes may have
+    `more` noise than those of the mean of two images.
     """
-    axis = mesh.axes[0]
-    width = _SHARE_WIDTH * (axis.size - 1) / axis.cells
+    width = _width(mesh)
     power = averaged(slope.square().sum(0) * images.weight, valid, width)
-    noisy = images.spline.noisy_slopes
-    if not images.given:
+    noisy = more * images.spline.noisy_slopes
+    if noise is not None and not images.given:
         noisy = noisy * averaged(noise, valid, width).clamp(max=1.0)
     return (1 - noisy / power.clamp(min=1e-30)).clamp(min=0.0)
 

@@ -6,16 +6,31 @@ from dataclasses import dataclass, replace
 import torch
 
 from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
-from lidar_mi.retrieval.velocimetry.band import spread
+from lidar_mi.retrieval.velocimetry.band import form
+from lidar_mi.retrieval.velocimetry.band_cholesky import BandCholesky, spread_half
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
-from lidar_mi.retrieval.velocimetry.block_banded import Factor
 from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.direct import Posterior, informed, solved_in_single
+from lidar_mi.retrieval.velocimetry.direct import (
+    Posterior,
+    Pull,
+    factor_in_single,
+    pull_of,
+    solved_in_single,
+)
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh, interpolated
-from lidar_mi.retrieval.velocimetry.likelihood import Images, Linear, linearised, usable_and_weight
+from lidar_mi.retrieval.velocimetry.likelihood import (
+    Images,
+    Linear,
+    information_near,
+    linearised,
+    linearised_there,
+    path,
+    told_by_first,
+    usable_and_weight,
+)
 from lidar_mi.retrieval.velocimetry.prior import Prior
-from lidar_mi.retrieval.velocimetry.quality import misfit_variance
+from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.warping import filtered_spline
 from lidar_mi.retrieval.velocimetry.windows import Windows
@@ -129,8 +144,63 @@ def flow_of(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Awaited:
+    """The next flow before its second image is there; see `awaited`.
+
+    Attributes
+    ----------
+    start, placed : Flow
+        As expected, and with what was learnt where it is now.
+    mesh : Mesh
+        Of the pixels, in single precision.
+    images : Images
+        Of the first image alone.
+    places : torch.Tensor, shape (2, images, z, y)
+        Of the air at the pixels at mid-time in both images, px.
+    first : tuple of torch.Tensor, shape (1, z, y)
+        Value and slopes of the first image there.
+    pull : Pull
+    root : BandCholesky
+        Factor of the precision of the flow, by the information that the first image shows.
+    covariance : torch.Tensor, shape (2, 2, *windows.count)
+        Of the flow by it, px^2.
+    information : torch.Tensor, shape (z, y)
+        On both components, see `information_near`.
+    """
+
+    start: Flow
+    placed: Flow
+    mesh: Mesh
+    images: Images
+    places: torch.Tensor
+    first: tuple[torch.Tensor, ...]
+    pull: Pull
+    root: BandCholesky
+    covariance: torch.Tensor
+    information: torch.Tensor
+
+
+def awaited(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None) -> Awaited:
+    """All of `next_flow` that concerns the first image and the expected flow alone."""
+    placed = start.placed()
+    images = _prepared(placed, first, noise)
+    mesh = Mesh(placed.prior.mesh.axes, _pixels(start.windows, images.spline.coefficients))
+    places = path(mesh, start.coefficients.float(), images.time, start.settings.path_order)
+    sampled = images.spline.sample(*places[:, :1])
+    slope, told = told_by_first(images, mesh, places, sampled, len(images.time))
+    pull = pull_of(placed.prior, start.coefficients, start.settings.ridge)
+    root = factor_in_single(form(told * slope[:, None] * slope, mesh) + pull.whole)
+    # the recursion for the inverse damps rounding: 1e-5 in single precision
+    inverse = root.covariance().float()
+    in_single = Mesh(placed.prior.mesh.axes, _centres(start.windows, inverse))
+    covariance = spread_half(inverse, in_single).to(start.coefficients)
+    near = information_near(slope, told, mesh)
+    return Awaited(start, placed, mesh, images, places, sampled, pull, root, covariance, near)
+
+
 def next_flow(
-    start: Flow,
+    start: Flow | Awaited,
     stack: Sequence[torch.Tensor],
     noise: float | torch.Tensor | None,
     min_correlation: float,
@@ -142,24 +212,29 @@ def next_flow(
 
     Parameters
     ----------
-    start : Flow
-        The expected one.
+    start : Flow or Awaited
+        The expected one, or what was made of it and of the first image before.
     stack : sequence of torch.Tensor, shape (z, y)
         Two images of the windows' size.
     noise : float or torch.Tensor, optional
     min_correlation : float
         As `variational` takes them.
     """
-    placed = start.placed()
+    ready = start if isinstance(start, Awaited) else awaited(start, stack[0], noise)
+    start, placed, mesh = ready.start, ready.placed, ready.mesh
     windows, settings, prior = start.windows, start.settings, placed.prior
-    images = _prepared(placed, stack, noise)
-    mesh = Mesh(prior.mesh.axes, _pixels(windows, images.spline.coefficients))
-    coefficients = start.coefficients
-    for _ in range(_ROUNDS):
-        linear = linearised(images, mesh, coefficients.float(), settings)
-        posterior = solved_in_single(linear, mesh, coefficients, prior, settings)
-        step = mesh.field((posterior.coefficients - coefficients).float())
-        coefficients = posterior.coefficients
+    images = _completed(ready.images, placed, stack, noise)
+    second = images.spline.only(1).sample(*ready.places[:, 1:])
+    sampled = [torch.cat(pair) for pair in zip(ready.first, second, strict=True)]
+    linear = linearised_there(images, mesh, ready.places, sampled, settings)
+    coefficients, pull = start.coefficients, ready.pull
+    for turn in range(_ROUNDS):
+        if turn:
+            linear = linearised(images, mesh, coefficients.float(), settings)
+            pull = pull.at(prior, coefficients)
+        after = solved_in_single(linear, mesh, coefficients, pull, ready.root)
+        step = mesh.field((after - coefficients).float())
+        coefficients = after
         far = float(step.abs().flatten().kthvalue(int(0.99 * step.numel())).values)
         if far < _SMALL:
             break
@@ -167,16 +242,28 @@ def next_flow(
     more = _energy(prior, coefficients) / start.energy
     if not (far < _SMALL and 1 / _MISFIT < worse < _MISFIT and 1 / _ENERGY < more < _ENERGY):
         return None
-    posterior = informed(posterior, linear, mesh)
     at_centres = Mesh(prior.mesh.axes, _centres(windows, coefficients))
-    # the recursion for the inverse damps rounding: 1e-5 in single precision
-    root = Factor(*(part.float() for part in posterior.root))
-    in_single = Mesh(prior.mesh.axes, _centres(windows, root.root))
-    covariance = worse * spread(posterior.band.covariance(root), in_single).to(coefficients)
+    covariance = worse * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
     found = found._replace(flag=found.flag | unskilled(found.d, covariance))
     return found, replace(start, coefficients=coefficients)
+
+
+def _as_informed(ready: Awaited, linear: Linear) -> torch.Tensor:
+    """The covariance (2, 2, *windows.count) by the information of all images.
+
+    That by the first one, changed as the information near each window differs. With a fraction f of
+    the variance before that the images removed, and r times the information, it changes by
+    1 / (1 + f (r - 1)).
+    """
+    found, before, windows = ready.covariance, ready.placed.before, ready.start.windows
+    known = information_near(linear.slope, linear.information, ready.mesh)
+    ratio = (known / ready.information.clamp(min=1e-30)).to(found)
+    pixels, centres = _pixels(windows, found), _centres(windows, found)
+    ratio = interpolated(ratio, pixels, centres)
+    removed = 1 - found.diagonal().sum(-1) / before.diagonal().sum(-1)
+    return found / (1 + removed.clamp(0, 1) * (ratio - 1))
 
 
 def _pixels(windows: Windows, like: torch.Tensor) -> list[torch.Tensor]:
@@ -195,23 +282,37 @@ def _back(places: Sequence[torch.Tensor], shift: Sequence[float]) -> list[torch.
     ]
 
 
-def _prepared(
-    start: Flow, stack: Sequence[torch.Tensor], noise: float | torch.Tensor | None
-) -> Images:
-    """New images with the filter and the noise of those before."""
-    last, settings = start.images, start.settings
-    known, weight = usable_and_weight(stack, noise, settings)
-    used = last.spline
-    chosen = Filter(
-        used.gain.float(), last.noise, used.passed, used.excess, used.efficiency, used.noisy_slopes
-    )
-    pair = normalised(stack)
-    return last._replace(
-        spline=filtered_spline(pair.nan_to_num(0.0).float(), chosen, settings.filter),
+def _prepared(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None) -> Images:
+    """The first of new images with the filter and the noise of those before."""
+    known, weight = usable_and_weight([first], noise, start.settings)
+    pair = normalised([first])
+    return start.images._replace(
+        spline=filtered_spline(pair.nan_to_num(0.0).float(), _filter(start), start.settings.filter),
         usable=known,
-        time=last.time.float(),
+        time=start.images.time.float(),
         weight=(weight * start.local).float(),
         stack=pair,
+    )
+
+
+def _completed(
+    images: Images, start: Flow, stack: Sequence[torch.Tensor], noise: float | torch.Tensor | None
+) -> Images:
+    """Both images, after `_prepared`."""
+    known = usable(stack)
+    if isinstance(noise, torch.Tensor) and noise.ndim:
+        known = known & usable([noise])
+    pair = normalised(stack)
+    second = pair[1:].nan_to_num(0.0).float()
+    both = images.spline.beside(filtered_spline(second, _filter(start), start.settings.filter))
+    return images._replace(spline=both, usable=known, stack=pair)
+
+
+def _filter(start: Flow) -> Filter:
+    """The filter that was learnt, in single precision."""
+    used, noise = start.images.spline, start.images.noise
+    return Filter(
+        used.gain.float(), noise, used.passed, used.excess, used.efficiency, used.noisy_slopes
     )
 
 

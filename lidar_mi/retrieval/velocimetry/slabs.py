@@ -7,17 +7,37 @@ from typing import Any
 import torch
 import xarray as xr
 
+from lidar_mi.retrieval.checks import checked_stack, on_device
+from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.methods import METHODS
-from lidar_mi.retrieval.velocimetry.next_flow import Flow, next_flow
+from lidar_mi.retrieval.velocimetry.next_flow import Awaited, Flow, awaited, next_flow
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.variational import variational_and_flow
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
 
+def awaited_wind(
+    image1: xr.DataArray, start: Flow, noise: float | xr.DataArray | None = None
+) -> Awaited:
+    """A start for `wind_of_slab`: the flow expected, and the first image, before the second one.
+
+    `noise` is that of `retrieve_wind`.
+    """
+    (image1,), noise = checked_stack([image1], noise)
+    if isinstance(noise, xr.DataArray):
+        noise = on_device(noise, "cpu")
+    with threads_for(image1.size):
+        return awaited(start, on_device(image1, "cpu"), noise)
+
+
 def wind_of_slab(
-    image1: xr.DataArray, image2: xr.DataArray, dt: float, start: Flow | None = None, **options: Any
+    image1: xr.DataArray,
+    image2: xr.DataArray,
+    dt: float,
+    start: Flow | Awaited | None = None,
+    **options: Any,
 ) -> tuple[xr.Dataset, Flow | None]:
     """The wind by the method "variational", and the flow from which the next one may start.
 
@@ -26,10 +46,11 @@ def wind_of_slab(
     image1, image2 : DataArray, dims (z, y)
     dt : float
         s.
-    start : Flow, optional
-        The flow expected, see `Flow.moved`: the retrieval starts there, with the prior and the
-        noise learnt before, and from scratch only where the images do not fit to these. They are
-        not searched again for structure at rest, changes of illumination and unrelated air.
+    start : Flow or Awaited, optional
+        The flow expected, see `Flow.moved`, or what `awaited_wind` made of it and of image 1: the
+        retrieval starts there, with the prior and the noise learnt before, and from scratch only
+        where the images do not fit to these. They are not searched again for structure at rest,
+        changes of illumination and unrelated air.
     **options
         Of `retrieve_wind`.
 

@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import scipy.fft
 import torch
 
 from lidar_mi.retrieval.velocimetry.band_limit import (
     Filter,
     best_filter,
     checked_noise,
+    even_fast_len,
     faded,
     frequencies,
     odd_fast_len,
@@ -51,10 +51,18 @@ class Spline(NamedTuple):
     noisy_slopes: float
     settings: FilterSettings
 
+    def only(self, number: int) -> "Spline":
+        """That of one of the images."""
+        return self._replace(coefficients=self.coefficients[number : number + 1])
+
+    def beside(self, other: "Spline") -> "Spline":
+        """With the images of another one after the same filter."""
+        return self._replace(coefficients=torch.cat([self.coefficients, other.coefficients]))
+
     def filtered(self, field: torch.Tensor) -> torch.Tensor:
         """A field on the images' pixels after the images' filter; it is zero beyond them."""
         margin = self.settings.margin
-        sizes = [scipy.fft.next_fast_len(n + margin, real=True) for n in self.shape]
+        sizes = [even_fast_len(n + margin) for n in self.shape]
         dims = tuple(range(-len(sizes), 0))
         # sizes of another parity may reach one shell further
         _, shell = radii(tuple(sizes), self.shape, field.dtype, field.device)
@@ -270,29 +278,37 @@ def transform_sizes(shape: Sequence[int], settings: FilterSettings) -> list[int]
 
 def filtered_spline(images: torch.Tensor, chosen: Filter, settings: FilterSettings) -> Spline:
     """Splines through finite images (images, ...) after a filter, in their precision."""
+    return filtered_splines(images, [chosen], settings)[0]
+
+
+def filtered_splines(
+    images: torch.Tensor, filters: Sequence[Filter], settings: FilterSettings
+) -> list[Spline]:
+    """Splines through finite images (images, ...) after each of several filters."""
     shape, margin, finer = tuple(images.shape[1:]), settings.margin, settings.nodes
     sizes = transform_sizes(shape, settings)
     dims = tuple(range(1, images.ndim))
-    frequency = frequencies(sizes, images)
-    gain = chosen.gain[radii(tuple(sizes), shape, images.dtype, images.device)[1]]
+    shell = radii(tuple(sizes), shape, images.dtype, images.device)[1]
     mean = images.mean(dims, keepdim=True)
     spectrum = torch.fft.rfftn(
         faded(images - mean, sizes, margin, settings.antisymmetric), dim=dims
     )
-    for axis in frequency:
-        gain = gain / ((2 + torch.cos(2 * torch.pi * axis / finer)) / 3)
-    smooth = _refined(spectrum * gain, sizes, finer) + mean
+    for axis in frequencies(sizes, images):
+        spectrum = spectrum / ((2 + torch.cos(2 * torch.pi * axis / finer)) / 3)
     keep = [slice(finer * (n + 2 * margin)) for n in shape]
-    return Spline(
-        smooth[:, *keep].contiguous(),
-        shape,
-        chosen.passed,
-        chosen.excess,
-        chosen.gain,
-        chosen.efficiency,
-        chosen.noisy_slopes,
-        settings,
-    )
+    return [
+        Spline(
+            (_refined(spectrum * one.gain[shell], sizes, finer) + mean)[:, *keep].contiguous(),
+            shape,
+            one.passed,
+            one.excess,
+            one.gain,
+            one.efficiency,
+            one.noisy_slopes,
+            settings,
+        )
+        for one in filters
+    ]
 
 
 def mismatch(spline: Spline, rest: torch.Tensor, number: int | None = None) -> torch.Tensor:

@@ -216,11 +216,20 @@ def averaged(field: torch.Tensor, known: torch.Tensor, width: float) -> torch.Te
     reach = math.ceil(3 * width)
     place = torch.arange(-reach, reach + 1, dtype=field.dtype, device=field.device) / width
     gaussian = torch.exp(-place.square() / 2)
-    both = torch.stack([torch.where(known, field, 0.0), known.to(field)])
-    for axis in range(1, both.ndim):
-        rim = [0, 0] * (both.ndim - 1 - axis) + [reach, reach]
-        both = window_sums(pad(both, rim), [gaussian], 1, axis)[0]
-    total, number = both
+
+    def summed(parts: torch.Tensor) -> torch.Tensor:
+        for axis in range(1, parts.ndim):
+            rim = [0, 0] * (parts.ndim - 1 - axis) + [reach, reach]
+            parts = window_sums(pad(parts, rim), [gaussian], 1, axis)[0]
+        return parts
+
+    if bool(known.all()):
+        # the weight of what is known is a product of those along the axes
+        number = torch.ones((), dtype=field.dtype, device=field.device)
+        for n in field.shape:
+            number = number[..., None] * summed(gaussian.new_ones(1, n))[0]
+        return summed(field[None])[0] / number
+    total, number = summed(torch.stack([torch.where(known, field, 0.0), known.to(field)]))
     mean = field[known].mean() if bool(known.any()) else 0.0
     return torch.where(number > 1e-3, total / number.clamp(min=1e-3), mean)
 

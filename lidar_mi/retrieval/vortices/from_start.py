@@ -1,21 +1,23 @@
 """A pair of vortices from two images and an expected pair: a few steps in place of a search."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from lidar_mi.retrieval.vortices.covariance import model_error_of
-from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
+from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images, Path, View
 from lidar_mi.retrieval.vortices.model_error import ModelError
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, moved, stepped, without_step
 
 # Blur and step between the pixels used (px), and the expected error of displacements (px) that they
 # are for: images of texture 3 px long agree by chance with themselves moved by more.
-_LEVELS = ((3.0, 4, 2.0), (1.5, 2, 0.7), (0.0, 2, 0.0))
+_LEVELS = ((3.0, 4, 2.0), (1.5, 2, 0.7), (0.0, 2, 0.2))
+# Of the fit itself.
+_WHITE = (0.0, 1)
 # Points along each axis at which the expected error of the displacements is looked at.
 _PROBES = 15
 # Standard deviation of the model error assumed at first, px.
@@ -23,11 +25,12 @@ _MODEL_ERROR = 0.1
 # Length (px) over which an image's slope changes, as far as steps are concerned: a displacement d
 # that is linearised leaves an error of d^2 over it.
 _CURVED = 3.0
-# Displacement (px) to which every second pixel of the filtered images is warped, at most so often.
-_CLOSE, _STEPS = 0.5, 4
-# Error, in standard errors of all parameters together, that the last step may leave; the unfiltered
-# images are warped at most so often.
-_LEFT, _ROUNDS = 0.3, 3
+# Displacement (px, rms over the image: near a core ten times as much) to which every second pixel
+# of the filtered images is warped, at most so often.
+_CLOSE, _STEPS = 0.05, 4
+# Error, in standard errors of all parameters together, that the last step may leave but for what
+# is corrected near the cores; the unfiltered images are warped at most so often.
+_LEFT, _ROUNDS = 0.1, 4
 # Rms normalised difference of fit and start beyond which one of them is wrong.
 _REJECTED = 4.0
 
@@ -45,21 +48,37 @@ class Found(NamedTuple):
     error: ModelError
 
 
-def fit_from(start: VortexPairFit, make: Builder, limits: Limits, lags: float) -> Found | None:
-    """The fit of `image_fit.fit_vortices` near an expected pair; None if there is none.
+@dataclass(frozen=True, eq=False)
+class Begun:
+    """A fit near an expected pair before its second image is there; see `begun`.
 
-    Steps on every second pixel of the filtered images, after blurred ones if the start is
-    uncertain; then the unfiltered images are warped once, and noise, change and model error are
-    estimated as from scratch. The last step is linear: its residuals are not looked at again.
-
-    Parameters
+    Attributes
     ----------
     start : VortexPairFit
+    theta : torch.Tensor, shape (16,)
+        Parameters of the start.
+    uncertain : float
+        Of the displacements at the start, px.
     make : Builder
-    limits : callable
-        (parameters, step) -> whether such a step may be tried.
-    lags : float
-        Over which the noise correlates, px.
+        Of the first image, with the filter of both.
+    first : View
+        The first image, unblurred, at the start.
+    second : Path
+        Of the air to the second one.
+    """
+
+    start: VortexPairFit
+    theta: torch.Tensor
+    uncertain: float
+    make: Builder
+    first: View
+    second: Path
+
+
+def begun(start: VortexPairFit, make: Builder, limits: Limits) -> Begun | None:
+    """All of `fit_from` that concerns the expected pair and the first image, that of `make`.
+
+    None if no fit starts there.
     """
     if not np.isfinite(start.parameters).all() or not np.isfinite(start.covariance).all():
         return None
@@ -67,7 +86,31 @@ def fit_from(start: VortexPairFit, make: Builder, limits: Limits, lags: float) -
     theta = theta.to(make.pair.device)
     if not limits(theta, torch.zeros_like(theta)):
         return None
-    return fit_near(theta, make, limits, lags, _displacement_error(start, make))
+    white = make(*_WHITE)
+    to_first, to_second = white.paths(theta)
+    first, uncertain = white.view(0, to_first), _displacement_error(start, make)
+    make = replace(make, of_first=make.splines)
+    return Begun(start, theta, uncertain, make, first, to_second)
+
+
+def fit_from(of: Begun, make: Builder, limits: Limits, lags: float) -> Found | None:
+    """The fit of `image_fit.fit_vortices` near an expected pair; None if there is none.
+
+    Steps on blurred images come first if the start is uncertain, on every second pixel. Then the
+    unfiltered images are warped once, and noise, change and model error are estimated as from
+    scratch. The last step is linear: its residuals are not looked at again.
+
+    Parameters
+    ----------
+    of : Begun
+    make : Builder
+        Of both images.
+    limits : callable
+        (parameters, step) -> whether such a step may be tried.
+    lags : float
+        Over which the noise correlates, px.
+    """
+    return fit_near(of.theta, make, limits, lags, of.uncertain, known=(of.first, of.second))
 
 
 def fit_near(
@@ -75,18 +118,20 @@ def fit_near(
     make: Builder,
     limits: Limits,
     lags: float,
-    uncertain: float = 0.0,
+    uncertain: float = _LEVELS[-1][-1],
     estimates: int = 1,
+    known: tuple[View, Path] | None = None,
 ) -> Found | None:
     """`fit_from` parameters (16,) whose displacements are uncertain by so many px.
 
     Noise, change and model error are estimated so many times, each with the filter and the weights
-    of the time before.
+    of the time before. The view of the first image and the path to the second may be `known`.
     """
     variance = (_MODEL_ERROR * (make.spacing[0] * make.spacing[1]) ** 0.5) ** 2
     for blur, step, least in _LEVELS:
         if uncertain < least:
             continue
+        known = None
         thin = make(blur, step)
         thin = replace(thin, whole=thin.spline)
         for _ in range(_STEPS):
@@ -97,16 +142,25 @@ def fit_near(
                 return None
             far = _displaced(found.parameters - theta, misfit, make)
             theta = found.parameters
-            if far < max(_CLOSE, blur):
+            if far < _CLOSE * max(1.0, 2 * blur):
                 break
-    white = make(0.0, 1)
+    white, close = make(*_WHITE), False
     for _ in range(_ROUNDS):
-        misfit = white(theta)
+        views = [known[0], white.view(1, known[1])] if known else white.views(theta)
+        misfit, known = white.misfit(theta, views), None
         images = white.at_least(_left(misfit, variance))
         plain = _near(limits, theta, stepped(theta, images.weighted(misfit), variance))
         if plain is None:
             return None
-        found = plain
+        # where air changes, the weights of the estimates below lead elsewhere
+        if not close and _leaves(plain, theta, misfit, make) > _LEFT:
+            theta = plain.parameters
+            continue
+        close = True
+        beyond = white.curved(misfit, views, theta, plain.parameters)
+        misfit = misfit._replace(residual=misfit.residual + beyond)
+        left = plain.misfit._replace(residual=plain.misfit.residual + beyond)
+        found = plain._replace(misfit=left)
         for _ in range(estimates):
             error = model_error_of(found, lags, changes=True)
             images = make.with_change(white, images, found.misfit, error.variance)
@@ -115,13 +169,19 @@ def fit_near(
             found = _near(limits, theta, stepped(theta, images.whitened(misfit), error.variance))
             if found is None:
                 return None
-        step = found.parameters - theta
-        far = _displaced(step, misfit, make) / _CURVED
-        if float(step @ found.normal @ step) ** 0.5 * far < _LEFT:
+        if _leaves(found, theta, misfit, make) < _LEFT:
             error = model_error_of(found, lags, changes=True)
+            step = found.parameters - theta
             return Found(found, images, misfit._replace(residual=moved(misfit, step)), error)
         theta, variance = found.parameters, error.variance
     return None
+
+
+def _leaves(found: Solution, theta: torch.Tensor, misfit: Misfit, make: Builder) -> float:
+    """Standard errors that a linear step from theta to a solution may be off by curvature."""
+    step = found.parameters - theta
+    far = _displaced(step, misfit, make) / _CURVED
+    return float(step @ found.normal @ step) ** 0.5 * far
 
 
 def _near(limits, theta: torch.Tensor, found: Solution | None) -> Solution | None:
@@ -132,8 +192,8 @@ def _near(limits, theta: torch.Tensor, found: Solution | None) -> Solution | Non
 def _displaced(step: torch.Tensor, misfit: Misfit, make: Builder) -> float:
     """Rms displacement (px) of the images by a step, along their slopes."""
     change = moved(misfit, step) - misfit.residual
-    slope = misfit.slope * make.dt
-    return float((2 * change.square().sum() / slope.square().sum()).sqrt()) / min(make.spacing)
+    ratio = 2 * change.square().sum() / misfit.slope.square().sum()
+    return float(ratio.sqrt()) / min(make.spacing)
 
 
 def _left(misfit: Misfit, variance: float) -> float:

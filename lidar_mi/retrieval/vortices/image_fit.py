@@ -4,8 +4,9 @@ No wind vectors are needed in between: the whole image informs the ten parameter
 works where the texture is too weak for any local method, and elsewhere as well as the noise allows.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -17,8 +18,6 @@ from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.beam_times import checked_times
 from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.quality import filled
-from lidar_mi.retrieval.velocimetry.warping import band_limited
 from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
     TOLERANCE,
@@ -33,12 +32,12 @@ from lidar_mi.retrieval.vortices.covariance import (
     model_error_of,
     parameter_covariance,
 )
-from lidar_mi.retrieval.vortices.from_start import Limits, agrees, fit_from, fit_near
+from lidar_mi.retrieval.vortices.from_start import Begun, Limits, agrees, begun, fit_from, fit_near
+from lidar_mi.retrieval.vortices.image_builder import builder_of, near_to
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder, Images
 from lidar_mi.retrieval.vortices.model import Profile, wind
 from lidar_mi.retrieval.vortices.model_error import ModelError, mean_length
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
-from lidar_mi.retrieval.vortices.pixel_times import PixelTimes
 from lidar_mi.retrieval.vortices.robust_fit import Misfit, Solution, fit, without_step
 from lidar_mi.retrieval.vortices.search import condensed, starting_points
 
@@ -138,8 +137,61 @@ def fit_vortices(
     >>> pair.success, abs(pair.port.circulation - 300) < 10
     (True, True)
     """
+    stack, noise = checked_stack([image1, image2], noise)
+    given = _checked_arguments(stack, dt, noise, profile, frozen, times, start, telescope, device)
+    pixels = [on_device(image, device) for image in stack]
+    with threads_for(image1.size):
+        return fit_pixels(*pixels, *given)
+
+
+def begun_fit(
+    image1: xr.DataArray,
+    dt: float,
+    noise: float | xr.DataArray | None = None,
+    profile: Profile = "lamb_oseen",
+    *,
+    start: VortexPairFit,
+    frozen: bool = False,
+    times: Sequence[xr.DataArray] | None = None,
+    telescope: tuple[float, float, float] | None = None,
+    device: str | torch.device = "cpu",
+) -> Callable[[xr.DataArray], VortexPairFit]:
+    """`fit_vortices` near an expected pair, begun before the second image is there.
+
+    What concerns the expected pair and the first image alone is done at once: its filter, its
+    splines, and the paths of the air. It is a quarter of the work. The filter of both images is
+    that of the first one's spectrum.
+
+    Returns
+    -------
+    callable
+        Takes image 2, on the grid of image 1, and gives the fit.
+    """
+    (image1,), noise = checked_stack([image1], noise)
+    given = _checked_arguments(
+        [image1, image1], dt, noise, profile, frozen, times, start, telescope, device
+    )
+    with threads_for(image1.size):
+        ready = _begun(on_device(image1, device), *given)
+    return partial(_with_second, image1, ready, given, device)
+
+
+def _with_second(
+    image1: xr.DataArray, ready: Begun | None, given: tuple, device, image2: xr.DataArray
+) -> VortexPairFit:
+    pair, _ = checked_stack([image1, image2])
+    first, second = (on_device(image, device) for image in pair)
+    with threads_for(image1.size):
+        near = ready and _completed(ready, first, second)
+        *others, _, telescope = given
+        return near or fit_pixels(first, second, *others, None, telescope)
+
+
+def _checked_arguments(
+    stack: Sequence[xr.DataArray], dt, noise, profile, frozen, times, start, telescope, device
+) -> tuple:
+    """What `fit_pixels` takes after both images."""
     dt = positive("dt", dt)
-    (image1, image2), noise = checked_stack([image1, image2], noise)
     check_profile(profile)
     if start is not None and start.profile != profile:
         raise InputError(f"start.profile: {start.profile!r} is not {profile!r}, that of the fit")
@@ -147,13 +199,11 @@ def fit_vortices(
         raise InputError(
             f"telescope: {telescope} m is not allowed; expected finite x, y and z with x < 0"
         )
-    tau = checked_times(times, [image1, image2], dt)
-    axes = [image1[name].values.astype(float) for name in ("z", "y")]
-    pixels = [on_device(image, device) for image in (image1, image2)]
+    tau = checked_times(times, stack, dt)
+    axes = [stack[0][name].values.astype(float) for name in ("z", "y")]
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
-    with threads_for(image1.size):
-        return fit_pixels(*pixels, *axes, dt, noise, profile, frozen, tau, start, telescope)
+    return *axes, dt, noise, profile, frozen, tau, start, telescope
 
 
 def fit_pixels(
@@ -170,38 +220,17 @@ def fit_pixels(
     telescope: tuple[float, float, float] | None = None,
 ) -> VortexPairFit:
     """`fit_vortices` on tensors (z, y) and axes in m, with times from `checked_times`."""
-    finite = torch.isfinite(image1) & torch.isfinite(image2)
-    if float(finite.double().mean()) < 0.5:
-        return no_fit(profile, f"{float(finite.double().mean()):.0%} of the pixels are finite")
-    # in units of image 1's own structure, so that no constant depends on the images' unit
-    pair = normalised([image1.double(), image2.double()]).nan_to_num(0.0)
-    contrast = pair[0][finite].std()
-    scale = filled(image1.double()).abs().max()
-    if not bool(contrast > 1e-9 * scale) or not bool(pair[1][finite].std() > 0):
-        return no_fit(profile, "an image is constant")
-    pair = pair / contrast
-    if isinstance(noise, torch.Tensor) and not bool((noise > 0).any()):
-        noise = None  # no pixel's noise is known: a fit that took it for 0 would follow it for long
-    if isinstance(noise, torch.Tensor):
-        noise = noise.double() * _understated(noise / contrast, pair)
-    level = _typical(noise, pair[0].square())
-    if level is not None:
-        level /= float(contrast)
-    bad = torch.nn.functional.max_pool2d((~finite)[None].double(), 5, 1, 2)[0] > 0
-    given = noise if isinstance(noise, torch.Tensor) else None
-    make = Builder(pair, bad, z, y, dt, level, given, float(contrast), profile, frozen, telescope)
-    if times is not None:
-        make = replace(make, times=_from_mid_time(times, make))
-    limits = step_limits(y, z, profile, dt)
-
+    given = z, y, dt, noise, profile, frozen, times
     if start is not None:
-        # steps need no more: places to 1e-5 m
-        single = make.single()
-        near = fit_from(start, single, limits, _NOISE_LAGS)
-        pair = near and replace(_checked(single, *near), from_start=True)
-        if pair and pair.success and agrees(start, pair):
-            return pair
+        ready = _begun(image1, *given, start, telescope)
+        near = ready and _completed(ready, image1, image2)
+        if near:
+            return near
     # from nothing in double precision: what rounding changes would decide between solutions
+    make = builder_of([image1, image2], *given, telescope)
+    if isinstance(make, str):
+        return no_fit(profile, make)
+    limits = step_limits(y, z, profile, dt)
     found = _searched(make, limits)
     if found is None:
         return no_fit(profile, "no vortex signature")
@@ -210,6 +239,40 @@ def fit_pixels(
     if pair and pair.success:
         return pair
     return _iterated(found, make, limits)
+
+
+def _begun(
+    image1: torch.Tensor,
+    z: np.ndarray,
+    y: np.ndarray,
+    dt: float,
+    noise: float | torch.Tensor | None,
+    profile: Profile,
+    frozen: bool,
+    times: Sequence[np.ndarray] | None,
+    start: VortexPairFit,
+    telescope: tuple[float, float, float] | None,
+) -> Begun | None:
+    """The fit near an expected pair before image 2 is there; None if there is none."""
+    make = builder_of([image1], z, y, dt, noise, profile, frozen, times, telescope)
+    if isinstance(make, str):
+        return None
+    # steps need no more: places to 1e-5 m
+    return begun(start, make.single(), step_limits(y, z, profile, dt))
+
+
+def _completed(ready: Begun, image1: torch.Tensor, image2: torch.Tensor) -> VortexPairFit | None:
+    """The fit near the expected pair; None if it is not accepted or does not agree with it."""
+    finite, make = torch.isfinite(image2), ready.make
+    second = normalised([image1, image2])[1].nan_to_num(0.0) / make.contrast
+    if float((finite & ~make.bad).double().mean()) < 0.5 or not bool(second.std() > 0):
+        return None
+    both = torch.cat([make.pair, second[None].to(make.pair)])
+    make = replace(make, pair=both, bad=make.bad | near_to(~finite))
+    limits = step_limits(make.y, make.z, make.profile, make.dt)
+    near = fit_from(ready, make, limits, _NOISE_LAGS)
+    pair = near and replace(_checked(make, *near), from_start=True)
+    return pair if pair and pair.success and agrees(ready.start, pair) else None
 
 
 def _searched(make: Builder, limits: Limits) -> Solution | None:
@@ -327,36 +390,3 @@ def _change_by_slopes(make: Builder, best: Solution, images: Images) -> np.ndarr
     swirl = swirl - best.parameters[8:10, None, None].to(swirl)
     beams = torch.stack([images.y - y, images.z - z]) / -x
     return np.stack([change_by_flow(best, make.dt * one * beams) for one in swirl], -1)
-
-
-def _from_mid_time(times: Sequence[np.ndarray], make: Builder) -> PixelTimes:
-    """Times of the pixels of both images from half way between their reference times."""
-    first, second = (torch.as_tensor(part, device=make.pair.device) for part in times)
-    values = torch.stack([first - make.dt / 2, second + make.dt / 2])
-    return PixelTimes(values, (float(make.y[0]), float(make.z[0])), make.spacing)
-
-
-def _understated(noise: torch.Tensor, pair: torch.Tensor) -> float:
-    """Factor by which the images vary more from pixel to pixel than a map states, at least 1.
-
-    Errors estimated from a few Monte Carlo samples miss the rare bright ones. With too low a noise
-    the filter mistakes the excess for texture and passes all of it. Texture down to single pixels
-    counts as noise here, with little effect: in images 150 m ahead the noise is overestimated by
-    1.5 and chi2 is 0.4, with the errors of the parameters unchanged.
-    """
-    stated = float(noise[torch.isfinite(noise)].double().square().mean().sqrt())
-    _, observed = band_limited(pair)
-    return max(1.0, observed / stated) if stated > 0 else 1.0
-
-
-def _typical(noise: float | torch.Tensor | None, contrast: torch.Tensor) -> float | None:
-    """One standard deviation for the filter: of a noise map the rms weighted by image contrast.
-
-    That of most pixels is not enough: where bright air is noisiest the filter would pass too
-    much noise, and circulations would be up to 10 % too large.
-    """
-    if not isinstance(noise, torch.Tensor):
-        return noise
-    known = torch.isfinite(noise)
-    variance = noise[known].double().square()
-    return float(((variance * contrast[known]).sum() / contrast[known].sum()).sqrt())

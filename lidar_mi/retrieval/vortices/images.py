@@ -1,7 +1,9 @@
 """The two images of a fit, at every level of blur, and their differences for any parameters."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,12 +21,12 @@ from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.velocimetry.warping import (
     Spline,
     band_limited,
-    filtered_spline,
+    filtered_splines,
     mismatch,
     transform_sizes,
 )
 from lidar_mi.retrieval.vortices.model import Profile, advected, drift, path_sensitivity, wind
-from lidar_mi.retrieval.vortices.pixel_times import PixelTimes, seen
+from lidar_mi.retrieval.vortices.pixel_times import PixelTimes, Seen, seen
 from lidar_mi.retrieval.vortices.robust_fit import Misfit
 from lidar_mi.retrieval.vortices.search import Observations
 
@@ -32,8 +34,56 @@ from lidar_mi.retrieval.vortices.search import Observations
 _INTERPOLATION = 1e-4
 # Width (px) of the Gaussian over which the misfit is averaged to the variance at a place.
 _LOCAL = 6.0
+# Core radii about the cores within which a change of the pair bends paths.
+_NEAR_CORES = 2.0
 # Gain 1 and offset 0 of image 2 over image 1, no change of either along y and z.
 SAME_BRIGHTNESS = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+class Path(NamedTuple):
+    """The way of the air at the pixels at mid-time to one image, tensors (..., z, y).
+
+    Attributes
+    ----------
+    steady : torch.Tensor, shape (10,)
+        The flow in the frame that moves with the pair.
+    middle : torch.Tensor
+        Of the way, in that frame, m.
+    place : torch.Tensor
+        Its end in the image: row and column.
+    time : torch.Tensor
+        It takes, s; negative to the first image.
+    seen : Seen, optional
+        Of pixels with times of their own.
+    """
+
+    steady: torch.Tensor
+    middle: torch.Tensor
+    place: torch.Tensor
+    time: torch.Tensor
+    seen: Seen | None
+
+
+class View(NamedTuple):
+    """One image where it sees the air that is at the pixels at mid-time, tensors (z, y).
+
+    Attributes
+    ----------
+    place : torch.Tensor, shape (2, z, y)
+        Row and column, px.
+    valid : torch.Tensor of bool
+        Whether that is on the image.
+    value, whole : torch.Tensor
+        After the filter, and without one.
+    jacobian : torch.Tensor, shape (10, z, y)
+        Derivatives of `value` with respect to the parameters of the pair.
+    """
+
+    place: torch.Tensor
+    valid: torch.Tensor
+    value: torch.Tensor
+    whole: torch.Tensor
+    jacobian: torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -77,66 +127,115 @@ class Images:
 
     def __call__(self, parameters: torch.Tensor) -> Misfit:
         """Residuals and their derivatives for parameters (16,)."""
-        parameters = parameters.to(self.y)
-        theta = parameters[:10]
-        gain, offset = (torch.tensordot(parameters[k : k + 3], self.linear, 1) for k in (10, 13))
-        half = self.dt / 2
-        moving = torch.zeros_like(theta[:2]) if self.frozen else drift(theta, self.profile)
-        # the flow is steady in the frame that moves with the pair
-        steady = torch.cat([theta[:8], theta[8:] - moving])
-        if self.times is None:
-            began = wind(steady, self.y, self.z, self.profile)
-            middle, place = zip(
-                *(
-                    advected(steady, self.y, self.z, time, self.profile, began)
-                    for time in (-half, half)
-                ),
-                strict=True,
-            )
-            shift = moving[:, None, None] * half
-            place = [place[0] - shift, place[1] + shift]
-            time = -half, half
-        else:
-            views = [
-                seen(self.times, k, steady, moving, self.y, self.z, self.profile) for k in (0, 1)
-            ]
-            middle, place, time = ([view[part] for view in views] for part in range(3))
-        columns, rows = (
-            (torch.stack([p[axis] for p in place]) - self.first[axis]) / self.spacing[axis]
-            for axis in (0, 1)
-        )
-        value, slope_z, slope_y = self.spline.sample(rows, columns)
-        valid = self.spline.holds(rows, columns).all(0)
+        return self.misfit(parameters, self.views(parameters))
+
+    def views(self, parameters: torch.Tensor) -> list["View"]:
+        """Both images where the air at the pixels at mid-time is then, for parameters (16,)."""
+        return [self.view(number, path) for number, path in enumerate(self.paths(parameters))]
+
+    def misfit(self, parameters: torch.Tensor, views: Sequence["View"]) -> Misfit:
+        """The same from the views of both images for these parameters of the pair."""
+        gain, offset = self._brightness(parameters)
+        valid = views[0].valid & views[1].valid
         if bool(self.bad.any()):
-            nearest = [
-                p.round().long().clamp(0, n - 1)
-                for p, n in zip((rows, columns), self.bad.shape, strict=True)
-            ]
-            valid &= ~self.bad[nearest[0], nearest[1]].any(0)
-        slope = torch.stack([slope_y / self.spacing[0], slope_z / self.spacing[1]], 1)
-        slope[0] *= gain
-        if self.times is not None:
-            slope = torch.stack([view.along(part) for view, part in zip(views, slope, strict=True)])
-        jacobian = value.new_empty(len(parameters), *valid.shape)
-        torch.sub(
-            path_sensitivity(steady, middle[1], slope[1], time[1], self.profile),
-            path_sensitivity(steady, middle[0], slope[0], time[0], self.profile),
-            out=jacobian[:10],
-        )
-        jacobian[8:10] = (
-            half * (slope[0] + slope[1])
-            if self.times is None
-            else time[1] * slope[1] - time[0] * slope[0]
-        )
-        jacobian[10:13], jacobian[13:16] = -value[0] * self.linear, -self.linear
-        if self.whole is not self.spline:
-            value = self.whole.values(rows, columns)
-        residual = valid * (value[1] - gain * value[0] - offset)
+            valid &= ~(self._bad(views[0].place) | self._bad(views[1].place))
+        jacobian = valid.new_empty(len(parameters), *valid.shape, dtype=gain.dtype)
+        torch.mul(gain, views[0].jacobian, out=jacobian[:10])
+        torch.sub(views[1].jacobian, jacobian[:10], out=jacobian[:10])
+        torch.mul(-views[0].value, self.linear, out=jacobian[10:13])
+        torch.neg(self.linear, out=jacobian[13:16])
+        residual = valid * (views[1].whole - gain * views[0].whole - offset)
         if self.whole is not self.spline:
             residual = self.spline.filtered(residual)
         slope = jacobian[8:10] / self.dt
         misfit = Misfit(residual, jacobian, slope, valid, self.variance, self.scatter)
         return misfit if self.whitening is None else self.whitened(misfit)
+
+    def view(self, number: int, path: "Path") -> "View":
+        """Image 0 or 1 at the ends of its path."""
+        place, time = path.place, path.time
+        (value,), (slope_z,), (slope_y,) = self.spline.only(number).sample(*place[:, None])
+        slope = torch.stack([slope_y / self.spacing[0], slope_z / self.spacing[1]])
+        if path.seen is not None:
+            slope = path.seen.along(slope)
+        jacobian = path_sensitivity(path.steady, path.middle, slope, time, self.profile)
+        torch.mul(slope, time, out=jacobian[8:10])
+        whole = value
+        if self.whole is not self.spline:
+            (whole,) = self.whole.only(number).values(*place[:, None])
+        return View(place, self.spline.holds(*place), value, whole, jacobian)
+
+    def paths(self, parameters: torch.Tensor) -> list["Path"]:
+        """Of the air at the pixels at mid-time to both images."""
+        theta = parameters.to(self.y)[:10]
+        moving = torch.zeros_like(theta[:2]) if self.frozen else drift(theta, self.profile)
+        # the flow is steady in the frame that moves with the pair
+        steady = torch.cat([theta[:8], theta[8:] - moving])
+        if self.times is None:
+            time = self.y.new_tensor([-self.dt / 2, self.dt / 2])[:, None, None]
+            began = wind(steady, self.y, self.z, self.profile)[:, None]
+            middle, place = advected(steady, self.y[None], self.z[None], time, self.profile, began)
+            place = place + moving[:, None, None, None] * time
+            ways = [(middle[:, k], place[:, k], time[k], None) for k in (0, 1)]
+        else:
+            both = [
+                seen(self.times, k, steady, moving, self.y, self.z, self.profile) for k in (0, 1)
+            ]
+            ways = [(one.middle, one.place, one.time, one) for one in both]
+        return [
+            Path(
+                steady,
+                middle,
+                torch.stack([(place[k] - self.first[k]) / self.spacing[k] for k in (1, 0)]),
+                time,
+                then,
+            )
+            for middle, place, time, then in ways
+        ]
+
+    def curved(
+        self, known: Misfit, views: Sequence["View"], start: torch.Tensor, end: torch.Tensor
+    ) -> torch.Tensor:
+        """Change (z, y) of the residuals from start to end, beyond the linear one of a misfit.
+
+        Of the filtered images, near both cores alone: elsewhere displacements are linear in the
+        parameters. `known` and `views` are those at the start.
+        """
+        box = self._near_cores(start)
+        near = replace(self, y=self.y[box], z=self.z[box])
+        then = [view.value[box] for view in views]
+        now = []
+        for number, path in enumerate(near.paths(end)):
+            now += near.spline.only(number).values(*path.place[:, None])
+        change = 0.0
+        for sign, parameters, (first, second) in ((-1, start, then), (1, end, now)):
+            gain, offset = near._brightness(parameters)
+            change = change + sign * (second - gain * first - offset)
+        step = (end - start).to(self.y)
+        found = torch.zeros_like(known.residual)
+        found[box] = change - torch.tensordot(step, known.jacobian[:, *box], 1)
+        return known.valid * found
+
+    def _near_cores(self, parameters: torch.Tensor) -> tuple[slice, slice]:
+        """Rows and columns within some core radii of one of the vortices or between them."""
+        reach = _NEAR_CORES * float(parameters[[1, 5]].exp().max())
+        box = []
+        for places, axis in ((parameters[[3, 7]], 1), (parameters[[2, 6]], 0)):
+            low = (float(places.min()) - reach - self.first[axis]) / self.spacing[axis]
+            high = (float(places.max()) + reach - self.first[axis]) / self.spacing[axis]
+            box.append(slice(max(0, int(low)), max(0, int(high) + 2)))
+        return box[0], box[1]
+
+    def _brightness(self, parameters: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gain and offset of image 2 over image 1 at the places."""
+        parts = (parameters[k : k + 3].to(self.y) for k in (10, 13))
+        gain, offset = (torch.tensordot(part, self.linear, 1) for part in parts)
+        return gain, offset
+
+    def _bad(self, place: torch.Tensor) -> torch.Tensor:
+        """Whether the pixels nearest to places (row, column) are to be left out."""
+        at = [p.round().long().clamp(0, n - 1) for p, n in zip(place, self.bad.shape, strict=True)]
+        return self.bad[at[0], at[1]]
 
     def whitened(self, misfit: Misfit) -> Misfit:
         """A misfit of the images without the whitening filter, after it."""
@@ -171,6 +270,24 @@ class Images:
         return Observations(*(part[..., clean] for part in parts))
 
 
+class Splines(NamedTuple):
+    """Splines through images after the filter against white noise and without one.
+
+    With the filter, and the power spectrum that it was chosen by.
+    """
+
+    sharp: Spline
+    whole: Spline
+    filter: Filter
+    spectrum: PowerSpectrum
+
+
+def spectrum_of(images: torch.Tensor) -> PowerSpectrum:
+    """Power spectrum of finite images (images, z, y)."""
+    settings = FilterSettings()
+    return power_spectrum(images, transform_sizes(images.shape[1:], settings), settings)
+
+
 @dataclass(frozen=True)
 class Builder:
     """Builds the images of the levels, from coarse to fine.
@@ -195,6 +312,8 @@ class Builder:
         m, as `image_fit.fit_vortices` takes it.
     times : PixelTimes, optional
         Left out: -dt / 2 and dt / 2.
+    of_first : Splines, optional
+        Of the first image, made before the second one was there: its filter is that of both.
     """
 
     pair: torch.Tensor
@@ -209,6 +328,7 @@ class Builder:
     frozen: bool
     telescope: tuple[float, float, float] | None = None
     times: PixelTimes | None = None
+    of_first: Splines | None = None
 
     @property
     def spacing(self) -> tuple[float, float]:
@@ -222,10 +342,19 @@ class Builder:
         return replace(self, pair=self.pair.float(), map=noise, times=times)
 
     @cached_property
-    def sharp(self) -> tuple[Spline, float]:
-        """The images after the filter against white noise, and the noise."""
-        chosen = self.filter(self.level)
-        return filtered_spline(self.pair, chosen, FilterSettings()), chosen.level
+    def splines(self) -> Splines:
+        """Of the images."""
+        if self.of_first is None:
+            return self._splines(self.pair, self.filter(self.level))
+        first, second = self.of_first, self._splines(self.pair[1:], self.of_first.filter)
+        return first._replace(
+            sharp=first.sharp.beside(second.sharp), whole=first.whole.beside(second.whole)
+        )
+
+    def _splines(self, images: torch.Tensor, chosen: Filter) -> Splines:
+        everything = Filter(torch.ones_like(chosen.gain), 0.0, 1.0, 1.0, 1.0, 0.0)
+        both = filtered_splines(images, [chosen, everything], FilterSettings())
+        return Splines(*both, chosen, self.spectrum)
 
     def filter(self, noise: float | None, mismatch: torch.Tensor | None = None) -> Filter:
         """The filter of both images, as `warping.band_limited` chooses it."""
@@ -234,24 +363,17 @@ class Builder:
 
     @cached_property
     def spectrum(self) -> PowerSpectrum:
-        """Of both images."""
-        settings = FilterSettings()
-        return power_spectrum(self.pair, transform_sizes(self.pair.shape[1:], settings), settings)
-
-    @cached_property
-    def unfiltered(self) -> Spline:
-        """The images as they are."""
-        everything = Filter(torch.ones_like(self.sharp[0].gain), 0.0, 1.0, 1.0, 1.0, 0.0)
-        return filtered_spline(self.pair, everything, FilterSettings())
+        """Of both images; of the first one, where its splines were made before."""
+        return spectrum_of(self.pair) if self.of_first is None else self.of_first.spectrum
 
     @property
     def noise(self) -> float:
         """Standard deviation of the white noise, as given or estimated."""
-        return self.sharp[1]
+        return self.splines.filter.level
 
     def __call__(self, blur: float, step: int) -> Images:
         """The images blurred by a Gaussian of so many pixels, at every so many-th pixel."""
-        spline, noise = self.sharp
+        spline, noise = self.splines.sharp, self.noise
         passed = spline.passed
         if blur:
             size = 2 * int(np.ceil(4 * blur)) + 1
@@ -273,7 +395,7 @@ class Builder:
             )[0]
             variance = 2 * known[step // 2 :: step, step // 2 :: step] / self.contrast**2
         floor = 2 * _INTERPOLATION**2
-        whole = spline if blur or noise == 0 else self.unfiltered
+        whole = spline if blur or noise == 0 else self.splines.whole
         return Images(
             spline,
             whole,

@@ -30,6 +30,8 @@ _LAMB_OSEEN = 1.2564
 # Angle (rad) by which the fastest air may rotate in one Runge-Kutta step: an error of 3e-4 of
 # its radius.
 _STEP_ANGLE = 0.5
+# Angle (rad) up to which the midpoint rule is used: an error of 2e-5 of the radius.
+_SLOW_ANGLE = 0.05
 # Steps for all air together; beyond, only air near a core takes as many as the core does.
 _FEW_STEPS = 4
 
@@ -71,9 +73,9 @@ def wind(theta: torch.Tensor, y: torch.Tensor, z: torch.Tensor, profile: Profile
     for first in (0, 4):
         circulation, radius = theta[first], theta[first + 1].exp()
         dy, dz = y - theta[first + 2], z - theta[first + 3]
-        value = swirl((dy**2 + dz**2) / radius**2, profile)
+        value = swirl(torch.addcmul(dy * dy, dz, dz) / radius**2, profile)
         omega = circulation / (2 * torch.pi * radius**2) * value
-        v, w = v - omega * dz, w + omega * dy
+        v, w = torch.addcmul(v, omega, dz, value=-1), torch.addcmul(w, omega, dy)
     return torch.stack([v, w])
 
 
@@ -147,10 +149,13 @@ def advected(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Positions of air after half of a time and after all of it, (2, ...) each, in m.
 
+    Places and times are broadcast.
+
     Runge-Kutta of fourth order in a steady flow; `time` in s, of all air or of each, negative:
     backward. `began` is the wind (2, ...) at the places, where it is known. The middle, which is
-    used for derivatives only, is by Hermite's cubic. Where the core takes many steps, air that
-    turns less than half as fast as four steps allow takes four.
+    used for derivatives only, is by Hermite's cubic. Air that turns little takes one step of the
+    midpoint rule. Where the core takes many steps, air that turns less than half as fast as four
+    steps allow takes four.
     """
     centre = {"lamb_oseen": _LAMB_OSEEN, "burnham_hallock": 1.0}[profile] / (2 * torch.pi)
     fastest = max(
@@ -160,17 +165,25 @@ def advected(
     steps = int(min(64, 1 + fastest * longest // _STEP_ANGLE))
     start = torch.stack([y, z])
     began = wind(theta, y, z, profile) if began is None else began
-    if steps <= _FEW_STEPS:
-        place, ended = _followed(theta, start, began, time, steps, profile)
-    else:
-        near = _turning(theta, y, z, profile) * abs(time) > _FEW_STEPS / 2 * _STEP_ANGLE
-        place, ended = torch.empty_like(start), torch.empty_like(start)
-        for some, number in ((near, steps), (~near, _FEW_STEPS)):
-            part = time[some] if isinstance(time, torch.Tensor) else time
-            place[:, some], ended[:, some] = _followed(
-                theta, start[:, some], began[:, some], part, number, profile
-            )
-    return (start + place) / 2 + time / 8 * (began - ended), place
+    if isinstance(time, torch.Tensor):
+        shape = torch.broadcast_shapes(y.shape, time.shape)
+        start, began, time = start.expand(2, *shape), began.expand(2, *shape), time.expand(shape)
+    there = wind(theta, *torch.add(start, began * time, alpha=0.5), profile)
+    place = start + time * there
+    # the wind at the end of a step is that at its middle as much further again
+    middle = (start + place) / 2 + time / 4 * (began - there)
+    angle = _turning(theta, y, z) * abs(time)
+    near = angle > _SLOW_ANGLE
+    groups = [(near, steps)]
+    if steps > _FEW_STEPS:
+        fast = angle > _FEW_STEPS / 2 * _STEP_ANGLE
+        groups = [(fast, steps), (near & ~fast, _FEW_STEPS)]
+    for some, number in groups:
+        part = time[some] if isinstance(time, torch.Tensor) else time
+        first, k1 = start[:, some], began[:, some]
+        last, ended = _followed(theta, first, k1, part, number, profile)
+        place[:, some], middle[:, some] = last, (first + last) / 2 + part / 8 * (k1 - ended)
+    return middle, place
 
 
 def _followed(theta, place, k1, time: float | torch.Tensor, steps: int, profile: Profile):
@@ -185,14 +198,16 @@ def _followed(theta, place, k1, time: float | torch.Tensor, steps: int, profile:
     return place, k1
 
 
-def _turning(theta, y, z, profile: Profile) -> torch.Tensor:
-    """Sum of the angular velocities about both vortices, s^-1, without their signs."""
+def _turning(theta, y, z) -> torch.Tensor:
+    """Sum of the angular velocities about both vortices, s^-1, without their signs: at most."""
     total = torch.zeros_like(y)
     for first in (0, 4):
-        radius2 = (2 * theta[first + 1]).exp()
-        square = (y - theta[first + 2]) ** 2 + (z - theta[first + 3]) ** 2
-        value = swirl(square / radius2, profile)
-        total = total + theta[first].abs() / (2 * torch.pi * radius2) * value
+        dy, dz = y - theta[first + 2], z - theta[first + 3]
+        # that of a vortex without a core, and in the core's middle
+        square = torch.addcmul(dy * dy, dz, dz).clamp(
+            min=(2 * theta[first + 1]).exp() / _LAMB_OSEEN
+        )
+        total = total + theta[first].abs() / (2 * torch.pi) / square
     return total
 
 

@@ -147,7 +147,7 @@ def _normal(misfit: Misfit, weight: torch.Tensor) -> tuple[torch.Tensor, torch.T
     """Sums of w J J^T and of -w J r."""
     columns = misfit.jacobian.flatten(1)
     weighted = columns * weight.flatten()
-    sums = weighted @ columns.T, -weighted @ misfit.residual.flatten()
+    sums = weighted @ columns.T, -(weighted @ misfit.residual.flatten())
     return tuple(part.double() for part in sums)
 
 

@@ -6,6 +6,7 @@ Detects a wrong block, shift or derivative.
 import torch
 
 from lidar_mi.retrieval.velocimetry.band import Band, form, spread
+from lidar_mi.retrieval.velocimetry.band_cholesky import cholesky, solved_near, spread_half
 from lidar_mi.retrieval.velocimetry.block_banded import factor
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
 
@@ -68,8 +69,25 @@ def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
     places = torch.tensor([0.0, 3.3, 21.5]), torch.tensor([2.0, 17.7, 36.9, 37.0])
     few = Mesh(AXES, [place.double() for place in places])
     at = torch.kron(few.basis(0), few.basis(1))
-    found = spread(knots.covariance(root), few)
+    of_blocks, alone = spread(knots.covariance(root), few), cholesky(band)
+    torch.testing.assert_close(
+        alone.solve(some).flatten(), torch.linalg.solve(dense, some.flatten())
+    )
+    of_band = spread_half(alone.covariance(), few)
     for a in (0, 1):
         for b in (0, 1):
             expected = (at @ inverse[a, :, b] @ at.T).diagonal().reshape(3, 4)
-            torch.testing.assert_close(found[a, b], expected)
+            torch.testing.assert_close(of_blocks[a, b], expected)
+            torch.testing.assert_close(of_band[a, b], expected)
+    # from the factor of another form, which is no longer asked for more than it is worth
+    similar = cholesky(1.3 * band)
+    near = solved_near(similar, band + 0.2 * band * (band > 0), some, 1e-9, 100)
+    changed = knots.factor(band + 0.2 * band * (band > 0))
+    torch.testing.assert_close(near, knots.solve(changed, some), rtol=1e-6, atol=1e-9)
+    assert solved_near(similar, band + 0.2 * band * (band > 0), some, 1e-9, 1) is None
+
+
+def test_a_form_that_is_not_positive_has_no_factor():
+    mesh = Mesh(AXES, pixels())
+    band = form(-torch.ones(2, 2, 23, 38, dtype=torch.float64), mesh)
+    assert cholesky(band) is None

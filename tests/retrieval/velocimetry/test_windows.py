@@ -57,9 +57,14 @@ def test_window_sums_are_weighted_sums():
 
 def test_averaged_is_a_gaussian_mean_of_known_values():
     random = torch.Generator().manual_seed(5)
-    for shape in ((13, 17), (9, 10, 11)):
+    for shape, least in (
+        ((13, 17), 0.3),
+        ((13, 17), -1.0),
+        ((9, 10, 11), 0.3),
+        ((9, 10, 11), -1.0),
+    ):
         field = torch.randn(shape, generator=random, dtype=torch.float64)
-        known = torch.rand(shape, generator=random) > 0.3
+        known = torch.rand(shape, generator=random) > least
         found = averaged(field, known, 1.5)
         at = torch.stack(torch.meshgrid(*map(torch.arange, shape), indexing="ij")).flatten(1).T
         for place in (0, 40, len(at) - 1):

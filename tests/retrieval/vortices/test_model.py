@@ -9,6 +9,7 @@ from lidar_mi.atmosphere.vortex import Vortex, velocity, vortex_pair
 from lidar_mi.retrieval.vortices.model import (
     PARAMETERS,
     PROFILES,
+    _followed,
     advected,
     drift,
     gradient,
@@ -99,3 +100,22 @@ def test_pair_drifts_down_by_its_own_swirl():
     pair = vortex_pair(400.0, 47.1, 3.0)
     moving = drift(torch.as_tensor(vector(*pair, mean=(2.0, 1.0))), "lamb_oseen")
     np.testing.assert_allclose(moving, [2.0, 1.0 - 400 / (2 * np.pi * 47.1)], atol=1e-9)
+
+
+def test_slow_air_takes_one_step_and_as_exact_a_path():
+    """Against paths of 64 steps, of single times and of one for each place."""
+    theta = torch.as_tensor(vector(*uneven(), mean=(3.0, -1.0)))
+    y, z = grid(61, 41)
+    for time in (-0.05, 0.05):
+        start = torch.stack([y, z])
+        exact, _ = _followed(theta, start, wind(theta, y, z, "lamb_oseen"), time, 64, "lamb_oseen")
+        middle, place = advected(theta, y, z, time, "lamb_oseen")
+        half, _ = _followed(
+            theta, start, wind(theta, y, z, "lamb_oseen"), time / 2, 64, "lamb_oseen"
+        )
+        # m: 1e-3 px of half a metre; middles are for derivatives only
+        assert float((place - exact).abs().max()) < 5e-4
+        assert float((middle - half).abs().max()) < 0.02
+        each = advected(theta, y[None], z[None], torch.tensor([[[time]], [[-time]]]), "lamb_oseen")
+        for alone, both in zip((middle, place), each, strict=True):
+            torch.testing.assert_close(both[:, 0], alone)
