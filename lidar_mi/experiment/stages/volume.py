@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 
 from lidar_mi import __version__
@@ -37,12 +38,12 @@ class Volumes:
     ----------
     pairs : dict of str to list of two xr.DataArray, dims (x, z, y)
         Attenuated backscatter at both times, m^-1 sr^-1, by `Source`.
-    noise : dict of str to float
-        Rms of its standard error, same unit.
+    noise : dict of str to xr.DataArray, dims (x, z, y)
+        Standard error of the first volume of each, same unit.
     """
 
     pairs: dict[str, list[xr.DataArray]]
-    noise: dict[str, float]
+    noise: dict[str, xr.DataArray]
 
 
 def check_volume(experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan]) -> None:
@@ -139,6 +140,32 @@ def scan_volume(
     return xr.DataArray(volume, coords, ("x", "z", "y"), attrs=about)
 
 
+def noise_map(
+    error: np.ndarray, plan: ScanPlan, nodes: tuple[np.ndarray, ...]
+) -> xr.DataArray:
+    """Standard error (m^-1 sr^-1) of the voxels of `scan_volume`, dims (x, z, y).
+
+    Between beams the variance is linear, less what the splines take from white noise in the mean.
+
+    Parameters
+    ----------
+    error : array, shape (gates, z, y)
+        Of the attenuated backscatter of every beam.
+    plan : ScanPlan
+    nodes : x, z, y of the grid, m
+    """
+    x, z, y = nodes
+    variance = [
+        RegularGridInterpolator((row, column), square)(np.stack(np.meshgrid(z, y, indexing="ij"), -1))
+        for square, row, column in zip(
+            PASSED * error**2, _places(plan, "z"), _places(plan, "y"), strict=True
+        )
+    ]
+    coords = {name: (name, axis, {"units": "m"}) for name, axis in zip("xzy", nodes, strict=True)}
+    about = {"long_name": "standard error of the backscatter", "units": "m-1 sr-1"}
+    return xr.DataArray(np.sqrt(variance), coords, ("x", "z", "y"), attrs=about)
+
+
 def scan_volumes(
     experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan], scans: Sequence[xr.Dataset]
 ) -> Volumes:
@@ -149,11 +176,11 @@ def scan_volumes(
     def volume(number: int, s0: xr.DataArray) -> xr.DataArray:
         return scan_volume(s0, plans[number], lidar, way, nodes)
 
-    def level(error: xr.DataArray) -> float:
-        oblique = attenuated_backscatter(
+    def level(error: xr.DataArray) -> xr.DataArray:
+        error = attenuated_backscatter(
             error.transpose("gate", "z", "y").values, plans[0], lidar.aperture_area, way
         )
-        return float(np.sqrt(PASSED * (oblique**2).mean()))
+        return noise_map(error, plans[0], nodes)
 
     first = scans[0]
     pairs = {Source.BACKSCATTER: [volume(k, scan["S0"]) for k, scan in enumerate(scans)]}

@@ -230,10 +230,10 @@ class VariationalSettings:
 
 VOLUME_VARIATIONAL = VariationalSettings(
     knots=(0.625,),
-    rounds=(5,),
+    rounds=(9,),
     noise_round=3,
     coloured=False,
-    least_vorticity=0.03,
+    least_vorticity=0.003,
     filter=VOLUME_FILTER,
 )
 """Of volumes: the flow of the multi-pass correlation makes a coarse level unnecessary."""

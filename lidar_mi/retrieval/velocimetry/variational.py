@@ -13,12 +13,13 @@ from lidar_mi.retrieval.velocimetry import direct, iterative, strips
 from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
-from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
+from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.velocimetry.likelihood import linearised, prepared, with_local_noise
 from lidar_mi.retrieval.velocimetry.next_flow import Flow, flow_of
 from lidar_mi.retrieval.velocimetry.prior import first_prior, refined
 from lidar_mi.retrieval.velocimetry.quality import Flag, check_between
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
+from lidar_mi.retrieval.velocimetry.unresolved import unresolved_variance
 from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, working
 
 
@@ -166,13 +167,19 @@ def variational_and_flow(
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
     score = agreement(linear, windows)
+    finer = unresolved_variance(
+        mesh.field(posterior.coefficients.to(like)), apart, settings.misfit_width * windows.template
+    )
+    finer = interpolated(finer, pixels, centres)
     # a flow that depends on how much is assumed to move through the plane is not in the images
     spread = (flow - flow.mean(tuple(range(1, flow.ndim)), keepdim=True)).square().mean()
     undetermined = images.through > 0 and bool((flow - displaced_only).square().mean() > spread)
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
+    unit = torch.eye(windows.dims).to(finer).reshape(*covariance.shape[:2], *[1] * windows.dims)
+    found = found._replace(covariance=covariance + unit * finer)
     if windows.dims > 2:
         return found, None
-    found = found._replace(flag=found.flag | unskilled(found.d, covariance))
+    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
     if undetermined:
         found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
     if not (keep and isinstance(posterior, direct.Posterior)):
