@@ -26,10 +26,6 @@ from lidar_mi.retrieval.velocimetry.common_grid import resample
 from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
-PASSED = 0.76
-"""Fraction of the variance of white noise that bicubic splines pass, mean over all places."""
-
-
 @dataclass(frozen=True)
 class Volumes:
     """Pairs of volumes by source, and their noise.
@@ -107,7 +103,8 @@ def scan_volume(
     """Attenuated backscatter (m^-1 sr^-1) of all gates on one grid in the air, dims (x, z, y).
 
     Gate by gate by bicubic splines, from the beams to the nodes. Beams are wider than gates are
-    thick, so that little structure is lost; the variance of white noise is reduced to `PASSED`.
+    thick, so that little structure is lost. The variance of white noise is reduced to 0.76 in the
+    mean, that of its long waves is not.
 
     Parameters
     ----------
@@ -143,9 +140,11 @@ def scan_volume(
 def noise_map(
     error: np.ndarray, plan: ScanPlan, nodes: tuple[np.ndarray, ...]
 ) -> xr.DataArray:
-    """Standard error (m^-1 sr^-1) of the voxels of `scan_volume`, dims (x, z, y).
+    """Level of the noise (m^-1 sr^-1) in the voxels of `scan_volume`, dims (x, z, y).
 
-    Between beams the variance is linear, less what the splines take from white noise in the mean.
+    The variance is linear between beams. Splines between the beams take noise from short waves
+    alone: their values add to the same constant everywhere. In waves as long as texture the noise
+    has the spectral density of that of the beams, and this is what retrievals take.
 
     Parameters
     ----------
@@ -155,10 +154,11 @@ def noise_map(
     nodes : x, z, y of the grid, m
     """
     x, z, y = nodes
+    mesh = np.stack(np.meshgrid(z, y, indexing="ij"), -1)
     variance = [
-        RegularGridInterpolator((row, column), square)(np.stack(np.meshgrid(z, y, indexing="ij"), -1))
+        RegularGridInterpolator((row, column), square)(mesh)
         for square, row, column in zip(
-            PASSED * error**2, _places(plan, "z"), _places(plan, "y"), strict=True
+            error**2, _places(plan, "z"), _places(plan, "y"), strict=True
         )
     ]
     coords = {name: (name, axis, {"units": "m"}) for name, axis in zip("xzy", nodes, strict=True)}
