@@ -115,8 +115,8 @@ def test_gates_are_put_where_their_air_is():
 
 
 def test_the_noise_told_is_that_of_long_waves():
-    """Of white noise, resampled: the spectral density of waves of 8 nodes and more, gate by gate."""
-    lidar, axis = BackscatterLidar(), np.arange(-60, 61.0)
+    """White noise, resampled, has its spectral density in waves of 8 nodes and more."""
+    axis = np.arange(-60, 61.0)
     (plan,) = plan_scans(Scan(range=200.0, thickness=8.0, gate_count=8), axis, axis, (0.0,))
     nodes = (200.5 + np.arange(8), np.arange(-50, 51.0), np.arange(-50, 51.0))
     random, level = np.random.default_rng(3), 1 + np.arange(8)[:, None, None]

@@ -26,6 +26,7 @@ from lidar_mi.retrieval.velocimetry.common_grid import resample
 from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
+
 @dataclass(frozen=True)
 class Volumes:
     """Pairs of volumes by source, and their noise.
@@ -137,9 +138,7 @@ def scan_volume(
     return xr.DataArray(volume, coords, ("x", "z", "y"), attrs=about)
 
 
-def noise_map(
-    error: np.ndarray, plan: ScanPlan, nodes: tuple[np.ndarray, ...]
-) -> xr.DataArray:
+def noise_map(error: np.ndarray, plan: ScanPlan, nodes: tuple[np.ndarray, ...]) -> xr.DataArray:
     """Level of the noise (m^-1 sr^-1) in the voxels of `scan_volume`, dims (x, z, y).
 
     The variance is linear between beams. Splines between the beams take noise from short waves
@@ -153,7 +152,7 @@ def noise_map(
     plan : ScanPlan
     nodes : x, z, y of the grid, m
     """
-    x, z, y = nodes
+    _, z, y = nodes
     mesh = np.stack(np.meshgrid(z, y, indexing="ij"), -1)
     variance = [
         RegularGridInterpolator((row, column), square)(mesh)

@@ -98,7 +98,8 @@ class IterativeSettings:
     tolerance, loose : float
         Residual over the first one at which iteration ends: for the flow, for a drawn one.
     steps : int
-        Largest number of steps.
+        Largest number of steps. Where the prior is strong, draws that end too early state too small
+        errors.
     draws, final_draws : int
         Flows drawn per round, and for the standard errors.
     damping : float
@@ -110,7 +111,7 @@ class IterativeSettings:
 
     tolerance: float = 1e-2
     loose: float = 1e-1
-    steps: int = 60
+    steps: int = 120
     draws: int = 4
     final_draws: int = 16
     damping: float = 0.05
@@ -235,7 +236,7 @@ VOLUME_VARIATIONAL = VariationalSettings(
     rounds=(7,),
     noise_round=3,
     coloured=False,
-    least_vorticity=0.003,
+    least_vorticity=0.03,
     filter=VOLUME_FILTER,
 )
 """Of volumes: the flow of the multi-pass correlation makes a coarse level unnecessary."""

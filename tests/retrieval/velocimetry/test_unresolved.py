@@ -19,9 +19,7 @@ KNOTS, WIDTH = 4.0, 6.0
 
 def left(flow):
     """Mean square that splines of these knots leave of a flow, by numpy's least squares."""
-    rows, columns = (
-        Axis(n, KNOTS).basis(torch.arange(n).double()).numpy() for n in flow.shape[1:]
-    )
+    rows, columns = (Axis(n, KNOTS).basis(torch.arange(n).double()).numpy() for n in flow.shape[1:])
     of_rows, of_columns = (basis @ np.linalg.pinv(basis) for basis in (rows, columns))
     return np.mean([(part - of_rows @ part @ of_columns.T) ** 2 for part in flow.numpy()])
 
@@ -52,7 +50,7 @@ def test_of_turbulence():
 
 
 def test_of_a_smooth_vortex_pair():
-    """Smooth flow is no turbulence: in the cores no more than what splines leave, outside nothing."""
+    """No turbulence: about what splines leave, and outside the cores nothing."""
     y, z = axes(219, 139)
     grid = np.meshgrid(y, z)
     v, w = velocity(vortex_pair(400.0, separation=47.1, core_radius=3.0), *grid)
