@@ -17,6 +17,7 @@ from lidar_mi.retrieval.velocimetry.likelihood import Images, Linear, linearised
 from lidar_mi.retrieval.velocimetry.prior import Prior
 from lidar_mi.retrieval.velocimetry.quality import misfit_variance
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
+from lidar_mi.retrieval.velocimetry.unresolved import with_unresolved
 from lidar_mi.retrieval.velocimetry.warping import filtered_spline
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
@@ -42,6 +43,8 @@ class Flow:
         Of the flow then, in the prior's units.
     before : torch.Tensor, shape (2, 2, *windows.count)
         Covariance of the flow a priori, px^2.
+    finer : torch.Tensor, shape windows.count
+        Variance of motion that the splines do not resolve, px^2, see `unresolved`.
     images : Images
         Their filter and noise.
     local : torch.Tensor, shape (z, y)
@@ -52,13 +55,14 @@ class Flow:
     settings : VariationalSettings
     offset : (float, float)
         Along z and y, px: how far what was learnt of places (the prior's strength, `before`,
-        `local`) has moved since.
+        `finer`, `local`) has moved since.
     """
 
     coefficients: torch.Tensor
     prior: Prior
     energy: float
     before: torch.Tensor
+    finer: torch.Tensor
     images: Images
     local: torch.Tensor
     misfit: float
@@ -98,6 +102,7 @@ class Flow:
             self,
             prior=self.prior._replace(local=strength.exp()),
             before=interpolated(self.before, centres, _back(centres, self.offset)),
+            finer=interpolated(self.finer, centres, _back(centres, self.offset)),
             local=interpolated(self.local, pixels, _back(pixels, self.offset)),
             offset=(0.0, 0.0),
         )
@@ -109,6 +114,7 @@ def flow_of(
     images: Images,
     given: torch.Tensor,
     before: torch.Tensor,
+    finer: torch.Tensor,
     windows: Windows,
     settings: VariationalSettings,
 ) -> Flow:
@@ -121,6 +127,7 @@ def flow_of(
         posterior.prior,
         _energy(posterior.prior, posterior.coefficients),
         before,
+        finer,
         images,
         images.weight / given,
         _misfit(linear, torch.zeros_like(linear.slope), images),
@@ -175,7 +182,8 @@ def next_flow(
     covariance = worse * spread(posterior.band.covariance(root), in_single).to(coefficients)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
-    found = found._replace(flag=found.flag | unskilled(found.d, covariance))
+    found = found._replace(covariance=with_unresolved(covariance, placed.finer))
+    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
     return found, replace(start, coefficients=coefficients)
 
 

@@ -50,3 +50,9 @@ def unresolved_variance(flow: torch.Tensor, knots: float, width: float) -> torch
     ratio = (ratio * change.clamp(max=1)).clamp(max=INERTIAL)
     # sum of ratio^n over the octaves n = 1, 2, ... from the knots to a pixel
     return fine * ratio * (1 - ratio ** math.log2(max(knots, 1.0))) / (1 - ratio)
+
+
+def with_unresolved(covariance: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+    """A covariance (components, components, ...) and the variance (...) of every component."""
+    unit = torch.eye(len(covariance)).to(variance)
+    return covariance + unit.reshape(*unit.shape, *[1] * variance.ndim) * variance
