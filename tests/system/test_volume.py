@@ -114,6 +114,26 @@ def test_gates_are_put_where_their_air_is():
         np.testing.assert_allclose(wrong, expected, atol=1e-3)
 
 
+def test_the_noise_told_is_that_of_long_waves():
+    """White noise, resampled, has its spectral density in waves of 8 nodes and more."""
+    axis = np.arange(-60, 61.0)
+    (plan,) = plan_scans(Scan(range=200.0, thickness=8.0, gate_count=8), axis, axis, (0.0,))
+    nodes = (200.5 + np.arange(8), np.arange(-50, 51.0), np.arange(-50, 51.0))
+    random, level = np.random.default_rng(3), 1 + np.arange(8)[:, None, None]
+    errors = level * np.ones((8, 121, 121))
+    told = volume_chain.noise_map(errors, plan, nodes).values
+    np.testing.assert_allclose(told, np.broadcast_to(level, told.shape), rtol=1e-12)
+    reach = (plan.gate_start + 0.5 + np.arange(8)) / plan.centre
+    frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(101), np.fft.fftfreq(101)))
+    for gate in (0, 7):
+        noise = level[gate] * random.standard_normal((121, 121))
+        places = {n: (n, reach[gate] * axis, {"units": "m"}) for n in "zy"}
+        image = volume_chain.resample(xr.DataArray(noise, places, ("z", "y")), *nodes[:0:-1])
+        power = np.abs(np.fft.fft2(image.values)) ** 2 / 101**2
+        density = power[(frequency > 0) & (frequency < 1 / 8)].mean()
+        assert density == pytest.approx(told[gate].mean() ** 2, rel=0.15)
+
+
 @pytest.mark.parametrize(
     ("sections", "message"),
     [

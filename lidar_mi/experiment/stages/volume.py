@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
+from scipy.interpolate import RegularGridInterpolator
 from scipy.ndimage import map_coordinates
 
 from lidar_mi import __version__
@@ -25,9 +26,6 @@ from lidar_mi.retrieval.velocimetry.common_grid import resample
 from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
-PASSED = 0.76
-"""Fraction of the variance of white noise that bicubic splines pass, mean over all places."""
-
 
 @dataclass(frozen=True)
 class Volumes:
@@ -37,12 +35,12 @@ class Volumes:
     ----------
     pairs : dict of str to list of two xr.DataArray, dims (x, z, y)
         Attenuated backscatter at both times, m^-1 sr^-1, by `Source`.
-    noise : dict of str to float
-        Rms of its standard error, same unit.
+    noise : dict of str to xr.DataArray, dims (x, z, y)
+        Standard error of the first volume of each, same unit.
     """
 
     pairs: dict[str, list[xr.DataArray]]
-    noise: dict[str, float]
+    noise: dict[str, xr.DataArray]
 
 
 def check_volume(experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan]) -> None:
@@ -106,7 +104,8 @@ def scan_volume(
     """Attenuated backscatter (m^-1 sr^-1) of all gates on one grid in the air, dims (x, z, y).
 
     Gate by gate by bicubic splines, from the beams to the nodes. Beams are wider than gates are
-    thick, so that little structure is lost; the variance of white noise is reduced to `PASSED`.
+    thick, so that little structure is lost. The variance of white noise is reduced to 0.76 in the
+    mean, that of its long waves is not.
 
     Parameters
     ----------
@@ -139,6 +138,33 @@ def scan_volume(
     return xr.DataArray(volume, coords, ("x", "z", "y"), attrs=about)
 
 
+def noise_map(error: np.ndarray, plan: ScanPlan, nodes: tuple[np.ndarray, ...]) -> xr.DataArray:
+    """Level of the noise (m^-1 sr^-1) in the voxels of `scan_volume`, dims (x, z, y).
+
+    The variance is linear between beams. Splines between the beams take noise from short waves
+    alone: their values add to the same constant everywhere. In waves as long as texture the noise
+    has the spectral density of that of the beams, and this is what retrievals take.
+
+    Parameters
+    ----------
+    error : array, shape (gates, z, y)
+        Of the attenuated backscatter of every beam.
+    plan : ScanPlan
+    nodes : x, z, y of the grid, m
+    """
+    _, z, y = nodes
+    mesh = np.stack(np.meshgrid(z, y, indexing="ij"), -1)
+    variance = [
+        RegularGridInterpolator((row, column), square)(mesh)
+        for square, row, column in zip(
+            error**2, _places(plan, "z"), _places(plan, "y"), strict=True
+        )
+    ]
+    coords = {name: (name, axis, {"units": "m"}) for name, axis in zip("xzy", nodes, strict=True)}
+    about = {"long_name": "standard error of the backscatter", "units": "m-1 sr-1"}
+    return xr.DataArray(np.sqrt(variance), coords, ("x", "z", "y"), attrs=about)
+
+
 def scan_volumes(
     experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan], scans: Sequence[xr.Dataset]
 ) -> Volumes:
@@ -149,11 +175,11 @@ def scan_volumes(
     def volume(number: int, s0: xr.DataArray) -> xr.DataArray:
         return scan_volume(s0, plans[number], lidar, way, nodes)
 
-    def level(error: xr.DataArray) -> float:
-        oblique = attenuated_backscatter(
+    def level(error: xr.DataArray) -> xr.DataArray:
+        error = attenuated_backscatter(
             error.transpose("gate", "z", "y").values, plans[0], lidar.aperture_area, way
         )
-        return float(np.sqrt(PASSED * (oblique**2).mean()))
+        return noise_map(error, plans[0], nodes)
 
     first = scans[0]
     pairs = {Source.BACKSCATTER: [volume(k, scan["S0"]) for k, scan in enumerate(scans)]}

@@ -32,6 +32,7 @@ from lidar_mi.retrieval.velocimetry.likelihood import (
 from lidar_mi.retrieval.velocimetry.prior import Prior
 from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
+from lidar_mi.retrieval.velocimetry.unresolved import with_unresolved
 from lidar_mi.retrieval.velocimetry.warping import filtered_spline
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
@@ -57,6 +58,8 @@ class Flow:
         Of the flow then, in the prior's units.
     before : torch.Tensor, shape (2, 2, *windows.count)
         Covariance of the flow a priori, px^2.
+    finer : torch.Tensor, shape windows.count
+        Variance of motion that the splines do not resolve, px^2, see `unresolved`.
     images : Images
         Their filter and noise.
     local : torch.Tensor, shape (z, y)
@@ -67,13 +70,14 @@ class Flow:
     settings : VariationalSettings
     offset : (float, float)
         Along z and y, px: how far what was learnt of places (the prior's strength, `before`,
-        `local`) has moved since.
+        `finer`, `local`) has moved since.
     """
 
     coefficients: torch.Tensor
     prior: Prior
     energy: float
     before: torch.Tensor
+    finer: torch.Tensor
     images: Images
     local: torch.Tensor
     misfit: float
@@ -113,6 +117,7 @@ class Flow:
             self,
             prior=self.prior._replace(local=strength.exp()),
             before=interpolated(self.before, centres, _back(centres, self.offset)),
+            finer=interpolated(self.finer, centres, _back(centres, self.offset)),
             local=interpolated(self.local, pixels, _back(pixels, self.offset)),
             offset=(0.0, 0.0),
         )
@@ -124,6 +129,7 @@ def flow_of(
     images: Images,
     given: torch.Tensor,
     before: torch.Tensor,
+    finer: torch.Tensor,
     windows: Windows,
     settings: VariationalSettings,
 ) -> Flow:
@@ -136,6 +142,7 @@ def flow_of(
         posterior.prior,
         _energy(posterior.prior, posterior.coefficients),
         before,
+        finer,
         images,
         images.weight / given,
         _misfit(linear, torch.zeros_like(linear.slope), images),
@@ -246,7 +253,8 @@ def next_flow(
     covariance = worse * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
-    found = found._replace(flag=found.flag | unskilled(found.d, covariance))
+    found = found._replace(covariance=with_unresolved(covariance, placed.finer))
+    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
     return found, replace(start, coefficients=coefficients)
 
 

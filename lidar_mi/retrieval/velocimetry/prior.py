@@ -214,16 +214,17 @@ def first_prior(
     spacing: Sequence[float],
     settings: VariationalSettings,
 ) -> Prior:
-    """A uniform prior of the strength that matches a flow's vorticity."""
+    """A prior of the strength that matches a flow's vorticity: in a volume at each place."""
     mesh = halves(axes, coefficients)
     dims = mesh.dims
     one = torch.ones(len(KINDS[dims]), *mesh.shape).to(coefficients)
     prior = Prior(one, mesh, width, tuple(spacing))
-    vorticity = prior.by_kind(prior.rates(coefficients).square())[:-1].sum(0).mean()
+    vorticity = prior.by_kind(prior.rates(coefficients).square())[:-1].sum(0)
+    vorticity = vorticity.mean() if dims == 2 else prior.smooth(vorticity)
     cells = math.prod(axis.cells / axis.size for axis in axes)
-    strength = (dims - 1) * cells / float(vorticity + settings.least_vorticity**2)
+    strength = (dims - 1) * cells / (vorticity + settings.least_vorticity**2)
     if dims == 2:
-        divergence = Divergence(settings.ratio * strength, settings.ratio)
+        divergence = Divergence(settings.ratio * float(strength), settings.ratio)
         return prior._replace(local=strength * one[:1], divergence=divergence)
     local = strength * one
     local[-1] *= settings.ratio

@@ -98,7 +98,8 @@ class IterativeSettings:
     tolerance, loose : float
         Residual over the first one at which iteration ends: for the flow, for a drawn one.
     steps : int
-        Largest number of steps.
+        Largest number of steps. Where the prior is strong, draws that end too early state too small
+        errors.
     draws, final_draws : int
         Flows drawn per round, and for the standard errors.
     damping : float
@@ -110,7 +111,7 @@ class IterativeSettings:
 
     tolerance: float = 1e-2
     loose: float = 1e-1
-    steps: int = 60
+    steps: int = 120
     draws: int = 4
     final_draws: int = 16
     damping: float = 0.05
@@ -166,7 +167,9 @@ class VariationalSettings:
     knots : tuple of float
         Spacing of the knots over the template on each level.
     rounds : tuple of int
-        Rounds of flow and evidence on each level.
+        Rounds of flow and evidence on each level. In volumes further ones make the prior too
+        strong: it takes vorticity for white, and that of a wake has more of its variance in long
+        waves.
     noise_round : int
         Round of the last level before which noise is estimated from the misfit.
     rounds_changed : int
@@ -191,8 +194,8 @@ class VariationalSettings:
         Initial strength of the divergence over the vorticity's; 100 is a standard deviation of
         10 % of the vorticity's.
     least_vorticity : float
-        Lower limit of the initial standard deviation of the vorticity, px per px: a coarse flow
-        may be rigid.
+        Lower limit of the initial standard deviation of the vorticity, px per px, of volumes at
+        each place: a coarse flow may be rigid.
     largest_ratio : float
         Upper limit of the ratio, images only; 1e5 is 0.3 % of the standard deviation. Images of
         weak texture without measurable divergence do not prove that there is none.
@@ -230,7 +233,7 @@ class VariationalSettings:
 
 VOLUME_VARIATIONAL = VariationalSettings(
     knots=(0.625,),
-    rounds=(5,),
+    rounds=(7,),
     noise_round=3,
     coloured=False,
     least_vorticity=0.03,

@@ -14,13 +14,14 @@ from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskill
 from lidar_mi.retrieval.velocimetry.coherent_change import what_is_left
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
-from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
+from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.velocimetry.likelihood import linearised, prepared
 from lidar_mi.retrieval.velocimetry.misfit import with_local_noise
 from lidar_mi.retrieval.velocimetry.next_flow import Flow, flow_of
 from lidar_mi.retrieval.velocimetry.prior import first_prior, refined
 from lidar_mi.retrieval.velocimetry.quality import Flag, check_between
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
+from lidar_mi.retrieval.velocimetry.unresolved import unresolved_variance, with_unresolved
 from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, working
 
 
@@ -87,8 +88,8 @@ def variational(
     Displacement
         Wind times dt at the windows' centres at mid-time. `score` is the smallest correlation of an
         image with the mean of the others, `covariance` that of the posterior, from noise, misfit
-        and prior. Neither contains what the splines cannot resolve: 0.02 px in vortex cores
-        without noise. On undersampled images displacements have an error that is correlated among
+        and prior, and of motion finer than the splines (`unresolved`), half of it in vortex cores.
+        On undersampled images displacements have an error that is correlated among
         neighbours: up to 0.04 px on particles of 2 px (1/e^2), 0.01 px of 2.5 px, none on larger
         ones.
 
@@ -171,18 +172,23 @@ def variational_and_flow(
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
     score = agreement(linear, windows)
+    finer = unresolved_variance(
+        mesh.field(posterior.coefficients.to(like)), apart, settings.misfit_width * windows.template
+    )
+    finer = interpolated(finer, pixels, centres)
     # a flow that depends on how much is assumed to move through the plane is not in the images
     spread = (flow - flow.mean(tuple(range(1, flow.ndim)), keepdim=True)).square().mean()
     undetermined = images.through > 0 and bool((flow - displaced_only).square().mean() > spread)
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
+    found = found._replace(covariance=with_unresolved(covariance, finer))
     if windows.dims > 2:
         return found, None
-    found = found._replace(flag=found.flag | unskilled(found.d, covariance))
+    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
     if undetermined:
         found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
     if not (keep and isinstance(posterior, direct.Posterior)):
         return found, None
-    return found, flow_of(posterior, linear, images, given, before, windows, settings)
+    return found, flow_of(posterior, linear, images, given, before, finer, windows, settings)
 
 
 def _solver(

@@ -1,0 +1,58 @@
+"""Motion that splines do not resolve: its variance, from that of the scales that they do."""
+
+import math
+
+import torch
+
+from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
+from lidar_mi.retrieval.velocimetry.windows import averaged
+
+INERTIAL = 2 ** (-2 / 3)
+"""Variance of turbulence in an octave of wavenumber over that in the octave of longer waves."""
+
+
+def unresolved_variance(flow: torch.Tensor, knots: float, width: float) -> torch.Tensor:
+    """Variance of a component of the motion between two knots of a flow's splines and a pixel.
+
+    Splines with knots 2, 4 and 8 times as far apart leave three octaves of the flow. The ratio of
+    variances of the last two, times its change from the two before, is that of the next octave to
+    the last one; it holds for all octaves down to a pixel. In smooth vortices the ratio falls
+    from octave to octave. In the inertial range of turbulence, of spectral density k^(-5/3), it is
+    2^(-2/3) (Kolmogorov 1941, Dokl. Akad. Nauk SSSR 30, 301-305; Pope 2000, Turbulent Flows,
+    section 6.5). It is taken to be no larger, and not to grow. The extrapolation is ours.
+
+    Parameters
+    ----------
+    flow : torch.Tensor, shape (components, ...)
+        At the pixels; px in dt.
+    knots : float
+        Spacing of the knots of its splines, px.
+    width : float
+        Standard deviation of the Gaussian that averages the variances, px.
+
+    Returns
+    -------
+    torch.Tensor, shape (...)
+        px^2, mean over the components as of isotropic motion. In vortex cores its root is half of
+        what splines leave. Where noise and prior have smoothed the finest octave it is too small.
+    """
+    shape, known = flow.shape[1:], torch.ones_like(flow[0], dtype=torch.bool)
+    places = [torch.arange(n).to(flow) for n in shape]
+    octaves, finer = [], flow
+    for times in (2, 4, 8):
+        mesh = Mesh([Axis(n, times * knots) for n in shape], places)
+        coarser = mesh.field(mesh.fitted(flow))
+        octaves.append(averaged((finer - coarser).square().mean(0), known, width))
+        finer = coarser
+    fine, middle, coarse = (octave.clamp(min=1e-30) for octave in octaves)
+    ratio = fine / middle
+    change = ratio / (middle / coarse).clamp(max=1)
+    ratio = (ratio * change.clamp(max=1)).clamp(max=INERTIAL)
+    # sum of ratio^n over the octaves n = 1, 2, ... from the knots to a pixel
+    return fine * ratio * (1 - ratio ** math.log2(max(knots, 1.0))) / (1 - ratio)
+
+
+def with_unresolved(covariance: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:
+    """A covariance (components, components, ...) and the variance (...) of every component."""
+    unit = torch.eye(len(covariance)).to(variance)
+    return covariance + unit.reshape(*unit.shape, *[1] * variance.ndim) * variance

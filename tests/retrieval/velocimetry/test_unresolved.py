@@ -1,0 +1,67 @@
+"""Variance of motion that splines leave, against what they leave of flows that are known.
+
+Detects turbulence that counts for nothing, a spectrum extrapolated with another law, and smooth
+flow that is taken for turbulence.
+"""
+
+import math
+
+import numpy as np
+import torch
+
+from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
+from lidar_mi.retrieval.velocimetry.unresolved import unresolved_variance
+from tests.support.flows import axes
+
+KNOTS, WIDTH = 4.0, 6.0
+
+
+def left(flow):
+    """Mean square that splines of these knots leave of a flow, by numpy's least squares."""
+    rows, columns = (Axis(n, KNOTS).basis(torch.arange(n).double()).numpy() for n in flow.shape[1:])
+    of_rows, of_columns = (basis @ np.linalg.pinv(basis) for basis in (rows, columns))
+    return np.mean([(part - of_rows @ part @ of_columns.T) ** 2 for part in flow.numpy()])
+
+
+def resolved(flow):
+    """What the splines hold of it."""
+    places = [torch.arange(n).double() for n in flow.shape[1:]]
+    mesh = Mesh([Axis(n, KNOTS) for n in flow.shape[1:]], places)
+    return mesh.field(mesh.fitted(flow))
+
+
+def turbulence(seed, size=256):
+    """Two components of a periodic plane, px in dt: a plane of turbulence has k^(-8/3) in it."""
+    k = np.hypot(*np.meshgrid(np.fft.fftfreq(size), np.fft.rfftfreq(size), indexing="ij"))
+    amplitude = np.where(k > 0, np.maximum(k, 1 / size), np.inf) ** (-4 / 3)
+    random = np.random.default_rng(seed)
+    noise = np.fft.rfft2(random.standard_normal((2, size, size)))
+    field = np.fft.irfft2(amplitude * noise)
+    return torch.as_tensor(field / field.std())
+
+
+def test_of_turbulence():
+    """Spectral density k^(-5/3): 30 % of what splines leave, from what they hold alone."""
+    for seed in (1, 2):
+        flow = turbulence(seed)
+        found = float(unresolved_variance(resolved(flow), KNOTS, WIDTH).mean())
+        assert abs(math.log(found / left(flow))) < math.log(1.7)
+
+
+def test_of_a_smooth_vortex_pair():
+    """No turbulence: about what splines leave, and outside the cores nothing."""
+    y, z = axes(219, 139)
+    grid = np.meshgrid(y, z)
+    v, w = velocity(vortex_pair(400.0, separation=47.1, core_radius=3.0), *grid)
+    flow = torch.as_tensor(np.stack([w, v])) * 0.1 / 0.5
+    found = unresolved_variance(resolved(flow), KNOTS, WIDTH)
+    assert 0.1 < float(found.mean()) / left(flow) < 2
+    outside = np.minimum(*(np.hypot(grid[0] - s * 47.1 / 2, grid[1]) for s in (1, -1))) > 12
+    assert float(found[torch.as_tensor(outside)].mean().sqrt()) < 1e-3
+
+
+def test_of_a_flow_that_splines_hold():
+    y = torch.arange(64).double()
+    shear = torch.stack([0 * y + 0.3, 0.05 * y])[:, None].expand(-1, 48, -1).contiguous()
+    assert float(unresolved_variance(shear, KNOTS, WIDTH).max()) < 1e-9
