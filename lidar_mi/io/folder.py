@@ -33,7 +33,8 @@ def make_folder(folder: str | Path) -> None:
     folder = Path(folder)
     try:
         if not folder.is_dir():
-            folder.mkdir(parents=True)
+            # another process may be making it, too
+            folder.mkdir(parents=True, exist_ok=True)
             sync_folder(folder.parent)
     except OSError as error:
         raise InputError(
