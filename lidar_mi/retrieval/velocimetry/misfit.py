@@ -10,7 +10,7 @@ from lidar_mi.retrieval.velocimetry.coherent_change import (
     mean_square_displacement,
 )
 from lidar_mi.retrieval.velocimetry.likelihood import Images, Linear
-from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, mismatch
+from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, filter_of, mismatch
 from lidar_mi.retrieval.velocimetry.windows import averaged
 
 # Misfit over white noise estimated from spectra below which that is not noise: of white noise the
@@ -69,9 +69,10 @@ def with_local_noise(
     if left is not None:
         square = mean_square_displacement(images, linear, left)
         coherent = max(coherent, square * CORRELATED_AREA)
-    residual, slope = (part * linear.valid for part in (_misfit(linear), linear.slope))
+    residual = (linear.warped - linear.warped.mean(0)) * linear.valid
+    slope = linear.slope * linear.valid
+    power, steep = _weighted(images, images.spline.passed, residual, slope)
     if not images.given and linear.valid.any():
-        power, steep = _weighted(images, images.spline, residual, slope)
         whole = float(power[linear.valid].sum() / steep[linear.valid].sum())
         overstated = whole < _OVERSTATED * images.white**2
         if overstated:
@@ -82,9 +83,7 @@ def with_local_noise(
         floor = min(floor, (_FINEST * rms(images.stack)) ** 2)
         # where air changes, what differs by less than the mean has been absorbed by the flow
         least, least_density, rounds = 1.0 if again else _LEAST_LOCAL, _LEAST_DENSITY, _ROUNDS
-    spline, whitened, steeper = images.spline, residual, slope
-    for _ in range(rounds):
-        power, steep = _weighted(images, spline, whitened, steeper)
+    for to_come in reversed(range(rounds)):
         local = averaged(power, linear.valid, width) / averaged(steep, linear.valid, width)
         mean = float(local[linear.valid].mean()) if linear.valid.any() else 0.0
         level = max(floor, mean, 1e-30)
@@ -93,20 +92,30 @@ def with_local_noise(
         if coloured:
             density = mismatch(images.spline, residual * weight.sqrt())
             density = density.clamp(min=max(floor, least_density * level))
-        spline, noise = _filtered(images, level, density, weight)
-        if rounds > 1:
-            parts = (_refiltered(images.spline, spline, part) for part in (residual, slope))
-            whitened, steeper = (part * linear.valid for part in parts)
+        if to_come:
+            chosen = filter_of(
+                images.stack,
+                level**0.5,
+                density,
+                weight.sqrt(),
+                images.blur,
+                images.spline.settings,
+            )
+            parts = (_refiltered(images.spline, chosen.gain, part) for part in (residual, slope))
+            power, steep = _weighted(
+                images, chosen.passed, *(part * linear.valid for part in parts)
+            )
     square = 0.0
     if coloured:
         through = displaced(images.spline, images.stack, images.white)
         square = unexplained(images.spline, mismatch(images.spline, residual), through, knots)
-        if square:
-            density = torch.maximum(density, square * through)
-            spline, noise = _filtered(images, level, density, weight)
+        density = torch.maximum(density, square * through)
+    spline, level = band_limited(
+        images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
+    )
     return images._replace(
         spline=spline,
-        noise=noise,
+        noise=level,
         weight=weight,
         noise_updated=True,
         through=square,
@@ -114,36 +123,23 @@ def with_local_noise(
     )
 
 
-def _misfit(linear: Linear) -> torch.Tensor:
-    """Each warped image less the mean of all."""
-    return linear.warped - linear.warped.mean(0)
-
-
 def _weighted(
-    images: Images, spline: Spline, residual: torch.Tensor, slope: torch.Tensor
+    images: Images, passed: float, residual: torch.Tensor, slope: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Variance of the noise times the squared slopes at each pixel, and the squared slopes.
 
+    Of fields after a filter that lets pass this fraction of the variance of white noise.
     What counts is the misfit where slopes are steep, and there it is largest (White 1980,
     Econometrica 48, 817-838).
     """
-    free = (len(residual) - 1) * max(spline.passed, 1e-6)
+    free = (len(residual) - 1) * max(passed, 1e-6)
     steep = slope.square().sum(0)
     steep = steep + 1e-3 * steep.mean() + 1e-30
     return residual.square().sum(0) * images.weight * steep / free, steep
 
 
-def _filtered(
-    images: Images, level: float, density: torch.Tensor | None, weight: torch.Tensor
-) -> tuple[Spline, float]:
-    """The images after the filter for this noise."""
-    return band_limited(
-        images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
-    )
-
-
-def _refiltered(before: Spline, after: Spline, fields: torch.Tensor) -> torch.Tensor:
-    """Fields of images after one filter, as they would be after another."""
+def _refiltered(before: Spline, gain: torch.Tensor, fields: torch.Tensor) -> torch.Tensor:
+    """Fields of images after one filter, as they would be after another of this gain."""
     most = float(before.gain.max())
-    gain = torch.where(before.gain > 1e-3 * most, after.gain / before.gain.clamp(min=1e-30), 0.0)
-    return before._replace(gain=gain).filtered(fields)
+    ratio = torch.where(before.gain > 1e-3 * most, gain / before.gain.clamp(min=1e-30), 0.0)
+    return before._replace(gain=ratio).filtered(fields)

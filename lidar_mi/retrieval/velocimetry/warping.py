@@ -253,14 +253,32 @@ def band_limited(
     InputError
         A noise that is no standard deviation.
     """
+    settings = settings or FilterSettings()
+    chosen = filter_of(images, noise, mismatch, weight, blur, settings)
+    return filtered_spline(_finite(images), chosen, settings), chosen.level
+
+
+def filter_of(
+    images: Sequence[torch.Tensor],
+    noise: float | None = None,
+    mismatch: torch.Tensor | None = None,
+    weight: torch.Tensor | None = None,
+    blur: float = 0.0,
+    settings: FilterSettings | None = None,
+) -> Filter:
+    """The filter of `band_limited`, which takes the same arguments, without the splines."""
     checked_noise(noise)
     settings = settings or FilterSettings()
     known = torch.stack([torch.isfinite(image) for image in images])
-    images = torch.stack([stored(_continued(image)) for image in images])
+    images = _finite(images)
     sizes = transform_sizes(images.shape[1:], settings)
     spectrum = power_spectrum(images, sizes, settings, weight, known)
-    chosen = best_filter(spectrum, settings, noise, mismatch, blur)
-    return filtered_spline(images, chosen, settings), chosen.level
+    return best_filter(spectrum, settings, noise, mismatch, blur)
+
+
+def _finite(images: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Images (images, ...) as they are stored, `_continued`."""
+    return torch.stack([stored(_continued(image)) for image in images])
 
 
 def _continued(image: torch.Tensor) -> torch.Tensor:

@@ -172,7 +172,9 @@ def begun_fit(
         [image1, image1], dt, noise, profile, frozen, times, start, telescope, device
     )
     with threads_for(image1.size):
-        ready = _begun(on_device(image1, device), *given)
+        *of_images, start, telescope = given
+        make = builder_of([on_device(image1, device)], *of_images, telescope)
+        ready = _begun(make, start)
     return partial(_with_second, image1, ready, given, device)
 
 
@@ -222,7 +224,7 @@ def fit_pixels(
     """`fit_vortices` on tensors (z, y) and axes in m, with times from `checked_times`."""
     given = z, y, dt, noise, profile, frozen, times
     if start is not None:
-        ready = _begun(image1, *given, start, telescope)
+        ready = _begun(builder_of([image1], *given, telescope), start)
         near = ready and _completed(ready, image1, image2)
         if near:
             return near
@@ -241,24 +243,16 @@ def fit_pixels(
     return _iterated(found, make, limits)
 
 
-def _begun(
-    image1: torch.Tensor,
-    z: np.ndarray,
-    y: np.ndarray,
-    dt: float,
-    noise: float | torch.Tensor | None,
-    profile: Profile,
-    frozen: bool,
-    times: Sequence[np.ndarray] | None,
-    start: VortexPairFit,
-    telescope: tuple[float, float, float] | None,
-) -> Begun | None:
-    """The fit near an expected pair before image 2 is there; None if there is none."""
-    make = builder_of([image1], z, y, dt, noise, profile, frozen, times, telescope)
+def _begun(make: Builder | str, start: VortexPairFit) -> Begun | None:
+    """The fit near an expected pair before image 2 is there; None if there is none.
+
+    `make` is that of image 1, or the reason for which there is none.
+    """
     if isinstance(make, str):
         return None
+    limits = step_limits(make.y, make.z, make.profile, make.dt)
     # steps need no more: places to 1e-5 m
-    return begun(start, make.single(), step_limits(y, z, profile, dt))
+    return begun(start, make.single(), limits)
 
 
 def _completed(ready: Begun, image1: torch.Tensor, image2: torch.Tensor) -> VortexPairFit | None:
