@@ -148,7 +148,7 @@ def bootstrap_covariance(
         lost = lost - torch.stack([averaged(part, everywhere, window) for part in lost])
         flow = flow + lost
 
-    wind = _at_mid_time(flow, coarse, centred)
+    wind = at_mid_time(flow, coarse, centred)
     first, second = normalised(images)
     carried = _carried(filled(first), wind)
     rest = torch.where(second.isfinite(), second - carried, 0.0)
@@ -263,7 +263,7 @@ def _slope(field: torch.Tensor, axis: int) -> torch.Tensor:
     return torch.gradient(field, dim=axis)[0]
 
 
-def _at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Tensor:
+def at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Tensor:
     """Displacement (2, z, y) in dt of the air that is at each pixel at mid-time."""
     weights = [
         linear_weights(windows.centres(axis).to(flow), torch.arange(n).to(flow))

@@ -171,12 +171,12 @@ def prior_and_gradient(
 
 def data_form(linear: Linear, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
     """Quadratic form of what the images tell, of all cells along z or of some (`band.form`)."""
-    return form(linear.information * linear.slope[:, None] * linear.slope, mesh, cells=cells)
+    return form(linear.information * linear.damped[:, None] * linear.damped, mesh, cells=cells)
 
 
 def curvature(linear: Linear, mesh: Mesh) -> torch.Tensor:
     """The log-likelihood's quadratic form: steps with less than it would overshoot."""
-    return form(linear.weight * linear.slope[:, None] * linear.slope, mesh)
+    return form(linear.weight * linear.damped[:, None] * linear.damped, mesh)
 
 
 def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:

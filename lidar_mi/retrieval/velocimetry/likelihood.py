@@ -10,16 +10,23 @@ from lidar_mi.retrieval.velocimetry.brightness import normalised, of_one_brightn
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
 from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
-from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, nearest
+from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, filter_of, nearest
 from lidar_mi.retrieval.velocimetry.windows import averaged, stored
 
 # Interpolation error of the splines over an image's rms structure: the least noise assumed.
 _INTERPOLATION = 1e-5
+# A noise that is given and below this fraction of that of the spectra (of the variances) is only a
+# lower limit: what differs are the air and what splines cannot interpolate.
+_SAYS_LITTLE = 0.1
 # Width of the means that tell texture from noise, in cells between knots: at 0.8 too few pixels,
 # at 3 the rim of smoke counts as texture beside it.
 _SHARE_WIDTH = 1.5
 # Standard deviation, px, of the Gaussian mean of slopes that are structure and not texture.
 STRUCTURE = 3.0
+# Of the mean that passes the long waves in which structure moves alike over an area; and the
+# variance of its motion in the other waves over that in these. Chosen on seeds 41 to 43 of the
+# true second states of ``validation/coverage.py``: 0.8 to 1.5 px and 0.1 to 0.3 are alike.
+_LONG, _SHORT = 1.0, 0.1
 
 
 class Images(NamedTuple):
@@ -48,7 +55,9 @@ class Images(NamedTuple):
     through : float
         Mean square displacement through the plane that the misfit tells of, px^2.
     given : bool
-        Whether the noise was given; else it is that of the images' spectra.
+        Whether the noise is as given; else it is that of the images' spectra.
+    told : float
+        The noise that was given, a lower limit; 0 if none was.
     coherent : float
         Variance of the displacement by which structure as a whole moves otherwise than the air in
         the plane, times the area over which it does so alike, px^4.
@@ -62,6 +71,7 @@ class Images(NamedTuple):
     stack: torch.Tensor
     blur: float
     white: float
+    told: float
     noise_updated: bool = False
     through: float = 0.0
     given: bool = True
@@ -80,6 +90,11 @@ class Linear(NamedTuple):
     ----------
     slope : torch.Tensor, shape (components, ...)
         Of the mean of the warped images.
+    damped : torch.Tensor, shape (components, ...)
+        The same without what is `coarse`: slopes that tell of the flow.
+    coarse : torch.Tensor, shape (z, y), or None
+        Fraction of the long waves of differences and slopes that is left out at each pixel, as
+        structure moves otherwise than the air there: what is left is as white as the noise.
     gradient : torch.Tensor, shape (components, ...)
         Of the log-likelihood with respect to the flow at each pixel.
     weight : torch.Tensor
@@ -95,6 +110,8 @@ class Linear(NamedTuple):
     """
 
     slope: torch.Tensor
+    damped: torch.Tensor
+    coarse: torch.Tensor | None
     gradient: torch.Tensor
     weight: torch.Tensor
     information: torch.Tensor
@@ -112,9 +129,12 @@ def prepared(
     """The images, normalised and band-limited, with the noise as given or estimated."""
     known_at, weight = usable_and_weight(stack, noise, settings)
     images = normalised(stack)
+    told = 0.0 if noise is None else rms(noise)
+    of_spectra = filter_of(images, None, None, weight.sqrt(), blur, settings.filter).level
+    given = told**2 > _SAYS_LITTLE * of_spectra**2
     spline, level = band_limited(
         images,
-        noise if noise is None else rms(noise),
+        told if given else of_spectra,
         weight=weight.sqrt(),
         blur=blur,
         settings=settings.filter,
@@ -122,8 +142,7 @@ def prepared(
     level = max(level, _INTERPOLATION * rms(images))
     time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
     time = time - time.mean()
-    given = noise is not None
-    return Images(spline, known_at, time, level, weight, images, blur, level, given=given)
+    return Images(spline, known_at, time, level, weight, images, blur, level, told, given=given)
 
 
 def usable_and_weight(
@@ -173,20 +192,33 @@ def linearised_there(
     off = (misfit / ((len(value) - 1) * passed * variance)).sqrt()
     weight = images.weight * (settings.robust / off.clamp(min=settings.robust)) * valid
     time = images.time.reshape(-1, *[1] * mesh.dims)
-    downhill = -(time * (value - value.mean(0))).sum(0) * slope
+    difference = (time * (value - value.mean(0))).sum(0)
     informed = images.spline.efficiency * weight / variance
+    coarse, damped = None, slope
     if images.coherent:
-        # changes in proportion to the structure's slope s: v = variance + coherent s^2 a pixel
+        # long waves scatter by variance + coherent s^2 a pixel where structure has the slope s
         structure = torch.stack([averaged(part, valid, STRUCTURE) for part in slope])
-        change = images.coherent * structure.square().sum(0)
-        informed = informed / (1 + change * images.weight / variance)
+        change = images.coherent * structure.square().sum(0) * images.weight / variance
+        informed = informed / (1 + _SHORT * change)
+        coarse = 1 - ((1 + _SHORT * change) / (1 + change)).sqrt()
+        damped = torch.stack([without_coarse(part, coarse, valid) for part in slope])
+        difference = without_coarse(difference, coarse, valid)
+    downhill = -difference * damped
     second = images.time.square().sum() * informed
     information = second / images.spline.excess
     if mesh.dims == 2:
         noise = misfit / ((len(value) - 1) * passed * variance)
         share = _share_of_texture(images, slope, noise, valid, mesh)
         information = second * share.square() * images.spline.excess
-    return Linear(slope, informed * downhill, second, information, variance, value, valid)
+    gradient = informed * downhill
+    return Linear(slope, damped, coarse, gradient, second, information, variance, value, valid)
+
+
+def without_coarse(
+    field: torch.Tensor, coarse: torch.Tensor | None, valid: torch.Tensor
+) -> torch.Tensor:
+    """A field (z, y) without a fraction of its long waves at each pixel, see `Linear.coarse`."""
+    return field if coarse is None else field - coarse * averaged(field, valid, _LONG)
 
 
 def told_by_first(

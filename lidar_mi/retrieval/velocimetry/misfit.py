@@ -80,7 +80,7 @@ def with_local_noise(
     floor = images.white**2
     least, least_density, rounds = _LEAST_GIVEN, _LEAST_GIVEN, 1
     if overstated and left is not None:
-        floor = min(floor, (_FINEST * rms(images.stack)) ** 2)
+        floor = max(min(floor, (_FINEST * rms(images.stack)) ** 2), images.told**2)
         # where air changes, what differs by less than the mean has been absorbed by the flow
         least, least_density, rounds = 1.0 if again else _LEAST_LOCAL, _LEAST_DENSITY, _ROUNDS
     for to_come in reversed(range(rounds)):

@@ -266,7 +266,7 @@ def _as_informed(ready: Awaited, linear: Linear) -> torch.Tensor:
     1 / (1 + f (r - 1)).
     """
     found, before, windows = ready.covariance, ready.placed.before, ready.start.windows
-    known = information_near(linear.slope, linear.information, ready.mesh)
+    known = information_near(linear.damped, linear.information, ready.mesh)
     ratio = (known / ready.information.clamp(min=1e-30)).to(found)
     pixels, centres = _pixels(windows, found), _centres(windows, found)
     ratio = interpolated(ratio, pixels, centres)

@@ -11,7 +11,9 @@ INERTIAL = 2 ** (-2 / 3)
 """Variance of turbulence in an octave of wavenumber over that in the octave of longer waves."""
 
 
-def unresolved_variance(flow: torch.Tensor, knots: float, width: float) -> torch.Tensor:
+def unresolved_variance(
+    flow: torch.Tensor, knots: float, width: float, known: torch.Tensor | None = None
+) -> torch.Tensor:
     """Variance of a component of the motion between two knots of a flow's splines and a pixel.
 
     Splines with knots 2, 4 and 8 times as far apart leave three octaves of the flow. The ratio of
@@ -29,6 +31,9 @@ def unresolved_variance(flow: torch.Tensor, knots: float, width: float) -> torch
         Spacing of the knots of its splines, px.
     width : float
         Standard deviation of the Gaussian that averages the variances, px.
+    known : torch.Tensor of bool, shape (...), optional
+        Pixels whose flow the images tell: beside them it is what the prior makes of noise. Left
+        out: all.
 
     Returns
     -------
@@ -36,7 +41,9 @@ def unresolved_variance(flow: torch.Tensor, knots: float, width: float) -> torch
         px^2, mean over the components as of isotropic motion. In vortex cores its root is half of
         what splines leave. Where noise and prior have smoothed the finest octave it is too small.
     """
-    shape, known = flow.shape[1:], torch.ones_like(flow[0], dtype=torch.bool)
+    shape = flow.shape[1:]
+    if known is None:
+        known = torch.ones_like(flow[0], dtype=torch.bool)
     places = [torch.arange(n).to(flow) for n in shape]
     octaves, finer = [], flow
     for times in (2, 4, 8):

@@ -19,7 +19,7 @@ from lidar_mi.retrieval.velocimetry.likelihood import linearised, prepared
 from lidar_mi.retrieval.velocimetry.misfit import with_local_noise
 from lidar_mi.retrieval.velocimetry.next_flow import Flow, flow_of
 from lidar_mi.retrieval.velocimetry.prior import first_prior, refined
-from lidar_mi.retrieval.velocimetry.quality import Flag, check_between
+from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, no_skill
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.velocimetry.unresolved import unresolved_variance, with_unresolved
 from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, working
@@ -135,6 +135,7 @@ def variational_and_flow(
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
     last, prior, displaced_only, posterior = len(settings.knots) - 1, None, flow, None
+    width = settings.misfit_width * windows.template
     for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
         apart = max(2.0, knots * windows.template)
         axes = [Axis(n, apart) for n in windows.shape]
@@ -143,8 +144,8 @@ def variational_and_flow(
         coefficients = mesh.fitted(flow)
         if prior is None:
             unit = (1.0,) * windows.dims
-            width = settings.prior_width * windows.template
-            prior = first_prior(axes, working(coefficients), width, spacing or unit, settings)
+            wide = settings.prior_width * windows.template
+            prior = first_prior(axes, working(coefficients), wide, spacing or unit, settings)
         else:
             prior = refined(prior, axes)
         rough, turn = images.single(), 0
@@ -152,7 +153,6 @@ def variational_and_flow(
             if level == last and turn in (settings.noise_round, rounds):
                 linear = linearised(images, mesh, coefficients, settings)
                 displaced_only = displaced_only if turn == rounds else mesh.field(coefficients)
-                width = settings.misfit_width * windows.template
                 left = None
                 if windows.dims == 2 and posterior is not None:
                     left = what_is_left(linear, mesh, posterior.response)
@@ -172,14 +172,14 @@ def variational_and_flow(
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
     score = agreement(linear, windows)
-    finer = unresolved_variance(
-        mesh.field(posterior.coefficients.to(like)), apart, settings.misfit_width * windows.template
-    )
-    finer = interpolated(finer, pixels, centres)
     # a flow that depends on how much is assumed to move through the plane is not in the images
     spread = (flow - flow.mean(tuple(range(1, flow.ndim)), keepdim=True)).square().mean()
     undetermined = images.through > 0 and bool((flow - displaced_only).square().mean() > spread)
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
+    known = (found.flag == 0) & ~no_skill(d, covariance)
+    known = interpolated(known.to(like), centres, pixels) > 0.5
+    finer = unresolved_variance(mesh.field(posterior.coefficients.to(like)), apart, width, known)
+    finer = interpolated(finer, pixels, centres)
     found = found._replace(covariance=with_unresolved(covariance, finer))
     if windows.dims > 2:
         return found, None

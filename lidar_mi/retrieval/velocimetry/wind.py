@@ -14,6 +14,7 @@ from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.beam_times import checked_times, vector_times
 from lidar_mi.retrieval.velocimetry.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.velocimetry.bound import displacement_bound
+from lidar_mi.retrieval.velocimetry.coherent_windows import coherent_covariance
 from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.velocimetry.illumination import described, illumination
 from lidar_mi.retrieval.velocimetry.methods import METHODS, Method
@@ -217,6 +218,8 @@ def retrieve_wind(
                 if standard_errors
                 else None
             )
+            if covariance is not None and chosen.centred:
+                covariance = covariance + coherent_covariance(pair, found, windows, noise)
             found = found._replace(covariance=covariance)
         if found.covariance is not None:
             unknown = ~found.covariance.isfinite().all(0).all(0) & bool(chosen.repeats)

@@ -12,7 +12,8 @@ from lidar_mi.retrieval.velocimetry.windows import Windows
 def linear(images):
     nothing = torch.zeros(2, *images.shape[1:])
     valid = torch.ones(images.shape[1:], dtype=torch.bool)
-    return Linear(nothing, nothing, nothing[0], nothing[0], 1.0, images, valid)
+    still = nothing[0]
+    return Linear(nothing, nothing, None, nothing, still, still, 1.0, images, valid)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.5, 1.0])

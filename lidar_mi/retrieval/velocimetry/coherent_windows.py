@@ -1,0 +1,95 @@
+"""Errors of windows where structure moves otherwise than the air, see `coherent_change`.
+
+A window follows what moves in it. The known motion that a bootstrap retrieves has no such structure
+(`bootstrap`), so that this error comes besides.
+"""
+
+from collections.abc import Sequence
+
+import torch
+
+from lidar_mi.retrieval.velocimetry.bootstrap import at_mid_time
+from lidar_mi.retrieval.velocimetry.coherent_change import Left, mean_square_displacement
+from lidar_mi.retrieval.velocimetry.displacement import Displacement
+from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
+from lidar_mi.retrieval.velocimetry.likelihood import STRUCTURE, Linear, linearised, prepared
+from lidar_mi.retrieval.velocimetry.outliers import validated
+from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
+from lidar_mi.retrieval.velocimetry.windows import (
+    Windows,
+    averaged,
+    linear_weights,
+    separable,
+    working,
+)
+
+
+def coherent_covariance(
+    stack: Sequence[torch.Tensor],
+    found: Displacement,
+    windows: Windows,
+    noise: float | torch.Tensor | None,
+) -> torch.Tensor:
+    """Covariance of vectors by structure that moves otherwise than the air.
+
+    Where structure of slope s moves by e, the images differ by |s| e. Over a window, where e is
+    alike, that displaces the vector by J^-1 <I' |s|> e, with the slopes I' of the image, J the mean
+    over the window of their products, and s their Gaussian mean over 3 px. A window that holds
+    nothing but structure follows it, and fine texture beside it holds the vector.
+
+    The mean square of e is `coherent_change.mean_square_displacement`, about the flow of the
+    vectors, as windows of least squares leave it.
+
+    Parameters
+    ----------
+    stack : sequence of torch.Tensor, shape (z, y)
+        Two images.
+    found : Displacement
+        Of windows that are deformed with the flow; at their centres.
+    windows : Windows
+    noise : float or torch.Tensor, optional
+        Standard deviation of the images' noise, see `variational.variational`.
+
+    Returns
+    -------
+    torch.Tensor, shape (2, 2, *windows.count)
+        px^2; 0 where air is carried as a whole.
+    """
+    settings = VariationalSettings()
+    images = prepared(stack, noise, 0.0, settings)
+    flow, _ = validated(working(found.d), max(1, round(windows.template / 2 / windows.stride)))
+    axes = [Axis(n, windows.template / 2) for n in windows.shape]
+    pixels = [torch.arange(n).to(flow) for n in windows.shape]
+    mesh = Mesh(axes, pixels)
+    linear = linearised(images, mesh, mesh.fitted(at_mid_time(flow, windows, True)), settings)
+    square = mean_square_displacement(images, linear, left_by_windows(linear, windows))
+    slope = working(linear.slope)
+    structure = torch.stack([averaged(part, linear.valid, STRUCTURE) for part in slope])
+    along = _displacement(slope, structure.square().sum(0).sqrt(), windows)
+    return square * along[:, None] * along
+
+
+def left_by_windows(linear: Linear, windows: Windows) -> Left:
+    """What displacements of windows leave of a difference of the images, to first order."""
+    slope = working(linear.slope) * linear.valid
+    weights = [
+        linear_weights(windows.centres(axis).to(slope), torch.arange(n).to(slope))
+        for axis, n in enumerate(windows.shape)
+    ]
+
+    def left(difference: torch.Tensor) -> torch.Tensor:
+        difference = working(difference) * linear.valid
+        moved = separable(_displacement(slope, difference, windows), weights)
+        return (difference - (slope * moved).sum(0)) * linear.valid
+
+    return left
+
+
+def _displacement(slope: torch.Tensor, difference: torch.Tensor, windows: Windows) -> torch.Tensor:
+    """Of each window by least squares, (2, *windows.count) px: J^-1 <slope difference>."""
+    products = windows.of_templates(slope[:, None] * slope).movedim((0, 1), (-2, -1))
+    # windows with nothing in them are not moved
+    least = 1e-3 * products.diagonal(dim1=-2, dim2=-1).mean()
+    products = products + (least + 1e-30) * torch.eye(2).to(products)
+    means = windows.of_templates(slope * difference).movedim(0, -1)
+    return torch.linalg.solve(products, means[..., None])[..., 0].movedim(-1, 0)
