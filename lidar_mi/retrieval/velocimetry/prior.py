@@ -15,6 +15,12 @@ from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh, halves, inter
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.windows import separable
 
+# Least rate at which the estimated ratio is taken to fall as a strength grows.
+_SLOWEST = 0.15
+# Least standard deviation of a rate in a cell between knots, px per px: images of a flow without
+# vorticity would make the prior stronger for ever.
+_LEAST = 1e-4
+
 Motion = tuple[tuple[int, int, float], ...]
 """A rate of the flow as terms (component, axis of its derivative, sign)."""
 
@@ -46,13 +52,13 @@ class Divergence(NamedTuple):
         Where there is no vorticity, as from wind through the plane.
     ratio : float
         Strength over the vorticity's of further divergence, as where splines do not resolve a core.
-    trend : (float, float), optional
+    trend : (torch.Tensor, torch.Tensor) of no dimension, optional
         ln of the strength one round before, and of the ratio estimated for it.
     """
 
     strength: float
     ratio: float
-    trend: tuple[float, float] | None = None
+    trend: tuple[torch.Tensor, torch.Tensor] | None = None
 
 
 class Prior(NamedTuple):
@@ -70,6 +76,8 @@ class Prior(NamedTuple):
         Of the pixels along each axis, in any unit: rates are those in space.
     divergence : Divergence, optional
         Of a plane; in a volume divergence is a local kind.
+    trend : (torch.Tensor, torch.Tensor), optional
+        ln of the local strength one round before, and of the ratio estimated for it.
     """
 
     local: torch.Tensor
@@ -77,6 +85,7 @@ class Prior(NamedTuple):
     width: float
     spacing: tuple[float, ...]
     divergence: Divergence | None = None
+    trend: tuple[torch.Tensor, torch.Tensor] | None = None
 
     @property
     def cell(self) -> float:
@@ -138,7 +147,11 @@ class Prior(NamedTuple):
         return strength[[kind for kind, _ in self.motions]]
 
     def updated(
-        self, informed: torch.Tensor, energy: torch.Tensor, settings: VariationalSettings
+        self,
+        informed: torch.Tensor,
+        energy: torch.Tensor,
+        settings: VariationalSettings,
+        trusted: bool = False,
     ) -> "Prior":
         """The prior after a step toward largest evidence (MacKay's fixed point).
 
@@ -147,14 +160,19 @@ class Prior(NamedTuple):
         informed, energy : torch.Tensor, shape (kinds, *mesh.shape)
             Variance of each kind of motion removed by the images, and its square in the flow.
         settings : VariationalSettings
+        trusted : bool
+            Whether the noise is known, so that the largest evidence itself is wanted: steps are
+            then those of the secant. Where the noise is that of the misfit, what the flow absorbs
+            is missing in it, and the strength would grow too far.
         """
         count = len(self.local)
-        change = bounded(
-            *(self.smooth(self.local * part[:count]) for part in (informed, energy)),
-            settings.largest_change,
-        )
+        most = settings.largest_change_trusted if trusted else settings.largest_change
+        means = (self.smooth(self.local * part[:count]) for part in (informed, energy))
+        trend = self.local.log(), bounded(*means, most).log()
+        change = _secant(trend, self.trend if trusted else None, math.log(most)).exp()
+        local = (self.local * change).clamp(max=_cells(self.mesh) / _LEAST**2)
         divergence = self.divergence and self._divergence(informed[-1], energy[-1], settings)
-        return self._replace(local=self.local * change, divergence=divergence)
+        return self._replace(local=local, divergence=divergence, trend=trend)
 
     def to(self, like: torch.Tensor) -> "Prior":
         """The same in the precision of a tensor."""
@@ -183,23 +201,33 @@ class Prior(NamedTuple):
             float(bounded(*((part * all_of_it * f).mean() for f in (informed, energy)), most))
             for part, most in ((fraction, largest), (1 - fraction, settings.largest_change))
         )
-        trend = math.log(before.strength), math.log(everywhere)
+        trend = torch.tensor(before.strength).log(), torch.tensor(everywhere).log()
         # images of weak texture without measurable divergence are no evidence that there is none
         most = settings.largest_ratio / float((1 / self.local[0]).mean())
-        change = math.exp(_secant(trend, before.trend, math.log(largest)))
+        change = float(_secant(trend, before.trend, math.log(largest)).exp())
         return Divergence(min(before.strength * change, most), before.ratio * beside, trend)
 
 
-def _secant(now: tuple[float, float], before: tuple[float, float] | None, limit: float) -> float:
+def _secant(
+    now: tuple[torch.Tensor, torch.Tensor],
+    before: tuple[torch.Tensor, torch.Tensor] | None,
+    limit: float,
+) -> torch.Tensor:
     """Change of ln strength that brings ln of its ratio to 0, by the secant of two rounds.
 
     Where the images inform little, the fixed point alone would take hundreds of rounds.
     """
-    slope = -1.0
+    slope = -torch.ones_like(now[1])
     if before is not None:
         run = now[0] - before[0]
-        slope = min(max((now[1] - before[1]) / run, -1.0), -0.15) if run else -1.0
-    return min(max(-now[1] / slope, -limit), limit)
+        secant = (now[1] - before[1]) / torch.where(run == 0, 1.0, run)
+        slope = torch.where(run == 0, slope, secant.clamp(-1.0, -_SLOWEST))
+    return (-now[1] / slope).clamp(-limit, limit)
+
+
+def _cells(mesh: Mesh) -> float:
+    """Cells between knots per pixel, of a mesh at half the spacing of the knots."""
+    return math.prod(axis.cells / axis.size for axis in mesh.axes)
 
 
 def bounded(informed: torch.Tensor, energy: torch.Tensor, most: float) -> torch.Tensor:
@@ -221,8 +249,7 @@ def first_prior(
     prior = Prior(one, mesh, width, tuple(spacing))
     vorticity = prior.by_kind(prior.rates(coefficients).square())[:-1].sum(0)
     vorticity = vorticity.mean() if dims == 2 else prior.smooth(vorticity)
-    cells = math.prod(axis.cells / axis.size for axis in axes)
-    strength = (dims - 1) * cells / (vorticity + settings.least_vorticity**2)
+    strength = (dims - 1) * _cells(mesh) / (vorticity + settings.least_vorticity**2)
     if dims == 2:
         divergence = Divergence(settings.ratio * float(strength), settings.ratio)
         return prior._replace(local=strength * one[:1], divergence=divergence)
@@ -236,4 +263,4 @@ def refined(prior: Prior, axes: Sequence[Axis]) -> Prior:
     mesh = halves(axes, prior.local)
     local = interpolated(prior.local.log(), prior.mesh.places, mesh.places).exp()
     trendless = prior.divergence and prior.divergence._replace(trend=None)
-    return prior._replace(local=local, mesh=mesh, divergence=trendless)
+    return prior._replace(local=local, mesh=mesh, divergence=trendless, trend=None)

@@ -201,8 +201,8 @@ class VariationalSettings:
         weak texture without measurable divergence do not prove that there is none.
     prior_width : float
         Standard deviation over the template within which the prior's strength varies little.
-    largest_change, largest_change_divergence : float
-        Factor by which a strength may change per round.
+    largest_change, largest_change_trusted, largest_change_divergence : float
+        Factor by which a strength may change per round, the second one where noise is given.
     filter : FilterSettings
     solver : IterativeSettings
         Of volumes.
@@ -223,8 +223,9 @@ class VariationalSettings:
     ratio: float = 100.0
     least_vorticity: float = 1e-3
     largest_ratio: float = 1e5
-    prior_width: float = 0.5
+    prior_width: float = 0.75
     largest_change: float = 4.0
+    largest_change_trusted: float = 16.0
     largest_change_divergence: float = 16.0
     filter: FilterSettings = FilterSettings()
     solver: IterativeSettings = IterativeSettings()
@@ -237,6 +238,7 @@ VOLUME_VARIATIONAL = VariationalSettings(
     noise_round=3,
     coloured=False,
     least_vorticity=0.03,
+    prior_width=0.5,
     filter=VOLUME_FILTER,
 )
 """Of volumes: the flow of the multi-pass correlation makes a coarse level unnecessary."""

@@ -163,7 +163,8 @@ def variational_and_flow(
             coefficients = posterior.coefficients.to(like)
             # the first flow on coarse knots is too far off to estimate the prior from
             if turn or level:
-                prior = prior.updated(*posterior.evidence(), settings)
+                trusted = images.given and windows.dims == 2
+                prior = prior.updated(*posterior.evidence(), settings, trusted)
             turn += 1
         flow = mesh.field(coefficients)
     linear = linearised(images, mesh, coefficients, settings)
