@@ -170,9 +170,8 @@ def mean_and_jacobian(
     amplitudes, by = model.amplitudes(parameters)
     n = torch.arange(1, amplitudes.shape[1] + 1, device=v.device)
     turned = torch.polar(torch.ones_like(v), 2 * math.pi * v / model.velocity_range) ** n
-    profile, slope, curvature, third = (
-        _product(amplitudes * turned * (2j * math.pi * n) ** k, waves.waves) for k in range(4)
-    )
+    at_rest = amplitudes * turned * (2j * math.pi * n) ** torch.arange(4).to(n)[:, None, None]
+    profile, slope, curvature, third = _product(at_rest.flatten(0, 1), waves.waves).chunk(4)
     profile = 1 + profile + moved * (slope + moved / 2 * (curvature + moved / 3 * third))
     lit = light * profile
     mean = level * lit + background
@@ -321,8 +320,11 @@ def _light(model, cells, r2, parameters) -> torch.Tensor:
 
 def _smooth(model, cells, parameters, names) -> torch.Tensor:
     """Sum of smooth terms times their parameters, (images, cells)."""
+    # 0 for the others: less work than to pick the terms of all cells
+    amplitudes = parameters.new_zeros(len(parameters), len(model.smooth))
     columns = [model.smooth.index(name) for name in names]
-    return parameters[:, [PARAMETERS.index(name) for name in names]] @ cells.terms[:, columns].T
+    amplitudes[:, columns] = parameters[:, [PARAMETERS.index(name) for name in names]]
+    return amplitudes @ cells.terms.T
 
 
 def _by_r2(model, cosine) -> torch.Tensor:
