@@ -1,6 +1,7 @@
 """Images and volumes as band-limited functions of place: values and gradients anywhere."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -311,12 +312,13 @@ def filtered_splines(
     spectrum = torch.fft.rfftn(
         faded(images - mean, sizes, margin, settings.antisymmetric), dim=dims
     )
-    for axis in frequencies(sizes, images):
-        spectrum = spectrum / ((2 + torch.cos(2 * torch.pi * axis / finer)) / 3)
+    # of images kept for the next ones, as the shells are
+    factor = _through_nodes if len(dims) == 2 else _through_nodes.__wrapped__
+    through = factor(tuple(sizes), finer, images.dtype, images.device)
     keep = [slice(finer * (n + 2 * margin)) for n in shape]
     return [
         Spline(
-            (_refined(spectrum * one.gain[shell], sizes, finer) + mean)[:, *keep].contiguous(),
+            _refined(spectrum * (one.gain[shell] * through), sizes, finer)[:, *keep] + mean,
             shape,
             one.passed,
             one.excess,
@@ -327,6 +329,15 @@ def filtered_splines(
         )
         for one in filters
     ]
+
+
+@lru_cache(maxsize=4)
+def _through_nodes(sizes, finer: int, dtype, device) -> torch.Tensor:
+    """Coefficients over values of a spline through nodes, `finer` of them a pixel, by its waves."""
+    factor = torch.ones((), dtype=dtype, device=device)
+    for axis in frequencies(sizes, factor):
+        factor = factor * 3 / (2 + torch.cos(2 * torch.pi * axis / finer))
+    return factor
 
 
 def mismatch(spline: Spline, rest: torch.Tensor, number: int | None = None) -> torch.Tensor:
