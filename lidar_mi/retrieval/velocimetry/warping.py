@@ -68,9 +68,14 @@ class Spline(NamedTuple):
         # sizes of another parity may reach one shell further
         _, shell = radii(tuple(sizes), self.shape, field.dtype, field.device)
         shell = shell.clamp(max=len(self.gain) - 1)
-        spectrum = torch.fft.rfftn(field, s=sizes, dim=dims) * self.gain[shell]
-        smooth = torch.fft.irfftn(spectrum, s=sizes, dim=dims)
-        return smooth[..., *(slice(n) for n in self.shape)]
+        # axis by axis: what is zero before, or not needed after, is not transformed
+        spectrum = torch.fft.rfft(field, n=sizes[-1])
+        for axis, size in zip(dims[:-1], sizes[:-1], strict=True):
+            spectrum = torch.fft.fft(spectrum, n=size, dim=axis)
+        spectrum = spectrum * self.gain[shell]
+        for axis, n in zip(dims[:-1], self.shape[:-1], strict=True):
+            spectrum = torch.fft.ifft(spectrum, dim=axis).narrow(axis, 0, n)
+        return torch.fft.irfft(spectrum, n=sizes[-1])[..., : self.shape[-1]]
 
     def holds(self, *place: torch.Tensor) -> torch.Tensor:
         """Which places lie on the images, up to the outer pixels' centres."""
