@@ -11,7 +11,7 @@ import xarray as xr
 from lidar_mi.encounter.combination import Completion
 from lidar_mi.encounter.doppler import LineFrames
 from lidar_mi.encounter.line_speeds import LineSpeeds
-from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, SlabWinds
+from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, SlabWinds, without_old_garbage
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
@@ -85,6 +85,7 @@ class Estimator:
         self._speeds, self._processes = speeds, processes
         # the last slab's vortices, near which the next wind starts
         self._last: VortexPairFit | None = None
+        without_old_garbage()
 
     def pair_of(
         self,

@@ -26,7 +26,7 @@ ITERATIONS = 8
 # it or less.
 CLOSE = 0.1
 # Images whose parameters are found together: what they need is near the cache.
-_AT_ONCE = 32
+_AT_ONCE = 64
 # Parameters whose derivatives do not grow with the light.
 _ADDED = ("level", "background")
 _PLACE = [PARAMETERS.index("x"), PARAMETERS.index("y")]

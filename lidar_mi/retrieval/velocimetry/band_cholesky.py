@@ -47,9 +47,7 @@ class BandCholesky(NamedTuple):
         width, kind = below + 1 + n, torch.as_tensor(self.lower[:1, :1]).dtype
         padded = torch.zeros((self.columns + REACH + 1) * n, width, dtype=kind)
         padded[: self.lower.shape[1], : below + 1] = torch.as_tensor(self.lower.T)
-        blocks = padded.as_strided(
-            (self.columns, n, (1 + REACH) * n), (n * width, width - 1, 1)
-        )
+        blocks = padded.as_strided((self.columns, n, (1 + REACH) * n), (n * width, width - 1, 1))
         own, others = blocks[..., :n], blocks[..., n:]
         (invert,) = get_lapack_funcs(("trtri",), (self.lower,))
         roots = np.stack([invert(block.T, lower=True)[0] for block in own.numpy()])

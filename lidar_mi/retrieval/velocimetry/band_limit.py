@@ -163,7 +163,7 @@ def checked_noise(noise: float | None) -> None:
 
 def odd_fast_len(least: int) -> int:
     """A length, fast to transform, at which no wave is its own mirror image."""
-    # odd multiples of 3 and 5 alone are far apart: of 267 px the next one has 375, with 7 and 11 275
+    # products of 3 and 5 alone are far apart: after 267 comes 375, with 7 and 11 275
     size = scipy.fft.next_fast_len(least)
     while size % 2 == 0:
         size = scipy.fft.next_fast_len(size + 1)

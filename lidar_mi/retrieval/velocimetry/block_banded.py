@@ -56,8 +56,8 @@ class Factor(NamedTuple):
         ratios = self.ratio.reshape(shape[0], -1, rows, n)
         found = ratios.new_empty(*ratios.shape[:2], n + rows, n)
         found[..., :n, :] = roots.mT @ roots
-        # the inverse of the blocks behind grows to the upper left of a larger matrix, and moves back
-        # to its lower right once it has reached the other end
+        # the inverse of the blocks behind grows to the upper left of a larger matrix, and moves
+        # back to its lower right once it has reached the other end
         most = _GROWTH * n
         around = found.new_zeros(ratios.shape[1], most + rows, most + rows)
         first = most
@@ -69,6 +69,7 @@ class Factor(NamedTuple):
             here, below = found[k, :, :n], found[k, :, n:]
             torch.bmm(around[:, rest, rest], ratios[k], out=below)
             whole = torch.baddbmm(here, ratios[k].mT, below)
+            # what is not symmetric by rounding would grow
             torch.add(whole, whole.mT, out=here).mul_(0.5)
             below.neg_()
             around[:, rest, own] = below

@@ -174,9 +174,7 @@ def model_error(
 # They depend on the grid alone: kept for the next images.
 @lru_cache(maxsize=8)
 def _distance(rows: int, columns: int, dtype, device) -> torch.Tensor:
-    along = [
-        torch.fft.fftfreq(n, 1 / n, dtype=dtype, device=device) for n in (rows, columns)
-    ]
+    along = [torch.fft.fftfreq(n, 1 / n, dtype=dtype, device=device) for n in (rows, columns)]
     return torch.hypot(along[0][:, None], along[1][None, :])
 
 
