@@ -136,17 +136,16 @@ def _read_images(
     flat = coefficients.reshape(-1)
     # derivatives along z and y
     orders = [(0, 0), (1, 0), (0, 1)] if slopes else [(0, 0)]
-    total, along = ([torch.zeros_like(z) for _ in of] for of in (orders, weight_y))
-    knot = torch.empty_like(z)
+    total = [torch.zeros_like(z) for _ in orders]
+    knot, *along = (torch.empty_like(z) for _ in range(1 + len(weight_y)))
     for i in range(4):
-        for part in along:
-            part.zero_()
-        number = corner + i * width
         for j in range(4):
-            torch.index_select(flat, 0, number, out=knot.view(-1))
-            number += 1
+            torch.index_select(flat[i * width + j :], 0, corner, out=knot.view(-1))
             for part, weight in zip(along, weight_y, strict=True):
-                part.addcmul_(knot, weight[j])
+                if j:
+                    part.addcmul_(knot, weight[j])
+                else:
+                    torch.mul(knot, weight[j], out=part)
         for part, (by_z, by_y) in zip(total, orders, strict=True):
             part.addcmul_(along[by_y], weight_z[by_z][i])
     return total
