@@ -163,10 +163,9 @@ def checked_noise(noise: float | None) -> None:
 
 def odd_fast_len(least: int) -> int:
     """A length, fast to transform, at which no wave is its own mirror image."""
-    # products of 3 and 5 alone are far apart: after 267 comes 375, with 7 and 11 275
-    size = scipy.fft.next_fast_len(least)
+    size = scipy.fft.next_fast_len(least, real=True)
     while size % 2 == 0:
-        size = scipy.fft.next_fast_len(size + 1)
+        size = scipy.fft.next_fast_len(size + 1, real=True)
     return size
 
 

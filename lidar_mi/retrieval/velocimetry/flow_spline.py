@@ -12,7 +12,7 @@ from lidar_mi.retrieval.velocimetry.windows import linear_weights, separable
 REACH = 3
 """Knots further apart than this have no common support."""
 # Cells along an axis that are multiplied at once: a spline is zero beyond four of them.
-_CELLS = 24
+_CELLS = 12
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from functools import lru_cache
 import torch
 
 from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
-from lidar_mi.retrieval.velocimetry.band import form
 from lidar_mi.retrieval.velocimetry.band_cholesky import BandCholesky, spread_half
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.brightness import normalised
@@ -15,6 +14,7 @@ from lidar_mi.retrieval.velocimetry.direct import (
     Posterior,
     Pull,
     factor_in_single,
+    form_of_slopes,
     pull_of,
     solved_in_single,
 )
@@ -199,7 +199,7 @@ def awaited(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None
     sampled = images.spline.sample(*places[:, :1])
     slope, told = told_by_first(images, mesh, places, sampled, len(images.time))
     pull = pull_of(placed.prior, start.coefficients, start.settings.ridge)
-    root = factor_in_single(form(told * slope[:, None] * slope, mesh) + pull.whole)
+    root = factor_in_single(form_of_slopes(told, slope, mesh) + pull.whole)
     # the recursion for the inverse damps rounding: 1e-5 in single precision
     inverse = root.covariance().float()
     at_centres = _of_centres(axes, start.windows, inverse)
