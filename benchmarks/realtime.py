@@ -17,6 +17,7 @@ from lidar_mi.encounter.combination import Completion
 from lidar_mi.encounter.doppler import DopplerScans, LineFrames, Midway, doppler_scans
 from lidar_mi.encounter.estimator import Estimator
 from lidar_mi.encounter.line_speeds import LineSpeeds
+from lidar_mi.encounter.slab_winds import without_old_garbage
 from lidar_mi.encounter.slabs import gates_of
 from lidar_mi.experiment.reading import load_experiment
 from lidar_mi.retrieval.threads import threads_for
@@ -75,6 +76,7 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
     scans = cast(DopplerScans, doppler_scans(experiment, gates_of(experiment)))
     # two processes, as on two cores; "from nothing" all in this one
     estimator = Estimator(experiment, processes=2, speeds=LineSpeeds(scans))
+    without_old_garbage()
     warm, scratch, truths = [], [], []
     last = None
     for k in range(number + 1):

@@ -71,7 +71,11 @@ def checked_image(name: str, image: xr.DataArray, axes: Sequence[str] = ("z", "y
         raise InputError(f"{name}: dims {tuple(image.dims)} are not {tuple(axes)}")
     if image.dtype.kind not in "fiu":
         raise InputError(f"{name}: values of type {image.dtype} are not real numbers")
-    largest = float(np.abs(image.values[np.isfinite(image.values)]).max(initial=0))
+    # of finite images without picking their pixels, which takes five times as long
+    values = image.values
+    if values.size and not (np.isfinite(values.min()) and np.isfinite(values.max())):
+        values = values[np.isfinite(values)]
+    largest = max(float(values.max()), -float(values.min())) if values.size else 0.0
     if largest > LARGEST:
         raise InputError(f"{name}: values up to {largest:g}; expected at most {LARGEST:g}")
     # variables: a coordinate as a DataArray takes as long as all checks of it
@@ -104,7 +108,7 @@ def same_grid(
         axes = " x ".join(map(str, image1.dims))
         raise InputError(f"{name}: sizes {sizes} {unit} ({axes}) differ; both must have one grid")
     for axis in image1.dims:
-        one, other = (image[axis].values.astype(float) for image in (image1, image2))
+        one, other = (i.coords.variables[axis].values.astype(float) for i in (image1, image2))
         off = np.abs(one - other).max()
         if off > 1e-3 * np.diff(one).mean():
             raise InputError(

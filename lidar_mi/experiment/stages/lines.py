@@ -202,18 +202,19 @@ def with_speeds(
     doppler, pulses = experiment.doppler, experiment.sensor.pulses
     seed = [experiment.seed, _DRIFTS + scan]
     drift, drift_std = drifts(doppler, pulses, seed, range(len(v_los)), PULSES)
-    found = lines.assign(
-        v_los=("line", v_los + drift + plate_error(doppler), lines["v_los"].attrs),
-        v_los_std=("line", np.hypot(std, drift_std), lines["v_los_std"].attrs),
-        v_los_systematic=(
+    # all at once: each variable that a data set takes later copies and aligns it again
+    found = {
+        "v_los": ("line", v_los + drift + plate_error(doppler), lines.variables["v_los"].attrs),
+        "v_los_std": ("line", np.hypot(std, drift_std), lines.variables["v_los_std"].attrs),
+        "v_los_systematic": (
             "line",
             np.hypot(systematic, plate_uncertainty(doppler)),
             {"units": "m s-1", "long_name": "systematic standard error common to all lines"},
         ),
-    )
+    }
     shared = shared_covariance(doppler, pulses, laser_std, PULSES)
     if shared is not None:
         text = "covariance of the random errors of v_los by the laser's frames, beside v_los_std"
         about = {"units": "m2 s-2", "long_name": text}
         found["v_los_covariance"] = ("line", "other_line"), shared, about
-    return found
+    return lines.assign(found)

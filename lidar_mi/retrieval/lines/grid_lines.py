@@ -50,10 +50,10 @@ def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridL
     along = wind_along_lines(scan)
     if "range_bin" not in scan:
         raise InputError("scan.range_bin: missing; expected the length of the range bins, m")
-    direction = scan["direction"].transpose("line", "axis").values
+    direction = scan.variables["direction"].transpose("line", "axis").values
     nodes, weights = np.polynomial.legendre.leggauss(_ALONG)
-    half = np.broadcast_to(scan["range_bin"].values, len(along)) / 2
-    reach = scan["range"].values[:, None] + half[:, None] * nodes
+    half = np.broadcast_to(scan.variables["range_bin"].values, len(along)) / 2
+    reach = scan.variables["range"].values[:, None] + half[:, None] * nodes
     origin = line_origins(scan)
     place = {
         axis: origin[:, k : k + 1] + reach * direction[:, k : k + 1]
@@ -80,7 +80,7 @@ def lines_on_grid(scan: xr.Dataset, z: np.ndarray, y: np.ndarray) -> tuple[GridL
         for dy in (0, 1)
     ]
     row, column, weight = (np.concatenate(p, axis=1)[used] for p in zip(*parts, strict=True))
-    covariance = np.diag(scan["v_los_std"].values[used] ** 2)
+    covariance = np.diag(scan.variables["v_los_std"].values[used] ** 2)
     shared = shared_covariance(scan)
     if shared is not None:
         covariance = covariance + shared[np.ix_(used, used)]

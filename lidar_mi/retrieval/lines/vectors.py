@@ -41,7 +41,9 @@ def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
     for name in _NAMES:
         if name not in scan:
             raise InputError(f"scan.{name}: missing; expected {', '.join(_NAMES)}")
-    own = {"line"} & set(scan["platform_velocity"].dims)
+    # variables: their coordinates take longer to attach than all checks
+    told = scan.variables
+    own = {"line"} & set(told["platform_velocity"].dims)
     for name, dims in (
         ("v_los", {"line"}),
         ("v_los_std", {"line"}),
@@ -50,39 +52,39 @@ def wind_along_lines(scan: xr.Dataset) -> np.ndarray:
         ("platform_velocity", {"axis"} | own),
         ("origin", {"line", "axis"}),
     ):
-        if name in scan and set(scan[name].dims) != dims:
-            raise InputError(f"scan.{name}: dims {scan[name].dims} are not {tuple(sorted(dims))}")
+        if name in told and set(told[name].dims) != dims:
+            raise InputError(f"scan.{name}: dims {told[name].dims} are not {tuple(sorted(dims))}")
     if scan.sizes["axis"] != 3:
         raise InputError(f"scan.axis: {scan.sizes['axis']} components are not x, y, z")
-    direction = scan["direction"].transpose("line", "axis").values
+    direction = told["direction"].transpose("line", "axis").values
     length = np.linalg.norm(direction, axis=1)
     if not (np.abs(length - 1) < 1e-6).all():
         raise InputError("scan.direction: not of length 1; expected unit vectors")
-    if not (scan["range"].values > 0).all() or not np.isfinite(scan["range"].values).all():
+    if not (told["range"].values > 0).all() or not np.isfinite(told["range"].values).all():
         raise InputError("scan.range: not > 0 m everywhere; every line needs its finite range")
-    if not (scan["v_los_std"].values[np.isfinite(scan["v_los"].values)] > 0).all():
+    if not (told["v_los_std"].values[np.isfinite(told["v_los"].values)] > 0).all():
         raise InputError("scan.v_los_std: not > 0 m/s everywhere; every line needs its error")
-    platform = scan["platform_velocity"].transpose(..., "axis").values
-    return (direction * platform).sum(1) - scan["v_los"].values
+    platform = told["platform_velocity"].transpose(..., "axis").values
+    return (direction * platform).sum(1) - told["v_los"].values
 
 
 def shared_covariance(scan: xr.Dataset) -> np.ndarray | None:
     """Covariance (line, line) of the lines' errors beyond their variances, (m/s)^2; None: none."""
     if "v_los_covariance" not in scan:
         return None
-    return scan["v_los_covariance"].transpose("line", "other_line").values
+    return scan.variables["v_los_covariance"].transpose("line", "other_line").values
 
 
 def line_origins(scan: xr.Dataset) -> np.ndarray:
     """Where lines of sight start, (line, 3), m from the telescope at the scan's reference time."""
     if "origin" not in scan:
         return np.zeros((scan.sizes["line"], 3))
-    return scan["origin"].transpose("line", "axis").values
+    return scan.variables["origin"].transpose("line", "axis").values
 
 
 def line_places(scan: xr.Dataset) -> np.ndarray:
     """Middles of the range bins, (line, 3), m from the telescope at the scan's reference time."""
-    away = (scan["range"] * scan["direction"]).transpose("line", "axis").values
+    away = (scan.variables["range"] * scan.variables["direction"]).transpose("line", "axis").values
     return line_origins(scan) + away
 
 

@@ -9,6 +9,7 @@ reference is near: rings that move by a tenth of their width lose 1 % of the inf
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 
@@ -24,6 +25,8 @@ ITERATIONS = 8
 # Standard deviations, largest last step of an image that is read: a further one would be a fifth of
 # it or less.
 CLOSE = 0.1
+# Images whose parameters are found together: what they need is near the cache.
+_AT_ONCE = 64
 # Parameters whose derivatives do not grow with the light.
 _ADDED = ("level", "background")
 _PLACE = [PARAMETERS.index("x"), PARAMETERS.index("y")]
@@ -66,6 +69,16 @@ class MatchedScore:
     inverse: torch.Tensor
     sensitivity: torch.Tensor
     systematic: torch.Tensor
+
+    @cached_property
+    def influence(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Of the cells' means on the parameters (names, cells), single precision; its squares.
+
+        And the variance (names,) by the priors.
+        """
+        whole = self.inverse @ self.score
+        kept = self.inverse**2 @ prior_information(self.model, self.names, whole.device)
+        return whole.float(), (whole**2).float(), kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,41 +195,61 @@ def read_matched(images: torch.Tensor, score: MatchedScore) -> MatchedRead:
         )
     with threads_for(0):
         means = score.waves.cells.means(images)
-    model, names = score.model, score.names
-    columns = [PARAMETERS.index(name) for name in names]
-    at, mean = _started(score, means)
-    information = prior_information(model, names, means.device)
-    middle = model.start(means.device)[:, columns]
-    influence = score.inverse @ score.score
-    # errors by noise, and of the priors
-    squares, kept = influence**2, score.inverse**2 @ information
-    added = torch.tensor([name in _ADDED for name in names], device=means.device)
-    close = torch.zeros(len(at), dtype=torch.bool, device=at.device)
-    for number in range(ITERATIONS):
-        if number:
-            mean = mean_and_jacobian(model, score.single, at.float())[0].double()
-        variance = cell_variance(mean, at, score.noise) / score.waves.cells.count
-        brighter = (at[:, _LEVEL] / score.values[_LEVEL]).clamp(0.1, 10)[:, None]
-        grown = torch.where(added, 1.0, brighter)
-        std = (variance @ squares.T + kept).sqrt() / grown
-        misfit = means - mean
-        total = misfit @ influence.T + (middle - at[:, columns]) * information @ score.inverse
-        step = total / grown
-        at[:, columns] += torch.where(close[:, None], 0.0, step)
-        close |= (step.abs() <= CLOSE * std).all(1)
-        if close.all():
-            break
-    freedom = means.shape[1] - len(names)
-    chi_square = (misfit**2 / variance).sum(1) / freedom
+        parts = [_read(part, score) for part in means.split(_AT_ONCE)]
+    at, std, chi_square, close = (torch.cat(part) for part in zip(*parts, strict=True))
+    columns = _columns(score)
+    freedom = means.shape[1] - len(columns)
     values = at.clone()
     values[:, _PLACE] += score.values[_PLACE]
     read = close & (chi_square <= 1 + MISFIT * math.sqrt(2 / freedom))
-    read &= at[:, _PLACE].norm(dim=1) <= reach(model)
+    read &= at[:, _PLACE].norm(dim=1) <= reach(score.model)
     spread = torch.zeros_like(values)
     spread[:, columns] = std
     spread[~read] = math.inf
     each = score.sensitivity.expand(len(values), -1)
     return MatchedRead(values, spread, chi_square, read, each, score.systematic)
+
+
+def _read(means: torch.Tensor, score: MatchedScore) -> tuple[torch.Tensor, ...]:
+    """Of some images the parameters from the cells' centre, their errors, chi-square, and an end.
+
+    From means (images, cells) to (images, `PARAMETERS`), (images, names), (images,) and whether
+    the last step was small, (images,). An image whose last step was small is not looked at again.
+    """
+    model, names, columns = score.model, score.names, _columns(score)
+    at, mean = _started(score, means)
+    information = prior_information(model, names, means.device)
+    middle = model.start(means.device)[:, columns]
+    added = torch.tensor([name in _ADDED for name in names], device=means.device)
+    influence, squares, kept = score.influence
+    freedom = means.shape[1] - len(names)
+    std, chi_square = at.new_zeros(len(at), len(names)), at.new_zeros(len(at))
+    far = torch.arange(len(at), device=at.device)
+    for number in range(ITERATIONS):
+        here = at[far]
+        if number:
+            mean = mean_and_jacobian(model, score.single, here.float())[0]
+        misfit = (means[far] - mean).float()
+        variance = cell_variance(mean.float(), here.float(), score.noise) / score.single.cells.count
+        brighter = (here[:, _LEVEL] / score.values[_LEVEL]).clamp(0.1, 10)[:, None]
+        grown = torch.where(added, 1.0, brighter)
+        std[far] = ((variance @ squares.T).double() + kept).sqrt() / grown
+        chi_square[far] = (misfit**2 / variance).sum(1).double() / freedom
+        total = (misfit @ influence.T).double()
+        total += (middle - here[:, columns]) * information @ score.inverse
+        step = total / grown
+        here[:, columns] += step
+        at[far] = here
+        far = far[(step.abs() > CLOSE * std[far]).any(1)]
+        if not len(far):
+            break
+    close = torch.ones(len(at), dtype=torch.bool, device=at.device)
+    close[far] = False
+    return at, std, chi_square, close
+
+
+def _columns(score: MatchedScore) -> list[int]:
+    return [PARAMETERS.index(name) for name in score.names]
 
 
 def _started(score: MatchedScore, means: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -235,6 +268,7 @@ def _in_single(waves: Waves) -> Waves:
     cells = waves.cells
     spread = None if cells.spread is None else cells.spread.float()
     cells = cells._replace(
+        count=cells.count.float(),
         x=cells.x.float(),
         y=cells.y.float(),
         r2=cells.r2.float(),

@@ -115,12 +115,21 @@ def squared_radius(
     model: RingModel, cells: Cells, dx: torch.Tensor, dy: torch.Tensor
 ) -> torch.Tensor:
     """Mean of r^2 about (dx, dy) from the cells' centre, over pixels' areas and blur, px^2."""
-    return cells.r2 - 2 * (cells.x * dx + cells.y * dy) + dx**2 + dy**2 + _area(model)
+    of_centre = torch.cat([torch.ones_like(dx), -2 * dx, -2 * dy, dx**2 + dy**2 + _area(model)], -1)
+    return of_centre @ torch.stack([cells.r2, cells.x, cells.y, torch.ones_like(cells.r2)])
 
 
 def _area(model: RingModel) -> float:
     """Mean squared distance of the light on a pixel from its centre: pixel and disc, px^2."""
     return PIXEL_R2 + model.blur / 2
+
+
+def _lean(model: RingModel, r2: torch.Tensor) -> torch.Tensor:
+    """Cosine of the angle less 1."""
+    tangent2 = (model.pixel / model.focal_length) ** 2 * r2
+    secant2 = 1 + tangent2
+    # without the difference of numbers next to one
+    return -tangent2 / (secant2.sqrt() + secant2)
 
 
 def orders(model: RingModel, r2: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -165,25 +174,29 @@ def mean_and_jacobian(
     r2 = squared_radius(model, cells, dx, dy)
     light = _light(model, cells, r2, parameters)
     # more light at the inner end of a cell
-    cosine, order = orders(model, r2 - falloff / area * waves.variance)
-    moved = order - waves.order + v * (cosine - 1) / model.velocity_range
+    lean = _lean(model, torch.addcmul(r2, falloff, waves.variance, value=-1 / area))
+    centre = model.order_at_centre
+    moved = torch.add(centre % 1 - waves.order, lean, alpha=centre)
+    moved.addcmul_(v / model.velocity_range, lean)
     amplitudes, by = model.amplitudes(parameters)
-    n = torch.arange(1, amplitudes.shape[1] + 1, device=v.device)
+    n = torch.arange(1, amplitudes.shape[1] + 1, dtype=torch.float64, device=v.device)
     turned = torch.polar(torch.ones_like(v), 2 * math.pi * v / model.velocity_range) ** n
-    profile, slope, curvature, third = (
-        _product(amplitudes * turned * (2j * math.pi * n) ** k, waves.waves) for k in range(4)
-    )
-    profile = 1 + profile + moved * (slope + moved / 2 * (curvature + moved / 3 * third))
-    lit = light * profile
-    mean = level * lit + background
+    # of the Taylor series in the order
+    powers = torch.stack([(2j * math.pi * n) ** k / math.factorial(k) for k in range(4)])
+    terms = _product((powers[:, None] * (amplitudes * turned)).flatten(0, 1), waves.waves).chunk(4)
+    profile = terms[3]
+    for term in reversed(terms[:3]):
+        profile = torch.addcmul(term, moved, profile)
+    lit = light * profile.add_(1)
+    mean = torch.addcmul(background, level, lit)
     uneven = [name for name in model.smooth if name in BACKGROUND]
     if uneven:
-        mean = mean + _smooth(model, cells, parameters, uneven)
+        mean += _smooth(model, cells, parameters, uneven)
     jacobian = mean.new_empty((len(mean), len(names), mean.shape[1]))
     if not names:
         return mean, jacobian
-    slope = slope + moved * (curvature + moved / 2 * third)
-    bright = level * light
+    slope = terms[1] + moved * (2 * terms[2] + moved * 3 * terms[3])
+    bright, cosine = level * light, 1 + lean
     by_r2 = bright * slope * _by_r2(model, cosine)
     for row, name in zip(jacobian.unbind(1), names, strict=True):
         if name == "v_los":
@@ -312,17 +325,20 @@ def mean_image(
 
 def _light(model, cells, r2, parameters) -> torch.Tensor:
     falloff = parameters[:, PARAMETERS.index("falloff"), None]
-    exponent = -falloff * r2 / model.half_diagonal**2
+    exponent = r2 * (-falloff / model.half_diagonal**2)
     uneven = [name for name in model.smooth if name in LIGHT]
     if uneven:
-        exponent = exponent + _smooth(model, cells, parameters, uneven)
-    return torch.exp(exponent)
+        exponent += _smooth(model, cells, parameters, uneven)
+    return exponent.exp_()
 
 
 def _smooth(model, cells, parameters, names) -> torch.Tensor:
     """Sum of smooth terms times their parameters, (images, cells)."""
+    # 0 for the others: less work than to pick the terms of all cells
+    amplitudes = parameters.new_zeros(len(parameters), len(model.smooth))
     columns = [model.smooth.index(name) for name in names]
-    return parameters[:, [PARAMETERS.index(name) for name in names]] @ cells.terms[:, columns].T
+    amplitudes[:, columns] = parameters[:, [PARAMETERS.index(name) for name in names]]
+    return amplitudes @ cells.terms.T
 
 
 def _by_r2(model, cosine) -> torch.Tensor:

@@ -6,6 +6,7 @@ the `falloff` about the rings' centre, so it is not among the light's terms.
 """
 
 import math
+from functools import lru_cache
 
 import torch
 
@@ -14,6 +15,7 @@ from lidar_mi.errors import InputError
 MOST_DEGREE = 8
 
 
+@lru_cache
 def term_names(kind: str, degree: int) -> tuple[str, ...]:
     """Names of the terms of ``light`` or ``background`` up to a degree: kind_n_m, m < 0 the sine.
 

@@ -40,21 +40,19 @@ class BandCholesky(NamedTuple):
 
     def covariance(self) -> torch.Tensor:
         """The inverse within the band: (2, 2, 7, Z, 4, Y), shifts as in `band.Band`."""
-        n, below, step = 2 * self.rows, len(self.lower) - 1, self.lower.itemsize
-        padded = np.zeros(((self.columns + REACH + 1) * n, below + 1), self.lower.dtype)
-        padded[: self.lower.shape[1]] = self.lower.T
+        n, below = 2 * self.rows, len(self.lower) - 1
         # in memory an element of the matrix is followed by that below it, and that to its right
         # comes a column less one element later: block columns are views, here with their columns
-        # as rows
-        blocks = np.lib.stride_tricks.as_strided(
-            padded, (self.columns, n, (1 + REACH) * n), (n * (below + 1) * step, below * step, step)
-        )
-        apart = np.arange((1 + REACH) * n) - np.arange(n)[:, None]
-        inside = (apart >= 0) & (apart <= below)
-        found = np.multiply(inside, blocks, dtype=blocks.dtype)
-        (invert,) = get_lapack_funcs(("trtri",), (found,))
-        root = torch.as_tensor(np.stack([invert(block[:, :n].T, lower=True)[0] for block in found]))
-        ratio = root.mT @ torch.as_tensor(found[:, :, n:])
+        # as rows, where columns end in as many zeros as others may begin above their diagonal
+        width, kind = below + 1 + n, torch.as_tensor(self.lower[:1, :1]).dtype
+        padded = torch.zeros((self.columns + REACH + 1) * n, width, dtype=kind)
+        padded[: self.lower.shape[1], : below + 1] = torch.as_tensor(self.lower.T)
+        blocks = padded.as_strided((self.columns, n, (1 + REACH) * n), (n * width, width - 1, 1))
+        own, others = blocks[..., :n], blocks[..., n:]
+        (invert,) = get_lapack_funcs(("trtri",), (self.lower,))
+        roots = np.stack([invert(block.T, lower=True)[0] for block in own.numpy()])
+        root = torch.as_tensor(roots)
+        ratio = root.mT @ others
         inverse = Factor(root, ratio.mT).inverse()
         there, _ = _places(self.rows, self.columns)
         found = torch.index_select(inverse.reshape(-1), 0, there.reshape(-1))

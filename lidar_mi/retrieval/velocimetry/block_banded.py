@@ -7,6 +7,9 @@ from typing import NamedTuple
 
 import torch
 
+# Blocks by which an inverse grows before it is moved: what it needs stays near the cache.
+_GROWTH = 6
+
 
 class Factor(NamedTuple):
     """Factor of one or more matrices A = (I + G) D (I + G)^T of blocks of size n, D diagonal.
@@ -51,24 +54,28 @@ class Factor(NamedTuple):
         rows, n = self.ratio.shape[-2:]
         roots = self.root.reshape(shape[0], -1, n, n)
         ratios = self.ratio.reshape(shape[0], -1, rows, n)
-        reach = rows // n
         found = ratios.new_empty(*ratios.shape[:2], n + rows, n)
-        # the inverse of the blocks behind; that of k + j at the place (k + j) % reach stays there
-        behind = found.new_zeros(ratios.shape[1], rows, rows)
-        ratio, below = torch.empty_like(ratios[0]), torch.empty_like(ratios[0])
+        found[..., :n, :] = roots.mT @ roots
+        # the inverse of the blocks behind grows to the upper left of a larger matrix, and moves
+        # back to its lower right once it has reached the other end
+        most = _GROWTH * n
+        around = found.new_zeros(ratios.shape[1], most + rows, most + rows)
+        first = most
         for k in range(len(found) - 1, -1, -1):
-            first, own = ((place % reach) * n for place in (k + 1, k))
-            last = rows - first
-            ratio[:, first:], ratio[:, :first] = ratios[k, :, :last], ratios[k, :, last:]
-            torch.bmm(behind, ratio, out=below)
-            here = torch.bmm(roots[k].mT, roots[k]).baddbmm_(ratio.mT, below)
-            here = (here + here.mT) / 2
+            if not first:
+                around[:, most:, most:] = around[:, :rows, :rows].clone()
+                first = most
+            own, rest = slice(first - n, first), slice(first, first + rows)
+            here, below = found[k, :, :n], found[k, :, n:]
+            torch.bmm(around[:, rest, rest], ratios[k], out=below)
+            whole = torch.baddbmm(here, ratios[k].mT, below)
+            # what is not symmetric by rounding would grow
+            torch.add(whole, whole.mT, out=here).mul_(0.5)
             below.neg_()
-            found[k, :, :n] = here
-            found[k, :, n : n + last], found[k, :, n + last :] = below[:, first:], below[:, :first]
-            behind[..., own : own + n] = below
-            behind[:, own : own + n] = below.mT
-            behind[:, own : own + n, own : own + n] = here
+            around[:, rest, own] = below
+            around[:, own, rest] = below.mT
+            around[:, own, own] = here
+            first -= n
         return found.reshape(*shape, n + rows, n)
 
 

@@ -26,7 +26,7 @@ Variable = tuple[Sequence[str], np.ndarray, dict]
 
 def spacing(image: xr.DataArray) -> tuple[float, ...]:
     """Of the pixels along every dim, m."""
-    nodes = [image[axis].values.astype(float) for axis in image.dims]
+    nodes = [image.coords.variables[axis].values.astype(float) for axis in image.dims]
     return tuple(float((n[-1] - n[0]) / (len(n) - 1)) for n in nodes)
 
 
@@ -43,7 +43,7 @@ def centres(image: xr.DataArray, windows: Windows, what: str) -> dict[str, Varia
     """Coordinates of the windows' centres, m."""
     found = {}
     for number, axis in enumerate(image.dims):
-        pixel = image[axis].values.astype(float)
+        pixel = image.coords.variables[axis].values.astype(float)
         start = np.asarray(windows.starts(number))
         place = (pixel[start] + pixel[start + windows.template - 1]) / 2
         direction, about = _DIRECTIONS[axis]

@@ -171,12 +171,21 @@ def prior_and_gradient(
 
 def data_form(linear: Linear, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
     """Quadratic form of what the images tell, of all cells along z or of some (`band.form`)."""
-    return form(linear.information * linear.damped[:, None] * linear.damped, mesh, cells=cells)
+    return form_of_slopes(linear.information, linear.damped, mesh, cells)
 
 
 def curvature(linear: Linear, mesh: Mesh) -> torch.Tensor:
     """The log-likelihood's quadratic form: steps with less than it would overshoot."""
-    return form(linear.weight * linear.damped[:, None] * linear.damped, mesh)
+    return form_of_slopes(linear.weight, linear.damped, mesh)
+
+
+def form_of_slopes(
+    weight: torch.Tensor, slope: torch.Tensor, mesh: Mesh, cells: slice | None = None
+) -> torch.Tensor:
+    """That of sum(weight * (slope . flow)^2), slopes (2, z, y): both mixed parts are alike."""
+    z, y = slope
+    first, mixed, last = form(weight * torch.stack([z * z, z * y, y * y]), mesh, cells=cells)
+    return torch.stack([first, mixed, mixed, last]).unflatten(0, (2, 2))
 
 
 def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:

@@ -12,7 +12,7 @@ from lidar_mi.retrieval.velocimetry.windows import linear_weights, separable
 REACH = 3
 """Knots further apart than this have no common support."""
 # Cells along an axis that are multiplied at once: a spline is zero beyond four of them.
-_CELLS = 24
+_CELLS = 12
 
 
 @dataclass(frozen=True)
@@ -89,6 +89,7 @@ class Mesh:
         self.shape = tuple(len(place) for place in places)
         self.dims = len(self.axes)
         self._bases, self._products, self._groups = {}, {}, {}
+        self._nearest: list[torch.Tensor] = []
 
     def basis(self, axis: int, order: int = 0) -> torch.Tensor:
         """Matrix (place, knot) of a derivative of the splines along an axis."""
@@ -156,13 +157,16 @@ class Mesh:
 
     def fitted(self, flow: torch.Tensor) -> torch.Tensor:
         """Coefficients of the splines nearest to a flow (components, *shape)."""
-        solvers = []
-        for axis in range(self.dims):
-            basis = self.basis(axis)
-            square = basis.T @ basis
-            square += 1e-6 * torch.eye(len(square), dtype=square.dtype, device=square.device)
-            solvers.append(torch.linalg.solve(square, basis.T))
-        return separable(flow, solvers)
+        if not self._nearest:
+            bases = [self.basis(axis) for axis in range(self.dims)]
+            squares = [basis.T @ basis for basis in bases]
+            for square in squares:
+                square.diagonal().add_(1e-6)
+            self._nearest = [
+                torch.linalg.solve(square, basis.T)
+                for square, basis in zip(squares, bases, strict=True)
+            ]
+        return separable(flow, self._nearest)
 
 
 def halves(axes: Sequence[Axis], like: torch.Tensor) -> Mesh:

@@ -1,12 +1,12 @@
 """The flow of the next slab of air: one step from the last one, with what was learnt there."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import torch
 
 from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
-from lidar_mi.retrieval.velocimetry.band import form
 from lidar_mi.retrieval.velocimetry.band_cholesky import BandCholesky, spread_half
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.brightness import normalised
@@ -14,11 +14,12 @@ from lidar_mi.retrieval.velocimetry.direct import (
     Posterior,
     Pull,
     factor_in_single,
+    form_of_slopes,
     pull_of,
     solved_in_single,
 )
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
-from lidar_mi.retrieval.velocimetry.flow_spline import Mesh, interpolated
+from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh, interpolated
 from lidar_mi.retrieval.velocimetry.likelihood import (
     Images,
     Linear,
@@ -100,11 +101,11 @@ class Flow:
             See `Flow`. Left out: the last one and the shift.
         """
         axes, like = self.prior.mesh.axes, self.coefficients
-        pixels = _pixels(self.windows, like)
-        flow = Mesh(axes, _back(pixels, shift)).field(self.coefficients) + change.to(like)
+        pixels = _of_pixels(axes, self.windows, like)
+        flow = Mesh(axes, _back(pixels.places, shift)).field(self.coefficients) + change.to(like)
         if offset is None:
             offset = [sum(pair) for pair in zip(self.offset, shift, strict=True)]
-        return replace(self, coefficients=Mesh(axes, pixels).fitted(flow), offset=offset)
+        return replace(self, coefficients=pixels.fitted(flow), offset=offset)
 
     def placed(self) -> "Flow":
         """What was learnt of places, where it is now: interpolated once, however often it moved."""
@@ -192,16 +193,17 @@ def awaited(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None
     """All of `next_flow` that concerns the first image and the expected flow alone."""
     placed = start.placed()
     images = _prepared(placed, first, noise)
-    mesh = Mesh(placed.prior.mesh.axes, _pixels(start.windows, images.spline.coefficients))
+    axes = placed.prior.mesh.axes
+    mesh = _of_pixels(axes, start.windows, images.spline.coefficients)
     places = path(mesh, start.coefficients.float(), images.time, start.settings.path_order)
     sampled = images.spline.sample(*places[:, :1])
     slope, told = told_by_first(images, mesh, places, sampled, len(images.time))
     pull = pull_of(placed.prior, start.coefficients, start.settings.ridge)
-    root = factor_in_single(form(told * slope[:, None] * slope, mesh) + pull.whole)
+    root = factor_in_single(form_of_slopes(told, slope, mesh) + pull.whole)
     # the recursion for the inverse damps rounding: 1e-5 in single precision
     inverse = root.covariance().float()
-    in_single = Mesh(placed.prior.mesh.axes, _centres(start.windows, inverse))
-    covariance = spread_half(inverse, in_single).to(start.coefficients)
+    at_centres = _of_centres(axes, start.windows, inverse)
+    covariance = spread_half(inverse, at_centres).to(start.coefficients)
     near = information_near(slope, told, mesh)
     return Awaited(start, placed, mesh, images, places, sampled, pull, root, covariance, near)
 
@@ -249,7 +251,7 @@ def next_flow(
     more = _energy(prior, coefficients) / start.energy
     if not (far < _SMALL and 1 / _MISFIT < worse < _MISFIT and 1 / _ENERGY < more < _ENERGY):
         return None
-    at_centres = Mesh(prior.mesh.axes, _centres(windows, coefficients))
+    at_centres = _of_centres(prior.mesh.axes, windows, coefficients)
     covariance = worse * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
@@ -272,6 +274,20 @@ def _as_informed(ready: Awaited, linear: Linear) -> torch.Tensor:
     ratio = interpolated(ratio, pixels, centres)
     removed = 1 - found.diagonal().sum(-1) / before.diagonal().sum(-1)
     return found / (1 + removed.clamp(0, 1) * (ratio - 1))
+
+
+def _of_pixels(axes: Sequence[Axis], windows: Windows, like: torch.Tensor) -> Mesh:
+    return _mesh(axes, windows, _pixels, like.dtype, like.device)
+
+
+def _of_centres(axes: Sequence[Axis], windows: Windows, like: torch.Tensor) -> Mesh:
+    return _mesh(axes, windows, _centres, like.dtype, like.device)
+
+
+@lru_cache(maxsize=8)
+def _mesh(axes: Sequence[Axis], windows: Windows, places: Callable, dtype, device) -> Mesh:
+    """Kept for the next slab: to make its splines takes longer than to use them."""
+    return Mesh(axes, places(windows, torch.empty(0, dtype=dtype, device=device)))
 
 
 def _pixels(windows: Windows, like: torch.Tensor) -> list[torch.Tensor]:

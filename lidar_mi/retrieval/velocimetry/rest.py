@@ -79,6 +79,9 @@ class AtRest(NamedTuple):
         bad = non_finite(images, windows)
         hidden = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
         flag = flag & ~(Flag.NON_FINITE_INPUT * hidden).to(flag.dtype)
+        nothing = not any(bool(part.any()) for part in (self.piled, self.saturated, self.structure))
+        if nothing and not self.pattern.spoils:
+            return flag
         wide = ~torch.isfinite(found.d).all(0) & ~bad
         piled = windows.of_templates(working(self.piled)).amax(0) > _SATURATED
         # an area of another brightness spoils a correlation from afar

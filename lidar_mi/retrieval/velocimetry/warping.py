@@ -1,6 +1,7 @@
 """Images and volumes as band-limited functions of place: values and gradients anywhere."""
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -67,9 +68,14 @@ class Spline(NamedTuple):
         # sizes of another parity may reach one shell further
         _, shell = radii(tuple(sizes), self.shape, field.dtype, field.device)
         shell = shell.clamp(max=len(self.gain) - 1)
-        spectrum = torch.fft.rfftn(field, s=sizes, dim=dims) * self.gain[shell]
-        smooth = torch.fft.irfftn(spectrum, s=sizes, dim=dims)
-        return smooth[..., *(slice(n) for n in self.shape)]
+        # axis by axis: what is zero before, or not needed after, is not transformed
+        spectrum = torch.fft.rfft(field, n=sizes[-1])
+        for axis, size in zip(dims[:-1], sizes[:-1], strict=True):
+            spectrum = torch.fft.fft(spectrum, n=size, dim=axis)
+        spectrum = spectrum * self.gain[shell]
+        for axis, n in zip(dims[:-1], self.shape[:-1], strict=True):
+            spectrum = torch.fft.ifft(spectrum, dim=axis).narrow(axis, 0, n)
+        return torch.fft.irfft(spectrum, n=sizes[-1])[..., : self.shape[-1]]
 
     def holds(self, *place: torch.Tensor) -> torch.Tensor:
         """Which places lie on the images, up to the outer pixels' centres."""
@@ -130,17 +136,16 @@ def _read_images(
     flat = coefficients.reshape(-1)
     # derivatives along z and y
     orders = [(0, 0), (1, 0), (0, 1)] if slopes else [(0, 0)]
-    total, along = ([torch.zeros_like(z) for _ in of] for of in (orders, weight_y))
-    knot = torch.empty_like(z)
+    total = [torch.zeros_like(z) for _ in orders]
+    knot, *along = (torch.empty_like(z) for _ in range(1 + len(weight_y)))
     for i in range(4):
-        for part in along:
-            part.zero_()
-        number = corner + i * width
         for j in range(4):
-            torch.index_select(flat, 0, number, out=knot.view(-1))
-            number += 1
+            torch.index_select(flat[i * width + j :], 0, corner, out=knot.view(-1))
             for part, weight in zip(along, weight_y, strict=True):
-                part.addcmul_(knot, weight[j])
+                if j:
+                    part.addcmul_(knot, weight[j])
+                else:
+                    torch.mul(knot, weight[j], out=part)
         for part, (by_z, by_y) in zip(total, orders, strict=True):
             part.addcmul_(along[by_y], weight_z[by_z][i])
     return total
@@ -311,12 +316,13 @@ def filtered_splines(
     spectrum = torch.fft.rfftn(
         faded(images - mean, sizes, margin, settings.antisymmetric), dim=dims
     )
-    for axis in frequencies(sizes, images):
-        spectrum = spectrum / ((2 + torch.cos(2 * torch.pi * axis / finer)) / 3)
+    # of images kept for the next ones, as the shells are
+    factor = _through_nodes if len(dims) == 2 else _through_nodes.__wrapped__
+    through = factor(tuple(sizes), finer, images.dtype, images.device)
     keep = [slice(finer * (n + 2 * margin)) for n in shape]
     return [
         Spline(
-            (_refined(spectrum * one.gain[shell], sizes, finer) + mean)[:, *keep].contiguous(),
+            _refined(spectrum * (one.gain[shell] * through), sizes, finer)[:, *keep] + mean,
             shape,
             one.passed,
             one.excess,
@@ -327,6 +333,15 @@ def filtered_splines(
         )
         for one in filters
     ]
+
+
+@lru_cache(maxsize=4)
+def _through_nodes(sizes, finer: int, dtype, device) -> torch.Tensor:
+    """Coefficients over values of a spline through nodes, `finer` of them a pixel, by its waves."""
+    factor = torch.ones((), dtype=dtype, device=device)
+    for axis in frequencies(sizes, factor):
+        factor = factor * 3 / (2 + torch.cos(2 * torch.pi * axis / finer))
+    return factor
 
 
 def mismatch(spline: Spline, rest: torch.Tensor, number: int | None = None) -> torch.Tensor:

@@ -180,7 +180,7 @@ def retrieve_wind(
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
 
-    axes = tuple(image1[name].values.astype(float) for name in ("z", "y"))
+    axes = tuple(image1.coords.variables[name].values.astype(float) for name in ("z", "y"))
     offered = {
         "min_correlation": min_correlation,
         "noise": noise,

@@ -202,7 +202,7 @@ def _checked_arguments(
             f"telescope: {telescope} m is not allowed; expected finite x, y and z with x < 0"
         )
     tau = checked_times(times, stack, dt)
-    axes = [stack[0][name].values.astype(float) for name in ("z", "y")]
+    axes = [stack[0].coords.variables[name].values.astype(float) for name in ("z", "y")]
     if isinstance(noise, xr.DataArray):
         noise = on_device(noise, device)
     return *axes, dt, noise, profile, frozen, tau, start, telescope

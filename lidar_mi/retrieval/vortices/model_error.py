@@ -8,6 +8,7 @@ error that does not average out over pixels.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -74,15 +75,18 @@ class Lags:
 
     def distance(self) -> torch.Tensor:
         """Of every lag, steps of the grid."""
-        along = [
-            torch.fft.fftfreq(n, 1 / n, dtype=self.like.dtype, device=self.like.device)
-            for n in self.sizes
-        ]
-        return torch.hypot(along[0][:, None], along[1][None, :])
+        return _distance(*self.sizes, self.like.dtype, self.like.device)
+
+    def between(self, shortest: float) -> torch.Tensor:
+        """Numbers of the lags from the shortest to those that do not wrap."""
+        kind = self.like.dtype, self.like.device
+        return _between(*self.sizes, *kind, float(shortest), float(self.reach))
 
     def transform(self, fields: torch.Tensor) -> torch.Tensor:
         """Fourier transform of fields, padded so that lags do not wrap."""
-        return torch.fft.rfft2(fields, s=self.sizes)
+        rows, columns = self.sizes
+        # rows of zeros are not transformed
+        return torch.fft.fft(torch.fft.rfft(fields, n=columns), n=rows, dim=-2)
 
     def autocorrelation(
         self, fields: Sequence[torch.Tensor], weights: Sequence[float]
@@ -138,20 +142,19 @@ def model_error(
     lags = lags_used(force)
     observed = lags.autocorrelation(force, (1.0, 1.0))
     unit = lags.autocorrelation(stiffness, (1.0, 2.0, 1.0))
-    distance = lags.distance()
     lengths = _lengths(lags.shape)
-    used = (distance >= shortest) & (distance <= lags.reach)
+    used = lags.between(shortest)
     scale = unit[0, 0]
-    if not float(scale) > 0 or not bool(used.any()):
+    if not float(scale) > 0 or not len(used):
         return ModelError()
-    found, square = observed[used] / scale, distance[used].square()
+    found, square = observed.take(used) / scale, lags.distance().take(used).square()
     size = float(found.abs().max())
     if not size > 0:
         return ModelError()
-    relative = unit[used] / scale
+    relative = unit.take(used) / scale
     columns = [relative * torch.exp(-square / (2 * n**2)) for n in lengths]
     if change is not None:
-        columns.append(change[used] / change.abs().max().clamp(min=1e-300))
+        columns.append(change.take(used) / change.abs().max().clamp(min=1e-300))
     # normalised in both directions: least squares needs numbers near one
     amplitudes, _ = nnls(torch.stack(columns, 1).cpu().numpy(), (found / size).cpu().numpy())
     variances = amplitudes[: len(lengths)] * size
@@ -160,11 +163,25 @@ def model_error(
             a * column for a, column in zip(variances, columns[:-1], strict=True)
         )
         # of white noise the sum at a lag has the variance of that at lag 0 squared, over pixels
-        noise = observed[distance < shortest].sum() / (force != 0).any(0).sum().sqrt()
+        near = observed[lags.distance() < shortest].sum()
+        noise = near / (force != 0).any(0).sum().sqrt()
         if not explained.square().sum().sqrt() > _SIGNIFICANT * noise:
             return ModelError()
     kept = [(float(a), n) for a, n in zip(variances, lengths, strict=True) if a > 0]
     return ModelError(tuple(a for a, _ in kept), tuple(n for _, n in kept))
+
+
+# They depend on the grid alone: kept for the next images.
+@lru_cache(maxsize=8)
+def _distance(rows: int, columns: int, dtype, device) -> torch.Tensor:
+    along = [torch.fft.fftfreq(n, 1 / n, dtype=dtype, device=device) for n in (rows, columns)]
+    return torch.hypot(along[0][:, None], along[1][None, :])
+
+
+@lru_cache(maxsize=8)
+def _between(rows: int, columns: int, dtype, device, shortest: float, reach: float):
+    distance = _distance(rows, columns, dtype, device)
+    return ((distance >= shortest) & (distance <= reach)).flatten().nonzero()[:, 0]
 
 
 def lags_used(like: torch.Tensor) -> Lags:
