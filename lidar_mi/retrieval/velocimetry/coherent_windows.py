@@ -65,7 +65,7 @@ def coherent_covariance(
     square = mean_square_displacement(images, linear, left_by_windows(linear, windows))
     slope = working(linear.slope)
     structure = torch.stack([averaged(part, linear.valid, STRUCTURE) for part in slope])
-    along = _displacement(slope, structure.square().sum(0).sqrt(), windows)
+    along = displacement_of_windows(slope, structure.square().sum(0).sqrt(), windows)
     return square * along[:, None] * along
 
 
@@ -79,13 +79,15 @@ def left_by_windows(linear: Linear, windows: Windows) -> Left:
 
     def left(difference: torch.Tensor) -> torch.Tensor:
         difference = working(difference) * linear.valid
-        moved = separable(_displacement(slope, difference, windows), weights)
+        moved = separable(displacement_of_windows(slope, difference, windows), weights)
         return (difference - (slope * moved).sum(0)) * linear.valid
 
     return left
 
 
-def _displacement(slope: torch.Tensor, difference: torch.Tensor, windows: Windows) -> torch.Tensor:
+def displacement_of_windows(
+    slope: torch.Tensor, difference: torch.Tensor, windows: Windows
+) -> torch.Tensor:
     """Of each window by least squares, (2, *windows.count) px: J^-1 <slope difference>."""
     products = windows.of_templates(slope[:, None] * slope).movedim((0, 1), (-2, -1))
     # windows with nothing in them are not moved

@@ -7,10 +7,11 @@ misfit.
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from lidar_mi.retrieval.velocimetry.band_limit import Filter
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
-from lidar_mi.retrieval.velocimetry.likelihood import linearised, path, prepared
+from lidar_mi.retrieval.velocimetry.likelihood import linearised, path, prepared, without_coarse
 from lidar_mi.retrieval.velocimetry.misfit import with_local_noise
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.velocimetry.warping import filtered_spline
@@ -171,3 +172,34 @@ def test_where_there_is_no_texture_images_tell_nothing():
     dark, bright = np.s_[10:-10, 10:45], np.s_[10:-10, 75:-10]
     assert float(told[dark].sum()) < 0.1 * float(seems[dark].sum())
     assert float(told[bright].sum()) > 0.5 * float(seems[bright].sum())
+
+
+def test_a_noise_far_below_that_of_the_spectra_is_a_lower_limit():
+    """Noise of 0, and of a thousandth of the texture, of images that differ by 5 % of it."""
+    random = np.random.default_rng(5)
+    air = gaussian_filter(random.standard_normal((80, 100)), 1.0, mode="wrap")
+    air = torch.as_tensor(air / air.std())
+    images = [air + 0.05 * torch.as_tensor(random.standard_normal(air.shape)) for _ in range(2)]
+    settings = VariationalSettings()
+    none = prepared(images, None, 0.0, settings)
+    assert abs(none.noise / 0.05 - 1) < 0.15
+    for told in (0.0, 1e-3):
+        found = prepared(images, told, 0.0, settings)
+        assert (found.noise, found.told, found.given) == (none.noise, told, False)
+    given = prepared(images, 0.04, 0.0, settings)
+    assert (given.noise, given.told, given.given) == (0.04, 0.04, True)
+
+
+def test_long_waves_are_left_out_and_short_ones_stay():
+    """Of waves of 60 and 2.5 px half is left out: half of the one, nothing of the other."""
+    z, y = torch.meshgrid(torch.arange(120.0), torch.arange(120.0), indexing="ij")
+    valid, half = torch.ones_like(z, dtype=torch.bool), torch.full_like(z, 0.5)
+    inside = slice(20, -20), slice(20, -20)
+    for length, left in ((60.0, 0.5), (2.5, 1.0)):
+        wave = torch.sin(2 * torch.pi * y / length)
+        found = without_coarse(wave, half, valid)
+        # of a Gaussian mean of 1 px
+        passed = np.exp(-((2 * np.pi / length) ** 2) / 2)
+        assert torch.allclose(found[inside], (1 - 0.5 * passed) * wave[inside], atol=2e-3)
+        assert abs((1 - 0.5 * passed) - left) < 0.03
+    assert without_coarse(z, None, valid) is z
