@@ -102,7 +102,8 @@ def bootstrap_covariance(
     3 points more errors within one standard error.
 
     The wind is not known better than its vectors: in vortex cores smaller than a window, standard
-    errors are too small, and so they are where air changes as if it moved. On a steep edge of
+    errors are too small, and so they are where air changes as if it moved: see
+    `coherent_windows.coherent_covariance`. On a steep edge of
     brightness that stands still (from 1 to 0.2 within 4 px) vectors of "multipass" err by three
     standard errors; on its bright side, up to three templates away, errors are stated 1.5 to 2
     times too large.

@@ -199,10 +199,13 @@ class VariationalSettings:
     largest_ratio : float
         Upper limit of the ratio, images only; 1e5 is 0.3 % of the standard deviation. Images of
         weak texture without measurable divergence do not prove that there is none.
-    prior_width : float
-        Standard deviation over the template within which the prior's strength varies little.
+    prior_width, prior_width_trusted : float
+        Standard deviation over the template within which the prior's strength varies little; the
+        second one in images whose noise is given. Wider, errors are smaller in steady noise, and
+        stated too large.
     largest_change, largest_change_trusted, largest_change_divergence : float
-        Factor by which a strength may change per round, the second one where noise is given.
+        Factor by which a strength may change per round; the second one in images whose noise is
+        given.
     filter : FilterSettings
     solver : IterativeSettings
         Of volumes.
@@ -223,7 +226,8 @@ class VariationalSettings:
     ratio: float = 100.0
     least_vorticity: float = 1e-3
     largest_ratio: float = 1e5
-    prior_width: float = 0.75
+    prior_width: float = 0.65
+    prior_width_trusted: float = 0.9
     largest_change: float = 4.0
     largest_change_trusted: float = 16.0
     largest_change_divergence: float = 16.0

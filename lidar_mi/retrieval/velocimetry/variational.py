@@ -48,7 +48,7 @@ def variational(
 
     with the images band-limited (`warping.band_limited`) and warped to mid-time along the curved
     paths of the flow, so that no texture has to be known; residuals beyond 3 s count linearly.
-    The prior's strength L(x), which may vary over half a template, D and q are those of
+    The prior's strength L(x), which may vary over about a template, D and q are those of the
     largest evidence: the energy of vorticity and of divergence is as large as the prior
     expects, of what the images inform (MacKay 1992, Neural Comput. 4, 415-447). So the flow is
     smoothed little in cores and strongly around them. In volumes vorticity along x, across x and
@@ -130,7 +130,7 @@ def variational_and_flow(
     if settings is None:
         settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
     images = prepared(stack, noise, blur, settings)
-    given = images.weight
+    given, trusted = images.weight, images.given and windows.dims == 2
     like = images.spline.coefficients[:0]
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
@@ -144,7 +144,8 @@ def variational_and_flow(
         coefficients = mesh.fitted(flow)
         if prior is None:
             unit = (1.0,) * windows.dims
-            wide = settings.prior_width * windows.template
+            wide = settings.prior_width_trusted if trusted else settings.prior_width
+            wide *= windows.template
             prior = first_prior(axes, working(coefficients), wide, spacing or unit, settings)
         else:
             prior = refined(prior, axes)
@@ -163,7 +164,6 @@ def variational_and_flow(
             coefficients = posterior.coefficients.to(like)
             # the first flow on coarse knots is too far off to estimate the prior from
             if turn or level:
-                trusted = images.given and windows.dims == 2
                 prior = prior.updated(*posterior.evidence(), settings, trusted)
             turn += 1
         flow = mesh.field(coefficients)
