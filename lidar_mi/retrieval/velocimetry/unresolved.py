@@ -10,9 +10,12 @@ from lidar_mi.retrieval.velocimetry.windows import averaged
 INERTIAL = 2 ** (-2 / 3)
 """Variance of turbulence in an octave of wavenumber over that in the octave of longer waves."""
 
+# Standard deviation of the Gaussian that averages variances, over the spacing of the knots.
+_WIDTH = 0.6
+
 
 def unresolved_variance(
-    flow: torch.Tensor, knots: float, width: float, known: torch.Tensor | None = None
+    flow: torch.Tensor, knots: float, known: torch.Tensor | None = None
 ) -> torch.Tensor:
     """Variance of a component of the motion between two knots of a flow's splines and a pixel.
 
@@ -28,9 +31,8 @@ def unresolved_variance(
     flow : torch.Tensor, shape (components, ...)
         At the pixels; px in dt.
     knots : float
-        Spacing of the knots of its splines, px.
-    width : float
-        Standard deviation of the Gaussian that averages the variances, px.
+        Spacing of the knots of its splines, px; variances are averaged over a Gaussian of 0.6 of
+        it. Wider, what splines leave in vortex cores is stated all around them.
     known : torch.Tensor of bool, shape (...), optional
         Pixels whose flow the images tell: beside them it is what the prior makes of noise. Left
         out: all.
@@ -49,7 +51,7 @@ def unresolved_variance(
     for times in (2, 4, 8):
         mesh = Mesh([Axis(n, times * knots) for n in shape], places)
         coarser = mesh.field(mesh.fitted(flow))
-        octaves.append(averaged((finer - coarser).square().mean(0), known, width))
+        octaves.append(averaged((finer - coarser).square().mean(0), known, _WIDTH * knots))
         finer = coarser
     fine, middle, coarse = (octave.clamp(min=1e-30) for octave in octaves)
     ratio = fine / middle

@@ -179,7 +179,7 @@ def variational_and_flow(
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
     known = (found.flag == 0) & ~no_skill(d, covariance)
     known = interpolated(known.to(like), centres, pixels) > 0.5
-    finer = unresolved_variance(mesh.field(posterior.coefficients.to(like)), apart, width, known)
+    finer = unresolved_variance(mesh.field(posterior.coefficients.to(like)), apart, known)
     finer = interpolated(finer, pixels, centres)
     found = found._replace(covariance=with_unresolved(covariance, finer))
     if windows.dims > 2:

@@ -14,7 +14,7 @@ from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.velocimetry.unresolved import unresolved_variance
 from tests.support.flows import axes
 
-KNOTS, WIDTH = 4.0, 6.0
+KNOTS = 4.0
 
 
 def left(flow):
@@ -45,7 +45,7 @@ def test_of_turbulence():
     """Spectral density k^(-5/3): 30 % of what splines leave, from what they hold alone."""
     for seed in (1, 2):
         flow = turbulence(seed)
-        found = float(unresolved_variance(resolved(flow), KNOTS, WIDTH).mean())
+        found = float(unresolved_variance(resolved(flow), KNOTS).mean())
         assert abs(math.log(found / left(flow))) < math.log(1.7)
 
 
@@ -55,7 +55,7 @@ def test_of_a_smooth_vortex_pair():
     grid = np.meshgrid(y, z)
     v, w = velocity(vortex_pair(400.0, separation=47.1, core_radius=3.0), *grid)
     flow = torch.as_tensor(np.stack([w, v])) * 0.1 / 0.5
-    found = unresolved_variance(resolved(flow), KNOTS, WIDTH)
+    found = unresolved_variance(resolved(flow), KNOTS)
     assert 0.1 < float(found.mean()) / left(flow) < 2
     outside = np.minimum(*(np.hypot(grid[0] - s * 47.1 / 2, grid[1]) for s in (1, -1))) > 12
     assert float(found[torch.as_tensor(outside)].mean().sqrt()) < 1e-3
@@ -64,4 +64,4 @@ def test_of_a_smooth_vortex_pair():
 def test_of_a_flow_that_splines_hold():
     y = torch.arange(64).double()
     shear = torch.stack([0 * y + 0.3, 0.05 * y])[:, None].expand(-1, 48, -1).contiguous()
-    assert float(unresolved_variance(shear, KNOTS, WIDTH).max()) < 1e-9
+    assert float(unresolved_variance(shear, KNOTS).max()) < 1e-9
