@@ -7,6 +7,7 @@ flow that is taken for turbulence.
 import math
 
 import numpy as np
+import pytest
 import torch
 
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
@@ -49,16 +50,17 @@ def test_of_turbulence():
         assert abs(math.log(found / left(flow))) < math.log(1.7)
 
 
-def test_of_a_smooth_vortex_pair():
-    """No turbulence: about what splines leave, and outside the cores nothing."""
+@pytest.mark.parametrize("core_radius", [2.0, 3.0, 5.0])
+def test_of_a_smooth_vortex_pair(core_radius):
+    """No turbulence: about what splines leave, and outside the cores nothing (0.01 m/s)."""
     y, z = axes(219, 139)
     grid = np.meshgrid(y, z)
-    v, w = velocity(vortex_pair(400.0, separation=47.1, core_radius=3.0), *grid)
+    v, w = velocity(vortex_pair(400.0, separation=47.1, core_radius=core_radius), *grid)
     flow = torch.as_tensor(np.stack([w, v])) * 0.1 / 0.5
     found = unresolved_variance(resolved(flow), KNOTS)
-    assert 0.1 < float(found.mean()) / left(flow) < 2
+    assert 0.3 < float(found.mean()) / left(flow) < 2
     outside = np.minimum(*(np.hypot(grid[0] - s * 47.1 / 2, grid[1]) for s in (1, -1))) > 12
-    assert float(found[torch.as_tensor(outside)].mean().sqrt()) < 1e-3
+    assert float(found[torch.as_tensor(outside)].mean().sqrt()) < 2e-3
 
 
 def test_of_a_flow_that_splines_hold():
