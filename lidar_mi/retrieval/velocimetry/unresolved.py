@@ -42,7 +42,8 @@ def unresolved_variance(
     -------
     torch.Tensor, shape (...)
         px^2, mean over the components as of isotropic motion. In vortex cores its root is 0.35 to
-        0.8 of what splines leave. Where noise and prior have smoothed the finest octave it is too small.
+        0.8 of what splines leave. Where noise and prior have smoothed the finest octave it is too
+        small.
     """
     shape = flow.shape[1:]
     if known is None:

@@ -52,7 +52,7 @@ def test_of_turbulence():
 
 @pytest.mark.parametrize("core_radius", [2.0, 3.0, 5.0])
 def test_of_a_smooth_vortex_pair(core_radius):
-    """No turbulence: about what splines leave, and outside the cores nothing (0.01 m/s)."""
+    """No turbulence: about what splines leave, and outside the cores next to nothing (0.025 m/s)."""
     y, z = axes(219, 139)
     grid = np.meshgrid(y, z)
     v, w = velocity(vortex_pair(400.0, separation=47.1, core_radius=core_radius), *grid)
@@ -60,7 +60,7 @@ def test_of_a_smooth_vortex_pair(core_radius):
     found = unresolved_variance(resolved(flow), KNOTS)
     assert 0.3 < float(found.mean()) / left(flow) < 2
     outside = np.minimum(*(np.hypot(grid[0] - s * 47.1 / 2, grid[1]) for s in (1, -1))) > 12
-    assert float(found[torch.as_tensor(outside)].mean().sqrt()) < 2e-3
+    assert float(found[torch.as_tensor(outside)].mean().sqrt()) < 5e-3
 
 
 def test_of_a_flow_that_splines_hold():
