@@ -1,10 +1,12 @@
 """Motion that splines do not resolve: its variance, from that of the scales that they do."""
 
 import math
+from collections.abc import Callable
 
 import torch
 
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
+from lidar_mi.retrieval.velocimetry.likelihood import Linear
 from lidar_mi.retrieval.velocimetry.windows import averaged
 
 INERTIAL = 2 ** (-2 / 3)
@@ -16,7 +18,10 @@ _WIDTH = 0.8
 
 
 def unresolved_variance(
-    flow: torch.Tensor, knots: float, known: torch.Tensor | None = None
+    flow: torch.Tensor,
+    knots: float,
+    known: torch.Tensor | None = None,
+    of_noise: torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Variance of a component of the motion between two knots of a flow's splines and a pixel.
 
@@ -37,6 +42,9 @@ def unresolved_variance(
     known : torch.Tensor of bool, shape (...), optional
         Pixels whose flow the images tell: beside them it is what the prior makes of noise. Left
         out: all.
+    of_noise : torch.Tensor, shape (number, ...), optional
+        Components of flows that nothing but the images' noise makes, see `made_by_noise`. The mean
+        variance of their octaves is no motion. Left out: none is.
 
     Returns
     -------
@@ -45,9 +53,50 @@ def unresolved_variance(
         0.8 of what splines leave. Where noise and prior have smoothed the finest octave it is too
         small.
     """
-    shape = flow.shape[1:]
     if known is None:
         known = torch.ones_like(flow[0], dtype=torch.bool)
+    octaves = _octaves(flow, knots, known)
+    if of_noise is not None:
+        octaves = octaves - _octaves(of_noise, knots, known)
+    fine, middle, coarse = octaves.clamp(min=1e-30)
+    ratio = fine / middle
+    change = ratio / (middle / coarse).clamp(max=1)
+    ratio = (ratio * change.clamp(max=1)).clamp(max=INERTIAL)
+    # sum of ratio^n over the octaves n = 1, 2, ... from the knots to a pixel
+    return fine * ratio * (1 - ratio ** math.log2(max(knots, 1.0))) / (1 - ratio)
+
+
+def made_by_noise(
+    linear: Linear, mesh: Mesh, response: Callable[[torch.Tensor], torch.Tensor], number: int = 4
+) -> torch.Tensor:
+    """Flows at the pixels that the noise of the images alone makes; seeded.
+
+    Parameters
+    ----------
+    linear : Linear
+        The likelihood about the fitted flow.
+    mesh : Mesh
+        Of the pixels.
+    response : callable
+        From a gradient of the log-likelihood (components, knots) to the flow's change.
+    number : int
+
+    Returns
+    -------
+    torch.Tensor, shape (number * components, ...)
+        px in dt.
+    """
+    random, flows = torch.Generator().manual_seed(3), []
+    root = linear.information.sqrt()
+    for _ in range(number):
+        draw = torch.randn(root.shape, generator=random, dtype=root.dtype).to(root.device)
+        flows.append(mesh.field(response(mesh.transposed(root * draw * linear.damped)).to(root)))
+    return torch.cat(flows)
+
+
+def _octaves(flow: torch.Tensor, knots: float, known: torch.Tensor) -> torch.Tensor:
+    """Variance of a component by octave (3, ...), the finest first."""
+    shape = flow.shape[1:]
     places = [torch.arange(n).to(flow) for n in shape]
     octaves, finer = [], flow
     for times in (2, 4, 8):
@@ -55,12 +104,7 @@ def unresolved_variance(
         coarser = mesh.field(mesh.fitted(flow))
         octaves.append(averaged((finer - coarser).square().mean(0), known, _WIDTH * knots))
         finer = coarser
-    fine, middle, coarse = (octave.clamp(min=1e-30) for octave in octaves)
-    ratio = fine / middle
-    change = ratio / (middle / coarse).clamp(max=1)
-    ratio = (ratio * change.clamp(max=1)).clamp(max=INERTIAL)
-    # sum of ratio^n over the octaves n = 1, 2, ... from the knots to a pixel
-    return fine * ratio * (1 - ratio ** math.log2(max(knots, 1.0))) / (1 - ratio)
+    return torch.stack(octaves)
 
 
 def with_unresolved(covariance: torch.Tensor, variance: torch.Tensor) -> torch.Tensor:

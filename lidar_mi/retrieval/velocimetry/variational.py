@@ -21,7 +21,11 @@ from lidar_mi.retrieval.velocimetry.next_flow import Flow, flow_of
 from lidar_mi.retrieval.velocimetry.prior import first_prior, refined
 from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, no_skill
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
-from lidar_mi.retrieval.velocimetry.unresolved import unresolved_variance, with_unresolved
+from lidar_mi.retrieval.velocimetry.unresolved import (
+    made_by_noise,
+    unresolved_variance,
+    with_unresolved,
+)
 from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, working
 
 
@@ -179,7 +183,9 @@ def variational_and_flow(
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
     known = (found.flag == 0) & ~no_skill(d, covariance)
     known = interpolated(known.to(like), centres, pixels) > 0.5
-    finer = unresolved_variance(mesh.field(posterior.coefficients.to(like)), apart, known)
+    # where the noise is not given, little is known of what it makes
+    of_noise = made_by_noise(linear, mesh, posterior.response) if trusted else None
+    finer = unresolved_variance(mesh.field(posterior.coefficients.to(like)), apart, known, of_noise)
     finer = interpolated(finer, pixels, centres)
     found = found._replace(covariance=with_unresolved(covariance, finer))
     if windows.dims > 2:
