@@ -226,7 +226,7 @@ class VariationalSettings:
     ratio: float = 100.0
     least_vorticity: float = 1e-3
     largest_ratio: float = 1e5
-    prior_width: float = 0.7
+    prior_width: float = 0.65
     prior_width_trusted: float = 0.85
     largest_change: float = 4.0
     largest_change_trusted: float = 16.0
