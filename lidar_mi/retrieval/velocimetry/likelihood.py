@@ -26,7 +26,7 @@ STRUCTURE = 3.0
 # Of the mean that passes the long waves in which structure moves alike over an area; and the
 # variance of its motion in the other waves over that in these. Chosen on seeds 41 to 43 of the
 # true second states of ``validation/coverage.py``: 0.8 to 1.5 px and 0.1 to 0.3 are alike.
-_LONG, _SHORT = 1.0, 0.2
+_LONG, _SHORT = 1.0, 0.17
 
 
 class Images(NamedTuple):
