@@ -183,8 +183,10 @@ def variational_and_flow(
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
     known = (found.flag == 0) & ~no_skill(d, covariance)
     known = interpolated(known.to(like), centres, pixels) > 0.5
-    # where the noise is not given, little is known of what it makes
-    of_noise = made_by_noise(linear, mesh, posterior.response) if trusted else None
+    # where the noise is not given, little is known of what it makes; in strips and in volumes a
+    # draw takes as long as a step to the flow, and changes errors by 1 %
+    drawn = trusted and isinstance(posterior, direct.Posterior)
+    of_noise = made_by_noise(linear, mesh, posterior.response) if drawn else None
     finer = unresolved_variance(mesh.field(posterior.coefficients.to(like)), apart, known, of_noise)
     finer = interpolated(finer, pixels, centres)
     found = found._replace(covariance=with_unresolved(covariance, finer))

@@ -14,7 +14,7 @@ from lidar_mi.retrieval.velocimetry.coherent_windows import (
 )
 from lidar_mi.retrieval.velocimetry.multipass import multipass
 from lidar_mi.retrieval.velocimetry.windows import Windows
-from tests.retrieval.velocimetry.test_coherent_change import SHAPE, pair
+from tests.support.smoke import SHAPE, pair
 from validation.coverage import measured
 
 WINDOWS = Windows(SHAPE, 8, 16, 4)
