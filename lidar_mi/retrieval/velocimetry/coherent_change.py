@@ -13,7 +13,12 @@ import torch
 from scipy.optimize import lsq_linear
 
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
-from lidar_mi.retrieval.velocimetry.likelihood import STRUCTURE, Images, Linear, without_coarse
+from lidar_mi.retrieval.velocimetry.likelihood import (
+    Images,
+    Linear,
+    steepness_of_structure,
+    without_coarse,
+)
 from lidar_mi.retrieval.velocimetry.windows import averaged, working
 
 Left = Callable[[torch.Tensor], torch.Tensor]
@@ -75,7 +80,7 @@ def what_is_left(
 
 def _white_noise(images: Images, number: int, seed: int) -> Iterator[torch.Tensor]:
     """White noise of unit variance after the images' filter, (z, y); seeded."""
-    for draw in _normal(images.weight, number, seed):
+    for draw in normal_fields(images.weight, number, seed):
         yield images.spline.filtered(draw)
 
 
@@ -116,8 +121,7 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
         return 0.0
     time = images.time.to(linear.warped).reshape(-1, 1, 1)
     difference = (time * linear.warped).sum(0) / time.square().sum() * valid
-    slope = torch.stack([averaged(working(part), valid, STRUCTURE) for part in linear.slope])
-    steep = slope.square().sum(0).sqrt()
+    steep = steepness_of_structure(working(linear.slope), valid).sqrt()
     fine = (difference - averaged(difference, valid, _FINE)).square()
     level = averaged(fine, valid, _LEVEL).sqrt()
     if images.given:
@@ -130,7 +134,7 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
 
     noise = moved = 0.0
     for one, smooth in zip(
-        _white_noise(images, _DRAWS, 1), _normal(difference, _DRAWS, 2), strict=True
+        _white_noise(images, _DRAWS, 1), normal_fields(difference, _DRAWS, 2), strict=True
     ):
         rest = one if images.given else one - averaged(one, valid, _FINE)
         noise = noise + squares(left(level * one / rest.std())) / _DRAWS
@@ -177,7 +181,7 @@ def _fitted(
     return _SQUARES * float((ratio - 1 - np.log(ratio)).sum()), mean * parts
 
 
-def _normal(like: torch.Tensor, number: int, seed: int) -> Iterator[torch.Tensor]:
+def normal_fields(like: torch.Tensor, number: int, seed: int) -> Iterator[torch.Tensor]:
     """Fields of independent standard normal numbers, the same on every device."""
     random = torch.Generator().manual_seed(seed)
     for _ in range(number):

@@ -12,16 +12,15 @@ from lidar_mi.retrieval.velocimetry.bootstrap import at_mid_time
 from lidar_mi.retrieval.velocimetry.coherent_change import Left, mean_square_displacement
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
-from lidar_mi.retrieval.velocimetry.likelihood import STRUCTURE, Linear, linearised, prepared
+from lidar_mi.retrieval.velocimetry.likelihood import (
+    Linear,
+    linearised,
+    prepared,
+    steepness_of_structure,
+)
 from lidar_mi.retrieval.velocimetry.outliers import validated
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
-from lidar_mi.retrieval.velocimetry.windows import (
-    Windows,
-    averaged,
-    linear_weights,
-    separable,
-    working,
-)
+from lidar_mi.retrieval.velocimetry.windows import Windows, working
 
 
 def coherent_covariance(
@@ -64,22 +63,18 @@ def coherent_covariance(
     linear = linearised(images, mesh, mesh.fitted(at_mid_time(flow, windows, True)), settings)
     square = mean_square_displacement(images, linear, left_by_windows(linear, windows))
     slope = working(linear.slope)
-    structure = torch.stack([averaged(part, linear.valid, STRUCTURE) for part in slope])
-    along = displacement_of_windows(slope, structure.square().sum(0).sqrt(), windows)
+    steep = steepness_of_structure(slope, linear.valid).sqrt()
+    along = displacement_of_windows(slope, steep, windows)
     return square * along[:, None] * along
 
 
 def left_by_windows(linear: Linear, windows: Windows) -> Left:
     """What displacements of windows leave of a difference of the images, to first order."""
     slope = working(linear.slope) * linear.valid
-    weights = [
-        linear_weights(windows.centres(axis).to(slope), torch.arange(n).to(slope))
-        for axis, n in enumerate(windows.shape)
-    ]
 
     def left(difference: torch.Tensor) -> torch.Tensor:
         difference = working(difference) * linear.valid
-        moved = separable(displacement_of_windows(slope, difference, windows), weights)
+        moved = at_mid_time(displacement_of_windows(slope, difference, windows), windows, True)
         return (difference - (slope * moved).sum(0)) * linear.valid
 
     return left

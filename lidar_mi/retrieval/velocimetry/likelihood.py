@@ -22,7 +22,7 @@ _SAYS_LITTLE = 0.1
 # at 3 the rim of smoke counts as texture beside it.
 _SHARE_WIDTH = 1.5
 # Standard deviation, px, of the Gaussian mean of slopes that are structure and not texture.
-STRUCTURE = 3.0
+_STRUCTURE = 3.0
 # Of the mean that passes the long waves in which structure moves alike over an area; and the
 # variance of its motion in the other waves over that in these. Chosen on seeds 41 to 43 of the
 # true second states of ``validation/coverage.py``: 0.8 to 1.5 px and 0.1 to 0.3 are alike.
@@ -197,8 +197,8 @@ def linearised_there(
     coarse, damped = None, slope
     if images.coherent:
         # long waves scatter by variance + coherent s^2 a pixel where structure has the slope s
-        structure = torch.stack([averaged(part, valid, STRUCTURE) for part in slope])
-        change = images.coherent * structure.square().sum(0) * images.weight / variance
+        steep = steepness_of_structure(slope, valid)
+        change = images.coherent * steep * images.weight / variance
         informed = informed / (1 + _SHORT * change)
         coarse = 1 - ((1 + _SHORT * change) / (1 + change)).sqrt()
         damped = torch.stack([without_coarse(part, coarse, valid) for part in slope])
@@ -212,6 +212,12 @@ def linearised_there(
         information = second * share.square() * images.spline.excess
     gradient = informed * downhill
     return Linear(slope, damped, coarse, gradient, second, information, variance, value, valid)
+
+
+def steepness_of_structure(slope: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Squared slope (z, y) of what images (2, z, y) show coarsely, in a Gaussian mean of 3 px."""
+    structure = torch.stack([averaged(part, valid, _STRUCTURE) for part in slope])
+    return structure.square().sum(0)
 
 
 def without_coarse(

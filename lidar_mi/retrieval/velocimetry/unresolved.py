@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import torch
 
+from lidar_mi.retrieval.velocimetry.coherent_change import normal_fields
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import Linear
 from lidar_mi.retrieval.velocimetry.windows import averaged
@@ -86,12 +87,9 @@ def made_by_noise(
     torch.Tensor, shape (number * components, ...)
         px in dt.
     """
-    random, flows = torch.Generator().manual_seed(3), []
     root = linear.information.sqrt()
-    for _ in range(number):
-        draw = torch.randn(root.shape, generator=random, dtype=root.dtype).to(root.device)
-        flows.append(mesh.field(response(mesh.transposed(root * draw * linear.damped)).to(root)))
-    return torch.cat(flows)
+    told = (mesh.transposed(root * draw * linear.damped) for draw in normal_fields(root, number, 3))
+    return torch.cat([mesh.field(response(gradient).to(root)) for gradient in told])
 
 
 def _octaves(flow: torch.Tensor, knots: float, known: torch.Tensor) -> torch.Tensor:
