@@ -22,9 +22,9 @@ from lidar_mi.retrieval.rings.scoring import cell_variance
 from lidar_mi.retrieval.threads import threads_for
 
 ITERATIONS = 8
-# Standard deviations, largest last step of an image that is read: a further one would be a fifth of
-# it or less.
-CLOSE = 0.1
+# Standard deviations, largest last step of an image that is read: a further one would be a seventh
+# of it or less, of the speed a thirtieth.
+CLOSE = 0.4
 # Images whose parameters are found together: what they need is near the cache.
 _AT_ONCE = 64
 # Parameters whose derivatives do not grow with the light.

@@ -77,10 +77,16 @@ class Lags:
         """Of every lag, steps of the grid."""
         return _distance(*self.sizes, self.like.dtype, self.like.device)
 
-    def between(self, shortest: float) -> torch.Tensor:
-        """Numbers of the lags from the shortest to those that do not wrap."""
+    def between(self, shortest: float, longest: float = np.inf) -> torch.Tensor:
+        """Numbers of the lags of `autocorrelation` from shortest to longest that do not wrap."""
         kind = self.like.dtype, self.like.device
-        return _between(*self.sizes, *kind, float(shortest), float(self.reach))
+        ends = float(shortest), float(min(longest, self.reach))
+        return _between(*self.sizes, self.rows, *kind, *ends)
+
+    @property
+    def rows(self) -> int:
+        """Of the lags of `autocorrelation`."""
+        return 1 + int(min(self.sizes[0] // 2, self.reach))
 
     def transform(self, fields: torch.Tensor) -> torch.Tensor:
         """Fourier transform of fields, padded so that lags do not wrap."""
@@ -91,13 +97,17 @@ class Lags:
     def autocorrelation(
         self, fields: Sequence[torch.Tensor], weights: Sequence[float]
     ) -> torch.Tensor:
-        """Sum over the fields of weight * sum_x f(x) f(x + lag)."""
+        """Sum over the fields of weight * sum_x f(x) f(x + lag), for lags of 0 or more along z.
+
+        It is the same for the opposite lags.
+        """
         waves = (self.transform(f) for f in fields)
         # a sum over a last axis of two takes six times as long
         power = sum(
             w * (f.real.square() + f.imag.square()) for f, w in zip(waves, weights, strict=True)
         )
-        return torch.fft.irfft2(power, s=self.sizes)
+        along_z = torch.fft.ifft(power, dim=0)[: self.rows]
+        return torch.fft.irfft(along_z, n=self.sizes[1])
 
     def quadratic(self, fields: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
         """Matrix sum_a sum_x,x' f_ia(x) C(x - x') f_ja(x') of fields (i, a, z, y), C by lags."""
@@ -147,7 +157,8 @@ def model_error(
     scale = unit[0, 0]
     if not float(scale) > 0 or not len(used):
         return ModelError()
-    found, square = observed.take(used) / scale, lags.distance().take(used).square()
+    distance = lags.distance()[: lags.rows]
+    found, square = observed.take(used) / scale, distance.take(used).square()
     size = float(found.abs().max())
     if not size > 0:
         return ModelError()
@@ -163,7 +174,7 @@ def model_error(
             a * column for a, column in zip(variances, columns[:-1], strict=True)
         )
         # of white noise the sum at a lag has the variance of that at lag 0 squared, over pixels
-        near = observed[lags.distance() < shortest].sum()
+        near = observed[0, 0] + 2 * observed.take(lags.between(1.0, np.nextafter(shortest, 0))).sum()
         noise = near / (force != 0).any(0).sum().sqrt()
         if not explained.square().sum().sqrt() > _SIGNIFICANT * noise:
             return ModelError()
@@ -179,9 +190,12 @@ def _distance(rows: int, columns: int, dtype, device) -> torch.Tensor:
 
 
 @lru_cache(maxsize=8)
-def _between(rows: int, columns: int, dtype, device, shortest: float, reach: float):
-    distance = _distance(rows, columns, dtype, device)
-    return ((distance >= shortest) & (distance <= reach)).flatten().nonzero()[:, 0]
+def _between(rows: int, columns: int, kept: int, dtype, device, shortest: float, longest: float):
+    distance = _distance(rows, columns, dtype, device)[:kept]
+    chosen = (distance >= shortest) & (distance <= longest)
+    # of opposite lags along y alone, one
+    chosen[0, columns // 2 + 1 :] = False
+    return chosen.flatten().nonzero()[:, 0]
 
 
 def lags_used(like: torch.Tensor) -> Lags:

@@ -76,16 +76,20 @@ def stepped(
 ) -> Solution | None:
     """The minimum of residuals that are linear in the parameters, None if there is none.
 
-    The weights are those of the residuals left: the step is taken again with them, `turns` times.
+    The weights are those of the residuals left: after the first step so many corrections less one
+    follow, each with the residuals' own weights and the first step's matrix.
     """
-    rest = misfit
-    for _ in range(turns):
-        normal, force = _normal(misfit, weights(rest, flow_variance))
-        step = _step(normal, force, 1e-6)
-        if step is None:
+    weight = weights(misfit, flow_variance)
+    normal, force = _normal(misfit, weight)
+    step, rest = torch.zeros_like(force), misfit
+    for turn in range(turns):
+        if turn:
+            force = _force(rest, weights(rest, flow_variance))
+        correction = _step(normal, force, 1e-6)
+        if correction is None:
             return None
-        left = moved(misfit, step)
-        rest = misfit._replace(residual=left)
+        step = step + correction
+        rest = misfit._replace(residual=moved(misfit, step))
     return _solution(parameters + step, rest, flow_variance, True)
 
 
@@ -147,8 +151,12 @@ def _normal(misfit: Misfit, weight: torch.Tensor) -> tuple[torch.Tensor, torch.T
     """Sums of w J J^T and of -w J r."""
     columns = misfit.jacobian.flatten(1)
     weighted = columns * weight.flatten()
-    sums = weighted @ columns.T, -(weighted @ misfit.residual.flatten())
-    return tuple(part.double() for part in sums)
+    return (weighted @ columns.T).double(), _force(misfit, weight)
+
+
+def _force(misfit: Misfit, weight: torch.Tensor) -> torch.Tensor:
+    """Sum of -w J r."""
+    return -(misfit.jacobian.flatten(1) @ (weight * misfit.residual).flatten()).double()
 
 
 def _step(normal, force, damping: float) -> torch.Tensor | None:

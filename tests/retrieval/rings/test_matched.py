@@ -53,7 +53,7 @@ def test_is_as_accurate_as_a_fit_of_every_image(score, v_los, light):
 
 
 def test_no_noise_no_error(score):
-    """To the last step of the iteration, a hundredth of a standard error."""
+    """To the last step of the iteration, a thirtieth of 0.4 standard errors."""
     speeds = np.array([40.0, 55.0, 60.0, 80.0])
     images = torch.as_tensor(
         np.stack([reference.ring_image(v, PHOTONS, CENTRE, **COARSE) for v in speeds])
