@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import NamedTuple
 
+import torch
 import xarray as xr
 
 from lidar_mi.encounter.combination import Completion
@@ -86,6 +87,8 @@ class Estimator:
         # the last slab's vortices, near which the next wind starts
         self._last: VortexPairFit | None = None
 
+    # no derivatives are recorded: 7 % of the time
+    @torch.inference_mode()
     def pair_of(
         self,
         image1: xr.DataArray,

@@ -138,12 +138,15 @@ class SlabWinds:
         """
         return partial(self._timed, second, complete)
 
+    # no derivatives are recorded, as in `Estimator.pair_of`
+    @torch.inference_mode()
     def _awaits(self, slab: FirstImage, before: VortexPairFit | None) -> float:
         began = time.perf_counter()
         self._slab, start = slab, self._start(slab, before)
         self._awaited = start and awaited_wind(slab.image, start, slab.noise)
         return time.perf_counter() - began
 
+    @torch.inference_mode()
     def _timed(self, second: xr.DataArray, complete: Complete | None) -> Found:
         began = time.perf_counter()
         wind = self._wind(second)

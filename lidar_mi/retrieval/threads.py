@@ -55,8 +55,10 @@ def mapped(function: Callable[[_Part], _Result], parts: Iterable[_Part]) -> list
     number = min(len(parts), _AVAILABLE.get() or before)
     if number < 2:
         return [function(part) for part in parts]
+    # modes are of a thread
+    alike = torch.inference_mode(torch.is_inference_mode_enabled())(function)
     try:
         with ThreadPoolExecutor(number, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            return list(pool.map(function, parts))
+            return list(pool.map(alike, parts))
     finally:
         torch.set_num_threads(before)

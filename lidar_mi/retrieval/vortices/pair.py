@@ -1,6 +1,6 @@
 """A pair of vortices in a mean wind: parameters, covariance, derived quantities, wind anywhere."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -135,7 +135,7 @@ class VortexPairFit(Tabular):
             return torch.stack(list(_derived(theta, self.profile).values()))
 
         values = _derived(theta, self.profile)
-        slope = torch.autograd.functional.jacobian(derived, theta).numpy()
+        slope = _jacobian(derived, self.parameters)
         spread = np.sqrt(np.einsum("ij,jk,ik->i", slope, self.covariance, slope))
         turned = np.zeros(len(spread)) if self.turned is None else slope @ self.turned
         return {
@@ -218,7 +218,7 @@ class VortexPairFit(Tabular):
             return theta + seconds * drift(theta, self.profile) @ _CENTRES.to(theta)
 
         theta = torch.as_tensor(self.parameters)
-        slope = torch.autograd.functional.jacobian(moved, theta).numpy()
+        slope = _jacobian(moved, self.parameters)
         covariance = slope @ self.covariance @ slope.T
         return replace(self, parameters=moved(theta).numpy(), covariance=covariance)
 
@@ -319,6 +319,14 @@ def circulation_5_15(
     radius = torch.linspace(5, 15, 101, dtype=torch.float64)
     s = (radius / core_radius) ** 2
     return circulation * torch.trapezoid(angular_velocity(s, profile)[0] * s, radius) / 10
+
+
+def _jacobian(
+    function: Callable[[torch.Tensor], torch.Tensor], parameters: np.ndarray
+) -> np.ndarray:
+    """Derivatives (values, parameters) at parameters; also where torch records no derivatives."""
+    with torch.inference_mode(False), torch.enable_grad():
+        return torch.autograd.functional.jacobian(function, torch.tensor(parameters)).numpy()
 
 
 def _derived(theta: torch.Tensor, profile: Profile) -> dict[str, torch.Tensor]:
