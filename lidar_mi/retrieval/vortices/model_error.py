@@ -174,7 +174,8 @@ def model_error(
             a * column for a, column in zip(variances, columns[:-1], strict=True)
         )
         # of white noise the sum at a lag has the variance of that at lag 0 squared, over pixels
-        near = observed[0, 0] + 2 * observed.take(lags.between(1.0, np.nextafter(shortest, 0))).sum()
+        below = lags.between(1.0, np.nextafter(shortest, 0))
+        near = observed[0, 0] + 2 * observed.take(below).sum()
         noise = near / (force != 0).any(0).sum().sqrt()
         if not explained.square().sum().sqrt() > _SIGNIFICANT * noise:
             return ModelError()
