@@ -77,7 +77,7 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
     # two processes, as on two cores; "from nothing" all in this one
     estimator = Estimator(experiment, processes=2, speeds=LineSpeeds(scans))
     without_old_garbage()
-    warm, scratch, truths = [], [], []
+    warm, scratch = [], []
     last = None
     for k in range(number + 1):
         images = slab(k, number, columns, rows)
@@ -87,7 +87,6 @@ def compare(repeats: int = 5, columns: int = 219, rows: int = 139) -> Comparison
         if not k:
             continue
         warm.append(found)
-        truths.append(images)
         if k % COLD == 0:
             # one that has learnt nothing
             cold = Estimator(experiment, speeds=LineSpeeds(scans))
