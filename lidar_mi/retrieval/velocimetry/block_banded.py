@@ -29,21 +29,23 @@ class Factor(NamedTuple):
         """The solution x of A x = right, both of shape (blocks, ..., n)."""
         blocks, n = len(right), right.shape[-1]
         rows = self.ratio.shape[-2]
+        ratios = self.ratio.reshape(blocks, -1, rows, n)
         # blocks beyond the last one, which count nothing, spare the loop its exceptions
-        some = torch.cat([right[..., None], right.new_zeros(rows // n, *right.shape[1:], 1)])
-        some = some.movedim(0, -3).flatten(-3, -2).contiguous()
-        for k, ratio in enumerate(self.ratio):
-            start, stop = k * n, (k + 1) * n
-            some[..., stop : stop + rows, :] -= ratio @ some[..., start:stop, :]
-        middle = some[..., : blocks * n, :].unflatten(-2, (blocks, n)).movedim(-3, 0)
-        middle = self.root.mT @ (self.root @ middle)
-        some[..., : blocks * n, :] = middle.movedim(0, -3).flatten(-3, -2)
-        some[..., blocks * n :, :] = 0.0
+        some = torch.cat([right, right.new_zeros(rows // n, *right.shape[1:])])
+        some = some.reshape(len(some), -1, n).transpose(0, 1).flatten(1)[..., None].contiguous()
+        parts = [some[:, k * n : (k + 1) * n] for k in range(blocks)]
+        beyond = [some[:, (k + 1) * n : (k + 1) * n + rows] for k in range(blocks)]
+        for ratio, part, ahead in zip(ratios, parts, beyond, strict=True):
+            ahead.baddbmm_(ratio, part, alpha=-1)
+        root = self.root.reshape(blocks, -1, n, n)
+        middle = some[:, : blocks * n].unflatten(1, (blocks, n)).transpose(0, 1)
+        middle = root.mT @ (root @ middle)
+        some[:, : blocks * n] = middle.transpose(0, 1).flatten(1, 2)
+        some[:, blocks * n :] = 0.0
         for k in range(blocks - 1, -1, -1):
-            start, stop = k * n, (k + 1) * n
-            ahead = some[..., stop : stop + rows, :]
-            some[..., start:stop, :] -= self.ratio[k].mT @ ahead
-        return some[..., : blocks * n, 0].unflatten(-1, (blocks, n)).movedim(-2, 0)
+            parts[k].baddbmm_(ratios[k].mT, beyond[k], alpha=-1)
+        found = some[:, : blocks * n, 0].unflatten(-1, (blocks, n)).transpose(0, 1)
+        return found.reshape(right.shape)
 
     def inverse(self) -> torch.Tensor:
         """The inverse's blocks on and below the diagonal, (blocks, ..., (1 + reach) n, n).

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from scipy.optimize import lsq_linear
 
+from lidar_mi.retrieval.threads import mapped
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import (
     Images,
@@ -132,14 +133,21 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
         coarse = averaged(rest, valid, _COARSE).square()
         return averaged(coarse, valid, _REGION)[::_APART, ::_APART]
 
-    noise = moved = 0.0
-    for one, smooth in zip(
-        _white_noise(images, _DRAWS, 1), normal_fields(difference, _DRAWS, 2), strict=True
-    ):
+    def noise_left(one: torch.Tensor) -> torch.Tensor:
         rest = one if images.given else one - averaged(one, valid, _FINE)
-        noise = noise + squares(left(level * one / rest.std())) / _DRAWS
-        smooth = averaged(smooth, torch.ones_like(valid), _SMOOTH)
-        moved = moved + squares(left(steep * smooth / smooth.std())) / _DRAWS
+        return squares(left(level * one / rest.std()))
+
+    def moved_left(draw: torch.Tensor) -> torch.Tensor:
+        smooth = averaged(draw, torch.ones_like(valid), _SMOOTH)
+        return squares(left(steep * smooth / smooth.std()))
+
+    noise, moved = (
+        sum(mapped(of_draw, draws)) / _DRAWS
+        for of_draw, draws in (
+            (noise_left, _white_noise(images, _DRAWS, 1)),
+            (moved_left, normal_fields(difference, _DRAWS, 2)),
+        )
+    )
     found = squares(difference)
     use = (averaged(valid.to(found), torch.ones_like(valid), _REGION)[::_APART, ::_APART] > 0.5) & (
         found > 0

@@ -5,6 +5,7 @@ hardly depends on what lies beyond the strip. Strips extend along y over the who
 """
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -53,7 +54,7 @@ class Posterior(NamedTuple):
 
     `stiff` is the prior's part of it, `both` all of it: bands. `images` is the
     likelihood that they are of, and its mesh. `response` gives the change of the coefficients by a
-    gradient (components, knots) of the log-likelihood.
+    gradient (components, knots) of the log-likelihood, to `StripSettings.loose`.
     """
 
     coefficients: torch.Tensor
@@ -180,18 +181,18 @@ def solved(
                 total[0, :, strip.knots] += part
         return total
 
-    def response(right: torch.Tensor) -> torch.Tensor:
+    def response(right: torch.Tensor, tolerance: float) -> torch.Tensor:
         (change,) = conjugate_gradients(
             lambda c: whole.apply(steep, c[0])[None],
             right[None],
             preconditioned,
-            solver.tolerance,
+            tolerance,
             solver.steps,
         )
         return change
 
-    change = response(gradient)
-    return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings, response)
+    change, loose = response(gradient, solver.tolerance), partial(response, tolerance=solver.loose)
+    return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings, loose)
 
 
 def _root(both: torch.Tensor, part: list[Strip]) -> Factor:
