@@ -1,7 +1,7 @@
 """From two images of a slab of air to its wind and its vortices, fast enough to be flown with."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import contextmanager
 from functools import partial
 from typing import NamedTuple
@@ -34,8 +34,9 @@ class SlabEstimate(NamedTuple):
         Of the parts `vortices`, `wind` and `combination` after the second image; `lines`,
         `vortices_before` and `wind_before`, as far as lines, the first image and the expected pair
         are concerned, before it; and `total`, from the second image to the end, with two processes
-        less than the sum. What has no time before the second image is in `total`: lines beyond the
-        half period before it, and of each process what the rest of its work leaves of a period.
+        less than the sum. What is not finished when the second image comes is in `total`: lines
+        come half a period before it, the first image with the second one of the last slab, and
+        each process finishes that slab before.
     lines : Dataset or None
         As `with_speeds` gives them; None without frames.
     flags : tuple of str
@@ -86,6 +87,8 @@ class Estimator:
         self._speeds, self._processes = speeds, processes
         # the last slab's vortices, near which the next wind starts
         self._last: VortexPairFit | None = None
+        # how long after its second image each process worked on it, s
+        self._busy: Sequence[float] = (0.0, 0.0)
 
     # no derivatives are recorded: 7 % of the time
     @torch.inference_mode()
@@ -147,25 +150,36 @@ class Estimator:
             if coming is not None:
                 wind, flags, parts = coming()
                 seconds |= parts
-        seconds["total"] += _too_late(seconds, dt, self._processes)
+        since = self._busy if expected else (0.0, 0.0)
+        self._busy = _with_delay(seconds, since, dt, self._processes)
         self._last = pair if pair.success else None
         return SlabEstimate(wind, pair, seconds, lines, flags)
 
 
-def _too_late(seconds: Mapping[str, float], dt: float, processes: int) -> float:
-    """Time (s) by which what precedes the second image outlasts it, from slab to slab."""
+def _with_delay(
+    seconds: dict[str, float], since: Sequence[float], period: float, processes: int
+) -> list[float]:
+    """Add to the total what a process is late at the second image; how long each is busy after it.
+
+    A process goes on with the last slab for so many seconds `since` the first image, which came
+    with that slab's second one. Then it does what can be done before the second image; the lines
+    come half a period before it. No more than a period is carried to the next slab: after one that
+    takes longer, as from nothing, others are left out.
+    """
 
     def of(*parts: str) -> float:
         return sum(seconds.get(part, 0.0) for part in parts)
 
-    work = [
-        (of("lines", "vortices_before"), of("vortices")),
-        (of("wind_before"), of("wind", "combination")),
-    ]
+    before = [of("vortices_before"), of("wind_before")]
+    after = [of("vortices"), of("wind", "combination")]
     if processes == 1:
-        work = [tuple(map(sum, zip(*work, strict=True)))]
-    late = [before - max(0.0, dt - after) for before, after in work]
-    return max(0.0, of("lines") - dt / 2, *late)
+        before, after, since = [sum(before)], [sum(after)], since[:1]
+    ended = [start + work for start, work in zip(since, before, strict=True)]
+    if "lines" in seconds:
+        ended[0] = max(ended[0], period / 2) + seconds["lines"]
+    done = [max(0.0, end - period) + work for end, work in zip(ended, after, strict=True)]
+    seconds["total"] += max(done) - max(after)
+    return [min(one, period) for one in done] * (2 // processes)
 
 
 @contextmanager

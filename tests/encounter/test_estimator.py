@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.cases import drifting_pair_images, vortex_pair_images
 from benchmarks.realtime import UNFORESEEN
-from lidar_mi.encounter.estimator import Estimator, _too_late
+from lidar_mi.encounter.estimator import Estimator, _with_delay
 from lidar_mi.experiment.reading import load_experiment
 from tests.support.vortex_pairs import uneven, vector
 
@@ -33,16 +33,26 @@ def test_vortices_from_nothing_and_from_the_last_fit(images):
     assert set(warm.seconds) == {"vortices_before", "vortices", "total"}
 
 
-def test_what_has_no_time_before_the_second_image_is_in_the_total():
-    """Lines in half a period; the work of each process in a period."""
-    enough = {"lines": 0.03, "vortices_before": 0.01, "vortices": 0.06, "wind_before": 0.04}
-    enough |= {"wind": 0.04, "combination": 0.02}
-    assert _too_late(enough, DT, 2) == 0
-    assert _too_late(enough | {"lines": 0.035}, DT, 2) == pytest.approx(0.005)
-    assert _too_late({"lines": 0.055, "vortices": 0.01}, DT, 2) == pytest.approx(0.005)
-    assert _too_late(enough | {"combination": 0.03}, DT, 2) == pytest.approx(0.01)
-    # one process that has more to do than a period after the second image alone
-    assert _too_late(enough, DT, 1) == pytest.approx(0.08)
+def test_what_is_not_finished_at_the_second_image_is_in_the_total():
+    """Each process finishes the last slab, then works ahead; lines come half a period before."""
+    parts = {"lines": 0.03, "vortices_before": 0.01, "wind_before": 0.04}
+    parts |= {"vortices": 0.06, "wind": 0.03, "combination": 0.02, "total": 0.065}
+
+    def total(change, since, processes=2):
+        seconds = parts | change
+        return seconds, _with_delay(seconds, since, DT, processes)
+
+    seconds, busy = total({}, (0.06, 0.05))
+    # both have time: at 0.1 s the lines, of 0.07 to 0.1 s, have just been read
+    assert seconds["total"] == pytest.approx(0.065) and busy == pytest.approx([0.06, 0.05])
+    seconds, busy = total({"lines": 0.055}, (0.0, 0.0))
+    assert seconds["total"] == pytest.approx(0.07) and busy == pytest.approx([0.065, 0.05])
+    # 0.08 s of the last slab's wind and 0.04 s before: 0.02 s late, the wind takes 0.01 s longer
+    seconds, busy = total({}, (0.06, 0.08))
+    assert seconds["total"] == pytest.approx(0.075) and busy == pytest.approx([0.06, 0.07])
+    seconds, busy = total({}, (0.1, 0.1), processes=1)
+    # 0.1 s of the last slab, 0.05 s before and the lines: 0.08 s late, but no more is carried over
+    assert seconds["total"] == pytest.approx(0.065 + 0.08) and busy == pytest.approx([DT, DT])
 
 
 def test_slopes_that_are_expected_correct_the_fit(images):
