@@ -97,8 +97,9 @@ def fit_from(of: Begun, make: Builder, limits: Limits, lags: float) -> Found | N
     """The fit of `image_fit.fit_vortices` near an expected pair; None if there is none.
 
     Steps on blurred images come first if the start is uncertain, on every second pixel. Then the
-    unfiltered images are warped once, and noise, change and model error are estimated as from
-    scratch. The last step is linear: its residuals are not looked at again.
+    unfiltered images are warped once, and noise and change are estimated as from scratch, with the
+    start's model error if it has one; that of the fit is estimated from what is left. The last step
+    is linear: its residuals are not looked at again.
 
     Parameters
     ----------
@@ -110,7 +111,9 @@ def fit_from(of: Begun, make: Builder, limits: Limits, lags: float) -> Found | N
     lags : float
         Over which the noise correlates, px.
     """
-    return fit_near(of.theta, make, limits, lags, of.uncertain, known=(of.first, of.second))
+    known, error = (of.first, of.second), of.start.model_error * make.dt
+    departure = error**2 if np.isfinite(error) else None
+    return fit_near(of.theta, make, limits, lags, of.uncertain, known=known, departure=departure)
 
 
 def fit_near(
@@ -121,11 +124,14 @@ def fit_near(
     uncertain: float = _LEVELS[-1][-1],
     estimates: int = 1,
     known: tuple[View, Path] | None = None,
+    departure: float | None = None,
 ) -> Found | None:
     """`fit_from` parameters (16,) whose displacements are uncertain by so many px.
 
     Noise, change and model error are estimated so many times, each with the filter and the weights
-    of the time before. The view of the first image and the path to the second may be `known`.
+    of the time before. The view of the first image and the path to the second may be `known`, and
+    the variance (m^2) of the flow's `departure` from the model, as from the slab before: it is then
+    estimated for the errors alone.
     """
     variance = (_MODEL_ERROR * (make.spacing[0] * make.spacing[1]) ** 0.5) ** 2
     for blur, step, least in _LEVELS:
@@ -162,18 +168,20 @@ def fit_near(
         left = plain.misfit._replace(residual=plain.misfit.residual + beyond)
         found = plain._replace(misfit=left)
         for _ in range(estimates):
-            error = model_error_of(found, lags, changes=True)
-            images = make.with_change(white, images, found.misfit, error.variance)
+            moves = departure
+            if moves is None:
+                moves = model_error_of(found, lags, changes=True).variance
+            images = make.with_change(white, images, found.misfit, moves)
             if not images.whitening.passed > 0:
                 return None
-            found = _near(limits, theta, stepped(theta, images.whitened(misfit), error.variance))
+            found = _near(limits, theta, stepped(theta, images.whitened(misfit), moves))
             if found is None:
                 return None
         if _leaves(found, theta, misfit, make) < _LEFT:
             error = model_error_of(found, lags, changes=True)
             step = found.parameters - theta
             return Found(found, images, misfit._replace(residual=moved(misfit, step)), error)
-        theta, variance = found.parameters, error.variance
+        theta, variance = found.parameters, moves
     return None
 
 
