@@ -209,7 +209,8 @@ def retrieve_wind(
         if chosen.repeats:
             if found.covariance is not None:
                 flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
-            pair = [first, second]
+            # errors of what is at rest or saturated say nothing of the vectors around
+            pair = _of_one_light(resting.left_out(whole[:2]), light)
             clear = clearly_textured(texture, min_texture, min_isotropy)
             covariance = (
                 bootstrap_covariance(

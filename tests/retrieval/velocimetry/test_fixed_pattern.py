@@ -173,8 +173,14 @@ def test_vignetting_is_no_pattern(kind):
         wind, whole = retrieved(dim, method), retrieved(images, method)
         assert not bool(((wind.flag & (Flag.AT_REST | Flag.SATURATED).value) > 0).any())
         good = (wind.flag == 0).values
-        assert good.mean() > (whole.flag == 0).values.mean() - 0.05
-        # less light, the same noise: larger errors, as stated
+        lost = 0.05
+        if kind == "straight edges":
+            # dark within 4 px: fewer than lie within a template of the rim, as uncertain ones
+            lost = 1 - (1 - 16 / COLUMNS) * (1 - 16 / ROWS)
+            why = Flag.LOW_TEXTURE | Flag.NO_SKILL | Flag.MEDIAN_OUTLIER
+            assert not bool(((wind.flag & ~why.value) > 0).any())
+        assert good.mean() > (whole.flag == 0).values.mean() - lost
+        # less light: larger errors, as stated
         off = errors(wind, v) / wind.v_stderr.values
         assert rms(off[good]) < 1.3
 
