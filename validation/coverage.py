@@ -77,11 +77,13 @@ class Coverage:
     valid: float
 
 
-def shipped_wake(second: str, rms: float, seed: int, noise: float | None = None) -> Pair:
+def shipped_wake(
+    second: str, rms: float, seed: int, noise: float | None = None, bright: bool = False
+) -> Pair:
     """The extinction of the shipped wake: advected, or its true state 0.1 s later.
 
-    With white noise of this fraction of the largest value, which is told, or without any, which is
-    not told.
+    With white noise of this fraction of the largest value, or of each pixel's in the first image
+    (``bright``), which is told, or without any, which is not told.
     """
     experiment = lm.load_experiment(
         SCENES / "wake_backscatter.yaml",
@@ -92,7 +94,7 @@ def shipped_wake(second: str, rms: float, seed: int, noise: float | None = None)
     images = [truth.image(0), truth.image(1)]
     if noise is None:
         return *images, truth.wind, None
-    level = noise * float(images[0].max())
+    level = noise * (images[0] if bright else float(images[0].max()))
     random = np.random.default_rng([seed, 1])
     images = [image + level * random.standard_normal(image.shape) for image in images]
     return *images, truth.wind, level
@@ -175,6 +177,9 @@ CASES: dict[str, Callable[[int], Pair]] = {
             ("true second state", "40.1 s", 0.1, 0.01),
         )
     },
+    "true second state, texture 10 %, noise 1 % of each pixel": partial(
+        shipped_wake, "40.1 s", 0.1, noise=0.01, bright=True
+    ),
     **{
         f"{100 * fraction:.0f} % of the texture replaced": partial(replaced_texture, fraction)
         for fraction in (0.0, 0.05, 0.1, 0.3)

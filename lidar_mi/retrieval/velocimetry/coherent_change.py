@@ -88,14 +88,15 @@ def _white_noise(images: Images, number: int, seed: int) -> Iterator[torch.Tenso
 def mean_square_displacement(images: Images, linear: Linear, left: Left) -> float:
     """Mean square displacement of structure besides that of the air, px^2.
 
-    Differences of the images are taken as noise and as a smooth random displacement e(x) of
-    variance d^2 times the slope of the structure, |grad I| in a Gaussian mean of 3 px. Both kinds
-    are drawn and sent through the fit. The squares of what is left of them, in waves of several
-    pixels, and those of the residual are averaged about places 8 px apart. By place the residual's
-    are fitted by the sum of the noise's and of d^2 times those of the displacement, neither below 0
-    (variance components; the squares have gamma distributions, so that the weighted least squares
-    are of largest likelihood). The noise has the variance of the finest waves at each place, and
-    is at least the one that was given.
+    Differences of the images are taken as noise, as texture that is replaced (noise, too, of one
+    variance everywhere), and as a smooth random displacement e(x) of variance d^2 times the slope
+    of the structure, |grad I| in a Gaussian mean of 3 px. All kinds are drawn and sent through the
+    fit. The squares of what is left of them, in waves of several pixels, and those of the residual
+    are averaged about places 8 px apart. By place the residual's are fitted by the sum of the
+    others', none below 0 (variance components; the squares have gamma distributions, so that the
+    weighted least squares are of largest likelihood). The noise has the variance of the finest
+    waves at each place, and is at least the one that was given. A noise that is given counts once;
+    one that is not has a factor in place of replaced texture.
 
     On the shipped wake d is known: with its own state 0.1 s later, the rms difference over the rms
     slope at the true flow is 0.062 px. From images with texture of 5 to 20 % it is estimated as
@@ -137,37 +138,47 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
         rest = one if images.given else one - averaged(one, valid, _FINE)
         return squares(left(level * one / rest.std()))
 
+    def replaced_left(one: torch.Tensor) -> torch.Tensor:
+        return squares(left(one))
+
     def moved_left(draw: torch.Tensor) -> torch.Tensor:
         smooth = averaged(draw, torch.ones_like(valid), _SMOOTH)
         return squares(left(steep * smooth / smooth.std()))
 
-    noise, moved = (
+    noise, moved, replaced = (
         sum(mapped(of_draw, draws)) / _DRAWS
         for of_draw, draws in (
             (noise_left, _white_noise(images, _DRAWS, 1)),
             (moved_left, normal_fields(difference, _DRAWS, 2)),
+            (replaced_left, _white_noise(images, _DRAWS, 1)),
         )
     )
     found = squares(difference)
     use = (averaged(valid.to(found), torch.ones_like(valid), _REGION)[::_APART, ::_APART] > 0.5) & (
         found > 0
     )
-    parts = [part[use] for part in (found, noise, moved)]
+    parts = [part[use] for part in (found, noise, moved, replaced)]
     # identical images, images without structure
     if not all(bool(part.mean() > 0) for part in parts):
         return 0.0
     return _component(*(part.cpu().numpy() for part in parts), images.given)
 
 
-def _component(found: np.ndarray, noise: np.ndarray, moved: np.ndarray, given: bool) -> float:
-    """Factor of `moved` in ``found = a noise + b moved``; 0 if it is not significant or small.
+def _component(
+    found: np.ndarray, noise: np.ndarray, moved: np.ndarray, replaced: np.ndarray, given: bool
+) -> float:
+    """Factor b of what `moved`; 0 if it is not significant or small.
 
-    Of a noise that is given a is 1 or more: texture that changes has coarse waves, too. Of one that
-    is not, which is that of the finest waves, a is 5 at most.
+    With a noise that is given, found = noise + a replaced + b moved: texture that changes has
+    coarse waves, too, but they do not follow a noise that varies as the slopes do (of Monte Carlo
+    samples, of photons). Of a noise that is not, which is that of the finest waves, found = a noise
+    + b moved, and a is 5 at most.
     """
-    held, most = (noise, np.inf) if given else (0.0 * noise, _COARSER)
-    terms = np.stack([noise / noise.mean(), moved / moved.mean()])
-    limits = np.array([most * noise.mean(), np.inf])
+    held, other, most = (
+        (noise, replaced, np.inf) if given else (0.0 * noise, noise, _COARSER * noise.mean())
+    )
+    terms = np.stack([other / other.mean(), moved / moved.mean()])
+    limits = np.array([most, np.inf])
     without, _ = _fitted(found, held, terms[:1], limits[:1])
     with_it, parts = _fitted(found, held, terms, limits)
     square = float(parts[1] / moved.mean())

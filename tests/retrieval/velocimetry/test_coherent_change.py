@@ -14,7 +14,7 @@ from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import linearised, prepared
 from lidar_mi.retrieval.velocimetry.prior import first_prior
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
-from tests.support.smoke import SHAPE, pair
+from tests.support.smoke import SHAPE, Y, Z, pair, smoke
 from validation.coverage import measured
 
 
@@ -54,6 +54,21 @@ def test_the_displacement_of_smoke_is_found():
 def test_air_that_is_carried_has_none(noise, told):
     found = [estimated(pair(seed, 0.0, noise=noise), told) for seed in range(21, 25)]
     assert found == [0.0] * 4
+
+
+def test_noise_that_varies_as_the_slopes_do_hides_no_displacement():
+    """As that of Monte Carlo samples on bright rims: it was taken for noise larger than given."""
+    steep = np.hypot(*np.gradient(smoke(Z, Y)))
+    noise = 0.01 + 0.15 * steep / steep.max()
+    rms = 0.15
+    found = [
+        estimated(pair(seed, moved, noise=noise), torch.as_tensor(noise))
+        for moved in (rms, 0.0)
+        for seed in (31, 32, 33)
+    ]
+    across = rms / np.sqrt(2)
+    assert 0.6 * across < np.mean(found[:3]) < 1.2 * across
+    assert found[3:] == [0.0] * 3
 
 
 @pytest.mark.parametrize(
