@@ -15,6 +15,8 @@ from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 _SHELL_WAVES = 200
 # Least number of shells per cycle per pixel.
 _SHELLS = 16
+# Fraction by which whitening must lessen the variance of displacements.
+_WORTH_WHITENING = 0.1
 
 
 class Filter(NamedTuple):
@@ -147,6 +149,53 @@ def best_filter(
         informed / spread if informed > 0 else 1.0,
         (2 * math.pi) ** 2 * _mean(steep * (floor / 2).expand(len(gain))[shell], sizes),
     )
+
+
+def flat_if_nearly(
+    spectrum: PowerSpectrum, mismatch: torch.Tensor, threshold: float
+) -> torch.Tensor:
+    """The mismatch, at one level if whitening it would lessen errors by little.
+
+    A filter of one image and one of an image that strain has deformed are not the same filter in
+    the air: where the gain changes by the factor e per factor e of the wavenumber, a strain e in dt
+    makes the images differ by about e times their texture. So a filter that is not flat costs
+    accuracy where there is strain and hardly any noise.
+
+    Displacements from texture of spectral density S through a filter g have the variance
+    sum(k^2 S g^4 N) / sum(k^2 S g^2)^2 in noise of the density N, the mismatch.
+
+    Parameters
+    ----------
+    spectrum : PowerSpectrum
+        Of the images.
+    mismatch : torch.Tensor, shape (shells,)
+        See `warping.band_limited`.
+    threshold : float
+        Standard errors by which a shell must exceed the mismatch to count as texture.
+
+    Returns
+    -------
+    torch.Tensor, shape (shells,)
+        The mean of the mismatch, weighted as in the variance, if whitening lessens the variance by
+        less than 10 %; infinite where the mismatch is. Else the mismatch.
+    """
+    density, uncertainty, shape, sizes = spectrum
+    above = mismatch.isfinite() & (density > mismatch * (1 + threshold * uncertainty))
+    if not bool(above.any()):
+        return mismatch
+    _, shell = radii(sizes, shape, density.dtype, density.device)
+    number = torch.bincount(shell.flatten(), minlength=len(density)).to(density)[above]
+    noise, texture = mismatch[above], (density - mismatch)[above]
+    response = texture / (texture + noise / 2)
+    steep = number * wavenumbers(density, shape)[above].square() * texture
+    level = (steep * response.square() * noise).sum() / (steep * response.square()).sum()
+    flat, white = (
+        (steep * g.square() * noise).sum() / (steep * g).sum().square()
+        for g in (response, response / noise)
+    )
+    if flat > (1 + _WORTH_WHITENING) * white:
+        return mismatch
+    return torch.where(mismatch.isfinite(), level, torch.inf)
 
 
 def _mean(values: torch.Tensor, sizes: Sequence[int]) -> float:

@@ -2,6 +2,7 @@
 
 import torch
 
+from lidar_mi.retrieval.velocimetry.band_limit import flat_if_nearly
 from lidar_mi.retrieval.velocimetry.brightness import rms
 from lidar_mi.retrieval.velocimetry.change import displaced, unexplained
 from lidar_mi.retrieval.velocimetry.coherent_change import (
@@ -10,7 +11,13 @@ from lidar_mi.retrieval.velocimetry.coherent_change import (
     mean_square_displacement,
 )
 from lidar_mi.retrieval.velocimetry.likelihood import Images, Linear
-from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, filter_of, mismatch
+from lidar_mi.retrieval.velocimetry.warping import (
+    Spline,
+    band_limited,
+    filter_of,
+    mismatch,
+    spectrum_of,
+)
 from lidar_mi.retrieval.velocimetry.windows import averaged
 
 # Misfit over white noise estimated from spectra below which that is not noise: of white noise the
@@ -110,6 +117,10 @@ def with_local_noise(
         through = displaced(images.spline, images.stack, images.white)
         square = unexplained(images.spline, mismatch(images.spline, residual), through, knots)
         density = torch.maximum(density, square * through)
+        if not (square or coherent):
+            settings = images.spline.settings
+            spectrum = spectrum_of(images.stack, weight.sqrt(), settings)
+            density = flat_if_nearly(spectrum, density, settings.threshold)
     spline, level = band_limited(
         images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
     )

@@ -8,6 +8,7 @@ import torch
 
 from lidar_mi.retrieval.velocimetry.band_limit import (
     Filter,
+    PowerSpectrum,
     best_filter,
     checked_noise,
     even_fast_len,
@@ -274,11 +275,17 @@ def filter_of(
     """The filter of `band_limited`, which takes the same arguments, without the splines."""
     checked_noise(noise)
     settings = settings or FilterSettings()
+    return best_filter(spectrum_of(images, weight, settings), settings, noise, mismatch, blur)
+
+
+def spectrum_of(
+    images: Sequence[torch.Tensor], weight: torch.Tensor | None, settings: FilterSettings
+) -> PowerSpectrum:
+    """The power spectrum of images that `band_limited` filters."""
     known = torch.stack([torch.isfinite(image) for image in images])
     images = _finite(images)
     sizes = transform_sizes(images.shape[1:], settings)
-    spectrum = power_spectrum(images, sizes, settings, weight, known)
-    return best_filter(spectrum, settings, noise, mismatch, blur)
+    return power_spectrum(images, sizes, settings, weight, known)
 
 
 def _finite(images: Sequence[torch.Tensor]) -> torch.Tensor:
