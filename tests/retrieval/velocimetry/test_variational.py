@@ -303,10 +303,11 @@ def test_blurred_images_with_less_noise_have_no_larger_errors():
 
 @pytest.mark.slow
 def test_known_blur_is_corrected_in_the_cores():
-    """It commutes with shifts, not with what turns and shears; beyond the cores it costs little."""
+    """It commutes with shifts, not with what turns and shears; beyond the cores it amplifies noise,
+    which costs less than half of what is gained within."""
     plain, undone = blurred_errors(1, 0.01, 1.0)
     assert (undone[0] < 0.85 * plain[0]).all()
-    assert (undone[1] < 1.5 * plain[1]).all()
+    assert (undone[1] - plain[1] < 0.5 * (plain[0] - undone[0])).all()
 
 
 @pytest.mark.parametrize(
