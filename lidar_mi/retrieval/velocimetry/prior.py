@@ -16,7 +16,7 @@ from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.windows import separable
 
 # Least rate at which the estimated ratio is taken to fall as a strength grows.
-_SLOWEST = 0.25
+_SLOWEST = 0.15
 # Least standard deviation of a rate in a cell between knots, px per px: images of a flow without
 # vorticity would make the prior stronger for ever.
 _LEAST = 1e-4
