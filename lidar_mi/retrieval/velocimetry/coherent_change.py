@@ -88,15 +88,16 @@ def _white_noise(images: Images, number: int, seed: int) -> Iterator[torch.Tenso
 def mean_square_displacement(images: Images, linear: Linear, left: Left) -> float:
     """Mean square displacement of structure besides that of the air, px^2.
 
-    Differences of the images are taken as noise, as texture that is replaced (noise, too, of one
-    variance everywhere), and as a smooth random displacement e(x) of variance d^2 times the slope
-    of the structure, |grad I| in a Gaussian mean of 3 px. All kinds are drawn and sent through the
-    fit. The squares of what is left of them, in waves of several pixels, and those of the residual
-    are averaged about places 8 px apart. By place the residual's are fitted by the sum of the
-    others', none below 0 (variance components; the squares have gamma distributions, so that the
-    weighted least squares are of largest likelihood). The noise has the variance of the finest
-    waves at each place, and is at least the one that was given. A noise that is given counts once;
-    one that is not has a factor in place of replaced texture.
+    Differences of the images are taken as noise, as texture that is replaced, and as a smooth
+    random displacement e(x) of variance d^2 times the slope of the structure, |grad I| in a
+    Gaussian mean of 3 px. All kinds are drawn and sent through the fit. The squares of what is left
+    of them, in waves of several pixels, and those of the residual are averaged about places 8 px
+    apart. By place the residual's are fitted by the sum of the others', none below 0 (variance
+    components; the squares have gamma distributions, so that the weighted least squares are of
+    largest likelihood). The noise has the variance of the finest waves at each place, and is at
+    least the one that was given. A noise that is given counts once, and a factor multiplies noise
+    of what the finest waves differ by beyond it: replaced texture does. (Where there is nothing,
+    or the noise contains the misfit, it multiplies the noise itself, as where none is given.)
 
     On the shipped wake d is known: with its own state 0.1 s later, the rms difference over the rms
     slope at the true flow is 0.062 px. From images with texture of 5 to 20 % it is estimated as
@@ -126,9 +127,14 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
     steep = steepness_of_structure(working(linear.slope), valid).sqrt()
     fine = (difference - averaged(difference, valid, _FINE)).square()
     level = averaged(fine, valid, _LEVEL).sqrt()
+    excess = level
     if images.given:
-        told = images.noise**2 * images.spline.passed / images.time.square().sum()
-        level = torch.maximum(level, (told / images.weight).sqrt())
+        told = images.noise**2 * images.spline.passed / images.time.square().sum() / images.weight
+        beyond = (level.square() - told).clamp(min=0.0).sqrt() * valid
+        excess = level = torch.maximum(level, told.sqrt())
+        # a noise that contains the misfit has nothing beyond it
+        if not images.noise_updated and bool((beyond > 0).any()):
+            excess = beyond
 
     def squares(rest: torch.Tensor) -> torch.Tensor:
         coarse = averaged(rest, valid, _COARSE).square()
@@ -139,7 +145,7 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
         return squares(left(level * one / rest.std()))
 
     def replaced_left(one: torch.Tensor) -> torch.Tensor:
-        return squares(left(one))
+        return squares(left(excess * one))
 
     def moved_left(draw: torch.Tensor) -> torch.Tensor:
         smooth = averaged(draw, torch.ones_like(valid), _SMOOTH)
@@ -169,10 +175,10 @@ def _component(
 ) -> float:
     """Factor b of what `moved`; 0 if it is not significant or small.
 
-    With a noise that is given, found = noise + a replaced + b moved: texture that changes has
-    coarse waves, too, but they do not follow a noise that varies as the slopes do (of Monte Carlo
-    samples, of photons). Of a noise that is not, which is that of the finest waves, found = a noise
-    + b moved, and a is 5 at most.
+    With a noise that is given, found = noise + a replaced + b moved. Texture that is replaced has
+    coarse waves and fine ones. A noise that varies as the slopes do, of photons or of Monte Carlo
+    samples, has no more coarse waves than it says, or it would stand for the displacement. Of a
+    noise that is not given, found = a noise + b moved, and a is 5 at most.
     """
     held, other, most = (
         (noise, replaced, np.inf) if given else (0.0 * noise, noise, _COARSER * noise.mean())
