@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 if not (ROOT / "validation").is_dir():
     pytest.skip("the validation is part of the source tree", allow_module_level=True)
 
-from validation import GROUPS, report
+from validation import GROUPS, SECTIONS, report
 from validation import __main__ as command
 from validation.report import Check, Row
 
@@ -298,6 +298,19 @@ def test_group_that_runs_by_name_writes_its_section_alone(quick, monkeypatch):
     assert "before" not in quick.read_text() and section in quick.read_text()
 
 
+def test_short_run_of_all_groups_leaves_the_section_of_a_long_one(quick, monkeypatch, capsys):
+    begin, end = "<!-- coverage: begin -->", "<!-- coverage: end -->"
+    quick.write_text(f"{begin}\n\nof twelve seeds\n\n{end}\n")
+    monkeypatch.setattr(command, "GROUPS", ("lidar_equation", "coverage"))
+    assert command.main(["-o", str(quick)]) == 0
+    short = quick.read_text()
+    assert "of twelve seeds" in short and "Title coverage" not in short
+    assert "Check coverage" in capsys.readouterr().out
+    assert command.main(["--slow", "-o", str(quick)]) == 0
+    slow = quick.read_text()
+    assert "of twelve seeds" not in slow and slow.count("## Title coverage") == 1
+
+
 # --- the page
 
 
@@ -308,7 +321,8 @@ def page():
 
 @pytest.mark.usefixtures("variant")
 def test_page_has_every_check_and_no_other(page):
-    known = [f"{name}.{check.__name__}" for name in GROUPS for check in group(name).CHECKS]
+    rest = [name for name in GROUPS if name not in SECTIONS]
+    known = [f"{name}.{check.__name__}" for name in rest for check in group(name).CHECKS]
     assert re.findall(r"^<!-- (\w+\.\w+) -->$", page, re.MULTILINE) == known
     for name in GROUPS:
         assert f"\n## {group(name).TITLE}\n\n{group(name).INTRODUCTION}\n" in page
