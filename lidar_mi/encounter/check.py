@@ -52,7 +52,7 @@ def geometry(experiment: Experiment, aircraft: AircraftModel | None = None) -> l
     if strength < _MISSED:
         found.append(
             "encounter.path: the flight misses the wake: its largest rolling moment is "
-            f"{strength:.1%} of the ailerons'; expected a smaller miss"
+            f"{strength:.1%} of the ailerons'; expected a smaller miss or a smaller crossing angle"
         )
     slabs = _slabs_in_view(experiment, gates)
     if encounter.control.mode == "feedforward" and slabs < _LEAST_SLABS:

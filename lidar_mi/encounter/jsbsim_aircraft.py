@@ -8,6 +8,7 @@ aircraft's own aerodynamics see air at rest. Its axes are x forward, y to starbo
 import math
 import tempfile
 from dataclasses import replace
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path as FilePath
 from typing import Any
@@ -38,6 +39,7 @@ _CONTROLS = ("aileron", "elevator", "rudder")
 _POSITIONS = ("fcs/left-aileron-pos-rad", "fcs/elevator-pos-rad", "fcs/rudder-pos-rad")
 _TRIMS = ("fcs/roll-trim-cmd-norm", "fcs/pitch-trim-cmd-norm", "fcs/yaw-trim-cmd-norm")
 _NOMINAL = math.radians(20)  # full deflection of a control that states no angle
+_LARGE = ("737", "787-8", "B747", "C130")  # named where no name is like the wanted one
 _SETTLED = 30  # steps in which a control reaches a small command
 
 
@@ -155,9 +157,10 @@ def _loaded(name) -> Any:
     root = FilePath(jsbsim.__file__).parent
     names = shipped_aircraft(root)
     if name not in names:
+        alike = get_close_matches(name, names, n=4, cutoff=0.5)
         raise InputError(
-            f"encounter.aircraft.model: {name!r} is not known; expected roll or an aircraft of "
-            f"JSBSim: {', '.join(names)}"
+            f"encounter.aircraft.model: {name!r} is not known; expected roll or one of the "
+            f"{len(names)} aircraft of JSBSim, such as {', '.join(alike or _LARGE)}"
         )
     jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.FATAL))
     fdm = jsbsim.FGFDMExec(str(root))

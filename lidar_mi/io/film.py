@@ -12,7 +12,7 @@ from lidar_mi.io.atomic import write_atomically
 QUALITY = 55
 """Of lossy frames, 0 to 100."""
 
-_COLOURS = 64
+_COLOURS = 128
 
 
 def frame_as_webp(frame: np.ndarray, quality: int = QUALITY) -> bytes:
@@ -25,7 +25,7 @@ def frame_as_webp(frame: np.ndarray, quality: int = QUALITY) -> bytes:
 
 
 def write_gif(path: str | Path, frames: Sequence[np.ndarray], seconds: float) -> None:
-    """An animation that repeats, in 64 colours.
+    """An animation that repeats, in 128 colours.
 
     Parameters
     ----------
@@ -44,9 +44,10 @@ def write_gif(path: str | Path, frames: Sequence[np.ndarray], seconds: float) ->
 
     if len({frame.shape for frame in frames}) != 1:
         raise InputError(f"{path}: {len(frames)} frames of one size expected")
-    # one palette for all, so that what rests does not flicker
+    # one palette for all, so that what rests does not flicker; of all colours, not of the most
+    # frequent, so that thin lines keep theirs beside a grey image
     palette = Image.fromarray(np.concatenate(frames[:: max(1, len(frames) // 4)])).quantize(
-        _COLOURS
+        _COLOURS, Image.Quantize.MAXCOVERAGE
     )
     images = [
         Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)

@@ -117,6 +117,7 @@ def _rolled(axes, series, time):
     largest = float(np.degrees(np.abs(series["roll"]).max())) * 1.1 or 1.0
     axes.set(xlabel="time of flight / s", ylabel="roll / degrees")
     axes.set_xlim(0, float(series["time"].max()))
-    axes.set_ylim(-largest, largest)
+    # the legend is above the curves
+    axes.set_ylim(-largest, 2 * largest)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=7, loc="upper left", ncols=3)

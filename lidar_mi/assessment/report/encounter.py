@@ -192,7 +192,8 @@ def _limits(metrics: Mapping[str, float]) -> list[str]:
     return [
         f"The rolling moment felt is {three(ours)} times the wake's with the lidar and "
         f"{three(perfect)} times with perfect preview (rms). What is left then is beyond the "
-        "rate and the deflection of the ailerons; the difference to it is the lidar's."
+        "rate and the deflection of the ailerons, or planned: the plan is for small roll angles, "
+        "and may bank against the wake before it comes. The difference is the lidar's."
     ]
 
 
