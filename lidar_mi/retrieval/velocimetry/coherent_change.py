@@ -49,6 +49,8 @@ _FINE, _LEVEL = 1.5, 6.0
 _LEAST, _GAIN = 0.03, 5.0
 # Largest noise of coarse waves over that of the finest, where noise is not given.
 _COARSER = 5.0
+# Fraction by which the variance of a given noise may be larger than told.
+_TOO_SMALL = 0.25
 # Least variance over its mean, and rounds of the weighted least squares.
 _FLOOR, _ROUNDS = 1e-3, 30
 
@@ -95,8 +97,8 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
     apart. By place the residual's are fitted by the sum of the others', none below 0 (variance
     components; the squares have gamma distributions, so that the weighted least squares are of
     largest likelihood). The noise has the variance of the finest waves at each place, and is at
-    least the one that was given. A noise that is given counts once, and a factor multiplies noise
-    of what the finest waves differ by beyond it: replaced texture does. (Where there is nothing,
+    least the one that was given. A noise that is given counts 1 to 1.25 times, and a factor
+    multiplies noise of what the finest waves differ by beyond it: replaced texture does. (Where there is nothing,
     or the noise contains the misfit, it multiplies the noise itself, as where none is given.)
 
     On the shipped wake d is known: with its own state 0.1 s later, the rms difference over the rms
@@ -175,19 +177,21 @@ def _component(
 ) -> float:
     """Factor b of what `moved`; 0 if it is not significant or small.
 
-    With a noise that is given, found = noise + a replaced + b moved. Texture that is replaced has
-    coarse waves and fine ones. A noise that varies as the slopes do, of photons or of Monte Carlo
-    samples, has no more coarse waves than it says, or it would stand for the displacement. Of a
-    noise that is not given, found = a noise + b moved, and a is 5 at most.
+    With a noise that is given, found = (1 + c) noise + a replaced + b moved, with c at most 0.25.
+    Texture that is replaced has coarse waves and fine ones. A noise that varies as the slopes do,
+    of photons or of Monte Carlo samples, has hardly more coarse waves than it says, or it would
+    stand for the displacement. Of a noise that is not given, found = a noise + b moved, and a is 5
+    at most.
     """
-    held, other, most = (
-        (noise, replaced, np.inf) if given else (0.0 * noise, noise, _COARSER * noise.mean())
-    )
-    terms = np.stack([other / other.mean(), moved / moved.mean()])
-    limits = np.array([most, np.inf])
-    without, _ = _fitted(found, held, terms[:1], limits[:1])
+    if given:
+        held, others, most = noise, [replaced, noise], [np.inf, _TOO_SMALL * noise.mean()]
+    else:
+        held, others, most = 0.0 * noise, [noise], [_COARSER * noise.mean()]
+    terms = np.stack([part / part.mean() for part in (*others, moved)])
+    limits = np.array([*most, np.inf])
+    without, _ = _fitted(found, held, terms[:-1], limits[:-1])
     with_it, parts = _fitted(found, held, terms, limits)
-    square = float(parts[1] / moved.mean())
+    square = float(parts[-1] / moved.mean())
     return square if without - with_it > _GAIN and square > _LEAST**2 else 0.0
 
 
