@@ -154,14 +154,15 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
         smooth = averaged(draw, torch.ones_like(valid), _SMOOTH)
         return squares(left(steep * smooth / smooth.std()))
 
-    noise, moved, replaced = (
-        sum(mapped(of_draw, draws)) / _DRAWS
-        for of_draw, draws in (
-            (noise_left, _white_noise(images, _DRAWS, 1)),
-            (moved_left, normal_fields(difference, _DRAWS, 2)),
-            (replaced_left, _white_noise(images, _DRAWS, 1)),
-        )
-    )
+    def mean(of_draw: Left, draws: Iterator[torch.Tensor]) -> torch.Tensor:
+        return sum(mapped(of_draw, draws)) / _DRAWS
+
+    noise = mean(noise_left, _white_noise(images, _DRAWS, 1))
+    moved = mean(moved_left, normal_fields(difference, _DRAWS, 2))
+    # the same fit of the same draws, unless there is more than the noise
+    replaced = noise
+    if excess is not level:
+        replaced = mean(replaced_left, _white_noise(images, _DRAWS, 1))
     found = squares(difference)
     use = (averaged(valid.to(found), torch.ones_like(valid), _REGION)[::_APART, ::_APART] > 0.5) & (
         found > 0
