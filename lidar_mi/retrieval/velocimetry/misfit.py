@@ -2,9 +2,9 @@
 
 import torch
 
-from lidar_mi.retrieval.velocimetry.band_limit import flat_if_nearly
+from lidar_mi.retrieval.velocimetry.band_limit import flat_if_nearly, wavenumbers
 from lidar_mi.retrieval.velocimetry.brightness import rms
-from lidar_mi.retrieval.velocimetry.change import displaced, unexplained
+from lidar_mi.retrieval.velocimetry.change import displaced, of_structure, unexplained
 from lidar_mi.retrieval.velocimetry.coherent_change import (
     CORRELATED_AREA,
     Left,
@@ -40,6 +40,7 @@ def with_local_noise(
     width: float,
     coloured: bool,
     knots: float,
+    strain: float = 0.0,
     left: Left | None = None,
 ) -> Images:
     """The images with the noise estimated from their misfit at each place and wavenumber.
@@ -67,6 +68,9 @@ def with_local_noise(
         Whether the misfit is resolved by wavenumber.
     knots : float
         Spacing of the flow's knots, px.
+    strain : float
+        Mean square of the flow's strain in dt, in a plane along its axes; blur that is not told
+        makes images differ by it.
     left : callable, optional
         What the fit leaves of a difference of images in a plane, see
         `coherent_change.what_is_left`. Left out: of volumes.
@@ -114,9 +118,11 @@ def with_local_noise(
             )
     square = 0.0
     if coloured:
-        through = displaced(images.spline, images.stack, images.white)
-        square = unexplained(images.spline, mismatch(images.spline, residual), through, knots)
-        density = torch.maximum(density, square * through)
+        structure = of_structure(images.spline, images.stack, images.white)
+        found = mismatch(images.spline, residual)
+        square = unexplained(images.spline, found, structure, strain, knots)
+        wave = wavenumbers(density, images.spline.shape)
+        density = torch.maximum(density, square * displaced(wave, structure))
         if not (square or coherent):
             settings = images.spline.settings
             spectrum = spectrum_of(images.stack, weight.sqrt(), settings)

@@ -11,6 +11,7 @@ import torch
 
 from lidar_mi.retrieval.velocimetry import direct, iterative, strips
 from lidar_mi.retrieval.velocimetry.agreement import agreement, flagged, unskilled
+from lidar_mi.retrieval.velocimetry.change import mean_square_strain
 from lidar_mi.retrieval.velocimetry.coherent_change import what_is_left
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
@@ -158,10 +159,13 @@ def variational_and_flow(
             if level == last and turn in (settings.noise_round, rounds):
                 linear = linearised(images, mesh, coefficients, settings)
                 displaced_only = displaced_only if turn == rounds else mesh.field(coefficients)
-                left = None
+                left, strain = None, 0.0
                 if windows.dims == 2 and posterior is not None:
                     left = what_is_left(linear, mesh, posterior.response)
-                images = with_local_noise(images, linear, width, settings.coloured, apart, left)
+                    strain = mean_square_strain(mesh.slopes(coefficients))
+                images = with_local_noise(
+                    images, linear, width, settings.coloured, apart, strain, left
+                )
                 rough = images.single()
             linear = linearised(rough, single, coefficients.float(), settings)
             posterior = solve(linear, single, coefficients, prior, settings, turn)
