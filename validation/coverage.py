@@ -168,10 +168,12 @@ CASES: dict[str, Callable[[int], Pair]] = {
         for rms in (0.0, 0.02, 0.05, 0.1, 0.2)
     },
     **{
-        f"{words}, texture {100 * rms:.0f} %, noise {100 * noise:.0f} %": partial(
+        f"{words}, texture {100 * rms:.0f} %, noise {100 * noise:g} %": partial(
             shipped_wake, second, rms, noise=noise
         )
         for words, second, rms, noise in (
+            ("advected", "advect", 0.0, 0.003),
+            ("true second state", "40.1 s", 0.0, 0.003),
             ("advected", "advect", 0.05, 0.01),
             ("advected", "advect", 0.2, 0.02),
             ("true second state", "40.1 s", 0.1, 0.01),

@@ -29,6 +29,11 @@ from lidar_mi.retrieval.velocimetry.unresolved import (
 )
 from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, working
 
+# Structure is assumed to move this many times as far otherwise than the air as was found, and the
+# flow may then change by this fraction of its spread. Smoke without texture, of the true second
+# states of `validation/coverage.py`: 0.19 to 0.7; with texture of 2 % or more: 0.05 at most.
+_FARTHER, _ALIKE = 10.0, 0.1
+
 
 def variational(
     image1: torch.Tensor,
@@ -127,7 +132,8 @@ def variational_and_flow(
 ) -> tuple[Displacement, Flow | None]:
     """`variational`, and if asked what the retrieval of the next images may start from.
 
-    There is none for volumes, and for images of more than `settings.strips.largest` knots.
+    There is none for volumes, for images of more than `settings.strips.largest` knots, and for
+    images that do not determine the flow.
     """
     check_between("min_correlation", min_correlation, -1, 1)
     for other in stack[1:]:
@@ -177,13 +183,18 @@ def variational_and_flow(
         flow = mesh.field(coefficients)
     linear = linearised(images, mesh, coefficients, settings)
     posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
+    flow = mesh.field(posterior.coefficients.to(like))
+    # a flow that depends on how much is assumed to move otherwise is not in the images
+    undetermined = images.through > 0 and _differ(flow, displaced_only, 1.0)
+    if images.coherent and not undetermined:
+        farther = images._replace(coherent=_FARTHER**2 * images.coherent)
+        there = linearised(farther, mesh, posterior.coefficients.to(like), settings)
+        other = solve(there, mesh, posterior.coefficients, prior, settings, settings.rounds[-1])
+        undetermined = _differ(flow, mesh.field(other.coefficients.to(like)), _ALIKE)
     centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
     d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
     score = agreement(linear, windows)
-    # a flow that depends on how much is assumed to move through the plane is not in the images
-    spread = (flow - flow.mean(tuple(range(1, flow.ndim)), keepdim=True)).square().mean()
-    undetermined = images.through > 0 and bool((flow - displaced_only).square().mean() > spread)
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
     known = (found.flag == 0) & ~no_skill(d, covariance)
     known = interpolated(known.to(like), centres, pixels) > 0.5
@@ -191,7 +202,7 @@ def variational_and_flow(
     # draw takes as long as a step to the flow, and changes errors by 1 %
     drawn = trusted and isinstance(posterior, direct.Posterior)
     of_noise = made_by_noise(linear, mesh, posterior.response) if drawn else None
-    finer = unresolved_variance(mesh.field(posterior.coefficients.to(like)), apart, known, of_noise)
+    finer = unresolved_variance(flow, apart, known, of_noise)
     finer = interpolated(finer, pixels, centres)
     found = found._replace(covariance=with_unresolved(covariance, finer))
     if windows.dims > 2:
@@ -199,9 +210,15 @@ def variational_and_flow(
     found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
     if undetermined:
         found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
-    if not (keep and isinstance(posterior, direct.Posterior)):
+    if undetermined or not (keep and isinstance(posterior, direct.Posterior)):
         return found, None
     return found, flow_of(posterior, linear, images, given, before, finer, windows, settings)
+
+
+def _differ(flow: torch.Tensor, other: torch.Tensor, fraction: float) -> bool:
+    """Whether the rms difference of flows (2, z, y) is above a fraction of the first one's spread."""
+    about = flow - flow.mean((1, 2), keepdim=True)
+    return bool((other - flow).square().mean() > fraction**2 * about.square().mean())
 
 
 def _solver(
