@@ -39,7 +39,8 @@ def test_calibration_mends(case):
     found = instrument.measured(CASES[case], 20, 7, instrument.calibrated_first, SMALL)
     for one in found.values():
         allowed = np.sqrt((one.stated**2).mean() / 20 + (one.systematic**2).mean())
-        assert abs(one.bias) < 4 * allowed < 0.15
+        # five calibrations that differ by 0.04 m/s
+        assert abs(one.bias) < 4 * allowed < 0.2
 
 
 @pytest.mark.slow

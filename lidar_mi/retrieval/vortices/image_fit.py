@@ -233,13 +233,15 @@ def fit_pixels(
     if isinstance(make, str):
         return no_fit(profile, make)
     limits = step_limits(y, z, profile, dt)
-    found = _searched(make, limits)
+    found, replaced = _searched(make, limits)
     if found is None:
         return no_fit(profile, "no vortex signature")
-    near = fit_near(found.parameters, make, limits, _NOISE_LAGS, estimates=2)
-    pair = near and _checked(make, *near)
-    if pair and pair.success:
-        return pair
+    # in air that is replaced there are many minima: a few steps may end in another one
+    if not replaced:
+        near = fit_near(found.parameters, make, limits, _NOISE_LAGS, estimates=2)
+        pair = near and _checked(make, *near)
+        if pair and pair.success:
+            return pair
     return _iterated(found, make, limits)
 
 
@@ -269,8 +271,10 @@ def _completed(ready: Begun, image1: torch.Tensor, image2: torch.Tensor) -> Vort
     return pair if pair and pair.success and agrees(ready.start, pair) else None
 
 
-def _searched(make: Builder, limits: Limits) -> Solution | None:
+def _searched(make: Builder, limits: Limits) -> tuple[Solution | None, bool]:
     """The fit to blurred images from the best of all pairs of places, None if there is none.
+
+    And whether part of the air is replaced.
 
     Blurred differences of images are linear in displacements of several pixels. Where air changes
     they are mostly change, and the pair is in the finer ones, of which there are more.
@@ -281,16 +285,16 @@ def _searched(make: Builder, limits: Limits) -> Solution | None:
     starts = starting_points(images.differences(), STARTS, make.profile)
     best = _best(images, starts, limits, spacing**2)
     if best is None:
-        return None
+        return None, False
     variance = (_FIRST_MODEL_ERROR * spacing) ** 2
     white = make(*_LEVELS[1])
     found, images = _refitted(white, best.parameters, variance, limits)
     if _replaced(white.weighted(found.misfit)) < _REPLACED:
-        return found
+        return found, False
     observed = condensed(white.at_least(float(images.scatter.mean())).differences())
     starts = starting_points(observed, STARTS, make.profile)
     others = _best(images, starts, limits, variance)
-    return others if others and others.cost < found.cost else found
+    return (others if others and others.cost < found.cost else found), True
 
 
 def _best(images: Images, starts: torch.Tensor, limits: Limits, variance: float) -> Solution | None:
