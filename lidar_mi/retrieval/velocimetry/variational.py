@@ -216,7 +216,7 @@ def variational_and_flow(
 
 
 def _differ(flow: torch.Tensor, other: torch.Tensor, fraction: float) -> bool:
-    """Whether the rms difference of flows (2, z, y) is above a fraction of the first one's spread."""
+    """Whether two flows (2, z, y) differ by more than a fraction of the first one's spread, rms."""
     about = flow - flow.mean((1, 2), keepdim=True)
     return bool((other - flow).square().mean() > fraction**2 * about.square().mean())
 

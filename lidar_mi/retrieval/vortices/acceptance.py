@@ -19,9 +19,9 @@ TOLERANCE = 0.03
 # Least circulation over its standard error and least correlation of the images of a valid fit.
 _SIGNIFICANCE = 5.0
 _MATCH = 0.5
-# Largest core radius over the separation. Wider cores deform each other (Sipp, Jacquin & Cossu 2000,
-# Phys. Fluids 12, 245-248), so that two circular ones are no model of them; and smoke that hides a
-# vortex as it is round like it looks as if the core were wide.
+# Largest core radius over the separation. Wider cores deform each other (Sipp, Jacquin & Cossu
+# 2000, Phys. Fluids 12, 245-248), so that two circular ones are no model of them; and smoke that
+# hides a vortex, as it is round like it, looks as if the core were wide.
 _WIDEST = 0.3
 
 
@@ -84,10 +84,11 @@ def checked_fit(
             )
         if not (y[0] <= at_y <= y[-1] and z[0] <= at_z <= z[-1]):
             reasons.append(f"{side} vortex at ({at_y:.1f}, {at_z:.1f}) m is outside")
-        if not np.exp(log_radius) <= _WIDEST * separation:
+        radius = np.exp(log_radius)
+        if not radius <= _WIDEST * separation:
             reasons.append(
-                f"{side} core radius {np.exp(log_radius):.1f} m; expected at most {_WIDEST:g} of the "
-                f"separation of {separation:.1f} m"
+                f"{side} core radius {radius:.1f} m; expected at most {_WIDEST:g} of the separation "
+                f"of {separation:.1f} m"
             )
     return VortexPairFit(
         theta,

@@ -1,7 +1,8 @@
 """Air that changes: the displacement across the plane is recovered, and winds without skill named.
 
 Detects a displacement that is wrong by a quarter, change found in air that has none or where blur
-is strained, standard errors too small by a third where texture is replaced, and smooth air that changes called valid.
+is strained, standard errors too small by a third where texture is replaced, and smooth air that
+changes called valid.
 """
 
 import numpy as np
