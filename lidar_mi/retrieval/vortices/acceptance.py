@@ -87,8 +87,8 @@ def checked_fit(
         radius = np.exp(log_radius)
         if not radius <= _WIDEST * separation:
             reasons.append(
-                f"{side} core radius {radius:.1f} m; expected at most {_WIDEST:g} of the separation "
-                f"of {separation:.1f} m"
+                f"{side} core radius {radius:.1f} m; expected at most {_WIDEST:g} of the "
+                f"separation of {separation:.1f} m"
             )
     return VortexPairFit(
         theta,
