@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from importlib.resources import files
 from pathlib import Path
 
@@ -12,6 +12,8 @@ import xarray as xr
 import lidar_mi as lm
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
+from lidar_mi.experiment.truth import blur_by_beam, mean_flow, read_flows
+from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
 
@@ -21,18 +23,19 @@ TITLE = "Standard errors of winds where air changes"
 INTRODUCTION = (
     "Winds are retrieved from image pairs of known wind. The second image shows the air of the "
     "first one moved by the wind, and in most cases more: another state of the simulation, "
-    "texture that is replaced, an instrument that changes. Within 1 and 1.96 standard errors "
-    "should be 68 and 95 % of the errors of valid vectors, and the normalised errors should have "
-    "the variance 1. The uncertainty of each number is from its scatter over blocks of the image, "
-    "each with all seeds, since the wind is that of one wake; the errors of one `vortex_fit` have "
-    "ten parameters in common, and those of all seeds as much as they are alike. Bold: more than 5 "
-    "points or outside 0.8 to 1.25, by more than the uncertainty. Cases and reasons: "
-    "[accuracy](accuracy.md#standard-errors-where-air-changes)."
+    "texture that is replaced, an instrument that changes. At the end are volumes that are carried "
+    "in three dimensions, rendered images, and both lidars as one sensor. Within 1 and 1.96 "
+    "standard errors should be 68 and 95 % of the errors of valid vectors, and the normalised "
+    "errors should have the variance 1. The uncertainty of each number is from its scatter over "
+    "blocks of the image, each with all seeds, since the wind is that of one wake; the errors of "
+    "one `vortex_fit` have ten parameters in common, and those of all seeds as much as they are "
+    "alike. Bold: more than 5 points or outside 0.8 to 1.25, by more than the uncertainty. Cases "
+    "and reasons: [accuracy](accuracy.md#standard-errors-where-air-changes)."
 )
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 METHODS = ("variational", "vortex_fit", "multipass", "cc")
-"""Methods that state standard errors."""
+"""Methods that state standard errors of winds in a plane."""
 TOLERANCE = {"coverage_68": 0.05, "coverage_95": 0.05}
 EXPECTED = {"coverage_68": 0.683, "coverage_95": 0.950}
 VARIANCE = (0.8, 1.25)
@@ -57,7 +60,7 @@ class Coverage:
     ----------
     case, method : str
     rmse, stated : float
-        Rms error of v and w, and rms standard error, m/s.
+        Rms error of v and w (and u, where it is found), and rms standard error, m/s.
     wind : float
         Rms of the true wind, m/s, the error without any skill.
     coverage_68, coverage_95, variance : (float, float)
@@ -158,6 +161,60 @@ def _with_noise(first, second, y, z, wind, level, seed, noise) -> Pair:
     return *(data_array(image, y, z) for image in images), xr.Dataset({"v": v, "w": w}), noise
 
 
+def carried_volume(noise: float, seed: int) -> Pair:
+    """Volumes of the shipped wake, carried along x, y and z, as the beams of `wake_3d` see them.
+
+    With white noise of a fraction of each voxel, whose map is given. There is no renderer.
+    """
+    experiment = lm.load_experiment("wake_3d", seed=seed)
+    flows = read_flows(experiment)
+    truth, wind = lm.make_truth(experiment, flows=flows), mean_flow(flows)
+    scan = experiment.scan
+    gates = slice(scan.range, scan.range + scan.thickness)
+    random = np.random.default_rng([seed, 1])
+    volumes = []
+    for air in truth.extinction:
+        air = air.transpose("x", "z", "y").sel(x=gates)
+        planes = [blur_by_beam(plane, experiment.lidar, float(plane["x"])) for plane in air]
+        volumes.append(air.copy(data=np.stack([plane.values for plane in planes])))
+    level = noise * volumes[0]
+    volumes = [one + level.values * random.standard_normal(one.shape) for one in volumes]
+    return *volumes, wind[["u", "v", "w"]].transpose("x", "z", "y"), level
+
+
+@lru_cache(maxsize=8)
+def rendered_images(seed: int) -> xr.Dataset:
+    """Winds of `wake_changing` by all methods: the simulation's true second state, all orders.
+
+    Its lidar has no detector, so that the noise is that of the Monte Carlo samples.
+    """
+    experiment = lm.load_experiment(
+        "wake_changing",
+        seed=seed,
+        detector=None,
+        retrieval={
+            "methods": METHODS,
+            "stride": STRIDE,
+            "sources": "measured",
+            "error_budget": False,
+        },
+    )
+    return lm.run(experiment).wind.isel(source=-1)
+
+
+def both_lidars(seed: int) -> xr.Dataset:
+    """Wind by both lidars 150 m ahead, of the simulation's true second state."""
+    experiment = lm.load_experiment(
+        "near_range",
+        variant="at_150m",
+        seed=seed,
+        wake={"second": "40.1 s"},
+        retrieval={"methods": ["variational"], "sources": "measured", "error_budget": False},
+    )
+    # as far apart as the vectors of the other cases
+    return lm.run(experiment).wind3d[{name: slice(None, None, 2) for name in ("z", "y")}]
+
+
 CASES: dict[str, Callable[[int], Pair]] = {
     **{
         f"advected, texture {100 * rms:.0f} %": partial(shipped_wake, "advect", rms)
@@ -195,20 +252,54 @@ CASES: dict[str, Callable[[int], Pair]] = {
 """Image pairs by seed."""
 
 
+VOLUMES: dict[str, Callable[[int], Pair]] = {
+    f"volume carried along x, y, z, noise {100 * noise:g} %": partial(carried_volume, noise)
+    for noise in (0.008, 0.03)
+}
+"""Pairs of volumes by seed."""
+VOLUME_METHODS = ("variational", "correlation")
+
+RUNS: dict[str, tuple[Callable[[int], xr.Dataset], tuple[str, ...]]] = {
+    "true second state, texture 10 %, rendered, all orders": (rendered_images, METHODS),
+    "the same by both lidars at 150 m": (both_lidars, ("sensor",)),
+}
+"""Winds of whole experiments by seed, with the true ones, and the methods in them."""
+
+FEWER = 3
+"""Seeds of the cases in a plane over those of volumes and of whole experiments, which take long."""
+
+
+def _found_and_true(case: str, method: str, seed: int) -> tuple[xr.Dataset, xr.Dataset]:
+    """Wind with standard errors and flags, and the true wind there, dims (..., z, y)."""
+    if case in RUNS:
+        wind = RUNS[case][0](seed)
+        if "algorithm" in wind.dims:
+            wind = wind.sel(algorithm=method)
+        names = [name for name in "uvw" if name in wind]
+        return wind, wind[[f"{n}_true" for n in names]].rename({f"{n}_true": n for n in names})
+    if case in VOLUMES:
+        first, second, truth, noise = VOLUMES[case](seed)
+        wind = retrieve_wind_volume(first, second, 0.1, method, stride=STRIDE, noise=noise)
+        return wind, truth.interp({name: wind[name] for name in ("x", "z", "y")})
+    first, second, truth, noise = CASES[case](seed)
+    wind = retrieve_wind(first, second, 0.1, method, stride=STRIDE, noise=noise)
+    return wind, truth_at_vectors(wind, truth)
+
+
 def measured(case: str, method: str, seeds) -> Coverage:
     """One row of the table, over all seeds."""
     errors, stated, valid, winds = [], [], [], []
     for seed in seeds:
-        first, second, truth, noise = CASES[case](seed)
-        wind = retrieve_wind(first, second, 0.1, method, stride=STRIDE, noise=noise)
-        true = truth_at_vectors(wind, truth)
+        wind, true = _found_and_true(case, method, seed)
         is_valid = (wind["flag"] == 0).values
-        for name in "vw":
-            errors.append(np.where(is_valid, (wind[name] - true[name]).values, np.nan))
+        for name in true:
+            field = true[name].values
+            errors.append(np.where(is_valid, wind[name].values - field, np.nan))
             stated.append(np.where(is_valid, wind[f"{name}_stderr"].values, np.nan))
-            winds.append(true[name].values)
+            winds.append(field)
         valid.append(is_valid)
-    error, stderr = np.stack(errors), np.stack(stated)
+    # planes of volumes follow one another
+    error, stderr = (np.stack(part).reshape(-1, *part[0].shape[-2:]) for part in (errors, stated))
     score = error / stderr
     most = PARAMETERS[method] * independent_pairs(error) if method in PARAMETERS else None
     return Coverage(
@@ -225,10 +316,15 @@ def measured(case: str, method: str, seeds) -> Coverage:
 
 
 def table(repeats: int) -> Iterator[Coverage]:
-    """All cases by all methods, seeds 1 to ``repeats``."""
+    """All cases by all methods, seeds 1 to ``repeats``, or a third as many of what takes long."""
     for case in CASES:
         for method in METHODS:
             yield measured(case, method, range(1, repeats + 1))
+    fewer = range(1, repeats // FEWER + 1)
+    of_volumes = dict.fromkeys(VOLUMES, VOLUME_METHODS)
+    for case, methods in (of_volumes | {case: run[1] for case, run in RUNS.items()}).items():
+        for method in methods:
+            yield measured(case, method, fewer)
 
 
 def coverage(effort) -> Check:
@@ -250,7 +346,7 @@ def coverage(effort) -> Check:
         if one.valid > 0.01
     ]
     command = "python -m validation coverage" + (" --slow" if effort.scale > 1 else "")
-    seeds = f"seeds 1 to {repeats}"
+    seeds = f"seeds 1 to {repeats} (of volumes and whole experiments 1 to {repeats // FEWER})"
     text = "\n".join(
         [
             f"Written by `{command}`, {seeds}; errors in m/s, of valid vectors. "
