@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import xarray as xr
+from scipy.fft import dctn, idctn
 from scipy.ndimage import map_coordinates, spline_filter
 
 from lidar_mi.errors import InputError
@@ -11,9 +12,11 @@ from lidar_mi.errors import InputError
 # Cells of edge values added around a plane or a volume, for the spline's response to the edge (it
 # falls by a factor 0.43 per cell) and for inflow.
 _MARGIN = 12
-# Of the splines. Cubic splines damp waves of three cells four times and waves of four cells nine
-# times as much.
+# Of the splines.
 _ORDER = 5
+# Nodes of the splines of a field per node of its own. On one, waves of 2 to 3 cells are damped, and
+# move too little: half way between nodes a wave of two cells stands still.
+_FINER = 2
 
 
 def _axis(field, name):
@@ -27,17 +30,22 @@ def _axis(field, name):
     return values, (values[-1] - values[0]) / (values.size - 1)
 
 
-def _sampler(values):
+def _sampler(values: np.ndarray, finer: int = 1) -> Callable[[np.ndarray], np.ndarray]:
     """Quintic B-spline through the nodes of a plane or a volume, a function of fractional indices.
 
-    Outside the grid it has the value at the nearest edge.
+    Outside the grid it has the value at the nearest edge. With `finer` nodes the spline is through
+    the cosine series of the field, which has all waves of the grid.
     """
-    coefficients = spline_filter(np.pad(values, _MARGIN, mode="edge"), order=_ORDER, mode="mirror")
+    padded = np.pad(values, _MARGIN, mode="edge")
+    if finer > 1:
+        more = [(0, (finer - 1) * n) for n in padded.shape]
+        padded = idctn(np.pad(dctn(padded, norm="forward"), more), norm="forward")
+    coefficients = spline_filter(padded, order=_ORDER, mode="mirror")
 
     def sample(indices: np.ndarray) -> np.ndarray:
-        return map_coordinates(
-            coefficients, indices + _MARGIN, order=_ORDER, mode="nearest", prefilter=False
-        )
+        # the nodes of a cosine series are half a spacing from its ends
+        places = finer * (indices + _MARGIN) + (finer - 1) / 2
+        return map_coordinates(coefficients, places, order=_ORDER, mode="nearest", prefilter=False)
 
     return sample
 
@@ -71,13 +79,17 @@ def advect(
     Every node is followed back along its trajectory in `steps` midpoint steps (second order:
     in solid rotation the departure point is off by r (omega dt)^3/(6 steps^2), which for
     omega = 5 s^-1 and dt = 0.1 s is 2 % of r in one step and 0.13 % in four), and the field
-    there is read from the quintic B-spline through its nodes (Staniforth and Cote,
-    Mon. Wea. Rev. 119, 1991). The
-    spline keeps waves of 4 cells and longer; a wave of 2 cells is lost at half-cell shifts, as
-    it must be on this grid. Without u there is no motion along x, and planes are independent of
-    each other. Air that enters through an edge has the value at the edge, so that a strip of width
-    speed*dt along inflow edges is not meaningful. A field without negative values remains so: the
-    undershoots of the spline at sharp edges are set to zero.
+    there is read from a quintic B-spline (Staniforth and Cote, Mon. Wea. Rev. 119, 1991) with two
+    nodes per node of the grid, between which its cosine series is evaluated: waves of 2.1 cells and
+    longer keep their amplitude to 0.2 % and move as far as the air. (A spline through the nodes
+    alone moves them too little: images of such air lack up to 5 % of the wind where noise is low.)
+    Where a field does not end smoothly, the series rings within some 20 cells of the edge, by
+    0.2 % of the step in its slope per cell.
+
+    Without u there is no motion along x, and planes are independent of each other. Air that enters
+    through an edge has the value at the edge, so that a strip of width speed*dt along inflow edges
+    is not meaningful. A field without negative values remains so: the undershoots of the spline at
+    sharp edges are set to zero.
 
     Parameters
     ----------
@@ -246,7 +258,7 @@ def _speeds(grid, v, w, u) -> list[np.ndarray]:
 def _reader(field, whole: bool) -> Callable[[Sequence[np.ndarray]], xr.DataArray]:
     """From places of the nodes of all `_pieces` (node indices) to the field there."""
     pieces = _pieces(field, whole)
-    samplers = [_sampler(piece) for piece in pieces]
+    samplers = [_sampler(piece, _FINER) for piece in pieces]
     result = field.transpose(*(axis for axis in ("x", "y", "z") if axis in field.dims))
     result = result.astype(float)
 
