@@ -125,12 +125,7 @@ def multipass(
     places = grid.windows(windows)
     fit = _fit(pair, flow, grid, places, settings.widths[-1] * sigma)
     d = travelled(fit.displacement, fit.gradient)
-    # far enough apart that the gradients' noise adds little
-    bent = curvature(fit.gradient, max(1, round(template / 2 / stride))) / stride
-    everywhere = torch.ones_like(bent[0], dtype=torch.bool)
-    curved = _BENT * torch.stack(
-        [averaged((sigma**2 / 2 * part).square(), everywhere, _NEAR) for part in bent]
-    )
+    curved = _curved(fit, sigma, stride, max(1, round(template / 2 / stride)))
     curved = torch.diag_embed(curved.movedim(0, -1)).movedim((-2, -1), (0, 1))
     matched = (fit.score > 0) & (fit.fraction_valid > 0.5)
     at = torch.meshgrid(*places, indexing="ij")
@@ -171,21 +166,39 @@ def travelled(d: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
     return torch.where(small[:, None, None], arc, chord)[..., 0].T.reshape(d.shape)
 
 
-def curvature(gradient: torch.Tensor, reach: int) -> torch.Tensor:
+def _curved(fit: "_Fit", sigma: float, stride: int, reach: int) -> torch.Tensor:
+    """Variance (components, ...) by the displacement's curvature over Gaussian windows.
+
+    Without what the noise of the gradients adds: of white noise a gradient has 1 / (2 sigma^2) of
+    the displacement's variance.
+    """
+    bent, by_noise = curvature(fit.gradient, reach)
+    variance = fit.covariance.diagonal().movedim(-1, 0)
+    square = bent.square() - by_noise * variance / (2 * sigma**2)
+    everywhere = torch.ones_like(bent[0], dtype=torch.bool)
+    near = torch.stack([averaged(part, everywhere, _NEAR) for part in square])
+    return _BENT * (sigma**2 / 2 / stride) ** 2 * near.clamp(min=0.0)
+
+
+def curvature(gradient: torch.Tensor, reach: int) -> tuple[torch.Tensor, torch.Tensor]:
     """Laplacian (components, ...) of a displacement from its gradient at places `reach` apart.
 
-    Per place; from one side at the rim, zero along a direction with a single place.
+    Per place; from one side at the rim, zero along a direction with a single place. And its
+    variance (...) over that of the gradients, of independent errors.
     """
     total = torch.zeros_like(gradient[:, 0])
+    by_noise = torch.zeros_like(total[0])
     for axis in range(1, total.ndim):
         part = gradient[:, axis - 1]
         n = part.shape[axis]
         place = torch.arange(n, device=part.device)
         ends = [(place + move).clamp(0, n - 1) for move in (reach, -reach)]
-        span = (ends[0] - ends[1]).clamp(min=1).to(part)
+        apart = ends[0] - ends[1]
+        span = apart.clamp(min=1).to(part).reshape(-1, *[1] * (part.ndim - 1 - axis))
         change = part.index_select(axis, ends[0]) - part.index_select(axis, ends[1])
-        total += change / span.reshape(-1, *[1] * (part.ndim - 1 - axis))
-    return total
+        total += change / span
+        by_noise += 2 * (apart.reshape(span.shape) > 0) / span**2
+    return total, by_noise
 
 
 class Pair(NamedTuple):

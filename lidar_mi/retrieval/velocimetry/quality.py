@@ -61,7 +61,7 @@ _SOBEL_NOISE = 3 / 16
 # By which texture exceeds its thresholds that exceeds them clearly.
 _MARGIN = 1.5
 # Standard error, px, that is no reason to reject a vector in any wind.
-_SMALL = 0.05
+SMALL = 0.05
 
 
 class Texture(NamedTuple):
@@ -212,7 +212,7 @@ def no_skill(d: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
         return torch.zeros_like(known)
     variance = covariance.diagonal().mean(-1)
     spread = working(d)[:, known].var(1, correction=0).mean()
-    limit = (spread / 4).clamp(min=_SMALL**2)
+    limit = (spread / 4).clamp(min=SMALL**2)
     return known & ((variance > limit) | (variance[known].mean() > limit))
 
 

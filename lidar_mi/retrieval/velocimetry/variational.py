@@ -20,7 +20,7 @@ from lidar_mi.retrieval.velocimetry.likelihood import linearised, prepared
 from lidar_mi.retrieval.velocimetry.misfit import with_local_noise
 from lidar_mi.retrieval.velocimetry.next_flow import Flow, flow_of
 from lidar_mi.retrieval.velocimetry.prior import first_prior, refined
-from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, no_skill
+from lidar_mi.retrieval.velocimetry.quality import SMALL, Flag, check_between, no_skill
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_VARIATIONAL, VariationalSettings
 from lidar_mi.retrieval.velocimetry.unresolved import (
     made_by_noise,
@@ -216,9 +216,13 @@ def variational_and_flow(
 
 
 def _differ(flow: torch.Tensor, other: torch.Tensor, fraction: float) -> bool:
-    """Whether two flows (2, z, y) differ by more than a fraction of the first one's spread, rms."""
+    """Whether two flows (2, z, y) differ by more than a fraction of the first one's spread, rms.
+
+    And by more than what is small for any wind: uniform wind has no spread.
+    """
     about = flow - flow.mean((1, 2), keepdim=True)
-    return bool((other - flow).square().mean() > fraction**2 * about.square().mean())
+    limit = max(fraction**2 * float(about.square().mean()), SMALL**2)
+    return float((other - flow).square().mean()) > limit
 
 
 def _solver(
