@@ -16,7 +16,7 @@ _SHELL_WAVES = 200
 # Least number of shells per cycle per pixel.
 _SHELLS = 16
 # Fraction by which whitening must lessen the variance of displacements.
-_WORTH_WHITENING = 0.1
+WORTH_WHITENING = 0.1
 
 
 class Filter(NamedTuple):
@@ -152,7 +152,10 @@ def best_filter(
 
 
 def flat_if_nearly(
-    spectrum: PowerSpectrum, mismatch: torch.Tensor, threshold: float
+    spectrum: PowerSpectrum,
+    mismatch: torch.Tensor,
+    threshold: float,
+    worth: float = WORTH_WHITENING,
 ) -> torch.Tensor:
     """The mismatch, at one level if whitening it would lessen errors by little.
 
@@ -172,12 +175,14 @@ def flat_if_nearly(
         See `warping.band_limited`.
     threshold : float
         Standard errors by which a shell must exceed the mismatch to count as texture.
+    worth : float
+        Fraction by which whitening must lessen the variance.
 
     Returns
     -------
     torch.Tensor, shape (shells,)
         The mean of the mismatch, weighted as in the variance, if whitening lessens the variance by
-        less than 10 %; infinite where the mismatch is. Else the mismatch.
+        less; infinite where the mismatch is. Else the mismatch.
     """
     density, uncertainty, shape, sizes = spectrum
     above = mismatch.isfinite() & (density > mismatch * (1 + threshold * uncertainty))
@@ -193,7 +198,7 @@ def flat_if_nearly(
         (steep * g.square() * noise).sum() / (steep * g).sum().square()
         for g in (response, response / noise)
     )
-    if flat > (1 + _WORTH_WHITENING) * white:
+    if flat > (1 + worth) * white:
         return mismatch
     return torch.where(mismatch.isfinite(), level, torch.inf)
 

@@ -106,7 +106,7 @@ def mean_square_strain(slopes: Sequence[torch.Tensor]) -> float:
 
 def unexplained(
     spline: Spline, density: torch.Tensor, structure: torch.Tensor, strain: float, knots: float
-) -> float:
+) -> tuple[float, float]:
     """Mean square displacement, px^2, across the plane that makes the images differ.
 
     The density of the differences is fitted by white noise, a multiple of that of `displaced` and
@@ -130,22 +130,24 @@ def unexplained(
 
     Returns
     -------
-    float
+    square : float
         0 below (0.03 px)^2.
+    blurred : float
+        Fraction of the differences that blur in strained air makes instead.
     """
     full = torch.arange(len(density), device=density.device) < min(spline.shape) // 2
     wave = wavenumbers(density, spline.shape)
     across, blurred = displaced(wave, structure), strained(wave, structure)
     use = density.isfinite() & (across > 0) & (wave > math.pi / knots) & full
     if int(use.sum()) < 3:
-        return 0.0
+        return 0.0, 0.0
     # a shell's number of waves is proportional to its radius
     found, across, blurred, root = (
         part[use].double().cpu().numpy() for part in (density, across, blurred, wave.sqrt())
     )
     scale = found.mean() / across.mean()
     if not scale > 0:
-        return 0.0
+        return 0.0, 0.0
     terms = np.stack([np.ones_like(found), across / across.mean(), blurred / found.mean()], 1)
     found = found / found.mean()
     # above 0, as the solver wants
@@ -156,4 +158,5 @@ def unexplained(
         fit = lsq_linear(terms * weight[:, None], found * weight, (0.0, most), method="bvls")
         parts = fit.x
     square = float(parts[1] * scale)
-    return square if square > _LEAST**2 else 0.0
+    blurred = float(parts[2] * terms[:, 2].mean())
+    return square if square > _LEAST**2 else 0.0, blurred

@@ -1,8 +1,9 @@
 """The noise of images by place and wavenumber, from what a flow leaves of their differences."""
 
+import numpy as np
 import torch
 
-from lidar_mi.retrieval.velocimetry.band_limit import flat_if_nearly, wavenumbers
+from lidar_mi.retrieval.velocimetry.band_limit import WORTH_WHITENING, flat_if_nearly, wavenumbers
 from lidar_mi.retrieval.velocimetry.brightness import rms
 from lidar_mi.retrieval.velocimetry.change import displaced, of_structure, unexplained
 from lidar_mi.retrieval.velocimetry.coherent_change import (
@@ -30,6 +31,9 @@ _FINEST = 0.004
 _LEAST_LOCAL, _LEAST_DENSITY = 0.01, 0.003
 # The same where it is given.
 _LEAST_GIVEN = 0.5
+# Fraction of the differences of images with a noise that is given, by blur in strained air, above
+# which their misfit is not whitened.
+_BLURRED = 0.25
 # Rounds in which noise by place and by wavenumber are estimated in turn.
 _ROUNDS = 3
 
@@ -120,13 +124,15 @@ def with_local_noise(
     if coloured:
         structure = of_structure(images.spline, images.stack, images.white)
         found = mismatch(images.spline, residual)
-        square = unexplained(images.spline, found, structure, strain, knots)
+        square, blurred = unexplained(images.spline, found, structure, strain, knots)
         wave = wavenumbers(density, images.spline.shape)
         density = torch.maximum(density, square * displaced(wave, structure))
         if not (square or coherent):
             settings = images.spline.settings
             spectrum = spectrum_of(images.stack, weight.sqrt(), settings)
-            density = flat_if_nearly(spectrum, density, settings.threshold)
+            # a filter that is not flat adds to what blur in strain makes
+            worth = np.inf if images.given and blurred > _BLURRED else WORTH_WHITENING
+            density = flat_if_nearly(spectrum, density, settings.threshold, worth)
     spline, level = band_limited(
         images.stack, level**0.5, density, weight.sqrt(), images.blur, images.spline.settings
     )

@@ -72,7 +72,7 @@ def differences(stack, given=NOISE):
 
 def found(stack, strain=0.0, given=NOISE):
     spline, density, structure = differences(stack, given)
-    return unexplained(spline, density, structure, strain, 4.0) ** 0.5
+    return unexplained(spline, density, structure, strain, 4.0)[0] ** 0.5
 
 
 @pytest.mark.parametrize("through", [0.1, 0.3])
@@ -125,6 +125,8 @@ def test_blur_in_strained_air_is_not_taken_for_motion_through_the_plane(blur):
     stack = blurred_in_strain(blur, 0.1, 5)
     assert found(stack, 0.1**2, 1e-5) == 0.0
     assert found(stack, 0.0, 1e-5) > 0
+    spline, density, structure = differences(stack, 1e-5)
+    assert unexplained(spline, density, structure, 0.1**2, 4.0)[1] == pytest.approx(1, abs=0.1)
 
 
 def test_little_strain_makes_no_motion_through_the_plane_blur():
