@@ -72,8 +72,8 @@ def multipass(
     min_correlation : float
         Vectors whose deformed windows correlate less are flagged; -1 to 1.
     noise : float or torch.Tensor, optional
-        Standard deviation of the images' white noise, of an image of them the rms; left out: from
-        the images' spectra.
+        Standard deviation of the images' white noise. A map does not weight the pixels; standard
+        errors are those of the mean in a window. Left out: from the images' spectra.
     settings : MultipassSettings, optional
         Left out: those of images or of volumes.
 
