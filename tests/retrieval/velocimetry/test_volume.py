@@ -110,6 +110,25 @@ def test_standard_errors_know_how_the_components_err_together():
         assert abs(float(found["uv_correlation"].median())) < 0.3, method
 
 
+def test_standard_errors_of_the_correlation_follow_the_noise_of_each_voxel():
+    """Noise of 0.4 and 4 % in two halves of one motion: windows have that of their own half."""
+    shape = (12, 16, 40)
+    pair = shifted(shape, (0.1, -0.2, 0.3), 0.0, seed=6)
+    level = pair[0].copy(data=np.where(nodes(shape)[2] < 20, 0.004, 0.04))
+    random = np.random.default_rng(7)
+    noisy = [one + level.values * random.standard_normal(shape) for one in pair]
+    found = retrieve_wind_volume(*noisy, DT, "correlation", noise=level)
+    quiet, loud = found.isel(y=slice(0, 2)), found.isel(y=slice(-2, None))
+    for name, true in zip("uvw", np.array([0.1, 0.3, -0.2]) * SPACING / DT, strict=True):
+        for half in (quiet, loud):
+            # some ten independent windows tell an rms to a quarter
+            reduced = (half[name] - true) / half[f"{name}_stderr"]
+            assert 0.4 < rms(reduced) < 1.6, (name, rms(reduced))
+        ratio = float(loud[f"{name}_stderr"].median() / quiet[f"{name}_stderr"].median())
+        # of 10 what curvature adds takes a part: its own noise is that of neighbours
+        assert 4 < ratio < 13, name
+
+
 @pytest.mark.slow
 def test_where_volumes_differ_standard_errors_are_larger():
     """In one half a volume holds fine texture that the other does not; noise is stated as it is."""
