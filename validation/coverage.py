@@ -34,8 +34,8 @@ INTRODUCTION = (
 )
 
 SCENES = Path(str(files("lidar_mi.scenes")))
-METHODS = ("variational", "vortex_fit", "multipass", "cc")
-"""Methods that state standard errors of winds in a plane."""
+METHODS = ("variational", "vortex_fit", "multipass", "cc", "ws")
+"""Of winds in a plane."""
 TOLERANCE = {"coverage_68": 0.05, "coverage_95": 0.05}
 EXPECTED = {"coverage_68": 0.683, "coverage_95": 0.950}
 VARIANCE = (0.8, 1.25)

@@ -114,10 +114,11 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
             *(f"{part}{s}" for part in ("", "outside_cores.", "all.") for s in STATISTICS),
         )
     }
-    # weight shift states no standard errors
     expected |= {
-        f"{source}.cc.{key}"
-        for source, key in product(SOURCES, ("stderr_v", "stderr_w", "no_skill_fraction"))
+        f"{source}.{method}.{key}"
+        for source, method, key in product(
+            SOURCES, ("cc", "ws"), ("stderr_v", "stderr_w", "no_skill_fraction")
+        )
     }
     # the noise of an image that was rendered is known, and so how well a wind can be found in it
     expected |= {
@@ -145,10 +146,10 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
     expected |= {f"true_wind.{part}rms_{q}" for part in ("", "outside_cores.") for q in "vw"}
     expected |= {f"timing.{step}_s" for step in ("truth", "render", "retrieve", "figures")}
     # no vector of smooth smoke is valid: what is of valid vectors is left out
-    smooth = "extinction_without_texture.cc."
-    assert metrics[f"{smooth}valid_fraction"] == 0
-    expected -= {f"{smooth}{part}{s}" for part in ("", "outside_cores.") for s in STATISTICS}
-    expected -= {f"{smooth}{q}" for q in ("stderr_v", "stderr_w", "no_skill_fraction")}
+    for smooth in ("extinction_without_texture.cc.", "extinction_without_texture.ws."):
+        assert metrics[f"{smooth}valid_fraction"] == 0
+        expected -= {f"{smooth}{part}{s}" for part in ("", "outside_cores.") for s in STATISTICS}
+        expected -= {f"{smooth}{q}" for q in ("stderr_v", "stderr_w", "no_skill_fraction")}
     assert set(metrics) == expected
 
 

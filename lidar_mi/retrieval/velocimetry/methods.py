@@ -33,7 +33,7 @@ class Method:
         whether the images are related.
     repeats : int
         Retrievals of a known motion that the standard errors are from (`bootstrap`). 0: the method
-        states its errors by itself, or not at all.
+        states its errors by itself.
     name : str
         Of a method that is not one of `METHODS`.
     """
@@ -56,7 +56,9 @@ METHODS: Mapping[str, Method] = {
         repeats=2,
     ),
     "ws": Method(
-        weight_shift, ("mismatch", "misfit of weight and centre of mass over their spread")
+        weight_shift,
+        ("mismatch", "misfit of weight and centre of mass over their spread"),
+        repeats=2,
     ),
     "multipass": Method(
         multipass,

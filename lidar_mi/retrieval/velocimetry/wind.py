@@ -113,15 +113,15 @@ def retrieve_wind(
         illumination, and images of unrelated air. False, for images known to be free of them:
         faster by 0.15 of the time of "variational", and none of this is removed or flagged.
     standard_errors : bool
-        False: "cc" and "multipass" state none, which halves their time. The others have theirs
-        from the fit.
+        False: "cc", "ws" and "multipass" state none and flag no vector for its own, which halves
+        their time. The others have theirs from the fit.
 
     Returns
     -------
     xr.Dataset, dims (z, y)
         At the template centres (an even template's lies between pixels): `v`, `w` (m s-1),
         `v_stderr`, `w_stderr` (m s-1) and `vw_correlation`, the standard errors of v and w and
-        their correlation ("cc" and "multipass": see `bootstrap`; NaN from "ws"), `time` (s from
+        their correlation ("cc", "ws" and "multipass": see `bootstrap`), `time` (s from
         image 1's reference time, the vector's mid-time), `displacement_y`, `displacement_z` (m),
         `correlation` or `mismatch`, `texture` (px^-1), `isotropy`, `flag`
         (bits of `quality.Flag`, 0 = valid; low texture also means a standard error beyond half a
