@@ -307,9 +307,16 @@ def shell_means(
     most = int(number.argmax())
     last = most + int((number[most:] >= min(_SHELL_WAVES, float(number[most]))).sum()) - 1
     density[last + 1 :] = density[last]
-    # independent waves: an image has as many as pixels, tapering leaves two fifths of them
-    fraction = 0.4 ** (len(shape) / 2) * len(images) * math.prod(shape) / math.prod(sizes)
+    fraction = len(images) * independent_fraction(shape, sizes)
     return density, (fraction * number.clamp(min=1)).rsqrt()
+
+
+def independent_fraction(shape: Sequence[int], sizes: Sequence[int]) -> float:
+    """Of the waves of the transform of an image, as `shell_means` takes it, how many count.
+
+    An image has as many as pixels, and tapering leaves two fifths of them.
+    """
+    return 0.4 ** (len(shape) / 2) * math.prod(shape) / math.prod(sizes)
 
 
 def faded(

@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import torch
-from scipy.optimize import lsq_linear
 
 from lidar_mi.retrieval.threads import mapped
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
@@ -20,12 +19,13 @@ from lidar_mi.retrieval.velocimetry.likelihood import (
     steepness_of_structure,
     without_coarse,
 )
+from lidar_mi.retrieval.velocimetry.variance_components import most_likely
 from lidar_mi.retrieval.velocimetry.windows import averaged, working
 
 Left = Callable[[torch.Tensor], torch.Tensor]
 """From a difference (z, y) of the images in dt to what the fitted flow leaves of it."""
 
-CORRELATED_AREA = 100.0
+CORRELATED_AREA = 60.0
 """Area over which structure moves alike, px^2, as noise in waves of several pixels counts it.
 
 Chosen on seeds 41 to 43 of the true second states of ``validation/coverage.py``: 60 to 200 are
@@ -51,8 +51,8 @@ _LEAST, _GAIN = 0.03, 5.0
 _COARSER = 5.0
 # Fraction by which the variance of a given noise may be larger than told.
 _TOO_SMALL = 0.25
-# Least variance over its mean, and rounds of the weighted least squares.
-_FLOOR, _ROUNDS = 1e-3, 30
+# Least variance over its mean.
+_FLOOR = 1e-3
 
 
 def what_is_left(
@@ -186,30 +186,14 @@ def _component(
     at most.
     """
     if given:
-        held, others, most = noise, [replaced, noise], [np.inf, _TOO_SMALL * noise.mean()]
+        held, others, most = noise, [replaced, noise], [np.inf, _TOO_SMALL]
     else:
-        held, others, most = 0.0 * noise, [noise], [_COARSER * noise.mean()]
-    terms = np.stack([part / part.mean() for part in (*others, moved)])
-    limits = np.array([*most, np.inf])
-    without, _ = _fitted(found, held, terms[:-1], limits[:-1])
-    with_it, parts = _fitted(found, held, terms, limits)
-    square = float(parts[-1] / moved.mean())
+        held, others, most = 0.0, [noise], [_COARSER]
+    terms, limits = np.stack([*others, moved]), np.array([*most, np.inf])
+    without, _ = most_likely(found, terms[:-1], limits[:-1], _SQUARES, held, _FLOOR)
+    with_it, factors = most_likely(found, terms, limits, _SQUARES, held, _FLOOR)
+    square = float(factors[-1])
     return square if without - with_it > _GAIN and square > _LEAST**2 else 0.0
-
-
-def _fitted(
-    found: np.ndarray, held: np.ndarray, terms: np.ndarray, limits: np.ndarray
-) -> tuple[float, np.ndarray]:
-    """Negative log-likelihood of the best factors (0 to `limits`) of terms besides what is held."""
-    mean = found.mean()
-    found, held, limits = found / mean, held / mean, limits / mean
-    parts = np.minimum(0.5, limits)
-    for _ in range(_ROUNDS):
-        weight = 1 / np.maximum(parts @ terms + held, _FLOOR)
-        wanted = np.maximum(found - held, 0.0) * weight
-        parts = lsq_linear((terms * weight).T, wanted, (0.0, limits), method="bvls").x
-    ratio = np.maximum(found, _FLOOR) / np.maximum(parts @ terms + held, _FLOOR)
-    return _SQUARES * float((ratio - 1 - np.log(ratio)).sum()), mean * parts
 
 
 def normal_fields(like: torch.Tensor, number: int, seed: int) -> Iterator[torch.Tensor]:
