@@ -17,6 +17,8 @@ from lidar_mi.retrieval.velocimetry.windows import separable
 
 # Least rate at which the estimated ratio is taken to fall as a strength grows.
 _SLOWEST = 0.15
+# Width over that of the strengths by which `Prior.evened` averages variances.
+_EVENED = 0.7
 # Least standard deviation of a rate in a cell between knots, px per px: images of a flow without
 # vorticity would make the prior stronger for ever.
 _LEAST = 1e-4
@@ -186,6 +188,15 @@ class Prior(NamedTuple):
             kernel = torch.exp(-((place[:, None] - place) / self.width).square() / 2)
             kernels.append(kernel / kernel.sum(1, keepdim=True))
         return separable(values, kernels)
+
+    def evened(self) -> "Prior":
+        """With variances averaged over 0.7 of the width within which they vary little.
+
+        The strength of a place is estimated from few motions. A core in which images hardly show
+        any swirl can take its vorticity for concentrated, and be smoothed the less for it.
+        """
+        wider = self._replace(width=_EVENED * self.width)
+        return self._replace(local=1 / wider.smooth(1 / self.local))
 
     def _divergent(self) -> torch.Tensor:
         """Strength of all divergence in a plane: its variances add."""

@@ -188,8 +188,9 @@ class VariationalSettings:
     coloured : bool
         Whether the misfit is resolved by wavenumber as well as by place. In a thin volume few
         shells hold the texture, and in none can its misfit be separated from edge effects.
-    misfit_width : float
-        Standard deviation over the template of the Gaussian that averages the misfit.
+    misfit_width, misfit_width_trusted : float
+        Standard deviation over the template of the Gaussian that averages the misfit; the second
+        one in images whose noise is given. Without noise the misfit varies as steeply as cores do.
     noise_width : float
         The same for a known noise map, px.
     ridge : float
@@ -225,7 +226,8 @@ class VariationalSettings:
     robust: float = 3.0
     path_order: int = 6
     coloured: bool = True
-    misfit_width: float = 0.75
+    misfit_width: float = 0.3
+    misfit_width_trusted: float = 0.75
     noise_width: float = 3.0
     ridge: float = 1e-4
     ratio: float = 100.0
@@ -246,6 +248,7 @@ VOLUME_VARIATIONAL = VariationalSettings(
     rounds=(7,),
     noise_round=3,
     coloured=False,
+    misfit_width=0.75,
     least_vorticity=0.03,
     prior_width=0.5,
     filter=VOLUME_FILTER,

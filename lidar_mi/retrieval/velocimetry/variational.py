@@ -33,6 +33,9 @@ from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, working
 # flow may then change by this fraction of its spread. Smoke without texture, of the true second
 # states of `validation/coverage.py`: 0.19 to 0.7; with texture of 2 % or more: 0.05 at most.
 _FARTHER, _ALIKE = 10.0, 0.1
+# Variance over a vector's own by which the flow changes by chance if the prior's strength is made
+# more even. In the cases of ``validation/coverage.py`` with noise and texture it is 0.1 to 0.3.
+_CHANCE = 0.25
 
 
 def variational(
@@ -146,7 +149,8 @@ def variational_and_flow(
     pixels = [torch.arange(n).to(like) for n in windows.shape]
     flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
     last, prior, displaced_only, posterior = len(settings.knots) - 1, None, flow, None
-    width = settings.misfit_width * windows.template
+    width = settings.misfit_width_trusted if trusted else settings.misfit_width
+    width *= windows.template
     for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
         apart = max(2.0, knots * windows.template)
         axes = [Axis(n, apart) for n in windows.shape]
@@ -183,6 +187,9 @@ def variational_and_flow(
         flow = mesh.field(coefficients)
     linear = linearised(images, mesh, coefficients, settings)
     posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
+    evened = posterior
+    if trusted:
+        evened = solve(linear, mesh, coefficients, prior.evened(), settings, settings.rounds[-1])
     flow = mesh.field(posterior.coefficients.to(like))
     # a flow that depends on how much is assumed to move otherwise is not in the images
     undetermined = images.through > 0 and _differ(flow, displaced_only, 1.0)
@@ -192,8 +199,11 @@ def variational_and_flow(
         other = solve(there, mesh, posterior.coefficients, prior, settings, settings.rounds[-1])
         undetermined = _differ(flow, mesh.field(other.coefficients.to(like)), _ALIKE)
     centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
-    d = Mesh(mesh.axes, centres).field(posterior.coefficients.to(like))
+    at_centres = Mesh(mesh.axes, centres)
+    d = at_centres.field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
+    off = at_centres.field((evened.coefficients - posterior.coefficients).to(like))
+    covariance = covariance + _beyond_chance(off.to(covariance), covariance)
     score = agreement(linear, windows)
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
     known = (found.flag == 0) & ~no_skill(d, covariance)
@@ -213,6 +223,14 @@ def variational_and_flow(
     if undetermined or not (keep and isinstance(posterior, direct.Posterior)):
         return found, None
     return found, flow_of(posterior, linear, images, given, before, finer, windows, settings)
+
+
+def _beyond_chance(off: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+    """Covariance of a flow's change (components, ...) where it is more than noise makes of it."""
+    square = off.square().sum(0)
+    chance = _CHANCE * covariance.diagonal().sum(-1)
+    share = ((square - chance) / square.clamp(min=1e-30)).clamp(min=0.0)
+    return share * off[:, None] * off
 
 
 def _differ(flow: torch.Tensor, other: torch.Tensor, fraction: float) -> bool:
