@@ -33,7 +33,6 @@ from lidar_mi.retrieval.velocimetry.likelihood import (
 from lidar_mi.retrieval.velocimetry.prior import Prior
 from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
-from lidar_mi.retrieval.velocimetry.unresolved import with_unresolved
 from lidar_mi.retrieval.velocimetry.warping import filtered_spline
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
@@ -59,8 +58,9 @@ class Flow:
         Of the flow then, in the prior's units.
     before : torch.Tensor, shape (2, 2, *windows.count)
         Covariance of the flow a priori, px^2.
-    finer : torch.Tensor, shape windows.count
-        Variance of motion that the splines do not resolve, px^2, see `unresolved`.
+    besides : torch.Tensor, shape (2, 2, *windows.count)
+        Covariance besides the posterior's, px^2: of motion that the splines do not resolve
+        (`unresolved`), and by the prior's strength (`Prior.evened`).
     images : Images
         Their filter and noise.
     local : torch.Tensor, shape (z, y)
@@ -71,14 +71,14 @@ class Flow:
     settings : VariationalSettings
     offset : (float, float)
         Along z and y, px: how far what was learnt of places (the prior's strength, `before`,
-        `finer`, `local`) has moved since.
+        `besides`, `local`) has moved since.
     """
 
     coefficients: torch.Tensor
     prior: Prior
     energy: float
     before: torch.Tensor
-    finer: torch.Tensor
+    besides: torch.Tensor
     images: Images
     local: torch.Tensor
     misfit: float
@@ -118,7 +118,7 @@ class Flow:
             self,
             prior=self.prior._replace(local=strength.exp()),
             before=interpolated(self.before, centres, _back(centres, self.offset)),
-            finer=interpolated(self.finer, centres, _back(centres, self.offset)),
+            besides=interpolated(self.besides, centres, _back(centres, self.offset)),
             local=interpolated(self.local, pixels, _back(pixels, self.offset)),
             offset=(0.0, 0.0),
         )
@@ -130,7 +130,7 @@ def flow_of(
     images: Images,
     given: torch.Tensor,
     before: torch.Tensor,
-    finer: torch.Tensor,
+    besides: torch.Tensor,
     windows: Windows,
     settings: VariationalSettings,
 ) -> Flow:
@@ -143,7 +143,7 @@ def flow_of(
         posterior.prior,
         _energy(posterior.prior, posterior.coefficients),
         before,
-        finer,
+        besides,
         images,
         images.weight / given,
         _misfit(linear, torch.zeros_like(linear.slope), images),
@@ -255,7 +255,7 @@ def next_flow(
     covariance = worse * _as_informed(ready, linear)
     d, score = at_centres.field(coefficients), agreement(linear, windows)
     found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
-    found = found._replace(covariance=with_unresolved(covariance, placed.finer))
+    found = found._replace(covariance=covariance + placed.besides)
     found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
     return found, replace(start, coefficients=coefficients)
 

@@ -18,7 +18,7 @@ from lidar_mi.retrieval.velocimetry.windows import separable
 # Least rate at which the estimated ratio is taken to fall as a strength grows.
 _SLOWEST = 0.15
 # Width over that of the strengths by which `Prior.evened` averages variances.
-_EVENED = 0.7
+_EVENED = 0.5
 # Least standard deviation of a rate in a cell between knots, px per px: images of a flow without
 # vorticity would make the prior stronger for ever.
 _LEAST = 1e-4
@@ -190,7 +190,7 @@ class Prior(NamedTuple):
         return separable(values, kernels)
 
     def evened(self) -> "Prior":
-        """With variances averaged over 0.7 of the width within which they vary little.
+        """With variances averaged over half the width within which they vary little.
 
         The strength of a place is estimated from few motions. A core in which images hardly show
         any swirl can take its vorticity for concentrated, and be smoothed the less for it.

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.optimize import lsq_linear
 
-# Rounds of the weighted least squares.
-_ROUNDS = 30
+# Rounds of the weighted least squares, halvings of a step, change of the misfit that ends them.
+_ROUNDS, _HALVINGS, _CONVERGED = 30, 12, 1e-3
 
 
 def most_likely(
@@ -19,9 +19,9 @@ def most_likely(
 
     A mean square of n normal numbers has a gamma distribution: its negative log-likelihood is
     n / 2 (r - 1 - ln r), with r the square over its variance, but for a constant. Least squares
-    weighted by the inverse variances of the squares, anew in each round, have the factors of the
-    largest likelihood as their fixed point (McCullagh & Nelder 1989, Generalized Linear Models,
-    ch. 2 and 8).
+    weighted by the inverse variances of the squares, anew in each round, are Fisher's scoring for
+    the largest likelihood (McCullagh & Nelder 1989, Generalized Linear Models, ch. 2 and 8); of the
+    fractions of each step the likeliest is taken.
 
     Parameters
     ----------
@@ -47,12 +47,26 @@ def most_likely(
     # terms of one size, as the solver wants them
     sizes = np.maximum(terms.mean(1), np.finfo(float).tiny)
     scaled, most = terms / sizes[:, None], limits * (sizes / mean)
-    observed, known = squares / mean, held / mean
+    observed, known = np.maximum(squares / mean, floor), held / mean
+
+    def variances(factors: np.ndarray) -> np.ndarray:
+        return np.maximum(factors @ scaled + known, floor)
+
+    def misfit(factors: np.ndarray) -> float:
+        ratio = observed / variances(factors)
+        return float((number * (ratio - 1 - np.log(ratio))).sum())
+
     factors = np.minimum(0.5, most)
+    reached = misfit(factors)
     for _ in range(_ROUNDS):
-        weight = np.sqrt(number) / np.maximum(factors @ scaled + known, floor)
+        weight = np.sqrt(number) / variances(factors)
         wanted = np.maximum(observed - known, 0.0) * weight
-        factors = lsq_linear((scaled * weight).T, wanted, (0.0, most), method="bvls").x
-    ratio = np.maximum(observed, floor) / np.maximum(factors @ scaled + known, floor)
-    misfit = float((number * (ratio - 1 - np.log(ratio))).sum())
-    return misfit, factors * mean / sizes
+        step = lsq_linear((scaled * weight).T, wanted, (0.0, most), method="bvls").x - factors
+        # a whole step can go too far, to variances of nearly nothing
+        tried = [factors + 0.5**n * step for n in range(_HALVINGS)]
+        after = [misfit(one) for one in tried]
+        best = int(np.argmin(after))
+        if after[best] >= reached - _CONVERGED:
+            break
+        factors, reached = tried[best], after[best]
+    return reached, factors * mean / sizes

@@ -35,7 +35,7 @@ from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair, working
 _FARTHER, _ALIKE = 10.0, 0.1
 # Variance over a vector's own by which the flow changes by chance if the prior's strength is made
 # more even. In the cases of ``validation/coverage.py`` with noise and texture it is 0.1 to 0.3.
-_CHANCE = 0.25
+_CHANCE = 0.5
 
 
 def variational(
@@ -202,8 +202,6 @@ def variational_and_flow(
     at_centres = Mesh(mesh.axes, centres)
     d = at_centres.field(posterior.coefficients.to(like))
     covariance, before = posterior.covariance(centres)
-    off = at_centres.field((evened.coefficients - posterior.coefficients).to(like))
-    covariance = covariance + _beyond_chance(off.to(covariance), covariance)
     score = agreement(linear, windows)
     found = flagged(d, covariance, before, score, stack, windows, min_correlation)
     known = (found.flag == 0) & ~no_skill(d, covariance)
@@ -214,7 +212,10 @@ def variational_and_flow(
     of_noise = made_by_noise(linear, mesh, posterior.response) if drawn else None
     finer = unresolved_variance(flow, apart, known, of_noise)
     finer = interpolated(finer, pixels, centres)
-    found = found._replace(covariance=with_unresolved(covariance, finer))
+    # neither what the splines do not resolve nor the prior's strength is in the posterior
+    off = at_centres.field((evened.coefficients - posterior.coefficients).to(like))
+    besides = with_unresolved(_beyond_chance(off.to(covariance), covariance), finer)
+    found = found._replace(covariance=covariance + besides)
     if windows.dims > 2:
         return found, None
     found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
@@ -222,7 +223,7 @@ def variational_and_flow(
         found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
     if undetermined or not (keep and isinstance(posterior, direct.Posterior)):
         return found, None
-    return found, flow_of(posterior, linear, images, given, before, finer, windows, settings)
+    return found, flow_of(posterior, linear, images, given, before, besides, windows, settings)
 
 
 def _beyond_chance(off: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:

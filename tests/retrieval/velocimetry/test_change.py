@@ -110,6 +110,15 @@ def test_noise_is_no_change():
     assert found(slices(0.0, 2)) == 0.0
 
 
+def test_noise_as_large_as_the_structure_is_no_change():
+    """1 to 8 px were found in seven of eight such pairs."""
+    for seed in range(8):
+        random = np.random.default_rng([seed, 7])
+        stack = slices(0.0, seed)
+        stack = stack + 0.2 * torch.as_tensor(random.standard_normal(stack.shape))
+        assert found(stack, given=0.2) == 0.0
+
+
 def test_differences_by_blur_in_strained_air():
     """Of independent plane waves, each of which is 5 % of all its shell has at most."""
     blur, strain = 0.5, 0.1

@@ -43,9 +43,9 @@ def pattern(images):
 
 
 def retrieved(images, method):
-    return retrieve_wind(
-        *(data_array(i, *axes(COLUMNS, ROWS)) for i in images), DT, method, stride=3
-    )
+    """Weight shift without standard errors, which flag nearly all of its vectors."""
+    images = (data_array(i, *axes(COLUMNS, ROWS)) for i in images)
+    return retrieve_wind(*images, DT, method, stride=3, standard_errors=method != "ws")
 
 
 def errors(wind, v):
