@@ -18,6 +18,7 @@ from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.outliers import median_outliers, validated
 from lidar_mi.retrieval.velocimetry.quality import filled
+from lidar_mi.retrieval.velocimetry.settings import VOLUME_FILTER, FilterSettings
 from lidar_mi.retrieval.velocimetry.warping import band_limited
 from lidar_mi.retrieval.velocimetry.windows import (
     Windows,
@@ -44,6 +45,8 @@ _ITERATIONS = 50
 _LEAST = 1e-3
 # Times that what a window's average takes away is added.
 _SHARPENINGS = 2
+# Of the splines that carry an image or a volume.
+_FILTERS = {2: FilterSettings(), 3: VOLUME_FILTER}
 # Steps of a path, rounds of the place at mid-time.
 _STEPS, _ROUNDS = 4, 3
 
@@ -110,7 +113,7 @@ def bootstrap_covariance(
 
     Parameters
     ----------
-    images : sequence of torch.Tensor, shape (z, y)
+    images : sequence of torch.Tensor, shape (z, y), or (x, z, y) of volumes
         The two images.
     found : Displacement
         Retrieved from them.
@@ -129,7 +132,7 @@ def bootstrap_covariance(
 
     Returns
     -------
-    torch.Tensor, shape (2, 2, *windows.count)
+    torch.Tensor, shape (axes, axes, *windows.count)
         px^2; NaN where fewer than five independent windows around (valid retrievals, within the
         Gaussian of 1.5 templates) have a known error, and where fewer than half of the textured
         windows around are clear.
@@ -137,12 +140,13 @@ def bootstrap_covariance(
     # vectors of windows that overlap by more than half would cost more and tell little
     every = max(1, windows.template // 2 // windows.stride)
     coarse = replace(windows, stride=every * windows.stride)
-    d = working(found.d)[:, ::every, ::every]
+    some = (..., *[slice(None, None, every)] * windows.dims)
+    d = working(found.d)[some]
     per_template = windows.template / coarse.stride
     flow, replaced = validated(d, max(1, round(per_template / 2)))
     window = per_template / math.sqrt(12)
     everywhere = torch.ones_like(flow[0], dtype=torch.bool)
-    known = everywhere if textured is None else textured[::every, ::every]
+    known = everywhere if textured is None else textured[some]
     smooth = torch.stack([averaged(part, everywhere, window) for part in flow])
     vectors, lost = flow, flow
     for _ in range(_SHARPENINGS):
@@ -151,15 +155,17 @@ def bootstrap_covariance(
 
     wind = at_mid_time(flow, coarse, centred)
     first, second = normalised(images)
-    carried = _carried(filled(first), wind)
-    rest = torch.where(second.isfinite(), second - carried, 0.0)
-    level = averaged(rest.square(), second.isfinite(), _LEVEL * windows.template).sqrt()
+    carried, inside = _carried(filled(first), wind)
+    # of air that came in nothing is known
+    alike = second.isfinite() & inside
+    rest = torch.where(alike, second - carried, 0.0)
+    level = averaged(rest.square(), alike, _LEVEL * windows.template).sqrt()
     level = level.clamp(min=torch.finfo(rest.dtype).tiny)
     same = [torch.ones_like(flow), _inverse_texture(filled(first), coarse)]
     if centred:
         shear = averaged(_squared_gradient(vectors), everywhere, _SHEAR * per_template)
         same.append(shear.square().expand_as(flow))
-        valid = known & ~replaced & (found.flag[::every, ::every] == 0)
+        valid = known & ~replaced & (found.flag[some] == 0)
         own = [_roughness(vectors, valid, _ROUGH * per_template)]
     else:
         same.append((flow - vectors).square())
@@ -168,7 +174,7 @@ def bootstrap_covariance(
     tried, number = [], torch.zeros_like(flow[0])
     width = _REGION * per_template
     for apart in _APART[:repeats]:
-        moved = (rest / level).roll([windows.template * part for part in apart], (0, 1))
+        moved = (rest / level).roll([windows.template * part for part in apart], (-2, -1))
         moved = torch.where(second.isfinite(), level * moved, torch.nan)
         again = retrieve(first, carried + moved, stride=coarse.stride)
         outlier = median_outliers(again.d, 3, max(1, round(per_template / 2)))
@@ -179,9 +185,9 @@ def bootstrap_covariance(
         # the wind carried is as rough as the vectors: their mean stands for the true one
         rough = [_roughness(_continued(error, use) + smooth, use, _ROUGH * per_template)] * len(own)
         tried.append((error, use, torch.stack([*same, *rough])))
-        number += 2 * math.pi * _REGION**2 * averaged(use.to(number), everywhere, width)
+        number += _in_a_mean(windows.dims) * averaged(use.to(number), everywhere, width)
     if not tried:
-        return torch.full_like(found.d[None].expand(2, -1, -1, -1), torch.nan)
+        return torch.full_like(torch.stack([found.d] * windows.dims), torch.nan)
     factors = _most_likely(
         torch.cat([x[:, :, use].flatten(1) for _, use, x in tried], 1),
         torch.cat([error[:, use].flatten() for error, use, _ in tried]).square() + _LEAST**2,
@@ -192,17 +198,29 @@ def bootstrap_covariance(
         products = torch.einsum("i...,j...->ij...", scaled, scaled).flatten(0, 1)
         means.append(torch.stack([averaged(p, use, width) for p in products]))
     scale = torch.tensordot(factors, predictors, 1).sqrt()
-    covariance = torch.stack(means).mean(0).unflatten(0, (2, 2)) * scale[:, None] * scale[None]
+    covariance = torch.stack(means).mean(0).unflatten(0, (windows.dims,) * 2)
+    covariance = covariance * scale[:, None] * scale[None]
     if clear is not None:
-        part = averaged(clear[::every, ::every].to(scale), known, _AROUND * per_template)
+        part = averaged(clear[some].to(scale), known, _AROUND * per_template)
         number = torch.where(part < _CLEAR, 0.0, number)
     weights = [
         linear_weights(*(frame.centres(axis).to(d) for frame in (coarse, windows)))
-        for axis in (0, 1)
+        for axis in range(windows.dims)
     ]
     covariance = separable(covariance, weights)
     covariance[:, :, separable(number, weights) < _FEWEST] = torch.nan
-    return covariance + _LEAST**2 * torch.eye(2).to(d)[:, :, None, None]
+    least = _LEAST**2 * torch.eye(windows.dims).to(d)
+    return covariance + least.reshape(*least.shape, *[1] * windows.dims)
+
+
+def _in_a_mean(dims: int) -> float:
+    """Windows that do not overlap within the Gaussian mean of squared errors."""
+    return (2 * math.pi) ** (dims / 2) * _REGION**dims
+
+
+def enough_windows(windows: Windows) -> bool:
+    """Whether images hold as many windows that do not overlap as one mean of squared errors."""
+    return math.prod(n / windows.template for n in windows.shape) >= _in_a_mean(windows.dims)
 
 
 def _most_likely(predictors: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:
@@ -224,31 +242,37 @@ def _most_likely(predictors: torch.Tensor, squares: torch.Tensor) -> torch.Tenso
 
 
 def _inverse_texture(image: torch.Tensor, windows: Windows) -> torch.Tensor:
-    """Diagonal (2, *windows.count) of the inverse mean product of an image's slopes, px^2."""
+    """Diagonal (axes, *windows.count) of the inverse mean product of an image's slopes, px^2."""
     slopes = torch.stack(torch.gradient(image))
     j = torch.einsum("i...,j...->...ij", *[slopes] * 2).movedim((-2, -1), (0, 1))
     j = windows.of_templates(j).movedim((0, 1), (-2, -1))
     # windows with nothing in them are in no mean, but must not be infinite
     least = 1e-6 * j.diagonal(dim1=-2, dim2=-1).mean().clamp(min=torch.finfo(j.dtype).tiny ** 0.25)
-    inverse = torch.linalg.inv(j + least * torch.eye(2).to(j))
+    inverse = torch.linalg.inv(j + least * torch.eye(windows.dims).to(j))
     return inverse.diagonal(dim1=-2, dim2=-1).movedim(-1, 0)
 
 
 def _squared_gradient(flow: torch.Tensor) -> torch.Tensor:
-    """Sum of the squared differences per vector of all components along both axes."""
-    return torch.stack([_slope(flow, axis).square().sum(0) for axis in (1, 2)]).sum(0)
+    """Sum of the squared differences per vector of all components along all axes."""
+    slopes = [_slope(flow, axis).square().sum(0) for axis in range(1, flow.ndim)]
+    return torch.stack(slopes).sum(0)
 
 
 def _roughness(flow: torch.Tensor, use: torch.Tensor, width: float) -> torch.Tensor:
-    """Gaussian mean of the squared second differences, the same for both components (2, z, y).
+    """Gaussian mean of the squared second differences, the same for all components (axes, ...).
 
     Of vectors that are in use with their neighbours two vectors away, which have pixels of their
     own.
     """
-    bend = torch.stack([_slope(_slope(flow, axis), axis) for axis in (1, 2)]).sum(0)
-    wide = pad(use, (2, 2, 2, 2), value=True)
-    around = [wide[4:, 2:-2], wide[:-4, 2:-2], wide[2:-2, 4:], wide[2:-2, :-4]]
-    mean = averaged(bend.square().mean(0), torch.stack([use, *around]).all(0), width)
+    bend = torch.stack([_slope(_slope(flow, axis), axis) for axis in range(1, flow.ndim)]).sum(0)
+    wide = pad(use, (2, 2) * use.ndim, value=True)
+    around = [use]
+    for axis, n in enumerate(use.shape):
+        inside = [slice(2, -2)] * use.ndim
+        for start in (0, 4):
+            inside[axis] = slice(start, start + n)
+            around.append(wide[tuple(inside)])
+    mean = averaged(bend.square().mean(0), torch.stack(around).all(0), width)
     return mean.expand_as(flow)
 
 
@@ -265,7 +289,7 @@ def _slope(field: torch.Tensor, axis: int) -> torch.Tensor:
 
 
 def at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Tensor:
-    """Displacement (2, z, y) in dt of the air that is at each pixel at mid-time."""
+    """Displacement (axes, ...) in dt of the air that is at each pixel at mid-time."""
     weights = [
         linear_weights(windows.centres(axis).to(flow), torch.arange(n).to(flow))
         for axis, n in enumerate(windows.shape)
@@ -279,18 +303,19 @@ def at_mid_time(flow: torch.Tensor, windows: Windows, centred: bool) -> torch.Te
 
 
 def _carried(image: torch.Tensor, wind: torch.Tensor) -> torch.Tensor:
-    """The image along paths in a steady wind (2, z, y), px per time step, one time step later."""
+    """The image along paths in a steady wind (axes, ...), px per time step, one time step later."""
     place = _pixels(image.shape, wind)
     for _ in range(_STEPS):
         half = place - _read(wind, place) / (2 * _STEPS)
         place = place - _read(wind, half) / _STEPS
-    spline, _ = band_limited([image])
-    return spline.sample(*place[:, None])[0][0]
+    spline, _ = band_limited([image], settings=_FILTERS[image.ndim])
+    at = place[:, None].to(spline.coefficients)
+    return spline.sample(*at)[0][0].to(wind), spline.holds(*at)[0]
 
 
 def _places(d: torch.Tensor, windows: Windows, centred: bool) -> torch.Tensor:
-    """Of vectors at mid-time, px (2, ...)."""
-    centres = [windows.centres(axis).to(d) for axis in (0, 1)]
+    """Of vectors at mid-time, px (axes, ...)."""
+    centres = [windows.centres(axis).to(d) for axis in range(windows.dims)]
     along = torch.stack(torch.meshgrid(*centres, indexing="ij"))
     return along + (0.0 if centred else 0.5) * d.nan_to_num(0.0)
 
@@ -300,7 +325,7 @@ def _pixels(shape: Sequence[int], like: torch.Tensor) -> torch.Tensor:
 
 
 def _read(field: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
-    """A field (n, z, y) on pixels at places (2, ...) between them, linearly; the rim's outside."""
+    """A field (n, ...) on pixels at places (axes, ...) between them, linearly; outside, the rim."""
     last = [max(1, n - 1) for n in field.shape[1:]]
     across = torch.stack([2 * p / n - 1 for p, n in zip(place, last, strict=True)][::-1], -1)
     return grid_sample(field[None], across[None], "bilinear", "border", align_corners=True)[0]

@@ -1,6 +1,7 @@
 """From two volumes to the wind in three dimensions: one call, CF data set out."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import torch
 import xarray as xr
@@ -8,6 +9,7 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.velocimetry.bootstrap import bootstrap_covariance, enough_windows
 from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.multipass import multipass
@@ -119,9 +121,18 @@ def retrieve_wind_volume(
     options = {"min_correlation": min_correlation, "noise": noise, "settings": settings}
     if method == "variational":
         options |= {"more": volumes[2:], "spacing": steps}
-    found = METHODS[method](*volumes[:2], template, search, stride, **options)
+    find = partial(METHODS[method], template=template, search=search, **options)
+    found = find(*volumes[:2], stride=stride)
     flag = resting.flags(found, whole, windows, True)
     flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+    if method == "correlation" and enough_windows(windows):
+        covariance = bootstrap_covariance(
+            volumes, found, windows, find, True, textured=flag & Flag.LOW_TEXTURE.value == 0
+        )
+        unknown = ~covariance.isfinite().all(0).all(0)
+        poor = uncertain(covariance) & ~unknown
+        both = Flag.LOW_TEXTURE * poor + Flag.ERROR_UNKNOWN * unknown
+        flag, found = flag | both.to(torch.int16), found._replace(covariance=covariance)
     if method == "correlation":
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, spacing=apart, continued=True)
