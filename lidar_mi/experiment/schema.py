@@ -384,6 +384,11 @@ class Experiment(Tabular, Section):
                 f"sensor.method: {method!r} is not allowed; expected one of retrieval.methods, "
                 f"{', '.join(self.retrieval.methods)}"
             )
+        if method == ImageMethod.WS and self.sensor.crossflow_std is None:
+            raise ValueError(
+                f"sensor.crossflow_std: missing; expected a speed, as method {method} knows the "
+                "standard errors of few vectors"
+            )
         return self
 
     @model_validator(mode="after")

@@ -422,6 +422,10 @@ def test_points_are_counted_as_each_table_means_them():
     [
         ({"doppler": None}, "sensor: not allowed without wake and doppler"),
         ({"sensor": {"method": "variational"}}, "sensor.method: 'variational' is not allowed"),
+        (
+            {"sensor": {"crossflow_std": None, "method": "ws"}, "retrieval": {"methods": ["ws"]}},
+            "sensor.crossflow_std: missing",
+        ),
         ({"sensor": {"directions": {"rows": 0}}}, "sensor.directions.rows: 0"),
         ({"sensor": {"errors": {"yaw": 0.1}}}, "sensor.errors.yaw: 0.1"),
     ],

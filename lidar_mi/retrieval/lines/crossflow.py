@@ -8,6 +8,7 @@ import xarray as xr
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_image
 from lidar_mi.retrieval.common_error import common_stderr, own_errors
+from lidar_mi.retrieval.velocimetry.quality import Flag
 
 # Standard deviation of v and w where the images gave no vector, over that of the valid ones:
 # vectors are rejected where the wind varies most.
@@ -45,6 +46,8 @@ def apparent_slopes(z: np.ndarray, y: np.ndarray, distance: float | None) -> np.
 def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
     """v and w of a data set with the covariance of their errors, or with errors of ``std`` (m/s).
 
+    Vectors that are flagged for nothing but an unknown error are valid with ``std``.
+
     Raises
     ------
     InputError
@@ -70,7 +73,10 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
             )
         *stderr, correlation = (_values(wind, name) for name in names)
         (first, second), correlation = own_errors(np.stack(stderr), correlation, common)
-    valid = (_values(wind, "flag") == 0) & np.isfinite(value).all(-1)
+    flag = wind.variables["flag"].transpose("z", "y").values.astype(int)
+    # an error that is given need not be known
+    allowed = 0 if std is None else Flag.ERROR_UNKNOWN.value
+    valid = (flag & ~allowed == 0) & np.isfinite(value).all(-1)
     valid &= (first > 0) & (second > 0) & (abs(correlation) < 1)
     if not valid.any():
         raise InputError("crossflow.flag: every vector is flagged; expected some valid ones")

@@ -20,6 +20,7 @@ from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors, scan_w
 from lidar_mi.retrieval.common_error import with_common_error
 from lidar_mi.retrieval.lines.combine import CombinedFlag, combine
 from lidar_mi.retrieval.lines.vectors import wind_from_triples
+from lidar_mi.retrieval.velocimetry.quality import Flag
 
 Y, Z = np.arange(-3, 3.1, 1.0), np.arange(-2, 2.1, 1.0)
 METRES = {"units": "m"}
@@ -580,6 +581,13 @@ def test_methods_that_know_no_errors():
         combine(bare, scan)
     found = combine(bare, scan, crossflow_std=0.7)
     assert float(found.v_stderr.mean()) == pytest.approx(0.7, rel=0.02)
+    # as weight shift flags it: an error that is given is known, an outlier remains one
+    bare["flag"] = bare["flag"].astype(np.uint16)
+    flagged = bare.assign(flag=bare["flag"] | np.uint16(Flag.ERROR_UNKNOWN))
+    flagged["flag"][:, :3] = np.uint16(Flag.MEDIAN_OUTLIER | Flag.ERROR_UNKNOWN)
+    found = combine(flagged, scan, crossflow_std=0.7)
+    bare["flag"][:, :3] = Flag.MEDIAN_OUTLIER.value
+    xr.testing.assert_equal(found, combine(bare, scan, crossflow_std=0.7))
 
 
 def test_data_set_survives_a_file(tmp_path):
