@@ -102,6 +102,8 @@ def variational(
         Wind times dt at the windows' centres at mid-time. `score` is the smallest correlation of an
         image with the mean of the others, `covariance` that of the posterior, from noise, misfit
         and prior, and of motion finer than the splines (`unresolved`), half of it in vortex cores.
+        In images whose noise is given it knows how little is known of the distribution of the
+        prior's strength (`prior.Prior.evened`).
         On undersampled images displacements have an error that is correlated among
         neighbours: up to 0.04 px on particles of 2 px (1/e^2), 0.01 px of 2.5 px, none on larger
         ones.
