@@ -36,6 +36,9 @@ _REGION, _LEVEL, _SHEAR, _ROUGH, _AROUND = 1.5, 1.25, 0.35, 0.7, 4.5
 # Independent windows of known error within those means (`_REGION`) that a variance needs: of the
 # two components of five windows, it is known to 45 %.
 _FEWEST = 5.0
+# Share of textured windows in which the known motion must be found again: a method that fails in
+# most of them has errors that the others do not tell.
+_FOUND = 0.5
 # Share of textured windows that must be clearly so: else most of them are by chance.
 _CLEAR = 0.5
 # Steps to the largest likelihood of the variances. A thousand change standard errors by 3 % or less
@@ -171,7 +174,7 @@ def bootstrap_covariance(
         same.append((flow - vectors).square())
         own = []
     predictors = torch.stack([*same, *own])
-    tried, number = [], torch.zeros_like(flow[0])
+    tried, number, again_found = [], torch.zeros_like(flow[0]), torch.zeros_like(flow[0])
     width = _REGION * per_template
     for apart in _APART[:repeats]:
         moved = (rest / level).roll([windows.template * part for part in apart], (-2, -1))
@@ -186,6 +189,7 @@ def bootstrap_covariance(
         rough = [_roughness(_continued(error, use) + smooth, use, _ROUGH * per_template)] * len(own)
         tried.append((error, use, torch.stack([*same, *rough])))
         number += _in_a_mean(windows.dims) * averaged(use.to(number), everywhere, width)
+        again_found += averaged(use.to(number), known, _AROUND * per_template) / repeats
     if not tried:
         return torch.full_like(torch.stack([found.d] * windows.dims), torch.nan)
     factors = _most_likely(
@@ -200,6 +204,7 @@ def bootstrap_covariance(
     scale = torch.tensordot(factors, predictors, 1).sqrt()
     covariance = torch.stack(means).mean(0).unflatten(0, (windows.dims,) * 2)
     covariance = covariance * scale[:, None] * scale[None]
+    number = torch.where(again_found < _FOUND, 0.0, number)
     if clear is not None:
         part = averaged(clear[some].to(scale), known, _AROUND * per_template)
         number = torch.where(part < _CLEAR, 0.0, number)
