@@ -100,6 +100,7 @@ def bootstrap_covariance(
 
     Where most windows around (Gaussian of 4.5 templates) that are textured are not `clear`, the few
     that are passed the tests of texture by chance, and their errors tell nothing.
+    Where the known motion is found again in less than half of them, neither do the errors of these.
 
     These predictors and numbers were chosen on seeds 41 to 46 of the cases of
     ``validation/coverage.py``. With one iterate of the sharpening, the standard errors of "cc" are
@@ -138,7 +139,7 @@ def bootstrap_covariance(
     torch.Tensor, shape (axes, axes, *windows.count)
         px^2; NaN where fewer than five independent windows around (valid retrievals, within the
         Gaussian of 1.5 templates) have a known error, and where fewer than half of the textured
-        windows around are clear.
+        windows around are clear, or have one.
     """
     # vectors of windows that overlap by more than half would cost more and tell little
     every = max(1, windows.template // 2 // windows.stride)

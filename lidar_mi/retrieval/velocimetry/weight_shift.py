@@ -32,7 +32,7 @@ def weight_shift(
 
     Most of its errors are candidates confused, of up to the size of the search region, and not
     normally distributed. Of a known motion (`bootstrap`) it then finds few vectors again, so that
-    `retrieve_wind` flags 93 to 100 % of them on random textures: their errors are unknown.
+    `retrieve_wind` flags all of them on random textures: their errors are unknown.
 
     Parameters
     ----------
