@@ -187,13 +187,33 @@ def test_errors_are_not_known_beyond_the_edge_of_valid_windows():
         return found._replace(d=d + 0.1 * random, flag=flag)
 
     still = found._replace(d=d, flag=torch.zeros_like(found.flag))
-    covariance = bootstrap_covariance([first, second], still, windows, right_half, False)
+    textured = torch.zeros_like(found.flag, dtype=torch.bool)
+    textured[:, edge:] = True
+    covariance = bootstrap_covariance(
+        [first, second], still, windows, right_half, False, textured=textured
+    )
     unknown = covariance.isnan().any(0).any(0).sum(1)
     # windows 4 px apart, the edge half way between two of them
     beyond = -1.5 * 8 / 4 * ndtri(5 / (2 * np.pi * 1.5**2)) + 0.5
     assert (abs(unknown - (edge - beyond)) <= 1.0).all()
     known = covariance[:, :, :, edge + 8 :]
     assert 0.06 < float(known.diagonal().mean().sqrt()) < 0.14
+
+
+@pytest.mark.parametrize(("share", "known"), [(0.35, False), (0.65, True)])
+def test_errors_are_not_known_where_the_motion_is_not_found_again(share, known):
+    """In windows by chance; the mean over 200 windows is uncertain by 0.035."""
+    first, second = torch.rand(2, 120, 200, generator=torch.Generator().manual_seed(1))
+    windows = Windows((120, 200), 8, 16, 4)
+    found = weight_shift(first, second, 8, 16, 4)
+    still = found._replace(d=0 * found.d.nan_to_num(), flag=0 * found.flag)
+
+    def some(*images, stride):
+        chance = torch.rand(found.flag.shape, generator=torch.Generator().manual_seed(2))
+        return still._replace(flag=(Flag.NO_MATCH.value * (chance > share)).to(found.flag))
+
+    covariance = bootstrap_covariance([first, second], still, windows, some, False)
+    assert bool((covariance.isfinite().all(0).all(0) == known).all())
 
 
 @pytest.mark.parametrize(
