@@ -115,10 +115,8 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
         )
     }
     expected |= {
-        f"{source}.{method}.{key}"
-        for source, method, key in product(
-            SOURCES, ("cc", "ws"), ("stderr_v", "stderr_w", "no_skill_fraction")
-        )
+        f"{source}.cc.{key}"
+        for source, key in product(SOURCES, ("stderr_v", "stderr_w", "no_skill_fraction"))
     }
     # the noise of an image that was rendered is known, and so how well a wind can be found in it
     expected |= {f"backscatter.cc.{q}_{name}" for q in ("bound", "efficiency") for name in "vw"}

@@ -73,7 +73,7 @@ def checked_crossflow(wind: xr.Dataset, std: float | None) -> Crossflow:
             )
         *stderr, correlation = (_values(wind, name) for name in names)
         (first, second), correlation = own_errors(np.stack(stderr), correlation, common)
-    flag = wind.variables["flag"].transpose("z", "y").values.astype(int)
+    flag = _values(wind, "flag").astype(int)
     # an error that is given need not be known
     allowed = 0 if std is None else Flag.ERROR_UNKNOWN.value
     valid = (flag & ~allowed == 0) & np.isfinite(value).all(-1)

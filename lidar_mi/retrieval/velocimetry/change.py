@@ -7,16 +7,14 @@ import numpy as np
 import torch
 
 from lidar_mi.retrieval.velocimetry.band_limit import (
-    frequencies,
     independent_fraction,
-    odd_fast_len,
+    radii,
     shell_means,
-    shells,
     wavenumbers,
 )
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.variance_components import most_likely
-from lidar_mi.retrieval.velocimetry.warping import Spline
+from lidar_mi.retrieval.velocimetry.warping import Spline, transform_sizes
 from lidar_mi.retrieval.velocimetry.windows import stored
 
 # Displacements, px, that splines do not resolve in vortex cores: below, no change is assumed.
@@ -46,9 +44,9 @@ def of_structure(spline: Spline, stack: torch.Tensor, noise: float) -> torch.Ten
     """
     known = torch.stack([torch.isfinite(image) for image in stack])
     stack = torch.stack([stored(filled(image)) for image in stack])
-    sizes = [odd_fast_len(n + 2 * spline.settings.margin) for n in spline.shape]
-    shell = shells(frequencies(sizes, stack), spline.shape)
     settings = spline.settings
+    sizes = transform_sizes(spline.shape, settings)
+    _, shell = radii(tuple(sizes), spline.shape, stack.dtype, stack.device)
     density, uncertainty = shell_means(stack, shell, sizes, settings.smoothing, known)
     structure = density > noise**2 * (1 + settings.threshold * uncertainty)
     return torch.where(structure, density - noise**2, 0.0)
@@ -162,7 +160,7 @@ def unexplained(
 
 def _independent_waves(spline: Spline, density: torch.Tensor) -> torch.Tensor:
     """Of the difference of two images, by shells."""
-    sizes = [odd_fast_len(n + 2 * spline.settings.margin) for n in spline.shape]
-    shell = shells(frequencies(sizes, density), spline.shape).flatten()
-    number = torch.bincount(shell, minlength=len(density))[: len(density)]
+    sizes = transform_sizes(spline.shape, spline.settings)
+    _, shell = radii(tuple(sizes), spline.shape, density.dtype, density.device)
+    number = torch.bincount(shell.flatten(), minlength=len(density))[: len(density)]
     return number * independent_fraction(spline.shape, sizes)

@@ -200,6 +200,13 @@ def uncertain(covariance: torch.Tensor, limit: float = 0.5) -> torch.Tensor:
     return worst_variance(covariance.nan_to_num(torch.inf, torch.inf)) > limit**2
 
 
+def of_bootstrap(covariance: torch.Tensor) -> torch.Tensor:
+    """Flags of displacements with standard errors from `bootstrap`: not known, or too large."""
+    unknown = ~covariance.isfinite().all(0).all(0)
+    poor = uncertain(covariance) & ~unknown
+    return (Flag.LOW_TEXTURE * poor + Flag.ERROR_UNKNOWN * unknown).to(torch.int16)
+
+
 def no_skill(d: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
     """Where a displacement's variance is above a quarter of the variance of all about their mean.
 

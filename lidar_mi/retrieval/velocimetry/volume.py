@@ -14,7 +14,7 @@ from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flag
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.multipass import multipass
 from lidar_mi.retrieval.velocimetry.outliers import median_outliers
-from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, uncertain
+from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, of_bootstrap, uncertain
 from lidar_mi.retrieval.velocimetry.relation import unrelated
 from lidar_mi.retrieval.velocimetry.rest import all_at_rest
 from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
@@ -80,7 +80,8 @@ def retrieve_wind_volume(
         At the windows' centres at mid-time: `u`, `v`, `w` and `u_stderr`, `v_stderr`, `w_stderr`
         (m s-1), `uv_correlation`, `uw_correlation`, `vw_correlation` of their errors,
         `correlation`, `flag` (bits of `quality.Flag`, 0 = valid; low texture means a standard error
-        beyond half a voxel in some direction). Rejected vectors keep their value, or NaN where
+        beyond half a voxel in some direction). Those of "correlation" are from `bootstrap` where
+        there are enough windows. Rejected vectors keep their value, or NaN where
         there is none.
 
     Raises
@@ -125,15 +126,12 @@ def retrieve_wind_volume(
     found = find(*volumes[:2], stride=stride)
     flag = resting.flags(found, whole, windows, True)
     flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
-    if method == "correlation" and enough_windows(windows):
-        covariance = bootstrap_covariance(
-            volumes, found, windows, find, True, textured=flag & Flag.LOW_TEXTURE.value == 0
-        )
-        unknown = ~covariance.isfinite().all(0).all(0)
-        poor = uncertain(covariance) & ~unknown
-        both = Flag.LOW_TEXTURE * poor + Flag.ERROR_UNKNOWN * unknown
-        flag, found = flag | both.to(torch.int16), found._replace(covariance=covariance)
     if method == "correlation":
+        if enough_windows(windows):
+            covariance = bootstrap_covariance(
+                volumes, found, windows, find, True, textured=flag & Flag.LOW_TEXTURE.value == 0
+            )
+            flag, found = flag | of_bootstrap(covariance), found._replace(covariance=covariance)
         apart = max(1, round(template / 2 / stride))
         outlier = median_outliers(found.d, spacing=apart, continued=True)
         flag = flag | (Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)

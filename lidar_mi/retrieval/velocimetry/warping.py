@@ -368,7 +368,7 @@ def mismatch(spline: Spline, rest: torch.Tensor, number: int | None = None) -> t
     torch.Tensor, shape (shells,)
         As `band_limited` takes it. Infinite where the filter passed nothing.
     """
-    sizes = [odd_fast_len(n + 2 * spline.settings.margin) for n in spline.shape]
+    sizes = transform_sizes(spline.shape, spline.settings)
     _, shell = radii(tuple(sizes), spline.shape, rest.dtype, rest.device)
     number = number or len(rest)
     rest = rest * (number / (number - 1)) ** 0.5

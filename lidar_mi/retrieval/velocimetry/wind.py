@@ -29,6 +29,7 @@ from lidar_mi.retrieval.velocimetry.quality import (
     filled,
     low_texture,
     non_finite,
+    of_bootstrap,
     uncertain,
 )
 from lidar_mi.retrieval.velocimetry.relation import unrelated
@@ -223,10 +224,10 @@ def retrieve_wind(
                 covariance = covariance + coherent_covariance(pair, found, windows, noise)
             found = found._replace(covariance=covariance)
         if found.covariance is not None:
-            unknown = ~found.covariance.isfinite().all(0).all(0) & bool(chosen.repeats)
-            poor = uncertain(found.covariance) & ~unknown
-            both = Flag.LOW_TEXTURE * poor + Flag.ERROR_UNKNOWN * unknown
-            flag = flag | both.to(torch.int16)
+            if chosen.repeats:
+                flag = flag | of_bootstrap(found.covariance)
+            else:
+                flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
         still = Standing()
         # a method that takes times by itself gives the displacement in dt
         by_itself = "times" in options
