@@ -46,7 +46,7 @@ _FINE, _LEVEL = 1.5, 6.0
 # Least displacement, px, as of `change.unexplained`; gain in the log-likelihood below which there
 # is none (one parameter gains as much by chance in 1 of 1300 cases; filters and outliers, which
 # the draws do not have, gained up to 4 where nothing but noise of 2 % was added).
-_LEAST, _GAIN = 0.03, 5.0
+_LEAST, _GAIN = 0.03, 10.0
 # Largest noise of coarse waves over that of the finest, where noise is not given.
 _COARSER = 5.0
 # Fraction by which the variance of a given noise may be larger than told.

@@ -4,7 +4,13 @@ import numpy as np
 import torch
 
 from lidar_mi.retrieval.velocimetry.windows import averaged
-from lidar_mi.retrieval.vortices.model_error import ModelError, model_error, of_change, spread_of
+from lidar_mi.retrieval.vortices.model_error import (
+    ModelError,
+    Response,
+    model_error,
+    of_change,
+    spread_of,
+)
 from lidar_mi.retrieval.vortices.robust_fit import Solution
 
 # Width (px) of the Gaussian over which squared residuals are averaged.
@@ -16,10 +22,13 @@ _BLOCK, _FEW_BLOCKS, _SIGNIFICANT = 12, 12, 4.0
 _LEAST_CURVATURE = 0.1
 
 
-def model_error_of(found: Solution, shortest: float, *, changes: bool = False) -> ModelError:
+def model_error_of(
+    found: Solution, shortest: float, *, changes: bool = False, before: bool = False
+) -> ModelError:
     """Departure of the flow from the model, from the residuals of a fit; see `model_error`.
 
-    With `changes`, residuals (z, y) may correlate for another reason, see `of_change`.
+    It is what the fit leaves of the departure, or, with `before`, the departure itself. With
+    `changes`, residuals (z, y) may correlate for another reason, see `of_change`.
     """
     misfit = found.misfit
     change = (
@@ -32,29 +41,36 @@ def model_error_of(found: Solution, shortest: float, *, changes: bool = False) -
     stiffness = torch.stack(
         [(weight * slope[a] * slope[b]).sum(0) for a, b in ((0, 0), (0, 1), (1, 1))]
     )
-    return model_error(force, stiffness, shortest, change)
+    response = Response(_responses(found), _inverse(found)) if before else None
+    return model_error(force, stiffness, shortest, change, response)
 
 
-def parameter_covariance(found: Solution, error: ModelError, excess: float) -> np.ndarray:
-    """Covariance (10, 10): H^-1 M H^-1, M that of the force by noise and flow error.
+def parameter_covariance(
+    found: Solution, left: ModelError, departure: ModelError, excess: float
+) -> np.ndarray:
+    """Covariance (10, 10): H^-1 M H^-1, M that of the force by noise and by the flow's departure.
 
-    The part by noise is multiplied by `excess`: for H of noisy slopes, 1 / `curvature`^2.
+    The part by noise is multiplied by `excess`: for H of noisy slopes, 1 / `curvature`^2. What is
+    `left` of the departure is in the residuals.
     """
-    misfit, weight = found.misfit, found.weight
-    spread = _noise_spread(found, error).double() * excess
-    jacobian, slope = misfit.jacobian, misfit.slope
-    if weight.ndim == 2:
-        weight, jacobian, slope = weight[None], jacobian[:, None], slope[:, None]
-    responses = torch.einsum("ozy,pozy,aozy->pazy", weight, jacobian, slope)
-    spread = spread + spread_of(responses, error).double()
+    spread = _noise_spread(found, left).double() * excess
+    spread = spread + spread_of(_responses(found), departure).double()
     inverse = _inverse(found)
     covariance = (inverse @ spread @ inverse)[:10, :10]
     attenuation = _attenuation(found)
     covariance = covariance + torch.outer(attenuation, attenuation)
     if not found.converged:
-        left = _remaining_step(found)
-        covariance = covariance + torch.outer(left, left)
+        left_over = _remaining_step(found)
+        covariance = covariance + torch.outer(left_over, left_over)
     return covariance.cpu().numpy()
+
+
+def _responses(found: Solution) -> torch.Tensor:
+    """Force (p, 2, z, y) on the parameters by a displacement (m/s of vectors) of the flow."""
+    misfit, weight = found.misfit, found.weight
+    if weight.ndim == 2:
+        return weight * misfit.jacobian[:, None] * misfit.slope
+    return torch.einsum("ozy,pozy,aozy->pazy", weight, misfit.jacobian, misfit.slope)
 
 
 def curvature(found: Solution, spacing: tuple[float, float]) -> float:

@@ -6,7 +6,7 @@ In the residuals of a fit it is a displacement correlated between neighbours, in
 error that does not average out over pixels.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -15,11 +15,14 @@ import torch
 from scipy.optimize import nnls
 
 from lidar_mi.retrieval.velocimetry.band_limit import even_fast_len
+from lidar_mi.retrieval.velocimetry.windows import linear_weights, separable
 
 # Lengths L_j in steps of the grid; those up to 1/5 of its shorter side are used.
 # Standard errors by which a departure must exceed what change and noise explain.
-_SIGNIFICANT = 4.0
+_SIGNIFICANT = 3.0
 _LENGTHS = (3.0, 6.0, 12.0, 24.0, 48.0)
+# Squares over which responses are summed, on grids whose shorter side is at least so long.
+_SIDE, _LARGE = 4, 64
 
 
 @dataclass(frozen=True)
@@ -129,6 +132,7 @@ def model_error(
     stiffness: torch.Tensor,
     shortest: float,
     change: torch.Tensor | None = None,
+    response: "Response | None" = None,
 ) -> ModelError:
     """The departure from a model that explains the correlation of the residuals of its fit.
 
@@ -148,6 +152,10 @@ def model_error(
     change : torch.Tensor, optional
         Correlation by another cause, of unknown amplitude, by the lags of `lags_used`; see
         `of_change`.
+    response : Response, optional
+        Of the fit. Then the departure is that before the fit, which absorbs part of it: what the
+        residuals lack is the expected part of a departure of each length (restricted maximum
+        likelihood: Patterson & Thompson 1971, Biometrika 58, 545-554). Left out: what is left.
     """
     lags = lags_used(force)
     observed = lags.autocorrelation(force, (1.0, 1.0))
@@ -164,6 +172,9 @@ def model_error(
         return ModelError()
     relative = unit.take(used) / scale
     columns = [relative * torch.exp(-square / (2 * n**2)) for n in lengths]
+    if response is not None:
+        taken = response.absorbed(stiffness, lags, lengths)
+        columns = [c - part.take(used) / scale for c, part in zip(columns, taken, strict=True)]
     if change is not None:
         columns.append(change.take(used) / change.abs().max().clamp(min=1e-300))
     # normalised in both directions: least squares needs numbers near one
@@ -208,6 +219,86 @@ def lags_used(like: torch.Tensor) -> Lags:
 def _lengths(shape: tuple[int, int]) -> list[float]:
     side = min(shape)
     return [length for length in _LENGTHS if length <= side / 5] or [side / 5]
+
+
+@dataclass(frozen=True)
+class Response:
+    """How the parameters of a fit follow a departure d of the flow: by H^-1 sum_x P(x) . d(x).
+
+    Attributes
+    ----------
+    force : torch.Tensor, shape (p, 2, z, y)
+        P: weight times slope times derivative by each parameter.
+    inverse : torch.Tensor, shape (p, p)
+        H^-1.
+    """
+
+    force: torch.Tensor
+    inverse: torch.Tensor
+
+    def absorbed(
+        self, stiffness: torch.Tensor, lags: Lags, lengths: Sequence[float]
+    ) -> Iterator[torch.Tensor]:
+        """What is missing in the correlation of `model_error` for each length, by lags.
+
+        The force of a departure d is A d before the fit and A d - P a after it, with its response
+        a. For a unit variance the expectation of a d(x) is K(x) = H^-1 sum_x' P(x') C(x - x'), so
+        that the correlations with each other of A K and P, and of P with itself, tell what is
+        missing. They are sums over squares of 4 pixels, between which lags are interpolated.
+        """
+        side = _SIDE if min(lags.shape) >= _LARGE else 1
+        force, stiff = (_sums(field, side) for field in (self.force, stiffness))
+        # as far as the longest covariance reaches
+        coarse = Lags(tuple(force.shape[-2:]), force, 2 * lags.reach / side)
+        inverse = self.inverse.to(force)
+        waves = coarse.transform(force)
+        follow = torch.tensordot(inverse.to(waves), waves, 1)
+        rows, columns = coarse.shape
+        to_lags = _interpolation(lags, coarse, side)
+        for length in lengths:
+            # means over two squares of a Gaussian
+            wide = (length / side) ** 2 + (1 - side**-2) / 6
+            share = (length / side) ** 2 / wide
+            covariance = share * torch.exp(-coarse.distance().square() / (2 * wide))
+            spectrum = torch.fft.rfft2(covariance).real.clamp(min=0)
+            back = torch.fft.ifft(follow * spectrum, dim=-2)[..., :rows, :]
+            expected = torch.fft.irfft(back, n=coarse.sizes[1])[..., :columns]
+            spread = torch.einsum("iazy,jazy->ij", expected, force) @ inverse
+            first, second = expected.unbind(1)
+            moved = torch.stack(
+                [stiff[0] * first + stiff[1] * second, stiff[1] * first + stiff[2] * second], 1
+            )
+            cross = coarse.transform(moved) - torch.tensordot(spread.to(waves), waves, 1) / 2
+            power = 2 * (cross.conj() * waves).real.sum((0, 1))
+            along_z = torch.fft.ifft(power, dim=0)[: coarse.rows]
+            found = torch.fft.irfft(along_z, n=coarse.sizes[1]) / side**2
+            yield separable(torch.fft.fftshift(found, 1), to_lags)
+
+
+def _sums(field: torch.Tensor, side: int) -> torch.Tensor:
+    """Sums of fields (..., z, y) over squares; what is missing at the edges is zero."""
+    pad = [extra for n in reversed(field.shape[-2:]) for extra in (0, -n % side)]
+    padded = torch.nn.functional.pad(field, pad).flatten(0, -3)
+    return (side**2 * torch.nn.functional.avg_pool2d(padded, side)).unflatten(
+        0, field.shape[:-2]
+    )
+
+
+def _interpolation(lags: Lags, coarse: Lags, side: int) -> list[torch.Tensor]:
+    """Matrices along z and y from lags of squares, those along y in ascending order, to `lags`."""
+    columns = coarse.sizes[1]
+    known = (
+        torch.arange(coarse.rows),
+        torch.arange(columns) - columns // 2,
+    )
+    wanted = (
+        torch.arange(lags.rows),
+        torch.fft.fftfreq(lags.sizes[1], 1 / lags.sizes[1]),
+    )
+    return [
+        linear_weights(side * old.to(lags.like), new.to(lags.like))
+        for old, new in zip(known, wanted, strict=True)
+    ]
 
 
 def of_change(residual: torch.Tensor, slope: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
