@@ -279,22 +279,14 @@ def _sums(field: torch.Tensor, side: int) -> torch.Tensor:
     """Sums of fields (..., z, y) over squares; what is missing at the edges is zero."""
     pad = [extra for n in reversed(field.shape[-2:]) for extra in (0, -n % side)]
     padded = torch.nn.functional.pad(field, pad).flatten(0, -3)
-    return (side**2 * torch.nn.functional.avg_pool2d(padded, side)).unflatten(
-        0, field.shape[:-2]
-    )
+    return (side**2 * torch.nn.functional.avg_pool2d(padded, side)).unflatten(0, field.shape[:-2])
 
 
 def _interpolation(lags: Lags, coarse: Lags, side: int) -> list[torch.Tensor]:
     """Matrices along z and y from lags of squares, those along y in ascending order, to `lags`."""
     columns = coarse.sizes[1]
-    known = (
-        torch.arange(coarse.rows),
-        torch.arange(columns) - columns // 2,
-    )
-    wanted = (
-        torch.arange(lags.rows),
-        torch.fft.fftfreq(lags.sizes[1], 1 / lags.sizes[1]),
-    )
+    known = (torch.arange(coarse.rows), torch.arange(columns) - columns // 2)
+    wanted = (torch.arange(lags.rows), torch.fft.fftfreq(lags.sizes[1], 1 / lags.sizes[1]))
     return [
         linear_weights(side * old.to(lags.like), new.to(lags.like))
         for old, new in zip(known, wanted, strict=True)
