@@ -17,9 +17,9 @@ from scipy.optimize import nnls
 from lidar_mi.retrieval.velocimetry.band_limit import even_fast_len
 from lidar_mi.retrieval.velocimetry.windows import linear_weights, separable
 
-# Lengths L_j in steps of the grid; those up to 1/5 of its shorter side are used.
 # Standard errors by which a departure must exceed what change and noise explain.
 _SIGNIFICANT = 3.0
+# Lengths L_j in steps of the grid; those up to 1/5 of its shorter side are used.
 _LENGTHS = (3.0, 6.0, 12.0, 24.0, 48.0)
 # Squares over which responses are summed, on grids whose shorter side is at least so long.
 _SIDE, _LARGE = 4, 64
