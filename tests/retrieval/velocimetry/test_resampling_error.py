@@ -151,11 +151,12 @@ def test_stated_errors_of_scattered_beams(px):
     """A serpentine of 0.1 s whose beams scatter, 3 of 20 % noise, over 12 seeds.
 
     Seeds are independent, vectors are not: 3 standard errors of the mean over seeds. Not too small,
-    and at most 20 % too large, as what resampling adds is an upper estimate for short scales, and
-    vectors' have what the prior's strength may do (they are 15 % too large, those of fits right).
+    and at most 30 % too large, as what resampling adds is an upper estimate for short scales, and
+    vectors' have twice what a more even prior changes (they are a third too large, 8 % of it for
+    that; those of fits are right).
     """
     runs = [normalised("serpentine", px, [seed]) for seed in range(101, 113)]
-    large = 1.2
+    large = 1.3
     for offs in zip(*runs, strict=True):
         for statistic, least, most in (
             (lambda off: (off**2).mean(), large**-2, 1.0),
