@@ -109,6 +109,10 @@ class Lags:
         power = sum(
             w * (f.real.square() + f.imag.square()) for f, w in zip(waves, weights, strict=True)
         )
+        return self.by_lags(power)
+
+    def by_lags(self, power: torch.Tensor) -> torch.Tensor:
+        """Correlation of a (cross) power spectrum, for lags of 0 or more along z."""
         along_z = torch.fft.ifft(power, dim=0)[: self.rows]
         return torch.fft.irfft(along_z, n=self.sizes[1])
 
@@ -270,8 +274,7 @@ class Response:
             )
             cross = coarse.transform(moved) - torch.tensordot(spread.to(waves), waves, 1) / 2
             power = 2 * (cross.conj() * waves).real.sum((0, 1))
-            along_z = torch.fft.ifft(power, dim=0)[: coarse.rows]
-            found = torch.fft.irfft(along_z, n=coarse.sizes[1]) / side**2
+            found = coarse.by_lags(power) / side**2
             yield separable(torch.fft.fftshift(found, 1), to_lags)
 
 
@@ -285,8 +288,8 @@ def _sums(field: torch.Tensor, side: int) -> torch.Tensor:
 def _interpolation(lags: Lags, coarse: Lags, side: int) -> list[torch.Tensor]:
     """Matrices along z and y from lags of squares, those along y in ascending order, to `lags`."""
     columns = coarse.sizes[1]
-    known = (torch.arange(coarse.rows), torch.arange(columns) - columns // 2)
-    wanted = (torch.arange(lags.rows), torch.fft.fftfreq(lags.sizes[1], 1 / lags.sizes[1]))
+    known = torch.arange(coarse.rows), torch.arange(columns) - columns // 2
+    wanted = torch.arange(lags.rows), torch.fft.fftfreq(lags.sizes[1], 1 / lags.sizes[1])
     return [
         linear_weights(side * old.to(lags.like), new.to(lags.like))
         for old, new in zip(known, wanted, strict=True)
