@@ -25,17 +25,21 @@ from lidar_mi.retrieval.velocimetry.windows import averaged, working
 Left = Callable[[torch.Tensor], torch.Tensor]
 """From a difference (z, y) of the images in dt to what the fitted flow leaves of it."""
 
-CORRELATED_AREA = 60.0
+CORRELATED_AREA = 50.0
 """Area over which structure moves alike, px^2, as noise in waves of several pixels counts it.
 
-Chosen on seeds 41 to 43 of the true second states of ``validation/coverage.py``: 60 to 200 are
+Chosen on seeds 41 to 46 of the true second states of ``validation/coverage.py``: 35 to 50 are
 alike.
+"""
+
+SMOOTH = 3.0
+"""Standard deviation of the Gaussian mean that makes a random displacement smooth, px.
+
+Between 3 and 6 px the likelihood of 12 true second states of ``validation/coverage.py`` prefers 3.
 """
 
 # Random differences of each kind that are sent through the fit.
 _DRAWS = 4
-# Standard deviation of the Gaussian mean that makes a random displacement smooth, px.
-_SMOOTH = 6.0
 # Of the Gaussian mean of differences: waves that are coherent pass, noise does not.
 _COARSE = 3.0
 # Of the Gaussian means between which noise and coherent differences are told apart by place, their
@@ -104,10 +108,11 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
     none is given.)
 
     On the shipped wake d is known: with its own state 0.1 s later, the rms difference over the rms
-    slope at the true flow is 0.062 px. From images with texture of 5 to 20 % it is estimated as
-    0.048 to 0.072 px, though the flow absorbs most of such differences; with 2 % as 0.12 px. Where
-    the displacement varies over 16 px, twice as far as is assumed, the flow follows it better, and
-    the estimate is a sixth too small. It does not tell what changes in proportion to the slope from
+    slope of smoke without texture is 0.08 px at the true flow. From images with texture of 5 to
+    20 % it is estimated as 0.065 to 0.088 px, though the flow absorbs most of such differences;
+    with 2 % as 0.15 px. Where the displacement varies over 8 px instead of the 3 px that are
+    assumed (standard deviations of Gaussians), the flow follows it better, and the estimate is an
+    eighth too small. It does not tell what changes in proportion to the slope from
     what moves, and is one number for the whole image.
 
     Parameters
@@ -128,7 +133,6 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
         return 0.0
     time = images.time.to(linear.warped).reshape(-1, 1, 1)
     difference = (time * linear.warped).sum(0) / time.square().sum() * valid
-    steep = steepness_of_structure(working(linear.slope), valid).sqrt()
     fine = (difference - averaged(difference, valid, _FINE)).square()
     level = averaged(fine, valid, _LEVEL).sqrt()
     excess = level
@@ -151,19 +155,12 @@ def mean_square_displacement(images: Images, linear: Linear, left: Left) -> floa
     def replaced_left(one: torch.Tensor) -> torch.Tensor:
         return squares(left(excess * one))
 
-    def moved_left(draw: torch.Tensor) -> torch.Tensor:
-        smooth = averaged(draw, torch.ones_like(valid), _SMOOTH)
-        return squares(left(steep * smooth / smooth.std()))
-
-    def mean(of_draw: Left, draws: Iterator[torch.Tensor]) -> torch.Tensor:
-        return sum(mapped(of_draw, draws)) / _DRAWS
-
-    noise = mean(noise_left, _white_noise(images, _DRAWS, 1))
-    moved = mean(moved_left, normal_fields(difference, _DRAWS, 2))
+    noise = _mean(noise_left, _white_noise(images, _DRAWS, 1))
+    moved = _mean(lambda one: squares(left(one)), _displacements(linear))
     # the same fit of the same draws, unless there is more than the noise
     replaced = noise
     if excess is not level:
-        replaced = mean(replaced_left, _white_noise(images, _DRAWS, 1))
+        replaced = _mean(replaced_left, _white_noise(images, _DRAWS, 1))
     found = squares(difference)
     use = (averaged(valid.to(found), torch.ones_like(valid), _REGION)[::_APART, ::_APART] > 0.5) & (
         found > 0
@@ -195,6 +192,32 @@ def _component(
     with_it, factors = most_likely(found, terms, limits, _SQUARES, held, _FLOOR)
     square = float(factors[-1])
     return square if without - with_it > _GAIN and square > _LEAST**2 else 0.0
+
+
+def square_left(linear: Linear, left: Left) -> torch.Tensor:
+    """Mean square of what is left of a displacement of 1 px of structure, (z, y).
+
+    Parameters
+    ----------
+    linear : Linear
+        About the fitted flow.
+    left : callable
+        See `what_is_left`.
+    """
+    return _mean(lambda one: left(one).square(), _displacements(linear))
+
+
+def _mean(of_draw: Left, draws: Iterator[torch.Tensor]) -> torch.Tensor:
+    return sum(mapped(of_draw, draws)) / _DRAWS
+
+
+def _displacements(linear: Linear) -> Iterator[torch.Tensor]:
+    """Differences by smooth random displacements of 1 px rms, (z, y); seeded."""
+    steep = steepness_of_structure(working(linear.slope), linear.valid).sqrt()
+    everywhere = torch.ones_like(linear.valid)
+    for draw in normal_fields(steep, _DRAWS, 2):
+        smooth = averaged(draw, everywhere, SMOOTH)
+        yield steep * smooth / smooth.std()
 
 
 def normal_fields(like: torch.Tensor, number: int, seed: int) -> Iterator[torch.Tensor]:

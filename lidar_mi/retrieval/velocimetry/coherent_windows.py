@@ -9,7 +9,12 @@ from collections.abc import Sequence
 import torch
 
 from lidar_mi.retrieval.velocimetry.bootstrap import at_mid_time
-from lidar_mi.retrieval.velocimetry.coherent_change import Left, mean_square_displacement
+from lidar_mi.retrieval.velocimetry.coherent_change import (
+    SMOOTH,
+    Left,
+    mean_square_displacement,
+    square_left,
+)
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.flow_spline import Axis, Mesh
 from lidar_mi.retrieval.velocimetry.likelihood import (
@@ -23,18 +28,20 @@ from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.windows import Windows, working
 
 
-def coherent_covariance(
+def coherent_change(
     stack: Sequence[torch.Tensor],
     found: Displacement,
     windows: Windows,
     noise: float | torch.Tensor | None,
-) -> torch.Tensor:
-    """Covariance of vectors by structure that moves otherwise than the air.
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Covariance of vectors by structure that moves otherwise than the air, and what is left of it.
 
     Where structure of slope s moves by e, the images differ by |s| e. Over a window, where e is
     alike, that displaces the vector by J^-1 <I' |s|> e, with the slopes I' of the image, J the mean
     over the window of their products, and s their Gaussian mean over 3 px. A window that holds
-    nothing but structure follows it, and fine texture beside it holds the vector.
+    nothing but structure follows it, and fine texture beside it holds the vector. e has a
+    correlation of exp(-r^2 / 4 S^2), S = 3 px. What is alike in a window of n px, its mean, has
+    1 / (1 + n^2 / 12 S^2) of the variance of e. The rest differs within the window, as noise does.
 
     The mean square of e is `coherent_change.mean_square_displacement`, about the flow of the
     vectors, as windows of least squares leave it.
@@ -51,8 +58,11 @@ def coherent_covariance(
 
     Returns
     -------
-    torch.Tensor, shape (2, 2, *windows.count)
+    covariance : torch.Tensor, shape (2, 2, *windows.count)
         px^2; 0 where air is carried as a whole.
+    left : torch.Tensor, shape (z, y)
+        Variance of the images' differences that displaced windows leave of this change: the
+        residuals contain it.
     """
     settings = VariationalSettings()
     images = prepared(stack, noise, 0.0, settings)
@@ -61,11 +71,13 @@ def coherent_covariance(
     pixels = [torch.arange(n).to(flow) for n in windows.shape]
     mesh = Mesh(axes, pixels)
     linear = linearised(images, mesh, mesh.fitted(at_mid_time(flow, windows, True)), settings)
-    square = mean_square_displacement(images, linear, left_by_windows(linear, windows))
+    left = left_by_windows(linear, windows)
+    square = mean_square_displacement(images, linear, left)
     slope = working(linear.slope)
     steep = steepness_of_structure(slope, linear.valid).sqrt()
     along = displacement_of_windows(slope, steep, windows)
-    return square * along[:, None] * along
+    alike = 1 / (1 + windows.template**2 / (12 * SMOOTH**2))
+    return alike * square * along[:, None] * along, square * square_left(linear, left)
 
 
 def left_by_windows(linear: Linear, windows: Windows) -> Left:

@@ -180,6 +180,9 @@ class VariationalSettings:
     rounds_changed : int
         Further rounds of the last level if structure moves through the plane (`change`), after a
         second estimate of the noise: the first flow absorbed part of the misfit.
+    rounds_finer : int
+        Further rounds of the last level if the misfit takes the place of a noise that was not
+        given: the prior is then that of images with more noise.
     robust : float
         Standard deviations beyond which residuals enter linearly (Huber 1964, Ann. Math. Stat.
         35, 73-101).
@@ -223,6 +226,7 @@ class VariationalSettings:
     rounds: tuple[int, ...] = (6, 4)
     noise_round: int = 2
     rounds_changed: int = 2
+    rounds_finer: int = 5
     robust: float = 3.0
     path_order: int = 6
     coloured: bool = True

@@ -178,9 +178,13 @@ def variational_and_flow(
                 if windows.dims == 2 and posterior is not None:
                     left = what_is_left(linear, mesh, posterior.response)
                     strain = mean_square_strain(mesh.slopes(coefficients))
+                white = images.white
                 images = with_local_noise(
                     images, linear, width, settings.coloured, apart, strain, left
                 )
+                # flow and prior so far are those of a noise that was far too large
+                if turn == settings.noise_round and images.white < white:
+                    rounds += settings.rounds_finer
                 rough = images.single()
             linear = linearised(rough, single, coefficients.float(), settings)
             posterior = solve(linear, single, coefficients, prior, settings, turn)

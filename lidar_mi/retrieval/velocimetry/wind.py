@@ -14,7 +14,7 @@ from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.beam_times import checked_times, vector_times
 from lidar_mi.retrieval.velocimetry.bootstrap import bootstrap_covariance
 from lidar_mi.retrieval.velocimetry.bound import displacement_bound
-from lidar_mi.retrieval.velocimetry.coherent_windows import coherent_covariance
+from lidar_mi.retrieval.velocimetry.coherent_windows import coherent_change
 from lidar_mi.retrieval.velocimetry.dataset import centres, dataset, field, flags, spacing, winds
 from lidar_mi.retrieval.velocimetry.illumination import described, illumination
 from lidar_mi.retrieval.velocimetry.methods import METHODS, Method
@@ -213,15 +213,14 @@ def retrieve_wind(
             # errors of what is at rest or saturated say nothing of the vectors around
             pair = _of_one_light(resting.left_out(whole[:2]), light)
             clear = clearly_textured(texture, min_texture, min_isotropy)
-            covariance = (
-                bootstrap_covariance(
-                    pair, found, windows, find, chosen.centred, chosen.repeats, ~low, clear
+            covariance = None
+            if standard_errors:
+                moved, left = 0.0, None
+                if chosen.centred:
+                    moved, left = coherent_change(pair, found, windows, noise)
+                covariance = moved + bootstrap_covariance(
+                    pair, found, windows, find, chosen.centred, chosen.repeats, ~low, clear, left
                 )
-                if standard_errors
-                else None
-            )
-            if covariance is not None and chosen.centred:
-                covariance = covariance + coherent_covariance(pair, found, windows, noise)
             found = found._replace(covariance=covariance)
         if found.covariance is not None:
             if chosen.repeats:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from lidar_mi.retrieval.velocimetry.coherent_windows import (
-    coherent_covariance,
+    coherent_change,
     displacement_of_windows,
 )
 from lidar_mi.retrieval.velocimetry.multipass import multipass
@@ -24,7 +24,7 @@ def stated(rms, fine, seed, noise=None):
     """Variance (2, *WINDOWS.count) of vectors of `multipass` by coherent change, px^2."""
     images = pair(seed, rms, fine=fine)
     found = multipass(*images, stride=4)
-    return coherent_covariance(images, found, WINDOWS, noise).diagonal().movedim(-1, 0)
+    return coherent_change(images, found, WINDOWS, noise)[0].diagonal().movedim(-1, 0)
 
 
 def test_a_window_follows_structure_and_fine_texture_holds_it():
@@ -76,5 +76,5 @@ def test_standard_errors_of_multipass_hold_in_smoke(case):
 def test_identical_images():
     image = pair(1, 0.0)[0]
     found = multipass(image, image.clone(), stride=4)
-    covariance = coherent_covariance([image, image], found, WINDOWS, None)
-    assert torch.equal(covariance, torch.zeros_like(covariance))
+    for part in coherent_change([image, image], found, WINDOWS, None):
+        assert torch.equal(part, torch.zeros_like(part))
