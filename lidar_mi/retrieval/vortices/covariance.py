@@ -29,11 +29,13 @@ def model_error_of(
 
     It is what the fit leaves of the departure, or, with `before`, the departure itself. With
     `changes`, residuals (z, y) may correlate for another reason, see `of_change`.
+
+    Each force then counts by the inverse of its variance in the waves of the departure that was
+    found first: by noise A, by the departure A^2 times its spectral density, with A the mean
+    stiffness around. So where images tell much, places count alike. Else those where smoke is
+    steepest would stand for the whole image, and the departure be too large where it grows there.
     """
     misfit = found.misfit
-    change = (
-        of_change(misfit.residual, found.weight * misfit.slope, misfit.valid) if changes else None
-    )
     residual, slope, weight = misfit.residual, misfit.slope, found.weight
     if residual.ndim == 2:
         residual, slope, weight = residual[None], slope[:, None], weight[None]
@@ -41,8 +43,21 @@ def model_error_of(
     stiffness = torch.stack(
         [(weight * slope[a] * slope[b]).sum(0) for a, b in ((0, 0), (0, 1), (1, 1))]
     )
-    response = Response(_responses(found), _inverse(found)) if before else None
-    return model_error(force, stiffness, shortest, change, response)
+    follow = (_responses(found), _inverse(found)) if before else None
+
+    def of_forces(even: torch.Tensor | float, tested: bool) -> ModelError:
+        change, response = None, follow and Response(*follow, even)
+        if changes:
+            steep = even * found.weight * misfit.slope
+            change = of_change(misfit.residual, steep, misfit.valid)
+        return model_error(even * force, even * stiffness, shortest, change, response, tested)
+
+    first = of_forces(1.0, True)
+    if not changes or not first.variances:
+        return first
+    information = averaged(stiffness[0] + stiffness[2], misfit.valid, _NEAR / 2) / 2
+    again = of_forces(1 / (1 + first.density * information), False)
+    return again if again.variances else first
 
 
 def parameter_covariance(

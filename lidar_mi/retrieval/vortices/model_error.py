@@ -45,6 +45,15 @@ class ModelError:
         """Of each component at a place."""
         return float(sum(self.variances))
 
+    @property
+    def density(self) -> float:
+        """Spectral density of each component, in the mean over the waves that have its variance.
+
+        Of a Gaussian covariance half of that at wavenumber 0: pi a_j L_j^2, per step squared.
+        """
+        pairs = zip(self.variances, self.lengths, strict=True)
+        return float(np.pi * sum(variance * length**2 for variance, length in pairs))
+
     def covariance(self, distance: torch.Tensor) -> torch.Tensor:
         """At distances in steps of the grid."""
         total = torch.zeros_like(distance)
@@ -137,6 +146,7 @@ def model_error(
     shortest: float,
     change: torch.Tensor | None = None,
     response: "Response | None" = None,
+    tested: bool = True,
 ) -> ModelError:
     """The departure from a model that explains the correlation of the residuals of its fit.
 
@@ -160,6 +170,8 @@ def model_error(
         Of the fit. Then the departure is that before the fit, which absorbs part of it: what the
         residuals lack is the expected part of a departure of each length (restricted maximum
         likelihood: Patterson & Thompson 1971, Biometrika 58, 545-554). Left out: what is left.
+    tested : bool
+        Whether a departure that is not significant is none; with `change` only.
     """
     lags = lags_used(force)
     observed = lags.autocorrelation(force, (1.0, 1.0))
@@ -184,7 +196,7 @@ def model_error(
     # normalised in both directions: least squares needs numbers near one
     amplitudes, _ = nnls(torch.stack(columns, 1).cpu().numpy(), (found / size).cpu().numpy())
     variances = amplitudes[: len(lengths)] * size
-    if change is not None:
+    if change is not None and tested:
         explained = scale * sum(
             a * column for a, column in zip(variances, columns[:-1], strict=True)
         )
@@ -235,10 +247,13 @@ class Response:
         P: weight times slope times derivative by each parameter.
     inverse : torch.Tensor, shape (p, p)
         H^-1.
+    even : torch.Tensor, shape (z, y)
+        Factor by which the forces are multiplied that are correlated; one if left out.
     """
 
     force: torch.Tensor
     inverse: torch.Tensor
+    even: torch.Tensor | float = 1.0
 
     def absorbed(
         self, stiffness: torch.Tensor, lags: Lags, lengths: Sequence[float]
@@ -246,17 +261,19 @@ class Response:
         """What is missing in the correlation of `model_error` for each length, by lags.
 
         The force of a departure d is A d before the fit and A d - P a after it, with its response
-        a. For a unit variance the expectation of a d(x) is K(x) = H^-1 sum_x' P(x') C(x - x'), so
+        a; `stiffness` is A times `even`. For a unit variance the expectation of a d(x) is K(x) = H^-1 sum_x' P(x') C(x - x'), so
         that the correlations with each other of A K and P, and of P with itself, tell what is
         missing. They are sums over squares of 4 pixels, between which lags are interpolated.
         """
         side = _SIDE if min(lags.shape) >= _LARGE else 1
-        force, stiff = (_sums(field, side) for field in (self.force, stiffness))
+        force, seen, stiff = (
+            _sums(field, side) for field in (self.force, self.even * self.force, stiffness)
+        )
         # as far as the longest covariance reaches
         coarse = Lags(tuple(force.shape[-2:]), force, 2 * lags.reach / side)
         inverse = self.inverse.to(force)
-        waves = coarse.transform(force)
-        follow = torch.tensordot(inverse.to(waves), waves, 1)
+        waves = coarse.transform(seen)
+        follow = torch.tensordot(inverse.to(waves), coarse.transform(force), 1)
         rows, columns = coarse.shape
         to_lags = _interpolation(lags, coarse, side)
         for length in lengths:
