@@ -40,13 +40,14 @@ def estimated(images, noise=None):
 def test_the_displacement_of_smoke_is_found():
     """Of six random ones of 0.15 px, of which a rim shows the component across it.
 
-    They vary over twice the distance that the estimate assumes, and the flow follows them better:
-    the mean may be too small by 40 %.
+    They vary over more than twice the distance that the estimate assumes, and the flow follows them
+    better: the mean may be too small by 30 %.
     """
     rms = 0.15
     found = np.array([estimated(pair(seed, rms)) for seed in range(11, 17)])
     across = rms / np.sqrt(2)
-    assert 0.6 * across < found.mean() < 1.2 * across
+    scatter = 3 * found.std(ddof=1) / np.sqrt(len(found))
+    assert 0.7 * across - scatter < found.mean() < across + scatter
     assert (found > 0.4 * across).all() and (found < 1.6 * across).all()
 
 
@@ -61,14 +62,14 @@ def test_noise_that_varies_as_the_slopes_do_hides_no_displacement():
     steep = np.hypot(*np.gradient(smoke(Z, Y)))
     noise = 0.01 + 0.15 * steep / steep.max()
     rms = 0.15
-    found = [
-        estimated(pair(seed, moved, noise=noise), torch.as_tensor(noise))
-        for moved in (rms, 0.0)
-        for seed in (31, 32, 33)
-    ]
+    found, none = (
+        np.array([estimated(pair(s, moved, noise=noise), torch.as_tensor(noise)) for s in seeds])
+        for moved, seeds in ((rms, range(31, 37)), (0.0, range(31, 34)))
+    )
     across = rms / np.sqrt(2)
-    assert 0.6 * across < np.mean(found[:3]) < 1.2 * across
-    assert found[3:] == [0.0] * 3
+    scatter = 3 * found.std(ddof=1) / np.sqrt(len(found))
+    assert 0.7 * across - scatter < found.mean() < across + scatter
+    assert (none == 0.0).all()
 
 
 @pytest.mark.parametrize(
