@@ -5,6 +5,8 @@ variance of the missed flow, and noise of pixels taken for it. A departure that 
 found as it was before: against the covariances of all pairs of places.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -180,12 +182,21 @@ def response_of(g, weight, jacobian, inverse):
     return Response(torch.as_tensor(force), torch.as_tensor(inverse)), torch.as_tensor(stiffness)
 
 
-def test_what_a_fit_absorbs_is_that_of_all_pairs_of_places():
-    """E[q q^T] of a departure before the fit, less that after it, from dense matrices."""
+@pytest.mark.parametrize("uneven", [False, True])
+def test_what_a_fit_absorbs_is_that_of_all_pairs_of_places(uneven):
+    """E[q q^T] of a departure before the fit, less that after it, from dense matrices.
+
+    Of forces q as they are, and of forces that count more at some places than at others.
+    """
     shape, length = (12, 15), 2.0
     g, weight, jacobian, inverse = linear_fit(shape, 1)
     response, stiffness = response_of(g, weight, jacobian, inverse)
     lags = Lags(shape, stiffness)
+    even = np.ones(shape)
+    if uneven:
+        even = np.random.default_rng(4).uniform(0.2, 1.0, shape)
+        response = replace(response, even=torch.as_tensor(even))
+        stiffness = torch.as_tensor(even) * stiffness
     (found,) = response.absorbed(stiffness, lags, [length])
     covariance = dense(ModelError((1.0,), (length,)), shape)
     w, j = weight.ravel(), jacobian.reshape(len(jacobian), -1)
@@ -194,7 +205,8 @@ def test_what_a_fit_absorbs_is_that_of_all_pairs_of_places():
     moved = sum(np.outer(part, part) * covariance for part in g.reshape(2, -1))
     left = after @ moved @ after.T
     for part in g.reshape(2, -1):
-        lost += np.outer(w * part, w * part) * (moved - left)
+        counted = even.ravel() * w * part
+        lost += np.outer(counted, counted) * (moved - left)
     rows, columns = np.indices(shape).reshape(2, -1)
     for dz, dy in ((0, 0), (1, 0), (2, 3), (4, -5), (0, 6)):
         pairs = (rows[None] - rows[:, None] == dz) & (columns[None] - columns[:, None] == dy)
