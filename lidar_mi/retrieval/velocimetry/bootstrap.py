@@ -108,16 +108,15 @@ def bootstrap_covariance(
 
     These predictors and numbers were chosen on seeds 41 to 46 of the cases of
     ``validation/coverage.py``. With steps of 1 instead of 0.8 the standard errors of "cc" are 3 to
-    4 % larger, and too large in blurred images. Where air is carried exactly, with <> over 1 template the variance of
-    normalised errors is 10 to 15 % larger, and with the level over 3 templates "multipass" has 2 to
-    3 points more errors within one standard error.
+    4 % larger, and too large in blurred images. Where air is carried exactly, with <> over 1
+    template the variance of normalised errors is 10 to 15 % larger, and with the level over 3
+    templates "multipass" has 2 to 3 points more errors within one standard error.
 
     The wind is not known better than its vectors: in vortex cores smaller than a window, standard
     errors are too small, and so they are where air changes as if it moved: see
-    `coherent_windows.coherent_change`. On a steep edge of
-    brightness that stands still (from 1 to 0.2 within 4 px) vectors of "multipass" err by three
-    standard errors; on its bright side, up to three templates away, errors are stated 1.5 to 2
-    times too large.
+    `coherent_windows.coherent_change`. On a steep edge of brightness that stands still (from 1 to
+    0.2 within 4 px) vectors of "multipass" err by three standard errors; on its bright side, up to
+    three templates away, errors are stated 1.5 to 2 times too large.
 
     Parameters
     ----------

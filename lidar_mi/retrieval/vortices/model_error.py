@@ -261,9 +261,10 @@ class Response:
         """What is missing in the correlation of `model_error` for each length, by lags.
 
         The force of a departure d is A d before the fit and A d - P a after it, with its response
-        a; `stiffness` is A times `even`. For a unit variance the expectation of a d(x) is K(x) = H^-1 sum_x' P(x') C(x - x'), so
-        that the correlations with each other of A K and P, and of P with itself, tell what is
-        missing. They are sums over squares of 4 pixels, between which lags are interpolated.
+        a; `stiffness` is A times `even`. For a unit variance the expectation of a d(x) is
+        K(x) = H^-1 sum_x' P(x') C(x - x'), so that the correlations with each other of A K and P,
+        and of P with itself, tell what is missing. They are sums over squares of 4 pixels, between
+        which lags are interpolated.
         """
         side = _SIDE if min(lags.shape) >= _LARGE else 1
         force, seen, stiff = (

@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from lidar_mi.retrieval.velocimetry.coherent_windows import (
-    coherent_change,
-    displacement_of_windows,
-)
+from lidar_mi.retrieval.velocimetry.coherent_windows import coherent_change, displacement_of_windows
 from lidar_mi.retrieval.velocimetry.multipass import multipass
 from lidar_mi.retrieval.velocimetry.windows import Windows
 from tests.support.smoke import SHAPE, pair

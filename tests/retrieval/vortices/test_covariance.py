@@ -68,7 +68,8 @@ def test_steep_places_do_not_stand_for_the_whole_image(larger):
     for seed in range(12):
         random = np.random.default_rng([seed, 3])
         noises = [random.standard_normal(shape) for _ in range(5)]
-        unit = [gaussian_filter(n, s, mode="wrap") for n, s in zip(noises, (1, 1, 4.24, 4.24, 0))]
+        widths = 1.0, 1.0, 4.24, 4.24, 0.0
+        unit = [gaussian_filter(n, s, mode="wrap") for n, s in zip(noises, widths, strict=True)]
         unit = [part / part.std() for part in unit]
         slope = np.stack(unit[:2]) * (0.2 + 0.8 * steep)
         residual = (slope * np.stack(unit[2:4]) * size).sum(0) + 0.05 * unit[4]
