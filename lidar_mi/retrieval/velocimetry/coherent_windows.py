@@ -77,7 +77,8 @@ def coherent_change(
     steep = steepness_of_structure(slope, linear.valid).sqrt()
     along = displacement_of_windows(slope, steep, windows)
     alike = 1 / (1 + windows.template**2 / (12 * SMOOTH**2))
-    return alike * square * along[:, None] * along, square * square_left(linear, left)
+    remains = square * square_left(linear, left) if square else torch.zeros_like(steep)
+    return alike * square * along[:, None] * along, remains
 
 
 def left_by_windows(linear: Linear, windows: Windows) -> Left:

@@ -11,6 +11,7 @@ import torch
 from scipy.special import ndtri
 
 from lidar_mi.retrieval.velocimetry.bootstrap import _most_likely, bootstrap_covariance
+from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.methods import METHODS
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.weight_shift import weight_shift
@@ -198,6 +199,32 @@ def test_errors_are_not_known_beyond_the_edge_of_valid_windows():
     assert (abs(unknown - (edge - beyond)) <= 1.0).all()
     known = covariance[:, :, :, edge + 8 :]
     assert 0.06 < float(known.diagonal().mean().sqrt()) < 0.14
+
+
+@pytest.mark.parametrize(("besides", "left"), [(0.0, 1.0), (0.75, 0.25), (2.0, 0.1)])
+def test_changes_that_are_stated_besides_are_not_in_the_residual(besides, left):
+    """Errors in proportion to the residual: their variance is what remains, a tenth at least."""
+    first = torch.as_tensor(texture(plane_waves(1, 4.0, 0.5), *np.meshgrid(*axes(160, 120))))
+    random = torch.Generator().manual_seed(1)
+    second = first + 0.05 * torch.randn(first.shape, generator=random, dtype=torch.float64)
+    windows = Windows(tuple(first.shape), 8, 16, 4)
+    found = weight_shift(first, second, 8, 16, 4)
+    still = found._replace(d=0 * found.d.nan_to_num(), flag=0 * found.flag)
+
+    def of_the_residual(image1, image2, stride):
+        means = 10 * windows.of_templates((image2 - image1).nan_to_num())
+        return still._replace(d=torch.stack([means, means]).to(still.d))
+
+    def variance(stated):
+        covariance = bootstrap_covariance(
+            [first, second], still, windows, of_the_residual, True, stated=stated
+        )
+        return float(covariance[0, 0].nanmean())
+
+    residual = torch.subtract(*normalised([first, second])).square().mean()
+    ratio = variance(besides * residual.expand_as(first)) / variance(None)
+    # the level scatters from place to place
+    assert ratio == pytest.approx(left, rel=0.1)
 
 
 @pytest.mark.parametrize(("share", "known"), [(0.35, False), (0.65, True)])
