@@ -23,12 +23,17 @@ _LEAST_CURVATURE = 0.1
 
 
 def model_error_of(
-    found: Solution, shortest: float, *, changes: bool = False, before: bool = False
+    found: Solution,
+    shortest: float,
+    *,
+    changes: bool = False,
+    before: ModelError | None = None,
 ) -> ModelError:
     """Departure of the flow from the model, from the residuals of a fit; see `model_error`.
 
-    It is what the fit leaves of the departure, or, with `before`, the departure itself. With
-    `changes`, residuals (z, y) may correlate for another reason, see `of_change`.
+    It is what the fit leaves of the departure. With `before`, what it leaves as found by this
+    function, it is the departure itself. With `changes`, residuals (z, y) may correlate for another
+    reason, see `of_change`.
 
     Each force then counts by the inverse of its variance in the waves of the departure that was
     found first: by noise A, by the departure A^2 times its spectral density, with A the mean
@@ -43,7 +48,7 @@ def model_error_of(
     stiffness = torch.stack(
         [(weight * slope[a] * slope[b]).sum(0) for a, b in ((0, 0), (0, 1), (1, 1))]
     )
-    follow = (_responses(found), _inverse(found)) if before else None
+    follow = (_responses(found), _inverse(found)) if before is not None else None
 
     def of_forces(even: torch.Tensor | float, tested: bool) -> ModelError:
         change, response = None, follow and Response(*follow, even)
@@ -52,7 +57,7 @@ def model_error_of(
             change = of_change(misfit.residual, steep, misfit.valid)
         return model_error(even * force, even * stiffness, shortest, change, response, tested)
 
-    first = of_forces(1.0, True)
+    first = before if changes and before is not None else of_forces(1.0, True)
     if not changes or not first.variances:
         return first
     information = averaged(stiffness[0] + stiffness[2], misfit.valid, _NEAR / 2) / 2

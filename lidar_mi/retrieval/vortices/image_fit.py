@@ -353,9 +353,7 @@ def _checked(
 ) -> VortexPairFit:
     """The pair of a solution in images, with its errors; `misfit` is that without whitening."""
     q = curvature(best, make.spacing)
-    departure = error
-    if error.variances:
-        departure = model_error_of(best, _NOISE_LAGS, changes=True, before=True)
+    departure = model_error_of(best, _NOISE_LAGS, changes=True, before=error)
     covariance = parameter_covariance(best, error, departure, 1 / q**2)
     valid = misfit.valid
     # image 1 at its places, and image 2 at its own: the residual with image 1 times its gain

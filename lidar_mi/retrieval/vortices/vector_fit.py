@@ -155,7 +155,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
         error = model_error_of(best, 1.0)
         best = fit(model, best.parameters, limits, error.variance, 12, TOLERANCE)
     error = model_error_of(best, 1.0)
-    covariance = parameter_covariance(best, error, model_error_of(best, 1.0, before=True), 1.0)
+    covariance = parameter_covariance(best, error, model_error_of(best, 1.0, before=error), 1.0)
     chi2 = float(best.misfit.residual[:, valid].square().mean()) if known else np.nan
     left = (tensors[2] - wind(best.parameters, *tensors[:2], profile))[:, valid]
     varied = tensors[2][:, valid] - tensors[2][:, valid].mean(1, keepdim=True)
