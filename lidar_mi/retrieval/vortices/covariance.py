@@ -23,11 +23,7 @@ _LEAST_CURVATURE = 0.1
 
 
 def model_error_of(
-    found: Solution,
-    shortest: float,
-    *,
-    changes: bool = False,
-    before: ModelError | None = None,
+    found: Solution, shortest: float, *, changes: bool = False, before: ModelError | None = None
 ) -> ModelError:
     """Departure of the flow from the model, from the residuals of a fit; see `model_error`.
 
