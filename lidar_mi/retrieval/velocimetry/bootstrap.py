@@ -67,6 +67,7 @@ def bootstrap_covariance(
     textured: torch.Tensor | None = None,
     clear: torch.Tensor | None = None,
     stated: torch.Tensor | None = None,
+    noise: float | torch.Tensor | None = None,
 ) -> torch.Tensor:
     """Covariance of the displacements' errors, from further retrievals of a known motion.
 
@@ -139,6 +140,9 @@ def bootstrap_covariance(
     stated : torch.Tensor, shape (z, y), optional
         Variance of the residual by changes whose errors are stated besides: it is taken away from
         the residual's, of which a tenth remains at least.
+    noise : float or torch.Tensor, optional
+        Standard deviation of the images' noise. Where it is known of each pixel, the residual's
+        level is taken to vary as it does.
 
     Returns
     -------
@@ -169,11 +173,12 @@ def bootstrap_covariance(
     # of air that came in nothing is known
     alike = second.isfinite() & inside
     rest = torch.where(alike, second - carried, 0.0)
-    square = averaged(rest.square(), alike, _LEVEL * windows.template)
+    known_noise = _variance(noise, rest)
+    square = known_noise * averaged(rest.square() / known_noise, alike, _LEVEL * windows.template)
     level = square.sqrt().clamp(min=torch.finfo(rest.dtype).tiny)
     added = level
     if stated is not None:
-        besides = averaged(stated, alike, _LEVEL * windows.template)
+        besides = known_noise * averaged(stated / known_noise, alike, _LEVEL * windows.template)
         added = (square - besides).clamp(min=_REMAINING * square).sqrt()
     same = [torch.ones_like(flow), _inverse_texture(filled(first), coarse)]
     if centred:
@@ -227,6 +232,15 @@ def bootstrap_covariance(
     covariance[:, :, separable(number, weights) < _FEWEST] = torch.nan
     least = _LEAST**2 * torch.eye(windows.dims).to(d)
     return covariance + least.reshape(*least.shape, *[1] * windows.dims)
+
+
+def _variance(noise: float | torch.Tensor | None, like: torch.Tensor) -> torch.Tensor:
+    """Of each pixel over the mean of all, at least a hundredth; one where it is not known."""
+    if not isinstance(noise, torch.Tensor) or not noise.ndim:
+        return torch.ones_like(like)
+    square = noise.to(like).square()
+    mean = square[square.isfinite()].mean()
+    return (square / mean).nan_to_num(1.0).clamp(min=0.01)
 
 
 def _in_a_mean(dims: int) -> float:

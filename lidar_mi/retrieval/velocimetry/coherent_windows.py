@@ -24,8 +24,11 @@ from lidar_mi.retrieval.velocimetry.likelihood import (
     steepness_of_structure,
 )
 from lidar_mi.retrieval.velocimetry.outliers import validated
-from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
+from lidar_mi.retrieval.velocimetry.settings import MultipassSettings, VariationalSettings
 from lidar_mi.retrieval.velocimetry.windows import Windows, working
+
+# Standard deviation of a window's weights over the template.
+_SIGMA = MultipassSettings().sigma
 
 
 def coherent_change(
@@ -40,8 +43,9 @@ def coherent_change(
     alike, that displaces the vector by J^-1 <I' |s|> e, with the slopes I' of the image, J the mean
     over the window of their products, and s their Gaussian mean over 3 px. A window that holds
     nothing but structure follows it, and fine texture beside it holds the vector. e has a
-    correlation of exp(-r^2 / 4 S^2), S = 3 px. What is alike in a window of n px, its mean, has
-    1 / (1 + n^2 / 12 S^2) of the variance of e. The rest differs within the window, as noise does.
+    correlation of exp(-r^2 / 4 S^2), S = 3 px. What is alike in a window, its mean over a Gaussian
+    of a third of the template n, has 1 / (1 + n^2 / 9 S^2) of the variance of e. The rest differs
+    within the window, as noise does.
 
     The mean square of e is `coherent_change.mean_square_displacement`, about the flow of the
     vectors, as windows of least squares leave it.
@@ -76,7 +80,7 @@ def coherent_change(
     slope = working(linear.slope)
     steep = steepness_of_structure(slope, linear.valid).sqrt()
     along = displacement_of_windows(slope, steep, windows)
-    alike = 1 / (1 + windows.template**2 / (12 * SMOOTH**2))
+    alike = 1 / (1 + (_SIGMA * windows.template / SMOOTH) ** 2)
     remains = square * square_left(linear, left) if square else torch.zeros_like(steep)
     return alike * square * along[:, None] * along, remains
 

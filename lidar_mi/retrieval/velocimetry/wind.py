@@ -219,7 +219,16 @@ def retrieve_wind(
                 if chosen.centred:
                     moved, left = coherent_change(pair, found, windows, noise)
                 covariance = moved + bootstrap_covariance(
-                    pair, found, windows, find, chosen.centred, chosen.repeats, ~low, clear, left
+                    pair,
+                    found,
+                    windows,
+                    find,
+                    chosen.centred,
+                    chosen.repeats,
+                    ~low,
+                    clear,
+                    left,
+                    noise,
                 )
             found = found._replace(covariance=covariance)
         if found.covariance is not None:
