@@ -83,7 +83,8 @@ def bootstrap_covariance(
     - Image 1 is carried along paths in that wind.
     - The residual, image 2 less image 1 so carried, is moved by two templates along both axes,
       scaled to the level (over Gaussians of 1.25 templates, times the noise where that is known of
-      each pixel) at its new place, and added. So noise and changes keep their size and correlation length, but are independent of the texture.
+      each pixel) at its new place, and added. So noise and changes keep their size and correlation
+      length, but are independent of the texture.
 
     With e the error of a vector retrieved from this pair, where it is valid, the covariance is
 
@@ -94,8 +95,9 @@ def bootstrap_covariance(
     sum of these that makes the errors of this very pair most likely (`_most_likely`):
 
     - x = 1;
-    - x = (J^-1)_ii, J the mean over the window of the products of image 1's slopes: differences of
-      the images displace a vector by J^-1 (Cramer-Rao);
+    - x = s^2 (J^-1)_ii, J the mean over the window of the products of image 1's slopes: differences
+      of the images, of the variance s^2 where it is known of each pixel, displace a vector by that
+      (Cramer-Rao);
     - windows that are not deformed: (flow - d)_i^2, which the window's average takes away;
     - windows that are (`centred`): the square of |grad d|^2 over a Gaussian of 0.35 template, as
       their fit leaves errors of second order in the gradient; and |D d|^2 over one of 0.7, D the
@@ -143,7 +145,7 @@ def bootstrap_covariance(
         the residual's, of which a tenth remains at least.
     noise : float or torch.Tensor, optional
         Standard deviation of the images' noise. Where it is known of each pixel, the residual's
-        level is taken to vary as it does.
+        level and the errors are taken to vary as it does.
 
     Returns
     -------
@@ -181,7 +183,8 @@ def bootstrap_covariance(
     if stated is not None:
         besides = known_noise * averaged(stated / known_noise, alike, _LEVEL * windows.template)
         added = (square - besides).clamp(min=_REMAINING * square).sqrt()
-    same = [torch.ones_like(flow), _inverse_texture(filled(first), coarse)]
+    told = coarse.of_templates(known_noise) * _inverse_texture(filled(first), coarse)
+    same = [torch.ones_like(flow), told]
     if centred:
         shear = averaged(_squared_gradient(vectors), everywhere, _SHEAR * per_template)
         same.append(shear.square().expand_as(flow))

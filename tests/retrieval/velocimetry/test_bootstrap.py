@@ -227,6 +227,39 @@ def test_changes_that_are_stated_besides_are_not_in_the_residual(besides, left):
     assert ratio == pytest.approx(left, rel=0.1)
 
 
+def test_dim_air_beside_bright_air_has_the_noise_that_is_known_there():
+    """Noise of 1 % and 5 % of two halves: errors beside the border are nearly as far from it.
+
+    Errors in proportion to the residual, one to two templates from the border. Without the noise of
+    each pixel they are twice as large there: its level and theirs are means over 1.25 and 1.5
+    templates.
+    """
+    first = torch.as_tensor(texture(plane_waves(1, 4.0, 0.5), *np.meshgrid(*axes(320, 160))))
+    noise = torch.full_like(first, 0.05)
+    noise[:, :160] = 0.01
+    random = torch.Generator().manual_seed(3)
+    second = first + noise * torch.randn(first.shape, generator=random, dtype=torch.float64)
+    windows = Windows(tuple(first.shape), 8, 16, 4)
+    found = weight_shift(first, second, 8, 16, 4)
+    still = found._replace(d=0 * found.d.nan_to_num(), flag=0 * found.flag)
+
+    def of_the_residual(image1, image2, stride):
+        means = 10 * windows.of_templates((image2 - image1).nan_to_num())
+        return still._replace(d=torch.stack([means, means]).to(still.d))
+
+    def dim(known):
+        covariance = bootstrap_covariance(
+            [first, second], still, windows, of_the_residual, False, noise=known
+        )
+        error = covariance[0, 0].sqrt()
+        border = int((windows.centres(1) < 160).sum())
+        # a template and more beside the border, and far from it
+        near = float(error[:, border - 4 : border - 2].nanmedian())
+        return near / float(error[:, : border - 20].nanmedian())
+
+    assert dim(noise) < 1.5 and dim(noise) < 0.8 * dim(None)
+
+
 @pytest.mark.parametrize(("share", "known"), [(0.35, False), (0.65, True)])
 def test_errors_are_not_known_where_the_motion_is_not_found_again(share, known):
     """In windows by chance; the mean over 200 windows is uncertain by 0.035."""
