@@ -16,9 +16,14 @@ from torch.nn.functional import grid_sample, pad
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
+from lidar_mi.retrieval.velocimetry.likelihood import usable_and_weight
 from lidar_mi.retrieval.velocimetry.outliers import median_outliers, validated
 from lidar_mi.retrieval.velocimetry.quality import filled
-from lidar_mi.retrieval.velocimetry.settings import VOLUME_FILTER, FilterSettings
+from lidar_mi.retrieval.velocimetry.settings import (
+    VOLUME_FILTER,
+    FilterSettings,
+    VariationalSettings,
+)
 from lidar_mi.retrieval.velocimetry.warping import band_limited
 from lidar_mi.retrieval.velocimetry.windows import (
     Windows,
@@ -176,7 +181,9 @@ def bootstrap_covariance(
     # of air that came in nothing is known
     alike = second.isfinite() & inside
     rest = torch.where(alike, second - carried, 0.0)
-    known_noise = _variance(noise, rest)
+    # that of few samples is smooth, as in the retrieval of smooth flows
+    _, weight = usable_and_weight(images, noise, VariationalSettings())
+    known_noise = 1 / weight.to(rest)
     square = known_noise * averaged(rest.square() / known_noise, alike, _LEVEL * windows.template)
     level = square.sqrt().clamp(min=torch.finfo(rest.dtype).tiny)
     added = level
@@ -236,15 +243,6 @@ def bootstrap_covariance(
     covariance[:, :, separable(number, weights) < _FEWEST] = torch.nan
     least = _LEAST**2 * torch.eye(windows.dims).to(d)
     return covariance + least.reshape(*least.shape, *[1] * windows.dims)
-
-
-def _variance(noise: float | torch.Tensor | None, like: torch.Tensor) -> torch.Tensor:
-    """Of each pixel over the mean of all, at least a hundredth; one where it is not known."""
-    if not isinstance(noise, torch.Tensor) or not noise.ndim:
-        return torch.ones_like(like)
-    square = noise.to(like).square()
-    mean = square[square.isfinite()].mean()
-    return (square / mean).nan_to_num(1.0).clamp(min=0.01)
 
 
 def _in_a_mean(dims: int) -> float:
