@@ -169,11 +169,13 @@ def bootstrap_covariance(
     window = per_template / math.sqrt(12)
     everywhere = torch.ones_like(flow[0], dtype=torch.bool)
     known = everywhere if textured is None else textured[some]
-    smooth = torch.stack([averaged(part, everywhere, window) for part in flow])
-    vectors = flow
+
+    def of_windows(field: torch.Tensor) -> torch.Tensor:
+        return torch.stack([averaged(part, everywhere, window) for part in field])
+
+    vectors, smooth = flow, of_windows(flow)
     for _ in range(_SHARPENINGS):
-        mean = torch.stack([averaged(part, everywhere, window) for part in flow])
-        flow = flow + vectors - mean
+        flow = flow + vectors - of_windows(flow)
 
     wind = at_mid_time(flow, coarse, centred)
     first, second = normalised(images)
@@ -181,15 +183,19 @@ def bootstrap_covariance(
     # of air that came in nothing is known
     alike = second.isfinite() & inside
     rest = torch.where(alike, second - carried, 0.0)
-    # that of few samples is smooth, as in the retrieval of smooth flows
+    # smoothed, as a noise that few samples tell is itself noisy; one where none is known
     _, weight = usable_and_weight(images, noise, VariationalSettings())
     known_noise = 1 / weight.to(rest)
-    square = known_noise * averaged(rest.square() / known_noise, alike, _LEVEL * windows.template)
+
+    def about(variance: torch.Tensor) -> torch.Tensor:
+        mean = averaged(variance / known_noise, alike, _LEVEL * windows.template)
+        return known_noise * mean
+
+    square = about(rest.square())
     level = square.sqrt().clamp(min=torch.finfo(rest.dtype).tiny)
     added = level
     if stated is not None:
-        besides = known_noise * averaged(stated / known_noise, alike, _LEVEL * windows.template)
-        added = (square - besides).clamp(min=_REMAINING * square).sqrt()
+        added = (square - about(stated)).clamp(min=_REMAINING * square).sqrt()
     told = coarse.of_templates(known_noise) * _inverse_texture(filled(first), coarse)
     same = [torch.ones_like(flow), told]
     if centred:

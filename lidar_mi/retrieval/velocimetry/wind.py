@@ -225,10 +225,10 @@ def retrieve_wind(
                     find,
                     chosen.centred,
                     chosen.repeats,
-                    ~low,
-                    clear,
-                    left,
-                    noise,
+                    textured=~low,
+                    clear=clear,
+                    stated=left,
+                    noise=noise,
                 )
             found = found._replace(covariance=covariance)
         if found.covariance is not None:

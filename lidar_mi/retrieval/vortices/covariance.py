@@ -36,6 +36,8 @@ def model_error_of(
     stiffness around. So where images tell much, places count alike. Else those where smoke is
     steepest would stand for the whole image, and the departure be too large where it grows there.
     """
+    if changes and before is not None and not before.variances:
+        return before
     misfit = found.misfit
     residual, slope, weight = misfit.residual, misfit.slope, found.weight
     if residual.ndim == 2:

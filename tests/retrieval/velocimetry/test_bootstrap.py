@@ -201,12 +201,12 @@ def test_errors_are_not_known_beyond_the_edge_of_valid_windows():
     assert 0.06 < float(known.diagonal().mean().sqrt()) < 0.14
 
 
-@pytest.mark.parametrize(("besides", "left"), [(0.0, 1.0), (0.75, 0.25), (2.0, 0.1)])
-def test_changes_that_are_stated_besides_are_not_in_the_residual(besides, left):
-    """Errors in proportion to the residual: their variance is what remains, a tenth at least."""
-    first = torch.as_tensor(texture(plane_waves(1, 4.0, 0.5), *np.meshgrid(*axes(160, 120))))
-    random = torch.Generator().manual_seed(1)
-    second = first + 0.05 * torch.randn(first.shape, generator=random, dtype=torch.float64)
+def errors_of_the_residual(noise, seed):
+    """Still images with noise (z, y), vectors at rest, and a method that finds 10 residuals, px."""
+    grid = np.meshgrid(*axes(*reversed(noise.shape)))
+    first = torch.as_tensor(texture(plane_waves(1, 4.0, 0.5), *grid))
+    random = torch.Generator().manual_seed(seed)
+    second = first + noise * torch.randn(first.shape, generator=random, dtype=torch.float64)
     windows = Windows(tuple(first.shape), 8, 16, 4)
     found = weight_shift(first, second, 8, 16, 4)
     still = found._replace(d=0 * found.d.nan_to_num(), flag=0 * found.flag)
@@ -215,14 +215,23 @@ def test_changes_that_are_stated_besides_are_not_in_the_residual(besides, left):
         means = 10 * windows.of_templates((image2 - image1).nan_to_num())
         return still._replace(d=torch.stack([means, means]).to(still.d))
 
+    return [first, second], still, windows, of_the_residual
+
+
+@pytest.mark.parametrize(("besides", "left"), [(0.0, 1.0), (0.75, 0.25), (2.0, 0.1)])
+def test_changes_that_are_stated_besides_are_not_in_the_residual(besides, left):
+    """Errors in proportion to the residual: their variance is what remains, a tenth at least."""
+    noise = torch.full((120, 160), 0.05, dtype=torch.float64)
+    images, still, windows, of_the_residual = errors_of_the_residual(noise, 1)
+
     def variance(stated):
         covariance = bootstrap_covariance(
-            [first, second], still, windows, of_the_residual, True, stated=stated
+            images, still, windows, of_the_residual, True, stated=stated
         )
         return float(covariance[0, 0].nanmean())
 
-    residual = torch.subtract(*normalised([first, second])).square().mean()
-    ratio = variance(besides * residual.expand_as(first)) / variance(None)
+    residual = torch.subtract(*normalised(images)).square().mean()
+    ratio = variance(besides * residual.expand_as(noise)) / variance(None)
     # the level scatters from place to place
     assert ratio == pytest.approx(left, rel=0.1)
 
@@ -234,22 +243,13 @@ def test_dim_air_beside_bright_air_has_the_noise_that_is_known_there():
     each pixel they are twice as large there: its level and theirs are means over 1.25 and 1.5
     templates.
     """
-    first = torch.as_tensor(texture(plane_waves(1, 4.0, 0.5), *np.meshgrid(*axes(320, 160))))
-    noise = torch.full_like(first, 0.05)
+    noise = torch.full((160, 320), 0.05, dtype=torch.float64)
     noise[:, :160] = 0.01
-    random = torch.Generator().manual_seed(3)
-    second = first + noise * torch.randn(first.shape, generator=random, dtype=torch.float64)
-    windows = Windows(tuple(first.shape), 8, 16, 4)
-    found = weight_shift(first, second, 8, 16, 4)
-    still = found._replace(d=0 * found.d.nan_to_num(), flag=0 * found.flag)
-
-    def of_the_residual(image1, image2, stride):
-        means = 10 * windows.of_templates((image2 - image1).nan_to_num())
-        return still._replace(d=torch.stack([means, means]).to(still.d))
+    images, still, windows, of_the_residual = errors_of_the_residual(noise, 3)
 
     def dim(known):
         covariance = bootstrap_covariance(
-            [first, second], still, windows, of_the_residual, False, noise=known
+            images, still, windows, of_the_residual, False, noise=known
         )
         error = covariance[0, 0].sqrt()
         border = int((windows.centres(1) < 160).sum())
