@@ -8,10 +8,11 @@ import drjit as dr
 import mitsuba as mi
 
 from .closed_paths import OpenPath, closing_distance, near_density, quarter_turn, sample_near
-from .media import Air, coefficients, collision, interaction, slabs, transmittance
+from .media import coefficients, collision, interaction, transmittance
 from .polarization import apply_phase_function, rotate_stokes, transverse
 from .random_numbers import generator, pair
 from .resampling import choose
+from .surfaces import Air, slabs
 
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))

@@ -8,7 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from plugins.media import Air, transmittance
+from plugins.media import transmittance
+from plugins.surfaces import Air
 
 pytestmark = pytest.mark.usefixtures("variant")
 
