@@ -1,9 +1,9 @@
 """Surfaces between media along a straight line, and the media behind them.
 
 Shapes whose surface lets light pass unchanged (``null`` BSDF) separate media; any other surface is
-opaque. The distance travelled is counted along the unperturbed line, so path lengths are exact; only
-the start of the *search* for the next surface is moved past the last one, by `SURFACE_SKIP` of the
-position's size (5 mm at 500 m). Media thinner than that along the line are missed.
+opaque. The distance travelled is counted along the unperturbed line, so path lengths are exact;
+only the start of the *search* for the next surface is moved past the last one, by `SURFACE_SKIP` of
+the position's size (5 mm at 500 m). Media thinner than that along the line are missed.
 """
 
 import drjit as dr
