@@ -65,8 +65,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .bounds import Bounds
+from .media import media_of
 from .parameters import choice, fail, whole
-from .path_sampling import Lidar
+from .path_sampling import Lidar, channel_of
 from .physical import Physical
 from .polarization import first_unpolarized_in_blend
 from .registration import register
@@ -91,6 +93,7 @@ def define():
             self.covariance = bool(props.get("covariance", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
             self.physical = Physical(NAME)
+            self.bounds = Bounds()
             # called with (samples done, samples in all) after every pass, when set
             self.progress = None
             # stores finished passes, when set: `kept()` returns their number and arrays by name;
@@ -212,6 +215,7 @@ def define():
                 samples = sensor.gate_count * max(2, -(-samples // sensor.gate_count))
             elif samples < 2:
                 fail(NAME, "sample_count", samples, "at least 2, for a standard error")
+            self.bounds.update(media_of(scene, sensor), channel_of(sensor.laser.wavelength))
             seed = mi.UInt32(seed)
             dr.make_opaque(seed)  # a new seed compiles nothing
             return sensor, seed, samples
@@ -256,7 +260,7 @@ def define():
             beam, gate = cell // gates, cell % gates
             number = (lane - cell * rounds_ + dr.opaque(mi.UInt32, start)) * gates + gate
             beam += dr.opaque(mi.UInt32, first)
-            lidar = Lidar(scene, sensor, differentiable)
+            lidar = Lidar(scene, sensor, self.bounds, differentiable)
             sample = lidar.emit(seed, beam, number)
 
             low, high = sensor.ranges(sample.frame.n, sample.start)
@@ -282,7 +286,7 @@ def define():
             rounds_ = dr.opaque(mi.UInt32, rounds)
             beam = lane // rounds_
             number = lane - beam * rounds_ + dr.opaque(mi.UInt32, start)
-            lidar = Lidar(scene, sensor)
+            lidar = Lidar(scene, sensor, self.bounds)
             sample = lidar.emit(seed, beam + dr.opaque(mi.UInt32, first), number)
 
             by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
@@ -395,11 +399,8 @@ def _errors(number, deviations):
 
 def _check_blends(scene, sensor):
     """Refuse blends of polarised with unpolarised phase functions."""
-    media = [sensor.get_medium()]
-    for shape in scene.shapes():
-        media += [shape.interior_medium(), shape.exterior_medium()]
-    for medium in media:
-        part = medium and first_unpolarized_in_blend(medium)
+    for medium in media_of(scene, sensor):
+        part = first_unpolarized_in_blend(medium)
         if part is not None:
             fail(
                 NAME,

@@ -3,7 +3,20 @@
 import drjit as dr
 import mitsuba as mi
 
+from .bounds import UNIFORM, UNKNOWN, leave, locate
 from .surfaces import SURFACE_SKIP
+
+# Optical depth along a segment by which the control variate may exceed the least extinction, and
+# the majorant over the largest difference of extinction and control. Both only concern efficiency.
+RAISED, MAJORANT = 0.5, 2.0
+
+
+def media_of(scene, sensor) -> list:
+    """All media of a scene and its sensor, each once."""
+    found = [sensor.get_medium()]
+    for shape in scene.shapes():
+        found += [shape.interior_medium(), shape.exterior_medium()]
+    return list(dict.fromkeys(medium for medium in found if medium is not None))
 
 
 def interaction(medium, position, direction, wavelengths, time):
@@ -26,6 +39,7 @@ def coefficients(medium, mei, channel, active):
 
 def transmittance(
     air,
+    bounds,
     medium,
     origin,
     direction,
@@ -39,8 +53,11 @@ def transmittance(
 ):
     """Unbiased estimate of the transmittance along a straight line, and the medium at its end.
 
-    Homogeneous media in closed form; others by residual ratio tracking (Novak et al. 2014, ACM TOG
-    33(6)), unbiased for any majorant that bounds the extinction coefficient.
+    Homogeneous media in closed form, others by residual ratio tracking (Novak et al. 2014, ACM TOG
+    33(6)) in the blocks of ``bounds``. The control variate of a block is its mean extinction, but
+    not so far above its least one that all blocks of a segment together exceed an optical depth of
+    `RAISED`. No field makes the variance explode: over the squared mean it is at most
+    exp((t + RAISED) / MAJORANT) - 1, with t the optical depth of what exceeds the control.
 
     With ``differentiable``, gradients are unbiased too: d ln T, the integral of -d(extinction), is
     estimated at one uniform place of the line, independent of the estimate of T.
@@ -49,6 +66,7 @@ def transmittance(
     with dr.suspend_grad():
         value, end, between = _walk(
             air,
+            bounds,
             medium,
             dr.detach(origin),
             dr.detach(direction),
@@ -70,7 +88,9 @@ def transmittance(
 
 
 @dr.syntax
-def _walk(air, medium, origin, direction, distance, where, channel, wavelengths, time, rng, active):
+def _walk(
+    air, bounds, medium, origin, direction, distance, where, channel, wavelengths, time, rng, active
+):
     """Transmittance, medium at the end, and medium at the distance ``where``."""
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
@@ -83,22 +103,39 @@ def _walk(air, medium, origin, direction, distance, where, channel, wavelengths,
         )
         skip = SURFACE_SKIP * (size + end)
         inside = active & (medium != None)
-        # control variate: the extinction in the middle of the segment; the remainder is tracked
-        middle = origin + direction * (0.5 * (travelled + end))
-        mei = interaction(medium, middle, direction, wavelengths, time)
-        _, control = coefficients(medium, mei, channel, inside)
-        value = dr.select(inside, value * dr.exp(-control * (end - travelled)), value)
-        majorant = medium.get_majorant(mei, inside)[channel]
-        tracking = inside & ~medium.is_homogeneous() & (majorant > 0)
-        position = mi.Float(travelled)
-        while dr.hint(tracking, label="ratio tracking"):
-            position -= dr.log(1 - rng.next_float32(tracking)) / majorant
-            tracking &= position < end
-            mei = interaction(medium, origin + direction * position, direction, wavelengths, time)
-            _, extinction = coefficients(medium, mei, channel, tracking)
-            excess = (extinction - control) / majorant
-            value = dr.select(tracking, value * (1 - excess), value)
-        value = dr.select(hit & ~passes, 0, value)
+        kind = bounds.kind(medium)
+        mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
+        uniform = inside & (kind == UNIFORM)
+        _, extinction = coefficients(medium, mei, channel, uniform)
+        depth = dr.select(uniform, extinction * (end - travelled), 0)
+        if dr.hint(bounds.varies, mode="scalar"):
+            tracking = inside & ~uniform
+            unknown = tracking & (kind == UNKNOWN)
+            whole = medium.get_majorant(mei, unknown)[channel]
+            start, step, counts, first = bounds.enter(medium, origin, direction)
+            block = locate(start, step, counts, travelled)
+            left = -dr.log(1 - rng.next_float32(tracking))
+            raised = RAISED / (end - travelled)
+            while dr.hint(tracking, label="ratio tracking"):
+                least, mean, most = bounds.extinction(block, counts, first)
+                control = dr.minimum(mean, least + raised)
+                majorant = MAJORANT * dr.maximum(most - control, control - least)
+                majorant = dr.select(unknown, whole, majorant)
+                stop, onward = leave(start, step, counts, block)
+                stop = dr.clip(stop, travelled, end)
+                # optical depths of the majorant: in the block, and left before the next collision
+                free = majorant * (stop - travelled)
+                collides = tracking & (left < free)
+                place = dr.select(collides, travelled + left / majorant, stop)
+                depth += dr.select(tracking, control * (place - travelled), 0)
+                mei = interaction(medium, origin + direction * place, direction, wavelengths, time)
+                _, extinction = coefficients(medium, mei, channel, collides)
+                value = dr.select(collides, value * (1 - (extinction - control) / majorant), value)
+                left = dr.select(collides, -dr.log(1 - rng.next_float32(collides)), left - free)
+                block = dr.select(collides, block, onward)
+                travelled = dr.select(tracking, place, travelled)
+                tracking &= (value > 0) & (collides | (stop < end))
+        value = dr.select(hit & ~passes, 0, value * dr.exp(-depth))
         medium = dr.select(hit, behind, medium)
         between = dr.select(hit & (end <= where), behind, between)
         travelled = end
@@ -107,7 +144,9 @@ def _walk(air, medium, origin, direction, distance, where, channel, wavelengths,
 
 
 @dr.syntax
-def collision(air, medium, origin, direction, distance, channel, wavelengths, time, rng, active):
+def collision(
+    air, bounds, medium, origin, direction, distance, channel, wavelengths, time, rng, active
+):
     """Distance to the first real collision by delta tracking, its medium, and whether it happened.
 
     Not forced: a sample without a collision within ``distance``, or at an opaque surface, is lost.
@@ -122,18 +161,28 @@ def collision(air, medium, origin, direction, distance, channel, wavelengths, ti
             crossings, origin, direction, travelled + skip, distance, medium, active
         )
         skip = SURFACE_SKIP * (size + end)
-        inside = active & (medium != None)
+        tracking = active & (medium != None)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
-        majorant = medium.get_majorant(mei, inside)[channel]
-        tracking = inside & (majorant > 0)
+        blind = tracking & (bounds.kind(medium) <= UNIFORM)
+        whole = medium.get_majorant(mei, blind)[channel]
+        start, step, counts, first = bounds.enter(medium, origin, direction)
+        block = locate(start, step, counts, travelled)
+        left = -dr.log(1 - rng.next_float32(tracking))
         while dr.hint(tracking, label="delta tracking"):
-            travelled -= dr.select(tracking, dr.log(1 - rng.next_float32(tracking)) / majorant, 0)
-            tracking &= travelled < end
-            mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
-            _, extinction = coefficients(medium, mei, channel, tracking)
-            real = tracking & (rng.next_float32(tracking) * majorant < extinction)
+            majorant = dr.select(blind, whole, bounds.extinction(block, counts, first).z)
+            stop, onward = leave(start, step, counts, block)
+            stop = dr.clip(stop, travelled, end)
+            free = majorant * (stop - travelled)
+            collides = tracking & (left < free)
+            place = dr.select(collides, travelled + left / majorant, stop)
+            mei = interaction(medium, origin + direction * place, direction, wavelengths, time)
+            _, extinction = coefficients(medium, mei, channel, collides)
+            real = collides & (rng.next_float32(collides) * majorant < extinction)
             found |= real
-            tracking &= ~real
+            left = dr.select(collides, -dr.log(1 - rng.next_float32(collides)), left - free)
+            block = dr.select(collides, block, onward)
+            travelled = dr.select(tracking, place, travelled)
+            tracking &= ~real & (collides | (stop < end))
         active &= ~found & hit & passes
         medium = dr.select(active, behind, medium)
         travelled = dr.select(found, travelled, end)

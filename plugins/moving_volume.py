@@ -105,6 +105,13 @@ def define():
         def eval(self, it, active=True):
             return mi.UnpolarizedSpectrum(self.eval_1(it, active))
 
+        def to_grid(self):
+            """The map from the world to the unit cube that the grid fills, 4 x 4."""
+            matrix = np.eye(4)
+            matrix[:3, :3] = np.array(self.m_to_local)[..., 0]
+            matrix[:3, 3] = np.array(self.m_offset).ravel()
+            return matrix
+
         def max(self):
             return float(dr.max(dr.detach(self.m_data.array))[0])
 

@@ -51,11 +51,12 @@ class Sample:
 class Lidar:
     """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
 
-    def __init__(self, scene, sensor, differentiable=False):
+    def __init__(self, scene, sensor, bounds, differentiable=False):
         self.air, self.sensor, self.differentiable = Air(scene), sensor, differentiable
+        self.bounds = bounds
         self.low, self.high = self.air.bounds(sensor.get_medium())
         self.wavelengths = sensor.laser.wavelengths()
-        self.channel = _channel(sensor.laser.wavelength)
+        self.channel = channel_of(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
         self.context = mi.PhaseFunctionContext()
 
@@ -134,6 +135,7 @@ class Lidar:
         while dr.hint(active, label="scattering orders"):
             out, medium = transmittance(
                 self.air,
+                self.bounds,
                 medium,
                 position,
                 direction,
@@ -308,6 +310,7 @@ class Lidar:
         active = active & self.sensor.in_field_of_view(sample.axes, vertex - sample.aperture)
         out, medium = transmittance(
             self.air,
+            self.bounds,
             medium,
             position,
             direction,
@@ -332,6 +335,7 @@ class Lidar:
         active = active & self.sensor.in_field_of_view(sample.axes, -back)
         out, _ = transmittance(
             self.air,
+            self.bounds,
             medium,
             mei.p,
             wo,
@@ -378,6 +382,7 @@ class Lidar:
             began = mi.Bool(active)
             flight, medium, active = collision(
                 self.air,
+                self.bounds,
                 medium,
                 position,
                 direction,
@@ -442,6 +447,6 @@ def _scaled(stokes, factor):
     return [s * factor for s in stokes]
 
 
-def _channel(wavelength: float) -> int:
+def channel_of(wavelength: float) -> int:
     """Index of the spectrum's entry for the laser."""
     return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0

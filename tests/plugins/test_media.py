@@ -8,6 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from plugins.bounds import Bounds
 from plugins.media import transmittance
 from plugins.surfaces import Air
 
@@ -57,7 +58,7 @@ def lines():
     return origin.astype(np.float32), direction.astype(np.float32), rng.uniform(150, 450, LINES)
 
 
-def walk(air, origin, direction, distance):
+def walk(air, origin, direction, distance, bounds):
     points = [
         type_(np.ascontiguousarray(a.T))
         for type_, a in ((mi.Point3f, origin), (mi.Vector3f, direction))
@@ -65,6 +66,7 @@ def walk(air, origin, direction, distance):
     rng = mi.PCG32(size=LINES)
     value, _ = transmittance(
         air,
+        bounds,
         mi.MediumPtr(None),
         *points,
         mi.Float(distance),
@@ -89,7 +91,9 @@ def test_transmittance_through_nested_cubes(surfaces):
     thin = inside(around, origin.astype(float), direction.astype(float), distance) - dense
     assert (dense > 0).mean() > 0.1
     expected = np.exp(-ENVIRONMENT * thin - SLAB * dense)
-    found = walk(air, origin, direction, distance)
+    bounds = Bounds()
+    bounds.update([shape.interior_medium() for shape in scene.shapes()], 0)
+    found = walk(air, origin, direction, distance, bounds)
     np.testing.assert_allclose(np.log(found), np.log(expected), rtol=0, atol=1e-3 * SLAB)
 
 

@@ -1,0 +1,205 @@
+"""Bounds of the extinction coefficient in blocks of grid cells.
+
+Transmittance and free flights walk a line block by block, each with the block's own majorant, so
+that a dense place takes lookups and makes noise only where it is. The size of the blocks is a
+matter of speed alone.
+"""
+
+import functools
+import re
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+# Least number of cells along the edge of a block, largest number of blocks along an axis, and the
+# optical depth of an axis, at the difference of the field's bounds, for which one more block pays.
+CELLS, BLOCKS, DEPTH = 4, 64, 0.5
+
+UNKNOWN, UNIFORM, BLOCKED = 0, 1, 2
+"""What is known of a medium: its majorant alone, that it is the same everywhere, its blocks."""
+
+
+class Bounds:
+    """Bounds of all media of a scene, in tables that a wavefront looks up.
+
+    Regular grids (``gridvolume``, `moving_volume`) have blocks of cells, those of a moving volume
+    over all its states. Beyond the grid the bounds are those of the whole grid, whatever its
+    ``wrap_mode``. Other volumes have their majorant.
+    """
+
+    def __init__(self):
+        self._read: dict = {}
+
+    def update(self, media, channel: int) -> None:
+        """Read the media, as far as they have changed since the last time."""
+        read = {medium: _blocks(medium, channel, self._read.get(medium)) for medium in media}
+        if not self._read or read != self._read:
+            self._tabulate(read)
+        self._read = read
+
+    def _tabulate(self, read):
+        # medium 0 is none: one block without any extinction
+        numbers = [0, *(_number(mi.MediumPtr(medium))[0] for medium in read)]
+        tables = [_Blocks(BLOCKED), *read.values()]
+        size, first, values = max(numbers) + 1, 0, []
+        kinds, firsts = np.zeros(size, np.uint32), np.zeros(size, np.uint32)
+        counts, frames = np.zeros((size, 3), np.int32), np.zeros((size, 4, 3), np.float32)
+        for number, blocks in zip(numbers, tables, strict=True):
+            kinds[number], firsts[number] = blocks.kind, first
+            counts[number], frames[number] = blocks.counts, blocks.frame
+            values.append(blocks.values)
+            first += len(blocks.values)
+        self.varies = any(blocks.kind != UNIFORM for blocks in read.values())
+        self.kinds, self.firsts = mi.UInt32(kinds), mi.UInt32(firsts)
+        self.counts, self.frames = mi.Int32(counts.ravel()), mi.Float(frames.ravel())
+        self.values = mi.Float(np.concatenate(values).ravel())
+        # opaque, also where there is one entry only, so that other fields run in the same kernel
+        dr.make_opaque(self.kinds, self.firsts, self.counts, self.frames, self.values)
+
+    def kind(self, medium):
+        """What is known of the medium of each lane."""
+        return dr.gather(mi.UInt32, self.kinds, _number(medium))
+
+    def enter(self, medium, origin, direction):
+        """A line in the blocks of a medium: its start, step per metre, counts and first value."""
+        number = _number(medium)
+        rows = [dr.gather(mi.Vector3f, self.frames, 4 * number + row) for row in range(4)]
+        start = mi.Vector3f([dr.dot(row, origin) for row in rows[:3]]) + rows[3]
+        step = mi.Vector3f([dr.dot(row, direction) for row in rows[:3]])
+        counts = dr.gather(mi.Vector3i, self.counts, number)
+        return start, step, counts, dr.gather(mi.UInt32, self.firsts, number)
+
+    def extinction(self, block, counts, first):
+        """Least, mean and largest extinction of a block, m^-1."""
+        place = block + 1
+        index = (place.z * (counts.y + 2) + place.y) * (counts.x + 2) + place.x
+        return dr.gather(mi.Vector3f, self.values, first + mi.UInt32(index))
+
+
+def _number(medium):
+    return dr.reinterpret_array(mi.UInt32, medium)
+
+
+def locate(start, step, counts, travelled):
+    """The block of a line at a distance; -1 and ``counts`` are all that lies beyond the grid."""
+    place = dr.clip(dr.floor(start + step * travelled), -1, mi.Vector3f(counts))
+    return mi.Vector3i(place)
+
+
+def leave(start, step, counts, block):
+    """Distance at which a line leaves a block, and the block behind it."""
+    forward = step > 0
+    onward = (forward & (block < counts)) | ((step < 0) & (block >= 0))
+    face = mi.Vector3f(dr.select(forward, block + 1, block))
+    ends = dr.select(onward, (face - start) / step, dr.inf)
+    end = dr.min(ends)
+    # one axis only, so that every block on the way is visited
+    along_x = ends.x == end
+    along_y = ~along_x & (ends.y == end)
+    turn = mi.Vector3i(
+        dr.select(along_x, 1, 0), dr.select(along_y, 1, 0), dr.select(along_x | along_y, 0, 1)
+    )
+    return end, block + dr.select(forward, turn, -turn)
+
+
+class _Blocks:
+    """Bounds of one medium; ``frame`` maps world coordinates to blocks."""
+
+    def __init__(self, kind, counts=(0, 0, 0), frame=0.0, values=0.0, source=None):
+        self.kind, self.counts, self.source = kind, counts, source
+        self.frame = np.broadcast_to(frame, (4, 3))
+        self.values = np.broadcast_to(values, (np.prod(np.add(counts, 2)), 3))
+
+
+def _blocks(medium, channel, known) -> _Blocks:
+    """Those of a medium; ``known`` again if it still is what it was."""
+    volume = _parts(medium).get("sigma_t")
+    data = _grid(volume)
+    if data is None:
+        constant = volume is not None and volume.class_name() == "ConstVolume"
+        kind = UNIFORM if constant or medium.is_homogeneous() else UNKNOWN
+        return known if known and known.kind == kind else _Blocks(kind)
+    scale, to_local = float(mi.traverse(medium)["scale"]), _to_local(volume)
+    # an array that stays in use keeps its index
+    array = mi.Float(dr.detach(data.array))
+    source = array.index, scale, channel, to_local.tobytes()
+    if known and known.source and known.source[0] == source:
+        return known
+    field = np.array(array, float).reshape(-1, *data.shape[-4:])
+    field = scale * field[..., channel if data.shape[-1] == 3 else 0]
+    least, most = field.min(0), field.max(0)
+    mean, outside = field.mean(0), (least.min(), field.mean(), most.max())
+    extents = np.linalg.norm(np.linalg.inv(to_local[:3, :3]), axis=0)[::-1]
+    wanted = np.clip((outside[2] - outside[0]) * extents / DEPTH, 1, BLOCKS)
+    edges = np.maximum(CELLS, np.ceil(mean.shape / wanted)).astype(int)
+    for axis, edge in enumerate(edges):
+        least = _reduced(np.minimum, least, axis, edge)
+        most = _reduced(np.maximum, most, axis, edge)
+        mean = _averaged(mean, axis, edge)
+    counts = mean.shape[::-1]
+    bounds = zip((least, mean, most), outside, strict=True)
+    values = np.stack([np.pad(part, 1, constant_values=value) for part, value in bounds], -1)
+    blocks = (np.array(field.shape[1:]) / edges)[::-1]
+    frame = np.vstack([to_local[:3, :3] * blocks[:, None], to_local[:3, 3] * blocks])
+    return _Blocks(BLOCKED, counts, frame, values.reshape(-1, 3), (source, array))
+
+
+def _parts(thing) -> dict:
+    """What an object of a scene consists of, by name."""
+    found = {}
+
+    class Parts(mi.TraversalCallback):
+        def put(self, name, value, *_):
+            found[name] = value
+
+    thing.traverse(Parts())
+    return found
+
+
+def _grid(volume):
+    """Values of a volume that is a regular grid of extinction coefficients; None for others."""
+    if volume is None or not (volume.class_name() == "GridVolume" or hasattr(volume, "to_grid")):
+        return None
+    data = mi.traverse(volume)["data"]
+    # in spectral variants colours are coefficients of polynomials
+    return data if data.shape[-1] == 1 or (mi.is_rgb and data.shape[-1] == 3) else None
+
+
+def _to_local(volume) -> np.ndarray:
+    """The map from the world to the unit cube that a grid fills, 4 x 4.
+
+    Mitsuba tells a grid's map in words only, to six digits: the middle of the bounding box gives
+    its place to the rounding of single precision, and its axes are right to a millionth of it.
+    """
+    if hasattr(volume, "to_grid"):
+        return volume.to_grid()
+    rows = re.search(r"matrix=\[\[(.*?)\]\]", str(volume), re.DOTALL)[1]
+    numbers = [float(word) for word in re.split(r"[\s,\[\]]+", rows) if word]
+    matrix = np.array(numbers).reshape(4, 4)
+    box = volume.bbox()
+    middle = (np.array(box.min, float).ravel() + np.array(box.max, float).ravel()) / 2
+    matrix[:3, 3] = 0.5 - matrix[:3, :3] @ middle
+    return matrix
+
+
+def _reduced(extreme, field, axis, edge):
+    """Extremes of blocks along an axis, each with one cell more on either side.
+
+    Interpolation looks up half of that cell; the other half is a margin for rounding. Beside the
+    first and the last cell lies the opposite one, too: a grid may repeat.
+    """
+    cells = field.shape[axis]
+    starts = np.arange(0, cells, edge)
+    places = [starts + offset for offset in range(-1, edge + 1)]
+    repeated = [np.where((p == -1) | (p == cells), p % cells, p) for p in (places[0], places[-1])]
+    parts = [field.take(np.clip(p, 0, cells - 1), axis) for p in places + repeated]
+    return functools.reduce(extreme, parts)
+
+
+def _averaged(field, axis, edge):
+    """Means of blocks along an axis."""
+    starts = np.arange(0, field.shape[axis], edge)
+    lengths = np.diff([*starts, field.shape[axis]])
+    sums = np.add.reduceat(field, starts, axis)
+    return sums / lengths.reshape([-1 if other == axis else 1 for other in range(3)])
