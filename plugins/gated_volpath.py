@@ -20,6 +20,8 @@ Parameter                    Type    Meaning                                    
 ``covariance``               bool    also give the standard error of S1 and the correlation  false
                                      of the errors of S0 and S1 (for the error of the
                                      depolarisation ratio)
+``shares``                   bool    also give the largest share of one sample in the        false
+                                     variance of S0
 ``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
                                      memory, does not change the result
 ============================ ======= ======================================================= =======
@@ -35,11 +37,17 @@ view; of two candidates one is selected in proportion to its contribution (Talbo
 ``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
 ``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
 each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... after these, with ``covariance``
-``gateNNN.S1_stderr`` and ``gateNNN.S0_S1_correlation`` after all. The Stokes vector of the received
-light, like that of the emitted light, refers to the horizontal axis e_h of the beam, projected
-perpendicular to the returning light, as for an analyser fixed to the telescope. Unpolarised
-variants compute intensity only: S1 to S3 are 0. RGB variants use the colour channel nearest to the
-wavelength of the laser.
+``gateNNN.S1_stderr`` and ``gateNNN.S0_S1_correlation`` after these, with ``shares``
+``gateNNN.S0_largest_share`` after all.
+
+A standard error to which one sample contributes half of the variance or more is known to a factor
+of two at best, and most of the light may not have been sampled. Where this holds for more than 1 %
+of the pixels that receive light, a warning says so. Light that no sample has met is not noticed.
+
+The Stokes vector of the received light, like that of the emitted light, refers to the horizontal
+axis e_h of the beam, projected perpendicular to the returning light, as for an analyser fixed to
+the telescope. Unpolarised variants compute intensity only: S1 to S3 are 0. RGB variants use the
+colour channel nearest to the wavelength of the laser.
 
 ``sample_count`` of the sensor's sampler (or ``spp``) is the number of Monte Carlo samples per beam.
 The gated estimator distributes them evenly over the gates and rounds up, so that every gate gets
@@ -60,6 +68,7 @@ replaced.
 import contextlib
 import functools
 import gc
+import warnings
 
 import drjit as dr
 import mitsuba as mi
@@ -79,6 +88,12 @@ NAME, KIND = "gated_volpath", "integrator"
 STOKES = ("S0", "S1", "S2", "S3")
 # products of deviations that are summed: S0's alone, or all that the errors of S0 and S1 need
 PRODUCTS = ((0, 0), (1, 1), (0, 1))
+# Deviations are multiplied by it before they are squared: a signal of 1e-19 has squares that
+# underflow in single precision. A power of two, so that nothing is rounded.
+MAGNIFIED = 2.0**50
+# Share of one sample in the variance of S0 from which on the standard error is not trusted. A
+# little less than one half: of two samples each has exactly that.
+HALF = 0.4999
 
 
 def define():
@@ -91,6 +106,7 @@ def define():
             self.estimator = choice(props, NAME, "estimator", "gated", ("gated", "analog"))
             self.orders = bool(props.get("orders", False))
             self.covariance = bool(props.get("covariance", False))
+            self.shares = bool(props.get("shares", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
             self.physical = Physical(NAME)
             self.bounds = Bounds()
@@ -107,7 +123,9 @@ def define():
             """Quantities that are rendered for every gate."""
             orders = range(1, self.max_order + 1) if self.orders else ()
             more = ("S1_stderr", "S0_S1_correlation") if self.covariance else ()
-            return [*STOKES, "S0_stderr", *(f"order{order}.S0" for order in orders), *more]
+            by_order = (f"order{order}.S0" for order in orders)
+            shares = ("S0_largest_share",) if self.shares else ()
+            return [*STOKES, "S0_stderr", *by_order, *more, *shares]
 
         def channel_names(self, sensor) -> list[str]:
             """Names of the last axis of the rendered tensor."""
@@ -127,6 +145,8 @@ def define():
                 before, arrays = 0, {}  # passes of another size
             image = _float(arrays.get("image"), beams * gates * quantities)
             done, total = 0, _moments(arrays)
+            # of the finished pixels that receive light, how many there are, and are not trusted
+            counts = np.array(arrays.get("counts", (0, 0)))
             with dr.suspend_grad(), _nothing_freed():
                 passes = enumerate(self._passes(sensor, samples), 1)
                 for number, (first, count, start, now, complete) in passes:
@@ -137,22 +157,28 @@ def define():
                     total = part if total is None else _merge(total, part)
                     if complete:
                         cells = self._places(first * gates, count * gates)
-                        for value, place in zip(_results(*total), cells, strict=True):
+                        results = _results(*total)
+                        for value, place in zip(results, cells, strict=False):
                             dr.scatter(image, value, place)
                         dr.eval(image)
+                        lit, share = results[0].numpy() > 0, results[-1].numpy()
+                        counts += lit.sum(), (lit & (share >= HALF)).sum()
                         total = None
                     if self.progress or self.batches:
                         dr.eval(image, total)
                         dr.sync_thread()
                     if self.batches and done < beams * samples:
-                        self.batches.keep(number, functools.partial(self._kept, image, total))
+                        store = functools.partial(self._kept, image, total, counts.copy())
+                        self.batches.keep(number, store)
                     if self.progress:
                         self.progress(done, beams * samples)
+            _warn_of_untrusted(*counts)
             width, height = sensor.film().size()
             return mi.TensorXf(image, (height, width, gates * quantities))
 
-        def _kept(self, image, total):
-            return _arrays(image, total) | {"samples_per_pass": np.array(self.samples_per_pass)}
+        def _kept(self, image, total, counts):
+            made_of = {"samples_per_pass": np.array(self.samples_per_pass), "counts": counts}
+            return _arrays(image, total) | made_of
 
         def render_backward(self, scene, params, grad_in, sensor=0, seed=0, spp=0):
             """Gradients of the scene from those of the image (of S0 to S3; S0_stderr has none)."""
@@ -185,7 +211,7 @@ def define():
             gates = sensor.gate_count
             for first, count, start, now, _ in self._passes(sensor, samples):
                 with dr.resume_grad():
-                    _, means, _ = self._gated(
+                    _, means, *_ = self._gated(
                         scene, sensor, seed, first, count, start, now, differentiable=True
                     )
                     fraction = now * gates / samples
@@ -274,10 +300,12 @@ def define():
             dr.eval(stokes, by_order)
             means = [dr.block_sum(s, rounds) / _opaque(rounds) for s in stokes]
             off = [
-                s - dr.gather(mi.Float, m, cell) for s, m in zip(stokes[:2], means[:2], strict=True)
+                MAGNIFIED * (s - dr.gather(mi.Float, m, cell))
+                for s, m in zip(stokes[:2], means[:2], strict=True)
             ]
             deviations = [dr.block_sum(off[i] * off[j], rounds) for i, j in self._products()]
-            return rounds, means + self._per_order(by_order, rounds), deviations
+            largest = dr.block_reduce(dr.ReduceOp.Max, off[0] * off[0], rounds)
+            return rounds, means + self._per_order(by_order, rounds), deviations, largest
 
         def _analog(self, scene, sensor, seed, first, count, start, rounds):
             """The same, with analog free flights."""
@@ -292,14 +320,26 @@ def define():
             by_order = dr.zeros(mi.Float, count * gates * self.max_order if self.orders else 1)
             sums = [dr.zeros(mi.Float, count * gates) for _ in STOKES]
             products = {pair: dr.zeros(mi.Float, count * gates) for pair in self._products()}
+            largest = dr.zeros(mi.UInt32, count * gates)
             lidar.analog(
-                sample, self.max_order, beam * gates, gates, sums, products, self.orders, by_order
+                sample,
+                self.max_order,
+                beam * gates,
+                gates,
+                sums,
+                products,
+                largest,
+                MAGNIFIED,
+                self.orders,
+                by_order,
             )
-            dr.eval(sums, products, by_order)
+            dr.eval(sums, products, largest, by_order)
             number = _opaque(rounds)
             means = [s / number for s in sums]
-            deviations = [p - number * means[i] * means[j] for (i, j), p in products.items()]
-            return rounds, means + self._per_order(by_order, rounds), deviations
+            large = [MAGNIFIED * mean for mean in means[:2]]
+            deviations = [p - number * large[i] * large[j] for (i, j), p in products.items()]
+            largest = dr.reinterpret_array(mi.Float, largest)
+            return rounds, means + self._per_order(by_order, rounds), deviations, largest
 
         def _products(self):
             """The pairs of Stokes components whose products are summed."""
@@ -350,11 +390,12 @@ def _arrays(image, total):
     """Finished beams, and the moments of those that are not, for NumPy."""
     arrays = {"image": image.numpy()}
     if total is not None:
-        number, means, deviations = total
+        number, means, deviations, largest = total
         arrays |= {
             "number": np.array(number),
             "means": np.stack([mean.numpy() for mean in means]),
             "spreads": np.stack([part.numpy() for part in deviations]),
+            "largest": largest.numpy(),
         }
     return arrays
 
@@ -364,37 +405,51 @@ def _moments(arrays):
     if "number" not in arrays:
         return None
     means, deviations = ([mi.Float(row) for row in arrays[name]] for name in ("means", "spreads"))
-    return int(arrays["number"]), means, deviations
+    return int(arrays["number"]), means, deviations, mi.Float(arrays["largest"])
 
 
-def _results(number, means, deviations):
-    """The image's quantities from the moments of all samples."""
+def _results(number, means, deviations, largest):
+    """The image's quantities from the moments of all samples, and the largest share after them."""
     errors = _errors(_opaque(number), deviations)
-    return [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:]]
+    whole = deviations[0]
+    share = dr.select(whole > 0, dr.minimum(largest / whole, 1), 0)
+    return [*means[: len(STOKES)], errors[0], *means[len(STOKES) :], *errors[1:], share]
 
 
 def _merge(first, second):
     """Moments of two sets of samples together (Chan, Golub & LeVeque 1983)."""
-    n1, means1, deviations1 = first
-    n2, means2, deviations2 = second
+    n1, means1, deviations1, largest1 = first
+    n2, means2, deviations2, largest2 = second
     fraction, weight = _opaque(n2 / (n1 + n2)), _opaque(n1 * n2 / (n1 + n2))
     off = [b - a for a, b in zip(means1, means2, strict=True)]
     means = [a + o * fraction for a, o in zip(means1, off, strict=True)]
+    off = [MAGNIFIED * o for o in off[:2]]
     deviations = [
         a + b + off[i] * off[j] * weight
         for a, b, (i, j) in zip(deviations1, deviations2, PRODUCTS[: len(deviations1)], strict=True)
     ]
-    return n1 + n2, means, deviations
+    # each from the mean of its own set, which differ little where there are enough samples
+    return n1 + n2, means, deviations, dr.maximum(largest1, largest2)
 
 
 def _errors(number, deviations):
     """Standard error of S0, and with all three sums that of S1 and their correlation."""
     variances = [dr.maximum(s, 0) / (number * (number - 1.0)) for s in deviations[:2]]
-    errors = [dr.sqrt(v) for v in variances]
+    errors = [dr.sqrt(v) / MAGNIFIED for v in variances]
     if len(deviations) == 1:
         return errors
     both = dr.sqrt(dr.maximum(deviations[0], 0)) * dr.sqrt(dr.maximum(deviations[1], 0))
     return [*errors, dr.select(both > 0, dr.clip(deviations[2] / both, -1, 1), 0)]
+
+
+def _warn_of_untrusted(lit: int, untrusted: int):
+    if untrusted > 0.01 * lit:
+        warnings.warn(
+            f"{NAME}: in {untrusted} of {lit} pixels that receive light one sample carries "
+            "half of the variance or more; their standard errors cannot be trusted; expected more "
+            "samples",
+            stacklevel=3,
+        )
 
 
 def _check_blends(scene, sensor):

@@ -363,8 +363,13 @@ class Lidar:
         return apply_phase_function(value, stokes, self.channel), pdf
 
     @dr.syntax
-    def analog(self, sample, max_order, base, gates, sums, products, split, by_order):
+    def analog(
+        self, sample, max_order, base, gates, sums, products, largest, magnified, split, by_order
+    ):
         """Analog free flights; every collision is connected to the telescope.
+
+        Adds contributions to ``sums``, and their products, each factor ``magnified``, to
+        ``products``; ``largest`` becomes the bits of the largest square.
 
         A sample's apparent range does not decrease from one order to the next (triangle
         inequality), so its contribution to a gate is complete when a later gate is reached: only
@@ -405,7 +410,7 @@ class Lidar:
             gain = self._receive(sample, rng, medium, mei, stokes, counts, mi.Float(1))
             now = dr.select(counts, mi.UInt32(dr.clip(fraction * gates, 0, gates - 1)), gate)
             done = now != gate
-            _deposit(sums, products, base + gate, held, done)
+            _deposit(sums, products, largest, magnified, base + gate, held, done)
             held = _sum(_scaled(held, dr.select(done, 0, 1)), gain)
             gate = now
             if dr.hint(split, mode="scalar"):
@@ -418,7 +423,7 @@ class Lidar:
             stokes = apply_phase_function(value, stokes, self.channel)
             direction = mi.Vector3f(onward)
             active &= (density > 0) & (stokes[0] > 0)
-            _deposit(sums, products, base + gate, held, began & ~active)
+            _deposit(sums, products, largest, magnified, base + gate, held, began & ~active)
 
 
 def _add(total, value, cell, active=True):
@@ -426,13 +431,16 @@ def _add(total, value, cell, active=True):
     dr.scatter_reduce(dr.ReduceOp.Add, total, value, cell, active, mode=dr.ReduceMode.Local)
 
 
-def _deposit(sums, products, cell, held, active):
+def _deposit(sums, products, largest, magnified, cell, held, active):
     """Add contributions of samples to their gates, and products of their components."""
     active = active & (held[0] != 0)
     for total, value in zip(sums, held, strict=True):
         _add(total, value, cell, active)
     for (i, j), total in products.items():
-        _add(total, held[i] * held[j], cell, active)
+        _add(total, magnified * held[i] * (magnified * held[j]), cell, active)
+    # positive floats are ordered as their bits, of which every backend has an atomic maximum
+    square = dr.reinterpret_array(mi.UInt32, dr.square(magnified * held[0]))
+    dr.scatter_reduce(dr.ReduceOp.Max, largest, square, cell, active, mode=dr.ReduceMode.Local)
 
 
 def _copied(stokes):
