@@ -41,8 +41,9 @@ each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... after these, wit
 ``gateNNN.S0_largest_share`` after all.
 
 A standard error to which one sample contributes half of the variance or more is known to a factor
-of two at best, and most of the light may not have been sampled. Where this holds for more than 1 %
-of the pixels that receive light, a warning says so. Light that no sample has met is not noticed.
+of two at best, and most of the light may not have been sampled. Without ``shares``, a warning says
+so where this holds for more than 1 % of the pixels that receive light; the integrator's ``lit`` and
+``untrusted`` are the numbers of these pixels. Light that no sample has met is not noticed.
 
 The Stokes vector of the received light, like that of the emitted light, refers to the horizontal
 axis e_h of the beam, projected perpendicular to the returning light, as for an analyser fixed to
@@ -108,6 +109,8 @@ def define():
             self.covariance = bool(props.get("covariance", False))
             self.shares = bool(props.get("shares", False))
             self.samples_per_pass = whole(props, NAME, "samples_per_pass", 1 << 22, 1)
+            # pixels of the last image that receive light, and those of them that cannot be trusted
+            self.lit, self.untrusted = 0, 0
             self.physical = Physical(NAME)
             self.bounds = Bounds()
             # called with (samples done, samples in all) after every pass, when set
@@ -172,7 +175,9 @@ def define():
                         self.batches.keep(number, store)
                     if self.progress:
                         self.progress(done, beams * samples)
-            _warn_of_untrusted(*counts)
+            self.lit, self.untrusted = (int(count) for count in counts)
+            if not self.shares:
+                _warn_of_untrusted(self.lit, self.untrusted)
             width, height = sensor.film().size()
             return mi.TensorXf(image, (height, width, gates * quantities))
 

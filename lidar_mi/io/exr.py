@@ -289,6 +289,7 @@ def unpack(image: np.ndarray, names: list[str], gates: int) -> dict[str, tuple]:
 def label_scan(scan: xr.Dataset) -> xr.Dataset:
     """The same scan with CF names and units on its variables."""
     meaning = _MEANING | {
+        "S0_largest_share": "largest share of one Monte Carlo sample in the variance of S0",
         "S1_stderr": "Monte Carlo standard error of S1",
         "S0_S1_correlation": "correlation of the Monte Carlo errors of S0 and S1",
         "depolarization": "linear depolarisation ratio",

@@ -133,10 +133,11 @@ def render_scans(
     Yields
     ------
     xr.Dataset
-        S0 ... S3, S0_stderr and, with more than one order, each order's S0 as ``orderK.S0``, dims
-        (gate, z, y); Y (z, y); y and z ascending. Where a plan has beams, also ``beam_time`` (s)
-        and ``y_reported``, ``z_reported`` (m), where a beam as reported crosses the plane in the
-        middle of the gates. One scan at a time, as soon as it is rendered.
+        S0 ... S3, S0_stderr, S0_largest_share (of one sample in the variance) and, with more than
+        one order, each order's S0 as ``orderK.S0``, dims (gate, z, y); Y (z, y); y and z ascending.
+        Where a plan has beams, also ``beam_time`` (s) and ``y_reported``, ``z_reported`` (m), where
+        a beam as reported crosses the plane in the middle of the gates. One scan at a time, as soon
+        as it is rendered.
     """
     chosen = list(range(len(plans)) if scans is None else scans)
     renderer = None
@@ -210,6 +211,7 @@ class ScanRenderer:
         names = integrator.quantities()
         scan = _as_dataset(image, names, plan, self._lidar, self._environment, self._settings, seed)
         earlier = batches.seconds if batches else 0.0
+        scan.attrs |= {"lit_pixels": integrator.lit, "untrusted_pixels": integrator.untrusted}
         scan.attrs["render_seconds"] = earlier + time.perf_counter() - start
         return scan
 
@@ -248,6 +250,7 @@ def scene_dict(
             "max_order": settings.max_order,
             "orders": settings.max_order > 1,
             "covariance": mi.is_polarized,
+            "shares": True,
             "estimator": settings.estimator,
             "samples_per_pass": samples_at_once(settings.samples_per_pass, settings.memory),
         },

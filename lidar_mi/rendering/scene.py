@@ -78,6 +78,7 @@ def render_file(
         image.attrs["scene"] = scene_path.name
         write_fringes(out, image)
         return image
+    integrator.shares = True
     integrator.samples_per_pass = samples_at_once(integrator.samples_per_pass, None)
     needed = image_bytes(sensor.beam_count, sensor.gate_count, len(integrator.quantities()))
     what = f"{scene_path}: {sensor.beam_count} beams x {sensor.gate_count} gates"
@@ -93,6 +94,8 @@ def render_file(
         "samples_per_beam": samples or sensor.sampler().sample_count(),
         "max_order": integrator.max_order,
         "estimator": integrator.estimator,
+        "lit_pixels": integrator.lit,
+        "untrusted_pixels": integrator.untrusted,
         "units": "Stokes: received over emitted energy; Y: m-1 sr-1; lengths: m; angles: rad",
     }
     write_scan(out, scan)
