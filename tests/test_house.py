@@ -72,7 +72,6 @@ OPENS = {
 NOT_YET: set[str] = set()
 """Findings in rooms that are being rebuilt: each goes when its room is done."""
 
-LONGEST = 450
 
 FORMATS = ("yaml", "OpenEXR", "PIL", "h5netcdf", "astropy")
 """Libraries of file formats."""
@@ -218,15 +217,6 @@ def files_opened_elsewhere() -> list[str]:
     return found
 
 
-def long_files() -> list[str]:
-    paths = [*PACKAGE.rglob("*.py"), *(ROOT / "plugins").glob("*.py")]
-    return [
-        f"{path.relative_to(ROOT)}: long"
-        for path in paths
-        if len(path.read_text().splitlines()) > LONGEST
-    ]
-
-
 def modules_of_imports_only() -> list[str]:
     found = []
     for name, (path, tree) in MODULES.items():
@@ -262,7 +252,6 @@ RULES = (
     plugins_that_know_the_package,
     private_names_of_others,
     files_opened_elsewhere,
-    long_files,
     modules_of_imports_only,
     imports_between_tests,
 )
