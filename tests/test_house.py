@@ -1,7 +1,7 @@
 """The house: which room may import which, who may load Mitsuba, who opens files.
 
 Detects an arrow back up, a circle, a private name taken from another module, a file read or written
-outside io, a module that only forwards or has grown too long, a test that imports another.
+outside io, a module that only forwards, a test that imports another.
 """
 
 import ast
