@@ -66,7 +66,7 @@ def test_files_that_are_none(tmp_path, values):
         ("bad.png", None, "no readable image"),
         ("bad.fits", None, "FITS"),
         ("bad.exr", None, "bad.exr"),
-        ("good.png", "Y", "only EXR files have layers"),
+        ("good.png", "Y", "only EXR, FITS, npz, mat and HDF5 files have layers"),
         ("two.exr", None, "expected a layer to be named, one of a, b"),
         ("two.exr", "c", "layer 'c' is not there; expected one of a, b"),
     ):
