@@ -21,9 +21,7 @@ from lidar_mi.io.pixels.png import read_png
 from lidar_mi.io.pixels.tiff import read_tiff
 
 
-def read_pixels(
-    path: str | Path, layer: str | None = None, frame: int | None = None
-) -> np.ndarray:
+def read_pixels(path: str | Path, layer: str | None = None, frame: int | None = None) -> np.ndarray:
     """One image of a file of any kind, float64, (height, width), top row first.
 
     Values are those of the file, of whatever depth and sign: nothing is scaled or cut. Colours are
@@ -49,7 +47,9 @@ def read_pixels(
     frames = _frames(path, layer)
     if frame is None and frames.count > 1:
         what = "channels" if frames.channels else "frames"
-        raise InputError(f"{path}: {frames.count} {what}; expected --frame, 0 to {frames.count - 1}")
+        raise InputError(
+            f"{path}: {frames.count} {what}; expected --frame, 0 to {frames.count - 1}"
+        )
     return _numbered(path, frames, [frame or 0])[0].astype(float)
 
 
@@ -78,8 +78,8 @@ def read_frames(
     if numbers is None:
         if frames.channels:
             raise InputError(
-                f"{path}: {frames.count} channels, not images one after the other; expected --frame, "
-                f"0 to {frames.count - 1}"
+                f"{path}: {frames.count} channels, not images one after the other; expected "
+                f"--frame, 0 to {frames.count - 1}"
             )
         numbers = range(frames.count)
     return _numbered(path, frames, numbers)
@@ -133,13 +133,7 @@ def _exr(path: Path, layer: str | None) -> Frames:
     return frames_of(path, grey(path, colours, 3)[None])
 
 
-_WITH_LAYERS = {
-    "exr": _exr,
-    "fits": read_fits,
-    "npz": read_npz,
-    "mat": read_mat,
-    "hdf5": read_hdf5,
-}
+_WITH_LAYERS = {"exr": _exr, "fits": read_fits, "npz": read_npz, "mat": read_mat, "hdf5": read_hdf5}
 _WITHOUT = {
     "tiff": read_tiff,
     "png": read_png,

@@ -60,7 +60,7 @@ def test_files_that_are_none(tmp_path, values):
     write_exr(tmp_path / "two.exr", a=values, b=values)
     for name in ("bad.png", "bad.exr", "bad.fits"):
         (tmp_path / name).write_bytes(b"no picture")
-    (tmp_path / "good.png").write_bytes(b"")
+    Image.fromarray(np.zeros((3, 4), np.uint8)).save(tmp_path / "good.png")
     for name, layer, message in (
         ("none.png", None, "no such file; expected an EXR, PNG, TIFF, BMP, JPEG or FITS image"),
         ("bad.png", None, "no readable image"),

@@ -87,7 +87,7 @@ def _values(part):
     missing = None if blank is None or stored.dtype.kind == "f" else stored == blank
     if scale == 1 and zero == 2**63 and stored.dtype == np.int64:
         # the convention for unsigned numbers: the sign bit turned
-        values = stored.view(np.uint64) ^ np.uint64(2**63)
+        values: np.ndarray = stored.view(np.uint64) ^ np.uint64(2**63)
     elif scale == 1 and zero == 0:
         values = stored
     else:

@@ -57,7 +57,9 @@ def kind_of(path: Path) -> str:
         with path.open("rb") as file:
             start = file.read(1024)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); expected an {KINDS}") from None
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); expected an {KINDS}"
+        ) from None
     for mark, kind in _STARTS:
         if start.startswith(mark):
             return kind

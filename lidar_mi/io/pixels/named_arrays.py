@@ -69,7 +69,12 @@ def read_mat(path: Path, layer: str | None) -> Frames:
     """
     from scipy.io import loadmat, whosmat
 
-    numbers = {"double", "single", "logical", *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64))}
+    numbers = {
+        "double",
+        "single",
+        "logical",
+        *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)),
+    }
     try:
         shapes = {name: shape for name, shape, kind in whosmat(path) if kind in numbers}
         chosen = _chosen(path, shapes, layer)
@@ -137,7 +142,9 @@ def _chosen(path, shapes: Mapping[str, tuple], layer: str | None) -> str:
     images = [n for n, shape in shapes.items() if len(shape) in (2, 3) and min(shape[-2:]) > 1]
     if layer is not None:
         if layer not in shapes:
-            raise InputError(f"{path}: layer {layer!r} is not there; expected one of {_listed(images)}")
+            raise InputError(
+                f"{path}: layer {layer!r} is not there; expected one of {_listed(images)}"
+            )
         return layer
     if not images:
         raise InputError(f"{path}: has no array of an image; expected one of two dimensions")

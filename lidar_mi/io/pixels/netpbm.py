@@ -27,7 +27,8 @@ def read_netpbm(path: Path) -> Frames:
     InputError
         A bitmap (P1, P4), a damaged file, images of different sizes, channels of unknown meaning.
     """
-    content, place, found = path.read_bytes(), 0, []
+    content, place = path.read_bytes(), 0
+    found: list[np.ndarray] = []
     if content[:2] in (b"P1", b"P4"):
         raise InputError(f"{path}: black and white (PBM) is no measured light; expected PGM or PPM")
     try:
@@ -40,7 +41,7 @@ def read_netpbm(path: Path) -> Frames:
                 break
     except InputError:
         raise
-    except (ValueError, IndexError, OverflowError, AttributeError) as error:
+    except (ValueError, IndexError, OverflowError) as error:
         raise damaged(path, _KIND, error) from None
     return frames_of(path, np.stack(found))
 
@@ -83,6 +84,8 @@ def _header(content, place, magic):
     colours = _COLOURS[magic] if magic in _COLOURS else _unknown(magic)
     for _ in range(3):
         found = _WORD.match(text, end)
+        if found is None:
+            raise ValueError("its header is cut off")
         words.append(found[1])
         end = found.end()
     scale = float(words[2])
@@ -99,14 +102,19 @@ def _pam_header(path, content, place):
     end = text.index(b"ENDHDR\n") + len(b"ENDHDR\n")
     lines = [line.split(b"#")[0].split() for line in text[:end].splitlines()[1:-1]]
     said = {line[0]: b" ".join(line[1:]) for line in lines if line}
-    tuples = {b"GRAYSCALE": (1, 0), b"GRAYSCALE_ALPHA": (1, 1), b"RGB": (3, 0), b"RGB_ALPHA": (3, 1)}
+    tuples = {
+        b"GRAYSCALE": (1, 0),
+        b"GRAYSCALE_ALPHA": (1, 1),
+        b"RGB": (3, 0),
+        b"RGB_ALPHA": (3, 1),
+    }
     numbers = [int(said.get(name, b"0")) for name in (b"WIDTH", b"HEIGHT", b"MAXVAL", b"DEPTH")]
     width, height, largest, depth = numbers
     kind = said.get(b"TUPLTYPE", b"GRAYSCALE" if depth == 1 else b"")
     if kind not in tuples or sum(tuples[kind]) != depth:
         raise InputError(
-            f"{path}: {depth} channels of TUPLTYPE {kind.decode(errors='replace')[:20]!r}; expected "
-            f"{', '.join(name.decode() for name in tuples)}"
+            f"{path}: {depth} channels of TUPLTYPE {kind.decode(errors='replace')[:20]!r}; "
+            f"expected {', '.join(name.decode() for name in tuples)}"
         )
     return *tuples[kind], width, height, largest, place + end
 

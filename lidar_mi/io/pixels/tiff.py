@@ -1,4 +1,4 @@
-"""TIFF, BigTIFF, OME-TIFF and stacks of ImageJ: every depth, layout and compression, by tifffile."""
+"""TIFF, BigTIFF, OME-TIFF, stacks of ImageJ: every depth, layout and compression, by tifffile."""
 
 import logging
 import math
@@ -103,8 +103,9 @@ class _Lost(logging.Handler):
 
 
 def _planes(path, file):
-    """Numbers of the pages that are images, in their order (None: one after another without pages
-    of their own), how many images, and whether they are channels.
+    """Numbers of the pages that are images, how many images, and whether they are channels.
+
+    No numbers (None): the images follow the first page's and have no pages of their own.
     """
     whole = [number for number, page in enumerate(file.pages) if not page.is_reduced]
     if not whole:
@@ -164,8 +165,9 @@ def _check(path, page, count=1):
     samples, photometric = page.samplesperpixel, int(page.photometric)
     extra = [int(kind) for kind in page.tags.valueof(_EXTRA, ())] if _EXTRA in page.tags else []
     if page.dtype is None or page.dtype.kind not in "biuf":
-        raise InputError(f"{path}: pixels of {page.bitspersample} bits, {page.dtype}; expected real "
-                         "numbers")
+        raise InputError(
+            f"{path}: pixels of {page.bitspersample} bits, {page.dtype}; expected real numbers"
+        )
     check_size(path, 8 * count * page.imagewidth * page.imagelength * samples)
     if _PHOTOMETRIC not in page.tags or photometric == _MINISWHITE:
         raise InputError(
