@@ -93,6 +93,8 @@ def frames_in(path: str | Path, layer: str | None = None) -> tuple[int, bool]:
     InputError
         As `read_pixels`.
     """
+    if kind_of(Path(path)) in _OF_ONE:
+        return 1, False
     frames = _frames(Path(path), layer)
     return frames.count, frames.channels
 
@@ -134,6 +136,8 @@ def _exr(path: Path, layer: str | None) -> Frames:
 
 
 _WITH_LAYERS = {"exr": _exr, "fits": read_fits, "npz": read_npz, "mat": read_mat, "hdf5": read_hdf5}
+_OF_ONE = ("exr", "png", "jpeg2000", "mat")
+"""Kinds that hold one image."""
 _WITHOUT = {
     "tiff": read_tiff,
     "png": read_png,
@@ -223,9 +227,21 @@ def read_image(
     >>> image.dims, image.shape, float(image["y"][-1])
     (('z', 'y'), (40, 60), 14.75)
     """
+    return _on_axes(path, layer, spacing, read_pixels(path, layer, frame))
+
+
+def read_images(
+    path: str | Path, numbers: Sequence[int], layer: str | None = None, spacing: float | None = None
+) -> list[xr.DataArray]:
+    """Some images of a file, each as `read_image` gives it; the file is read once."""
+    images = read_frames(path, layer, numbers)
+    return [_on_axes(path, layer, spacing, one.astype(float)) for one in images]
+
+
+def _on_axes(path, layer, spacing, pixels):
+    """Pixels, top row first, on the axes of their file or of even spacing."""
     if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"{path}: spacing: {spacing} m is not allowed; expected a number above 0")
-    pixels = read_pixels(path, layer, frame)
     rows, columns = pixels.shape
     header = read_layers(path)[0] if _is_exr(path) else {}
     if spacing is not None:

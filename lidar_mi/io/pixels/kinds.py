@@ -68,6 +68,8 @@ def kind_of(path: Path) -> str:
     # before HDF5 there may be a block of 512 bytes, which in a MATLAB 7.3 file says so
     if _HDF5 in (start[:8], start[512:520]):
         return "hdf5"
+    if path.suffix.lower() == ".exr":
+        return "exr"  # its reader says what is wrong
     if path.suffix.lower() in _DAVIS:
         return "davis"
     if path.suffix.lower() == ".mat" and start[:1] in b"\0\x01\x02\x03":
