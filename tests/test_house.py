@@ -74,7 +74,7 @@ NOT_YET: set[str] = set()
 
 LONGEST = 450
 
-FORMATS = ("yaml", "OpenEXR", "PIL", "h5netcdf", "astropy")
+FORMATS = ("yaml", "OpenEXR", "PIL", "h5netcdf", "astropy", "tifffile", "imagecodecs", "lvpyio")
 """Libraries of file formats."""
 
 OPENING = {

@@ -161,7 +161,9 @@ def _series(images, layer, options, out, overwrite) -> None:
     from lidar_mi.retrieval.rings.series import analyse_series
 
     if out is not None:
-        check_target(out, images, overwrite=overwrite, suffixes=(".csv",))
+        if out.suffix.lower() != ".csv":
+            raise InputError(f"{out}: a table of frames; expected a name that ends in .csv")
+        check_target(out, images, overwrite=overwrite)
     names, frames = zip(*_frames(images, layer), strict=True)
     _remark(frames)
     series = analyse_series(frames, *options)

@@ -26,7 +26,7 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
-from lidar_mi.io.exr_header import declared_size
+from lidar_mi.io.exr_header import declared
 from lidar_mi.io.size import check_size
 
 MOST_LAYERS = 2**15 - 1
@@ -167,7 +167,7 @@ def _read(path: str | Path, *, header_only: bool = False) -> tuple[dict, dict[st
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an OpenEXR image")
     try:
-        size = declared_size(path)
+        size, count = declared(path)
     except ValueError as error:
         raise InputError(f"{path}: not a readable OpenEXR image ({error})") from None
     check_size(path, size)
@@ -175,8 +175,11 @@ def _read(path: str | Path, *, header_only: bool = False) -> tuple[dict, dict[st
         with OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file:
             header = {k: v for k, v in file.header().items() if k not in _STRUCTURE}
             layers = {} if header_only else _layers(file.parts)
+            whole = header_only or len(file.parts) == count
     except Exception:  # any exception of the library in a damaged file
         raise InputError(f"{path}: not a readable OpenEXR image") from None
+    if not whole:
+        raise InputError(f"{path}: not a readable OpenEXR image (part of it is missing)")
     if not header_only and len({pixels.shape for pixels in layers.values()}) != 1:
         raise InputError(f"{path}: not a readable OpenEXR image (its layers differ in size)")
     return header, layers

@@ -33,24 +33,20 @@ def read_fits(path: Path, layer: str | None) -> Frames:
             f"{path}: FITS files need the library astropy: pip install 'lidar-mi[fits]'"
         ) from None
     try:
-        with (
-            warnings.catch_warnings(record=True) as remarks,
-            fits.open(path, memmap=False, do_not_scale_image_data=True) as parts,
-        ):
-            warnings.simplefilter("always")
-            images = {}
-            for number, part in enumerate(parts):
-                if part.is_image and part.shape and math.prod(part.shape):
-                    check_size(path, 8 * math.prod(part.shape))
-                    images[number] = part
-            cube = _values(_chosen(path, images, layer))
-        cut = [str(one.message) for one in remarks if "truncated" in str(one.message)]
+        with warnings.catch_warnings():
+            # a last block that is not filled up loses nothing; missing values are an error
+            warnings.simplefilter("ignore")
+            with fits.open(path, memmap=False, do_not_scale_image_data=True) as parts:
+                images = {}
+                for number, part in enumerate(parts):
+                    if part.is_image and part.shape and math.prod(part.shape):
+                        check_size(path, 8 * math.prod(part.shape))
+                        images[number] = part
+                cube = _values(_chosen(path, images, layer))
     except InputError:
         raise
     except Exception as error:  # any exception of the library in a damaged file
         raise damaged(path, _KIND, error) from None
-    if cut:
-        raise damaged(path, _KIND, cut[0])
     shape = cube.shape
     while cube.ndim > 2 and cube.shape[0] == 1:
         cube = cube[0]

@@ -18,7 +18,7 @@ from lidar_mi.io.size import check_size
 _LOSSES = re.compile(
     r"invalid (page )?offset|invalid next page|corrupted (tag list|file)|circular|"
     r"missing (\d+ )?(frames|pages|files|data|ByteCounts)|series metadata|failed to read|"
-    r"out of range|discontiguous|OME series"
+    r"out of range|discontiguous|OME series|TiffTag (2[5-9]|3[0-4])\d .*invalid"
 )
 _IN_ORDER = "TZIQ"
 """Axes along which images follow each other: time, depth, a sequence, one of no name."""
