@@ -7,10 +7,8 @@ from pathlib import Path
 
 from lidar_mi.errors import InputError
 
-KINDS = (
-    "EXR, PNG, TIFF, BMP, JPEG or FITS image (also JPEG 2000, GIF, WebP, PGM, PPM, PAM, PFM, npy, "
-    "npz, mat, HDF5, im7)"
-)
+_COMMON = "EXR, PNG, TIFF, BMP, JPEG or FITS image"
+KINDS = f"{_COMMON} (also JPEG 2000, GIF, WebP, PGM, PPM, PAM, PFM, npy, npz, mat, HDF5, im7)"
 """What is read, for messages."""
 
 _STARTS = (
@@ -52,7 +50,7 @@ def kind_of(path: Path) -> str:
         No such file, one that cannot be opened, or of a kind that is not read.
     """
     if not path.is_file():
-        raise InputError(f"{path}: no such file; expected an {KINDS}")
+        raise InputError(f"{path}: no such file; expected an {_COMMON}")
     try:
         with path.open("rb") as file:
             start = file.read(1024)
