@@ -122,6 +122,9 @@ def test_identical_images_are_remarked_on(here, lidar_mi):
         assert code == 0 and words in " ".join(out.split())
     pages("pair.tif", images)
     assert words not in lidar_mi("retrieve", "pair.tif", *OPTIONS)[1]
+    # air has no rings, but that both frames are one is said before
+    for option in ("--all", "--average"):
+        assert f"frames 0 and 1 {words}" in lidar_mi("rings", "same.tif", option)[1]
 
 
 def test_depth_of_colour_does_not_change_the_wind(here, lidar_mi):

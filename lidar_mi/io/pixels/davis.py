@@ -1,5 +1,6 @@
-"""Images of LaVision's DaVis: im7 and imx files."""
+"""Images of LaVision's DaVis: im7 files."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,12 @@ def read_davis(path: Path) -> Frames:
             "'lidar-mi[davis]'; or export TIFF"
         ) from None
     try:
+        with path.open("rb") as file:
+            width, height, depth, count = struct.unpack("<8x4i", file.read(24))
+        if min(width, height, depth, count) < 1:
+            raise ValueError(f"{width} x {height} x {depth} x {count} pixels")
+        check_size(path, 8 * width * height * depth * count)
         buffer = lvpyio.read_buffer(str(path))
-        check_size(path, 8 * sum(int(np.prod(frame.shape)) for frame in buffer))
         found = [_frame(path, frame) for frame in buffer]
     except InputError:
         raise

@@ -28,7 +28,7 @@ _STARTS = (
     *((b"P%d%c" % (n, end), "netpbm") for n in range(1, 7) for end in b"\n \r\t#"),
 )
 _HDF5 = b"\x89HDF\r\n\x1a\n"
-_DAVIS = (".im7", ".imx")
+_DAVIS = ".im7"
 # of sound files that are not read: what to do
 _ELSEWHERE = (
     (b"CDF", "NetCDF-3", "nccopy -k nc4 FILE NEW.nc"),
@@ -49,6 +49,8 @@ def kind_of(path: Path) -> str:
     InputError
         No such file, one that cannot be opened, or of a kind that is not read.
     """
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; expected a file: an {_COMMON}")
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an {_COMMON}")
     try:
@@ -68,7 +70,7 @@ def kind_of(path: Path) -> str:
         return "hdf5"
     if path.suffix.lower() == ".exr":
         return "exr"  # its reader says what is wrong
-    if path.suffix.lower() in _DAVIS:
+    if path.suffix.lower() == _DAVIS:
         return "davis"
     if path.suffix.lower() == ".mat" and start[:1] in b"\0\x01\x02\x03":
         return "mat"
