@@ -61,7 +61,8 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
         u = _values(data["u"], data, dims) if "u" in data else np.zeros_like(v)
         points["wind [m s-1]"] = u, v, w  # type: ignore[assignment]
     axes = [np.atleast_1d(data[axis].values).astype(float) for axis in AXES]
-    start, steps = (), ()
+    start: tuple[float, ...] = ()
+    steps: tuple[float, ...] = ()
     if kind == ".vti":
         start = tuple(float(axis[0]) for axis in axes)
         steps = tuple(float(axis[-1] - axis[0]) / max(axis.size - 1, 1) or 1.0 for axis in axes)

@@ -63,6 +63,57 @@ def test_white_as_zero_is_refused_at_every_depth(tmp_path):
             read_pixels(tmp_path / "a.tif")
 
 
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"photometric": "separated", "channels": 4}, "pixels are SEPARATED"),
+        ({"photometric": "cielab", "channels": 3}, "pixels are CIELAB"),
+        ({"photometric": "cfa"}, "pixels are CFA"),
+        ({"tag": (259, 34661)}, "compressed by JBIG, which is not read"),
+        ({"kind": "c8"}, "complex"),
+    ],
+)
+def test_what_is_no_grey_and_no_colour_is_named(tmp_path, options, says):
+    channels, kind = options.get("channels", 1), options.get("kind", "u1")
+    data = np.ones((16, 16, channels)[: 3 if channels > 1 else 2], kind)
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        data,
+        photometric=options.get("photometric", "minisblack"),
+        metadata=None,
+    )
+    if "tag" in options:
+        with tifffile.TiffFile(tmp_path / "a.tif", mode="r+") as file:
+            file.pages[0].tags[options["tag"][0]].overwrite(options["tag"][1])
+    with pytest.raises(InputError, match=says):
+        read_pixels(tmp_path / "a.tif")
+
+
+def test_luma_is_turned_into_colours(tmp_path):
+    """JPEG within TIFF, colour at half the resolution; a smooth image survives it."""
+    y, x = np.mgrid[:32, :32] * 3
+    colours = np.stack([y + 60, 200 - x, x + 80], -1).astype("u1")
+    tifffile.imwrite(
+        tmp_path / "a.tif",
+        colours,
+        photometric="rgb",
+        compression="jpeg",
+        compressionargs={"level": 95},
+    )
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        assert file.pages[0].photometric.name == "YCBCR"
+    assert np.abs(read_pixels(tmp_path / "a.tif") - files.mean(colours)).max() < 6
+
+
+def test_shallow_bitmaps_are_refused(tmp_path):
+    """BMP of 5 bits a colour, which would be spread over 0 to 255."""
+    head = b"BM" + (14 + 40 + 32).to_bytes(4, "little") + bytes(4) + (54).to_bytes(4, "little")
+    about = b"".join(n.to_bytes(4, "little") for n in (40, 4, 4)) + b"\1\0\x10\0" + bytes(24)
+    (tmp_path / "a.bmp").write_bytes(head + about + bytes(range(32)))
+    with pytest.raises(InputError, match="BMP of 16 bits a pixel"):
+        read_pixels(tmp_path / "a.bmp")
+
+
 def test_a_frame_of_several(tmp_path):
     path = tmp_path / "a.tif"
     pages = np.random.default_rng(1).integers(0, 60000, (3, 8, 9)).astype("u2")

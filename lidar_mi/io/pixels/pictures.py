@@ -77,10 +77,11 @@ def _opened(path, formats):
 
 def _refuse_shallow(path, file):
     """Five or six bits a colour, which the library spreads over 0 to 255."""
-    if file.format == "BMP" and file.info.get("compression") is not None:
+    if file.format == "BMP":
         with path.open("rb") as raw:
-            depth = int.from_bytes(raw.read(30)[28:], "little")
-        if depth == 16:
+            head = raw.read(30)
+        # the oldest header, of 12 bytes, has no such depth
+        if head[14:15] != b"\x0c" and head[28:30] == b"\x10\0":
             raise InputError(f"{path}: BMP of 16 bits a pixel; expected 1, 4, 8, 24 or 32")
 
 

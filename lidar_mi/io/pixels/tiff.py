@@ -162,11 +162,19 @@ def _pixels(path, page):
 
 def _check(path, page, count=1):
     """Refuse what is no light, or not there; the number of channels of transparency."""
+    import tifffile
+
     samples, photometric = page.samplesperpixel, int(page.photometric)
     extra = [int(kind) for kind in page.tags.valueof(_EXTRA, ())] if _EXTRA in page.tags else []
     if page.dtype is None or page.dtype.kind not in "biuf":
         raise InputError(
             f"{path}: pixels of {page.bitspersample} bits, {page.dtype}; expected real numbers"
+        )
+    if page.compression not in tifffile.TIFF.DECOMPRESSORS:
+        name = getattr(page.compression, "name", page.compression)
+        raise InputError(
+            f"{path}: compressed by {name}, which is not read; expected another compression: "
+            "tiffcp -c lzw FILE NEW"
         )
     check_size(path, 8 * count * page.imagewidth * page.imagelength * samples)
     if _PHOTOMETRIC not in page.tags or photometric == _MINISWHITE:
