@@ -78,8 +78,8 @@ def read_frames(
     if numbers is None:
         if frames.channels:
             raise InputError(
-                f"{path}: {frames.count} channels, not images one after the other; expected "
-                f"--frame, 0 to {frames.count - 1}"
+                f"{path}: {frames.count} channels, not images one after the other; expected frames "
+                "in time, or one by --frame where the command has it"
             )
         numbers = range(frames.count)
     return _numbered(path, frames, numbers)

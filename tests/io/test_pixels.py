@@ -131,6 +131,23 @@ def test_a_frame_of_several(tmp_path):
         read_pixels(path, frame=3)
 
 
+def test_pages_that_share_their_pixels_are_no_bomb(tmp_path):
+    """1000 pages of the same megabyte: refused before memory is asked for."""
+    with tifffile.TiffWriter(tmp_path / "a.tif", byteorder=">") as file:
+        file.write(np.zeros((1024, 1024), "u1"), metadata=None, rowsperstrip=1024)
+    content = (tmp_path / "a.tif").read_bytes()
+    start = int.from_bytes(content[4:8], "big")
+    size = 2 + 12 * int.from_bytes(content[start : start + 2], "big")
+    page, content = content[start : start + size], content + bytes(len(content) % 2)
+    ends = [len(content) + (k + 1) * (size + 4) for k in range(1000)]
+    content = content[:4] + len(content).to_bytes(4, "big") + content[8:]
+    content += b"".join(page + end.to_bytes(4, "big") for end in (*ends[:-1], 0))
+    (tmp_path / "a.tif").write_bytes(content)
+    np.testing.assert_array_equal(read_pixels(tmp_path / "a.tif", frame=999), 0)
+    with pytest.raises(InputError, match=r"declares 8\.39e\+09 bytes"):
+        read_frames(tmp_path / "a.tif")
+
+
 def test_channels_are_no_frames_unless_asked_for(tmp_path):
     path = tmp_path / "a.tif"
     data = np.random.default_rng(1).integers(0, 60000, (2, 8, 9)).astype("u2")

@@ -51,7 +51,10 @@ def read_tiff(path: Path) -> Frames:
         with _opened(path) as file:
             found = []
             for number in chosen:
-                found.append(_pixels(path, file.pages[numbers[number]]))
+                page = file.pages[numbers[number]]
+                # pages can share their pixels
+                check_size(path, 8 * len(chosen) * page.imagewidth * page.imagelength)
+                found.append(_pixels(path, page))
                 if found[-1].shape != found[0].shape:
                     (high, wide), (rows, columns) = found[-1].shape, found[0].shape
                     raise InputError(
