@@ -33,7 +33,7 @@ _ALPHA = (1, 2)
 def read_tiff(path: Path) -> Frames:
     """The pages of a file, or the axis of time, depth or channels that its metadata state.
 
-    Reduced copies of a page (pyramids, thumbnails) are left out. A page is turned as its
+    Reduced copies of a page (pyramids, thumbnails) and masks are left out. A page is turned as its
     orientation says; GDAL's value for missing data becomes NaN.
 
     Raises
@@ -110,7 +110,7 @@ def _planes(path, file):
 
     No numbers (None): the images follow the first page's and have no pages of their own.
     """
-    whole = [number for number, page in enumerate(file.pages) if not page.is_reduced]
+    whole = [n for n, page in enumerate(file.pages) if not (page.is_reduced or page.is_mask)]
     if not whole:
         raise InputError(f"{path}: no page of full size; expected an image")
     series = file.series
