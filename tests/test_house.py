@@ -73,7 +73,7 @@ NOT_YET: set[str] = set()
 """Findings in rooms that are being rebuilt: each goes when its room is done."""
 
 
-FORMATS = ("yaml", "OpenEXR", "PIL", "h5netcdf", "astropy")
+FORMATS = ("yaml", "OpenEXR", "PIL", "h5netcdf", "astropy", "tifffile", "imagecodecs", "lvpyio")
 """Libraries of file formats."""
 
 OPENING = {

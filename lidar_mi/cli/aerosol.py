@@ -29,7 +29,7 @@ def aerosol(
     wavelength: Annotated[str, typer.Option(help="Vacuum wavelength.")] = "532 nm",
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", help="Table to write. Default: aerosol_NAME_NNNnm.txt."),
+        typer.Option("-o", "--out", help="Table to write (.txt). Default: aerosol_NAME_NNNnm.txt."),
     ] = None,
     name: Annotated[
         str | None,
@@ -103,7 +103,7 @@ def aerosol(
         number_density=quantity("--number-density", number_density, "1/m^3", "2e8 / m^3"),
     )
     path = out or Path(f"aerosol_{particles.name}_{metres * 1e9:.0f}nm.txt")
-    check_target(path, overwrite=overwrite)
+    check_target(path, overwrite=overwrite, suffixes=(".txt",))
     with progress() as notice:
         table = make_table(particles, metres, nodes, notice)
     write_table(table, path)

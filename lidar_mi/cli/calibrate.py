@@ -20,8 +20,8 @@ def calibrate(
     frames: Annotated[
         list[Path],
         typer.Argument(
-            help="Frames of the laser's own light: EXR, PNG, TIFF (also of several pages) or FITS "
-            "(also cubes); two at least, twenty are good."
+            help="Frames of the laser's own light: images of any kind, TIFF also of several pages, "
+            "FITS and arrays also cubes; two at least, twenty are good."
         ),
     ],
     instrument: NominalInstrument = "fringes_paper",
@@ -50,8 +50,12 @@ def calibrate(
         int, typer.Option(help="Degree of the background's polynomial; 8 for stray light.")
     ] = 4,
     max_chi_square: Annotated[float, typer.Option(help="Frames that fit worse are refused.")] = 2.0,
-    layer: Annotated[str | None, typer.Option(help="Layer of EXR files.")] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="NetCDF file.")] = Path("etalon.nc"),
+    layer: Annotated[
+        str | None, typer.Option(help="Layer of EXR files, array of npz, mat and HDF5 files.")
+    ] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="NetCDF file (.nc).")] = Path(
+        "etalon.nc"
+    ),
     overwrite: Overwrite = False,
 ) -> None:
     """Calibrate an etalon from frames of its laser: focal length, tilt, distortion, finesse, light.
@@ -68,15 +72,18 @@ def calibrate(
     from lidar_mi.io.netcdf import write_netcdf
     from lidar_mi.io.png import write_png
     from lidar_mi.io.target import check_target
+    from lidar_mi.retrieval.checks import identical
 
     figure = out.with_suffix(".png")
     lamps = _lines(line or [])
     given = [*frames, *(flat or []), *(path for paths in lamps.values() for path in paths)]
-    for path in (out, figure):
-        check_target(path, given, overwrite=overwrite)
+    check_target(out, given, overwrite=overwrite, suffixes=(".nc",))
+    check_target(figure, given, overwrite=overwrite)
     experiment = load(experiment_file(instrument), list(changes or []))
     ccd, counts = doppler_of(experiment, "--instrument").ccd, not electrons
     values = read_electrons(frames, ccd, counts=counts, layer=layer)
+    if same := identical(values, "frames", start=0):
+        output.print(f"warning: {same}")
     white = None
     if flat:
         white = read_electrons(flat, ccd, counts=counts, layer=layer).mean(0)

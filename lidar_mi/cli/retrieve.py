@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 EXAMPLES = (
     "Examples: `lidar-mi retrieve image_t1.exr image_t2.exr --dt 0.1 -o wind.nc` - "
-    "`lidar-mi retrieve frame_*.tif --dt 0.1 --spacing 0.5 --pairs all`"
+    "`lidar-mi retrieve frame_*.tif --dt 0.1 --spacing 0.5 --pairs all` - "
+    "`lidar-mi retrieve stack.tif --frame 3,4 --dt 0.1 --spacing 0.5 -o wind.csv`"
 )
 
 _SAME = 1e-3
@@ -26,14 +27,20 @@ _SAME = 1e-3
 
 
 def retrieve(
-    first: Annotated[Path, typer.Argument(help="Image at t1: EXR, TIFF, PNG, BMP, JPEG or FITS.")],
-    second: Annotated[Path, typer.Argument(help="Image at t2.")],
-    *,
-    more: Annotated[
-        list[Path] | None,
+    files: Annotated[
+        list[Path],
         typer.Argument(
-            help="Further images, each dt after the one before: of a burst (variational), or of "
-            "a sequence (--pairs)."
+            help="Images at t1 and t2: EXR, TIFF, PNG, BMP, JPEG, FITS, PGM, npy, mat, HDF5, ...; "
+            "or one file that holds both, such as a TIFF of two pages. Further images, each dt "
+            "after the one before: of a burst (variational), or of a sequence (--pairs)."
+        ),
+    ],
+    *,
+    frame: Annotated[
+        str | None,
+        typer.Option(
+            help="Numbers of the frames, from 0, of files that hold several: two of one file, such "
+            "as 0,1 (more: a burst), or one for each file."
         ),
     ] = None,
     pairs: Annotated[
@@ -47,7 +54,15 @@ def retrieve(
         float | None,
         typer.Option(help="Time between the images, s. Default: what the files of a run say."),
     ] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="NetCDF file.")] = Path("wind.nc"),
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--out",
+            help="File of the winds: .nc (NetCDF), .csv, .mat (MATLAB), .vtk or .vti (VTK), .flo "
+            "(Middlebury: displacements in pixels alone).",
+        ),
+    ] = Path("wind.nc"),
     method: Annotated[
         str,
         typer.Option(
@@ -62,8 +77,8 @@ def retrieve(
     layer: Annotated[
         str | None,
         typer.Option(
-            help="Layer of the EXR files. Default: Y_noisy (with the detector's noise), else Y, or "
-            "the only one."
+            help="Layer of the EXR files, array of npz, mat and HDF5 files. Default: Y_noisy (with "
+            "the detector's noise), else Y, or the only one."
         ),
     ] = None,
     spacing: Annotated[
@@ -90,12 +105,13 @@ def retrieve(
     overwrite: Overwrite = False,
 ) -> None:
     """Retrieve the cross-flow wind (v, w) from any two images of the same air, or from many."""
+    import numpy as np
     import xarray as xr
 
     from lidar_mi import __version__
-    from lidar_mi.io.images import read_beams, read_image, read_noise
-    from lidar_mi.io.netcdf import write_netcdf
+    from lidar_mi.io.images import read_beams, read_images, read_noise
     from lidar_mi.io.target import check_target
+    from lidar_mi.io.wind_file import SERIES, SUFFIXES, write_wind
     from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
     from lidar_mi.retrieval.velocimetry.gridding import on_nodes
     from lidar_mi.retrieval.velocimetry.methods import METHODS
@@ -103,16 +119,19 @@ def retrieve(
     from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
     from lidar_mi.retrieval.velocimetry.wind_series import retrieve_winds
 
-    paths = (first, second, *(more or []))
+    check_target(out, files, overwrite=overwrite, suffixes=SUFFIXES if pairs is None else SERIES)
+    numbers = None if frame is None else _numbers(frame)
+    layer = layer or _layer(files)
+    asked = _frames(files, layer, numbers, pairs)
+    paths = [path for path, frames in asked for _ in frames]
     chosen = None if pairs is None else _pairs(pairs, len(paths))
-    if more and chosen is None and method in METHODS and "more" not in METHODS[method].options:
+    more = len(paths) > 2 and chosen is None
+    if more and method in METHODS and "more" not in METHODS[method].options:
         raise InputError(
             f"{len(paths)} images are not allowed with --method {method}; expected two, --pairs "
             "all (a wind from each pair), or --method variational (one wind from all)"
         )
-    check_target(out, paths, overwrite=overwrite)
-    layer = layer or _layer(paths)
-    images = [read_image(path, layer, spacing) for path in paths]
+    images = [one for path, frames in asked for one in read_images(path, frames, layer, spacing)]
     steps = _time_steps(paths, dt, equal=chosen is None)
     noisy = paths if chosen is not None else paths[:1]
     levels: list[Any] = [
@@ -151,6 +170,7 @@ def retrieve(
         "min_texture": min_texture,
         "min_isotropy": min_isotropy,
     }
+    grid = images[0]
     if chosen is not None:
         with progress() as notice:
             wind = retrieve_winds(
@@ -163,7 +183,7 @@ def retrieve(
                 **options,
             )
     else:
-        pair = on_one_grid(*images[:2])
+        grid, _ = pair = on_one_grid(*images[:2])
         level = levels[0]
         if isinstance(level, xr.DataArray) and pair[0] is not images[0]:
             # noise cannot be interpolated: its median is used
@@ -176,13 +196,81 @@ def retrieve(
             times=on_one_grid(*seen[:2]) if timed else None,
             **options,
         )
-    write_netcdf(wind.assign_attrs(software=f"lidar-mi {__version__}"), out)
+    z, y = (float(np.diff(grid[axis].values).mean()) for axis in "zy")
+    wind = wind.assign_attrs(software=f"lidar-mi {__version__}")
+    lost = write_wind(out, wind, (z, y))
     if chosen is not None:
         _print_series(wind)
     else:
         _print_wind(wind)
     output.print(f"method   {method}")
     output.print(f"winds    {out}")
+    if lost:
+        output.print(f"lost     {lost}; .nc has them", soft_wrap=True)
+
+
+def _numbers(text: str) -> list[int]:
+    """Frames that --frame names."""
+    numbers = [part.strip() for part in text.split(",")]
+    if not all(number.isascii() and number.isdigit() and len(number) < 10 for number in numbers):
+        raise InputError(
+            f"--frame: {text[:50]!r} is not allowed; expected numbers from 0, such as 0,1"
+        )
+    return [int(number) for number in numbers]
+
+
+def _frames(
+    files: Sequence[Path], layer: str | None, numbers: list[int] | None, pairs: str | None
+) -> list[tuple[Path, Sequence[int]]]:
+    """Which frames of which files are meant; what is ambiguous is refused with the choices."""
+    from lidar_mi.io.images import frames_in
+
+    if len(files) == 1:
+        return [(files[0], _of_one_file(files[0], layer, numbers, pairs))]
+    if numbers is None:
+        for path in files:
+            count, _ = frames_in(path, layer)
+            if count > 1:
+                shown = ",".join("0" for _ in files[:4])
+                raise InputError(
+                    f"{path}: {count} frames; expected --frame with a number for each file, such "
+                    f"as {shown}, or this file alone"
+                )
+        numbers = [0]
+    if len(numbers) not in (1, len(files)):
+        raise InputError(
+            f"--frame: {len(numbers)} numbers are not allowed with {len(files)} files; expected "
+            f"one, or {len(files)}"
+        )
+    each = numbers * len(files) if len(numbers) == 1 else numbers
+    return [(path, [number]) for path, number in zip(files, each, strict=True)]
+
+
+def _of_one_file(
+    path: Path, layer: str | None, numbers: list[int] | None, pairs: str | None
+) -> Sequence[int]:
+    from lidar_mi.io.images import frames_in
+
+    if numbers is not None:
+        if pairs is not None:
+            raise InputError("--frame, --pairs: both with one file; expected one of them")
+        if len(numbers) < 2:
+            raise InputError(f"--frame: one frame of {path}; expected two, such as 0,1")
+        return numbers
+    count, channels = frames_in(path, layer)
+    if count == 1:
+        raise InputError(f"{path}: one image; expected two files, or a file of two frames")
+    if channels:
+        raise InputError(
+            f"{path}: {count} channels of one moment by what the file says; expected --frame 0,1 "
+            "to take two as images one after the other"
+        )
+    if count > 2 and pairs is None:
+        raise InputError(
+            f"{path}: {count} frames; expected --frame with two of them, such as 0,1, or --pairs "
+            "all (a wind from each with the next)"
+        )
+    return range(count)
 
 
 def _pairs(text: str, count: int) -> list[tuple[int, int]]:
@@ -225,6 +313,8 @@ def _print_wind(wind: "xr.Dataset") -> None:
     """What was retrieved from two images or from a burst."""
     if "fit" in wind.attrs:
         _print_vortices(wind)
+    if "identical_images" in wind.attrs:
+        output.print(f"warning: {wind.attrs['identical_images']}: no motion can be told from them")
     if "fixed_pattern" in wind.attrs:
         output.print(f"warning: {wind.attrs['fixed_pattern']} in all images")
     if "illumination" in wind.attrs:

@@ -22,8 +22,8 @@ def rings(
     images: Annotated[
         list[Path],
         typer.Argument(
-            help="EXR, PNG, TIFF, BMP, JPEG or FITS image, a TIFF of several pages, a FITS cube, "
-            "or several files of one instrument."
+            help="Image of any kind (EXR, PNG, TIFF, BMP, JPEG, FITS, PGM, npy, mat, HDF5, ...), a "
+            "TIFF of several pages, a cube, or several files of one instrument."
         ),
     ],
     frame: Annotated[
@@ -58,7 +58,11 @@ def rings(
         typer.Option("-o", "--out", help="Image (PNG). Default: IMAGE_rings.png; a table: none."),
     ] = None,
     layer: Annotated[
-        str | None, typer.Option(help="Layer of an EXR file. Default: Y, or the only one.")
+        str | None,
+        typer.Option(
+            help="Layer of an EXR file, array of an npz, mat or HDF5 file. Default: Y, or the only "
+            "one."
+        ),
     ] = None,
     saturation: Annotated[
         float | None, typer.Option(help="Value from which a pixel is saturated.")
@@ -84,7 +88,7 @@ def rings(
         _series(images, layer, (centre, saturation, spacing), out, overwrite)
         return
     path = out or Path(f"{images[0].stem}_rings.png")
-    check_target(path, images, overwrite=overwrite)
+    check_target(path, images, overwrite=overwrite, suffixes=(".png",))
     values = _one(images, layer, frame, average, saturation)
     name = images[0] if len(images) == 1 else f"{images[0]} to {images[-1]}"
     try:
@@ -116,26 +120,38 @@ def _frames(images: list[Path], layer: str | None):
 
 def _one(images, layer, frame, average, saturation):
     """The frame that is asked for, or the mean of all."""
+    from lidar_mi.io.images import frames_in, read_frames
     from lidar_mi.retrieval.rings.frames import checked
 
-    frames = list(_frames(images, layer))
     if average:
+        frames = list(_frames(images, layer))
         for name, one in frames:
             try:
                 checked(one, saturation)
             except InputError as error:
                 raise InputError(f"{name}: {error}") from None
+        _remark([one for _, one in frames])
         return sum(one for _, one in frames) / len(frames)
-    if frame is None and len(frames) > 1:
+    places = [(path, n) for path in images for n in range(frames_in(path, layer)[0])]
+    if frame is None and len(places) > 1:
         raise InputError(
-            f"{images[0]}: {len(frames)} frames; expected --frame N, --average or --all"
+            f"{images[0]}: {len(places)} frames; expected --frame N, --average or --all"
         )
     number = frame or 0
-    if not 0 <= number < len(frames):
+    if not 0 <= number < len(places):
         raise InputError(
-            f"--frame: {number} is not allowed; expected 0 to {len(frames) - 1} of {images[0]}"
+            f"--frame: {number} is not allowed; expected 0 to {len(places) - 1} of {images[0]}"
         )
-    return frames[number][1]
+    path, one = places[number]
+    return read_frames(path, layer, [one])[0].astype(float)
+
+
+def _remark(frames) -> None:
+    """Frames that are there twice."""
+    from lidar_mi.retrieval.checks import identical
+
+    if same := identical(frames, "frames", start=0):
+        output.print(f"warning: {same}")
 
 
 def _series(images, layer, options, out, overwrite) -> None:
@@ -149,6 +165,7 @@ def _series(images, layer, options, out, overwrite) -> None:
             raise InputError(f"{out}: a table of frames; expected a name that ends in .csv")
         check_target(out, images, overwrite=overwrite)
     names, frames = zip(*_frames(images, layer), strict=True)
+    _remark(frames)
     series = analyse_series(frames, *options)
     if not any(series.rings):
         raise InputError(f"{names[0]}: {series.refused[0]}; no frame has rings that are measured")

@@ -20,8 +20,8 @@ def v_los(
     frames: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Frames of the echo of air: EXR, PNG, TIFF (also of several pages) or FITS (also "
-            "cubes)."
+            help="Frames of the echo of air: images of any kind, TIFF also of several pages, FITS "
+            "and arrays also cubes."
         ),
     ] = None,
     signal: Annotated[
@@ -43,9 +43,11 @@ def v_los(
         float | None,
         typer.Option(help="Frames that fit worse are refused. Default: doppler.retrieval's."),
     ] = None,
-    layer: Annotated[str | None, typer.Option(help="Layer of EXR files.")] = None,
+    layer: Annotated[
+        str | None, typer.Option(help="Layer of EXR files, array of npz, mat and HDF5 files.")
+    ] = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", help="NetCDF file. Default: none.")
+        Path | None, typer.Option("-o", "--out", help="NetCDF file (.nc). Default: none.")
     ] = None,
     overwrite: Overwrite = False,
 ) -> None:
@@ -55,6 +57,7 @@ def v_los(
     from lidar_mi.experiment.shipped import experiment_file
     from lidar_mi.io.netcdf import read_netcdf, write_netcdf
     from lidar_mi.io.target import check_target
+    from lidar_mi.retrieval.checks import identical
     from lidar_mi.retrieval.rings.calibration import calibration_of
     from lidar_mi.tables import Table, with_error
 
@@ -63,7 +66,7 @@ def v_los(
         raise InputError("frames: none is not allowed; expected files of the echo of air")
     given = [*frames, *(reference or []), *([calibration] if calibration else [])]
     if out is not None:
-        check_target(out, given, overwrite=overwrite)
+        check_target(out, given, overwrite=overwrite, suffixes=(".nc",))
     experiment = load(experiment_file(instrument), list(changes or []))
     ccd, counts = doppler_of(experiment, "--instrument").ccd, not electrons
     known = None
@@ -73,6 +76,8 @@ def v_los(
         except InputError as error:
             raise InputError(f"{calibration}: {error}") from None
     air = read_electrons(frames, ccd, counts=counts, layer=layer)
+    if same := identical(air, "frames", start=0):
+        output.print(f"warning: {same}")
     laser = read_electrons(reference, ccd, counts=counts, layer=layer) if reference else None
     found = retrieve_v_los(air, laser, experiment, calibration=known, max_chi_square=max_chi_square)
     rows: list[tuple[str, ...]] = []

@@ -26,7 +26,7 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
-from lidar_mi.io.exr_header import declared_size
+from lidar_mi.io.exr_header import declared
 from lidar_mi.io.size import check_size
 
 MOST_LAYERS = 2**15 - 1
@@ -167,20 +167,33 @@ def _read(path: str | Path, *, header_only: bool = False) -> tuple[dict, dict[st
     if not path.is_file():
         raise InputError(f"{path}: no such file; expected an OpenEXR image")
     try:
-        size = declared_size(path)
+        size, count = declared(path)
     except ValueError as error:
         raise InputError(f"{path}: not a readable OpenEXR image ({error})") from None
     check_size(path, size)
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file:
             header = {k: v for k, v in file.header().items() if k not in _STRUCTURE}
-            channels = {} if header_only else file.channels()
-            layers = {k: np.array(c.pixels) for k, c in channels.items()}
+            layers = {} if header_only else _layers(file.parts)
+            whole = header_only or len(file.parts) == count
     except Exception:  # any exception of the library in a damaged file
         raise InputError(f"{path}: not a readable OpenEXR image") from None
+    if not whole:
+        raise InputError(f"{path}: not a readable OpenEXR image (part of it is missing)")
     if not header_only and len({pixels.shape for pixels in layers.values()}) != 1:
         raise InputError(f"{path}: not a readable OpenEXR image (its layers differ in size)")
     return header, layers
+
+
+def _layers(parts) -> dict[str, np.ndarray]:
+    """Pixels by the names of channels; of several parts by PART.CHANNEL."""
+    names = [part.name() if len(parts) > 1 else "" for part in parts]
+    found = {}
+    for number, (name, part) in enumerate(zip(names, parts, strict=True)):
+        prefix = name if names.count(name) == 1 else f"{name or 'part'}{number}"
+        for channel, content in part.channels.items():
+            found[f"{prefix}.{channel}" if prefix else channel] = np.array(content.pixels)
+    return found
 
 
 def axis_of(header: dict, name: str, size: int, path: str | Path) -> np.ndarray:

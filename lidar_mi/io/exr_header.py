@@ -10,8 +10,8 @@ _LONGEST = 64 << 20
 _BYTES = {0: 4, 1: 2, 2: 4}
 
 
-def declared_size(path: Path) -> int:
-    """Bytes of all pixels of all parts.
+def declared(path: Path) -> tuple[int, int]:
+    """Bytes of all pixels of all parts, and the number of parts.
 
     Raises
     ------
@@ -21,29 +21,30 @@ def declared_size(path: Path) -> int:
     with path.open("rb") as file:
         content = file.read(min(_LONGEST, path.stat().st_size))
     try:
-        return _size(content)
+        return _declared(content)
     except (struct.error, IndexError, KeyError):
         raise ValueError("its header is cut off or damaged") from None
 
 
-def _size(content: bytes) -> int:
+def _declared(content: bytes) -> tuple[int, int]:
     if content[:4] != _MAGIC:
         raise ValueError("it does not begin as one")
     (flags,) = struct.unpack_from("<I", content, 4)
     if flags & _DEEP:
         raise ValueError("deep pixels")
-    place, total = 8, 0
+    place, total, parts = 8, 0, 0
     while True:
         attributes, place = _attributes(content, place)
         if not attributes:  # an empty header ends those of several parts
-            return total
+            return total, parts
         low_x, low_y, high_x, high_y = struct.unpack("<4i", attributes[b"dataWindow"])
         width, height = high_x - low_x + 1, high_y - low_y + 1
         if width < 1 or height < 1:
             raise ValueError(f"{width} x {height} pixels")
         total += width * height * _bytes_of_pixel(attributes[b"channels"])
+        parts += 1
         if not flags & _PARTS:
-            return total
+            return total, parts
 
 
 def _attributes(content: bytes, place: int) -> tuple[dict[bytes, bytes], int]:

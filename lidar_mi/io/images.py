@@ -1,7 +1,6 @@
 """Images of any common kind: pixels, axes, noise; and packed for a report."""
 
-import math
-import warnings
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
@@ -11,64 +10,143 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.exr import axis_of, read_header, read_layers
-from lidar_mi.io.size import check_size
+from lidar_mi.io.pixels.davis import read_davis
+from lidar_mi.io.pixels.fits import read_fits
+from lidar_mi.io.pixels.frames import Frames, frames_of, grey
+from lidar_mi.io.pixels.kinds import kind_of
+from lidar_mi.io.pixels.named_arrays import read_hdf5, read_mat, read_npy, read_npz
+from lidar_mi.io.pixels.netpbm import read_netpbm
+from lidar_mi.io.pixels.pictures import read_jpeg2000, read_picture
+from lidar_mi.io.pixels.png import read_png
+from lidar_mi.io.pixels.tiff import read_tiff
 
-FITS = (".fits", ".fit", ".fts")
-TIFF = (".tif", ".tiff")
 
+def read_pixels(path: str | Path, layer: str | None = None, frame: int | None = None) -> np.ndarray:
+    """One image of a file of any kind, float64, (height, width), top row first.
 
-def read_pixels(path: str | Path, layer: str | None = None) -> np.ndarray:
-    """Image of an EXR, PNG, TIFF, BMP, JPEG or FITS file, float64, (height, width), top row first.
-
-    Colours are averaged, transparency is left out. Values are those of the file: 8 or 16 bit
-    numbers, floats. A FITS image is read as stored, first row first.
+    Values are those of the file, of whatever depth and sign: nothing is scaled or cut. Colours are
+    averaged in float64, unweighted: where red, green and blue are equal, the value is theirs.
+    Transparency is left out. A FITS image is read as stored, first row first.
 
     Parameters
     ----------
     layer : str, optional
-        Of an EXR file. Default: Y_noisy (what a detector delivered), else Y, or the only one, or
-        the mean of R, G and B.
+        Of an EXR file; the name of an array in an npz, mat or HDF5 file, of a part of a FITS file.
+        Default: of EXR Y_noisy (what a detector delivered), else Y, or the mean of R, G and B; of
+        any file the only one.
+    frame : int, optional
+        Number of the image, from 0; needed where the file has several.
 
     Raises
     ------
     InputError
-        No such file, one that cannot be read, or no such layer.
+        No such file, one that cannot be read, or no such layer or frame; several frames, and none
+        named; values that float64 does not hold exactly.
     """
     path = Path(path)
-    if not path.is_file():
+    frames = _frames(path, layer)
+    if frame is None and frames.count > 1:
+        what = "channels" if frames.channels else "frames"
         raise InputError(
-            f"{path}: no such file; expected an EXR, PNG, TIFF, BMP, JPEG or FITS image"
+            f"{path}: {frames.count} {what}; expected --frame, 0 to {frames.count - 1}"
         )
-    if _is_exr(path):
-        image = _exr(path, layer)
-    elif layer is not None:
-        raise InputError(f"layer: {layer!r} is not allowed for {path}; only EXR files have layers")
-    else:
-        image = _fits(path) if path.suffix.lower() in FITS else _image(path)
-    return np.array(image, dtype=float)
+    return _numbered(path, frames, [frame or 0])[0].astype(float)
 
 
-def read_frames(path: str | Path, layer: str | None = None) -> np.ndarray:
-    """All images of a file as stored, (frames, height, width), top row first.
+def read_frames(
+    path: str | Path, layer: str | None = None, numbers: Sequence[int] | None = None
+) -> np.ndarray:
+    """Images of a file as stored, (frames, height, width), top row first.
 
-    The pages of a TIFF file, the planes of a FITS cube; one for any other. Colours are averaged.
+    The pages of a TIFF file, the planes of a FITS cube or of an array; one for other files. Colours
+    as of `read_pixels`.
 
     Parameters
     ----------
     layer : str, optional
         As of `read_pixels`.
+    numbers : sequence of int, optional
+        Which images, from 0. Default: all, which must not be channels of one moment.
 
     Raises
     ------
     InputError
-        As `read_pixels`; pages of different size.
+        As `read_pixels`; pages of different size, channels.
     """
     path = Path(path)
-    if path.is_file() and layer is None and path.suffix.lower() in FITS:
-        return _fits_cube(path)
-    if path.is_file() and layer is None and path.suffix.lower() in TIFF:
-        return _pages(path)
-    return read_pixels(path, layer)[None]
+    frames = _frames(path, layer)
+    if numbers is None:
+        if frames.channels:
+            raise InputError(
+                f"{path}: {frames.count} channels, not images one after the other; expected frames "
+                "in time, or one by --frame where the command has it"
+            )
+        numbers = range(frames.count)
+    return _numbered(path, frames, numbers)
+
+
+def frames_in(path: str | Path, layer: str | None = None) -> tuple[int, bool]:
+    """How many images a file has, and whether they are channels of one moment.
+
+    Raises
+    ------
+    InputError
+        As `read_pixels`.
+    """
+    if kind_of(Path(path)) in _OF_ONE:
+        return 1, False
+    frames = _frames(Path(path), layer)
+    return frames.count, frames.channels
+
+
+def _numbered(path, frames, numbers):
+    for number in numbers:
+        if not 0 <= number < frames.count:
+            raise InputError(
+                f"{path}: frame {number} is not there; expected --frame 0"
+                + (f" to {frames.count - 1}" if frames.count > 1 else "")
+            )
+    return frames.read(numbers)
+
+
+def _frames(path: Path, layer: str | None) -> Frames:
+    """The images of a file, by the reader of its kind."""
+    kind = kind_of(path)
+    if kind in _WITH_LAYERS:
+        return _WITH_LAYERS[kind](path, layer)
+    if layer is not None:
+        raise InputError(
+            f"layer: {layer!r} is not allowed for {path}; only EXR, FITS, npz, mat and HDF5 files "
+            "have layers"
+        )
+    return _WITHOUT[kind](path)
+
+
+def _exr(path: Path, layer: str | None) -> Frames:
+    layers = read_layers(path)[1]
+    if layer is not None and layer not in layers:
+        raise InputError(
+            f"{path}: layer {layer!r} is not there; expected one of {', '.join(sorted(layers))}"
+        )
+    named = layer or default_layer(path)
+    if named:
+        return frames_of(path, layers[named][None])
+    colours = np.stack([layers[name] for name in "RGB"], -1)
+    return frames_of(path, grey(path, colours, 3)[None])
+
+
+_WITH_LAYERS = {"exr": _exr, "fits": read_fits, "npz": read_npz, "mat": read_mat, "hdf5": read_hdf5}
+_OF_ONE = ("exr", "png", "jpeg2000", "mat")
+"""Kinds that hold one image."""
+_WITHOUT = {
+    "tiff": read_tiff,
+    "png": read_png,
+    "picture": read_picture,
+    "jpeg2000": read_jpeg2000,
+    "netpbm": read_netpbm,
+    "npy": read_npy,
+    "davis": read_davis,
+}
 
 
 def default_layer(path: str | Path) -> str | None:
@@ -82,7 +160,7 @@ def default_layer(path: str | Path) -> str | None:
     InputError
         One that cannot be read, or several layers of which one has to be named.
     """
-    if not Path(path).is_file() or not _is_exr(path):
+    if not _is_exr(path):
         return None
     layers = read_layers(path)[1]
     for name in ("Y_noisy", "Y"):
@@ -97,15 +175,17 @@ def default_layer(path: str | Path) -> str | None:
 
 def stated_units(path: str | Path) -> str:
     """Units of the values as the header of a rendered EXR file states them; empty otherwise."""
-    path = Path(path)
-    if not path.is_file() or not _is_exr(path):
+    if not _is_exr(path):
         return ""
     return str(read_header(path).get("units", ""))
 
 
 @checked_arguments
 def read_image(
-    path: str | Path, layer: str | None = None, spacing: float | None = None
+    path: str | Path,
+    layer: str | None = None,
+    spacing: float | None = None,
+    frame: int | None = None,
 ) -> xr.DataArray:
     """Pixels as `read_pixels` gives them, on axes (z, y), ascending, in metres.
 
@@ -116,12 +196,16 @@ def read_image(
     Parameters
     ----------
     path : path
-        EXR, PNG, TIFF, BMP, JPEG or FITS file. Colours are averaged.
+        EXR, TIFF, PNG, JPEG, JPEG 2000, BMP, GIF, WebP, PGM, PPM, PAM, PFM, FITS, npy, npz, mat,
+        HDF5 or im7 file. Colours are averaged, transparency is left out.
     layer : str, optional
-        Of an EXR file. Default: Y_noisy (what a detector delivered), else Y, or the only one, or
-        the mean of R, G and B.
+        Of an EXR file; the name of an array in an npz, mat or HDF5 file, of a part of a FITS file.
+        Default: of EXR Y_noisy (what a detector delivered), else Y, or the mean of R, G and B; of
+        any file the only one.
     spacing : float, optional
         From pixel to pixel, m; for files without axes.
+    frame : int, optional
+        Number of the image, from 0; needed where the file has several.
 
     Returns
     -------
@@ -131,7 +215,8 @@ def read_image(
     Raises
     ------
     InputError
-        No such file, one that cannot be read, or no such layer; no axes and no spacing above 0.
+        No such file, one that cannot be read, or no such layer or frame; several frames, and none
+        named; no axes and no spacing above 0.
 
     Examples
     --------
@@ -142,9 +227,21 @@ def read_image(
     >>> image.dims, image.shape, float(image["y"][-1])
     (('z', 'y'), (40, 60), 14.75)
     """
+    return _on_axes(path, layer, spacing, read_pixels(path, layer, frame))
+
+
+def read_images(
+    path: str | Path, numbers: Sequence[int], layer: str | None = None, spacing: float | None = None
+) -> list[xr.DataArray]:
+    """Some images of a file, each as `read_image` gives it; the file is read once."""
+    images = read_frames(path, layer, numbers)
+    return [_on_axes(path, layer, spacing, one.astype(float)) for one in images]
+
+
+def _on_axes(path, layer, spacing, pixels):
+    """Pixels, top row first, on the axes of their file or of even spacing."""
     if spacing is not None and not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"{path}: spacing: {spacing} m is not allowed; expected a number above 0")
-    pixels = read_pixels(path, layer)
     rows, columns = pixels.shape
     header = read_layers(path)[0] if _is_exr(path) else {}
     if spacing is not None:
@@ -259,107 +356,7 @@ def as_webp(path: str | Path) -> bytes:
 
 
 def _is_exr(path: str | Path) -> bool:
-    return Path(path).suffix.lower() == ".exr"
-
-
-def _exr(path, layer):
-    layers = read_layers(path)[1]
-    if layer is not None:
-        if layer not in layers:
-            raise InputError(
-                f"{path}: layer {layer!r} is not there; expected one of {', '.join(sorted(layers))}"
-            )
-        return layers[layer]
-    named = default_layer(path)
-    return layers[named] if named else np.mean([layers[name] for name in "RGB"], axis=0)
-
-
-def _fits(path):
-    cube = _fits_cube(path)
-    if len(cube) != 1:
-        raise InputError(
-            f"{path}: its first image is {' x '.join(map(str, cube.shape))}; expected one of two "
-            "dimensions"
-        )
-    return cube[0]
-
-
-def _fits_cube(path):
-    try:
-        from astropy.io import fits
-    except ImportError:
-        raise InputError(
-            f"{path}: FITS files need the library astropy: pip install 'lidar-mi[fits]'"
-        ) from None
-    with path.open("rb") as file:
-        if file.read(6) != b"SIMPLE":
-            raise InputError(f"{path}: no readable FITS file (it does not begin as one)")
-    try:
-        with fits.open(path, memmap=False) as parts:
-            shapes = [part.shape for part in parts if part.is_image]
-            check_size(path, max((8 * math.prod(shape) for shape in shapes), default=0))
-            found = [part.data for part in parts if part.is_image and part.data is not None]
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise InputError(f"{path}: no readable FITS file ({_short(error)})") from None
-    image = found[0].squeeze() if found else np.zeros(())
-    if image.ndim not in (2, 3):
-        shape = " x ".join(map(str, found[0].shape)) if found else "none"
-        raise InputError(f"{path}: its first image is {shape}; expected two or three dimensions")
-    return image.reshape(-1, *image.shape[-2:])
-
-
-def _opened(path):
-    """An image of one of the formats of cameras: reading others may execute programs."""
-    from PIL import Image
-
-    with warnings.catch_warnings():
-        # its size is checked once it is known
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-        return Image.open(path, formats=("PNG", "TIFF", "BMP", "JPEG", "WEBP"))
-
-
-def _image(path):
-    try:
-        with _opened(path) as file:
-            check_size(path, 8 * file.width * file.height * len(file.getbands()))
-            return _grey(file)
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise InputError(f"{path}: no readable image ({_short(error)})") from None
-
-
-def _pages(path):
-    try:
-        with _opened(path) as file:
-            number = getattr(file, "n_frames", 1)
-            check_size(path, 8 * number * file.width * file.height * len(file.getbands()))
-            first, found = file.size, []
-            for page in range(number):
-                file.seek(page)
-                if file.size != first:
-                    raise InputError(
-                        f"{path}: page {page} is {file.width} x {file.height} px; expected "
-                        f"{first[0]} x {first[1]} px as of the first"
-                    )
-                found.append(_grey(file))
-            return np.stack(found)
-    except InputError:
-        raise
-    except Exception as error:  # any exception of the library in a damaged file
-        raise InputError(f"{path}: no readable image ({_short(error)})") from None
-
-
-def _grey(file):
-    """Pixels of an image of the library, colours averaged, transparency left out."""
-    indirect = file.mode in ("P", "CMYK", "YCbCr", "HSV", "LAB")
-    image = file.convert("RGB") if indirect else file
-    bands, pixels = image.getbands(), np.asarray(image)
-    if pixels.ndim == 2:
-        return pixels
-    return pixels[..., [k for k, band in enumerate(bands) if band != "A"]].mean(-1)
+    return kind_of(Path(path)) == "exr"
 
 
 def _short(error: Exception) -> str:

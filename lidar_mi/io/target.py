@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from PIL import Image, UnidentifiedImageError
@@ -15,7 +15,11 @@ _OURS = "lidar-mi "
 
 
 def check_target(
-    path: str | Path, inputs: Iterable[str | Path] = (), *, overwrite: bool = False
+    path: str | Path,
+    inputs: Iterable[str | Path] = (),
+    *,
+    overwrite: bool = False,
+    suffixes: Sequence[str] = (),
 ) -> None:
     """Refuse an output path that must not be written, before any work is done.
 
@@ -26,17 +30,20 @@ def check_target(
         Input files, which are never replaced, under any name.
     overwrite : bool
         Replace a file that is no result of lidar-mi.
+    suffixes : sequence of str
+        Of the formats that the command writes; none: whatever the name, the format is one.
 
     Raises
     ------
     InputError
         There is no such folder; the path is that of an input or of no ordinary file; or it is a
-        foreign file, and ``overwrite`` is not set.
+        foreign file, and ``overwrite`` is not set; or no format of the command has its suffix.
     """
     path = Path(path)
     if not path.parent.is_dir():
         raise InputError(f"{path}: {path.parent} is no folder; expected one that exists")
     if not path.exists():
+        _check_suffix(path, suffixes)
         return
     if not path.is_file():
         raise InputError(f"{path}: is no ordinary file; expected a file or a new name (-o FILE)")
@@ -46,6 +53,15 @@ def check_target(
         raise InputError(
             f"{path}: is no result of lidar-mi; expected another file (-o FILE), or --overwrite to "
             "replace it"
+        )
+    _check_suffix(path, suffixes)
+
+
+def _check_suffix(path: Path, suffixes: Sequence[str]) -> None:
+    if suffixes and path.suffix.lower() not in suffixes:
+        raise InputError(
+            f"{path}: {path.suffix or 'no suffix'} is not allowed; expected "
+            f"{', '.join(suffixes[:-1])}{' or ' if suffixes[1:] else ''}{suffixes[-1]}"
         )
 
 

@@ -1,17 +1,23 @@
-"""VTK's XML files: fields on grids and at points in space, for ParaView and its kin."""
+"""VTK files: fields on grids and at points in space, for ParaView and its kin."""
 
 import tempfile
 from pathlib import Path
+from urllib.parse import quote
 
 import numpy as np
 import xarray as xr
 from pyevtk.hl import gridToVTK, imageToVTK, pointsToVTK
 
+from lidar_mi import __version__
+from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
 
 AXES = ("x", "y", "z")
 # of a coordinate's steps, relative to their mean: nodes of float32
 _UNEVEN = 1e-4
+_LEGACY = {"i1": "char", "i2": "short", "i4": "int", "i8": "vtktypeint64"}
+_LEGACY |= {"u1": "unsigned_char", "u2": "unsigned_short", "u4": "unsigned_int"}
+_LEGACY |= {"u8": "vtktypeuint64", "f4": "float", "f8": "double"}
 
 
 def suffix(data: xr.Dataset) -> str:
@@ -33,7 +39,7 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
     Parameters
     ----------
     path : str or Path
-        With the suffix that `suffix` gives.
+        With the suffix that `suffix` gives: XML. Or ``.vtk``, the legacy format, of uniform axes.
     data : xr.Dataset
         With the coordinates x, y, z in m, each a number, an axis, or a value of every node; one
         dimension of another name: points.
@@ -41,7 +47,7 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
     Raises
     ------
     InputError
-        As of `write_atomically`.
+        As of `write_atomically`; uneven axes in the legacy format.
     """
     kind, shape = suffix(data), data[[*AXES]].sizes
     dims = tuple(map(str, shape)) if kind in (".vts", ".vtu") else AXES
@@ -54,12 +60,21 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
         v, w = (_values(data[name], data, dims) for name in ("v", "w"))
         u = _values(data["u"], data, dims) if "u" in data else np.zeros_like(v)
         points["wind [m s-1]"] = u, v, w  # type: ignore[assignment]
+    axes = [np.atleast_1d(data[axis].values).astype(float) for axis in AXES]
+    start: tuple[float, ...] = ()
+    steps: tuple[float, ...] = ()
+    if kind == ".vti":
+        start = tuple(float(axis[0]) for axis in axes)
+        steps = tuple(float(axis[-1] - axis[0]) / max(axis.size - 1, 1) or 1.0 for axis in axes)
+    if Path(path).suffix.lower() == ".vtk":
+        if kind != ".vti":
+            raise InputError(f"{path}: uneven axes; expected a file {kind}")
+        write_atomically(path, _legacy(start, steps, tuple(axis.size for axis in axes), points))
+        return
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "data"
-        axes = [np.atleast_1d(data[axis].values).astype(float) for axis in AXES]
         if kind == ".vti":
-            steps = tuple(float(axis[-1] - axis[0]) / max(axis.size - 1, 1) or 1.0 for axis in axes)
-            imageToVTK(str(file), tuple(float(axis[0]) for axis in axes), steps, None, points)
+            imageToVTK(str(file), start, steps, None, points)
         elif kind == ".vtr":
             gridToVTK(str(file), *axes, None, points)
         else:
@@ -69,6 +84,25 @@ def write_vtk(path: str | Path, data: xr.Dataset) -> None:
             else:
                 pointsToVTK(str(file), *nodes, points)
         write_atomically(path, file.with_suffix(kind).read_bytes())
+
+
+def _legacy(start, steps, sizes, points) -> bytes:
+    """VTK's legacy format: big endian, white space in names as in a URL."""
+    rows = {"DIMENSIONS": sizes, "ORIGIN": start, "SPACING": steps}
+    text = [f"# vtk DataFile Version 3.0\n# software: lidar-mi {__version__}\nBINARY"]
+    text += ["DATASET STRUCTURED_POINTS"]
+    text += [f"{name} {' '.join(map(repr, values))}" for name, values in rows.items()]
+    text += [f"POINT_DATA {sizes[0] * sizes[1] * sizes[2]}", ""]
+    content = "\n".join(text).encode()
+    for name, values in points.items():
+        parts = values if isinstance(values, tuple) else (values,)
+        kind, label = _LEGACY[parts[0].dtype.str[1:]], quote(name)
+        vector = len(parts) > 1
+        head = f"VECTORS {label} {kind}\n" if vector else f"SCALARS {label} {kind} 1\n"
+        content += (head + ("" if vector else "LOOKUP_TABLE default\n")).encode()
+        table = np.stack([part.ravel(order="F") for part in parts], -1)
+        content += table.astype(table.dtype.newbyteorder(">")).tobytes() + b"\n"
+    return content
 
 
 def _is_uniform(axis: np.ndarray) -> bool:

@@ -1,6 +1,7 @@
 """Checks of a retrieval's images: one uniform grid in metres, real numbers."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -40,6 +41,22 @@ def checked_stack(
         if bool(unknown.any()):
             noise = noise.where(~unknown, float(noise.median()))
     return stack, noise
+
+
+def identical(
+    images: Sequence[xr.DataArray | np.ndarray] | np.ndarray, name: str = "images", start: int = 1
+) -> str:
+    """Which images, counted from a start, are the same as the one before, in words; empty: none.
+
+    Two exposures never are: there is one image where two were meant.
+    """
+    same = [
+        f"{first} and {first + 1}"
+        for first, pair in enumerate(pairwise(iter(images)), start)
+        if np.array_equal(*(np.asarray(image) for image in pair), equal_nan=True)
+    ]
+    more = f" and {len(same) - 3} more pairs" if len(same) > 3 else ""
+    return f"{name} {', '.join(same[:3])}{more} are the same, bit for bit" if same else ""
 
 
 def on_device(image: xr.DataArray, device: str | torch.device) -> torch.Tensor:

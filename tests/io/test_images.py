@@ -60,13 +60,13 @@ def test_files_that_are_none(tmp_path, values):
     write_exr(tmp_path / "two.exr", a=values, b=values)
     for name in ("bad.png", "bad.exr", "bad.fits"):
         (tmp_path / name).write_bytes(b"no picture")
-    (tmp_path / "good.png").write_bytes(b"")
+    Image.fromarray(np.zeros((3, 4), np.uint8)).save(tmp_path / "good.png")
     for name, layer, message in (
         ("none.png", None, "no such file; expected an EXR, PNG, TIFF, BMP, JPEG or FITS image"),
         ("bad.png", None, "no readable image"),
         ("bad.fits", None, "FITS"),
         ("bad.exr", None, "bad.exr"),
-        ("good.png", "Y", "only EXR files have layers"),
+        ("good.png", "Y", "only EXR, FITS, npz, mat and HDF5 files have layers"),
         ("two.exr", None, "expected a layer to be named, one of a, b"),
         ("two.exr", "c", "layer 'c' is not there; expected one of a, b"),
     ):

@@ -1,12 +1,15 @@
 """Images and their noise before a retrieval.
 
 Detects: noise that is unknown outside of the images' pixels and refused, or unknown within and
-taken for something.
+taken for something; one image given twice of which nothing is said.
 """
 
 import numpy as np
+import pytest
 
-from lidar_mi.retrieval.checks import checked_stack
+from lidar_mi.retrieval.checks import checked_stack, identical
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.velocimetry.wind_series import retrieve_winds
 from tests.support.flows import data_array
 
 
@@ -21,3 +24,25 @@ def test_noise_need_not_be_known_where_there_is_no_image():
     assert np.isnan(found.values[5, 5])
     known = np.isfinite(noise)
     np.testing.assert_array_equal(found.values[known], noise[known])
+
+
+def test_images_that_are_the_same_are_named():
+    one, other = np.array([[1.0, np.nan]]), np.array([[1.0, 2.0]])
+    assert identical([one, other, one]) == ""
+    assert identical([one, one.copy(), other]) == "images 1 and 2 are the same, bit for bit"
+    assert identical([other, one, one], "frames", 0) == ("frames 1 and 2 are the same, bit for bit")
+    assert "0 and 1, 1 and 2, 2 and 3 and 6 more pairs" in identical([one] * 10, "frames", 0)
+    # the least number above is another image
+    assert identical([other, np.nextafter(other, 9)]) == ""
+
+
+@pytest.mark.parametrize("method", ["cc", "variational"])
+def test_a_wind_says_that_its_images_are_the_same(method):
+    y, z = np.arange(40.0), np.arange(32.0)
+    air = 1 + 0.1 * np.random.default_rng(1).random((32, 41))
+    image, moved = (data_array(air[:, k : k + 40], y, z) for k in (0, 1))
+    words = "images 1 and 2 are the same, bit for bit"
+    assert retrieve_wind(image, image.copy(), 1.0, method).identical_images == words
+    assert "identical_images" not in retrieve_wind(image, moved, 1.0, method).attrs
+    winds = retrieve_winds([image, image, moved], 1.0, method=method)
+    assert [words in str(remark) for remark in winds["remark"].values] == [True, False]

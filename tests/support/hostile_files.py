@@ -18,6 +18,7 @@ from lidar_mi.retrieval.vortices.model import PARAMETERS
 from tests.support.cases import Case
 from tests.support.hostile_experiments import BASE, as_yaml, scenes
 from tests.support.hostile_values import ANYTHING, NUMBERS, TEXTS, UNITS, damaged
+from tests.support.image_files import made
 
 ROWS, COLUMNS = 24, 30
 
@@ -134,8 +135,15 @@ def image_file(suffix: str, mode: str) -> bytes:
     return buffer.getvalue()
 
 
+@cache
+def drawn_file(seed: int) -> tuple[str, bytes]:
+    """Name and content of an image file of any sort."""
+    drawn = made(np.random.default_rng(seed))
+    return drawn.name, drawn.content
+
+
 def image_cases() -> st.SearchStrategy:
-    """Damaged PNG, TIFF, BMP, JPEG and FITS files."""
+    """Damaged image files of every sort."""
     kinds = st.sampled_from(
         [
             (".png", "L"),
@@ -149,9 +157,11 @@ def image_cases() -> st.SearchStrategy:
             (".fits", ""),
         ]
     )
-    return kinds.flatmap(
-        lambda kind: damaged(image_file(*kind)).flatmap(
-            lambda content: looked_at("image", f"a{kind[0]}", content, spacing=True)
+    files = kinds.map(lambda kind: (f"a{kind[0]}", image_file(*kind)))
+    files |= st.integers(0, 10_000).map(drawn_file)
+    return files.flatmap(
+        lambda file: damaged(file[1]).flatmap(
+            lambda content: looked_at("image", file[0], content, spacing=True)
         )
     )
 

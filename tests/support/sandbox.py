@@ -32,7 +32,9 @@ PRELOADED = (
     "PIL.Image",
     "PIL.ImageFile",
     "PIL.PngImagePlugin",
-    "PIL.TiffImagePlugin",
+    "tifffile",
+    "imagecodecs",
+    "scipy.io",
     "astropy.io.fits",
 )
 

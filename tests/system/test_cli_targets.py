@@ -64,9 +64,32 @@ def test_foreign_files_are_kept(images, lidar_mi, command, target, says):
 
 
 def test_overwriting_needs_its_option(images, lidar_mi):
-    (images / "notes.txt").write_text("mine")
-    assert lidar_mi(*RETRIEVE, "-o", "notes.txt", "--overwrite")[0] == 0
-    assert (images / "notes.txt").read_bytes().startswith(b"\x89HDF")
+    (images / "notes.nc").write_text("mine")
+    assert lidar_mi(*RETRIEVE, "-o", "notes.nc")[0] == 2
+    assert (images / "notes.nc").read_text() == "mine"
+    assert lidar_mi(*RETRIEVE, "-o", "notes.nc", "--overwrite")[0] == 0
+    assert (images / "notes.nc").read_bytes().startswith(b"\x89HDF")
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (RETRIEVE, ".nc, .csv, .mat, .vtk, .vti or .flo"),
+        ((*RETRIEVE, "--pairs", "all"), ".nc, .csv or .mat"),
+        (("render", "slab.xml", "-s", "2"), ".exr or .png"),
+        (("rings", "a.png"), ".png"),
+        (("rings", "a.png", "--all"), "a name that ends in .csv"),
+        (("calibrate", "a.png"), ".nc"),
+        (("v_los", "a.png"), ".nc"),
+        (("aerosol", "soot"), ".txt"),
+    ],
+)
+def test_a_name_of_another_format_is_refused(images, lidar_mi, command, expected):
+    """One line, said before the work, and nothing is written under a name that says otherwise."""
+    before = files_in(images)
+    code, _, err = lidar_mi(*command, "-o", "out.dat")
+    assert code == 2 and err.count("\n") == 1 and f"expected {expected}" in err
+    assert files_in(images) == before
 
 
 def test_a_run_never_replaces_its_input(there, lidar_mi, quick):

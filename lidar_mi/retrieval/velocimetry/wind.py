@@ -9,7 +9,7 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.checks import checked_stack, identical, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.beam_times import checked_times, vector_times
 from lidar_mi.retrieval.velocimetry.bootstrap import bootstrap_covariance
@@ -132,7 +132,8 @@ def retrieve_wind(
         each with `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or
         NaN if there is none); nothing is replaced. Gains of a detector's columns and rows are
         removed beforehand, see `fixed_pattern`, and so is a change of illumination from edge to
-        edge, see `illumination`; attributes of these names say so.
+        edge, see `illumination`; attributes of these names say so. `identical_images` names
+        images that are the same, bit for bit, from which no motion can be told.
 
     Raises
     ------
@@ -279,6 +280,8 @@ def retrieve_wind(
         attributes["fixed_pattern"] = ", ".join(patterns)
     if still.fraction:
         attributes["standing_fraction"] = still.fraction
+    if same := identical(stack):
+        attributes["identical_images"] = same
     if any(map(described, light)):
         attributes["illumination"] = described(light[-1])
     when = vector_times(None if by_itself else tau, dt, windows, found.d.cpu(), chosen.centred)

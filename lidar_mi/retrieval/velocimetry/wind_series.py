@@ -14,7 +14,7 @@ from lidar_mi.retrieval.velocimetry.common_grid import all_on_one_grid
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
-_PER_PAIR = "fixed_pattern", "illumination"
+_PER_PAIR = "identical_images", "fixed_pattern", "illumination"
 """Attributes of a wind that are remarks on its images."""
 
 

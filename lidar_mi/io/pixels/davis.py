@@ -1,0 +1,53 @@
+"""Images of LaVision's DaVis: im7 files."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from lidar_mi.errors import InputError
+from lidar_mi.io.pixels.frames import Frames, damaged, frames_of
+from lidar_mi.io.size import check_size
+
+
+def read_davis(path: Path) -> Frames:
+    """The frames of a DaVis image, raw counts; masked pixels are NaN.
+
+    Raises
+    ------
+    InputError
+        lvpyio is not installed; a damaged file; frames of several planes or different sizes.
+    """
+    try:
+        import lvpyio
+    except ImportError:
+        raise InputError(
+            f"{path}: DaVis files need the library lvpyio of LaVision: pip install "
+            "'lidar-mi[davis]'; or export TIFF"
+        ) from None
+    try:
+        with path.open("rb") as file:
+            width, height, depth, count = struct.unpack("<8x4i", file.read(24))
+        if min(width, height, depth, count) < 1:
+            raise ValueError(f"{width} x {height} x {depth} x {count} pixels")
+        check_size(path, 8 * width * height * depth * count)
+        buffer = lvpyio.read_buffer(str(path))
+        found = [_frame(path, frame) for frame in buffer]
+    except InputError:
+        raise
+    except Exception as error:  # any exception of the library in a damaged file
+        raise damaged(path, "DaVis image", error) from None
+    if len({image.shape for image in found}) != 1:
+        raise InputError(f"{path}: no frames, or of different sizes; expected one size")
+    return frames_of(path, np.stack(found))
+
+
+def _frame(path, frame):
+    if "PIXEL" not in frame.components or len(frame.components["PIXEL"].planes) != 1:
+        raise InputError(f"{path}: frames of several planes, or vectors; expected images")
+    pixels = np.asarray(frame.components["PIXEL"].planes[0])
+    masked = np.zeros(pixels.shape, bool)
+    if "MASK" in frame.components:
+        # there a pixel is 1 where it is valid
+        masked = np.asarray(frame.components["MASK"].planes[0]) == 0
+    return np.where(masked, np.nan, pixels) if masked.any() else pixels

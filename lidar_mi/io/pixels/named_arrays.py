@@ -1,0 +1,207 @@
+"""Arrays under names that hold images: npy, npz, MATLAB and HDF5 files."""
+
+import math
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from lidar_mi.errors import InputError
+from lidar_mi.io.pixels.frames import Frames, damaged, frames_of
+from lidar_mi.io.size import check_size
+
+_COLOURS = 4
+"""The last axis of so few may be colours."""
+_PACKED = ("scale_factor", "add_offset")
+
+
+def read_npy(path: Path) -> Frames:
+    """An image (height, width) or images (frames, height, width).
+
+    Raises
+    ------
+    InputError
+        A damaged file, Python objects, another number of dimensions.
+    """
+    try:
+        with path.open("rb") as file:
+            image = _numpy_array(path, file, path.stat().st_size)
+    except InputError:
+        raise
+    except Exception as error:  # any exception of the library in a damaged file
+        raise damaged(path, "npy", error) from None
+    return _stack(path, image)
+
+
+def read_npz(path: Path, layer: str | None) -> Frames:
+    """One array of a NumPy zip file, as `read_npy`; ``layer`` names it where there are several."""
+    try:
+        with zipfile.ZipFile(path) as packed:
+            names = {n.removesuffix(".npy"): n for n in packed.namelist() if n.endswith(".npy")}
+            # two dimensions at least: parameters are stored beside images
+            shapes = {}
+            for name, member in names.items():
+                with packed.open(member) as file:
+                    shapes[name] = _numpy_header(file)[0]
+            chosen = _chosen(path, shapes, layer)
+            size = packed.getinfo(names[chosen]).file_size
+            check_size(path, size)
+            with packed.open(names[chosen]) as file:
+                image = _numpy_array(path, file, size)
+    except InputError:
+        raise
+    except Exception as error:  # any exception of the libraries in a damaged file
+        raise damaged(path, "npz", error) from None
+    return _stack(path, image)
+
+
+def read_mat(path: Path, layer: str | None) -> Frames:
+    """A matrix of a MATLAB file of version 4 to 7; ``layer`` names it where there are several.
+
+    Raises
+    ------
+    InputError
+        A damaged file; no or several matrices; an array of more than two dimensions, in which
+        images may be first or last.
+    """
+    from scipy.io import loadmat, whosmat
+
+    numbers = {
+        "double",
+        "single",
+        "logical",
+        *(f"{u}int{n}" for u in ("", "u") for n in (8, 16, 32, 64)),
+    }
+    try:
+        shapes = {name: shape for name, shape, kind in whosmat(path) if kind in numbers}
+        chosen = _chosen(path, shapes, layer)
+        check_size(path, 8 * math.prod(shapes[chosen]))
+        image = loadmat(path, variable_names=[chosen])[chosen]
+    except InputError:
+        raise
+    except Exception as error:  # any exception of the library in a damaged file
+        raise damaged(path, "MATLAB file", error) from None
+    return _matrix(path, np.asarray(image))
+
+
+def read_hdf5(path: Path, layer: str | None) -> Frames:
+    """An image or images of an HDF5 file, of MATLAB 7.3 too; ``layer`` is the path of the data set.
+
+    Raises
+    ------
+    InputError
+        A damaged file; no or several images; a filter that is not installed; packed numbers.
+    """
+    try:
+        with h5py.File(path, "r") as file:
+            found: dict[str, Any] = {}
+
+            def add(name: str, part: Any) -> None:
+                if isinstance(part, h5py.Dataset) and part.dtype.kind in "iufb":
+                    found[name] = part
+
+            file.visititems(add)
+            found = {name: part for name, part in found.items() if not name.startswith("#")}
+            chosen = _chosen(path, {name: part.shape for name, part in found.items()}, layer)
+            part = found[chosen]
+            _refuse_unreadable(path, part)
+            matlab = "MATLAB_class" in part.attrs
+            image = part[()]
+    except InputError:
+        raise
+    except Exception as error:  # any exception of the library in a damaged file
+        raise damaged(path, "HDF5", error) from None
+    return _matrix(path, image.T) if matlab else _stack(path, image)
+
+
+def _refuse_unreadable(path, part):
+    """Filters that are not there, values elsewhere, sizes out of proportion, packed numbers."""
+    filters = part.id.get_create_plist()
+    for number in range(filters.get_nfilters()):
+        code, _, _, name = filters.get_filter(number)
+        if not h5py.h5z.filter_avail(code):
+            raise InputError(
+                f"{path}: compressed by {name.decode(errors='replace')[:40]} (HDF5 filter {code}), "
+                "which is not installed; expected gzip: h5repack -f GZIP=4 FILE NEW"
+            )
+    if part.external or part.is_virtual:
+        raise InputError(f"{path}: its values are in other files; expected them in this one")
+    check_size(path, 8 * math.prod(part.shape))
+    if part.chunks is not None:
+        check_size(path, math.prod(part.chunks) * part.dtype.itemsize)
+    packed = [name for name in _PACKED if name in part.attrs]
+    if packed:
+        raise InputError(f"{path}: packed numbers ({packed[0]}); expected plain ones")
+
+
+def _chosen(path, shapes: Mapping[str, tuple], layer: str | None) -> str:
+    """The array that is meant: the one named, else the only one of two or three dimensions."""
+    images = [n for n, shape in shapes.items() if len(shape) in (2, 3) and min(shape[-2:]) > 1]
+    if layer is not None:
+        if layer not in shapes:
+            raise InputError(
+                f"{path}: layer {layer!r} is not there; expected one of {_listed(images)}"
+            )
+        return layer
+    if not images:
+        raise InputError(f"{path}: has no array of an image; expected one of two dimensions")
+    if len(images) > 1:
+        raise InputError(
+            f"{path}: {len(images)} arrays; expected --layer, one of {_listed(images)}"
+        )
+    return images[0]
+
+
+def _listed(names: list[str]) -> str:
+    shown = ", ".join(name[:30] for name in names[:4])
+    return shown + (", ..." if len(names) > 4 else "")
+
+
+def _numpy_header(file: Any) -> tuple[tuple[int, ...], np.dtype]:
+    version = np.lib.format.read_magic(file)
+    read: dict[Any, Callable] = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
+    if version not in read:
+        raise ValueError(f"version {version}")
+    shape, _, dtype = read[version](file)
+    return shape, dtype
+
+
+def _numpy_array(path, file, size):
+    """The array, if the file holds as many bytes as its header says."""
+    shape, dtype = _numpy_header(file)
+    if dtype.hasobject or dtype.fields:
+        raise InputError(f"{path}: objects of Python; expected numbers")
+    if math.prod(shape) * dtype.itemsize > size:
+        raise ValueError(f"{' x '.join(map(str, shape))} values in {size} bytes")
+    file.seek(0)
+    return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _stack(path, image):
+    """An array as images; refused where its axes may mean something else."""
+    if image.ndim not in (2, 3):
+        raise InputError(
+            f"{path}: an array of {image.ndim} dimensions; expected (height, width) or (frames, "
+            "height, width)"
+        )
+    if image.ndim == 3 and image.shape[-1] <= _COLOURS:
+        raise InputError(
+            f"{path}: an array of {' x '.join(map(str, image.shape))}; its last axis may be "
+            "colours; expected (height, width) or (frames, height, width)"
+        )
+    return frames_of(path, image.reshape(-1, *image.shape[-2:]))
+
+
+def _matrix(path, image):
+    if image.ndim != 2:
+        raise InputError(
+            f"{path}: an array of {' x '.join(map(str, image.shape))}; in MATLAB files images may "
+            "be first or last; expected a matrix for each image, chosen by --layer"
+        )
+    return frames_of(path, image[None])
