@@ -6,6 +6,8 @@ Short tests try a few seeds, ``make fuzz`` as many as there is time for, and pri
 from collections.abc import Callable
 from functools import cache
 
+from tests.support import image_files
+
 
 @cache
 def _variant():
@@ -23,4 +25,7 @@ def extinction_fields(seed: int) -> str | None:
     return check(seed)
 
 
-PROPERTIES: dict[str, Callable[[int], str | None]] = {"extinction_fields": extinction_fields}
+PROPERTIES: dict[str, Callable[[int], str | None]] = {
+    "extinction_fields": extinction_fields,
+    "image_files": image_files.check,
+}
