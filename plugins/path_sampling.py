@@ -29,6 +29,8 @@ PHASE_FLIGHT_FRACTION = 0.3
 WIDER = 1.6
 # Of intermediate flights, the fraction whose remaining path is sampled as that of first vertices.
 NEAR_FLIGHT_FRACTION = 0.3
+# below one by the rounding of a scalar product
+LARGEST_COSINE = 1 - 2.0**-21
 # Russian roulette: probability of survival over the weight.
 ROULETTE_FACTOR = 30.0
 
@@ -355,6 +357,9 @@ class Lidar:
 
     def _scatter(self, medium, mei, stokes, wo, active):
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
+        # Mitsuba's tables give nothing where rounding makes a cosine exceed one
+        cosine = dr.abs(dr.dot(mei.wi, wo))
+        wo = dr.select(cosine > LARGEST_COSINE, wo * (LARGEST_COSINE / cosine), wo)
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
         return apply_phase_function(value, stokes, self.channel), pdf
 
