@@ -3,8 +3,6 @@
 import drjit as dr
 import mitsuba as mi
 
-from .surfaces import SURFACE_SKIP
-
 
 def interaction(medium, position, direction, wavelengths, time):
     """The medium interaction of light that arrives at ``position`` along ``direction``."""
@@ -74,14 +72,14 @@ def _walk(air, medium, origin, direction, distance, where, channel, wavelengths,
     """Transmittance, medium at the end, and medium at the distance ``where``."""
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
-    travelled, skip, value = mi.Float(0), mi.Float(0), mi.Float(1)
+    travelled, value = mi.Float(0), mi.Float(1)
     between = mi.MediumPtr(medium)
-    crossings, size = air.crossings(origin, direction), dr.max(dr.abs(origin))
+    crossings = air.crossings(origin, direction)
     while dr.hint(active, label="transmittance"):
-        end, hit, passes, behind = air.next_surface(
-            crossings, origin, direction, travelled + skip, distance, medium, active
+        end, hit, passes, medium, behind = air.next_surface(
+            crossings, origin, direction, travelled, distance, medium, active
         )
-        skip = SURFACE_SKIP * (size + end)
+        between = dr.select(active & (travelled <= where), medium, between)
         inside = active & (medium != None)
         # control variate: the extinction in the middle of the segment; the remainder is tracked
         middle = origin + direction * (0.5 * (travelled + end))
@@ -100,7 +98,6 @@ def _walk(air, medium, origin, direction, distance, where, channel, wavelengths,
             value = dr.select(tracking, value * (1 - excess), value)
         value = dr.select(hit & ~passes, 0, value)
         medium = dr.select(hit, behind, medium)
-        between = dr.select(hit & (end <= where), behind, between)
         travelled = end
         active &= hit & (value > 0)
     return value, medium, between
@@ -114,14 +111,13 @@ def collision(air, medium, origin, direction, distance, channel, wavelengths, ti
     """
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
-    travelled, skip = mi.Float(0), mi.Float(0)
+    travelled = mi.Float(0)
     found = mi.Bool(False)
-    crossings, size = air.crossings(origin, direction), dr.max(dr.abs(origin))
+    crossings = air.crossings(origin, direction)
     while dr.hint(active, label="free flight"):
-        end, hit, passes, behind = air.next_surface(
-            crossings, origin, direction, travelled + skip, distance, medium, active
+        end, hit, passes, medium, behind = air.next_surface(
+            crossings, origin, direction, travelled, distance, medium, active
         )
-        skip = SURFACE_SKIP * (size + end)
         inside = active & (medium != None)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
         majorant = medium.get_majorant(mei, inside)[channel]

@@ -54,8 +54,9 @@ class Lidar:
     """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
 
     def __init__(self, scene, sensor, differentiable=False):
-        self.air, self.sensor, self.differentiable = Air(scene), sensor, differentiable
-        self.low, self.high = self.air.bounds(sensor.get_medium())
+        self.air, self.sensor = Air(scene, sensor), sensor
+        self.differentiable = differentiable
+        self.low, self.high = self.air.bounds
         self.wavelengths = sensor.laser.wavelengths()
         self.channel = _channel(sensor.laser.wavelength)
         self.area = sensor.aperture_area()

@@ -236,7 +236,12 @@ def define():
                 if values.size != each * self.beam_count or not np.isfinite(values).all():
                     what = f"{values.size} numbers, {np.sum(~np.isfinite(values))} of them NaN"
                     fail(NAME, name, what, f"{each * self.beam_count} finite ones")
-            farthest = np.array(self.m_origins).reshape(-1, 3)[:, 0].max()
+            origins = np.array(self.m_origins, float).reshape(-1, 3)
+            farthest = origins[:, 0].max()
+            matrix = np.array(self.m_pose.matrix, float).reshape(4, 4)
+            # where beams start, in the world; a single place, if it is that of all
+            alike = (origins == origins[0]).all()
+            self.places = origins[: 1 if alike else None] @ matrix[:3, :3].T + matrix[:3, 3]
             if not farthest < start:
                 fail(NAME, "origins", f"x = {farthest:g} m", f"before gate_start = {start:g} m")
 

@@ -1,92 +1,270 @@
-"""Surfaces between media along a straight line, and the media behind them.
+"""Surfaces between media along a straight line, and the medium between two of them.
 
 Shapes whose surface lets light pass unchanged (``null`` BSDF) separate media; any other surface is
-opaque. The distance travelled is counted along the unperturbed line, so path lengths are exact;
-only the start of the *search* for the next surface is moved past the last one, by `SURFACE_SKIP` of
-the position's size (5 mm at 500 m). Media thinner than that along the line are missed.
+opaque. What is inside of a closed shape is found anew for every part of a line: from both distances
+at which the line crosses the shape, or, for a mesh, from the side from which it meets the shape
+next. So it depends neither on the order of surfaces that touch nor on rounding, and no surface is
+lost, however close behind another it lies. Where shapes overlap, the smallest one's medium holds.
 """
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-SURFACE_SKIP = 1e-5
+from .parameters import fail
+
+# A ray is traced from this far behind the last surface, relative to the position's size: several
+# roundings of a coordinate in single precision (0.5 mm at 500 m).
+STEP = 1e-6
 # m, beyond any air
 FAR = 1e9
 
 
 class Air:
-    """A scene's media and the surfaces between them.
+    """A scene's media and the surfaces between them, seen by a sensor, or from a vacuum.
 
-    Where all of these are cubes that let light pass, a straight line's crossings are found in
-    closed form, in less than half of the time. For any other scene rays are traced, and only
-    within the box that holds all surfaces. Outside, on most of the path between telescope and slab,
-    there is nothing to intersect.
+    Closed shapes are ``bodies``, from the largest to the smallest. A line's crossings of cubes and
+    spheres are found in closed form; for any other shape rays are traced, to each shape alone:
+    where surfaces coincide, a common search would find one of them. ``around`` is the medium
+    outside of all bodies.
+
+    Raises
+    ------
+    ValueError
+        Sensor and shapes contradict each other about a medium.
     """
 
-    def __init__(self, scene):
-        self.scene = scene
-        self.cubes = _cubes(scene)
-        box = mi.ScalarBoundingBox3f()
+    def __init__(self, scene, sensor=None):
+        self.bodies, self.sheets, opaque = [], [], []
+        self.low, self.high = _box(scene.shapes())
         for shape in scene.shapes():
-            box.expand(shape.bbox())
-        if not box.valid():
-            box = mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
-        margin = SURFACE_SKIP * (1 + max(dr.max(dr.abs(box.min)), dr.max(dr.abs(box.max))))
-        self.low, self.high = mi.Point3f(box.min - margin), mi.Point3f(box.max + margin)
-        # opaque, so that no scene's size is compiled into a kernel
-        dr.make_opaque(self.low, self.high)
-
-    def bounds(self, outside):
-        """Corners of a box that holds all air, for a telescope in the medium ``outside``."""
-        shapes = self.scene.shapes()
-        within = [shape.interior_medium() for shape in shapes]
-        beyond = [shape.exterior_medium() for shape in shapes]
-        if outside is None and all(medium is None or medium in within for medium in beyond):
-            return self.low, self.high
-        return dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)
+            if not passes_light(shape):
+                opaque.append(shape)
+            elif shape.is_medium_transition():
+                body = _body(scene, shape)
+                (self.sheets if isinstance(body, Sheet) else self.bodies).append(body)
+        self.bodies.sort(key=lambda body: -body.volume)
+        self.opaque = _alone(scene, opaque) if opaque else None
+        around = _surroundings(self.bodies, self.sheets, sensor) if sensor else None
+        self.around = mi.MediumPtr(around)
+        dr.make_opaque(self.around)
+        everywhere = around is not None or self.sheets
+        self.bounds = _everywhere() if everywhere else (self.low, self.high)
 
     def crossings(self, origin, direction):
-        """Where a line enters and leaves each cube, if it does: first and last distance."""
-        found = []
-        for to_local, offset, _, _ in self.cubes or ():
-            start, step = to_local @ origin + offset, to_local @ direction
-            near, far = slabs(mi.Vector3f(-1), mi.Vector3f(1), start, step)
-            found.append((dr.select(near < far, near, dr.inf), dr.select(near < far, far, -dr.inf)))
-        return found
+        """What each body needs to know of a line, and the distance of its first opaque surface."""
+        lines = [body.line(origin, direction) for body in self.bodies]
+        return lines, self._opaque(origin, direction)
+
+    def _opaque(self, origin, direction):
+        if self.opaque is None:
+            return mi.Float(dr.inf)
+        si = _hit(self.opaque, origin, direction, mi.Bool(True))
+        return dr.select(si.is_valid(), si.t, dr.inf)
 
     def next_surface(self, crossings, origin, direction, start, distance, medium, active):
-        """The next surface of a line between two distances, and the medium behind it.
+        """The part of a line that begins at the distance ``start``.
 
-        Returns the end of the present segment, whether a surface ends it, whether light passes that
-        surface and the medium behind it.
+        Returns its end, whether a surface is there, whether light passes that surface, the medium
+        of this part, and what to hand over as ``medium`` for the next one.
         """
         active = active & (start < distance)
-        if self.cubes is None:
-            return self._trace(origin, direction, start, distance, medium, active)
-        end, behind = mi.Float(distance), mi.MediumPtr(medium)
-        for (near, far), (_, _, interior, exterior) in zip(crossings, self.cubes, strict=True):
-            enters = near > start
-            place = dr.select(enters, near, far)
-            nearest = active & (place > start) & (place < end)
-            end = dr.select(nearest, place, end)
-            behind = dr.select(nearest, dr.select(enters, interior, exterior), behind)
-        return end, end < distance, mi.Bool(True), behind
+        lines, opaque = crossings
+        end = dr.minimum(distance, dr.select(opaque > start, opaque, dr.inf))
+        around = mi.MediumPtr(medium) if self.sheets else self.around
+        within = []
+        for body, line in zip(self.bodies, lines, strict=True):
+            place, inside = body.ahead(line, origin, direction, start, active)
+            end = dr.minimum(end, place)
+            within.append(inside)
+        if self.sheets:
+            # outside of the largest body
+            for body, inside in zip(self.bodies[::-1], within[::-1], strict=True):
+                around = dr.select(inside, body.outside, around)
+        here = around
+        for body, inside in zip(self.bodies, within, strict=True):
+            here = dr.select(inside, body.inside, here)
+        if self.sheets:
+            end, around = self._sheets(origin, direction, start, end, around, active)
+        end = dr.select(active, end, distance)
+        return end, active & (end < distance), end < opaque, mi.MediumPtr(here), around
 
-    def _trace(self, origin, direction, start, distance, medium, active):
-        ray = mi.Ray3f(origin + direction * start, direction)
-        ray.maxt = distance - start
-        near, far = slabs(self.low, self.high, ray.o, ray.d)
-        active &= ~((near > far) | (far < 0) | (near > ray.maxt))
-        # one by one: packets of rays are slower here, coherent or not
-        si = self.scene.ray_intersect(
-            ray, ray_flags=+mi.RayFlags.Minimal, coherent=False, active=active
-        )
+    def _sheets(self, origin, direction, start, end, medium, active):
+        """The same end, or that at an open surface, and the medium behind.
+
+        Of surfaces that coincide within rounding, light crosses first the one in front of which is
+        the medium that it is in: the last one is that whose far side is in front of no other.
+        """
+        found = [sheet.ahead(origin, direction, start, active) for sheet in self.sheets]
+        for place, _, _ in found:
+            end = dr.minimum(end, place)
+        slack = STEP * (dr.max(dr.abs(origin)) + end)
+        at = [place <= end + slack for place, _, _ in found]
+        behind = mi.MediumPtr(medium)
+        for i, (_, front, back) in enumerate(found):
+            last = mi.Bool(at[i])
+            for j, (_, other, _) in enumerate(found):
+                if i != j:
+                    last &= ~(at[j] & (other == back))
+            # left already where surfaces overlap: the medium in front of it is another one
+            last &= (front == medium) | (front == None) | _any(at, found, i, front)
+            behind = dr.select(last, back, behind)
+        return end, behind
+
+
+def _any(at, found, index, front):
+    """Whether another of the surfaces that coincide ends at the medium ``front``."""
+    result = mi.Bool(False)
+    for j, (_, _, back) in enumerate(found):
+        if j != index:
+            result |= at[j] & (back == front)
+    return result
+
+
+class Body:
+    """A closed shape: its volume (m^3), the media on both sides of its surface."""
+
+    def __init__(self, shape, volume):
+        self.volume, self.shape = volume, shape
+        media = shape.interior_medium(), shape.exterior_medium()
+        self.interior, self.exterior = media[::-1] if _is_flipped(shape) else media
+        self.inside, self.outside = mi.MediumPtr(self.interior), mi.MediumPtr(self.exterior)
+        dr.make_opaque(self.inside, self.outside)
+
+    def contains(self, places):
+        """Whether places (n, 3) are inside."""
+        box = self.shape.bbox()
+        near = ((places > np.array(box.min)) & (places < np.array(box.max))).all(1)
+        if not near.any():
+            return near
+        origin = mi.Point3f(*(mi.Float(np.ascontiguousarray(axis)) for axis in places.T))
+        direction = mi.Vector3f(1, 0, 0)
+        line = self.line(origin, direction)
+        _, inside = self.ahead(line, origin, direction, mi.Float(0), mi.Bool(True))
+        return np.broadcast_to(np.array(inside), len(places))
+
+
+class Convex(Body):
+    """A body that lines enter and leave once, at distances in closed form."""
+
+    def ahead(self, line, origin, direction, start, active):
+        """Distance of the next crossing behind ``start``, and whether that is inside."""
+        near, far = line
+        outside, inside = near > start, (near <= start) & (far > start)
+        return dr.select(outside, near, dr.select(inside, far, dr.inf)), inside
+
+
+class Cube(Convex):
+    """The image of the cube of half edge 1."""
+
+    def __init__(self, shape, matrix, centre):
+        super().__init__(shape, 8 * abs(np.linalg.det(matrix)))
+        inverse = np.linalg.inv(matrix)
+        self.to_local, self.offset = mi.Matrix3f(inverse), mi.Vector3f(-inverse @ centre)
+        dr.make_opaque(self.to_local, self.offset)
+
+    def line(self, origin, direction):
+        """Where a line enters and leaves it; infinity, if it misses."""
+        start, step = self.to_local @ origin + self.offset, self.to_local @ direction
+        near, far = slabs(mi.Vector3f(-1), mi.Vector3f(1), start, step)
+        return dr.select(near < far, near, dr.inf), far
+
+
+class Sphere(Convex):
+    def __init__(self, shape):
+        low, high = (np.array(corner, float) for corner in (shape.bbox().min, shape.bbox().max))
+        radius = (high - low).mean() / 2
+        super().__init__(shape, 4 / 3 * np.pi * radius**3)
+        self.centre, self.radius = mi.Point3f((low + high) / 2), mi.Float(radius)
+        dr.make_opaque(self.centre, self.radius)
+
+    def line(self, origin, direction):
+        """Where a line enters and leaves it; infinity, if it misses."""
+        offset = self.centre - origin
+        middle = dr.dot(offset, direction)
+        beside = dr.norm(offset - direction * middle)
+        half2 = (self.radius - beside) * (self.radius + beside)
+        half = dr.safe_sqrt(half2)
+        return dr.select(half2 > 0, middle - half, dr.inf), middle + half
+
+
+class Closed(Body):
+    """A closed mesh. Light that leaves it at the next surface is inside."""
+
+    def __init__(self, scene, shape, volume):
+        super().__init__(shape, abs(volume))
+        self.scene, (self.low, self.high) = _alone(scene, [shape]), _box([shape])
+        # whether normals point outwards: they follow the order of corners, unless flipped
+        outwards = (volume > 0) != shape.has_flipped_normals()
+        self.outwards = dr.opaque(mi.Float, 1 if outwards else -1)
+
+    def line(self, origin, direction):
+        """Where a line is near it."""
+        return slabs(self.low, self.high, origin, direction)
+
+    def ahead(self, line, origin, direction, start, active):
+        """Distance of the next crossing behind ``start``, and whether that is inside."""
+        near, far = line
+        start = start + STEP * (dr.max(dr.abs(origin)) + start)
+        active = active & (near <= far) & (far >= start)
+        si = _hit(self.scene, origin + direction * start, direction, active)
         hit = active & si.is_valid()
-        end = dr.select(hit, dr.minimum(start + si.t, distance), distance)
-        passes = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
-        behind = dr.select(hit & si.is_medium_transition(), si.target_medium(direction), medium)
-        return end, hit, passes, behind
+        leaves = dr.dot(si.n, direction) * self.outwards > 0
+        return dr.select(hit, start + si.t, dr.inf), hit & leaves
+
+
+class Sheet:
+    """An open surface: a rectangle, a disc, a cylinder, a mesh with a rim."""
+
+    def __init__(self, scene, shape):
+        self.shape, self.scene = shape, _alone(scene, [shape])
+        self.interior, self.exterior = shape.interior_medium(), shape.exterior_medium()
+
+    def ahead(self, origin, direction, start, active):
+        """Distance of the surface behind ``start``, the media in front of it and behind."""
+        start = start + STEP * (dr.max(dr.abs(origin)) + start)
+        si = _hit(self.scene, origin + direction * start, direction, active)
+        place = dr.select(active & si.is_valid(), start + si.t, dr.inf)
+        return place, si.target_medium(-direction), si.target_medium(direction)
+
+
+def passes_light(shape) -> bool:
+    """Whether light passes a shape's surface unchanged."""
+    bsdf = shape.bsdf()
+    return bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+
+
+def _surroundings(bodies, sheets, sensor):
+    """The medium outside of all closed shapes, as sensor and shapes state it."""
+    stated, places = sensor.get_medium(), sensor.places
+    around, innermost = [stated] * len(places), [None] * len(places)
+    for body in bodies:
+        for beam in np.flatnonzero(body.contains(places)):
+            around[beam] = body.exterior if innermost[beam] is None else around[beam]
+            innermost[beam] = body
+    for body in innermost:
+        if body is not None and stated is not None and stated != body.interior:
+            fail(
+                "scanning_lidar",
+                "medium",
+                stated.id(),
+                f"the medium of {body.shape.id()}, in which the telescope is, by reference",
+            )
+    around = list(dict.fromkeys(around))
+    if len(around) > 1:
+        names = [medium and medium.id() for medium in around]
+        fail("scanning_lidar", "medium", names, "one medium around the shapes for all beams")
+    media = {around[0], None, *(body.interior for body in bodies)}
+    media |= {medium for sheet in sheets for medium in (sheet.interior, sheet.exterior)}
+    for body in bodies:
+        if body.exterior not in media:
+            fail(
+                body.shape.id(),
+                "exterior",
+                body.exterior.id(),
+                "by reference, the sensor's medium or that of a shape around or beside it",
+            )
+    return around[0]
 
 
 def slabs(low, high, origin, direction):
@@ -96,40 +274,81 @@ def slabs(low, high, origin, direction):
     return dr.max(dr.minimum(first, last)), dr.min(dr.maximum(first, last))
 
 
-def _cubes(scene):
-    """Of all surfaces between media: the map to the cube of half edge 1, interior and exterior.
-
-    None, if a surface is not a cube or does not let light pass unchanged.
-    """
-    corners = _corners(mi.load_dict({"type": "cube"}))
-    found = []
-    for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        passes = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-        if shape.class_name() != "Cube" or not passes or shape.has_flipped_normals():
-            return None
-        # x = A c + b for each corner c; a mirrored cube's normals point inwards
-        reference, moved = np.column_stack([corners, np.ones(len(corners))]), _corners(shape)
-        if moved.shape != corners.shape:
-            return None
-        affine, *_ = np.linalg.lstsq(reference, moved, rcond=None)
-        matrix, centre = affine[:3].T, affine[3]
-        bent = np.abs(reference @ affine - moved).max() > 1e-5 * np.abs(moved).max()
-        if bent or np.linalg.det(matrix) <= 0:
-            return None
-        if not shape.is_medium_transition():
-            continue
-        inverse = np.linalg.inv(matrix)
-        cube = (
-            mi.Matrix3f(inverse),
-            mi.Vector3f(-inverse @ centre),
-            mi.MediumPtr(shape.interior_medium()),
-            mi.MediumPtr(shape.exterior_medium()),
-        )
-        dr.make_opaque(cube)
-        found.append(cube)
-    return found
+def _hit(scene, origin, direction, active):
+    # one by one: packets of rays are slower here, coherent or not
+    return scene.ray_intersect(
+        mi.Ray3f(origin, direction), ray_flags=+mi.RayFlags.Minimal, coherent=False, active=active
+    )
 
 
-def _corners(cube):
-    return np.array(cube.vertex_positions_buffer(), float).reshape(-1, 3)
+def _alone(scene, shapes):
+    """A scene of some of a scene's shapes."""
+    if len(shapes) == len(scene.shapes()):
+        return scene
+    return mi.load_dict({"type": "scene", **{f"shape{i}": s for i, s in enumerate(shapes)}})
+
+
+def _everywhere():
+    return dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)
+
+
+def _box(shapes):
+    """Corners of a box around shapes, opaque, so that no scene's size is compiled into a kernel."""
+    box = mi.ScalarBoundingBox3f()
+    for shape in shapes:
+        box.expand(shape.bbox())
+    if not box.valid():
+        box = mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
+    margin = 10 * STEP * (1 + max(dr.max(dr.abs(box.min)), dr.max(dr.abs(box.max))))
+    low, high = mi.Point3f(box.min - margin), mi.Point3f(box.max + margin)
+    dr.make_opaque(low, high)
+    return low, high
+
+
+def _body(scene, shape):
+    """A shape whose surface lets light pass, as what can be said of its inside."""
+    kind = shape.class_name()
+    if kind == "Sphere":
+        return Sphere(shape)
+    if kind == "Cube":
+        corners, moved = _corners(mi.load_dict({"type": "cube"})), _corners(shape)
+        # x = A c + b for each corner c
+        reference = np.column_stack([corners, np.ones(len(corners))])
+        if moved.shape == corners.shape:
+            affine, *_ = np.linalg.lstsq(reference, moved, rcond=None)
+            bent = np.abs(reference @ affine - moved).max() > 1e-5 * np.abs(moved).max()
+            if not bent and np.linalg.det(affine[:3]) != 0:
+                return Cube(shape, affine[:3].T, affine[3])
+    volume = _volume(shape) if shape.is_mesh() else 0
+    return Closed(scene, shape, volume) if volume else Sheet(scene, shape)
+
+
+def _is_flipped(shape) -> bool:
+    """Whether a scene asks for flipped normals; a mirrored sphere's are flipped by Mitsuba."""
+    mirrored = False
+    if shape.class_name() == "Sphere":
+        place = np.array(mi.traverse(shape)["to_world"].matrix, float).reshape(4, 4)
+        mirrored = np.linalg.det(place[:3, :3]) < 0
+    return shape.has_flipped_normals() != mirrored
+
+
+def _volume(mesh) -> float:
+    """Volume of a closed mesh, negative where its corners run clockwise; 0, if it is open."""
+    corners, faces = _corners(mesh), np.array(mesh.faces_buffer()).reshape(-1, 3)
+    # corners of one place are one, whatever their normals and texture coordinates
+    _, same = np.unique(corners, axis=0, return_inverse=True)
+    faces = same.reshape(-1)[faces]
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    edges = edges[edges[:, 0] != edges[:, 1]]
+    forward, backward = (
+        np.sort(edges[:, k] * (int(faces.max()) + 1) + edges[:, 1 - k]) for k in (0, 1)
+    )
+    if not np.array_equal(forward, backward):
+        return 0.0
+    places = np.unique(corners, axis=0) - corners.mean(0)
+    first, second, third = (places[faces[:, k]] for k in range(3))
+    return float((first * np.cross(second, third)).sum() / 6)
+
+
+def _corners(mesh):
+    return np.array(mesh.vertex_positions_buffer(), float).reshape(-1, 3)
