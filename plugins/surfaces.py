@@ -7,6 +7,8 @@ next. So it depends neither on the order of surfaces that touch nor on rounding,
 lost, however close behind another it lies. Where shapes overlap, the smallest one's medium holds.
 """
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -41,10 +43,10 @@ class Air:
             if not passes_light(shape):
                 opaque.append(shape)
             elif shape.is_medium_transition():
-                body = _body(scene, shape)
-                (self.sheets if isinstance(body, Sheet) else self.bodies).append(body)
+                for part in _parts(shape):
+                    (self.sheets if isinstance(part, Sheet) else self.bodies).append(part)
         self.bodies.sort(key=lambda body: -body.volume)
-        self.opaque = _alone(scene, opaque) if opaque else None
+        self.opaque = _scene(opaque) if opaque else None
         around = _surroundings(self.bodies, self.sheets, sensor) if sensor else None
         self.around = mi.MediumPtr(around)
         dr.make_opaque(self.around)
@@ -98,7 +100,8 @@ class Air:
         found = [sheet.ahead(origin, direction, start, active) for sheet in self.sheets]
         for place, _, _ in found:
             end = dr.minimum(end, place)
-        slack = STEP * (dr.max(dr.abs(origin)) + end)
+        # all that the next search may miss, and more
+        slack = 2 * STEP * (dr.max(dr.abs(origin)) + end)
         at = [place <= end + slack for place, _, _ in found]
         behind = mi.MediumPtr(medium)
         for i, (_, front, back) in enumerate(found):
@@ -171,6 +174,8 @@ class Cube(Convex):
 
 
 class Sphere(Convex):
+    """A sphere."""
+
     def __init__(self, shape):
         low, high = (np.array(corner, float) for corner in (shape.bbox().min, shape.bbox().max))
         radius = (high - low).mean() / 2
@@ -191,12 +196,11 @@ class Sphere(Convex):
 class Closed(Body):
     """A closed mesh. Light that leaves it at the next surface is inside."""
 
-    def __init__(self, scene, shape, volume):
+    def __init__(self, shape, piece, volume):
         super().__init__(shape, abs(volume))
-        self.scene, (self.low, self.high) = _alone(scene, [shape]), _box([shape])
+        self.scene, (self.low, self.high) = _scene([piece]), _box([piece])
         # whether normals point outwards: they follow the order of corners, unless flipped
-        outwards = (volume > 0) != shape.has_flipped_normals()
-        self.outwards = dr.opaque(mi.Float, 1 if outwards else -1)
+        self.outwards = _sign((volume > 0) != piece.has_flipped_normals())
 
     def line(self, origin, direction):
         """Where a line is near it."""
@@ -205,27 +209,30 @@ class Closed(Body):
     def ahead(self, line, origin, direction, start, active):
         """Distance of the next crossing behind ``start``, and whether that is inside."""
         near, far = line
-        start = start + STEP * (dr.max(dr.abs(origin)) + start)
-        active = active & (near <= far) & (far >= start)
-        si = _hit(self.scene, origin + direction * start, direction, active)
-        hit = active & si.is_valid()
-        leaves = dr.dot(si.n, direction) * self.outwards > 0
-        return dr.select(hit, start + si.t, dr.inf), hit & leaves
+        place, normal = _next(
+            self.scene, origin, direction, start, active & (near <= far) & (far >= start)
+        )
+        leaves = dr.dot(normal, direction) * self.outwards > 0
+        return place, (place < dr.inf) & leaves
 
 
 class Sheet:
     """An open surface: a rectangle, a disc, a cylinder, a mesh with a rim."""
 
-    def __init__(self, scene, shape):
-        self.shape, self.scene = shape, _alone(scene, [shape])
+    def __init__(self, shape, piece):
+        self.shape, self.scene = shape, _scene([piece])
         self.interior, self.exterior = shape.interior_medium(), shape.exterior_medium()
+        self.inside, self.outside = mi.MediumPtr(self.interior), mi.MediumPtr(self.exterior)
+        dr.make_opaque(self.inside, self.outside)
+        # whether the interior is behind the normal
+        self.outwards = _sign(shape.has_flipped_normals() == piece.has_flipped_normals())
 
     def ahead(self, origin, direction, start, active):
         """Distance of the surface behind ``start``, the media in front of it and behind."""
-        start = start + STEP * (dr.max(dr.abs(origin)) + start)
-        si = _hit(self.scene, origin + direction * start, direction, active)
-        place = dr.select(active & si.is_valid(), start + si.t, dr.inf)
-        return place, si.target_medium(-direction), si.target_medium(direction)
+        place, normal = _next(self.scene, origin, direction, start, active)
+        leaves = dr.dot(normal, direction) * self.outwards > 0
+        front = dr.select(leaves, self.inside, self.outside)
+        return place, front, dr.select(leaves, self.outside, self.inside)
 
 
 def passes_light(shape) -> bool:
@@ -281,11 +288,19 @@ def _hit(scene, origin, direction, active):
     )
 
 
-def _alone(scene, shapes):
-    """A scene of some of a scene's shapes."""
-    if len(shapes) == len(scene.shapes()):
-        return scene
+def _next(scene, origin, direction, start, active):
+    """Distance of the next surface behind ``start``, infinite if there is none, and its normal."""
+    start = start + STEP * (dr.max(dr.abs(origin)) + start)
+    si = _hit(scene, origin + direction * start, direction, active)
+    return dr.select(active & si.is_valid(), start + si.t, dr.inf), si.n
+
+
+def _scene(shapes):
     return mi.load_dict({"type": "scene", **{f"shape{i}": s for i, s in enumerate(shapes)}})
+
+
+def _sign(positive):
+    return dr.opaque(mi.Float, 1 if positive else -1)
 
 
 def _everywhere():
@@ -305,22 +320,79 @@ def _box(shapes):
     return low, high
 
 
-def _body(scene, shape):
-    """A shape whose surface lets light pass, as what can be said of its inside."""
-    kind = shape.class_name()
-    if kind == "Sphere":
-        return Sphere(shape)
-    if kind == "Cube":
-        corners, moved = _corners(mi.load_dict({"type": "cube"})), _corners(shape)
-        # x = A c + b for each corner c
-        reference = np.column_stack([corners, np.ones(len(corners))])
-        if moved.shape == corners.shape:
-            affine, *_ = np.linalg.lstsq(reference, moved, rcond=None)
-            bent = np.abs(reference @ affine - moved).max() > 1e-5 * np.abs(moved).max()
-            if not bent and np.linalg.det(affine[:3]) != 0:
-                return Cube(shape, affine[:3].T, affine[3])
-    volume = _volume(shape) if shape.is_mesh() else 0
-    return Closed(scene, shape, volume) if volume else Sheet(scene, shape)
+def _parts(shape):
+    """What is on both sides of a shape whose surface lets light pass: bodies and open surfaces."""
+    if shape.class_name() == "Sphere":
+        return [Sphere(shape)]
+    if not shape.is_mesh():
+        return [Sheet(shape, shape)]
+    corners, faces = _corners(shape), np.array(shape.faces_buffer()).reshape(-1, 3)
+    pieces = _pieces(corners, faces)
+    return [_part(shape, corners, piece, closed, len(pieces) == 1) for piece, closed in pieces]
+
+
+def _part(shape, corners, faces, closed, whole):
+    volume = _volume(corners, faces) if closed else 0
+    if volume:
+        used = corners[faces.min() : faces.max() + 1]
+        affine = _affine(used)
+        if affine is not None:
+            return Cube(shape, *affine)
+    piece = shape if whole else _mesh(corners, faces)
+    return Closed(shape, piece, volume) if volume else Sheet(shape, piece)
+
+
+def _affine(corners):
+    """The map from the cube of half edge 1 to a cube with these corners, or None."""
+    reference = _corners(mi.load_dict({"type": "cube"}))
+    if corners.shape != reference.shape:
+        return None
+    # x = A c + b for each corner c
+    reference = np.column_stack([reference, np.ones(len(reference))])
+    affine, *_ = np.linalg.lstsq(reference, corners, rcond=None)
+    bent = np.abs(reference @ affine - corners).max() > 1e-5 * np.abs(corners).max()
+    return None if bent else (affine[:3].T, affine[3])
+
+
+def _pieces(corners, faces):
+    """Parts of a mesh, each with whether it is closed: Mitsuba merges shapes of one medium.
+
+    A part ends at the first face after which every edge has been passed as often one way as the
+    other; edges of a rim, for which that never holds, aside.
+    """
+    # corners of one place are one, whatever their normals and texture coordinates
+    _, same = np.unique(corners, axis=0, return_inverse=True)
+    ends = same.reshape(-1)[faces].astype(np.int64)
+    ends = np.stack([ends, np.roll(ends, -1, axis=1)], -1).reshape(-1, 2)
+    face = np.repeat(np.arange(len(faces)), 3)
+    key, sign = ends.min(1) * len(corners) + ends.max(1), np.sign(ends[:, 1] - ends[:, 0])
+    order = np.lexsort((face, key))
+    key, sign, face = key[order], sign[order], face[order]
+    first = np.flatnonzero(np.diff(key, prepend=-1))
+    total = np.add.reduceat(sign, first)
+    count = np.diff(first, append=len(key))
+    rim = np.repeat(total != 0, count)
+    # zero at the end of each edge that is no rim
+    passed = np.where(rim, 0, sign).cumsum()
+    pending = np.zeros(len(faces) + 1, int)
+    np.add.at(pending, face[:-1], passed[:-1] != 0)
+    np.subtract.at(pending, face[1:], passed[:-1] != 0)
+    last = np.flatnonzero(pending.cumsum()[:-1] == 0)
+    open_ = np.zeros(len(faces), bool)
+    open_[face[rim]] = True
+    starts = np.concatenate([[0], last + 1])
+    return [(faces[a:b], not open_[a:b].any()) for a, b in itertools.pairwise(starts)]
+
+
+def _mesh(corners, faces):
+    """A mesh of some faces."""
+    used, faces = np.unique(faces, return_inverse=True)
+    mesh = mi.Mesh("part", len(used), faces.size // 3)
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = mi.Float(corners[used].ravel())
+    parameters["faces"] = mi.UInt32(faces.ravel())
+    parameters.update()
+    return mesh
 
 
 def _is_flipped(shape) -> bool:
@@ -332,21 +404,9 @@ def _is_flipped(shape) -> bool:
     return shape.has_flipped_normals() != mirrored
 
 
-def _volume(mesh) -> float:
-    """Volume of a closed mesh, negative where its corners run clockwise; 0, if it is open."""
-    corners, faces = _corners(mesh), np.array(mesh.faces_buffer()).reshape(-1, 3)
-    # corners of one place are one, whatever their normals and texture coordinates
-    _, same = np.unique(corners, axis=0, return_inverse=True)
-    faces = same.reshape(-1)[faces]
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges = edges[edges[:, 0] != edges[:, 1]]
-    forward, backward = (
-        np.sort(edges[:, k] * (int(faces.max()) + 1) + edges[:, 1 - k]) for k in (0, 1)
-    )
-    if not np.array_equal(forward, backward):
-        return 0.0
-    places = np.unique(corners, axis=0) - corners.mean(0)
-    first, second, third = (places[faces[:, k]] for k in range(3))
+def _volume(corners, faces) -> float:
+    """Volume of a closed mesh, negative where its corners run clockwise from outside."""
+    first, second, third = (corners[faces[:, k]] - corners[faces[0, 0]] for k in range(3))
     return float((first * np.cross(second, third)).sum() / 6)
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from plugins.media import transmittance
 from plugins.surfaces import Air, Closed, Cube
+from tests.support.meshes import box_file
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -80,8 +81,7 @@ def walk(air, origin, direction, distance):
 def test_transmittance_through_nested_cubes(surfaces, tmp_path):
     shape = {"type": "cube"}
     if surfaces == "meshes":
-        mi.load_dict(shape).write_ply(str(tmp_path / "cube.ply"))
-        shape = {"type": "ply", "filename": str(tmp_path / "cube.ply")}
+        shape = {"type": "ply", "filename": box_file(tmp_path)}
     scene, (around, slab) = nested(shape)
     kind = {"cubes": Cube, "meshes": Closed}[surfaces]
     air = Air(scene)
