@@ -70,6 +70,8 @@ from .path_sampling import Lidar
 from .physical import Physical
 from .polarization import first_unpolarized_in_blend
 from .registration import register
+from .supported import check_supported
+from .surfaces import extent
 
 # how samples scatter and where they fly next is in `path_sampling`, of both estimators
 NAME, KIND = "gated_volpath", "integrator"
@@ -195,6 +197,7 @@ def define():
                 sensor = scene.sensors()[sensor]
             if not hasattr(sensor, "beam_frame"):
                 fail(NAME, "sensor", type(sensor).__name__, "a sensor of type 'scanning_lidar'")
+            check_supported(NAME, scene, sensor)
             self.physical.check(scene, sensor)
             _check_gate_meets_medium(scene, sensor)
             _check_blends(scene, sensor)
@@ -418,7 +421,7 @@ def _check_gate_meets_medium(scene, sensor):
     for shape in scene.shapes():
         if shape.interior_medium() is None and shape.exterior_medium() is None:
             continue
-        low, high = (np.array(corner, float) for corner in (shape.bbox().min, shape.bbox().max))
+        low, high = extent(shape)
         first = np.linalg.norm(np.maximum(0, np.maximum(low - origins, origins - high)), axis=1)
         last = np.linalg.norm(np.maximum(origins - low, high - origins), axis=1)
         if ((first <= far) & (last >= near)).any():

@@ -6,7 +6,6 @@ traces. Arrays that have passed are not checked again until they are replaced, s
 optimisation only needs the extremes of the array that it changes.
 """
 
-import math
 import re
 
 import drjit as dr
@@ -14,6 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from .parameters import fail
+from .surfaces import extent, name_of
 
 # rounding to single precision may leave an albedo of 1 this much above it
 ROUNDING = 1e-5
@@ -60,17 +60,18 @@ class Physical:
         if sensor.get_medium() is not None:
             media[sensor.get_medium()] = sensor.get_medium().id()
         for shape in scene.shapes():
-            self._place(shape.id(), shape.bbox())
+            self._place(name_of(shape), extent(shape))
             for side in ("interior_medium", "exterior_medium"):
                 medium = getattr(shape, side)()
                 if medium is not None:
-                    media.setdefault(medium, f"{shape.id()}.{side}")
+                    media.setdefault(medium, f"{name_of(shape)}.{side}")
         passed = {}
         for medium, where in media.items():
             parameters = mi.traverse(medium)
             for name, (_, _, node, _) in parameters.properties.items():
                 if isinstance(node, mi.Volume):
-                    self._place(f"{where}.{name}", node.bbox())
+                    box = node.bbox()
+                    self._place(f"{where}.{name}", np.array([box.min, box.max], float))
                 value = parameters[name]
                 rule = next((rule for rule in RULES if rule[0].fullmatch(name)), None)
                 if rule is None or not _is_coefficient(node, value):
@@ -82,8 +83,8 @@ class Physical:
         self.passed = passed
 
     def _place(self, field, box):
-        if not (box.valid() and all(math.isfinite(end) for end in (*box.min, *box.max))):
-            fail(self.plugin, field, str(box), "a finite position; its transform is not finite")
+        if not (np.isfinite(box).all() and (box[0] <= box[1]).all()):
+            fail(self.plugin, field, box.tolist(), "a finite position; its transform is not finite")
 
     def check_values(self, field, arrays, least, most, allowed):
         """Raise an error if a parameter has a value out of its range."""

@@ -162,6 +162,13 @@ def define():
             limit = self.m_fov_tan * local.z
             return (local.z > 0) & (dr.squared_norm(local.xy) <= limit * limit)
 
+        def beam_axes(self) -> tuple[np.ndarray, np.ndarray]:
+            """Of all beams: origins and directions in the world, (n, 3) each."""
+            beam = dr.arange(mi.UInt32, self.beam_count)
+            to_world = self.world_transform()
+            axes = to_world @ dr.gather(mi.Vector3f, self.m_directions, beam)
+            return tuple(np.array(v, float).T for v in (to_world @ self.beam_origin(beam), axes))
+
         def origins_and_ranges(self) -> tuple[np.ndarray, np.ndarray]:
             """Of all beams: origins in the world, (n, 3), first and last recorded range, (2, n)."""
             beam = dr.arange(mi.UInt32, self.beam_count)

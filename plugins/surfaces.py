@@ -136,8 +136,8 @@ class Body:
 
     def contains(self, places):
         """Whether places (n, 3) are inside."""
-        box = self.shape.bbox()
-        near = ((places > np.array(box.min)) & (places < np.array(box.max))).all(1)
+        low, high = extent(self.shape)
+        near = ((places >= low) & (places <= high)).all(1)
         if not near.any():
             return near
         origin = mi.Point3f(*(mi.Float(np.ascontiguousarray(axis)) for axis in places.T))
@@ -177,7 +177,7 @@ class Sphere(Convex):
     """A sphere."""
 
     def __init__(self, shape):
-        low, high = (np.array(corner, float) for corner in (shape.bbox().min, shape.bbox().max))
+        low, high = extent(shape)
         radius = (high - low).mean() / 2
         super().__init__(shape, 4 / 3 * np.pi * radius**3)
         self.centre, self.radius = mi.Point3f((low + high) / 2), mi.Float(radius)
@@ -235,6 +235,11 @@ class Sheet:
         return place, front, dr.select(leaves, self.outside, self.inside)
 
 
+def name_of(thing) -> str:
+    """What a message calls a shape or medium: those that Mitsuba has merged have no name."""
+    return thing.id() or thing.class_name()
+
+
 def passes_light(shape) -> bool:
     """Whether light passes a shape's surface unchanged."""
     bsdf = shape.bsdf()
@@ -254,24 +259,64 @@ def _surroundings(bodies, sheets, sensor):
             fail(
                 "scanning_lidar",
                 "medium",
-                stated.id(),
-                f"the medium of {body.shape.id()}, in which the telescope is, by reference",
+                name_of(stated),
+                f"the medium of {name_of(body.shape)}, in which the telescope is, by reference",
             )
+    if sheets:
+        _check_fronts(bodies, sheets, sensor, around, innermost)
     around = list(dict.fromkeys(around))
     if len(around) > 1:
-        names = [medium and medium.id() for medium in around]
+        names = [medium and name_of(medium) for medium in around]
         fail("scanning_lidar", "medium", names, "one medium around the shapes for all beams")
     media = {around[0], None, *(body.interior for body in bodies)}
     media |= {medium for sheet in sheets for medium in (sheet.interior, sheet.exterior)}
     for body in bodies:
         if body.exterior not in media:
             fail(
-                body.shape.id(),
+                name_of(body.shape),
                 "exterior",
-                body.exterior.id(),
+                name_of(body.exterior),
                 "by reference, the sensor's medium or that of a shape around or beside it",
             )
     return around[0]
+
+
+def _check_fronts(bodies, sheets, sensor, around, innermost):
+    """Refuse open surfaces on whose near side is another medium than the beam that meets them."""
+    origin, axis = (vectors.T.astype(np.float32) for vectors in sensor.beam_axes())
+    origin, axis = mi.Point3f(*origin), mi.Vector3f(*axis)
+    start, every = mi.Float(0), mi.Bool(True)
+    first = mi.Float(dr.inf)
+    for body in bodies:
+        first = dr.minimum(first, body.ahead(body.line(origin, axis), origin, axis, start, every)[0])
+    found = [sheet.ahead(origin, axis, start, every) for sheet in sheets]
+    for place, _, _ in found:
+        first = dr.minimum(first, place)
+    count = dr.width(axis)
+    media = [body and body.interior or out for body, out in zip(innermost, around, strict=True)]
+    light = np.resize(np.array(media, object), count)
+    for sheet, (place, front, _) in zip(sheets, found, strict=True):
+        here = (place == first) & (place < dr.inf)
+        for side, medium, pointer in (
+            ("interior", sheet.interior, sheet.inside),
+            ("exterior", sheet.exterior, sheet.outside),
+        ):
+            meets = np.resize(np.array(here & (front == pointer)), count)
+            if medium is not None and any(other != medium for other in light[meets]):
+                fail(
+                    name_of(sheet.shape),
+                    side,
+                    name_of(medium),
+                    "behind this surface, as light of the telescope comes from another medium",
+                )
+
+
+def extent(shape):
+    """Lowest and highest corner, (2, 3); Mitsuba's own is missing where it has merged meshes."""
+    if shape.is_mesh():
+        corners = _corners(shape)
+        return np.stack([corners.min(0), corners.max(0)])
+    return np.array([shape.bbox().min, shape.bbox().max], float)
 
 
 def slabs(low, high, origin, direction):
@@ -296,7 +341,13 @@ def _next(scene, origin, direction, start, active):
 
 
 def _scene(shapes):
-    return mi.load_dict({"type": "scene", **{f"shape{i}": s for i, s in enumerate(shapes)}})
+    """A scene of some shapes alone. Mitsuba names them anew; they keep their names."""
+    names = [shape.id() for shape in shapes]
+    parts = {f"shape{number}": shape for number, shape in enumerate(shapes)}
+    scene = mi.load_dict({"type": "scene", **parts}, optimize=False)
+    for shape, name in zip(shapes, names, strict=True):
+        shape.set_id(name)
+    return scene
 
 
 def _sign(positive):
@@ -309,13 +360,9 @@ def _everywhere():
 
 def _box(shapes):
     """Corners of a box around shapes, opaque, so that no scene's size is compiled into a kernel."""
-    box = mi.ScalarBoundingBox3f()
-    for shape in shapes:
-        box.expand(shape.bbox())
-    if not box.valid():
-        box = mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
-    margin = 10 * STEP * (1 + max(dr.max(dr.abs(box.min)), dr.max(dr.abs(box.max))))
-    low, high = mi.Point3f(box.min - margin), mi.Point3f(box.max + margin)
+    corners = np.concatenate([*(extent(shape) for shape in shapes), np.zeros((0 if shapes else 1, 3))])
+    margin = 10 * STEP * (1 + np.abs(corners).max())
+    low, high = mi.Point3f(corners.min(0) - margin), mi.Point3f(corners.max(0) + margin)
     dr.make_opaque(low, high)
     return low, high
 

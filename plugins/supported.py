@@ -1,0 +1,74 @@
+"""What a scene asks for and the lidar integrator cannot do: refused, each in a line.
+
+Mitsuba accepts any film, sampler, emitter and surface beside a sensor. What is refused here would
+otherwise be ignored without a word. The table in the reference of `gated_volpath` lists all.
+"""
+
+import re
+
+import mitsuba as mi
+
+from .parameters import fail
+from .surfaces import name_of
+
+# shapes whose sides can be told apart along a line; besides all meshes
+SIDED = ("Cube", "Sphere", "Rectangle", "Disk", "Cylinder")
+
+
+def check_supported(plugin: str, scene, sensor) -> None:
+    """Raise an error for the first thing in a scene that would be ignored.
+
+    Parameters
+    ----------
+    plugin : str
+        Name of the integrator, with which messages begin.
+
+    Raises
+    ------
+    ValueError
+        A film that is cropped or filtered, a sampler that is not independent, a shutter, another
+        source of light, a surface that refracts, polarises or covers partly, an instance.
+    """
+    film, sampler = sensor.film(), sensor.sampler()
+    if film.class_name() != "HDRFilm":
+        fail(plugin, "film", film.class_name(), "hdrfilm")
+    if list(film.crop_offset()) != [0, 0] or list(film.crop_size()) != list(film.size()):
+        crop = [list(film.crop_offset()), list(film.crop_size())]
+        fail(plugin, "film.crop", crop, "the whole film; select beams with 'directions'")
+    if film.sample_border():
+        fail(plugin, "film.sample_border", True, "false: beams are pixels, without a border")
+    filter_ = str(film.rfilter())
+    if not filter_.startswith(("BoxFilter", "GaussianFilter[stddev=0.50,")):
+        fail(plugin, "film.rfilter", filter_, "box: a beam is a pixel of its own")
+    if sampler.class_name() != "IndependentSampler":
+        fail(plugin, "sampler", sampler.class_name(), "independent: errors are those of such samples")
+    seed = re.search(r"base_seed = (\d+)", str(sampler))
+    if seed and int(seed[1]):
+        fail(plugin, "sampler.seed", int(seed[1]), "0; a seed is given to mi.render")
+    if sensor.shutter_open() != 0 or sensor.shutter_open_time() != 0:
+        shutter = sensor.shutter_open(), sensor.shutter_open_time()
+        fail(plugin, "shutter", shutter, "none: 'beams' have times of their own")
+    for emitter in scene.emitters():
+        kind = emitter.class_name()
+        if kind == "Emitter":
+            kind = str(emitter).partition("[")[0]
+        fail(plugin, "emitter", kind, "the sensor's laser alone; other light is not followed")
+    for shape in scene.shapes():
+        _check_shape(plugin, shape)
+
+
+def _check_shape(plugin, shape):
+    name, kind, bsdf = name_of(shape), shape.class_name(), shape.bsdf()
+    if kind == "Instance":
+        fail(plugin, name, "instance", "the shape itself")
+    if bsdf is None:
+        return
+    flags, kinds = bsdf.flags(), mi.BSDFFlags
+    bending = kinds.DiffuseTransmission | kinds.GlossyTransmission | kinds.DeltaTransmission
+    if bsdf.class_name() != "Null" and flags & (kinds.Null | bending):
+        expected = "null, or a BSDF that transmits nothing: such a surface blocks all light"
+        fail(plugin, f"{name}.bsdf", bsdf.class_name(), expected)
+    if shape.is_medium_transition() and not (shape.is_mesh() or kind in SIDED):
+        fail(plugin, name, kind, "a cube, sphere, rectangle, disk, cylinder or mesh around a medium")
+    if shape.is_medium_transition() and bsdf.class_name() != "Null":
+        fail(plugin, f"{name}.bsdf", bsdf.class_name(), "null, for light to enter its medium")
