@@ -91,9 +91,7 @@ def define():
         def sample_local(self, sample_position, sample_direction):
             """Origin and direction of a ray in the laser's own frame, axis along +z."""
             origin = mi.Point3f(0, 0, 0)
-            radius = self.m_radius * dr.sqrt(
-                beam_radius_squared(self.m_inside, sample_position.x)
-            )
+            radius = self.m_radius * dr.sqrt(beam_radius_squared(self.m_inside, sample_position.x))
             sine, cosine = dr.sincos(dr.two_pi * sample_position.y)
             origin.x, origin.y = radius * cosine, radius * sine
             tangent = self.m_divergence_half * dr.sqrt(beam_radius_squared(1, sample_direction.x))

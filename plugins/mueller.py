@@ -6,8 +6,8 @@ Tabulated scattering matrix (``mueller``)
 
 A phase function from a table of the six independent elements of the scattering matrix of a
 macroscopically isotropic, mirror-symmetric medium (spheres, randomly oriented spheroids, ...).
-In unpolarised variants only a1 is used. Samples have the density a1 at every angle, so that they all
-have the weight 1.
+In unpolarised variants only a1 is used. Samples have the density a1 at every angle: the weight of
+each is 1.
 
 ============================ =============== ====================================================
 Parameter                    Type            Meaning

@@ -41,7 +41,9 @@ def check_supported(plugin: str, scene, sensor) -> None:
     if not filter_.startswith(("BoxFilter", "GaussianFilter[stddev=0.50,")):
         fail(plugin, "film.rfilter", filter_, "box: a beam is a pixel of its own")
     if sampler.class_name() != "IndependentSampler":
-        fail(plugin, "sampler", sampler.class_name(), "independent: errors are those of such samples")
+        fail(
+            plugin, "sampler", sampler.class_name(), "independent: errors are those of such samples"
+        )
     seed = re.search(r"base_seed = (\d+)", str(sampler))
     if seed and int(seed[1]):
         fail(plugin, "sampler.seed", int(seed[1]), "0; a seed is given to mi.render")
@@ -69,6 +71,8 @@ def _check_shape(plugin, shape):
         expected = "null, or a BSDF that transmits nothing: such a surface blocks all light"
         fail(plugin, f"{name}.bsdf", bsdf.class_name(), expected)
     if shape.is_medium_transition() and not (shape.is_mesh() or kind in SIDED):
-        fail(plugin, name, kind, "a cube, sphere, rectangle, disk, cylinder or mesh around a medium")
+        fail(
+            plugin, name, kind, "a cube, sphere, rectangle, disk, cylinder or mesh around a medium"
+        )
     if shape.is_medium_transition() and bsdf.class_name() != "Null":
         fail(plugin, f"{name}.bsdf", bsdf.class_name(), "null, for light to enter its medium")

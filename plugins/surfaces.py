@@ -288,12 +288,14 @@ def _check_fronts(bodies, sheets, sensor, around, innermost):
     start, every = mi.Float(0), mi.Bool(True)
     first = mi.Float(dr.inf)
     for body in bodies:
-        first = dr.minimum(first, body.ahead(body.line(origin, axis), origin, axis, start, every)[0])
+        first = dr.minimum(
+            first, body.ahead(body.line(origin, axis), origin, axis, start, every)[0]
+        )
     found = [sheet.ahead(origin, axis, start, every) for sheet in sheets]
     for place, _, _ in found:
         first = dr.minimum(first, place)
     count = dr.width(axis)
-    media = [body and body.interior or out for body, out in zip(innermost, around, strict=True)]
+    media = [body.interior if body else out for body, out in zip(innermost, around, strict=True)]
     light = np.resize(np.array(media, object), count)
     for sheet, (place, front, _) in zip(sheets, found, strict=True):
         here = (place == first) & (place < dr.inf)
@@ -360,7 +362,9 @@ def _everywhere():
 
 def _box(shapes):
     """Corners of a box around shapes, opaque, so that no scene's size is compiled into a kernel."""
-    corners = np.concatenate([*(extent(shape) for shape in shapes), np.zeros((0 if shapes else 1, 3))])
+    corners = np.concatenate(
+        [*(extent(shape) for shape in shapes), np.zeros((0 if shapes else 1, 3))]
+    )
     margin = 10 * STEP * (1 + np.abs(corners).max())
     low, high = mi.Point3f(corners.min(0) - margin), mi.Point3f(corners.max(0) + margin)
     dr.make_opaque(low, high)

@@ -1,4 +1,4 @@
-"""What Mitsuba's scene interface offers beside the lidar: honoured or refused, each row of the table.
+"""What Mitsuba's scene interface offers beside the lidar, row by row: honoured or refused.
 
 Detects: a film, sampler, source of light, surface or shape that is ignored without a word; a
 parameter of a medium, volume or shape that does not do what Mitsuba says; an update through
@@ -225,14 +225,14 @@ PAIRS = {
     "constvolume": (scene(air(sigma_t={"type": "constvolume", "value": 5e-3})), scene()),
     "mirrored": (scene(slab=slab(to_world=Place(60, -20))), scene()),
     "inside out": (
-        scene(slab={k: v for k, v in slab(flip_normals=True, exterior=AIR).items() if k != "interior"}),
+        scene(
+            slab={k: v for k, v in slab(flip_normals=True, exterior=AIR).items() if k != "interior"}
+        ),
         scene(),
     ),
     "one medium on both sides": (
         scene(
-            lidar=lidar(medium=AIR),
-            around=slab(to_world=Place(0, 200)),
-            slab=slab(exterior=AIR),
+            lidar=lidar(medium=AIR), around=slab(to_world=Place(0, 200)), slab=slab(exterior=AIR)
         ),
         scene(around=slab(to_world=Place(0, 200))),
     ),
@@ -266,10 +266,7 @@ PAIRS = {
         ),
         scene(),
     ),
-    "ends at the gate's end": (
-        scene(slab=slab(to_world=Place(57.5, 17.5))),
-        scene(),
-    ),
+    "ends at the gate's end": (scene(slab=slab(to_world=Place(57.5, 17.5))), scene()),
 }
 
 
@@ -341,9 +338,18 @@ def layers(*extinctions):
     ("volume", "extinctions"),
     [
         ((([1e-3, 9e-3]), {"filter_type": "nearest"}), (1e-3, 9e-3)),
-        ((([1e-3, 9e-3], 40, 60), {"filter_type": "nearest", "wrap_mode": "clamp"}), (1e-3, 9e-3, 9e-3, 9e-3)),
-        ((([1e-3, 9e-3], 40, 60), {"filter_type": "nearest", "wrap_mode": "repeat"}), (1e-3, 9e-3, 1e-3, 9e-3)),
-        ((([1e-3, 9e-3], 40, 60), {"filter_type": "nearest", "wrap_mode": "mirror"}), (1e-3, 9e-3, 9e-3, 1e-3)),
+        (
+            (([1e-3, 9e-3], 40, 60), {"filter_type": "nearest", "wrap_mode": "clamp"}),
+            (1e-3, 9e-3, 9e-3, 9e-3),
+        ),
+        (
+            (([1e-3, 9e-3], 40, 60), {"filter_type": "nearest", "wrap_mode": "repeat"}),
+            (1e-3, 9e-3, 1e-3, 9e-3),
+        ),
+        (
+            (([1e-3, 9e-3], 40, 60), {"filter_type": "nearest", "wrap_mode": "mirror"}),
+            (1e-3, 9e-3, 9e-3, 1e-3),
+        ),
     ],
     ids=["nearest", "clamp", "repeat", "mirror"],
 )
@@ -413,7 +419,8 @@ def test_a_shape_that_moves():
     loaded = mi.load_dict(made(scene()))
     image(loaded)
     parameters = mi.traverse(loaded)
-    corners = np.array(parameters["slab.vertex_positions"]).reshape(-1, 3) + [10, 0, 0]
+    corners = np.array(parameters["slab.vertex_positions"]).reshape(-1, 3)
+    corners[:, 0] += 10
     parameters["slab.vertex_positions"] = mi.Float(corners.ravel())
     parameters.update()
     assert_same(image(loaded), image(scene(slab=slab(to_world=Place(70)))))
@@ -434,7 +441,8 @@ def test_other_shapes_that_move(kind, tmp_path):
     image(loaded)
     parameters = mi.traverse(loaded)
     if kind == "ply":
-        corners = np.array(parameters["one.vertex_positions"]).reshape(-1, 3) + [10, 0, 0]
+        corners = np.array(parameters["one.vertex_positions"]).reshape(-1, 3)
+        corners[:, 0] += 10
         parameters["one.vertex_positions"] = mi.Float(corners.ravel())
     else:
         moved = mi.ScalarTransform4f().translate([10, 0, 0]) @ at(60)["one"]["to_world"]
@@ -454,7 +462,8 @@ def test_moving_a_shape_compiles_nothing(kind, tmp_path):
     parameters = mi.traverse(loaded)
     compiled = []
     for shift in (0, 5, 7):
-        corners = np.array(parameters["slab.vertex_positions"]).reshape(-1, 3) + [shift, 0, 0]
+        corners = np.array(parameters["slab.vertex_positions"]).reshape(-1, 3)
+        corners[:, 0] += shift
         parameters["slab.vertex_positions"] = mi.Float(corners.ravel())
         parameters.update()
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):

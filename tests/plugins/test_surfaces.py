@@ -53,7 +53,9 @@ def shape(kind, folder, first, last, half_width, medium):
         return [{"type": "rectangle", "to_world": at, **sides} for at in (forward, back)]
     size = [half, half_width, half_width]
     if kind == "mesh":
-        return [{"type": "ply", "filename": box_file(folder), "to_world": place.scale(size), **sides}]
+        return [
+            {"type": "ply", "filename": box_file(folder), "to_world": place.scale(size), **sides}
+        ]
     sign = -1 if kind == "mirrored" else 1
     cube = {"type": "cube", "to_world": place.scale([sign * half, *size[1:]]), **sides}
     if kind == "inside out":
