@@ -8,6 +8,7 @@ than its cut, a random number of 0 or next to 1 that makes NaN.
 
 import math
 from importlib.resources import files
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -113,10 +114,11 @@ def test_value_at_the_poles_is_the_tables(optics, name):
 
 def test_tables_of_mitsuba_are_not_cut_off(world):
     """Backscatter within rounding of 180 degrees: as of the isotropic function that they hold."""
+    narrow = {"divergence_full_mrad": 0.1, "beam_radius": 0.01, "beam_cut": 0.01}
     images = [
         world.render(
             world.scene(
-                world.lidar((1, 1), (500, 510), {"divergence_full_mrad": 0.1}, fov_half_mrad=0.1),
+                world.lidar((1, 1), (500, 510), narrow, fov_half_mrad=0.1, aperture_radius=0.01),
                 slab=world.box((495, -20, -20), (515, 20, 20), world.homogeneous(1e-3, phase)),
             ),
             spp=20_000,
@@ -129,7 +131,7 @@ def test_tables_of_mitsuba_are_not_cut_off(world):
 def quadrature(given, edges):
     """Probability of rings of the sphere, for a1 linear in angle."""
     result = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         inner = given[(given[:, 0] > low) & (given[:, 0] < high), 0]
         nodes = np.concatenate(
             [np.linspace(a, b, 400) for a, b in zip([low, *inner], [*inner, high], strict=True)]
@@ -257,7 +259,7 @@ def test_light_of_the_laser_is_bounded(beam):
 
 @pytest.mark.parametrize("ratio", [1e-3, 0.1, 1.0, 5.0])
 def test_directions_of_plane_waves(ratio):
-    """The squared sine within the cone: P = (1 - exp(-2 s / scale)) / (1 - exp(-2 limit / scale))."""
+    """P = (1 - exp(-2 s / scale)) / (1 - exp(-2 limit / scale)) of the squared sine s."""
     field = 20e-3
     waves = mi.load_dict(
         {
@@ -268,7 +270,7 @@ def test_directions_of_plane_waves(ratio):
         }
     )
     direction, weight, _ = waves.sample_direction_of_light(pairs(6))
-    x, y, z = np.array(direction, float)
+    _, y, z = np.array(direction, float)
     limit, scale = math.sin(field) ** 2, (math.tan(field) / ratio) ** 2
     sine2 = y**2 + z**2
     law = lambda s: np.expm1(-2 * s / scale) / math.expm1(-2 * limit / scale)  # noqa: E731
