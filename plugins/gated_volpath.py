@@ -71,7 +71,7 @@ from .physical import Physical
 from .polarization import first_unpolarized_in_blend
 from .registration import register
 from .supported import check_supported
-from .surfaces import extent
+from .surfaces import extent, media_of
 
 # how samples scatter and where they fly next is in `path_sampling`, of both estimators
 NAME, KIND = "gated_volpath", "integrator"
@@ -398,11 +398,8 @@ def _errors(number, deviations):
 
 def _check_blends(scene, sensor):
     """Refuse blends of polarised with unpolarised phase functions."""
-    media = [sensor.get_medium()]
-    for shape in scene.shapes():
-        media += [shape.interior_medium(), shape.exterior_medium()]
-    for medium in media:
-        part = medium and first_unpolarized_in_blend(medium)
+    for medium in media_of(scene, sensor):
+        part = first_unpolarized_in_blend(medium)
         if part is not None:
             fail(
                 NAME,

@@ -94,7 +94,8 @@ def define():
             radius = self.m_radius * dr.sqrt(beam_radius_squared(self.m_inside, sample_position.x))
             sine, cosine = dr.sincos(dr.two_pi * sample_position.y)
             origin.x, origin.y = radius * cosine, radius * sine
-            tangent = self.m_divergence_half * dr.sqrt(beam_radius_squared(1, sample_direction.x))
+            # 1 - sample lies in (0, 1], without rounding: the logarithm stays finite
+            tangent = self.m_divergence_half * dr.sqrt(-0.5 * dr.log(1 - sample_direction.x))
             sine, cosine = dr.sincos(dr.two_pi * sample_direction.y)
             return origin, dr.normalize(mi.Vector3f(tangent * cosine, tangent * sine, 1))
 

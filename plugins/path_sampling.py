@@ -9,10 +9,10 @@ import mitsuba as mi
 
 from .closed_paths import OpenPath, closing_distance, near_density, quarter_turn, sample_near
 from .media import coefficients, collision, interaction, transmittance
-from .polarization import apply_phase_function, rotate_stokes, transverse
+from .polarization import apply_phase_function, parts_of, rotate_stokes, transverse
 from .random_numbers import generator, pair
 from .resampling import choose
-from .surfaces import Air, slabs
+from .surfaces import Air, media_of, slabs
 
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
@@ -56,6 +56,11 @@ class Lidar:
     def __init__(self, scene, sensor, differentiable=False):
         self.air, self.sensor = Air(scene, sensor), sensor
         self.differentiable = differentiable
+        self.tables = any(
+            part.class_name() == "TabulatedPhaseFunction"
+            for medium in media_of(scene, sensor)
+            for part in parts_of(medium.phase_function())
+        )
         self.low, self.high = self.air.bounds
         self.wavelengths = sensor.laser.wavelengths()
         self.channel = _channel(sensor.laser.wavelength)
@@ -358,9 +363,10 @@ class Lidar:
 
     def _scatter(self, medium, mei, stokes, wo, active):
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
-        # Mitsuba's tables give nothing where rounding makes a cosine exceed one
-        cosine = dr.abs(dr.dot(mei.wi, wo))
-        wo = dr.select(cosine > LARGEST_COSINE, wo * (LARGEST_COSINE / cosine), wo)
+        if self.tables:
+            # Mitsuba's give nothing where rounding makes a cosine exceed one
+            cosine = dr.abs(dr.dot(mei.wi, wo))
+            wo = dr.select(cosine > LARGEST_COSINE, wo * (LARGEST_COSINE / cosine), wo)
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
         return apply_phase_function(value, stokes, self.channel), pdf
 

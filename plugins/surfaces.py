@@ -18,6 +18,8 @@ from .parameters import fail
 # A ray is traced from this far behind the last surface, relative to the position's size: several
 # roundings of a coordinate in single precision (0.5 mm at 500 m).
 STEP = 1e-6
+# of a line across the cube of half edge 1, per m
+SLOWEST = 1e-30
 # m, beyond any air
 FAR = 1e9
 
@@ -56,13 +58,10 @@ class Air:
     def crossings(self, origin, direction):
         """What each body needs to know of a line, and the distance of its first opaque surface."""
         lines = [body.line(origin, direction) for body in self.bodies]
-        return lines, self._opaque(origin, direction)
-
-    def _opaque(self, origin, direction):
         if self.opaque is None:
-            return mi.Float(dr.inf)
+            return lines, None
         si = _hit(self.opaque, origin, direction, mi.Bool(True))
-        return dr.select(si.is_valid(), si.t, dr.inf)
+        return lines, dr.select(si.is_valid(), si.t, dr.inf)
 
     def next_surface(self, crossings, origin, direction, start, distance, medium, active):
         """The part of a line that begins at the distance ``start``.
@@ -72,7 +71,7 @@ class Air:
         """
         active = active & (start < distance)
         lines, opaque = crossings
-        end = dr.minimum(distance, dr.select(opaque > start, opaque, dr.inf))
+        end = mi.Float(distance)
         around = mi.MediumPtr(medium) if self.sheets else self.around
         within = []
         for body, line in zip(self.bodies, lines, strict=True):
@@ -88,8 +87,11 @@ class Air:
             here = dr.select(inside, body.inside, here)
         if self.sheets:
             end, around = self._sheets(origin, direction, start, end, around, active)
-        end = dr.select(active, end, distance)
-        return end, active & (end < distance), end < opaque, mi.MediumPtr(here), around
+        passes = mi.Bool(True)
+        if self.opaque is not None:
+            passes = ~((opaque > start) & (opaque <= end))
+            end = dr.select(passes, end, dr.minimum(opaque, end))
+        return end, active & (end < distance), passes, mi.MediumPtr(here), around
 
     def _sheets(self, origin, direction, start, end, medium, active):
         """The same end, or that at an open surface, and the medium behind.
@@ -153,8 +155,8 @@ class Convex(Body):
     def ahead(self, line, origin, direction, start, active):
         """Distance of the next crossing behind ``start``, and whether that is inside."""
         near, far = line
-        outside, inside = near > start, (near <= start) & (far > start)
-        return dr.select(outside, near, dr.select(inside, far, dr.inf)), inside
+        outside, ahead = near > start, far > start
+        return dr.select(outside, near, dr.select(ahead, far, dr.inf)), ~outside & ahead
 
 
 class Cube(Convex):
@@ -169,7 +171,10 @@ class Cube(Convex):
     def line(self, origin, direction):
         """Where a line enters and leaves it; infinity, if it misses."""
         start, step = self.to_local @ origin + self.offset, self.to_local @ direction
-        near, far = slabs(mi.Vector3f(-1), mi.Vector3f(1), start, step)
+        # along a face, the slowest of steps: products with the inverse stay finite
+        slow = dr.rcp(dr.select(dr.abs(step) > SLOWEST, step, SLOWEST))
+        middle, half = -start * slow, dr.abs(slow)
+        near, far = dr.max(middle - half), dr.min(middle + half)
         return dr.select(near < far, near, dr.inf), far
 
 
@@ -244,6 +249,14 @@ def passes_light(shape) -> bool:
     """Whether light passes a shape's surface unchanged."""
     bsdf = shape.bsdf()
     return bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+
+
+def media_of(scene, sensor) -> list:
+    """All media of a scene and of the sensor in it, each once."""
+    media = [sensor.get_medium()]
+    for shape in scene.shapes():
+        media += [shape.interior_medium(), shape.exterior_medium()]
+    return [medium for medium in dict.fromkeys(media) if medium is not None]
 
 
 def _surroundings(bodies, sheets, sensor):

@@ -115,11 +115,19 @@ def test_value_at_the_poles_is_the_tables(optics, name):
 def test_tables_of_mitsuba_are_not_cut_off(world):
     """Backscatter within rounding of 180 degrees: as of the isotropic function that they hold."""
     narrow = {"divergence_full_mrad": 0.1, "beam_radius": 0.01, "beam_cut": 0.01}
+    directions = mi.TensorXf(np.array([[2.0, 1.1, 0.7]]))
     images = [
         world.render(
             world.scene(
-                world.lidar((1, 1), (500, 510), narrow, fov_half_mrad=0.1, aperture_radius=0.01),
-                slab=world.box((495, -20, -20), (515, 20, 20), world.homogeneous(1e-3, phase)),
+                world.lidar(
+                    (1, 1),
+                    (400, 410),
+                    narrow,
+                    fov_half_mrad=0.1,
+                    aperture_radius=0.01,
+                    directions=directions,
+                ),
+                slab=world.box((300, -900, -900), (600, 900, 900), world.homogeneous(1e-3, phase)),
             ),
             spp=20_000,
         )
