@@ -8,49 +8,52 @@ Renders all beams of a :ref:`scanning_lidar <sensor-scanning_lidar>` in one wave
 for every beam and gate is the Stokes vector of the received light as *received energy over emitted
 pulse energy*, and the standard error of its first component.
 
-============================ ======= ======================================================= =======
-Parameter                    Type    Meaning                                                 Default
-============================ ======= ======================================================= =======
-``max_order``                int     highest scattering order that is followed               1
-``estimator``                string  ``gated``: the last collision is forced into the gate;  gated
-                                     ``analog``: free flights from their physical
-                                     distribution, most samples miss the gate (for
-                                     validation)
-``orders``                   bool    also give S0 of every scattering order                  false
-``covariance``               bool    also give the standard error of S1 and the correlation  false
-                                     of the errors of S0 and S1 (for the error of the
-                                     depolarisation ratio)
-``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
-                                     memory, does not change the result
-============================ ======= ======================================================= =======
-
-Both estimators connect every collision to a sampled point of the telescope, test the field of
-view and multiply by the transmittance of all media on the way. They have the same expectation. In
-the gated estimator every sample belongs to a gate and has a range R in it. The last vertex of each
-scattering order is placed so that the whole path is 2 R long: on the ellipsoid whose foci are the
-last but one vertex and the telescope point. Its direction is drawn preferably into the field of
-view; of two candidates one is selected in proportion to its contribution (Talbot, Cline & Egbert
-2005).
-
-``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
-``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
-each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... after these, with ``covariance``
-``gateNNN.S1_stderr`` and ``gateNNN.S0_S1_correlation`` after all. The Stokes vector of the received
-light, like that of the emitted light, refers to the horizontal axis e_h of the beam, projected
-perpendicular to the returning light, as for an analyser fixed to the telescope. Unpolarised
-variants compute intensity only: S1 to S3 are 0. RGB variants use the colour channel nearest to the
-wavelength of the laser.
-
-``sample_count`` of the sensor's sampler (or ``spp``) is the number of Monte Carlo samples per beam.
-The gated estimator distributes them evenly over the gates and rounds up, so that every gate gets
-the same number, at least two. Samples are independent; the random numbers of a sample depend only
-on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
-depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
-
-A scene is refused if a medium, Mitsuba's own included, has a negative, infinite or undefined
-extinction coefficient, an albedo or a weight of a blend outside 0 to 1, or if a shape or volume has
-a transform that is not finite. Values are checked before the first rendering and whenever they are
-replaced.
+============================ ======= ============================================================= =============================================================
+Of a scene                            What becomes of it
+===================================== =============================================================
+film: ``width``, ``height``           honoured: the beams
+film: crop, ``sample_border``         refused
+film: ``rfilter``                     ``box``, or none stated: a beam is a pixel of its own; others
+                                      are refused
+film: formats of pixel and file       no effect: the tensor is single precision and its channels
+                                      have names
+other films than ``hdrfilm``          refused
+sampler                               ``independent``; others are refused, and its ``seed``: it is
+                                      given to ``mi.render``
+sensor: shutter                       refused; ``beams`` have times of their own
+sensor: clipping, fields of cameras   unknown parameters: refused by Mitsuba
+sensor: medium                        honoured; refused if it is not that of the shape in which the
+                                      telescope is. If none is stated, the shape's
+several sensors                       the one that ``mi.render`` is asked for
+arguments of ``mi.render``            ``spp``, ``seed``, ``sensor``, ``integrator`` and ``params``
+                                      are honoured
+other emitters than the sensor's      refused: area, environment, point, a second laser
+BSDF ``null``                         light passes: a surface between media
+BSDF that transmits otherwise         refused: ``mask``, ``blendbsdf``, ``thindielectric``,
+                                      dielectrics, etalons
+any other BSDF                        the surface blocks all light; what it reflects is not
+                                      followed. Refused around a medium
+cube, sphere, closed mesh             honoured: the interior is what it encloses, whatever the
+                                      order of a mesh's corners and however its transform mirrors
+                                      it
+``flip_normals``                      honoured: exchanges interior and exterior
+rectangle, disk, cylinder, open mesh  honoured: the exterior is on the side of the normal. Refused
+                                      where a beam first meets the side of another medium
+other shapes around media             refused; instances always
+shapes that touch, nest, overlap      honoured, without a least distance. Where closed shapes
+                                      overlap, the smallest one's medium holds
+exterior medium                       if none is stated, what surrounds the shape. Refused if it is
+                                      neither the sensor's nor that of another shape
+``merge``, shapes that Mitsuba merges honoured: taken apart again
+medium: ``scale``, chromatic values   honoured, at the laser's wavelength
+medium: ``sample_emitters``           no effect: there is no emitter to sample
+volume: all parameters                honoured, of extinction and albedo
+grid of three channels                as Mitsuba reads colours: the laser's channel in RGB
+                                      variants, the luminance in ``mono`` ones
+phase function ``tabphase``           honoured within rounding of 0 and 180 degrees as well
+``mi.traverse``                       all that it lists is honoured, shapes that move included. It
+                                      cannot exchange media
+===================================== =============================================================
 
 .. code-block:: xml
 
