@@ -8,7 +8,53 @@ Renders all beams of a :ref:`scanning_lidar <sensor-scanning_lidar>` in one wave
 for every beam and gate is the Stokes vector of the received light as *received energy over emitted
 pulse energy*, and the standard error of its first component.
 
-============================ ======= ============================================================= =============================================================
+============================ ======= ======================================================= =======
+Parameter                    Type    Meaning                                                 Default
+============================ ======= ======================================================= =======
+``max_order``                int     highest scattering order that is followed               1
+``estimator``                string  ``gated``: the last collision is forced into the gate;  gated
+                                     ``analog``: free flights from their physical
+                                     distribution, most samples miss the gate (for
+                                     validation)
+``orders``                   bool    also give S0 of every scattering order                  false
+``covariance``               bool    also give the standard error of S1 and the correlation  false
+                                     of the errors of S0 and S1 (for the error of the
+                                     depolarisation ratio)
+``samples_per_pass``         int     Monte Carlo samples that are traced at once; limits the 4194304
+                                     memory, does not change the result
+============================ ======= ======================================================= =======
+
+Both estimators connect every collision to a sampled point of the telescope, test the field of
+view and multiply by the transmittance of all media on the way. They have the same expectation. In
+the gated estimator every sample belongs to a gate and has a range R in it. The last vertex of each
+scattering order is placed so that the whole path is 2 R long: on the ellipsoid whose foci are the
+last but one vertex and the telescope point. Its direction is drawn preferably into the field of
+view; of two candidates one is selected in proportion to its contribution (Talbot, Cline & Egbert
+2005).
+
+``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``gateNNN.S0`` ...
+``gateNNN.S3``, ``gateNNN.S0_stderr``, gate by gate; row 0 is the top of the scan. With ``orders``
+each gate has ``gateNNN.order1.S0``, ``gateNNN.order2.S0``, ... after these, with ``covariance``
+``gateNNN.S1_stderr`` and ``gateNNN.S0_S1_correlation`` after all. The Stokes vector of the received
+light, like that of the emitted light, refers to the horizontal axis e_h of the beam, projected
+perpendicular to the returning light, as for an analyser fixed to the telescope. Unpolarised
+variants compute intensity only: S1 to S3 are 0. RGB variants use the colour channel nearest to the
+wavelength of the laser.
+
+``sample_count`` of the sensor's sampler (or ``spp``) is the number of Monte Carlo samples per beam.
+The gated estimator distributes them evenly over the gates and rounds up, so that every gate gets
+the same number, at least two. Samples are independent; the random numbers of a sample depend only
+on the seed, its beam and its number. Unpolarised phase functions (``isotropic``, ``hg``)
+depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
+
+A scene is refused if a medium, Mitsuba's own included, has a negative, infinite or undefined
+extinction coefficient, an albedo or a weight of a blend outside 0 to 1, if ``hg`` has a g beyond
+0.99 in magnitude, or if a shape or volume has a transform that is not finite. Values are checked
+before the first rendering and whenever they are replaced.
+
+What else Mitsuba's scenes offer is honoured or refused in one line, before anything is rendered:
+
+===================================== =============================================================
 Of a scene                            What becomes of it
 ===================================== =============================================================
 film: ``width``, ``height``           honoured: the beams
