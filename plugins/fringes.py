@@ -31,6 +31,7 @@ from the line of the source and stored with the ray, as an offset in Hz in place
 ``S3``, ``S0_stderr``; row 0 is the top. The Stokes vector refers to the horizontal axis.
 Unpolarised variants compute intensity only: S1 to S3 are 0. ``sample_count`` of the sensor's
 sampler (or ``spp``) is the number of paths per pixel, for ``forward`` the mean over all pixels.
+Films and samplers are those of :ref:`gated_volpath <integrator-gated_volpath>`.
 With ``forward`` the S0_stderr of a pixel without any path is 0. Gradients are refused: the orders
 of an etalon are split in two parts, exact in single precision, when it is loaded.
 
@@ -48,6 +49,7 @@ from .physical import Physical
 from .polarization import horizontal_axis, rotate_stokes
 from .random_numbers import generator, pair
 from .registration import register
+from .supported import check_sensor
 
 NAME, KIND = "fringes", "integrator"
 
@@ -84,6 +86,7 @@ def define():
             source = scene.environment()
             if not hasattr(source, "sample_direction_of_light"):
                 fail(NAME, "source", type(source).__name__, "an emitter of type 'plane_waves'")
+            check_sensor(NAME, sensor)
             self.physical.check(scene, sensor)
             _check_straight(scene)
             paths = int(spp) or sensor.sampler().sample_count()

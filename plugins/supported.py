@@ -1,4 +1,4 @@
-"""What a scene asks for and the lidar integrator cannot do: refused, each in a line.
+"""What a scene asks for and the integrators cannot do: refused, each in a line.
 
 Mitsuba accepts any film, sampler, emitter and surface beside a sensor. What is refused here would
 otherwise be ignored without a word. The table in the reference of `gated_volpath` lists all.
@@ -29,17 +29,29 @@ def check_supported(plugin: str, scene, sensor) -> None:
         A film that is cropped or filtered, a sampler that is not independent, a shutter, another
         source of light, a surface that refracts, polarises or covers partly, an instance.
     """
+    check_sensor(plugin, sensor)
+    for emitter in scene.emitters():
+        kind = emitter.class_name()
+        if kind == "Emitter":
+            kind = str(emitter).partition("[")[0]
+        fail(plugin, "emitter", kind, "the sensor's laser alone; other light is not followed")
+    for shape in scene.shapes():
+        _check_shape(plugin, shape)
+
+
+def check_sensor(plugin: str, sensor) -> None:
+    """Raise an error for what a film, a sampler or a shutter asks for and would not get."""
     film, sampler = sensor.film(), sensor.sampler()
     if film.class_name() != "HDRFilm":
         fail(plugin, "film", film.class_name(), "hdrfilm")
     if list(film.crop_offset()) != [0, 0] or list(film.crop_size()) != list(film.size()):
         crop = [list(film.crop_offset()), list(film.crop_size())]
-        fail(plugin, "film.crop", crop, "the whole film; select beams with 'directions'")
+        fail(plugin, "film.crop", crop, "the whole film")
     if film.sample_border():
-        fail(plugin, "film.sample_border", True, "false: beams are pixels, without a border")
+        fail(plugin, "film.sample_border", True, "false")
     filter_ = str(film.rfilter())
     if not filter_.startswith(("BoxFilter", "GaussianFilter[stddev=0.50,")):
-        fail(plugin, "film.rfilter", filter_, "box: a beam is a pixel of its own")
+        fail(plugin, "film.rfilter", filter_, "box: pixels are independent")
     if sampler.class_name() != "IndependentSampler":
         fail(
             plugin, "sampler", sampler.class_name(), "independent: errors are those of such samples"
@@ -49,14 +61,7 @@ def check_supported(plugin: str, scene, sensor) -> None:
         fail(plugin, "sampler.seed", int(seed[1]), "0; a seed is given to mi.render")
     if sensor.shutter_open() != 0 or sensor.shutter_open_time() != 0:
         shutter = sensor.shutter_open(), sensor.shutter_open_time()
-        fail(plugin, "shutter", shutter, "none: 'beams' have times of their own")
-    for emitter in scene.emitters():
-        kind = emitter.class_name()
-        if kind == "Emitter":
-            kind = str(emitter).partition("[")[0]
-        fail(plugin, "emitter", kind, "the sensor's laser alone; other light is not followed")
-    for shape in scene.shapes():
-        _check_shape(plugin, shape)
+        fail(plugin, "shutter", shutter, "0 s")
 
 
 def _check_shape(plugin, shape):
