@@ -88,8 +88,9 @@ rectangle, disk, cylinder, open mesh  honoured: the exterior is on the side of t
 other shapes around media             refused; instances always
 shapes that touch, nest, overlap      honoured, without a least distance. Where closed shapes
                                       overlap, the smallest one's medium holds
-exterior medium                       if none is stated, what surrounds the shape. Refused if it is
-                                      neither the sensor's nor that of another shape
+exterior medium                       if none is stated, what surrounds the shape; beside open
+                                      surfaces a vacuum. Refused if it is neither the sensor's nor
+                                      that of another shape
 ``merge``, shapes that Mitsuba merges honoured: taken apart again
 medium: ``scale``, chromatic values   honoured, at the laser's wavelength
 medium: ``sample_emitters``           no effect: there is no emitter to sample

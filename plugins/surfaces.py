@@ -51,6 +51,9 @@ class Air:
         self.opaque = _scene(opaque) if opaque else None
         around = _surroundings(self.bodies, self.sheets, sensor) if sensor else None
         self.around = mi.MediumPtr(around)
+        for body in self.bodies:
+            if body.hollow and body.interior is None:
+                body.inside = self.around
         dr.make_opaque(self.around)
         everywhere = around is not None or self.sheets
         self.bounds = _everywhere() if everywhere else (self.low, self.high)
@@ -127,12 +130,15 @@ def _any(at, found, index, front):
 
 
 class Body:
-    """A closed shape: its volume (m^3), the media on both sides of its surface."""
+    """A closed shape: its volume (m^3), the media on both sides of its surface.
 
-    def __init__(self, shape, volume):
-        self.volume, self.shape = volume, shape
+    ``hollow``: a cavity of the shape, which has the exterior medium in it.
+    """
+
+    def __init__(self, shape, volume, hollow=False):
+        self.volume, self.shape, self.hollow = volume, shape, hollow
         media = shape.interior_medium(), shape.exterior_medium()
-        self.interior, self.exterior = media[::-1] if _is_flipped(shape) else media
+        self.interior, self.exterior = media[::-1] if _is_flipped(shape) != hollow else media
         self.inside, self.outside = mi.MediumPtr(self.interior), mi.MediumPtr(self.exterior)
         dr.make_opaque(self.inside, self.outside)
 
@@ -162,8 +168,8 @@ class Convex(Body):
 class Cube(Convex):
     """The image of the cube of half edge 1."""
 
-    def __init__(self, shape, matrix, centre):
-        super().__init__(shape, 8 * abs(np.linalg.det(matrix)))
+    def __init__(self, shape, matrix, centre, hollow):
+        super().__init__(shape, 8 * abs(np.linalg.det(matrix)), hollow)
         inverse = np.linalg.inv(matrix)
         self.to_local, self.offset = mi.Matrix3f(inverse), mi.Vector3f(-inverse @ centre)
         dr.make_opaque(self.to_local, self.offset)
@@ -201,8 +207,8 @@ class Sphere(Convex):
 class Closed(Body):
     """A closed mesh. Light that leaves it at the next surface is inside."""
 
-    def __init__(self, shape, piece, volume):
-        super().__init__(shape, abs(volume))
+    def __init__(self, shape, piece, volume, hollow):
+        super().__init__(shape, abs(volume), hollow)
         self.scene, (self.low, self.high) = _scene([piece]), _box([piece])
         # whether normals point outwards: they follow the order of corners, unless flipped
         self.outwards = _sign((volume > 0) != piece.has_flipped_normals())
@@ -392,18 +398,35 @@ def _parts(shape):
         return [Sheet(shape, shape)]
     corners, faces = _corners(shape), np.array(shape.faces_buffer()).reshape(-1, 3)
     pieces = _pieces(corners, faces)
-    return [_part(shape, corners, piece, closed, len(pieces) == 1) for piece, closed in pieces]
+    volumes = [_volume(corners, faces) if closed else 0 for faces, closed in pieces]
+    boxes = [(corners[faces].min((0, 1)), corners[faces].max((0, 1))) for faces, _ in pieces]
+    whole = len(pieces) == 1
+    return [
+        _part(shape, corners, faces, volume, _is_hollow(k, volumes, boxes), whole)
+        for k, ((faces, _), volume) in enumerate(zip(pieces, volumes, strict=True))
+    ]
 
 
-def _part(shape, corners, faces, closed, whole):
-    volume = _volume(corners, faces) if closed else 0
+def _is_hollow(index, volumes, boxes) -> bool:
+    """Whether a piece is a cavity: within a larger one, and wound the other way round."""
+    volume, (low, high) = volumes[index], boxes[index]
+    return any(
+        other * volume < 0
+        and abs(other) > abs(volume)
+        and (first <= low).all()
+        and (high <= last).all()
+        for other, (first, last) in zip(volumes, boxes, strict=True)
+    )
+
+
+def _part(shape, corners, faces, volume, hollow, whole):
     if volume:
         used = corners[faces.min() : faces.max() + 1]
         affine = _affine(used)
         if affine is not None:
-            return Cube(shape, *affine)
+            return Cube(shape, *affine, hollow)
     piece = shape if whole else _mesh(corners, faces)
-    return Closed(shape, piece, volume) if volume else Sheet(shape, piece)
+    return Closed(shape, piece, volume, hollow) if volume else Sheet(shape, piece)
 
 
 def _affine(corners):

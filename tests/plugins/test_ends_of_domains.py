@@ -98,6 +98,24 @@ def test_density_follows_the_value_at_the_poles(optics, phase, side):
     assert (np.abs(matrix) <= matrix[:, :1, :1] * (1 + 1e-5)).all()
 
 
+@pytest.mark.parametrize("side", [1, -1], ids=["forward", "backward"])
+def test_matrices_at_the_poles_are_those_of_dipoles(optics, side):
+    """E' = E - k' (k'.E) between Mitsuba's axes, in double precision, from 1 nrad on."""
+    rng = np.random.default_rng(9)
+    incident = optics.unit_vectors(rng, 5000).astype(np.float32).astype(float)
+    tilt = rng.standard_normal(incident.shape) * np.geomspace(1e-9, 1e-1, 5000)[:, None]
+    scattered = optics.normalized(side * incident + tilt).astype(np.float32).astype(float)
+    found, _ = optics.evaluate(phase_function("rayleigh_polarized", 0.0), incident, scattered)
+    before, after = (np.stack(optics.axes(k), 1) for k in (incident, scattered))
+    jones = np.einsum("nik,njk->nij", after, before)
+    pauli = np.array([[[1, 0], [0, 1]], [[1, 0], [0, -1]], [[0, 1], [1, 0]], [[0, -1j], [1j, 0]]])
+    expected = np.einsum("aij,njk,bkl,nil->nab", pauli, jones, pauli, jones).real
+    expected *= 3 / (16 * math.pi)
+    # the sign of V is a matter of convention
+    expected[:, 3, 3] = np.copysign(expected[:, 3, 3], found[:, 3, 3])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=3e-6 * found.max())
+
+
 @pytest.mark.parametrize("name", ["three angles", "droplets", "steep in few cells"])
 def test_value_at_the_poles_is_the_tables(optics, name):
     """Where a1 hardly changes over the angles that float32 cannot tell apart."""

@@ -222,6 +222,26 @@ def test_an_opaque_surface_ends_all_light(tmp_path):
         assert np.isinf(depth(scene, origin, direction, 120.0)).all()
 
 
+@pytest.mark.parametrize("outside", [None, "high"])
+def test_a_mesh_with_a_cavity(outside, tmp_path):
+    """In which is the exterior medium, or none."""
+    scene = {
+        "type": "scene",
+        **{k: {"type": "homogeneous", "sigma_t": v} for k, v in EXTINCTION.items()},
+        "shell": {
+            "type": "ply",
+            "filename": box_file(tmp_path, 0.5),
+            "to_world": mi.ScalarTransform4f().translate([100, 0, 0]).scale(40),
+            "bsdf": {"type": "null"},
+            "interior": {"type": "ref", "id": "low"},
+            **({"exterior": {"type": "ref", "id": outside}} if outside else {}),
+        },
+    }
+    boxes = [(60, 80, "low"), (120, 140, "low")]
+    boxes += [(80, 120, outside)] if outside else []
+    check(mi.load_dict(scene), boxes)
+
+
 def test_shapes_with_one_medium_on_both_sides_change_nothing(tmp_path):
     boxes = [(50, 150, "low")]
     inner = {
