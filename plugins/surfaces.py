@@ -48,7 +48,7 @@ class Air:
                 for part in _parts(shape):
                     (self.sheets if isinstance(part, Sheet) else self.bodies).append(part)
         self.bodies.sort(key=lambda body: -body.volume)
-        self.opaque = _scene(opaque) if opaque else None
+        self.opaque = scene_of(opaque) if opaque else None
         around = _surroundings(self.bodies, self.sheets, sensor) if sensor else None
         self.around = mi.MediumPtr(around)
         for body in self.bodies:
@@ -63,8 +63,7 @@ class Air:
         lines = [body.line(origin, direction) for body in self.bodies]
         if self.opaque is None:
             return lines, None
-        si = _hit(self.opaque, origin, direction, mi.Bool(True))
-        return lines, dr.select(si.is_valid(), si.t, dr.inf)
+        return lines, first_hit(self.opaque, origin, direction, mi.Bool(True))[0]
 
     def next_surface(self, crossings, origin, direction, start, distance, medium, active):
         """The part of a line that begins at the distance ``start``.
@@ -209,7 +208,7 @@ class Closed(Body):
 
     def __init__(self, shape, piece, volume, hollow):
         super().__init__(shape, abs(volume), hollow)
-        self.scene, (self.low, self.high) = _scene([piece]), _box([piece])
+        self.scene, (self.low, self.high) = scene_of([piece]), _box([piece])
         # whether normals point outwards: they follow the order of corners, unless flipped
         self.outwards = _sign((volume > 0) != piece.has_flipped_normals())
 
@@ -231,7 +230,7 @@ class Sheet:
     """An open surface: a rectangle, a disc, a cylinder, a mesh with a rim."""
 
     def __init__(self, shape, piece):
-        self.shape, self.scene = shape, _scene([piece])
+        self.shape, self.scene = shape, scene_of([piece])
         self.interior, self.exterior = shape.interior_medium(), shape.exterior_medium()
         self.inside, self.outside = mi.MediumPtr(self.interior), mi.MediumPtr(self.exterior)
         dr.make_opaque(self.inside, self.outside)
@@ -340,6 +339,11 @@ def extent(shape):
     return np.array([shape.bbox().min, shape.bbox().max], float)
 
 
+def scene_extent(shapes):
+    """Corners of all shapes' boxes, (n, 3); the origin, if there is no shape."""
+    return np.concatenate([extent(shape) for shape in shapes]) if shapes else np.zeros((1, 3))
+
+
 def slabs(low, high, origin, direction):
     """Distances along a line at which it is inside a box, first and last."""
     # a component of 0 makes infinities; where it makes NaN (0 times infinity), comparisons fail
@@ -347,21 +351,23 @@ def slabs(low, high, origin, direction):
     return dr.max(dr.minimum(first, last)), dr.min(dr.maximum(first, last))
 
 
-def _hit(scene, origin, direction, active):
+def first_hit(scene, origin, direction, active):
+    """Distance of the first surface, infinite if there is none, and its normal."""
     # one by one: packets of rays are slower here, coherent or not
-    return scene.ray_intersect(
+    si = scene.ray_intersect(
         mi.Ray3f(origin, direction), ray_flags=+mi.RayFlags.Minimal, coherent=False, active=active
     )
+    return dr.select(active & si.is_valid(), si.t, dr.inf), si.n
 
 
 def _next(scene, origin, direction, start, active):
     """Distance of the next surface behind ``start``, infinite if there is none, and its normal."""
     start = start + STEP * (dr.max(dr.abs(origin)) + start)
-    si = _hit(scene, origin + direction * start, direction, active)
-    return dr.select(active & si.is_valid(), start + si.t, dr.inf), si.n
+    place, normal = first_hit(scene, origin + direction * start, direction, active)
+    return start + place, normal
 
 
-def _scene(shapes):
+def scene_of(shapes):
     """A scene of some shapes alone. Mitsuba names them anew; they keep their names."""
     names = [shape.id() for shape in shapes]
     parts = {f"shape{number}": shape for number, shape in enumerate(shapes)}
@@ -381,9 +387,7 @@ def _everywhere():
 
 def _box(shapes):
     """Corners of a box around shapes, opaque, so that no scene's size is compiled into a kernel."""
-    corners = np.concatenate(
-        [*(extent(shape) for shape in shapes), np.zeros((0 if shapes else 1, 3))]
-    )
+    corners = scene_extent(shapes)
     margin = 10 * STEP * (1 + np.abs(corners).max())
     low, high = mi.Point3f(corners.min(0) - margin), mi.Point3f(corners.max(0) + margin)
     dr.make_opaque(low, high)
