@@ -5,11 +5,13 @@ one that is kept where it ends, a result that depends on the kind of shape, on t
 normals, on the order of shapes in the scene or on another shape elsewhere.
 """
 
+import math
+
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from plugins.media import transmittance
+from plugins.media import collision, transmittance
 from plugins.surfaces import Air, Closed, Cube, Sheet, Sphere
 from tests.support.meshes import box_file
 
@@ -137,6 +139,40 @@ def check(scene, boxes, tolerance=2e-4):
 def test_boxes(name, kind, tmp_path):
     boxes = ARRANGEMENTS[name]
     check(build(boxes, kind, tmp_path), boxes)
+
+
+@pytest.mark.parametrize("kind", ["cube", "mesh"])
+@pytest.mark.parametrize("name", ["touching", "gap of 1e-5 m", "nested, a face shared"])
+def test_free_flights(name, kind, tmp_path):
+    """As many collisions as optical depths say, and their mean distance, within 4 sigma."""
+    boxes = ARRANGEMENTS[name]
+    origin, direction, distance = (np.tile(a, (30, *[1] * (a.ndim - 1))) for a in lines())
+    points = (
+        type_(*(np.ascontiguousarray(axis) for axis in a.T))
+        for type_, a in ((mi.Point3f, origin), (mi.Vector3f, direction))
+    )
+    flight, medium, found = collision(
+        Air(build(boxes, kind, tmp_path)),
+        mi.MediumPtr(None),
+        *points,
+        mi.Float(distance),
+        0,
+        mi.Color0f(),
+        mi.Float(0),
+        mi.PCG32(size=len(origin)),
+        mi.Bool(True),
+    )
+    flight, found = np.array(flight, float), np.array(found)
+    chance = -np.expm1(-expected(boxes, origin.astype(float), direction.astype(float), distance))
+    sigma = np.sqrt((chance * (1 - chance)).sum())
+    assert abs(found.sum() - chance.sum()) < 4 * sigma
+    # of those, uniform on the scale of optical depth
+    passed = -np.expm1(-expected(boxes, origin.astype(float), direction.astype(float), flight))
+    part = (passed / chance)[found]
+    assert abs(part.mean() - 0.5) < 4 / math.sqrt(12 * found.sum())
+    where = origin[:, 0] + direction[:, 0] * flight
+    nowhere = np.array(medium == mi.MediumPtr(None)) & found
+    assert not nowhere.any() and ((where > 50) & (where < 150))[found].all()
 
 
 @pytest.mark.parametrize("name", ARRANGEMENTS)
