@@ -47,13 +47,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .bodies import first_hit, name_of, scene_extent, scene_of
 from .parameters import choice, fail, whole
 from .physical import Physical
 from .polarization import horizontal_axis, rotate_stokes
 from .random_numbers import generator, pair
 from .registration import register
 from .supported import check_sensor
-from .surfaces import first_hit, name_of, scene_extent, scene_of
 
 NAME, KIND = "fringes", "integrator"
 

@@ -118,10 +118,8 @@ import numpy as np
 from .parameters import choice, fail, whole
 from .path_sampling import Lidar
 from .physical import Physical
-from .polarization import first_unpolarized_in_blend
 from .registration import register
-from .supported import check_supported
-from .surfaces import extent, media_of
+from .supported import check_air, check_supported
 
 # how samples scatter and where they fly next is in `path_sampling`, of both estimators
 NAME, KIND = "gated_volpath", "integrator"
@@ -249,8 +247,7 @@ def define():
                 fail(NAME, "sensor", type(sensor).__name__, "a sensor of type 'scanning_lidar'")
             check_supported(NAME, scene, sensor)
             self.physical.check(scene, sensor)
-            _check_gate_meets_medium(scene, sensor)
-            _check_blends(scene, sensor)
+            check_air(NAME, scene, sensor)
             values = sensor.beam_count * sensor.gate_count * len(self.quantities())
             if values >= 2**32:
                 most = (2**32 - 1) // (sensor.beam_count * len(self.quantities()))
@@ -444,39 +441,6 @@ def _errors(number, deviations):
         return errors
     both = dr.sqrt(dr.maximum(deviations[0], 0)) * dr.sqrt(dr.maximum(deviations[1], 0))
     return [*errors, dr.select(both > 0, dr.clip(deviations[2] / both, -1, 1), 0)]
-
-
-def _check_blends(scene, sensor):
-    """Refuse blends of polarised with unpolarised phase functions."""
-    for medium in media_of(scene, sensor):
-        part = first_unpolarized_in_blend(medium)
-        if part is not None:
-            fail(
-                NAME,
-                "blendphase",
-                part.class_name(),
-                "phase functions that are all polarised, such as mueller, or all unpolarised",
-            )
-
-
-def _check_gate_meets_medium(scene, sensor):
-    """A gate without any medium in it is an error of the scene, not a black image."""
-    if sensor.get_medium() is not None:
-        return
-    origins, (near, far) = sensor.origins_and_ranges()
-    spans = []
-    for shape in scene.shapes():
-        if shape.interior_medium() is None and shape.exterior_medium() is None:
-            continue
-        low, high = extent(shape)
-        first = np.linalg.norm(np.maximum(0, np.maximum(low - origins, origins - high)), axis=1)
-        last = np.linalg.norm(np.maximum(origins - low, high - origins), axis=1)
-        if ((first <= far) & (last >= near)).any():
-            return
-        spans.append((first.min(), last.max()))
-    where = ", ".join(f"{a:g} to {b:g} m" for a, b in spans) or "nowhere"
-    gates = f"{near.min():g} to {far.max():g} m"
-    fail(NAME, "gates", gates, f"ranges with a medium (there is one: {where})")
 
 
 register(KIND, NAME, define)

@@ -240,6 +240,11 @@ def define():
     return Laser
 
 
+def channel_of(wavelength: float) -> int:
+    """Index of a spectrum's entry for a laser: a colour in RGB variants."""
+    return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0
+
+
 def _stokes(text) -> tuple[float, float, float, float]:
     try:
         values = [float(v) for v in str(text).replace(",", " ").split()]

@@ -7,12 +7,15 @@ physical distribution. Both give Stokes vectors about the instrument's horizonta
 import drjit as dr
 import mitsuba as mi
 
+from .bodies import slabs
 from .closed_paths import OpenPath, closing_distance, near_density, quarter_turn, sample_near
+from .laser import channel_of
 from .media import coefficients, collision, interaction, transmittance
-from .polarization import apply_phase_function, parts_of, rotate_stokes, transverse
+from .mitsuba_tables import has_tables, off_the_poles
+from .polarization import apply_phase_function, rotate_stokes, transverse
 from .random_numbers import generator, pair
 from .resampling import choose
-from .surfaces import Air, media_of, slabs
+from .surfaces import Air, media_of
 
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
@@ -29,8 +32,6 @@ PHASE_FLIGHT_FRACTION = 0.3
 WIDER = 1.6
 # Of intermediate flights, the fraction whose remaining path is sampled as that of first vertices.
 NEAR_FLIGHT_FRACTION = 0.3
-# below one by the rounding of a scalar product
-LARGEST_COSINE = 1 - 2.0**-21
 # Russian roulette: probability of survival over the weight.
 ROULETTE_FACTOR = 30.0
 
@@ -56,14 +57,10 @@ class Lidar:
     def __init__(self, scene, sensor, differentiable=False):
         self.air, self.sensor = Air(scene, sensor), sensor
         self.differentiable = differentiable
-        self.tables = any(
-            part.class_name() == "TabulatedPhaseFunction"
-            for medium in media_of(scene, sensor)
-            for part in parts_of(medium.phase_function())
-        )
+        self.rounded = has_tables(media_of(scene, sensor))
         self.low, self.high = self.air.bounds
         self.wavelengths = sensor.laser.wavelengths()
-        self.channel = _channel(sensor.laser.wavelength)
+        self.channel = channel_of(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
         self.context = mi.PhaseFunctionContext()
 
@@ -363,10 +360,8 @@ class Lidar:
 
     def _scatter(self, medium, mei, stokes, wo, active):
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
-        if self.tables:
-            # Mitsuba's give nothing where rounding makes a cosine exceed one
-            cosine = dr.abs(dr.dot(mei.wi, wo))
-            wo = dr.select(cosine > LARGEST_COSINE, wo * (LARGEST_COSINE / cosine), wo)
+        if self.rounded:
+            wo = off_the_poles(mei.wi, wo)
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
         return apply_phase_function(value, stokes, self.channel), pdf
 
@@ -452,8 +447,3 @@ def _sum(first, second):
 
 def _scaled(stokes, factor):
     return [s * factor for s in stokes]
-
-
-def _channel(wavelength: float) -> int:
-    """Index of the spectrum's entry for the laser."""
-    return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0

@@ -12,8 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .bodies import extent, name_of
 from .parameters import fail
-from .surfaces import extent, name_of
 
 # rounding to single precision may leave an albedo of 1 this much above it
 ROUNDING = 1e-5
@@ -60,7 +60,7 @@ class Physical:
         if sensor.get_medium() is not None:
             media[sensor.get_medium()] = sensor.get_medium().id()
         for shape in scene.shapes():
-            self._place(name_of(shape), extent(shape))
+            self._place(name_of(shape), *extent(shape))
             for side in ("interior_medium", "exterior_medium"):
                 medium = getattr(shape, side)()
                 if medium is not None:
@@ -70,8 +70,7 @@ class Physical:
             parameters = mi.traverse(medium)
             for name, (_, _, node, _) in parameters.properties.items():
                 if isinstance(node, mi.Volume):
-                    box = node.bbox()
-                    self._place(f"{where}.{name}", np.array([box.min, box.max], float))
+                    self._place(f"{where}.{name}", node.bbox().min, node.bbox().max)
                 value = parameters[name]
                 rule = next((rule for rule in RULES if rule[0].fullmatch(name)), None)
                 if rule is None or not _is_coefficient(node, value):
@@ -82,9 +81,11 @@ class Physical:
                 passed[medium, name] = held
         self.passed = passed
 
-    def _place(self, field, box):
-        if not (np.isfinite(box).all() and (box[0] <= box[1]).all()):
-            fail(self.plugin, field, box.tolist(), "a finite position; its transform is not finite")
+    def _place(self, field, low, high):
+        # NaN compares as false
+        if not (np.isfinite([low, high]).all() and (np.array(low) <= np.array(high)).all()):
+            box = mi.ScalarBoundingBox3f(low, high)
+            fail(self.plugin, field, str(box), "a finite position; its transform is not finite")
 
     def check_values(self, field, arrays, least, most, allowed):
         """Raise an error if a parameter has a value out of its range."""

@@ -7,9 +7,12 @@ otherwise be ignored without a word. The table in the reference of `gated_volpat
 import re
 
 import mitsuba as mi
+import numpy as np
 
+from .bodies import extent, name_of
 from .parameters import fail
-from .surfaces import name_of
+from .polarization import first_unpolarized_in_blend
+from .surfaces import media_of
 
 # shapes whose sides can be told apart along a line; besides all meshes
 SIDED = ("Cube", "Sphere", "Rectangle", "Disk", "Cylinder")
@@ -81,3 +84,48 @@ def _check_shape(plugin, shape):
         )
     if shape.is_medium_transition() and bsdf.class_name() != "Null":
         fail(plugin, f"{name}.bsdf", bsdf.class_name(), "null, for light to enter its medium")
+
+
+def check_air(plugin: str, scene, sensor) -> None:
+    """Raise an error if no gate meets air, or for a blend that cannot be told from its parts.
+
+    Raises
+    ------
+    ValueError
+        A gate without any medium in it; polarised phase functions blended with unpolarised ones.
+    """
+    _check_gate_meets_medium(plugin, scene, sensor)
+    _check_blends(plugin, scene, sensor)
+
+
+def _check_blends(plugin, scene, sensor):
+    """Refuse blends of polarised with unpolarised phase functions."""
+    for medium in media_of(scene, sensor):
+        part = first_unpolarized_in_blend(medium)
+        if part is not None:
+            fail(
+                plugin,
+                "blendphase",
+                part.class_name(),
+                "phase functions that are all polarised, such as mueller, or all unpolarised",
+            )
+
+
+def _check_gate_meets_medium(plugin, scene, sensor):
+    """A gate without any medium in it is an error of the scene, not a black image."""
+    if sensor.get_medium() is not None:
+        return
+    origins, (near, far) = sensor.origins_and_ranges()
+    spans = []
+    for shape in scene.shapes():
+        if shape.interior_medium() is None and shape.exterior_medium() is None:
+            continue
+        low, high = extent(shape)
+        first = np.linalg.norm(np.maximum(0, np.maximum(low - origins, origins - high)), axis=1)
+        last = np.linalg.norm(np.maximum(origins - low, high - origins), axis=1)
+        if ((first <= far) & (last >= near)).any():
+            return
+        spans.append((first.min(), last.max()))
+    where = ", ".join(f"{a:g} to {b:g} m" for a, b in spans) or "nowhere"
+    gates = f"{near.min():g} to {far.max():g} m"
+    fail(plugin, "gates", gates, f"ranges with a medium (there is one: {where})")

@@ -8,8 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from plugins.bodies import Closed, Cube
 from plugins.media import transmittance
-from plugins.surfaces import Air, Closed, Cube
+from plugins.surfaces import Air
 from tests.support.meshes import box_file
 
 pytestmark = pytest.mark.usefixtures("variant")

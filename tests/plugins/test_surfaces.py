@@ -11,8 +11,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from plugins.bodies import Closed, Cube, Sheet, Sphere
 from plugins.media import collision, transmittance
-from plugins.surfaces import Air, Closed, Cube, Sheet, Sphere
+from plugins.surfaces import Air
 from tests.support.meshes import box_file
 
 pytestmark = pytest.mark.usefixtures("variant")
