@@ -16,6 +16,8 @@ import numpy as np
 STEP = 1e-6
 # of a line across the cube of half edge 1, per m
 SLOWEST = 1e-30
+# open surfaces of a mesh that are told apart
+MOST_SHEETS = 64
 
 
 def parts_of_shape(shape):
@@ -29,9 +31,11 @@ def parts_of_shape(shape):
     volumes = [_volume(corners, faces) if closed else 0 for faces, closed in pieces]
     boxes = [(corners[faces].min((0, 1)), corners[faces].max((0, 1))) for faces, _ in pieces]
     whole = len(pieces) == 1
+    # two open surfaces at one place that face each other enclose nothing
     return [
         _part(shape, corners, faces, volume, _is_hollow(k, volumes, boxes), whole)
-        for k, ((faces, _), volume) in enumerate(zip(pieces, volumes, strict=True))
+        for k, ((faces, closed), volume) in enumerate(zip(pieces, volumes, strict=True))
+        if volume or not closed
     ]
 
 
@@ -283,7 +287,21 @@ def _pieces(corners, faces):
     open_ = np.zeros(len(faces), bool)
     open_[face[rim]] = True
     starts = np.concatenate([[0], last + 1])
-    return [(faces[a:b], not open_[a:b].any()) for a, b in itertools.pairwise(starts)]
+    pieces = [(faces[a:b], not open_[a:b].any()) for a, b in itertools.pairwise(starts)]
+    return [
+        (part, closed)
+        for piece, closed in pieces
+        for part in ([piece] if closed else _sheets(piece))
+    ]
+
+
+def _sheets(faces):
+    """Open surfaces that share no corner, as Mitsuba has merged them."""
+    before = np.maximum.accumulate(faces.max(1))
+    behind = np.minimum.accumulate(faces.min(1)[::-1])[::-1]
+    sheets = np.split(faces, np.flatnonzero(before[:-1] < behind[1:]) + 1)
+    # beyond that, a surface of separate triangles
+    return sheets if len(sheets) <= MOST_SHEETS else [faces]
 
 
 def _mesh(corners, faces):
@@ -307,9 +325,11 @@ def _is_flipped(shape) -> bool:
 
 
 def _volume(corners, faces) -> float:
-    """Volume of a closed mesh, negative where its corners run clockwise from outside."""
+    """Volume (m^3) of a closed mesh, negative where corners run clockwise from outside."""
     first, second, third = (corners[faces[:, k]] - corners[faces[0, 0]] for k in range(3))
-    return float((first * np.cross(second, third)).sum() / 6)
+    parts = (first * np.cross(second, third)).sum(1) / 6
+    # 0 where it is no more than the rounding of its parts
+    return float(parts.sum() if abs(parts.sum()) > 1e-12 * np.abs(parts).sum() else 0)
 
 
 def _corners(mesh):

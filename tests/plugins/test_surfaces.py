@@ -198,6 +198,15 @@ def test_rectangles(name, tmp_path):
     check(scene, boxes, 1e-3)
 
 
+def test_rectangles_of_one_medium_at_one_place(tmp_path, monkeypatch):
+    """Of one size, so that Mitsuba merges what faces each other."""
+    monkeypatch.setattr(f"{__name__}.SHRINK", 1.0)
+    boxes = ARRANGEMENTS["one medium"]
+    scene = build(boxes, "rectangles", tmp_path)
+    assert len(scene.shapes()) == 1 and len(Air(scene).sheets) == 4
+    check(scene, boxes, 1e-3)
+
+
 @pytest.mark.parametrize("surface", ["null", "diffuse"])
 @pytest.mark.parametrize("kind", ["sphere", "rectangle", "cylinder", "disk", "cube"])
 def test_a_shape_elsewhere_changes_nothing(kind, surface, tmp_path):
