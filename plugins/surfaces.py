@@ -142,25 +142,30 @@ def media_of(scene, sensor) -> list:
 def _surroundings(bodies, sheets, sensor):
     """The medium outside of all closed shapes, as sensor and shapes state it."""
     stated, places = sensor.get_medium(), sensor.places
-    around, innermost = [stated] * len(places), [None] * len(places)
-    for body in bodies:
-        for beam in np.flatnonzero(body.contains(places)):
-            around[beam] = body.exterior if innermost[beam] is None else around[beam]
-            innermost[beam] = body
-    for body in innermost:
-        if body is not None and stated is not None and stated != body.interior:
+    # of every beam: the largest and the smallest body in which it begins, -1 if in none
+    outer, inner = (np.full(len(places), -1) for _ in range(2))
+    for index, body in enumerate(bodies):
+        inside = body.contains(places)
+        outer[inside & (outer < 0)] = index
+        inner[inside] = index
+    for index in np.unique(inner[inner >= 0]):
+        if stated is not None and stated != bodies[index].interior:
             fail(
                 "scanning_lidar",
                 "medium",
                 name_of(stated),
-                f"the medium of {name_of(body.shape)}, in which the telescope is, by reference",
+                f"the medium of {name_of(bodies[index].shape)}, in which the telescope is, "
+                "by reference",
             )
-    if sheets:
-        _check_fronts(bodies, sheets, sensor, around, innermost)
-    around = list(dict.fromkeys(around))
+    # -1 is the last
+    around = [*(body.exterior for body in bodies), stated]
+    around = list(dict.fromkeys(around[index] for index in np.unique(outer)))
     if len(around) > 1:
         names = [medium and name_of(medium) for medium in around]
         fail("scanning_lidar", "medium", names, "one medium around the shapes for all beams")
+    if sheets:
+        light = np.array([*(body.interior for body in bodies), stated], object)[inner]
+        _check_fronts(bodies, sheets, sensor, light)
     media = {around[0], None, *(body.interior for body in bodies)}
     media |= {medium for sheet in sheets for medium in (sheet.interior, sheet.exterior)}
     for body in bodies:
@@ -174,8 +179,8 @@ def _surroundings(bodies, sheets, sensor):
     return around[0]
 
 
-def _check_fronts(bodies, sheets, sensor, around, innermost):
-    """Refuse open surfaces on whose near side is another medium than the beam that meets them."""
+def _check_fronts(bodies, sheets, sensor, light):
+    """Refuse open surfaces on whose near side is another medium than ``light``, that of beams."""
     origin, axis = (vectors.T.astype(np.float32) for vectors in sensor.beam_axes())
     origin, axis = mi.Point3f(*origin), mi.Vector3f(*axis)
     start, every = mi.Float(0), mi.Bool(True)
@@ -187,16 +192,14 @@ def _check_fronts(bodies, sheets, sensor, around, innermost):
     found = [sheet.ahead(origin, axis, start, every) for sheet in sheets]
     for place, _, _ in found:
         first = dr.minimum(first, place)
-    count = dr.width(axis)
-    media = [body.interior if body else out for body, out in zip(innermost, around, strict=True)]
-    light = np.resize(np.array(media, object), count)
+    light = np.resize(light, dr.width(axis))
     for sheet, (place, front, _) in zip(sheets, found, strict=True):
         here = (place == first) & (place < dr.inf)
         for side, medium, pointer in (
             ("interior", sheet.interior, sheet.inside),
             ("exterior", sheet.exterior, sheet.outside),
         ):
-            meets = np.resize(np.array(here & (front == pointer)), count)
+            meets = np.resize(np.array(here & (front == pointer)), len(light))
             if medium is not None and any(other != medium for other in light[meets]):
                 fail(
                     name_of(sheet.shape),
