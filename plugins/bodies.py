@@ -26,7 +26,10 @@ def parts_of_shape(shape):
         return [Sphere(shape)]
     if not shape.is_mesh():
         return [Sheet(shape, shape)]
-    corners, faces = _corners(shape), np.array(shape.faces_buffer()).reshape(-1, 3)
+    corners = _corners(shape)
+    if (affine := _affine(corners)) is not None:
+        return [Cube(shape, *affine)]
+    faces = np.array(shape.faces_buffer()).reshape(-1, 3)
     pieces = _pieces(corners, faces)
     volumes = [_volume(corners, faces) if closed else 0 for faces, closed in pieces]
     boxes = [(corners[faces].min((0, 1)), corners[faces].max((0, 1))) for faces, _ in pieces]
@@ -78,7 +81,7 @@ class Convex(Body):
 class Cube(Convex):
     """The image of the cube of half edge 1."""
 
-    def __init__(self, shape, matrix, centre, hollow):
+    def __init__(self, shape, matrix, centre, hollow=False):
         super().__init__(shape, 8 * abs(np.linalg.det(matrix)), hollow)
         inverse = np.linalg.inv(matrix)
         self.to_local, self.offset = mi.Matrix3f(inverse), mi.Vector3f(-inverse @ centre)
