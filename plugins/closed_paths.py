@@ -14,6 +14,9 @@ about 1 / (1 + cos(theta)): flights towards the telescope contribute by far the 
 import drjit as dr
 import mitsuba as mi
 
+# of the components of the sum of two unit vectors in single precision
+ROUNDING = 1e-6
+
 
 class OpenPath:
     """The remaining part of a path at a vertex, before it is closed.
@@ -61,7 +64,9 @@ class OpenPath:
         """Of `sample`, per steradian."""
         least, most, offset = self._limits(used)
         place = one_plus_cosine + offset
-        inside = (place >= least) & (place <= most)
+        # wherever a sample may lie, whose direction was rounded
+        slack = ROUNDING * (dr.sqrt(2 * one_plus_cosine) + ROUNDING)
+        inside = (place >= least - slack) & (place <= most + slack)
         return dr.select(inside, dr.inv_two_pi / (dr.log(most / least) * place), 0)
 
     def _limits(self, used):

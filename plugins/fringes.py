@@ -24,13 +24,15 @@ Parameter                    Type    Meaning                                    
 
 All estimators have the same expectation. A path is a straight line from the source to the stop.
 Surfaces multiply its weight (component ``Null`` of their BSDF) and do not displace it. Surfaces
-without that component block the light; reflected light is lost. The frequency of each path is drawn
-from the line of the source and stored with the ray, as an offset in Hz in place of its ``time``.
+without that component block the light; reflected light is lost. A scene is refused if a surface
+lies so close behind another one that a ray would miss it. The frequency of each path is drawn from
+the line of the source and stored with the ray, as an offset in Hz in place of its ``time``.
 
 ``mi.render(scene)`` returns a tensor (height, width, channels) with the channels ``S0`` ...
 ``S3``, ``S0_stderr``; row 0 is the top. The Stokes vector refers to the horizontal axis.
 Unpolarised variants compute intensity only: S1 to S3 are 0. ``sample_count`` of the sensor's
 sampler (or ``spp``) is the number of paths per pixel, for ``forward`` the mean over all pixels.
+Films and samplers are those of :ref:`gated_volpath <integrator-gated_volpath>`.
 With ``forward`` the S0_stderr of a pixel without any path is 0. Gradients are refused: the orders
 of an etalon are split in two parts, exact in single precision, when it is loaded.
 
@@ -39,19 +41,25 @@ of an etalon are split in two parts, exact in single precision, when it is loade
     <integrator type="fringes"> <string name="estimator" value="forward"/> </integrator>
 """
 
+import itertools
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from .bodies import first_hit, name_of, scene_extent, scene_of
 from .parameters import choice, fail, whole
 from .physical import Physical
 from .polarization import horizontal_axis, rotate_stokes
 from .random_numbers import generator, pair
 from .registration import register
+from .supported import check_sensor
 
 NAME, KIND = "fringes", "integrator"
 
 STOKES = ("S0", "S1", "S2", "S3")
+# 1500 times the rounding of single precision, doubled
+OFFSET = 2e-4
 
 
 def define():
@@ -84,8 +92,10 @@ def define():
             source = scene.environment()
             if not hasattr(source, "sample_direction_of_light"):
                 fail(NAME, "source", type(source).__name__, "an emitter of type 'plane_waves'")
+            check_sensor(NAME, sensor)
             self.physical.check(scene, sensor)
             _check_straight(scene)
+            _check_apart(scene, source, sensor)
             paths = int(spp) or sensor.sampler().sample_count()
             if self.estimator == "camera" and not 2 <= paths <= self.samples_per_pass:
                 fail(NAME, "sample_count", paths, f"2 to samples_per_pass, {self.samples_per_pass}")
@@ -291,6 +301,29 @@ def _check_straight(scene):
         flags = shape.bsdf().flags()
         if flags & bending and not flags & kinds.Null:
             fail(NAME, "scene", shape.id(), "surfaces that light passes straight or not at all")
+
+
+def _check_apart(scene, source, sensor):
+    """Refuse surfaces so close behind another one that a ray which leaves that one misses them."""
+    shapes = scene.shapes()
+    if len(shapes) < 2:
+        return
+    rng = generator(mi.UInt32(0), mi.UInt32(0), dr.arange(mi.UInt32, 256))
+    direction, _, _ = source.sample_direction_of_light(pair(rng))
+    length = dr.opaque(mi.Float, _reach(scene, sensor))
+    origin = sensor.sample_stop(pair(rng)) - direction * length
+    places = [
+        np.array(first_hit(scene_of([shape]), origin, direction, mi.Bool(True))[0])
+        for shape in shapes
+    ]
+    # Mitsuba moves the start of a ray by this fraction of its coordinates and 1 m
+    apart = OFFSET * (1 + np.abs(scene_extent(shapes)).max())
+    for first, second in itertools.combinations(range(len(shapes)), 2):
+        with np.errstate(invalid="ignore"):
+            gap = np.abs(places[first] - places[second])
+        if (gap[np.isfinite(gap)] < apart).any():
+            names = f"{name_of(shapes[first])} and {name_of(shapes[second])}"
+            fail(NAME, "scene", names, f"surfaces at least {apart:.2g} m apart")
 
 
 register(KIND, NAME, define)

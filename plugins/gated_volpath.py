@@ -57,9 +57,59 @@ on the seed, its beam and its number. Unpolarised phase functions (``isotropic``
 depolarise completely; in polarised variants a ``blendphase`` must not mix them with polarised ones.
 
 A scene is refused if a medium, Mitsuba's own included, has a negative, infinite or undefined
-extinction coefficient, an albedo or a weight of a blend outside 0 to 1, or if a shape or volume has
-a transform that is not finite. Values are checked before the first rendering and whenever they are
-replaced.
+extinction coefficient, an albedo or a weight of a blend outside 0 to 1, if ``hg`` has a g beyond
+0.99 in magnitude, or if a shape or volume has a transform that is not finite. Values are checked
+before the first rendering and whenever they are replaced.
+
+What else Mitsuba's scenes offer is honoured or refused in one line, before anything is rendered:
+
+===================================== =============================================================
+Of a scene                            What becomes of it
+===================================== =============================================================
+film: ``width``, ``height``           honoured: the beams
+film: crop, ``sample_border``         refused
+film: ``rfilter``                     ``box``, or none stated: a beam is a pixel of its own; others
+                                      are refused
+film: formats of pixel and file       no effect: the tensor is single precision and its channels
+                                      have names
+other films than ``hdrfilm``          refused
+sampler                               ``independent``; others are refused, and its ``seed``: it is
+                                      given to ``mi.render``
+sensor: shutter                       refused; ``beams`` have times of their own
+sensor: clipping, fields of cameras   unknown parameters: refused by Mitsuba
+sensor: medium                        honoured; refused if it is not that of the shape in which the
+                                      telescope is. If none is stated, the shape's
+several sensors                       the one that ``mi.render`` is asked for
+arguments of ``mi.render``            ``spp``, ``seed``, ``sensor``, ``integrator`` and ``params``
+                                      are honoured
+other emitters than the sensor's      refused: area, environment, point, a second laser
+BSDF ``null``                         light passes: a surface between media
+BSDF that transmits otherwise         refused: ``mask``, ``blendbsdf``, ``thindielectric``,
+                                      dielectrics, etalons
+any other BSDF                        the surface blocks all light; what it reflects is not
+                                      followed. Refused around a medium
+cube, sphere, closed mesh             honoured: the interior is what it encloses, whatever the
+                                      order of a mesh's corners and however its transform mirrors
+                                      it
+``flip_normals``                      honoured: exchanges interior and exterior
+rectangle, disk, cylinder, open mesh  honoured: the exterior is on the side of the normal. Refused
+                                      where a beam first meets the side of another medium
+other shapes around media             refused; instances always
+shapes that touch, nest, overlap      honoured, without a least distance. Where closed shapes
+                                      overlap, the smallest one's medium holds
+exterior medium                       if none is stated, what surrounds the shape; beside open
+                                      surfaces a vacuum. Refused if it is neither the sensor's nor
+                                      that of another shape
+``merge``, shapes that Mitsuba merges honoured: taken apart again
+medium: ``scale``, chromatic values   honoured, at the laser's wavelength
+medium: ``sample_emitters``           no effect: there is no emitter to sample
+volume: all parameters                honoured, of extinction and albedo
+grid of three channels                as Mitsuba reads colours: the laser's channel in RGB
+                                      variants, the luminance in ``mono`` ones
+phase function ``tabphase``           honoured within rounding of 0 and 180 degrees as well
+``mi.traverse``                       all that it lists is honoured, shapes that move included. It
+                                      cannot exchange media
+===================================== =============================================================
 
 .. code-block:: xml
 
@@ -76,12 +126,13 @@ import mitsuba as mi
 import numpy as np
 
 from .bounds import Bounds
-from .media import media_of
+from .laser import channel_of
 from .parameters import choice, fail, whole
-from .path_sampling import Lidar, channel_of
+from .path_sampling import Lidar
 from .physical import Physical
-from .polarization import first_unpolarized_in_blend
 from .registration import register
+from .supported import check_air, check_supported
+from .surfaces import media_of
 
 # how samples scatter and where they fly next is in `path_sampling`, of both estimators
 NAME, KIND = "gated_volpath", "integrator"
@@ -229,9 +280,9 @@ def define():
                 sensor = scene.sensors()[sensor]
             if not hasattr(sensor, "beam_frame"):
                 fail(NAME, "sensor", type(sensor).__name__, "a sensor of type 'scanning_lidar'")
+            check_supported(NAME, scene, sensor)
             self.physical.check(scene, sensor)
-            _check_gate_meets_medium(scene, sensor)
-            _check_blends(scene, sensor)
+            check_air(NAME, scene, sensor)
             values = sensor.beam_count * sensor.gate_count * len(self.quantities())
             if values >= 2**32:
                 most = (2**32 - 1) // (sensor.beam_count * len(self.quantities()))
@@ -455,39 +506,6 @@ def _warn_of_untrusted(lit: int, untrusted: int):
             "samples",
             stacklevel=3,
         )
-
-
-def _check_blends(scene, sensor):
-    """Refuse blends of polarised with unpolarised phase functions."""
-    for medium in media_of(scene, sensor):
-        part = first_unpolarized_in_blend(medium)
-        if part is not None:
-            fail(
-                NAME,
-                "blendphase",
-                part.class_name(),
-                "phase functions that are all polarised, such as mueller, or all unpolarised",
-            )
-
-
-def _check_gate_meets_medium(scene, sensor):
-    """A gate without any medium in it is an error of the scene, not a black image."""
-    if sensor.get_medium() is not None:
-        return
-    origins, (near, far) = sensor.origins_and_ranges()
-    spans = []
-    for shape in scene.shapes():
-        if shape.interior_medium() is None and shape.exterior_medium() is None:
-            continue
-        low, high = (np.array(corner, float) for corner in (shape.bbox().min, shape.bbox().max))
-        first = np.linalg.norm(np.maximum(0, np.maximum(low - origins, origins - high)), axis=1)
-        last = np.linalg.norm(np.maximum(origins - low, high - origins), axis=1)
-        if ((first <= far) & (last >= near)).any():
-            return
-        spans.append((first.min(), last.max()))
-    where = ", ".join(f"{a:g} to {b:g} m" for a, b in spans) or "nowhere"
-    gates = f"{near.min():g} to {far.max():g} m"
-    fail(NAME, "gates", gates, f"ranges with a medium (there is one: {where})")
 
 
 register(KIND, NAME, define)

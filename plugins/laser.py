@@ -51,6 +51,7 @@ import mitsuba as mi
 
 from .parameters import at_least, check_pose, fail, pose, positive
 from .polarization import rotate_stokes, transverse
+from .random_numbers import beam_radius_squared
 from .registration import register
 
 NAME, KIND = "laser", "emitter"
@@ -90,13 +91,18 @@ def define():
         def sample_local(self, sample_position, sample_direction):
             """Origin and direction of a ray in the laser's own frame, axis along +z."""
             origin = mi.Point3f(0, 0, 0)
-            radius = self.m_radius * dr.sqrt(-0.5 * dr.log(1 - self.m_inside * sample_position.x))
+            radius = self.m_radius * dr.sqrt(beam_radius_squared(self.m_inside, sample_position.x))
             sine, cosine = dr.sincos(dr.two_pi * sample_position.y)
             origin.x, origin.y = radius * cosine, radius * sine
-            # 1 - sample lies in (0, 1]: the logarithm stays finite
+            # 1 - sample lies in (0, 1], without rounding: the logarithm stays finite
             tangent = self.m_divergence_half * dr.sqrt(-0.5 * dr.log(1 - sample_direction.x))
             sine, cosine = dr.sincos(dr.two_pi * sample_direction.y)
             return origin, dr.normalize(mi.Vector3f(tangent * cosine, tangent * sine, 1))
+
+        def _fluence(self, r2):
+            """Of a pulse of 1 J over the aperture, J/m^2, at a squared distance from its middle."""
+            scale2 = dr.square(self.m_radius)
+            return 2 * dr.inv_pi / (scale2 * self.m_inside) * dr.exp(-2 * r2 / scale2)
 
         def sample_ray(self, time, sample1, sample2, sample3, active=True):
             """A ray of the beam; the weight's first column is its Stokes vector, in joules."""
@@ -167,10 +173,7 @@ def define():
             )
             directions /= cosine**3
             r2 = dr.square(origin.x) + dr.square(origin.y)
-            fluence = 2 * dr.inv_pi / (dr.square(radius) * self.m_inside)
-            fluence *= dr.select(
-                r2 <= dr.square(self.m_cut), dr.exp(-2 * r2 / dr.square(radius)), 0
-            )
+            fluence = dr.select(r2 <= dr.square(self.m_cut), self._fluence(r2), 0)
             wide = half * place.z > radius
             value = dr.select(wide, directions / dr.square(distance), fluence / cosine)
             value = dr.select(active & (place.z > 0), value * self.m_energy, 0)
@@ -181,13 +184,14 @@ def define():
             return mi.Float(0)
 
         def sample_position(self, time, sample, active=True):
-            """A place of the aperture, by its fluence."""
+            """A place of the aperture, by its fluence, and the inverse of its density (m^2)."""
             origin, _ = self.sample_local(sample, sample)
             ps = dr.zeros(mi.PositionSample3f)
             ps.p = self.m_pose @ origin
             ps.n = mi.Normal3f(dr.normalize(self.m_pose @ mi.Vector3f(0, 0, 1)))
-            ps.time, ps.pdf, ps.delta = time, mi.Float(1), mi.Bool(False)
-            return ps, mi.Float(1)
+            ps.time, ps.delta = time, mi.Bool(False)
+            ps.pdf = self._fluence(dr.squared_norm(mi.Vector2f(origin.x, origin.y)))
+            return ps, dr.rcp(ps.pdf)
 
         def sample_wavelengths(self, si, sample, active=True):
             """The laser's own."""
@@ -234,6 +238,11 @@ def define():
             )
 
     return Laser
+
+
+def channel_of(wavelength: float) -> int:
+    """Index of a spectrum's entry for a laser: a colour in RGB variants."""
+    return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0
 
 
 def _stokes(text) -> tuple[float, float, float, float]:

@@ -4,19 +4,10 @@ import drjit as dr
 import mitsuba as mi
 
 from .bounds import UNIFORM, UNKNOWN, leave, locate
-from .surfaces import SURFACE_SKIP
 
 # Optical depth along a segment by which the control variate may exceed the least extinction, and
 # the majorant over the largest difference of extinction and control. Both only concern efficiency.
 RAISED, MAJORANT = 0.5, 2.0
-
-
-def media_of(scene, sensor) -> list:
-    """All media of a scene and its sensor, each once."""
-    found = [sensor.get_medium()]
-    for shape in scene.shapes():
-        found += [shape.interior_medium(), shape.exterior_medium()]
-    return list(dict.fromkeys(medium for medium in found if medium is not None))
 
 
 def interaction(medium, position, direction, wavelengths, time):
@@ -94,14 +85,14 @@ def _walk(
     """Transmittance, medium at the end, and medium at the distance ``where``."""
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
-    travelled, skip, value = mi.Float(0), mi.Float(0), mi.Float(1)
+    travelled, value = mi.Float(0), mi.Float(1)
     between = mi.MediumPtr(medium)
-    crossings, size = air.crossings(origin, direction), dr.max(dr.abs(origin))
+    crossings = air.crossings(origin, direction)
     while dr.hint(active, label="transmittance"):
-        end, hit, passes, behind = air.next_surface(
-            crossings, origin, direction, travelled + skip, distance, medium, active
+        end, hit, passes, medium, behind = air.next_surface(
+            crossings, origin, direction, travelled, distance, medium, active
         )
-        skip = SURFACE_SKIP * (size + end)
+        between = dr.select(active & (travelled <= where), medium, between)
         inside = active & (medium != None)
         kind = bounds.kind(medium)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
@@ -137,7 +128,6 @@ def _walk(
                 tracking &= (value > 0) & (collides | (stop < end))
         value = dr.select(hit & ~passes, 0, value * dr.exp(-depth))
         medium = dr.select(hit, behind, medium)
-        between = dr.select(hit & (end <= where), behind, between)
         travelled = end
         active &= hit & (value > 0)
     return value, medium, between
@@ -153,14 +143,13 @@ def collision(
     """
     active = mi.Bool(active)
     medium = mi.MediumPtr(medium)
-    travelled, skip = mi.Float(0), mi.Float(0)
+    travelled = mi.Float(0)
     found = mi.Bool(False)
-    crossings, size = air.crossings(origin, direction), dr.max(dr.abs(origin))
+    crossings = air.crossings(origin, direction)
     while dr.hint(active, label="free flight"):
-        end, hit, passes, behind = air.next_surface(
-            crossings, origin, direction, travelled + skip, distance, medium, active
+        end, hit, passes, medium, behind = air.next_surface(
+            crossings, origin, direction, travelled, distance, medium, active
         )
-        skip = SURFACE_SKIP * (size + end)
         tracking = active & (medium != None)
         mei = interaction(medium, origin + direction * travelled, direction, wavelengths, time)
         blind = tracking & (bounds.kind(medium) <= UNIFORM)

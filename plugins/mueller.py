@@ -6,7 +6,8 @@ Tabulated scattering matrix (``mueller``)
 
 A phase function from a table of the six independent elements of the scattering matrix of a
 macroscopically isotropic, mirror-symmetric medium (spheres, randomly oriented spheroids, ...).
-In unpolarised variants only a1 is used.
+In unpolarised variants only a1 is used. Samples have the density a1 at every angle: the weight of
+each is 1.
 
 ============================ =============== ====================================================
 Parameter                    Type            Meaning
@@ -43,6 +44,11 @@ from .registration import register
 
 NAME, KIND = "mueller", "phase"
 
+# widest cell, degrees: there the fourth power of half of it is below single precision
+CELL = 1.0
+# where a1 changes by a factor of 2 at most, they leave 1e-6 of a cell
+NEWTON_STEPS = 3
+
 
 def define():
     """The plugin's class in the variant in force."""
@@ -58,16 +64,13 @@ def define():
             self.m_flags = +mi.PhaseFunctionFlags.Isotropic
 
         def _tabulate(self, table):
-            """Elements, and the distribution of the cosine, of a table as it was given."""
+            """Elements, and the probabilities of cells, of a table as it was given."""
             table = check_table(table)
+            table = _refined(table)
             self.m_angle = mi.Float(np.radians(table[:, 0]))
             self.m_elements = [mi.Float(column) for column in table[:, 1:].T]
-            cosine, first = np.unique(np.cos(np.radians(table[:, 0])).astype(np.float32), True)
-            density = np.maximum(table[first, 1], 1e-6 * table[:, 1].max()).astype(np.float32)
-            self.m_cosine = mi.IrregularContinuousDistribution(mi.Float(cosine), mi.Float(density))
-            self.m_cell = mi.DiscreteDistribution(
-                mi.Float(np.diff(cosine) * (density[1:] + density[:-1]))
-            )
+            # probability of every cell but for the factor of 2 pi, exact for a1 linear in angle
+            self.m_cell = mi.DiscreteDistribution(mi.Float(_cells(table)))
 
         def traverse(self, callback):
             callback.put("table", self.m_table, mi.ParamFlags.NonDifferentiable)
@@ -94,30 +97,40 @@ def define():
                 for column in (self.m_elements if mi.is_polarized else self.m_elements[:1])
             ]
 
-        def sample_cosine(self, sample, active=True):
-            """Cosines distributed as ``m_cosine``, whose own inversion cancels where a1 is flat."""
-            cell, sample = self.m_cell.sample_reuse(sample, active)
-            low, high = (
-                dr.gather(mi.Float, self.m_cosine.pdf, cell + end, active) for end in (0, 1)
+        def sample_angle(self, which, sample, active=True):
+            """Scattering angles of the density a1 per steradian; ``which`` selects the cell.
+
+            Within a cell, where the density in angle is nearly linear, its integral is inverted by
+            Newton's method from the inverse for the straight line between its ends.
+            """
+            cell = self.m_cell.sample(which, active)
+            first, last, low, high = (
+                dr.gather(mi.Float, values, cell + end, active)
+                for values in (self.m_angle, self.m_elements[0])
+                for end in (0, 1)
             )
-            root = dr.sqrt(dr.lerp(low * low, high * high, sample))
-            first, last = (
-                dr.gather(mi.Float, self.m_cosine.nodes, cell + end, active) for end in (0, 1)
-            )
-            return dr.lerp(first, last, sample * (low + high) / (low + root))
+            width, slope = last - first, (high - low) / (last - first)
+            whole = _integral(first, width, low, slope)
+            near, far = low * dr.sin(first), dr.maximum(high * dr.sin(last), 0)
+            root = dr.sqrt(dr.lerp(near * near, far * far, sample))
+            step = width * sample * (near + far) / dr.maximum(near + root, dr.smallest(mi.Float))
+            for _ in range(NEWTON_STEPS):
+                excess = _integral(first, step, low, slope) - sample * whole
+                density = (low + slope * step) * dr.sin(first + step)
+                change = dr.select(density > 0, excess / density, 0)
+                step = dr.clip(step - change, 0, width)
+            return first + step
 
         def eval_pdf(self, ctx, mei, wo, active=True):
             incident = -mei.wi
             elements = self.elements(scattering_angle(incident, wo), active)
-            pdf = self.m_cosine.eval_pdf_normalized(dr.dot(incident, wo), active)
-            pdf *= dr.inv_two_pi
+            pdf = elements[0]
             if not mi.is_polarized:
-                return mi.Spectrum(elements[0]), pdf
+                return mi.Spectrum(pdf), pdf
             return rotate_from_scattering_plane(incident, wo, elements), pdf
 
         def sample(self, ctx, mei, sample1, sample2, active=True):
-            cosine = self.sample_cosine(sample2.x, active)
-            sine = dr.safe_sqrt(1 - cosine * cosine)
+            sine, cosine = dr.sincos(self.sample_angle(sample1, sample2.x, active))
             sin_azimuth, cos_azimuth = dr.sincos(dr.two_pi * sample2.y)
             wo = mi.Frame3f(-mei.wi).to_world(
                 mi.Vector3f(sine * cos_azimuth, sine * sin_azimuth, cosine)
@@ -151,13 +164,40 @@ def check_table(table: np.ndarray) -> np.ndarray:
         fail(NAME, "table", f"a1 down to {a1.min():g}", "a1 above 0 at every angle")
     if (np.abs(table[:, 2:]) > a1[:, None] * (1 + 1e-6)).any():
         fail(NAME, "table", "an element above a1", "no element larger than a1 in magnitude")
-    # exact for a1 linear in angle between the nodes
-    theta = np.radians(angle)
-    slope = np.diff(a1) / np.diff(theta)
-    integral = (a1[:-1] * np.cos(theta[:-1]) - a1[1:] * np.cos(theta[1:])).sum()
-    integral += (slope * np.diff(np.sin(theta))).sum()
-    table[:, 1:] /= 2 * np.pi * integral
+    table[:, 1:] /= 2 * np.pi * _cells(table).sum()
     return table
+
+
+def _refined(table):
+    """The same elements, linear in angle, at more nodes: cells of a degree, a1 of a factor of 2."""
+    angle, a1 = table[:, 0], table[:, 1]
+    nodes = [angle, np.arange(0, 180, CELL)]
+    for cell in np.flatnonzero(np.abs(np.diff(np.log2(a1))) > 1):
+        ends = a1[cell : cell + 2]
+        levels = np.geomspace(*ends, 1 + int(np.ceil(abs(np.log2(ends[1] / ends[0])))))
+        fraction = (levels[1:-1] - ends[0]) / (ends[1] - ends[0])
+        nodes.append(angle[cell] + fraction * (angle[cell + 1] - angle[cell]))
+    nodes = np.concatenate(nodes)
+    # as single precision tells them apart
+    nodes = nodes[np.unique(np.radians(nodes).astype(np.float32), return_index=True)[1]]
+    return np.column_stack([nodes, *(np.interp(nodes, angle, c) for c in table[:, 1:].T)])
+
+
+def _cells(table):
+    """Integral of a1 sin(angle) over each cell of a table, for a1 linear in angle."""
+    theta, a1 = np.radians(table[:, 0]), table[:, 1]
+    slope = np.diff(a1) / np.diff(theta)
+    cells = a1[:-1] * np.cos(theta[:-1]) - a1[1:] * np.cos(theta[1:])
+    return cells + slope * np.diff(np.sin(theta))
+
+
+def _integral(first, step, low, slope):
+    """Integral of (low + slope s) sin(first + s) ds from 0 to ``step``, without cancellation."""
+    half = 0.5 * step
+    sine, cosine = dr.sincos(first + half)
+    even = step * (1 - dr.square(half) / 6)  # 2 sin(half), for cells of a degree
+    odd = step * dr.square(half) / 3  # sin(half) - half cos(half), times 2
+    return even * sine * low + slope * (odd * cosine + half * even * sine)
 
 
 register(KIND, NAME, define)

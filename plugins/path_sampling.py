@@ -7,12 +7,15 @@ physical distribution. Both give Stokes vectors about the instrument's horizonta
 import drjit as dr
 import mitsuba as mi
 
+from .bodies import slabs
 from .closed_paths import OpenPath, closing_distance, near_density, quarter_turn, sample_near
+from .laser import channel_of
 from .media import coefficients, collision, interaction, transmittance
+from .mitsuba_tables import has_tables, off_the_poles
 from .polarization import apply_phase_function, rotate_stokes, transverse
 from .random_numbers import generator, pair
 from .resampling import choose
-from .surfaces import Air, slabs
+from .surfaces import Air, media_of
 
 SPEED_OF_LIGHT = 299_792_458.0
 FWHM_TO_SIGMA = 0.42466090014400953  # 1 / (2 sqrt(2 ln 2))
@@ -52,9 +55,10 @@ class Lidar:
     """A scene and the lidar in it: emission, scattering and connection of a wavefront."""
 
     def __init__(self, scene, sensor, bounds, differentiable=False):
-        self.air, self.sensor, self.differentiable = Air(scene), sensor, differentiable
-        self.bounds = bounds
-        self.low, self.high = self.air.bounds(sensor.get_medium())
+        self.air, self.sensor = Air(scene, sensor), sensor
+        self.bounds, self.differentiable = bounds, differentiable
+        self.rounded = has_tables(media_of(scene, sensor))
+        self.low, self.high = self.air.bounds
         self.wavelengths = sensor.laser.wavelengths()
         self.channel = channel_of(sensor.laser.wavelength)
         self.area = sensor.aperture_area()
@@ -359,6 +363,8 @@ class Lidar:
 
     def _scatter(self, medium, mei, stokes, wo, active):
         """Stokes vector after scattering into a direction (per steradian), and its pdf."""
+        if self.rounded:
+            wo = off_the_poles(mei.wi, wo)
         value, pdf = medium.phase_function().eval_pdf(self.context, mei, wo, active)
         return apply_phase_function(value, stokes, self.channel), pdf
 
@@ -453,8 +459,3 @@ def _sum(first, second):
 
 def _scaled(stokes, factor):
     return [s * factor for s in stokes]
-
-
-def channel_of(wavelength: float) -> int:
-    """Index of the spectrum's entry for the laser."""
-    return (2 if wavelength < 490e-9 else 1 if wavelength < 580e-9 else 0) if mi.is_rgb else 0

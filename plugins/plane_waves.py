@@ -41,6 +41,7 @@ import numpy as np
 
 from .parameters import fail, numbers, pose, positive
 from .polarization import horizontal_axis, rotate_stokes
+from .random_numbers import beam_radius_squared
 from .registration import register
 
 NAME, KIND = "plane_waves", "emitter"
@@ -79,7 +80,9 @@ def define():
             sine2 = limit * (nodes + 1) / 2
             radiance = np.exp(-2 * sine2 / (1 - sine2) / scale**2)
             self.m_flux = dr.opaque(mi.Float, math.pi * limit * (weights @ radiance) / 2)
-            drawn = -math.expm1(-2 * limit / scale**2) * scale**2 / 2 if not self.uniform else limit
+            inside = -math.expm1(-2 * limit / scale**2)
+            drawn = limit if self.uniform else inside * scale**2 / 2
+            self.m_inside = dr.opaque(mi.Float, inside)
             self.m_drawn = dr.opaque(mi.Float, math.pi * drawn)
             self.m_pose = pose(props, NAME)
             dr.make_opaque(self.m_pose)
@@ -94,8 +97,8 @@ def define():
             if self.uniform:
                 disc = mi.warp.square_to_uniform_disk(sample) * self.m_sine
             else:
-                inside = 1 - dr.exp(-2 * dr.square(self.m_sine) / self.m_scale2)
-                radius = dr.sqrt(-0.5 * self.m_scale2 * dr.log(1 - inside * sample.x))
+                radius2 = self.m_scale2 * beam_radius_squared(self.m_inside, sample.x)
+                radius = dr.minimum(dr.sqrt(radius2), self.m_sine)
                 sine, cosine = dr.sincos(dr.two_pi * sample.y)
                 disc = mi.Point2f(radius * cosine, radius * sine)
             sine2 = dr.squared_norm(disc)

@@ -82,27 +82,24 @@ def first_unpolarized_in_blend(medium):
     axes. Alone it is recognised and depolarises; added to a Mueller matrix it cannot be
     recognised. None without a blend, or if all or none of its parts are polarised.
     """
-    leaves = []
-
-    def collect(phase):
-        nested = []
-
-        class Nested(mi.TraversalCallback):
-            def put(self, name, value, *_):
-                if isinstance(value, mi.PhaseFunction):
-                    nested.append(value)
-
-        phase.traverse(Nested())
-        for part in nested:
-            collect(part)
-        if not nested:
-            leaves.append(phase)
-
-    collect(medium.phase_function())
+    leaves = parts_of(medium.phase_function())
     if len(leaves) < 2 or not mi.is_polarized:
         return None
     scalar = [leaf for leaf in leaves if _is_scalar(leaf)]
     return scalar[0] if 0 < len(scalar) < len(leaves) else None
+
+
+def parts_of(phase) -> list:
+    """The phase functions that a blend consists of; one that is no blend itself."""
+    nested = []
+
+    class Nested(mi.TraversalCallback):
+        def put(self, name, value, *_):
+            if isinstance(value, mi.PhaseFunction):
+                nested.append(value)
+
+    phase.traverse(Nested())
+    return [leaf for part in nested for leaf in parts_of(part)] or [phase]
 
 
 def _is_scalar(phase) -> bool:

@@ -1,5 +1,6 @@
-"""Random numbers of samples: independent generators, and pairs of numbers."""
+"""Random numbers of samples: independent generators, pairs of numbers, truncated Gaussian beams."""
 
+import drjit as dr
 import mitsuba as mi
 
 
@@ -15,3 +16,14 @@ def generator(seed, group, number):
 def pair(rng):
     """Two numbers in [0, 1)."""
     return mi.Point2f(rng.next_float32(), rng.next_float32())
+
+
+def beam_radius_squared(inside, sample):
+    """Squared radius, over the 1/e^2 radius squared, of a place in a truncated Gaussian beam.
+
+    ``inside`` is the fraction of the whole beam that is not cut off, 1 - exp(-2 cut^2); the
+    density in the plane is proportional to exp(-2 r^2). -ln(1 - x) is 2 artanh(x / (2 - x)), which
+    keeps its digits for the small x of a beam that is much wider than its cut.
+    """
+    below = inside * sample
+    return dr.atanh(below / (2 - below))

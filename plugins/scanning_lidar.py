@@ -162,6 +162,13 @@ def define():
             limit = self.m_fov_tan * local.z
             return (local.z > 0) & (dr.squared_norm(local.xy) <= limit * limit)
 
+        def beam_axes(self) -> tuple[np.ndarray, np.ndarray]:
+            """Of all beams: origins and directions in the world, (n, 3) each."""
+            beam = dr.arange(mi.UInt32, self.beam_count)
+            to_world = self.world_transform()
+            axes = to_world @ dr.gather(mi.Vector3f, self.m_directions, beam)
+            return tuple(np.array(v, float).T for v in (to_world @ self.beam_origin(beam), axes))
+
         def origins_and_ranges(self) -> tuple[np.ndarray, np.ndarray]:
             """Of all beams: origins in the world, (n, 3), first and last recorded range, (2, n)."""
             beam = dr.arange(mi.UInt32, self.beam_count)
@@ -236,7 +243,12 @@ def define():
                 if values.size != each * self.beam_count or not np.isfinite(values).all():
                     what = f"{values.size} numbers, {np.sum(~np.isfinite(values))} of them NaN"
                     fail(NAME, name, what, f"{each * self.beam_count} finite ones")
-            farthest = np.array(self.m_origins).reshape(-1, 3)[:, 0].max()
+            origins = np.array(self.m_origins, float).reshape(-1, 3)
+            farthest = origins[:, 0].max()
+            matrix = np.array(self.m_pose.matrix, float).reshape(4, 4)
+            # where beams start, in the world; a single place, if it is that of all
+            alike = (origins == origins[0]).all()
+            self.places = origins[: 1 if alike else None] @ matrix[:3, :3].T + matrix[:3, 3]
             if not farthest < start:
                 fail(NAME, "origins", f"x = {farthest:g} m", f"before gate_start = {start:g} m")
 

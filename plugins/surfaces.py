@@ -1,135 +1,213 @@
-"""Surfaces between media along a straight line, and the media behind them.
+"""Surfaces between media along a straight line, and the medium between two of them.
 
 Shapes whose surface lets light pass unchanged (``null`` BSDF) separate media; any other surface is
-opaque. The distance travelled is counted along the unperturbed line, so path lengths are exact;
-only the start of the *search* for the next surface is moved past the last one, by `SURFACE_SKIP` of
-the position's size (5 mm at 500 m). Media thinner than that along the line are missed.
+opaque. What is inside of a closed shape is found anew for every part of a line: from both distances
+at which the line crosses the shape, or, for a mesh, from the side from which it meets the shape
+next. So it depends neither on the order of surfaces that touch nor on rounding, and no surface is
+lost, however close behind another it lies. Where shapes overlap, the smallest one's medium holds.
 """
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-SURFACE_SKIP = 1e-5
+from .bodies import (
+    STEP,
+    Sheet,
+    box_around,
+    first_hit,
+    name_of,
+    parts_of_shape,
+    passes_light,
+    scene_of,
+)
+from .parameters import fail
+
 # m, beyond any air
 FAR = 1e9
 
 
 class Air:
-    """A scene's media and the surfaces between them.
+    """A scene's media and the surfaces between them, seen by a sensor, or from a vacuum.
 
-    Where all of these are cubes that let light pass, a straight line's crossings are found in
-    closed form, in less than half of the time. For any other scene rays are traced, and only
-    within the box that holds all surfaces. Outside, on most of the path between telescope and slab,
-    there is nothing to intersect.
+    Closed shapes are ``bodies``, from the largest to the smallest. A line's crossings of cubes and
+    spheres are found in closed form; for any other shape rays are traced, to each shape alone:
+    where surfaces coincide, a common search would find one of them. ``around`` is the medium
+    outside of all bodies.
+
+    Raises
+    ------
+    ValueError
+        Sensor and shapes contradict each other about a medium.
     """
 
-    def __init__(self, scene):
-        self.scene = scene
-        self.cubes = _cubes(scene)
-        box = mi.ScalarBoundingBox3f()
+    def __init__(self, scene, sensor=None):
+        self.bodies, self.sheets, opaque = [], [], []
+        self.low, self.high = box_around(scene.shapes())
         for shape in scene.shapes():
-            box.expand(shape.bbox())
-        if not box.valid():
-            box = mi.ScalarBoundingBox3f(mi.ScalarPoint3f(0))
-        margin = SURFACE_SKIP * (1 + max(dr.max(dr.abs(box.min)), dr.max(dr.abs(box.max))))
-        self.low, self.high = mi.Point3f(box.min - margin), mi.Point3f(box.max + margin)
-        # opaque, so that no scene's size is compiled into a kernel
-        dr.make_opaque(self.low, self.high)
-
-    def bounds(self, outside):
-        """Corners of a box that holds all air, for a telescope in the medium ``outside``."""
-        shapes = self.scene.shapes()
-        within = [shape.interior_medium() for shape in shapes]
-        beyond = [shape.exterior_medium() for shape in shapes]
-        if outside is None and all(medium is None or medium in within for medium in beyond):
-            return self.low, self.high
-        return dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)
+            if not passes_light(shape):
+                opaque.append(shape)
+            elif shape.is_medium_transition():
+                for part in parts_of_shape(shape):
+                    (self.sheets if isinstance(part, Sheet) else self.bodies).append(part)
+        self.bodies.sort(key=lambda body: -body.volume)
+        self.opaque = scene_of(opaque) if opaque else None
+        around = _surroundings(self.bodies, self.sheets, sensor) if sensor else None
+        self.around = mi.MediumPtr(around)
+        for body in self.bodies:
+            if body.hollow and body.interior is None:
+                body.inside = self.around
+        dr.make_opaque(self.around)
+        everywhere = around is not None or self.sheets
+        self.bounds = _everywhere() if everywhere else (self.low, self.high)
 
     def crossings(self, origin, direction):
-        """Where a line enters and leaves each cube, if it does: first and last distance."""
-        found = []
-        for to_local, offset, _, _ in self.cubes or ():
-            start, step = to_local @ origin + offset, to_local @ direction
-            near, far = slabs(mi.Vector3f(-1), mi.Vector3f(1), start, step)
-            found.append((dr.select(near < far, near, dr.inf), dr.select(near < far, far, -dr.inf)))
-        return found
+        """What each body needs to know of a line, and the distance of its first opaque surface."""
+        lines = [body.line(origin, direction) for body in self.bodies]
+        if self.opaque is None:
+            return lines, None
+        return lines, first_hit(self.opaque, origin, direction, mi.Bool(True))[0]
 
     def next_surface(self, crossings, origin, direction, start, distance, medium, active):
-        """The next surface of a line between two distances, and the medium behind it.
+        """The part of a line that begins at the distance ``start``.
 
-        Returns the end of the present segment, whether a surface ends it, whether light passes that
-        surface and the medium behind it.
+        Returns its end, whether a surface is there, whether light passes that surface, the medium
+        of this part, and what to hand over as ``medium`` for the next one.
         """
         active = active & (start < distance)
-        if self.cubes is None:
-            return self._trace(origin, direction, start, distance, medium, active)
-        end, behind = mi.Float(distance), mi.MediumPtr(medium)
-        for (near, far), (_, _, interior, exterior) in zip(crossings, self.cubes, strict=True):
-            enters = near > start
-            place = dr.select(enters, near, far)
-            nearest = active & (place > start) & (place < end)
-            end = dr.select(nearest, place, end)
-            behind = dr.select(nearest, dr.select(enters, interior, exterior), behind)
-        return end, end < distance, mi.Bool(True), behind
+        lines, opaque = crossings
+        end = mi.Float(distance)
+        around = mi.MediumPtr(medium) if self.sheets else self.around
+        within = []
+        for body, line in zip(self.bodies, lines, strict=True):
+            place, inside = body.ahead(line, origin, direction, start, active)
+            end = dr.minimum(end, place)
+            within.append(inside)
+        if self.sheets:
+            # outside of the largest body
+            for body, inside in zip(self.bodies[::-1], within[::-1], strict=True):
+                around = dr.select(inside, body.outside, around)
+        here = around
+        for body, inside in zip(self.bodies, within, strict=True):
+            here = dr.select(inside, body.inside, here)
+        if self.sheets:
+            end, around = self._sheets(origin, direction, start, end, around, active)
+        passes = mi.Bool(True)
+        if self.opaque is not None:
+            passes = ~((opaque > start) & (opaque <= end))
+            end = dr.select(passes, end, dr.minimum(opaque, end))
+        return end, active & (end < distance), passes, mi.MediumPtr(here), around
 
-    def _trace(self, origin, direction, start, distance, medium, active):
-        ray = mi.Ray3f(origin + direction * start, direction)
-        ray.maxt = distance - start
-        near, far = slabs(self.low, self.high, ray.o, ray.d)
-        active &= ~((near > far) | (far < 0) | (near > ray.maxt))
-        # one by one: packets of rays are slower here, coherent or not
-        si = self.scene.ray_intersect(
-            ray, ray_flags=+mi.RayFlags.Minimal, coherent=False, active=active
-        )
-        hit = active & si.is_valid()
-        end = dr.select(hit, dr.minimum(start + si.t, distance), distance)
-        passes = mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Null)
-        behind = dr.select(hit & si.is_medium_transition(), si.target_medium(direction), medium)
-        return end, hit, passes, behind
+    def _sheets(self, origin, direction, start, end, medium, active):
+        """The same end, or that at an open surface, and the medium behind.
+
+        Of surfaces that coincide within rounding, light crosses first the one in front of which is
+        the medium that it is in: the last one is that whose far side is in front of no other.
+        """
+        found = [sheet.ahead(origin, direction, start, active) for sheet in self.sheets]
+        for place, _, _ in found:
+            end = dr.minimum(end, place)
+        # all that the next search may miss, and more
+        slack = 2 * STEP * (dr.max(dr.abs(origin)) + end)
+        at = [place <= end + slack for place, _, _ in found]
+        behind = mi.MediumPtr(medium)
+        for i, (_, front, back) in enumerate(found):
+            last = mi.Bool(at[i])
+            for j, (_, other, _) in enumerate(found):
+                if i != j:
+                    last &= ~(at[j] & (other == back))
+            # left already where surfaces overlap: the medium in front of it is another one
+            last &= (front == medium) | (front == None) | _any(at, found, i, front)
+            behind = dr.select(last, back, behind)
+        return end, behind
 
 
-def slabs(low, high, origin, direction):
-    """Distances along a line at which it is inside a box, first and last."""
-    # a component of 0 makes infinities; where it makes NaN (0 times infinity), comparisons fail
-    first, last = (low - origin) / direction, (high - origin) / direction
-    return dr.max(dr.minimum(first, last)), dr.min(dr.maximum(first, last))
+def _any(at, found, index, front):
+    """Whether another of the surfaces that coincide ends at the medium ``front``."""
+    result = mi.Bool(False)
+    for j, (_, _, back) in enumerate(found):
+        if j != index:
+            result |= at[j] & (back == front)
+    return result
 
 
-def _cubes(scene):
-    """Of all surfaces between media: the map to the cube of half edge 1, interior and exterior.
-
-    None, if a surface is not a cube or does not let light pass unchanged.
-    """
-    corners = _corners(mi.load_dict({"type": "cube"}))
-    found = []
+def media_of(scene, sensor) -> list:
+    """All media of a scene and of the sensor in it, each once."""
+    media = [sensor.get_medium()]
     for shape in scene.shapes():
-        bsdf = shape.bsdf()
-        passes = bsdf is not None and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
-        if shape.class_name() != "Cube" or not passes or shape.has_flipped_normals():
-            return None
-        # x = A c + b for each corner c; a mirrored cube's normals point inwards
-        reference, moved = np.column_stack([corners, np.ones(len(corners))]), _corners(shape)
-        if moved.shape != corners.shape:
-            return None
-        affine, *_ = np.linalg.lstsq(reference, moved, rcond=None)
-        matrix, centre = affine[:3].T, affine[3]
-        bent = np.abs(reference @ affine - moved).max() > 1e-5 * np.abs(moved).max()
-        if bent or np.linalg.det(matrix) <= 0:
-            return None
-        if not shape.is_medium_transition():
-            continue
-        inverse = np.linalg.inv(matrix)
-        cube = (
-            mi.Matrix3f(inverse),
-            mi.Vector3f(-inverse @ centre),
-            mi.MediumPtr(shape.interior_medium()),
-            mi.MediumPtr(shape.exterior_medium()),
+        media += [shape.interior_medium(), shape.exterior_medium()]
+    return [medium for medium in dict.fromkeys(media) if medium is not None]
+
+
+def _surroundings(bodies, sheets, sensor):
+    """The medium outside of all closed shapes, as sensor and shapes state it."""
+    stated, places = sensor.get_medium(), sensor.places
+    # of every beam: the largest and the smallest body in which it begins, -1 if in none
+    outer, inner = (np.full(len(places), -1) for _ in range(2))
+    for index, body in enumerate(bodies):
+        inside = body.contains(places)
+        outer[inside & (outer < 0)] = index
+        inner[inside] = index
+    for index in np.unique(inner[inner >= 0]):
+        if stated is not None and stated != bodies[index].interior:
+            fail(
+                "scanning_lidar",
+                "medium",
+                name_of(stated),
+                f"the medium of {name_of(bodies[index].shape)}, in which the telescope is, "
+                "by reference",
+            )
+    # -1 is the last
+    around = [*(body.exterior for body in bodies), stated]
+    around = list(dict.fromkeys(around[index] for index in np.unique(outer)))
+    if len(around) > 1:
+        names = [medium and name_of(medium) for medium in around]
+        fail("scanning_lidar", "medium", names, "one medium around the shapes for all beams")
+    if sheets:
+        light = np.array([*(body.interior for body in bodies), stated], object)[inner]
+        _check_fronts(bodies, sheets, sensor, light)
+    media = {around[0], None, *(body.interior for body in bodies)}
+    media |= {medium for sheet in sheets for medium in (sheet.interior, sheet.exterior)}
+    for body in bodies:
+        if body.exterior not in media:
+            fail(
+                name_of(body.shape),
+                "exterior",
+                name_of(body.exterior),
+                "by reference, the sensor's medium or that of a shape around or beside it",
+            )
+    return around[0]
+
+
+def _check_fronts(bodies, sheets, sensor, light):
+    """Refuse open surfaces on whose near side is another medium than ``light``, that of beams."""
+    origin, axis = (vectors.T.astype(np.float32) for vectors in sensor.beam_axes())
+    origin, axis = mi.Point3f(*origin), mi.Vector3f(*axis)
+    start, every = mi.Float(0), mi.Bool(True)
+    first = mi.Float(dr.inf)
+    for body in bodies:
+        first = dr.minimum(
+            first, body.ahead(body.line(origin, axis), origin, axis, start, every)[0]
         )
-        dr.make_opaque(cube)
-        found.append(cube)
-    return found
+    found = [sheet.ahead(origin, axis, start, every) for sheet in sheets]
+    for place, _, _ in found:
+        first = dr.minimum(first, place)
+    light = np.resize(light, dr.width(axis))
+    for sheet, (place, front, _) in zip(sheets, found, strict=True):
+        here = (place == first) & (place < dr.inf)
+        for side, medium, pointer in (
+            ("interior", sheet.interior, sheet.inside),
+            ("exterior", sheet.exterior, sheet.outside),
+        ):
+            meets = np.resize(np.array(here & (front == pointer)), len(light))
+            if medium is not None and any(other != medium for other in light[meets]):
+                fail(
+                    name_of(sheet.shape),
+                    side,
+                    name_of(medium),
+                    "behind this surface, as light of the telescope comes from another medium",
+                )
 
 
-def _corners(cube):
-    return np.array(cube.vertex_positions_buffer(), float).reshape(-1, 3)
+def _everywhere():
+    return dr.opaque(mi.Point3f, -FAR), dr.opaque(mi.Point3f, FAR)

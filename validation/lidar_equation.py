@@ -144,6 +144,36 @@ def profile_through_layers(effort):
     )
 
 
+def surfaces_that_touch(effort):
+    """Slabs one behind the other: faces at one place, nearly, nested, with a shape elsewhere."""
+    edges = np.linspace(400, 520, 25)
+    thin, dense = medium(2e-3), medium(6e-3)
+    sphere = {"type": "sphere", "center": [0, 4000, 0], "bsdf": {"type": "null"}, "interior": thin}
+    near, far = layer(390, 450, thin), layer(450, 530, dense, half_width=1800.0)
+    cases = {
+        "touching": {"near": near, "far": far},
+        "a gap of 0.01 mm": {"near": near, "far": layer(450.00001, 530, dense)},
+        "touching, a sphere elsewhere": {"near": near, "far": far, "sphere": sphere},
+        "nested, a face shared": {"near": layer(390, 530, thin), "far": far},
+        "overlapping by 10 m": {"near": layer(390, 460, thin, half_width=2200.0), "far": far},
+    }
+    truth = layered(edges, [(0, 0.0), (390, 2e-3), (450, 6e-3)])[:, None, None]
+    rows = []
+    for seed, (name, shapes) in enumerate(cases.items()):
+        loaded = scene(
+            (edges[0], edges[-1]), shapes, gate_count=len(edges) - 1, gate_kind="spherical"
+        )
+        found = render(loaded, 60 + seed, 50_000 * effort.scale)
+        # the beam's width smears the faces over 1e-6 of the range
+        rows += compared(name, found, truth, 2 * TRUNCATION)
+    return Check(
+        "Surfaces that touch",
+        "24 gates of 5 m through slabs of 0.002 / m from 390 m and of 0.006 / m from 450 m. The "
+        "smaller one's medium holds where they overlap.",
+        tuple(rows),
+    )
+
+
 def valley_of_extinction(effort):
     """A grid that is linear between cell centres, with a minimum of the extinction."""
     size, edges = (9, 7), np.linspace(500, 540, 5)
@@ -307,6 +337,7 @@ def depolarisation(effort):
 CHECKS = (
     scan_of_a_slab,
     profile_through_layers,
+    surfaces_that_touch,
     valley_of_extinction,
     random_fields,
     phase_functions,

@@ -5,6 +5,7 @@ from functools import cache
 from importlib.resources import files
 
 import miepython
+import mitsuba as mi
 import numpy as np
 import rustmatrix
 import scatrs
@@ -46,6 +47,79 @@ def coherency(elements):
     h[:, 0, 1] = 2 * b1 - 2j * b2
     h[:, 1, 0] = h[:, 0, 1].conj()
     return h / 4
+
+
+# --- directions -------------------------------------------------------------------------------
+
+
+def poles(effort):
+    """Density over value next to 0 and 180 degrees, and samples against the tables there."""
+    rng = np.random.default_rng(70)
+    number, rows = 400_000 * effort.scale, []
+    off = np.r_[0, np.geomspace(3e-4, 1, 20)]
+    for name in sorted(AEROSOLS):
+        path = files("lidar_mi.scenes") / f"aerosol_{name}_532nm.txt"
+        angle, a1 = np.loadtxt(str(path))[:, :2].T
+        phase = mi.load_dict({"type": "mueller", "table": str(path)})
+        incident = rng.standard_normal((number, 3))
+        incident /= np.linalg.norm(incident, axis=1, keepdims=True)
+        tilt = rng.standard_normal((number, 3)) * np.geomspace(1e-8, 1e-2, number)[:, None]
+        ratios = []
+        for side in (1, -1):
+            scattered = side * incident + tilt
+            scattered /= np.linalg.norm(scattered, axis=1, keepdims=True)
+            value, density = _evaluate(phase, incident, scattered)
+            ratios += [(density / value).min(), (density / value).max()]
+        rows.append(
+            largest(
+                f"{name}: density over value within 10 mrad of 0 and 180 degrees",
+                "the sampler draws what is evaluated",
+                ratios,
+                1.0,
+                1e-5,
+            )
+        )
+        edges = np.degrees(off)
+        dense = np.union1d(np.union1d(np.linspace(0, 180, 200_001), angle), edges)
+        table = np.interp(dense, angle, a1) * np.sin(np.radians(dense))
+        below = np.r_[0, np.cumsum((table[1:] + table[:-1]) / 2 * np.diff(dense))]
+        expected = number * np.diff(np.interp(edges, dense, below)) / below[-1]
+        samples = phase.sample(
+            mi.PhaseFunctionContext(),
+            _interaction(np.tile([0.0, 0, 1], (number, 1))),
+            mi.Float(rng.random(number)),
+            mi.Point2f(mi.Float(rng.random(number)), mi.Float(rng.random(number))),
+        )[0]
+        x, y, z = np.array(samples, float)
+        found, _ = np.histogram(np.degrees(np.arctan2(np.hypot(x, y), z)), edges)
+        enough = expected > 20
+        rows.append(
+            Row(
+                f"{name}: chi-square over rings from 0.3 mrad to 1 rad",
+                "table, linear in angle",
+                enough.sum(),
+                ((found - expected)[enough] ** 2 / expected[enough]).sum(),
+                math.sqrt(2 * enough.sum()),
+            )
+        )
+    return Check(
+        "Directions at the poles",
+        "Directions whose cosine single precision rounds to 1, and beyond it.",
+        tuple(rows),
+    )
+
+
+def _interaction(incident):
+    mei = mi.MediumInteraction3f()
+    vectors = mi.Vector3f(*(mi.Float(np.ascontiguousarray(axis)) for axis in incident.T))
+    mei.wi, mei.sh_frame = -vectors, mi.Frame3f(vectors)
+    return mei
+
+
+def _evaluate(phase, incident, scattered):
+    wo = mi.Vector3f(*(mi.Float(np.ascontiguousarray(axis)) for axis in scattered.T))
+    value, density = phase.eval_pdf(mi.PhaseFunctionContext(), _interaction(incident), wo)
+    return np.array(value[0, 0][0], float), np.array(density, float)
 
 
 def laws(effort):
@@ -464,4 +538,4 @@ def shipped(effort):
     )
 
 
-CHECKS = (laws, published, prolate, spheres, small_spheroids, shipped)
+CHECKS = (poles, laws, published, prolate, spheres, small_spheroids, shipped)

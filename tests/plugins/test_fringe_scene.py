@@ -46,6 +46,13 @@ def plates(to_world=None, **parameters):
     return {"type": "disk", "to_world": place, "bsdf": parameters}
 
 
+def close(gap):
+    """Two etalons, one behind the other."""
+    behind = mi.ScalarTransform4f().translate([gap, 0, 0])
+    more = plates(behind, **ETALON | {"line_shape": "sampled"})
+    return scene(shapes=sampled() | {"more": more})
+
+
 def scene(
     size=(96, 78), pixel=74e-6, estimator="camera", source=None, line=None, shapes=None, **camera
 ):
@@ -615,6 +622,12 @@ def test_passes_and_seeds():
         (lambda: mi.load_dict({"type": "plane_waves"}), "plane_waves.line: 0 is not allowed"),
         (lambda: scene(estimator="both"), "fringes.estimator: 'both' is not allowed"),
         (lambda: mi.render(scene(), spp=1), "fringes.sample_count: 1 is not allowed"),
+        (lambda: mi.render(close(0)), "fringes.scene: 'plates and more' is not allowed"),
+        (lambda: mi.render(close(1e-5)), "fringes.scene: 'plates and more' is not allowed"),
+        (
+            lambda: mi.render(scene(sampler={"type": "stratified", "sample_count": 4})),
+            "fringes.sampler: 'StratifiedSampler' is not allowed",
+        ),
         (
             lambda: mi.render(
                 mi.load_dict(
