@@ -179,8 +179,8 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
         passed = wake.second - wake.time
         if abs(passed - experiment.platform.dt) > 1e-3 * experiment.platform.dt:
             raise InputError(
-                f"wake.second: {wake.second:g} s is not allowed; expected platform.dt = "
-                f"{experiment.platform.dt:g} s after wake.time = {wake.time:g} s"
+                f"wake.second: {wake.second:.15g} s is not allowed; expected platform.dt = "
+                f"{experiment.platform.dt:g} s after wake.time = {wake.time:.15g} s"
             )
     flows = []
     for when in (wake.time, None if wake.second == "advect" else wake.second):

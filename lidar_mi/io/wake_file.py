@@ -9,8 +9,9 @@ import pint
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.io.netcdf import load_variable, open_netcdf
+from lidar_mi.io.netcdf import load_variable, open_netcdf, valid_range
 from lidar_mi.io.regrid import even_axis, interpolated, is_even, statement
+from lidar_mi.io.time_axis import count_unit, listing, state_at, tolerances
 from lidar_mi.units import parse_units
 
 _DIMENSIONS = ("time", "x", "y", "z")
@@ -82,7 +83,7 @@ def _pick_time(data, name, time, path):
         if time is None:
             return data, None
         raise InputError(
-            f"{path}: time {time:g} s is asked for, but there is no {name!r}; it has the "
+            f"{path}: time {time:.15g} s is asked for, but there is no {name!r}; it has the "
             f"dimensions {', '.join(map(str, data.dims))}"
         )
     if name not in data.variables:
@@ -94,26 +95,38 @@ def _pick_time(data, name, time, path):
     coordinate = data[name]
     if coordinate.ndim > 1:
         raise InputError(f"{path}: {name!r} has dims {coordinate.dims}; allowed: one at most")
-    # "seconds since 2000-01-01" counts in seconds; the date itself is not used.
-    plain = coordinate.copy()
-    if "units" in plain.attrs:
-        plain.attrs["units"] = str(plain.attrs["units"]).split(" since ")[0]
-    times = np.atleast_1d(_numbers(coordinate, path)) * _scale_to(plain, "s", name, path)
-    listing = ", ".join(f"{t:.10g}" for t in times[:20]) + (" ..." if times.size > 20 else "")
+    counted = coordinate.copy()
+    if "units" in counted.attrs:
+        counted.attrs["units"] = count_unit(counted.attrs["units"], f"{path}: {name}")
+    scale = _scale_to(counted, "s", name, path)
+    stored = np.atleast_1d(_numbers(coordinate, path))
+    bad = np.flatnonzero(~np.isfinite(stored))
+    if bad.size:
+        raise InputError(
+            f"{path}: {name!r} is not finite at {bad.size} of {stored.size} places, the first at "
+            f"index {bad[0]}; allowed: finite numbers"
+        )
+    times, rounding = stored * scale, _rounding(coordinate, stored) * scale
     if time is None:
-        if times.size > 1:
+        if times.size != 1:
+            listed = listing(times, tolerances(times, rounding))
             raise InputError(
                 f"{path}: has {times.size} times, and none is chosen; expected wake.time: one of "
-                f"{listing} s"
+                f"{listed} s"
             )
         index = 0
+    elif not np.isfinite(time):
+        raise InputError(f"wake.time: {time} s is not allowed; any finite time is")
     else:
-        if not np.isfinite(time):
-            raise InputError(f"wake.time: {time} s is not allowed; any finite time is")
-        index = int(np.argmin(np.abs(times - time)))
-        if not abs(times[index] - time) <= 1e-6 * max(abs(time), abs(times[index])):
-            raise InputError(f"{path}: time {time:.10g} s is not there; allowed: {listing} s")
+        index = state_at(time, times, rounding, str(path))
     return data.isel({name: index}) if name in data.dims else data, float(times[index])
+
+
+def _rounding(variable, values):
+    """To which the file rounds a variable's values; integers are as they were meant."""
+    kind = np.dtype(variable.encoding.get("dtype", variable.dtype))
+    half = np.spacing(np.abs(values).astype(kind)) / 2 if kind.kind == "f" else 0.0 * values
+    return half.astype(float)
 
 
 def _axis(data, name, ours, path, sign):
@@ -158,11 +171,13 @@ def _plane_index(axis, x, path, name):
     return int(np.argmin(np.abs(axis - x)))
 
 
-def _check_values(values, axes, name, path, may_be_negative):
-    """Every value finite and, unless it may, not negative."""
-    for fault, bad in (
-        ("not finite", ~np.isfinite(values)),
-        ("negative", (values < 0) & (not may_be_negative)),
+def _check_values(values, axes, name, path, may_be_negative, limits):
+    """Every value finite and, unless it may, not negative; ``limits``: those of valid values."""
+    low, high = limits
+    within = f", valid ones are {low:g} to {high:g}" if low > -np.inf or high < np.inf else ""
+    for fault, bad, allowed in (
+        ("not finite", ~np.isfinite(values), f"nowhere{within}"),
+        ("negative", (values < 0) & (not may_be_negative), "nowhere"),
     ):
         count = int(bad.sum())
         if count:
@@ -170,7 +185,7 @@ def _check_values(values, axes, name, path, may_be_negative):
             place = ", ".join(f"{d} = {axes[d][i]:g} m" for d, i in zip("xyz", first, strict=True))
             raise InputError(
                 f"{path}: variable {name!r} is {fault} at {count} of {values.size} places, the "
-                f"first at {place}; allowed: nowhere"
+                f"first at {place}; allowed: {allowed}"
             )
 
 
@@ -194,8 +209,8 @@ def read_wake(
     path : str or Path
         NetCDF-4 or NetCDF-3 classic.
     time : float, optional
-        s; the file must hold it to 1e-6 relative. May be left out where there is one time only.
-        In "seconds since ..." axes the count is meant.
+        s; the file must hold it to 1e-3 of the step to the next state and to 1 ms. May be left out
+        where there is one time only. In "seconds since ..." axes the count is meant.
     names : mapping, optional
         Our name to the file's, for time, x, y, z, u, v, w, tracer, aerosol, where they differ:
         {"v": "V_wind", "y": "lateral"}. A variable named here must exist. A minus sign before the
@@ -361,7 +376,7 @@ def _read(data, table, sign, asked, time, x, path):
         values = _numbers(variable, path).reshape([n.size for n in nodes]) * scale
         amount = name in asked and name in ("tracer", "aerosol")
         here = dict(zip("xyz", nodes, strict=True))
-        _check_values(values, here, table[name], path, may_be_negative=not amount)
+        _check_values(values, here, table[name], path, not amount, valid_range(variable, path))
         low, high = values.min(), values.max()
         values, errors[name] = interpolated(values, nodes, [axes[d] for d in "xyz"])
         if name in ("tracer", "aerosol"):
