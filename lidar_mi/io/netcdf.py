@@ -64,7 +64,7 @@ def open_netcdf(path: str | Path) -> xr.Dataset:
         try:
             raw = _open(path, decode_cf=False)
             for variable in raw.variables.values():
-                _mark_never_written(variable)
+                _mark_missing(variable)
             return xr.decode_cf(raw, decode_times=False)
         except InputError:
             raise
@@ -168,18 +168,26 @@ def _missing_filters(variable: h5py.Dataset) -> dict[int, str]:
     }
 
 
-def _mark_never_written(variable: xr.Variable) -> None:
-    """Let what the library writes into cells that nobody wrote count as missing."""
-    fill = _NEVER_WRITTEN.get(variable.dtype.str[1:])
-    attributes = variable.attrs
-    if fill is None or str(attributes.get("_Unsigned", "")).lower() in ("true", "false"):
+def _mark_missing(variable: xr.Variable) -> None:
+    """Let xarray find what CF calls missing and it does not.
+
+    What the library writes into cells that nobody wrote; the sign of ``missing_value`` where
+    ``_Unsigned`` changes that of the values.
+    """
+    attributes, kind = variable.attrs, variable.dtype
+    signs = {"true": "u", "false": "i"}.get(str(attributes.get("_Unsigned", "")).lower())
+    if signs and kind.kind in "iu":
+        if "missing_value" in attributes:
+            stored = np.ravel(attributes["missing_value"]).astype(kind)
+            attributes["missing_value"] = stored.view(f"{signs}{kind.itemsize}")
         return
+    fill = _NEVER_WRITTEN.get(kind.str[1:])
     # no measured number, also where another fill value came later
-    if variable.dtype.kind == "f":
+    if fill is not None and kind.kind == "f":
         also = np.append(np.ravel(attributes.get("missing_value", [])), fill)
-        attributes["missing_value"] = also.astype(variable.dtype)
-    elif "_FillValue" not in attributes:
-        attributes["_FillValue"] = variable.dtype.type(fill)
+        attributes["missing_value"] = also.astype(kind)
+    elif fill is not None and "_FillValue" not in attributes:
+        attributes["_FillValue"] = kind.type(fill)
 
 
 def read_netcdf(path: str | Path) -> xr.Dataset:

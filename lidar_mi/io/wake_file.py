@@ -8,9 +8,9 @@ import numpy as np
 import pint
 import xarray as xr
 
+from lidar_mi.atmosphere.regrid import even_axis, interpolated, is_even, statement
 from lidar_mi.errors import InputError
 from lidar_mi.io.netcdf import load_variable, open_netcdf, valid_range
-from lidar_mi.io.regrid import even_axis, interpolated, is_even, statement
 from lidar_mi.io.time_axis import count_unit, listing, state_at, tolerances
 from lidar_mi.units import parse_units
 
@@ -159,14 +159,35 @@ def _axis(data, name, ours, path, sign):
     return (exact if is_even(values) else values), falls
 
 
+def _positive_down(data, table, sign, heights, path) -> list[str]:
+    """Axes of heights that the file says to be depths, unless the sign is changed by their name."""
+    down = [
+        name
+        for name in heights
+        if name in data.variables
+        and sign["z"] > 0
+        and str(data[name].attrs.get("positive", "")).lower() == "down"
+    ]
+    upwards = data[table["w"]].attrs.get("standard_name") == "upward_air_velocity"
+    if down and sign["w"] > 0 and not upwards:
+        z, w = table["z"], table["w"]
+        raise InputError(
+            f"{path}: axis {down[0]!r} is positive down, and {w!r} is not said to be the "
+            f"upward_air_velocity; expected wake.names: {{z: -{z}}}, or {{z: -{z}, w: -{w}}} "
+            "where it points down, too"
+        )
+    return down
+
+
 def _plane_index(axis, x, path, name):
     """Index of the plane nearest to x, which must lie in one of the planes' cells."""
     half = (axis[1] - axis[0]) / 2 if axis.size > 1 else 0.0
-    slack = half + 1e-6 * max(1.0, abs(x))
+    # rounding of the file's axis, whatever its origin; of a single plane 1 mm
+    slack = half * (1 + 1e-3) if half else 1e-3
     if not axis[0] - slack <= x <= axis[-1] + slack:
         raise InputError(
-            f"{path}: {name} = {x:g} m is outside; allowed: {axis[0] - half:g} to "
-            f"{axis[-1] + half:g} m"
+            f"{path}: {name} = {x:.9g} m is outside; allowed: {axis[0] - half:.9g} to "
+            f"{axis[-1] + half:.9g} m"
         )
     return int(np.argmin(np.abs(axis - x)))
 
@@ -202,7 +223,7 @@ def read_wake(
     gets one x plane, at its scalar coordinate or at 0). Descending axes are turned round, units
     are converted. The lowest levels are left out where a variable has no value at any of their
     nodes (the ground). Stretched axes and staggered variables are interpolated to even nodes, see
-    `lidar_mi.io.regrid`; the attribute ``interpolated`` then states with which error.
+    `lidar_mi.atmosphere.regrid`; the attribute ``interpolated`` then states with which error.
 
     Parameters
     ----------
@@ -316,11 +337,13 @@ def _read(data, table, sign, asked, time, x, path):
         )
 
     data, seconds = _pick_time(data, table["time"], time, path)
-    axes, reverse = {}, []
+    reverse = []
     places = {theirs: ours for dims in own.values() for theirs, ours in dims.items()} | spatial
+    down = _positive_down(data, table, sign, [d for d, ours in places.items() if ours == "z"], path)
     found = {}
     for theirs, ours in places.items():
-        found[theirs], turned = _axis(data, theirs, ours, path, sign[ours])
+        points = sign[ours] * (-1.0 if theirs in down else 1.0)
+        found[theirs], turned = _axis(data, theirs, ours, path, points)
         if turned:
             reverse.append(theirs)
     data = data.isel({theirs: slice(None, None, -1) for theirs in reverse})
