@@ -39,9 +39,10 @@ def resample(
 
     Splines (not-a-knot) along one axis after the other, through the nodes; exact for cubic
     polynomials. Where the spacing divides the extent, the end nodes are kept: 110 x 70 nodes of 1 m
-    become 219 x 139 of 0.5 m. Elsewhere the nodes lie about the middle of the extent, within it, and
-    the attribute ``interpolated`` states with which error. tracer and aerosol are clipped to the
-    range of their data, which a spline exceeds at sharp edges (a tracer would go negative there).
+    become 219 x 139 of 0.5 m. Elsewhere the nodes lie about the middle of the extent, within it,
+    and the attribute ``interpolated`` states with which error. tracer and aerosol are clipped to
+    the range of their data, which a spline exceeds at sharp edges (a tracer would go negative
+    there).
 
     Parameters
     ----------
@@ -90,8 +91,8 @@ def resample(
     fine = wake.drop_vars([*wake.data_vars, *axes]).assign_coords(
         {name: (name, values, {"units": "m"}) for name, values in nodes.items()}
     )
-    places = [wake[axis].values.astype(float) for axis in "xyz"]
-    targets = [nodes.get(axis, own) for axis, own in zip("xyz", places, strict=True)]
+    old = [wake[axis].values.astype(float) for axis in "xyz"]
+    targets = [nodes.get(axis, own) for axis, own in zip("xyz", old, strict=True)]
     errors = {}
     for variable_name, variable in wake.data_vars.items():
         own = variable.transpose("x", "y", "z").values.astype(float)
@@ -100,7 +101,7 @@ def resample(
             for axis in axes:
                 values = CubicSpline(wake[axis].values, values, axis="xyz".index(axis))(nodes[axis])
         else:
-            values, errors[str(variable_name)] = interpolated(own, places, targets)
+            values, errors[str(variable_name)] = interpolated(own, old, targets)
         if variable_name in ("tracer", "aerosol"):
             values = values.clip(own.min(), own.max())
         fine[variable_name] = ("x", "y", "z"), values, variable.attrs

@@ -322,7 +322,8 @@ def find_file(name: str, beside: str | Path, field: str) -> Path:
     """A file named by an experiment: as given, beside the experiment, or shipped."""
     shipped = Path(str(files("lidar_mi.scenes")))
     for candidate in (Path(beside) / name, shipped / name):
-        if candidate.is_file():
+        # a reader says what it expects instead of a folder, such as a Zarr store
+        if candidate.is_file() or (candidate.is_dir() and candidate.suffix):
             return candidate
     samples = sorted(p.name for p in shipped.glob("*.nc")) if field == "wake.file" else []
     raise InputError(

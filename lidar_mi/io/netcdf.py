@@ -105,7 +105,7 @@ def _kind(path: Path) -> str:
     if path.is_dir() and any((path / name).exists() for name in _ZARR):
         name = shlex.quote(str(path))
         raise InputError(
-            f"{path}: is a Zarr store; expected a NetCDF file: python -c \"import sys, xarray; "
+            f'{path}: is a Zarr store; expected a NetCDF file: python -c "import sys, xarray; '
             f"xarray.open_zarr(sys.argv[1]).to_netcdf('out.nc')\" {name}"
         )
     if path.exists() and not (path.is_file() or path.is_dir()):
@@ -134,7 +134,8 @@ def _convert(command: str, path: Path, wanted: str = "NetCDF-4 or NetCDF-3 class
 
 def _declared(path):
     """Bytes read on opening and the largest chunk read for a value; filters that are missing."""
-    found, filters = [], {}
+    found: list[tuple[str, int]] = []
+    filters: dict[int, str] = {}
     try:
         with h5py.File(path, "r") as file:
             file.attrs.get("_nc3_strict")  # h5netcdf could not even be closed without

@@ -107,7 +107,9 @@ def by_h5py(path: Path, file: File, **packing: Any) -> None:
 def by_xarray(path: Path, file: File, engine: str = "h5netcdf") -> None:
     """By xarray."""
     variables = {name: (one.dims, one.filled, one.attributes) for name, one in file.items()}
-    bare = {n: {"_FillValue": None} for n, one in file.items() if "_FillValue" not in one.attributes}
+    bare = {
+        n: {"_FillValue": None} for n, one in file.items() if "_FillValue" not in one.attributes
+    }
     xr.Dataset(variables).to_netcdf(path, engine=engine, encoding=bare)
 
 
@@ -217,7 +219,7 @@ def _wind(rng, dims, values, bad) -> tuple[Stored, float]:
     ways += ["unwritten"] if stored.dtype.itemsize > 1 else []
     ways += ["unpacked"] if kind[0] in "iu" and "scale_factor" in attributes else []
     way, unwritten = str(rng.choice(ways)), None
-    wide = {"f4": 999.0, "f8": 999.0, "i1": -120, "u1": 250, "unsigned": -3, "i2": 32000}
+    wide = {"f4": high + 999, "f8": high + 999, "i1": -120, "u1": 250, "unsigned": -3, "i2": 32000}
     wide |= {"u2": 20, "i4": 2000000}
     outside = stored.dtype.type(wide[kind])
     if way in ("_FillValue", "missing_value"):
@@ -248,10 +250,7 @@ def check(seed: int) -> str | None:
     along = {"time": np.arange(seconds.size), **nodes} if timed else nodes
     dims = tuple(rng.permutation(list(along)))
     grid = dict(zip(dims, np.meshgrid(*(along[d] for d in dims), indexing="ij"), strict=True))
-    field = {
-        "v": 3 + grid["y"] - 2 * grid["z"] + 0.5 * grid["x"],
-        "w": 1 - grid["y"] + grid["z"],
-    }
+    field = {"v": 3 + grid["y"] - 2 * grid["z"] + 0.5 * grid["x"], "w": 1 - grid["y"] + grid["z"]}
     if timed:
         field = {name: values + 4 * grid["time"] for name, values in field.items()}
     places = {d: state if d == "time" else int(rng.integers(along[d].size)) for d in dims}
