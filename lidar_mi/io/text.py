@@ -60,7 +60,7 @@ def _encoding(content: bytes) -> str | None:
     """How text that is not UTF-8 may be encoded; None: it is no text."""
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         with suppress(UnicodeDecodeError):
-            return "UTF-16" if content.decode("utf-16") else None
+            return "UTF-16" if "\n" in content.decode("utf-16") else None
     # control characters beside tabs, ends of lines and pages are in no text
     return None if re.search(rb"[\x00-\x08\x0e-\x1f\x7f]", content) else "LATIN1"
 
