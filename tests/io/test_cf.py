@@ -13,6 +13,7 @@ import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.describe import sections
 from lidar_mi.io import netcdf
 from lidar_mi.io.netcdf import load_variable, open_netcdf
 from lidar_mi.io.time_axis import count_unit, listing, state_at, tolerances
@@ -365,3 +366,12 @@ def test_the_check_itself_finds_faults(monkeypatch):
             for name, other in changed.items():
                 patch.setitem(module, name, other)
             assert any(check(seed) for seed in range(30))
+
+
+def test_info_tells_the_ends_of_a_time_axis_apart(tmp_path):
+    by_netcdf4(tmp_path / "epoch.nc", timed(1.6e9 + np.arange(3), EPOCH))
+    rows = {row[0]: row for row in next(sections(str(tmp_path / "epoch.nc")))[1]}
+    assert rows["time"][2] == "1600000000 ... 1600000002" and rows["v"][2] == "1 ... 3"
+    (tmp_path / "epoch.nc.gz").write_bytes(gzip.compress((tmp_path / "epoch.nc").read_bytes()))
+    with pytest.raises(InputError, match=r"is compressed with gzip; .* gunzip "):
+        list(sections(str(tmp_path / "epoch.nc.gz")))
