@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+import lidar_mi as lm
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import sections
 from lidar_mi.io import netcdf
@@ -375,3 +376,19 @@ def test_info_tells_the_ends_of_a_time_axis_apart(tmp_path):
     (tmp_path / "epoch.nc.gz").write_bytes(gzip.compress((tmp_path / "epoch.nc").read_bytes()))
     with pytest.raises(InputError, match=r"is compressed with gzip; .* gunzip "):
         list(sections(str(tmp_path / "epoch.nc.gz")))
+
+
+def test_an_experiment_names_what_it_cannot_read(tmp_path):
+    """A folder in the place of a file, a second state 3 s beside the one that is there."""
+    store = tmp_path / "wake.zarr"
+    store.mkdir()
+    (store / ".zgroup").write_text("{}")
+    changes = {"wake.file": str(store), "wake.time": None, "wake.extinction.tracer": None}
+    with pytest.raises(InputError, match="is a Zarr store; expected a NetCDF file"):
+        lm.make_truth(lm.load_experiment("wake_backscatter", **changes))
+    by_h5py(tmp_path / "epoch.nc", timed(1.6e9 + np.arange(0, 40, 10), EPOCH))
+    changes |= {"wake.file": str(tmp_path / "epoch.nc"), "wake.extinction.source": "speed"}
+    changes |= {"wake.time": "1600000000 s", "wake.second": "1600000013 s", "platform.dt": "13 s"}
+    changes |= {"platform.speed": "10 m/s"}
+    with pytest.raises(InputError, match="time 1600000013 s is not there; allowed: 1600000000, "):
+        lm.make_truth(lm.load_experiment("wake_backscatter", **changes))
