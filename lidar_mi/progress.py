@@ -21,7 +21,8 @@ _NOTEBOOK_INTERVAL = 0.2
 class Terminal(Console):
     """A console for text that may hold names from files and folders.
 
-    Brackets and colons in it are no markup; what a terminal would obey shows as an escape.
+    Brackets and colons in it are no markup; what a terminal would obey, or has no character for,
+    shows as an escape.
     """
 
     def __init__(self, **options: Any) -> None:
@@ -29,7 +30,8 @@ class Terminal(Console):
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Text of whatever is printed: lines, titles and cells of tables."""
-        return super().render_str(printable(text), **options)
+        shown = printable(text).encode(self.encoding, "backslashreplace").decode(self.encoding)
+        return super().render_str(shown, **options)
 
 
 def progress(console: Console | None = None) -> AbstractContextManager[Notice]:

@@ -93,7 +93,8 @@ def table(plugin: str, field: str, source, columns: int) -> np.ndarray:
         if path.suffix == ".npy":
             return np.asarray(np.load(path), float)
         rows = (
-            line.split("#")[0].replace(",", " ").split() for line in path.read_text().splitlines()
+            line.split("#")[0].replace(",", " ").split()
+            for line in path.read_text("utf-8-sig").splitlines()
         )
         return np.array([row for row in rows if row], float)
     except (ValueError, EOFError) as error:

@@ -18,6 +18,15 @@ trap 'exit 143' HUP TERM
 say() { printf '%s\n' "setup: $*"; }
 die() { printf '%s\n' "setup: $*" >&2; exit 1; }
 
+# A virtual environment's programs name it in their first line, and PATH is split at colons.
+check_name() {
+    case $root in
+        *[:\"\$\`\\]* | *'
+'*) die "$root: a folder with a colon, a quotation mark, \$, \`, \\ or a line's end in its name cannot" \
+            "hold a virtual environment; move the project to another folder" ;;
+    esac
+}
+
 good_python() {
     "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null
 }
@@ -85,7 +94,8 @@ create_venv() {
     if ! "$python" -m venv .venv; then
         rm -rf .venv
         die "$python cannot make virtual environments (see above);" \
-            "Debian/Ubuntu: sudo apt install python3-venv"
+            "Debian/Ubuntu: sudo apt install python3-venv; in a folder whose name is not UTF-8: move" \
+            "the project to another folder"
     fi
 }
 
@@ -101,6 +111,7 @@ install_packages() {
     rm -f "$interrupted"
 }
 
+check_name
 find_python
 provide_llvm
 wanted=$(printf '%s\n' "$root" && cat pyproject.toml)

@@ -23,6 +23,7 @@ ARROWS = {
     "io": {
         "atmosphere.aerosols",
         "atmosphere.particle_scattering",
+        "atmosphere.regrid",
         "atmosphere.scattering",
         "retrieval.vortices.model",
         "retrieval.vortices.pair",

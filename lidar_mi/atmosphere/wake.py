@@ -7,6 +7,7 @@ import numpy as np
 import xarray as xr
 from scipy.interpolate import CubicSpline
 
+from lidar_mi.atmosphere.regrid import interpolated, statement
 from lidar_mi.errors import InputError
 
 MOST_NODES = 10**8
@@ -37,16 +38,18 @@ def resample(
     """Finer nodes by cubic splines, in y and z unless other axes are named.
 
     Splines (not-a-knot) along one axis after the other, through the nodes; exact for cubic
-    polynomials. The end nodes are kept: 110 x 70 nodes of 1 m become 219 x 139 of 0.5 m. tracer and
-    aerosol are clipped to the range of their data, which a spline exceeds at sharp edges (a tracer
-    would go negative there).
+    polynomials. Where the spacing divides the extent, the end nodes are kept: 110 x 70 nodes of 1 m
+    become 219 x 139 of 0.5 m. Elsewhere the nodes lie about the middle of the extent, within it,
+    and the attribute ``interpolated`` states with which error. tracer and aerosol are clipped to
+    the range of their data, which a spline exceeds at sharp edges (a tracer would go negative
+    there).
 
     Parameters
     ----------
     wake : xarray.Dataset
         Variables on (x, y, z), from `lidar_mi.io.wake_file.read_wake`.
     spacing : float
-        m; it must divide the extent along each of the axes.
+        m; at most the extent along each of the axes.
     axes : "yz" or "xyz"
     most : int
         Nodes.
@@ -58,12 +61,12 @@ def resample(
     Raises
     ------
     InputError
-        A spacing that is not positive, does not divide an extent or gives too many nodes, fewer
-        than 4 nodes.
+        A spacing that is not positive, is larger than an extent or gives too many nodes, fewer than
+        4 nodes.
     """
     if not (np.isfinite(spacing) and spacing > 0):
         raise InputError(f"wake.spacing: {spacing} m is not allowed; it must be > 0 m")
-    ends = {}
+    ends, divided = {}, True
     for name in axes:
         places = wake[name].values.astype(float)
         if places.size < 4:
@@ -72,26 +75,40 @@ def resample(
             )
         extent = places[-1] - places[0]
         cells = round(extent / spacing)
-        if cells < 1 or abs(cells * spacing - extent) > _UNEVEN * spacing:
+        margin = 0.0
+        if abs(cells * spacing - extent) > _UNEVEN * spacing:
+            cells, divided = math.floor(extent / spacing), False
+            margin = (extent - cells * spacing) / 2
+        if cells < 1:
             raise InputError(
-                f"wake.spacing: {spacing:g} m does not divide the extent of {name}, "
-                f"{extent:g} m; allowed: {extent:g} m over a whole number"
+                f"wake.spacing: {spacing:g} m is not allowed; expected at most the extent of "
+                f"{name}, {extent:g} m"
             )
-        ends[name] = (places[0], places[-1], cells + 1)
+        ends[name] = (places[0] + margin, places[-1] - margin, cells + 1)
     check_nodes(spacing, {d: ends[d][2] if d in ends else wake.sizes[d] for d in "xyz"}, most)
     nodes = {name: np.linspace(*end) for name, end in ends.items()}
 
     fine = wake.drop_vars([*wake.data_vars, *axes]).assign_coords(
         {name: (name, values, {"units": "m"}) for name, values in nodes.items()}
     )
+    old = [wake[axis].values.astype(float) for axis in "xyz"]
+    targets = [nodes.get(axis, own) for axis, own in zip("xyz", old, strict=True)]
+    errors = {}
     for variable_name, variable in wake.data_vars.items():
-        values = variable.transpose("x", "y", "z").values.astype(float)
-        low, high = values.min(), values.max()
-        for axis in axes:
-            values = CubicSpline(wake[axis].values, values, axis="xyz".index(axis))(nodes[axis])
+        own = variable.transpose("x", "y", "z").values.astype(float)
+        values = own
+        if divided:
+            for axis in axes:
+                values = CubicSpline(wake[axis].values, values, axis="xyz".index(axis))(nodes[axis])
+        else:
+            values, errors[str(variable_name)] = interpolated(own, old, targets)
         if variable_name in ("tracer", "aerosol"):
-            values = values.clip(low, high)
+            values = values.clip(own.min(), own.max())
         fine[variable_name] = ("x", "y", "z"), values, variable.attrs
+    units = {name: wake[name].attrs.get("units", "") for name in errors}
+    said = [wake.attrs.get("interpolated", ""), statement(errors, units)]
+    if any(said):
+        fine.attrs["interpolated"] = ", then ".join(filter(None, said))
     return fine
 
 

@@ -1,5 +1,6 @@
 """From exceptions and signals to one printable line on stderr and an exit code."""
 
+import io
 import os
 import signal
 import sys
@@ -30,8 +31,12 @@ def exit_by(app: Callable[..., int | None]) -> None:
     """Run a typer app; errors and signals are reported in one line.
 
     Exit code 2: bad input, a disk or a file that fails, too little memory, equations that have no
-    solution. Exit code 128 + n: signal n (Ctrl-C, SIGTERM, SIGHUP).
+    solution. Exit code 128 + n: signal n (Ctrl-C, SIGTERM, SIGHUP). Characters that the terminal
+    has not are printed as escapes.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
     try:
         with _raised_signals():
             code = app(standalone_mode=False)

@@ -53,7 +53,6 @@ def sections(
         raise InputError(f"--altitude: not allowed with {what}; expected {MOLECULES}")
     kinds = {
         ".exr": _image,
-        ".nc": _netcdf,
         ".nc4": _netcdf,
         ".cdf": _netcdf,
         ".txt": _table_file,
@@ -72,6 +71,8 @@ def sections(
         )
     elif path.is_dir():
         yield from _folder(path)
+    elif ".nc" in path.suffixes:
+        yield from _netcdf(path)
     elif path.suffix in kinds:
         yield from kinds[path.suffix](path)
     elif path.suffix in (".yaml", ".yml"):
@@ -149,10 +150,19 @@ def _netcdf(path: Path) -> Iterator[Section]:
             # larger variables would have to be read in parts
             if variable.dtype.kind in "fiu" and variable.size and fits(path, variable.nbytes):
                 values = load_variable(xr.DataArray(variable, name=name), path)
-                span = f"{float(values.min()):.4g} ... {float(values.max()):.4g}"
+                span = _span(float(values.min()), float(values.max()))
             rows.append((str(name), shape, span, str(variable.attrs.get("units", ""))))
         yield str(path), rows
         yield "attributes", [(key, _short(value)) for key, value in data.attrs.items()]
+
+
+def _span(low: float, high: float) -> str:
+    """Both ends with 4 digits, or with as many as tell them apart."""
+    for digits in range(4, 17):
+        ends = f"{low:.{digits}g}", f"{high:.{digits}g}"
+        if ends[0] != ends[1] or not low < high:
+            break
+    return " ... ".join(ends)
 
 
 def _folder(folder: Path) -> Iterator[Section]:

@@ -69,11 +69,15 @@ def _images(results: Results) -> dict[str, float]:
     found, cores = results["wind"], results["cores"]
     place = {axis: slice(found[axis].min(), found[axis].max()) for axis in ("y", "z")}
     noise = results.get("detector_noise", {})
+    true = results["truth"].wind.sel(place)
+    if 0 in true.sizes.values():
+        # a single row or column of vectors, between nodes
+        true = results["truth"].wind.sel(y=found["y"], z=found["z"], method="nearest")
     return (
         cross_flow_metrics(found, cores)
         | light_metrics(results["scans"][0])
         | core_metrics(cores)
-        | true_wind_metrics(results["truth"].wind.sel(place), cores)
+        | true_wind_metrics(true, cores)
         | (sweep_metrics(results["texture_sweep"]) if "texture_sweep" in results else {})
         | {f"detector.{key}": value for key, value in noise.items()}
         | safety_metrics(results["eye_safety"])

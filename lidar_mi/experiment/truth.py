@@ -179,8 +179,8 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
         passed = wake.second - wake.time
         if abs(passed - experiment.platform.dt) > 1e-3 * experiment.platform.dt:
             raise InputError(
-                f"wake.second: {wake.second:g} s is not allowed; expected platform.dt = "
-                f"{experiment.platform.dt:g} s after wake.time = {wake.time:g} s"
+                f"wake.second: {wake.second:.15g} s is not allowed; expected platform.dt = "
+                f"{experiment.platform.dt:g} s after wake.time = {wake.time:.15g} s"
             )
     flows = []
     for when in (wake.time, None if wake.second == "advect" else wake.second):
@@ -322,7 +322,8 @@ def find_file(name: str, beside: str | Path, field: str) -> Path:
     """A file named by an experiment: as given, beside the experiment, or shipped."""
     shipped = Path(str(files("lidar_mi.scenes")))
     for candidate in (Path(beside) / name, shipped / name):
-        if candidate.is_file():
+        # a reader says what it expects instead of a folder, such as a Zarr store
+        if candidate.is_file() or (candidate.is_dir() and candidate.suffix):
             return candidate
     samples = sorted(p.name for p in shipped.glob("*.nc")) if field == "wake.file" else []
     raise InputError(

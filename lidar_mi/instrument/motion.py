@@ -131,7 +131,7 @@ class Trajectory:
         """
         first, last = self.time[0], self.time[-1]
         # rounding of times in a file
-        slack = 1e-9 * max(abs(first), abs(last))
+        slack = 1e-9 * (last - first)
         if time.min() < first - slack:
             raise InputError(
                 f"{self.source} begins at {first:g} s; expected from {time.min():.6g} s on, when "

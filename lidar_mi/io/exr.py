@@ -27,6 +27,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.exr_header import declared
+from lidar_mi.io.library_name import library_name
 from lidar_mi.io.size import check_size
 
 MOST_LAYERS = 2**15 - 1
@@ -172,7 +173,10 @@ def _read(path: str | Path, *, header_only: bool = False) -> tuple[dict, dict[st
         raise InputError(f"{path}: not a readable OpenEXR image ({error})") from None
     check_size(path, size)
     try:
-        with OpenEXR.File(str(path), separate_channels=True, header_only=header_only) as file:
+        with (
+            library_name(path) as name,
+            OpenEXR.File(name, separate_channels=True, header_only=header_only) as file,
+        ):
             header = {k: v for k, v in file.header().items() if k not in _STRUCTURE}
             layers = {} if header_only else _layers(file.parts)
             whole = header_only or len(file.parts) == count

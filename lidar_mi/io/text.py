@@ -1,6 +1,10 @@
 """Text files."""
 
+import codecs
+import re
+import shlex
 import stat
+from contextlib import suppress
 from pathlib import Path
 
 from lidar_mi.errors import InputError
@@ -11,7 +15,7 @@ LONGEST = 64 << 20
 
 
 def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
-    """Text of a file, UTF-8.
+    """Text of a file, UTF-8, without the mark that some editors set before it.
 
     Parameters
     ----------
@@ -36,11 +40,29 @@ def read_text(path: str | Path, expected: str, longest: int = LONGEST) -> str:
                 f"{path}: {found.st_size} bytes are not allowed; expected {expected} of at most "
                 f"{longest} bytes"
             )
-        return path.read_text(encoding="utf-8")
+        content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}; expected {expected}") from None
-    except UnicodeDecodeError:
+    try:
+        # line ends of any system
+        return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
+    except UnicodeDecodeError as error:
+        other, line = _encoding(content), content.count(b"\n", 0, error.start) + 1
+    if other is None:
         raise InputError(f"{path}: not a text file; expected {expected}") from None
+    command = f"iconv -f {other} -t UTF-8 {shlex.quote(str(path))}"
+    raise InputError(
+        f"{path}: line {line} is not UTF-8; expected {expected} in UTF-8: {command}"
+    ) from None
+
+
+def _encoding(content: bytes) -> str | None:
+    """How text that is not UTF-8 may be encoded; None: it is no text."""
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        with suppress(UnicodeDecodeError):
+            return "UTF-16" if "\n" in content.decode("utf-16") else None
+    # control characters beside tabs, ends of lines and pages are in no text
+    return None if re.search(rb"[\x00-\x08\x0e-\x1f\x7f]", content) else "LATIN1"
 
 
 def write_text(path: str | Path, text: str) -> None:

@@ -11,6 +11,7 @@ import pint
 from lidar_mi.errors import InputError
 from lidar_mi.io.netcdf import load_variable, open_netcdf
 from lidar_mi.io.text import read_text
+from lidar_mi.io.time_axis import count_unit
 from lidar_mi.units import parse_units
 
 TIME = "t"
@@ -67,7 +68,7 @@ def read_timed_table(path: str | Path, units: Mapping[str, str]) -> dict[str, np
     if back.size:
         row = int(back[0]) + 1
         raise InputError(
-            f"{path}: t: {time[row]:g} s in row {row + 1} after {time[row - 1]:g} s is not "
+            f"{path}: t: {time[row]:.15g} s in row {row + 1} after {time[row - 1]:.15g} s is not "
             "allowed; expected times that increase"
         )
     return table
@@ -137,8 +138,9 @@ def _netcdf(path: Path, wanted: Mapping[str, str]) -> dict[str, tuple[np.ndarray
                 )
             values = load_variable(variable, path).values.astype(float)
             unit = variable.attrs.get("units")
-            # "seconds since 2000-01-01" counts in seconds
-            found[name] = values, None if unit is None else str(unit).split(" since ")[0]
+            if name == TIME and unit is not None:
+                unit = count_unit(unit, f"{path}: {name}")
+            found[name] = values, None if unit is None else str(unit)
     sizes = {len(values) for values, _ in found.values()}
     if len(sizes) > 1:
         raise InputError(

@@ -8,9 +8,10 @@ import numpy as np
 import pint
 import xarray as xr
 
+from lidar_mi.atmosphere.regrid import even_axis, interpolated, is_even, statement
 from lidar_mi.errors import InputError
-from lidar_mi.io.netcdf import load_variable, open_netcdf
-from lidar_mi.io.regrid import even_axis, interpolated, is_even, statement
+from lidar_mi.io.netcdf import load_variable, open_netcdf, valid_range
+from lidar_mi.io.time_axis import count_unit, listing, state_at, tolerances
 from lidar_mi.units import parse_units
 
 _DIMENSIONS = ("time", "x", "y", "z")
@@ -82,7 +83,7 @@ def _pick_time(data, name, time, path):
         if time is None:
             return data, None
         raise InputError(
-            f"{path}: time {time:g} s is asked for, but there is no {name!r}; it has the "
+            f"{path}: time {time:.15g} s is asked for, but there is no {name!r}; it has the "
             f"dimensions {', '.join(map(str, data.dims))}"
         )
     if name not in data.variables:
@@ -94,26 +95,38 @@ def _pick_time(data, name, time, path):
     coordinate = data[name]
     if coordinate.ndim > 1:
         raise InputError(f"{path}: {name!r} has dims {coordinate.dims}; allowed: one at most")
-    # "seconds since 2000-01-01" counts in seconds; the date itself is not used.
-    plain = coordinate.copy()
-    if "units" in plain.attrs:
-        plain.attrs["units"] = str(plain.attrs["units"]).split(" since ")[0]
-    times = np.atleast_1d(_numbers(coordinate, path)) * _scale_to(plain, "s", name, path)
-    listing = ", ".join(f"{t:.10g}" for t in times[:20]) + (" ..." if times.size > 20 else "")
+    counted = coordinate.copy()
+    if "units" in counted.attrs:
+        counted.attrs["units"] = count_unit(counted.attrs["units"], f"{path}: {name}")
+    scale = _scale_to(counted, "s", name, path)
+    stored = np.atleast_1d(_numbers(coordinate, path))
+    bad = np.flatnonzero(~np.isfinite(stored))
+    if bad.size:
+        raise InputError(
+            f"{path}: {name!r} is not finite at {bad.size} of {stored.size} places, the first at "
+            f"index {bad[0]}; allowed: finite numbers"
+        )
+    times, rounding = stored * scale, _rounding(coordinate, stored) * scale
     if time is None:
-        if times.size > 1:
+        if times.size != 1:
+            listed = listing(times, tolerances(times, rounding))
             raise InputError(
                 f"{path}: has {times.size} times, and none is chosen; expected wake.time: one of "
-                f"{listing} s"
+                f"{listed} s"
             )
         index = 0
+    elif not np.isfinite(time):
+        raise InputError(f"wake.time: {time} s is not allowed; any finite time is")
     else:
-        if not np.isfinite(time):
-            raise InputError(f"wake.time: {time} s is not allowed; any finite time is")
-        index = int(np.argmin(np.abs(times - time)))
-        if not abs(times[index] - time) <= 1e-6 * max(abs(time), abs(times[index])):
-            raise InputError(f"{path}: time {time:.10g} s is not there; allowed: {listing} s")
+        index = state_at(time, times, rounding, str(path))
     return data.isel({name: index}) if name in data.dims else data, float(times[index])
+
+
+def _rounding(variable, values):
+    """To which the file rounds a variable's values; integers are as they were meant."""
+    kind = np.dtype(variable.encoding.get("dtype", variable.dtype))
+    half = np.spacing(np.abs(values).astype(kind)) / 2 if kind.kind == "f" else 0.0 * values
+    return half.astype(float)
 
 
 def _axis(data, name, ours, path, sign):
@@ -146,23 +159,46 @@ def _axis(data, name, ours, path, sign):
     return (exact if is_even(values) else values), falls
 
 
+def _positive_down(data, table, sign, heights, path) -> list[str]:
+    """Axes of heights that the file says to be depths, unless the sign is changed by their name."""
+    down = [
+        name
+        for name in heights
+        if name in data.variables
+        and sign["z"] > 0
+        and str(data[name].attrs.get("positive", "")).lower() == "down"
+    ]
+    upwards = data[table["w"]].attrs.get("standard_name") == "upward_air_velocity"
+    if down and sign["w"] > 0 and not upwards:
+        z, w = table["z"], table["w"]
+        raise InputError(
+            f"{path}: axis {down[0]!r} is positive down, and {w!r} is not said to be the "
+            f"upward_air_velocity; expected wake.names: {{z: -{z}}}, or {{z: -{z}, w: -{w}}} "
+            "where it points down, too"
+        )
+    return down
+
+
 def _plane_index(axis, x, path, name):
     """Index of the plane nearest to x, which must lie in one of the planes' cells."""
     half = (axis[1] - axis[0]) / 2 if axis.size > 1 else 0.0
-    slack = half + 1e-6 * max(1.0, abs(x))
+    # rounding of the file's axis, whatever its origin; of a single plane 1 mm
+    slack = half * (1 + 1e-3) if half else 1e-3
     if not axis[0] - slack <= x <= axis[-1] + slack:
         raise InputError(
-            f"{path}: {name} = {x:g} m is outside; allowed: {axis[0] - half:g} to "
-            f"{axis[-1] + half:g} m"
+            f"{path}: {name} = {x:.9g} m is outside; allowed: {axis[0] - half:.9g} to "
+            f"{axis[-1] + half:.9g} m"
         )
     return int(np.argmin(np.abs(axis - x)))
 
 
-def _check_values(values, axes, name, path, may_be_negative):
-    """Every value finite and, unless it may, not negative."""
-    for fault, bad in (
-        ("not finite", ~np.isfinite(values)),
-        ("negative", (values < 0) & (not may_be_negative)),
+def _check_values(values, axes, name, path, may_be_negative, limits):
+    """Every value finite and, unless it may, not negative; ``limits``: those of valid values."""
+    low, high = limits
+    within = f", valid ones are {low:g} to {high:g}" if low > -np.inf or high < np.inf else ""
+    for fault, bad, allowed in (
+        ("not finite", ~np.isfinite(values), f"nowhere{within}"),
+        ("negative", (values < 0) & (not may_be_negative), "nowhere"),
     ):
         count = int(bad.sum())
         if count:
@@ -170,7 +206,7 @@ def _check_values(values, axes, name, path, may_be_negative):
             place = ", ".join(f"{d} = {axes[d][i]:g} m" for d, i in zip("xyz", first, strict=True))
             raise InputError(
                 f"{path}: variable {name!r} is {fault} at {count} of {values.size} places, the "
-                f"first at {place}; allowed: nowhere"
+                f"first at {place}; allowed: {allowed}"
             )
 
 
@@ -187,15 +223,15 @@ def read_wake(
     gets one x plane, at its scalar coordinate or at 0). Descending axes are turned round, units
     are converted. The lowest levels are left out where a variable has no value at any of their
     nodes (the ground). Stretched axes and staggered variables are interpolated to even nodes, see
-    `lidar_mi.io.regrid`; the attribute ``interpolated`` then states with which error.
+    `lidar_mi.atmosphere.regrid`; the attribute ``interpolated`` then states with which error.
 
     Parameters
     ----------
     path : str or Path
         NetCDF-4 or NetCDF-3 classic.
     time : float, optional
-        s; the file must hold it to 1e-6 relative. May be left out where there is one time only.
-        In "seconds since ..." axes the count is meant.
+        s; the file must hold it to 1e-3 of the step to the next state and to 1 ms. May be left out
+        where there is one time only. In "seconds since ..." axes the count is meant.
     names : mapping, optional
         Our name to the file's, for time, x, y, z, u, v, w, tracer, aerosol, where they differ:
         {"v": "V_wind", "y": "lateral"}. A variable named here must exist. A minus sign before the
@@ -301,11 +337,13 @@ def _read(data, table, sign, asked, time, x, path):
         )
 
     data, seconds = _pick_time(data, table["time"], time, path)
-    axes, reverse = {}, []
+    reverse = []
     places = {theirs: ours for dims in own.values() for theirs, ours in dims.items()} | spatial
+    down = _positive_down(data, table, sign, [d for d, ours in places.items() if ours == "z"], path)
     found = {}
     for theirs, ours in places.items():
-        found[theirs], turned = _axis(data, theirs, ours, path, sign[ours])
+        points = sign[ours] * (-1.0 if theirs in down else 1.0)
+        found[theirs], turned = _axis(data, theirs, ours, path, points)
         if turned:
             reverse.append(theirs)
     data = data.isel({theirs: slice(None, None, -1) for theirs in reverse})
@@ -361,7 +399,7 @@ def _read(data, table, sign, asked, time, x, path):
         values = _numbers(variable, path).reshape([n.size for n in nodes]) * scale
         amount = name in asked and name in ("tracer", "aerosol")
         here = dict(zip("xyz", nodes, strict=True))
-        _check_values(values, here, table[name], path, may_be_negative=not amount)
+        _check_values(values, here, table[name], path, not amount, valid_range(variable, path))
         low, high = values.min(), values.max()
         values, errors[name] = interpolated(values, nodes, [axes[d] for d in "xyz"])
         if name in ("tracer", "aerosol"):

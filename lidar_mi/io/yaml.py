@@ -114,4 +114,8 @@ def read_yaml(path: str | Path, expected: str) -> Any:
 
 def to_yaml(data: Any) -> str:
     """Plain data as YAML text, keys in the order in which they are."""
-    return yaml.dump(data, Dumper=_DUMPER, sort_keys=False)
+    try:
+        return yaml.dump(data, Dumper=_DUMPER, sort_keys=False)
+    except UnicodeEncodeError:
+        # names of files that are not UTF-8, which libyaml does not escape
+        return yaml.dump(data, Dumper=yaml.SafeDumper, sort_keys=False)

@@ -1,5 +1,6 @@
 """Mitsuba scene files with our plugins."""
 
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ import xarray as xr
 from lidar_mi import __version__
 from lidar_mi.errors import InputError
 from lidar_mi.io.exr import label_scan, unpack, write_fringes, write_scan
+from lidar_mi.io.library_name import is_text
 from lidar_mi.io.text import read_text
 from lidar_mi.io.xml import check_scene_file
 from lidar_mi.rendering.fringes import render_image
@@ -52,6 +54,7 @@ def render_file(
         raise InputError(f"{scene_path}: no such file; expected a Mitsuba scene (XML)")
     if not out.parent.is_dir():
         raise InputError(f"{out}: {out.parent} is no folder; expected one that exists")
+    _check_names(scene_path, definitions or {})
     check_scene_file(scene_path)
     use_variant(variant)
     try:
@@ -100,6 +103,21 @@ def render_file(
     }
     write_scan(out, scan)
     return scan
+
+
+def _check_names(scene_path: Path, definitions: dict[str, str]) -> None:
+    """Refuse names that Mitsuba cannot take or takes for something else."""
+    if not is_text(os.path.abspath(scene_path)):
+        raise InputError(
+            f"{scene_path}: a name that is not UTF-8 is not allowed for a scene; expected another "
+            "file or folder"
+        )
+    for key, value in definitions.items():
+        if "$" in value or not is_text(value):
+            raise InputError(
+                f"-D {key}={value}: not allowed; expected UTF-8 without $, which stands for a "
+                "parameter in a scene"
+            )
 
 
 def files_of(scene_path: str | Path, definitions: dict[str, str]) -> list[Path]:

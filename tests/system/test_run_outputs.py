@@ -16,6 +16,7 @@ import xarray as xr
 import yaml
 from PIL import Image
 
+import lidar_mi as lm
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.resumable_folder import IMAGES
 from lidar_mi.io.exr import read_scan
@@ -194,3 +195,17 @@ def test_images_are_described_by_their_metadata(demo):
             values = scan[axis].values
             np.testing.assert_allclose(values[[0, -1]], [-end, end], atol=1e-4)
         assert (scan["S0"].values > 0).all() and (scan["S0_stderr"].values > 0).all()
+
+
+def test_a_single_vector_between_nodes(tmp_path):
+    """Of images with room for no more: the true wind there is that of the node beside it."""
+    pair = {"circulation": 150, "separation": "8 m", "core_radius": "1 m"}
+    wake = {"vortex_pair": pair | {"width": "20 m", "height": "16 m"}, "spacing": "1 m"}
+    experiment = lm.load_experiment(
+        "wake_backscatter",
+        wake={"file": None, "time": None, "second": "advect"} | wake,
+        render={"samples_per_beam": 2, "max_order": 1},
+        retrieval={"methods": ["cc"], "stride": 8, "sources": "measured"},
+    )
+    metrics = lm.run(experiment, tmp_path / "out").metrics
+    assert np.isfinite(list(metrics.values())).all() and metrics["true_wind.rms_w"] > 1

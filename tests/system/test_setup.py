@@ -126,6 +126,14 @@ def test_scripts_parse():
         assert os.access(ROOT / script, os.X_OK), f"{script} is not executable"
 
 
+@pytest.mark.parametrize("name", ["a:b", 'a "b"', "a $HOME", "a\nb", "a\\b", "a `b`"])
+def test_folders_that_cannot_hold_a_virtual_environment(machine, name):
+    machine.project = machine.project.rename(machine.project.with_name(name))
+    done = machine.set_up()
+    assert done.returncode == 1 and "move the project to another folder" in done.stderr
+    assert machine.log() == [] and not (machine.project / ".venv").exists()
+
+
 def test_second_run_does_nothing_until_pyproject_changes(machine):
     first = machine.set_up()
     assert first.returncode == 0, first.stderr

@@ -193,7 +193,7 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
                 f"{percent(rotor.turbulence)}"
             )
         else:
-            when = "" if wake.time is None else f" at {wake.time:g} s"
+            when = "" if wake.time is None else f" at {wake.time:.15g} s"
             flow = f"{wake.file}{when}, {wake.spacing:g} m grid"
         texture = "no texture added"
         if wake.texture.rms:

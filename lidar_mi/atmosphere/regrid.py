@@ -35,7 +35,7 @@ def even_axis(nodes: np.ndarray, low: float, high: float) -> np.ndarray:
     """
     if is_even(nodes):
         exact = np.linspace(nodes[0], nodes[-1], nodes.size)
-        slack = 1e-6 * max(1.0, abs(low), abs(high))
+        slack = _UNEVEN * _step(nodes)
         return exact[(exact >= low - slack) & (exact <= high + slack)]
     least = max(float(np.diff(nodes).min()), (high - low) / (_DENSEST * nodes.size))
     power = 10.0 ** math.floor(math.log10(least))

@@ -1,0 +1,108 @@
+"""Times of a file's states: their unit, the state of a time, the times as they are listed."""
+
+import re
+
+import numpy as np
+
+from lidar_mi.errors import InputError
+
+_SINCE = re.compile(r"\s*(\S+)\s+(?:since|after|from|ref)\s+(?=\S*\d).*", re.IGNORECASE | re.DOTALL)
+# No two of them need be equally long.
+_CALENDAR = re.compile(r"(common_|leap_|julian_|tropical_|gregorian_)?(months?|years?|yrs?)", re.I)
+
+# A state belongs to the time asked for to this fraction of the way to its neighbour: velocities of
+# two states are wrong by twice of it.
+_SAME = 1e-3
+# Of axes in single precision, to their rounding, where that is this fraction at most.
+_ROUNDING = 1e-2
+# In seconds: the fastest air of a wake, 50 m/s, moves by 5 cm.
+_LARGEST = 1e-3
+
+
+def count_unit(text: str, where: str) -> str:
+    """The unit in which a time counts: of "seconds since 1970-01-01", seconds.
+
+    The date and the calendar do not matter to a count of seconds, minutes, hours or days, which all
+    calendars have of one length.
+
+    Parameters
+    ----------
+    text : str
+        The attribute ``units``.
+    where : str
+        File and variable, for the message.
+
+    Raises
+    ------
+    InputError
+        Months or years, whose length depends on the date.
+    """
+    match = _SINCE.fullmatch(str(text))
+    unit = match[1] if match else str(text).strip()
+    if _CALENDAR.fullmatch(unit):
+        raise InputError(
+            f"{where} has the unit {str(text)!r}, of no fixed length; allowed: s or a unit that "
+            "converts to it"
+        )
+    # units of time are written in any case (UDUNITS, cftime); one letter may be a prefix
+    return unit.lower() if match and len(unit) > 1 else unit
+
+
+def tolerances(times: np.ndarray, rounding: np.ndarray) -> np.ndarray:
+    """How far from each time one may be that means it, s, whatever the axis counts from.
+
+    1e-3 of the way to the nearest other time or, up to 1e-2 of it, the axis' own rounding; 1 ms at
+    most.
+
+    Parameters
+    ----------
+    times, rounding : (n,) arrays
+        s.
+    """
+    order = np.argsort(times)
+    steps = np.diff(times[order])
+    gaps = np.full(times.size, np.inf)
+    gaps[order] = np.fmin(np.append(steps, np.inf), np.append(np.inf, steps))
+    fraction = np.maximum(_SAME * gaps, np.minimum(rounding, _ROUNDING * gaps))
+    # text that is read and units that are converted differ by the last bits of double precision
+    return np.minimum(fraction, _LARGEST) + 2 * np.spacing(np.abs(times))
+
+
+def listing(times: np.ndarray, tolerance: np.ndarray, most: int = 20) -> str:
+    """Times as the shortest numbers that mean them: "40, 40.1 ..."."""
+    shown = [_shortest(float(t), float(d)) for t, d in zip(times[:most], tolerance, strict=False)]
+    return ", ".join(shown) + (" ..." if times.size > most else "")
+
+
+def _shortest(time: float, tolerance: float) -> str:
+    texts = (f"{time:.{digits}f}" for digits in range(18))
+    fitting = (text for text in texts if abs(float(text) - time) <= tolerance)
+    return next(fitting, repr(time))
+
+
+def state_at(time: float, times: np.ndarray, rounding: np.ndarray, where: str) -> int:
+    """Index of the state of a time.
+
+    Parameters
+    ----------
+    time : float
+        s.
+    times, rounding : (n,) arrays
+        Of the states, and to which they are rounded in the file, s.
+    where : str
+        File, for the message.
+
+    Raises
+    ------
+    InputError
+        No state, or more than one, has this time.
+    """
+    tolerance = tolerances(times, rounding)
+    fits = np.flatnonzero(np.abs(times - time) <= tolerance)
+    if fits.size == 1:
+        return int(fits[0])
+    asked = _shortest(time, 2 * float(np.spacing(abs(time))))
+    allowed = f"allowed: {listing(times, tolerance)} s"
+    if fits.size:
+        raise InputError(f"{where}: {fits.size} states have the time {asked} s; expected one each")
+    raise InputError(f"{where}: time {asked} s is not there; {allowed}")
