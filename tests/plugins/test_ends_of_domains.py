@@ -343,7 +343,7 @@ def test_directions_of_the_field_of_view(world, fov):
         world.lidar((1, 1), (500, 510), fov_half_mrad=fov),
         slab=world.box((495, -20, -20), (515, 20, 20), world.homogeneous(1e-3)),
     )
-    lidar, sensor = Lidar(scene, scene.sensors()[0]), scene.sensors()[0]
+    lidar, sensor = Lidar(scene, scene.sensors()[0], None), scene.sensors()[0]
     axes = mi.Frame3f(mi.Vector3f(0, 0, 1))
     rng = mi.PCG32(size=NUMBER)
     local = axes.to_local(lidar._in_field(axes, rng))

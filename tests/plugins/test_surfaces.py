@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from plugins.bodies import Closed, Cube, Sheet, Sphere
+from plugins.bounds import Bounds
 from plugins.media import collision, transmittance
 from plugins.surfaces import Air
 from tests.support.meshes import box_file
@@ -107,6 +108,13 @@ def lines():
     return (middle - direction * 100).astype(np.float32), direction.astype(np.float32), distance
 
 
+def bounds_of(scene):
+    bounds = Bounds()
+    sides = [(shape.interior_medium(), shape.exterior_medium()) for shape in scene.shapes()]
+    bounds.update({medium: None for pair in sides for medium in pair if medium is not None}, 0)
+    return bounds
+
+
 def depth(scene, origin, direction, distance):
     points = (
         type_(*(np.ascontiguousarray(axis) for axis in a.T))
@@ -114,6 +122,7 @@ def depth(scene, origin, direction, distance):
     )
     value, _ = transmittance(
         Air(scene),
+        bounds_of(scene),
         mi.MediumPtr(None),
         *points,
         mi.Float(distance),
@@ -152,8 +161,10 @@ def test_free_flights(name, kind, tmp_path):
         type_(*(np.ascontiguousarray(axis) for axis in a.T))
         for type_, a in ((mi.Point3f, origin), (mi.Vector3f, direction))
     )
+    scene = build(boxes, kind, tmp_path)
     flight, medium, found = collision(
-        Air(build(boxes, kind, tmp_path)),
+        Air(scene),
+        bounds_of(scene),
         mi.MediumPtr(None),
         *points,
         mi.Float(distance),
