@@ -19,6 +19,7 @@ from lidar_mi.assessment.metrics.sensor import (
     margin_metrics,
     vector_metrics,
 )
+from lidar_mi.assessment.metrics.simulation import simulation_metrics
 from lidar_mi.assessment.metrics.velocities import velocity_metrics
 from lidar_mi.assessment.metrics.volume import volume_metrics
 from lidar_mi.assessment.metrics.vortices import core_metrics, vortex_metrics
@@ -68,9 +69,10 @@ def measure(
 def _images(results: Results) -> dict[str, float]:
     found, cores = results["wind"], results["cores"]
     place = {axis: slice(found[axis].min(), found[axis].max()) for axis in ("y", "z")}
-    noise = results.get("detector_noise", {})
+    noise, changes = results.get("detector_noise", {}), results.get("simulation_noise")
     return (
         cross_flow_metrics(found, cores)
+        | ({} if changes is None else simulation_metrics(changes, found, cores))
         | light_metrics(results["scans"][0])
         | core_metrics(cores)
         | true_wind_metrics(results["truth"].wind.sel(place), cores)

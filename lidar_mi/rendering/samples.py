@@ -103,7 +103,9 @@ def choose_samples(
     of_one = samples * _of_the_worst_gate(noise_ratio(pilot))
     mean = float(of_one.mean())
     most = settings.most_samples(beams, gates)
-    wanted = mean / settings.monte_carlo_fraction
+    # as much as the pilot leaves open, which beams of independent samples say
+    open_ = 2 * float(of_one.std()) / math.sqrt(of_one.size)
+    wanted = (mean + open_) / settings.monte_carlo_fraction
     if math.isfinite(wanted):
         needed = max(_rounded_up(wanted / gates), LEAST) * gates
         needed = max(needed, -(-least // gates) * gates)

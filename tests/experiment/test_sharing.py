@@ -92,7 +92,7 @@ def images(experiment):
 def signatures(experiment):
     record = new_record(experiment, ".")
     return {
-        part: made_by(record, stage.indifferent_to)
+        part: made_by(record, stage.indifferent(experiment))
         for stage in storing_stages(experiment)
         for part in stage.parts(experiment)
     }

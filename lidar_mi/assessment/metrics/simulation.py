@@ -1,0 +1,91 @@
+"""Which part of the wind's error is noise of the simulation, and not the lidar's."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.metrics.cores import Core, outside_cores
+from lidar_mi.assessment.metrics.names import OUTSIDE_CORES, RENDERED, far_from_cores, wind_key
+
+
+def simulation_metrics(
+    changes: xr.Dataset, found: xr.Dataset, cores: Sequence[Core]
+) -> dict[str, float]:
+    """Standard deviation that the simulation's noise has in the wind, by method.
+
+    Parameters
+    ----------
+    changes : xr.Dataset, dims (algorithm, z, y)
+        v, w (m s^-1) from `lidar_mi.experiment.stages.simulation_noise.simulation_noise`.
+    found : xr.Dataset, dims (source, algorithm, z, y)
+        The winds; the last source is that of the changes.
+    cores : sequence of Core
+        True vortices.
+
+    Returns
+    -------
+    dict
+        ``SOURCE.METHOD.monte_carlo_v``, ``.monte_carlo_w`` (m s^-1), and with cores
+        ``.outside_cores.monte_carlo_v`` beyond two core radii.
+    """
+    metrics: dict[str, float] = {}
+    source = found["source"].values[-1]
+    for method in changes["algorithm"].values:
+        wind = found.sel(source=source, algorithm=method)
+        far = outside_cores(wind["y_vector"].values, wind["z_vector"].values, list(cores))
+        places = {"": np.ones_like(far)} | ({OUTSIDE_CORES: far} if cores else {})
+        for place, inside in places.items():
+            for name in ("v", "w"):
+                values = changes[name].sel(algorithm=method).values[inside]
+                values = values[np.isfinite(values)]
+                if values.size:
+                    key = wind_key(source, method, f"{place}monte_carlo_{name}")
+                    metrics[key] = float(np.sqrt(np.mean(values**2)))
+    return metrics
+
+
+class SimulationPart(NamedTuple):
+    """A method's error of v and w together, beyond two core radii where there are cores.
+
+    Attributes
+    ----------
+    method : str
+    fraction : float
+        Of the mean square error that is noise of the simulation, 1 at most.
+    place : str
+        `OUTSIDE_CORES` or nothing.
+    """
+
+    method: str
+    fraction: float
+    place: str
+
+    def exceeds(self, allowed: float) -> bool:
+        """Whether the simulation's part is more than ``allowed`` times that of all else."""
+        return self.fraction > allowed * (1 - self.fraction)
+
+
+def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> list[SimulationPart]:
+    """Of the most complete images, by every method with known errors.
+
+    Parameters
+    ----------
+    metrics : mapping of str to float
+        Of a run, with those of `simulation_metrics`; empty without them.
+    """
+    place = far_from_cores(metrics, "true_wind.", "rms_")
+    found = []
+    for source in reversed(RENDERED):
+        for method in methods:
+            noise, error = (
+                [metrics.get(wind_key(source, method, f"{place}{name}_{c}")) for c in "vw"]
+                for name in ("monte_carlo", "rmse")
+            )
+            if None not in noise and None not in error and any(error):
+                part = sum(x**2 for x in noise) / sum(x**2 for x in error)
+                found.append(SimulationPart(str(method), min(part, 1.0), place))
+        if found:
+            break
+    return found
