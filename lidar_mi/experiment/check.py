@@ -37,7 +37,12 @@ LEAST_SHOWN = 0.5
 
 
 def sections(
-    asked: Experiment, beside: str | Path = ".", notice: Notice = silent, *, timed: bool = False
+    asked: Experiment,
+    beside: str | Path = ".",
+    notice: Notice = silent,
+    *,
+    timed: bool = False,
+    sampled: bool = False,
 ) -> Iterator[Section]:
     """Titled tables of an experiment's instruments and the observed air; nothing is written.
 
@@ -49,8 +54,10 @@ def sections(
     notice : callable
         Called with the name of the running step.
     timed : bool
-        With the time of the run and, with a detector, the number of Monte Carlo samples per beam
-        beside its noise: this takes probes of some seconds.
+        With the time of the run, which takes a probe of about a second.
+    sampled : bool
+        Say of Monte Carlo samples, where there is a detector, how many are chosen and what their
+        noise is beside its own, which takes an image of few samples.
 
     Raises
     ------
@@ -62,7 +69,7 @@ def sections(
     preparation, ahead = time.process_time() - start, prepared.results
     chosen: Samples | None = None
     if asked.wake:
-        if timed:
+        if sampled:
             needed = [ahead[name] for name in ("truth", "plans", "air", "flows")]
             chosen = chosen_samples(asked, *needed, log=Log(notice))
         yield from _backscatter(asked, ahead["truth"], ahead["plans"][0], ahead["air"], chosen)

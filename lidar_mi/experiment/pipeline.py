@@ -113,7 +113,6 @@ BEHIND_IMAGES = ("name", "lidar.pulse_energy", "detector", "retrieval", "doppler
 """What is used only after the backscatter lidar's images, which are per emitted energy."""
 
 
-
 def needed_by_samples(experiment: Experiment) -> tuple[str, ...]:
     """Keys that determine how many samples images have, where that is chosen by the noise."""
     if experiment.render.samples_per_beam != "auto":

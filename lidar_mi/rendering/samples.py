@@ -61,9 +61,7 @@ def noise_ratio(scan: xr.Dataset) -> np.ndarray:
         scan[name].transpose("gate", "z", "y").values.astype(float) ** 2
         for name in ("S0_stderr", "S0_noise_std")
     )
-    return np.divide(
-        simulated, detected, out=np.full(simulated.shape, np.nan), where=detected > 0
-    )
+    return np.divide(simulated, detected, out=np.full(simulated.shape, np.nan), where=detected > 0)
 
 
 def monte_carlo_fraction(scan: xr.Dataset) -> float:

@@ -1,6 +1,8 @@
 """Which part of the wind's error is noise of the simulation, and not the lidar's."""
 
+import math
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -67,6 +69,35 @@ class SimulationPart(NamedTuple):
         return self.fraction > allowed * (1 - self.fraction)
 
 
+def largest_parts(metrics: Mapping[str, xr.DataArray]) -> xr.DataArray | None:
+    """Largest part of the simulation in any method's mean square error, at every point.
+
+    Parameters
+    ----------
+    metrics : mapping of str to xr.DataArray
+        Of a campaign. Points without `simulation_metrics`, at which the part is as small as asked
+        for, are NaN.
+
+    Returns
+    -------
+    xr.DataArray or None
+        1 at most. None: no point has any.
+    """
+    parts: list[xr.DataArray] = []
+    for place, source in product((OUTSIDE_CORES, ""), RENDERED):
+        for key in metrics:
+            head, found, _ = key.partition(f".{place}monte_carlo_v")
+            if found and head.startswith(f"{source}.") and key == head + found:
+                both = [[f"{head}.{place}{n}_{c}" for c in "vw"] for n in ("monte_carlo", "rmse")]
+                noise, error = ([metrics[k] ** 2 for k in keys] for keys in both)
+                parts.append((noise[0] + noise[1]) / (error[0] + error[1]))
+        if parts:
+            break
+    if not parts:
+        return None
+    return xr.concat(parts, "part", coords="minimal", compat="override").max("part").clip(max=1.0)
+
+
 def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> list[SimulationPart]:
     """Of the most complete images, by every method with known errors.
 
@@ -80,12 +111,14 @@ def simulation_parts(metrics: Mapping[str, float], methods: Sequence[str]) -> li
     for source in reversed(RENDERED):
         for method in methods:
             noise, error = (
-                [metrics.get(wind_key(source, method, f"{place}{name}_{c}")) for c in "vw"]
+                sum(
+                    metrics.get(wind_key(source, method, f"{place}{name}_{c}"), math.nan) ** 2
+                    for c in "vw"
+                )
                 for name in ("monte_carlo", "rmse")
             )
-            if None not in noise and None not in error and any(error):
-                part = sum(x**2 for x in noise) / sum(x**2 for x in error)
-                found.append(SimulationPart(str(method), min(part, 1.0), place))
+            if error > 0 and noise >= 0:
+                found.append(SimulationPart(str(method), min(noise / error, 1.0), place))
         if found:
             break
     return found

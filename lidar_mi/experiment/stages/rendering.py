@@ -9,12 +9,7 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.forecast import (
-    check_brightness,
-    check_size,
-    check_states,
-    least_samples,
-)
+from lidar_mi.experiment.forecast import check_brightness, check_size, check_states, least_samples
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Keeper
@@ -29,12 +24,7 @@ from lidar_mi.instrument.speckle import speckle_modes
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
-from lidar_mi.rendering.samples import (
-    Samples,
-    choose_samples,
-    monte_carlo_fraction,
-    pilot_samples,
-)
+from lidar_mi.rendering.samples import Samples, choose_samples, monte_carlo_fraction, pilot_samples
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
 
@@ -239,7 +229,9 @@ def chosen_samples(
     log.bar("choosing the number of samples", None)
     samples = pilot_samples(experiment.render, len(plan.y) * len(plan.z), plan.gate_count)
     seed = experiment.seed + PILOT_SEED
-    asked = with_samples(experiment, samples)
+    # noise is that of air at the scan's reference time, which need not be moved for it
+    frozen = experiment.scan.model_copy(update={"air": "frozen"})
+    asked = with_samples(experiment.model_copy(update={"scan": frozen}), samples)
     (pilot,) = _rendered(asked, truth, plans, air, flows, [0], log, seed)
     pulses = experiment.scan.pulses_per_beam
     pilot = noisy_scan(pilot, experiment.lidar, detector, [seed, 0, 1], plan, pulses)
@@ -257,8 +249,8 @@ def with_samples(experiment: Experiment, number: int) -> Experiment:
 def samples_text(experiment: Experiment, chosen: Samples) -> str:
     """A number of samples, and what their noise is beside that of the detector."""
     text = (
-        f"{chosen.number} Monte Carlo samples per beam; their noise has {chosen.fraction:.2g} of "
-        f"the variance of the detector's (median {chosen.median:.2g}, 90 % of the beams below "
+        f"{chosen.number} Monte Carlo samples per beam, with {chosen.fraction:.2g} times the "
+        f"variance of the detector noise (median {chosen.median:.2g}, 90 % of the beams below "
         f"{chosen.upper:.2g})"
     )
     if chosen.reached:
