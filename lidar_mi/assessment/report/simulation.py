@@ -74,9 +74,10 @@ def simulation_remark(experiment, metrics: Mapping[str, float]) -> str:
     text = sentence[0].lower() + sentence[1:].removesuffix(".")
     samples, needed = metrics[_SAMPLES], _needed(experiment, metrics)
     if experiment.render.samples_per_beam == "auto" and experiment.detector:
-        times = f"; expected {needed / samples:.2g} times as much" if needed else ""
+        times = f"; expected {float(f'{needed / samples:.2g}'):g} times as many" if needed else ""
         return f"render.max_samples: {text}{times}"
-    expected = f"{needed:.2g} or more" if needed else "more"
+    # two digits of it are known
+    expected = f"{float(f'{needed:.2g}'):.0f} or more" if needed else "more"
     automatic = ", or auto" if experiment.detector else ""
     return f"render.samples_per_beam: {text}; expected {expected}{automatic}"
 

@@ -256,7 +256,7 @@ def samples_text(experiment: Experiment, chosen: Samples) -> str:
     if chosen.reached:
         return text
     asked = experiment.render.monte_carlo_fraction
-    return f"{text}; {asked:g} needs {chosen.needed:.2g}"
+    return f"{text}; {asked:g} needs {chosen.needed}"
 
 
 def batches_of(
