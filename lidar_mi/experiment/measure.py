@@ -19,7 +19,7 @@ from lidar_mi.assessment.metrics.sensor import (
     margin_metrics,
     vector_metrics,
 )
-from lidar_mi.assessment.metrics.simulation import simulation_metrics
+from lidar_mi.assessment.metrics.simulation import sample_metrics, simulation_metrics
 from lidar_mi.assessment.metrics.velocities import velocity_metrics
 from lidar_mi.assessment.metrics.volume import volume_metrics
 from lidar_mi.assessment.metrics.vortices import core_metrics, vortex_metrics
@@ -47,7 +47,7 @@ def measure(
         metrics |= _images(results)
     if "wind_volume" in results:
         metrics |= volume_metrics(results["wind_volume"], results["cores"])
-        metrics |= noise_metrics(results["scans"][0])
+        metrics |= noise_metrics(results["scans"][0]) | sample_metrics(results["detected"])
     if "pointing" in results:
         metrics |= pointing_metrics(results["pointing"])
     if "error_budget" in results:
@@ -74,6 +74,7 @@ def _images(results: Results) -> dict[str, float]:
         cross_flow_metrics(found, cores)
         | ({} if changes is None else simulation_metrics(changes, found, cores))
         | light_metrics(results["scans"][0])
+        | sample_metrics(results["detected"])
         | core_metrics(cores)
         | true_wind_metrics(results["truth"].wind.sel(place), cores)
         | (sweep_metrics(results["texture_sweep"]) if "texture_sweep" in results else {})

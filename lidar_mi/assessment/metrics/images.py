@@ -1,7 +1,5 @@
 """Metrics of a rendered scan: its Monte Carlo noise, multiple scattering, depolarisation."""
 
-import math
-
 import xarray as xr
 
 from lidar_mi.assessment.metrics.names import Source
@@ -9,21 +7,9 @@ from lidar_mi.instrument.products import linear_depolarization
 
 
 def noise_metrics(scan: xr.Dataset) -> dict[str, float]:
-    """Monte Carlo samples of a scan, and their noise.
-
-    ``mc_relative_error`` is their standard error over the signal, median over the pixels; behind a
-    detector ``monte_carlo_fraction`` is their variance over that of the detector's noise, see
-    `lidar_mi.rendering.samples.monte_carlo_fraction`.
-    """
+    """Monte Carlo standard error over signal, median over the pixels, ``mc_relative_error``."""
     lit = scan["S0"].where(scan["S0"] > 0)
-    metrics = {f"{Source.BACKSCATTER}.mc_relative_error": float((scan["S0_stderr"] / lit).median())}
-    if "samples_per_beam" in scan.attrs:
-        samples = int(scan.attrs["samples_per_beam"])
-        metrics[f"{Source.BACKSCATTER}.samples_per_beam"] = samples
-    fraction = scan.attrs.get("monte_carlo_fraction", math.nan)
-    if math.isfinite(fraction):
-        metrics[f"{Source.NOISY}.monte_carlo_fraction"] = float(fraction)
-    return metrics
+    return {f"{Source.BACKSCATTER}.mc_relative_error": float((scan["S0_stderr"] / lit).median())}
 
 
 def light_metrics(scan: xr.Dataset) -> dict[str, float]:

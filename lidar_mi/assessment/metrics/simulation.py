@@ -9,7 +9,30 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
-from lidar_mi.assessment.metrics.names import OUTSIDE_CORES, RENDERED, far_from_cores, wind_key
+from lidar_mi.assessment.metrics.names import (
+    OUTSIDE_CORES,
+    RENDERED,
+    Source,
+    far_from_cores,
+    wind_key,
+)
+
+
+def sample_metrics(scans: Sequence[xr.Dataset]) -> dict[str, float]:
+    """Monte Carlo samples of both scans, and their noise beside a detector's.
+
+    ``backscatter.samples_per_beam``; behind a detector ``backscatter_noisy.monte_carlo_fraction``,
+    their variance over that of its noise in the scan where that is larger, see
+    `lidar_mi.rendering.samples.monte_carlo_fraction`.
+    """
+    metrics: dict[str, float] = {}
+    if "samples_per_beam" in scans[0].attrs:
+        key = f"{Source.BACKSCATTER}.samples_per_beam"
+        metrics[key] = int(scans[0].attrs["samples_per_beam"])
+    fraction = max(scan.attrs.get("monte_carlo_fraction", math.inf) for scan in scans)
+    if math.isfinite(fraction):
+        metrics[f"{Source.NOISY}.monte_carlo_fraction"] = float(fraction)
+    return metrics
 
 
 def simulation_metrics(

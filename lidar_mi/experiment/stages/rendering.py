@@ -217,26 +217,28 @@ def chosen_samples(
     *,
     log: Log,
 ) -> Samples | None:
-    """Samples per beam of both scans, from a pilot of the first one; None without a detector.
+    """Samples per beam of both scans, from pilots of both; None without a detector.
 
-    Another pilot of the same experiment gives the same number. Where the experiment has a number,
-    it is that, with what its noise is.
+    The scan of more noise decides. Other pilots of the same experiment give the same number. Where
+    the experiment has a number, it is that, with what its noise is.
     """
-    detector, plan = experiment.detector, plans[0]
+    detector = experiment.detector
     if detector is None:
         return None
     use_variant(experiment.render.variant)
     log.bar("choosing the number of samples", None)
-    samples = pilot_samples(experiment.render, len(plan.y) * len(plan.z), plan.gate_count)
-    seed = experiment.seed + PILOT_SEED
+    beams, gates = len(plans[0].y) * len(plans[0].z), plans[0].gate_count
+    samples, seed = pilot_samples(experiment.render, beams, gates), experiment.seed + PILOT_SEED
     # noise is that of air at the scan's reference time, which need not be moved for it
     frozen = experiment.scan.model_copy(update={"air": "frozen"})
     asked = with_samples(experiment.model_copy(update={"scan": frozen}), samples)
-    (pilot,) = _rendered(asked, truth, plans, air, flows, [0], log, seed)
-    pulses = experiment.scan.pulses_per_beam
-    pilot = noisy_scan(pilot, experiment.lidar, detector, [seed, 0, 1], plan, pulses)
-    least = least_samples(experiment, truth.extinction, plan)
-    return choose_samples(pilot, samples, experiment.render, least)
+    pilots = _rendered(asked, truth, plans, air, flows, range(len(plans)), log, seed)
+    pulses, found = experiment.scan.pulses_per_beam, []
+    for plan, pilot in zip(plans, pilots, strict=True):
+        seen = noisy_scan(pilot, experiment.lidar, detector, [seed, 0, 1], plan, pulses)
+        least = least_samples(experiment, truth.extinction, plan)
+        found.append(choose_samples(seen, samples, experiment.render, least))
+    return max(found, key=lambda one: (one.number, one.fraction))
 
 
 def with_samples(experiment: Experiment, number: int) -> Experiment:

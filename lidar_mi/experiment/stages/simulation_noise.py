@@ -41,7 +41,7 @@ def simulation_noise(
         where the noise has no more than ``render.monte_carlo_fraction`` of the detector's
         variance: neither has it then of the wind's.
     """
-    fraction = detected[0].attrs.get("monte_carlo_fraction", np.inf)
+    fraction = max(scan.attrs.get("monte_carlo_fraction", np.inf) for scan in detected)
     if fraction <= experiment.render.monte_carlo_fraction:
         return None
     log.bar("retrieving winds with more noise of the simulation", None)
