@@ -101,14 +101,12 @@ def choose_samples(
     of_one = samples * _of_the_worst_gate(noise_ratio(pilot))
     mean = float(of_one.mean())
     most = settings.most_samples(beams, gates)
+    if not math.isfinite(mean):  # a detector without noise: no number is enough
+        return Samples(most, 2**31 - 1, math.inf, math.inf, math.inf)
     # as much as the pilot leaves open, which beams of independent samples say
     open_ = 2 * float(of_one.std()) / math.sqrt(of_one.size)
     wanted = (mean + open_) / settings.monte_carlo_fraction
-    if math.isfinite(wanted):
-        needed = max(_rounded_up(wanted / gates), LEAST) * gates
-        needed = max(needed, -(-least // gates) * gates)
-    else:
-        needed = 2**31 - 1
+    needed = max(_rounded_up(wanted / gates), LEAST, -(-least // gates)) * gates
     number = min(needed, most) if settings.samples_per_beam == "auto" else most
     spread = np.quantile(of_one, (0.5, 0.9))
     return Samples(number, needed, *(float(x) / number for x in (mean, *spread)))
