@@ -281,7 +281,7 @@ def _checked(points: Points, notice: Notice) -> list[Row]:
 def _row(experiment: Experiment, beside: Path) -> Row:
     record = new_record(experiment, beside)
     stages = storing_stages(experiment)
-    images = [made_by(record, stage.indifferent_to or ()) for stage in stages]
+    images = [made_by(record, stage.indifferent(experiment) or ()) for stage in stages]
     return Row(made_by(record)[:_SHORT], tuple(images))
 
 

@@ -275,9 +275,9 @@ def _signatures(experiment: Experiment, beside: Path) -> dict[str, str]:
     """Signatures of the stages computed ahead that runs can share."""
     record = resumable_folder.new_record(experiment, beside)
     return {
-        stage.name: resumable_folder.made_by(record, stage.indifferent_to)
+        stage.name: resumable_folder.made_by(record, indifferent)
         for stage in stages_of(experiment)
-        if stage.ahead and stage.indifferent_to is not None
+        if stage.ahead and (indifferent := stage.indifferent(experiment)) is not None
     }
 
 

@@ -30,7 +30,7 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
             for section in (
                 flight_sections(one.read_from(path.parent), notice, timed=True)
                 if one.encounter
-                else sections(one, path.parent, notice, timed=True)
+                else sections(one, path.parent, notice, timed=True, sampled=True)
             )
         ]
     for title, rows in found:

@@ -84,7 +84,8 @@ def sections(
     warnings = geometry(experiment)
     encounter, gates = encounter_of(experiment), gates_of(experiment)
     path = encounter.path
-    yield from of_a_run.sections(_first_slab(experiment), experiment.folder, notice)
+    first = _first_slab(experiment)
+    yield from of_a_run.sections(first, experiment.folder, notice, sampled=timed)
     ahead = (gates.look_ahead - gates.stride) / path.speed - encounter.control.latency
     rows = [
         ("aircraft", encounter.aircraft.model),
@@ -102,7 +103,6 @@ def sections(
     yield f"{experiment.name}: flight into the wake", rows
     if timed:
         notice("timing a few samples and a retrieval", None)
-        first = _first_slab(experiment)
         steers = encounter.control.mode == "feedforward"
         scans = duration(encounter) * encounter.rate if steers else 0.0
         seconds = flight_seconds(first, prepare(first).results, scans)

@@ -1,6 +1,7 @@
 """The lidar as an object that is stepped: light, detector, and what is estimated from them."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +22,15 @@ from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.reading import load_experiment
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.rendering import environment_extinction
+from lidar_mi.experiment.stages.rendering import PILOT_SEED, environment_extinction
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector_noise import noisy_scan
 from lidar_mi.instrument.products import with_products
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.backscatter import ScanRenderer
 from lidar_mi.rendering.phase import molecules, scatterer
+from lidar_mi.rendering.samples import choose_samples, pilot_samples
+from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.velocimetry.common_grid import resample
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
@@ -236,24 +239,56 @@ class VirtualLidar:
         air = self.air.at_scan(number, (pose.y, pose.z), ahead, turned)
         use_variant(experiment.render.variant)
         if self._renderer is None:
-            lidar, scattering = experiment.lidar, experiment.scattering
-            self._renderer = ScanRenderer(
-                air,
-                plan,
-                lidar,
-                environment_extinction(experiment),
-                *scatterer(scattering, experiment.folder, lidar.wavelength),
-                experiment.render,
-                molecules(self.air.molecules, lidar.wavelength, scattering.band),
-            )
+            self._renderer = self._renderer_of(air, plan, self._settings)
         # seeds as of the images of an experiment
         scan = with_products(self._renderer.render(air, plan, experiment.seed + (number << 16)))
-        if experiment.detector:
-            pulses = experiment.scan.pulses_per_beam
-            seed = [experiment.seed, number, 1]
-            scan = noisy_scan(scan, experiment.lidar, experiment.detector, seed, plan, pulses)
+        scan = self._detected(scan, plan, number)
         near, far = (self._image(scan, plan, gate, pose) for gate in (0, -1))
         return Scan(near[0], *far)
+
+    def _renderer_of(
+        self, air: xr.DataArray, plan: ScanPlan, settings: RenderSettings
+    ) -> ScanRenderer:
+        experiment = self.experiment
+        lidar, scattering = experiment.lidar, experiment.scattering
+        return ScanRenderer(
+            air,
+            plan,
+            lidar,
+            environment_extinction(experiment),
+            *scatterer(scattering, experiment.folder, lidar.wavelength),
+            settings,
+            molecules(self.air.molecules, lidar.wavelength, scattering.band),
+        )
+
+    def _detected(self, scan: xr.Dataset, plan: ScanPlan, number: int) -> xr.Dataset:
+        """A scan with the detector's noise, if there is one."""
+        experiment = self.experiment
+        if experiment.detector is None:
+            return scan
+        pulses, seed = experiment.scan.pulses_per_beam, [experiment.seed, number, 1]
+        return noisy_scan(scan, experiment.lidar, experiment.detector, seed, plan, pulses)
+
+    @cached_property
+    def _settings(self) -> RenderSettings:
+        """With the number of samples of all scans: as given, or by a pilot of the first one.
+
+        The pilot is of the nominal pose, so that images do not depend on the first pose.
+        """
+        experiment, settings = self.experiment, self.experiment.render
+        if settings.samples_per_beam != "auto":
+            return settings
+        plan = self.gates.plan()
+        number = settings.without_detector(plan.gate_count)
+        if experiment.detector:
+            samples = pilot_samples(settings, len(plan.y) * len(plan.z), plan.gate_count)
+            asked = settings.model_copy(update={"samples_per_beam": samples})
+            air = self.air.at_scan(0, (0.0, 0.0))
+            pilot = self._renderer_of(air, plan, asked).render(
+                air, plan, experiment.seed + PILOT_SEED
+            )
+            number = choose_samples(self._detected(pilot, plan, 0), samples, settings).number
+        return settings.model_copy(update={"samples_per_beam": number})
 
     def _image(
         self, scan: xr.Dataset, plan: ScanPlan, gate: int, pose: AircraftPose

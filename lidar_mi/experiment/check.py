@@ -15,9 +15,10 @@ from lidar_mi.experiment.cost import cost
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.forecast import forecast
 from lidar_mi.experiment.light_budget import light_budget
-from lidar_mi.experiment.log import Notice, silent
+from lidar_mi.experiment.log import Log, Notice, silent
 from lidar_mi.experiment.remarks import window_reach
 from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text, with_samples
 from lidar_mi.experiment.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth import Truth
 from lidar_mi.experiment.truth_in_time import values_of_states
@@ -27,6 +28,7 @@ from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.scan_timing import Schedule
 from lidar_mi.rendering.memory import ceiling
 from lidar_mi.rendering.phase import Scatterer
+from lidar_mi.rendering.samples import Samples
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.units import shown
 
@@ -35,7 +37,12 @@ LEAST_SHOWN = 0.5
 
 
 def sections(
-    asked: Experiment, beside: str | Path = ".", notice: Notice = silent, *, timed: bool = False
+    asked: Experiment,
+    beside: str | Path = ".",
+    notice: Notice = silent,
+    *,
+    timed: bool = False,
+    sampled: bool = False,
 ) -> Iterator[Section]:
     """Titled tables of an experiment's instruments and the observed air; nothing is written.
 
@@ -48,6 +55,9 @@ def sections(
         Called with the name of the running step.
     timed : bool
         With the time of the run, which takes a probe of about a second.
+    sampled : bool
+        Say of Monte Carlo samples, where there is a detector, how many are chosen and what their
+        noise is beside its own, which takes an image of few samples.
 
     Raises
     ------
@@ -57,8 +67,12 @@ def sections(
     start = time.process_time()
     prepared = experiment.prepare(asked, beside, notice)
     preparation, ahead = time.process_time() - start, prepared.results
+    chosen: Samples | None = None
     if asked.wake:
-        yield from _backscatter(asked, ahead["truth"], ahead["plans"][0], ahead["air"])
+        if sampled:
+            needed = [ahead[name] for name in ("truth", "plans", "air", "flows")]
+            chosen = chosen_samples(asked, *needed, log=Log(notice))
+        yield from _backscatter(asked, ahead["truth"], ahead["plans"][0], ahead["air"], chosen)
         if asked.scan.timing:
             schedule = scan_schedule(asked, ahead["plans"][0], beside)
             yield "scan of the backscatter lidar", _timing(asked, schedule)
@@ -70,13 +84,14 @@ def sections(
             yield "scan of the Doppler lidar", _timing(asked, lines_schedule(asked, beside))
     if timed:
         notice("timing a few samples and a retrieval", None)
-        yield "cost of the run, to a factor of 2", _cost(asked, ahead, preparation)
+        whole = with_samples(asked, chosen.number) if chosen else asked
+        yield "cost of the run, to a factor of 2", _cost(whole, ahead, preparation)
     if prepared.warnings:
         yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
 
 
 def _backscatter(
-    asked: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer
+    asked: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer, chosen: Samples | None
 ) -> Iterator[Section]:
     wind, extinction = truth.wind, truth.extinction[0]
     rows = [(axis, _span(wind[axis].values, "m")) for axis in ("y", "z")]
@@ -102,16 +117,23 @@ def _backscatter(
         ("beam's 1/e^2 radius there", f"{float(lidar.radius_at(plan.centre)):.3g} m"),
         ("gates", f"{scan.gate_count}, from {plan.gate_start:g} to {plan.gate_stop:g} m"),
         ("warning time", _warning(plan.gate_start, platform.speed)),
-        (
-            "samples per beam",
-            f"{asked.render.samples_per_beam}, orders 1 to {asked.render.max_order}",
-        ),
+        ("samples per beam", _samples(asked, chosen)),
         ("time between the images", f"{platform.dt:g} s"),
         *_light(asked, truth, plan, air),
     ]
     if not asked.volume:
         rows += _displacements(asked, wind, plan)
     yield "backscatter lidar", rows
+
+
+def _samples(asked: Experiment, chosen: Samples | None) -> str:
+    """Monte Carlo samples, and the variance of their noise over that of the detector's."""
+    number: object = asked.render.samples_per_beam
+    if chosen:
+        number = samples_text(asked, chosen)
+    elif asked.detector is None:
+        number = asked.render.without_detector(asked.scan.gate_count)
+    return f"{number}, orders 1 to {asked.render.max_order}"
 
 
 def _light(

@@ -16,7 +16,7 @@ import xarray as xr
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.pipeline import has_error_budget, has_vortices
 from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.rendering import IMAGES, render_images
+from lidar_mi.experiment.stages.rendering import IMAGES, chosen_samples, render_images, with_samples
 from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMethod
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 
@@ -146,17 +146,23 @@ def probe() -> None:
 def render_seconds(experiment: Experiment, ahead: Mapping[str, Any]) -> float:
     """Time of one image, from the first one with few samples and with four times as many.
 
-    Their difference has no part of what is done once, such as compiling.
+    Their difference has no part of what is done once, such as compiling. Where the number of
+    samples is to be chosen, with the time of doing so.
     """
     plan, render = ahead["plans"][0], experiment.render
+    needed = [ahead[name] for name in ("truth", "plans", "air", "flows")]
+    if render.samples_per_beam == "auto":
+        begin = time.process_time()
+        chosen = chosen_samples(experiment, *needed, log=Log())
+        number = chosen.number if chosen else render.without_detector(plan.gate_count)
+        choosing = time.process_time() - begin
+        return choosing / 2 + render_seconds(with_samples(experiment, number), ahead)
     beams, least = plan.y.size * plan.z.size, 2 * experiment.scan.gate_count
     few = max(2, least, round(_SAMPLES / 4 / (beams * render.max_order)))
     whole = max(render.samples_per_beam, least)
-    needed = [ahead[name] for name in ("truth", "plans", "air", "flows")]
 
     def timed(samples: int) -> float:
-        settings = render.model_copy(update={"samples_per_beam": samples})
-        asked = experiment.model_copy(update={"render": settings})
+        asked = with_samples(experiment, samples)
         start = time.process_time()
         for _ in render_images(asked, *needed, log=Log(), missing=IMAGES[:1]):
             pass

@@ -203,9 +203,12 @@ def _run_folder(folder: Path) -> Iterator[Section]:
 
     record = read_record(folder)
     experiment = record["experiment"]
+    asked = dict(_asked_first(experiment))
+    if asked.get("render.samples_per_beam") == "auto" and "samples_per_beam" in record:
+        asked["render.samples_per_beam"] = f"auto: {record['samples_per_beam']}"
     yield (
         f"{folder}: experiment {experiment.get('name')}",
-        [(key, setting(value)) for key, value in _asked_first(experiment)],
+        [(key, setting(value)) for key, value in asked.items()],
     )
     yield "versions", [(name, str(number)) for name, number in record["versions"].items()]
     yield _files(folder)

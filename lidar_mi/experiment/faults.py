@@ -68,7 +68,7 @@ def first_fault(error: ValidationError, model: type[BaseModel]) -> str:
     elif fault["type"] == "too_short":
         expected = f"{fault['ctx']['min_length']} or more"
     else:
-        expected = message.removeprefix("Input should be ")
+        expected = word + message.removeprefix("Input should be ")
     return f"{field}: {shown} is not allowed; expected {expected}"
 
 

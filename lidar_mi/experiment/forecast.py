@@ -56,7 +56,7 @@ def forecast(experiment: Experiment, beams: int, in_states: int = 0) -> float:
     if not beams:
         return PROGRAM + rings
     render, gates = experiment.render, experiment.scan.gate_count
-    samples = beams * max(render.samples_per_beam, 2 * gates)
+    samples = beams * max(most_samples(experiment, beams), 2 * gates)
     at_once = samples_at_once(render.samples_per_pass, render.memory)
     images = _per_beam(experiment, gates) * beams + PER_SAMPLE * min(samples, at_once)
     return PROGRAM + PER_STATE * in_states + images + rings
@@ -179,7 +179,6 @@ def check_brightness(
     length, distance = float(np.median(plan.gate_length())), float(np.median(plan.ranges()[0]))
     around = mapping.background + mapping.molecules
     arriving = math.exp(-min(around * plan.gate_start, 300))
-    seen = overlap(lidar, distance)
     light = lidar.aperture_area / distance**2 * albedo * inside * length / (4 * math.pi)
     if light * arriving**2 < SINGLE:
         raise InputError(
@@ -187,22 +186,52 @@ def check_brightness(
             f"{distance:g} m is not allowed; expected that at least {SINGLE:g} of the light comes "
             f"back, not {light * arriving**2:.1g}"
         )
-    if render.estimator == "analog":
-        # samples contribute if they collide in the gate
-        key, value, fraction = "render.estimator", "analog", seen * inside * length * arriving
-    else:
-        key, value, fraction = (
-            "lidar.fov_half",
-            shown(lidar.fov_half, "mrad"),
-            seen / plan.gate_count,
-        )
-    bring = fraction * render.samples_per_beam
-    if bring < CONTRIBUTIONS and (seen < 0.9 or render.estimator == "analog"):
+    beams = len(plan.y) * len(plan.z)
+    samples = most_samples(experiment, beams)
+    least = least_samples(experiment, extinction, plan)
+    if samples < least:
+        key, value = "lidar.fov_half", shown(lidar.fov_half, "mrad")
+        if render.estimator == "analog":
+            key, value = "render.estimator", "analog"
+        chosen = render.samples_per_beam == "auto" and experiment.detector
+        asked, needed = ("max_samples", least * beams) if chosen else ("samples_per_beam", least)
         raise InputError(
-            f"{key}: {value} is not allowed with {render.samples_per_beam} samples per beam, of "
-            f"which {bring:.2g} would bring light to a pixel; expected "
-            f"render.samples_per_beam of {math.ceil(CONTRIBUTIONS / fraction):.3g} or more"
+            f"{key}: {value} is not allowed with {samples} samples per beam, of "
+            f"which {CONTRIBUTIONS * samples / least:.2g} would bring light to a pixel; expected "
+            f"render.{asked} of {needed:.3g} or more"
         )
+
+
+def most_samples(experiment: Experiment, beams: int) -> int:
+    """Samples per beam that an image may have, where their number is chosen; else their number."""
+    render, gates = experiment.render, experiment.scan.gate_count
+    if experiment.detector is None:
+        return render.without_detector(gates)
+    return render.most_samples(beams, gates)
+
+
+def least_samples(
+    experiment: Experiment, extinction: Sequence[xr.DataArray], plan: ScanPlan
+) -> int:
+    """Samples per beam of which `CONTRIBUTIONS` bring light to a pixel of the median extinction.
+
+    2 where nearly all do.
+    """
+    lidar, mapping = experiment.lidar, experiment.wake.extinction
+    distance = float(np.median(plan.ranges()[0]))
+    seen = overlap(lidar, distance)
+    if experiment.render.estimator == "analog":
+        # samples contribute if they collide in the gate
+        inside = float(np.median([np.median(field.values) for field in extinction]))
+        around = mapping.background + mapping.molecules
+        arriving = math.exp(-min(around * plan.gate_start, 300))
+        fraction = seen * inside * float(np.median(plan.gate_length())) * arriving
+    else:
+        fraction = seen / plan.gate_count
+        if seen >= 0.9:
+            return 2
+    # their number is counted in 31 bits
+    return math.ceil(min(CONTRIBUTIONS / max(fraction, 1e-300), 2.0**31))
 
 
 def overlap(lidar: BackscatterLidar, distance: float) -> float:

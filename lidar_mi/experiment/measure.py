@@ -19,6 +19,7 @@ from lidar_mi.assessment.metrics.sensor import (
     margin_metrics,
     vector_metrics,
 )
+from lidar_mi.assessment.metrics.simulation import sample_metrics, simulation_metrics
 from lidar_mi.assessment.metrics.velocities import velocity_metrics
 from lidar_mi.assessment.metrics.volume import volume_metrics
 from lidar_mi.assessment.metrics.vortices import core_metrics, vortex_metrics
@@ -46,7 +47,7 @@ def measure(
         metrics |= _images(results)
     if "wind_volume" in results:
         metrics |= volume_metrics(results["wind_volume"], results["cores"])
-        metrics |= noise_metrics(results["scans"][0])
+        metrics |= noise_metrics(results["scans"][0]) | sample_metrics(results["detected"])
     if "pointing" in results:
         metrics |= pointing_metrics(results["pointing"])
     if "error_budget" in results:
@@ -68,14 +69,16 @@ def measure(
 def _images(results: Results) -> dict[str, float]:
     found, cores = results["wind"], results["cores"]
     place = {axis: slice(found[axis].min(), found[axis].max()) for axis in ("y", "z")}
-    noise = results.get("detector_noise", {})
+    noise, changes = results.get("detector_noise", {}), results.get("simulation_noise")
     true = results["truth"].wind.sel(place)
     if 0 in true.sizes.values():
         # a single row or column of vectors, between nodes
         true = results["truth"].wind.sel(y=found["y"], z=found["z"], method="nearest")
     return (
         cross_flow_metrics(found, cores)
+        | ({} if changes is None else simulation_metrics(changes, found, cores))
         | light_metrics(results["scans"][0])
+        | sample_metrics(results["detected"])
         | core_metrics(cores)
         | true_wind_metrics(true, cores)
         | (sweep_metrics(results["texture_sweep"]) if "texture_sweep" in results else {})

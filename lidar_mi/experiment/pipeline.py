@@ -40,6 +40,7 @@ from lidar_mi.experiment.stages.ring_images import (
 from lidar_mi.experiment.stages.ring_velocities import line_of_sight_winds, ring_budget
 from lidar_mi.experiment.stages.sensor import combined_wind, doppler_alone, limits_of_u
 from lidar_mi.experiment.stages.sensor_cost import lidar_costs, pulses_needed
+from lidar_mi.experiment.stages.simulation_noise import simulation_noise
 from lidar_mi.experiment.stages.texture import texture_sweep
 from lidar_mi.experiment.stages.volume import check_volume, scan_volumes, volume_winds
 from lidar_mi.experiment.stages.vortices import combined_vectors, fit_pairs, image_vectors
@@ -110,6 +111,14 @@ def _quiet(function: Callable[..., Any]) -> Callable[..., Any]:
 
 BEHIND_IMAGES = ("name", "lidar.pulse_energy", "detector", "retrieval", "doppler", "sensor")
 """What is used only after the backscatter lidar's images, which are per emitted energy."""
+
+
+def needed_by_samples(experiment: Experiment) -> tuple[str, ...]:
+    """Keys that determine how many samples images have, where that is chosen by the noise."""
+    if experiment.render.samples_per_beam != "auto":
+        return ()
+    return ("detector", "lidar.pulse_energy") if experiment.detector else ("detector",)
+
 
 BEHIND_RING_IMAGES = (
     "name",
@@ -187,6 +196,7 @@ STAGES = (
         remarks=image_remarks,
         parts=lambda experiment: IMAGES,
         indifferent_to=BEHIND_IMAGES,
+        needed_by=needed_by_samples,
     ),
     Stage("detected", _quiet(detect_images), ("images", "plans"), has_wake),
     Stage("scans", _quiet(gridded_scans), ("detected",), has_wake),
@@ -196,6 +206,13 @@ STAGES = (
         ("truth", "plans", "scans"),
         has_images,
         check=check_windows,
+        timing="retrieve",
+    ),
+    Stage(
+        "simulation_noise",
+        simulation_noise,
+        ("detected", "plans", "scans", "wind"),
+        has_images,
         timing="retrieve",
     ),
     Stage(

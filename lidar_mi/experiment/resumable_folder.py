@@ -13,7 +13,7 @@ from typing import Any
 import xarray as xr
 
 from lidar_mi import __version__
-from lidar_mi.assessment.metrics.names import current_name
+from lidar_mi.assessment.metrics.names import Source, current_name
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import log, reading
 from lidar_mi.experiment.image_store import BATCHES, MADE_BY, ImageStore
@@ -235,6 +235,9 @@ def write_verdict(
     text = to_json(metrics)
     (folder / METRICS).unlink(missing_ok=True)
     checked = {**record, "metrics": hashlib.sha256(text.encode()).hexdigest()}
+    samples = metrics.get(f"{Source.BACKSCATTER}.samples_per_beam")
+    if samples is not None:  # which the experiment may have left to be chosen
+        checked["samples_per_beam"] = int(samples)
     write_text(folder / RECORD, to_yaml(checked))
     write_text(folder / REPORT, page)
     if answer:

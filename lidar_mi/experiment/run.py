@@ -14,6 +14,7 @@ from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.assessment.metrics.names import timing_key
 from lidar_mi.assessment.report.page import page
+from lidar_mi.assessment.report.simulation import simulation_remark
 from lidar_mi.errors import InputError, is_interrupt
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.measure import measure
@@ -196,6 +197,9 @@ def finish(prepared: Run, kept: Keeper | None = None, *, illustrated: bool = Tru
         seconds = sum(scan.attrs["render_seconds"] for scan in prepared.scans)
         prepared.seconds["render"] = seconds
     prepared.metrics = measure(prepared.experiment, prepared.results, prepared.seconds)
+    remark = simulation_remark(prepared.experiment, prepared.metrics)
+    if remark:
+        prepared.log.remark(remark)
 
 
 def _carry_out(stage: Stage, run: Run, kept: Keeper | None = None) -> None:

@@ -45,6 +45,9 @@ class Stage:
     indifferent_to : tuple of str, optional
         Dotted keys of the experiment, sections or values, that have no influence on the result.
         Runs that differ in these alone share it. None: it is not shared.
+    needed_by : callable, optional
+        ``needed_by(experiment)``, those of ``indifferent_to`` that have an influence after all,
+        with the experiment's other settings; see `indifferent`.
     illustrates : bool
         Only the report needs it.
     """
@@ -59,7 +62,15 @@ class Stage:
     parts: Callable[[Experiment], Sequence[str]] | None = None
     timing: str | None = None
     indifferent_to: tuple[str, ...] | None = None
+    needed_by: Callable[[Experiment], Sequence[str]] | None = None
     illustrates: bool = False
+
+    def indifferent(self, experiment: Experiment) -> tuple[str, ...] | None:
+        """Keys of an experiment that have no influence on the result; None: it is not shared."""
+        if self.indifferent_to is None or self.needed_by is None:
+            return self.indifferent_to
+        needed = self.needed_by(experiment)
+        return tuple(key for key in self.indifferent_to if key not in needed)
 
 
 class Keeper(Protocol):

@@ -224,7 +224,11 @@ def without_noise(scan: xr.Dataset) -> xr.Dataset:
     """A scan without the variables of `noisy_scan`."""
     noise = ("S0_noisy", "S0_noise_std", "Y_noisy", "Y_noise_std")
     kept = scan.drop_vars(noise, errors="ignore")
-    kept.attrs = {k: value for k, value in scan.attrs.items() if not k.startswith("detector_")}
+    kept.attrs = {
+        k: value
+        for k, value in scan.attrs.items()
+        if not k.startswith("detector_") and k != "monte_carlo_fraction"
+    }
     return kept
 
 

@@ -227,6 +227,7 @@ def scene_dict(
     molecules: Molecules | None = None,
 ) -> dict:
     """The Mitsuba scene of one scan as a dictionary for ``mi.load_dict``."""
+    samples = settings.without_detector(plan.gate_count)
     low, high = _box(extinction)
     place = mi.ScalarTransform4f().translate(low).scale(high - low)
 
@@ -282,7 +283,7 @@ def scene_dict(
                 "pixel_format": "luminance",
                 "rfilter": {"type": "box"},
             },
-            "sampler": {"type": "independent", "sample_count": settings.samples_per_beam},
+            "sampler": {"type": "independent", "sample_count": samples},
             "medium": {"type": "ref", "id": "environment"},
         },
         "slab": {
@@ -385,7 +386,7 @@ def _as_dataset(image, names, plan, lidar, environment, settings, seed) -> xr.Da
         "variant": settings.variant,
         "polarized": int(mi.is_polarized),
         "seed": int(seed),
-        "samples_per_beam": settings.samples_per_beam,
+        "samples_per_beam": settings.without_detector(plan.gate_count),
         "max_order": settings.max_order,
         "estimator": settings.estimator,
         "gate_kind": plan.gate_kind,

@@ -1,11 +1,12 @@
 """Settings of the light transport."""
 
+import math
 from typing import Annotated, Literal, get_args
 
 from pydantic import Field
 
 from lidar_mi.description import Description
-from lidar_mi.units import Length, Memory, Within
+from lidar_mi.units import Length, Memory, Number, Within
 
 Variant = Literal[
     "llvm_ad_mono_polarized",
@@ -25,13 +26,24 @@ VARIANTS: tuple[str, ...] = get_args(Variant)
 _CEILING = Within(1e8, 1e15, "from a small scene to the largest machine")
 
 
+SAMPLES_PER_GATE = 64
+"""Monte Carlo samples of a beam and gate where no detector has noise to compare theirs with."""
+
+
 class RenderSettings(Description):
     """Settings of the light transport."""
 
     variant: Variant = "llvm_ad_mono_polarized"
-    samples_per_beam: Annotated[
-        int, Within(2, 2**31 - 1, "a standard error needs two; counted in 31 bits")
-    ] = 64
+    samples_per_beam: (
+        Literal["auto"]
+        | Annotated[int, Within(2, 2**31 - 1, "a standard error needs two; counted in 31 bits")]
+    ) = Field("auto", description="by the detector's noise; or so many")
+    monte_carlo_fraction: Annotated[
+        Number, Within(1e-4, 100, "from a hundredth of the detector's noise to ten times it")
+    ] = Field(0.1, description="variance of the simulation's noise over that of the detector's")
+    max_samples: Annotated[Number, Within(1e3, 1e15, "from a small image to a year of them")] = (
+        Field(3e7, description="of all beams of an image, where their number is chosen")
+    )
     max_order: Annotated[int, Within(1, 64, "higher orders are below single precision")] = Field(
         4, description="scattering orders; 1 = single scattering"
     )
@@ -42,6 +54,19 @@ class RenderSettings(Description):
     memory: Annotated[Memory, _CEILING] | None = Field(
         None, description="that a run may take; default: half of the machine's"
     )
+
+    def without_detector(self, gates: int) -> int:
+        """Samples per beam as given, or `SAMPLES_PER_GATE` of every gate."""
+        asked = self.samples_per_beam
+        return SAMPLES_PER_GATE * gates if asked == "auto" else asked
+
+    def most_samples(self, beams: int, gates: int) -> int:
+        """Samples per beam as given, or as many as may be chosen for so many beams."""
+        asked = self.samples_per_beam
+        if asked != "auto":
+            return asked
+        each = min(math.floor(self.max_samples / (beams * gates)), (2**31 - 1) // gates)
+        return gates * max(2, each)
 
 
 class FringeSettings(Description):

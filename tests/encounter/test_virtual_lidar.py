@@ -68,6 +68,21 @@ def test_vortices_within_stated_errors(flight):
     assert sum(chi2) < 10 * len(chi2) + 4 * np.sqrt(20 * len(chi2))
 
 
+def test_samples_are_chosen_once_for_all_scans():
+    """By the nominal pose, whatever the first one is; a larger fraction takes fewer."""
+    settings = {"samples_per_beam": "auto"}
+    one = lm.VirtualLidar(small_encounter(detector={}, render=settings))
+    number = one._settings.samples_per_beam
+    moved = lm.VirtualLidar(small_encounter(detector={}, render=settings))
+    moved.step(0.0, AircraftPose(0.0, 1.0, 0.5))
+    assert moved._settings.samples_per_beam == number > 2 * 16
+    looser = small_encounter(detector={}, render=settings | {"monte_carlo_fraction": 1})
+    assert lm.VirtualLidar(looser)._settings.samples_per_beam < number
+    gates = one.gates.between + 1
+    alone = lm.VirtualLidar(small_encounter(render=settings))
+    assert alone._settings.samples_per_beam == 64 * gates
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("angle", [0, 10])
 def test_stated_errors_over_a_flight(angle):

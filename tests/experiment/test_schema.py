@@ -243,7 +243,7 @@ FAULTS = [
     ("scattering.albedo=1.1", "scattering.albedo: 1.1 is not allowed; expected 0 to 1"),
     (
         "render.samples_per_beam=1",
-        "render.samples_per_beam: 1 is not allowed; expected 2 to 2147483647",
+        "render.samples_per_beam: 1 is not allowed; expected 'auto' or 2 to 2147483647",
     ),
     (
         "render.samples_per_pass=0",
@@ -290,7 +290,7 @@ FAULTS = [
     ("wake.texture.rms=", "wake.texture.rms: None is not allowed; expected a quantity"),
     (
         "render.samples_per_beam=many",
-        "render.samples_per_beam: 'many' is not allowed; expected a valid",
+        "render.samples_per_beam: 'many' is not allowed; expected 'auto' or a valid",
     ),
     # values that exclude each other
     ("wake.vortex_pair={}", "wake: expected one of file, vortex_pair and turbine"),

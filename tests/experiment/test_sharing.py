@@ -92,7 +92,7 @@ def images(experiment):
 def signatures(experiment):
     record = new_record(experiment, ".")
     return {
-        part: made_by(record, stage.indifferent_to)
+        part: made_by(record, stage.indifferent(experiment))
         for stage in storing_stages(experiment)
         for part in stage.parts(experiment)
     }
@@ -168,3 +168,19 @@ def test_images_of_equal_experiments_are_shared_whatever_their_units():
         for text in ("0.5 deg", f"{math.radians(0.5)!r} rad", "0.51 deg")
     )
     assert degrees == radians != other
+
+
+def test_where_the_detector_chooses_the_samples_images_depend_on_it():
+    """Other pulse energies and detectors have other numbers of samples, or none of their own."""
+    auto = small() | {"render": {"samples_per_beam": "auto", "max_order": 1}}
+    with_detector = changed(auto, "detector", {})
+    signed = signatures(with_detector)["image_t1"]
+    for one, key in ((with_detector, "lidar.pulse_energy"), (with_detector, "detector")):
+        other = changed(reading.settings(one), key, BEHIND[key])
+        assert signatures(other)["image_t1"] != signed
+    for key in ("name", "retrieval", "doppler"):
+        other = changed(reading.settings(with_detector), key, BEHIND[key])
+        assert signatures(other)["image_t1"] == signed
+    without = reading.check(auto, "base")
+    other = changed(auto, "lidar.pulse_energy", BEHIND["lidar.pulse_energy"])
+    assert signatures(without)["image_t1"] == signatures(other)["image_t1"] != signed

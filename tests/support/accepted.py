@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import check, reading
+from lidar_mi.experiment.forecast import most_samples
 from tests.support.cases import Case
 from tests.support.hostile_experiments import as_yaml, settings
 
@@ -47,8 +48,9 @@ def _paths(experiment) -> float:
         beams = experiment.scan.columns * experiment.scan.rows
         if experiment.scan.aim == "grid" and pair:
             beams = pair.width * pair.height / wake.spacing**2
-        render = experiment.render
-        total += 2 * beams * render.samples_per_beam * render.max_order * experiment.scan.gate_count
+        samples = most_samples(experiment, max(1, int(beams)))
+        orders = experiment.render.max_order
+        total += 2 * beams * samples * orders * experiment.scan.gate_count
     if rings:
         camera, reading_of = rings.camera, rings.retrieval
         images = len(rings.v_los) * (1 + max(reading_of.averaged) * reading_of.images)

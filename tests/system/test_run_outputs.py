@@ -123,6 +123,8 @@ def test_metrics_are_finite_and_their_keys_are_the_agreed_ones(demo):
     expected |= {f"backscatter.cc.{q}_{name}" for q in ("bound", "efficiency") for name in "vw"}
     expected |= {
         "backscatter.mc_relative_error",
+        "backscatter.samples_per_beam",
+        *(f"backscatter.cc.{p}monte_carlo_{n}" for p in ("", "outside_cores.") for n in "vw"),
         "backscatter.multiple_scattering_fraction",
         "backscatter.depolarization",
         "backscatter.depolarization_stderr",

@@ -96,6 +96,8 @@ def chosen(metrics: Mapping[str, xr.DataArray], asked: Sequence[str] | None) -> 
         *(f"sensor.rmse_{name}" for name in "uvw"),
         *(() if "sensor.rmse_w" in known else (f"{best}.rmse_v", f"{best}.rmse_w")),
         *(() if "sensor.rmse_w" in known else (f"{best}.valid_fraction",)),
+        # of these, what the simulation's own noise adds
+        f"{best}.monte_carlo_w",
         "sensor.coverage_95_w",
         *vortex,
         "sensor.rmse_v_los",

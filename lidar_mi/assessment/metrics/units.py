@@ -2,7 +2,7 @@
 
 from lidar_mi.retrieval.vortices.pair import MEANING
 
-_WIND = ("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_")
+_WIND = ("rms_", "rmse_", "bias", "p50_", "p90_", "std", "expected_", "monte_carlo_")
 _NAMED = {
     "pointing.scan_time": "s",
     "pointing.rms_y": "m",
@@ -34,7 +34,7 @@ def unit_of(key: str) -> str:
     if key in _NAMED:
         return _NAMED[key]
     *_, parent, name = ("", *key.split("."))
-    if name.startswith(_WIND):
+    if name.startswith(_WIND) and name != "monte_carlo_fraction":
         return "rad" if name.endswith("_direction") else "m/s"
     if key.startswith("encounter.") and parent != "removed_of_perfect":
         return _ENCOUNTER.get(name, "")

@@ -16,6 +16,7 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 from lidar_mi.assessment.metrics.velocities import READERS
 from lidar_mi.assessment.metrics.winds import has_no_skill
 from lidar_mi.assessment.report.digits import whole_percent
+from lidar_mi.assessment.report.simulation import simulation_sentence
 from lidar_mi.tables import with_error
 from lidar_mi.units import shown
 
@@ -43,10 +44,13 @@ def answer(experiment, metrics: Mapping[str, float], judged: Judged = ()) -> lis
     Returns
     -------
     list of str
-        Sentences: errors of the wind, vortices, and one verdict per requirement table. Tables of
-        phases of flight at another air speed are named and not judged.
+        Sentences: which part of the error is the simulation's, unless it is as small as asked for;
+        errors of the wind, vortices, and one verdict per requirement table. Tables of phases of
+        flight at another air speed are named and not judged.
     """
-    lines = [*_wind(experiment, metrics), *_stated(experiment, metrics), *_vortices(metrics)]
+    simulated = simulation_sentence(experiment, metrics)
+    lines = [simulated] if simulated else []
+    lines += [*_wind(experiment, metrics), *_stated(experiment, metrics), *_vortices(metrics)]
     speed = experiment.platform.speed if experiment.wake else 0.0
     lines += [verdict(table, findings) for table, findings in judged if table.applies_at(speed)]
     others = [table for table, _ in judged if not table.applies_at(speed)]

@@ -9,6 +9,7 @@ from lidar_mi.assessment.metrics.names import Source, wind_key
 from lidar_mi.assessment.metrics.winds import has_no_skill
 from lidar_mi.assessment.report.digits import in_row, percent, three
 from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.assessment.report.simulation import samples_of
 
 # rows of the table of results: key, name, unit
 _ROWS = (
@@ -106,7 +107,7 @@ def _noise(experiment, metrics) -> str:
     line = (
         "Noise of the first image, relative to a pixel's signal (medians): simulation "
         f"{percent(metrics['backscatter.mc_relative_error'])} "
-        f"({experiment.render.samples_per_beam} samples per beam)"
+        f"({samples_of(experiment, metrics)})"
     )
     if not experiment.detector:
         return f"{line}; no detector."

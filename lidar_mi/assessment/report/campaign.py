@@ -18,6 +18,7 @@ from lidar_mi.assessment.report.digits import three, with_error
 from lidar_mi.assessment.report.encounters import encounter_blocks
 from lidar_mi.assessment.report.page import template
 from lidar_mi.assessment.report.sample import margin_blocks, sample_blocks
+from lidar_mi.assessment.report.simulation import points_sentence
 from lidar_mi.units import usual_unit
 
 _PANELS = 16
@@ -187,7 +188,8 @@ def _lead(dataset: xr.Dataset, axes: Mapping[str, Axis], margins: Mapping) -> st
     failed = int((status == _FAILED).sum())
     members = dataset.sizes.get(MEMBER, 1)
     points = runs // (status.sizes.get(MEMBER, 1))
-    text = f"{points} point{'s' * (points != 1)} of {dataset.attrs.get('base', 'an experiment')}"
+    text = points_sentence(dataset, lambda at: _place(dataset, at))
+    text += f"{points} point{'s' * (points != 1)} of {dataset.attrs.get('base', 'an experiment')}"
     if members > 1:
         text += f" with {members} members each"
     text += f": {done} of {runs} runs done, {failed} failed"

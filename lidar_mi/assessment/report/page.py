@@ -14,6 +14,7 @@ from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.assessment.report.digits import percent
+from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
 from lidar_mi.units import shown
 
@@ -117,7 +118,7 @@ def page(
     overview, first[:1] = first[:1], []
     return template("report.html").render(
         name=experiment.name,
-        simulated=simulated(experiment, versions),
+        simulated=simulated(experiment, versions, metrics),
         resolved=resolved,
         metrics={key: _rounded(key, value) for key, value in metrics.items()},
         answer=answer,
@@ -173,7 +174,9 @@ def script(name: str) -> Markup:
     return Markup(files("lidar_mi.assessment.report").joinpath(name).read_text())
 
 
-def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
+def simulated(
+    experiment, versions: Mapping[str, str], metrics: Mapping[str, float]
+) -> list[tuple[str, str]]:
     """What was simulated, as (name, text): wake, instruments, seed, versions."""
     rows = []
     if experiment.wake:
@@ -213,7 +216,7 @@ def simulated(experiment, versions: Mapping[str, str]) -> list[tuple[str, str]]:
         air, render = experiment.scattering, experiment.render
         light = (
             f"scattering by {air.aerosol or air.table or air.phase.replace('_', ' ')}, orders up "
-            f"to {render.max_order}, {render.samples_per_beam} samples per beam, {render.variant}"
+            f"to {render.max_order}, {samples_of(experiment, metrics)}, {render.variant}"
         )
         rows.append(("light", light))
         chosen = experiment.volume or experiment.retrieval

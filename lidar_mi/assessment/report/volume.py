@@ -8,6 +8,7 @@ from lidar_mi.assessment.metrics.names import Source, wind_key
 from lidar_mi.assessment.metrics.volume import COMPONENTS
 from lidar_mi.assessment.report.digits import fixed, in_row, percent
 from lidar_mi.assessment.report.page import Chapter, Tables
+from lidar_mi.assessment.report.simulation import samples_of
 
 
 def volume_chapter(experiment, metrics: Mapping[str, float], drawn: Sequence[Drawn]) -> Chapter:
@@ -28,7 +29,7 @@ def volume_chapter(experiment, metrics: Mapping[str, float], drawn: Sequence[Dra
     noise = (
         "Noise of the simulation in a voxel, relative to its signal (median): "
         f"{percent(metrics['backscatter.mc_relative_error'])} "
-        f"({experiment.render.samples_per_beam} samples per beam); "
+        f"({samples_of(experiment, metrics)}); "
         f"{'with the noise of a detector' if experiment.detector else 'no detector'}."
     )
     numbers = Tables(

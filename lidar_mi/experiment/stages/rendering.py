@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.forecast import check_brightness, check_size, check_states
+from lidar_mi.experiment.forecast import check_brightness, check_size, check_states, least_samples
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stage import Keeper
@@ -22,11 +24,15 @@ from lidar_mi.instrument.speckle import speckle_modes
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
+from lidar_mi.rendering.samples import Samples, choose_samples, monte_carlo_fraction, pilot_samples
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
 
 IMAGES = ("image_t1", "image_t2")
 """Parts of the result of `render_images`."""
+
+PILOT_SEED = 1 << 30
+"""Added to the seed for a pilot: far from those of all scans."""
 
 
 def scan_plans(
@@ -140,30 +146,22 @@ def render_images(
     """
     use_variant(experiment.render.variant)
     wanted = [IMAGES.index(name) for name in missing]
+    number: int | None = None
+    if experiment.render.samples_per_beam == "auto":
+        chosen = chosen_samples(experiment, truth, plans, air, flows, log=log)
+        number = experiment.render.without_detector(plans[0].gate_count)
+        if chosen:
+            number = chosen.number
+            log(samples_text(experiment, chosen))
+        experiment = with_samples(experiment, number)
     log(f"rendering {len(wanted)} scans of {len(plans[0].y)} x {len(plans[0].z)} beams")
 
     def progress(scan: int, done: int, total: int) -> None:
         log.bar(f"rendering scan {scan + 1} of {len(plans)}", done / total)
 
-    fields = list(truth.extinction)
-    if experiment.scan.air == "moving":
-        for index, plan in enumerate(plans):
-            if index in wanted and plan.beams is not None:
-                log.bar(f"moving the air of scan {index + 1} of {len(plans)}", None)
-                fields[index] = air_in_time(experiment, truth, flows, index, plan.beams.time)
-    mapping = experiment.wake.extinction
-    rendered = render_scans(
-        _media(experiment, fields, plans),
-        plans,
-        experiment.lidar,
-        environment_extinction(experiment),
-        *air,
-        experiment.render,
-        experiment.seed,
-        progress,
-        wanted,
-        molecules(mapping.molecules, experiment.lidar.wavelength, experiment.scattering.band),
-        batches_of(IMAGES, keeper, log),
+    batches = batches_of(IMAGES, keeper, log, number)
+    rendered = _rendered(
+        experiment, truth, plans, air, flows, wanted, log, progress=progress, batches=batches
     )
     platform = {"platform_speed": experiment.platform.speed, "dt": experiment.platform.dt}
     for index, scan in zip(wanted, rendered, strict=True):
@@ -175,10 +173,104 @@ def render_images(
         yield IMAGES[index], scan
 
 
+def _rendered(
+    experiment: Experiment,
+    truth: Truth,
+    plans: Sequence[ScanPlan],
+    air: Scatterer,
+    flows: Flows,
+    wanted: Sequence[int],
+    log: Log,
+    seed: int | None = None,
+    **how: Any,
+) -> Iterator[xr.Dataset]:
+    """Some of the scans, of the air at their times, from `render_scans`."""
+    fields = list(truth.extinction)
+    if experiment.scan.air == "moving":
+        for index, plan in enumerate(plans):
+            if index in wanted and plan.beams is not None:
+                log.bar(f"moving the air of scan {index + 1} of {len(plans)}", None)
+                fields[index] = air_in_time(experiment, truth, flows, index, plan.beams.time)
+    mapping = experiment.wake.extinction
+    return render_scans(
+        _media(experiment, fields, plans),
+        plans,
+        experiment.lidar,
+        environment_extinction(experiment),
+        *air,
+        experiment.render,
+        experiment.seed if seed is None else seed,
+        scans=wanted,
+        molecules=molecules(
+            mapping.molecules, experiment.lidar.wavelength, experiment.scattering.band
+        ),
+        **how,
+    )
+
+
+def chosen_samples(
+    experiment: Experiment,
+    truth: Truth,
+    plans: Sequence[ScanPlan],
+    air: Scatterer,
+    flows: Flows,
+    *,
+    log: Log,
+) -> Samples | None:
+    """Samples per beam of both scans, from pilots of both; None without a detector.
+
+    The scan of more noise decides. Other pilots of the same experiment give the same number. Where
+    the experiment has a number, it is that, with what its noise is.
+    """
+    detector = experiment.detector
+    if detector is None:
+        return None
+    use_variant(experiment.render.variant)
+    log.bar("choosing the number of samples", None)
+    beams, gates = len(plans[0].y) * len(plans[0].z), plans[0].gate_count
+    samples, seed = pilot_samples(experiment.render, beams, gates), experiment.seed + PILOT_SEED
+    # noise is that of air at the scan's reference time, which need not be moved for it
+    frozen = experiment.scan.model_copy(update={"air": "frozen"})
+    asked = with_samples(experiment.model_copy(update={"scan": frozen}), samples)
+    pilots = _rendered(asked, truth, plans, air, flows, range(len(plans)), log, seed)
+    pulses, found = experiment.scan.pulses_per_beam, []
+    for plan, pilot in zip(plans, pilots, strict=True):
+        seen = noisy_scan(pilot, experiment.lidar, detector, [seed, 0, 1], plan, pulses)
+        least = least_samples(experiment, truth.extinction, plan)
+        found.append(choose_samples(seen, samples, experiment.render, least))
+    return max(found, key=lambda one: (one.number, one.fraction))
+
+
+def with_samples(experiment: Experiment, number: int) -> Experiment:
+    """The experiment with a number of samples per beam."""
+    render = experiment.render.model_copy(update={"samples_per_beam": number})
+    found = experiment.model_copy(update={"render": render})
+    return found.read_from(experiment.folder)
+
+
+def samples_text(experiment: Experiment, chosen: Samples) -> str:
+    """A number of samples, and what their noise is beside that of the detector."""
+    text = (
+        f"{chosen.number} Monte Carlo samples per beam, with {chosen.fraction:.2g} times the "
+        f"variance of the detector noise (median {chosen.median:.2g}, 90 % of the beams below "
+        f"{chosen.upper:.2g})"
+    )
+    if chosen.reached:
+        return text
+    asked = experiment.render.monte_carlo_fraction
+    return f"{text}; {asked:g} needs {chosen.needed}"
+
+
 def batches_of(
-    names: Sequence[str], keeper: Keeper | None, log: Log
+    names: Sequence[str], keeper: Keeper | None, log: Log, samples: int | None = None
 ) -> Callable[[int], Batches] | None:
-    """Storage of an image's samples while it is rendered, by its index among the names."""
+    """Storage of an image's samples while it is rendered, by its index among the names.
+
+    Parameters
+    ----------
+    samples : int, optional
+        Per beam, where that was chosen: stored ones of an image with another number are not used.
+    """
     if keeper is None:
         return None
 
@@ -187,11 +279,16 @@ def batches_of(
 
         def load() -> dict | None:
             found = keeper.unfinished(name)
-            if found:
-                log(f"resuming {name}: {found['passes']} passes are kept from an earlier run")
+            if not found or found.pop("samples", samples) != samples:
+                return None
+            log(f"resuming {name}: {found['passes']} passes are kept from an earlier run")
             return found
 
-        return Batches(load, lambda arrays: keeper.keep_unfinished(name, arrays))
+        def save(arrays: dict) -> None:
+            number = {} if samples is None else {"samples": np.array(samples)}
+            keeper.keep_unfinished(name, arrays | number)
+
+        return Batches(load, save)
 
     return batches
 
@@ -213,10 +310,11 @@ def detect_images(
     air = {"environment_extinction": environment_extinction(experiment)}
     pulses = experiment.scan.pulses_per_beam
     # random numbers different from those of the light transport
-    return [
+    found = [
         noisy_scan(scan.assign_attrs(air), lidar, detector, [seed, index, 1], plan, pulses)
         for index, (scan, plan) in enumerate(zip(scans, plans, strict=True))
     ]
+    return [scan.assign_attrs(monte_carlo_fraction=monte_carlo_fraction(scan)) for scan in found]
 
 
 def _on_nodes(scan: xr.Dataset, plan: ScanPlan) -> xr.Dataset:

@@ -21,12 +21,9 @@ from lidar_mi.retrieval.velocimetry.resampling_error import flag_resampled
 from lidar_mi.retrieval.velocimetry.wind import retrieve_wind, wind_bound
 from lidar_mi.retrieval.velocimetry.windows import Windows
 
-# Noise of the simulation over the signal of a pixel from which winds suffer.
 _FEW_VALID = 0.25
 _OF_TEMPLATES = (ImageMethod.CC, ImageMethod.MULTIPASS)
 """Methods that find each vector by itself; below that fraction, chance correlations are many."""
-
-_SAMPLED = 0.02
 
 
 def check_windows(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan]) -> None:
@@ -63,7 +60,6 @@ def cross_flow_winds(
     """
     log("retrieving winds")
     _warn_of_wide_beams(experiment, truth, plans, log)
-    _warn_of_few_samples(experiment, scans[0], log)
     settings, blur = experiment.retrieval, known_blur(experiment, plans[0])
     pairs, times = _image_pairs(experiment, truth, plans, scans), pixel_times(experiment, scans)
     lost = resampled_noise(experiment, scans)
@@ -236,23 +232,6 @@ def _warn_of_wide_beams(experiment, truth, plans, log) -> None:
         log.remark(
             f"beams are {width:.3g} m wide at {plans[0].centre:g} m, wider than a template of "
             f"{template:g} m: structure that the retrieval needs is blurred"
-        )
-
-
-def _warn_of_few_samples(experiment, scan, log) -> None:
-    """Noise of the simulation that hides what the instrument could do."""
-    level, seen = scan["Y"], attenuated_backscatter_stderr(scan)
-    lit = level > 0
-    simulated = float((seen / level).where(lit).median())
-    instrument = 0.0
-    if "Y_noise_std" in scan:
-        instrument = float((scan["Y_noise_std"] / level).where(lit).median())
-    if simulated > max(_SAMPLED, instrument):
-        detector = f", beside {instrument:.2g} of the detector" if instrument else ""
-        log.remark(
-            f"render.samples_per_beam: with {experiment.render.samples_per_beam} samples the "
-            f"noise of the simulation itself is {simulated:.2g} of the signal of a pixel"
-            f"{detector}; raise it for what the lidar can do"
         )
 
 

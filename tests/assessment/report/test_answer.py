@@ -1,5 +1,6 @@
 """The answer of a run. Detects numbers that are not those of the metrics, a verdict without its
-reason, a phase of flight that is judged at another speed, and skill that is not there."""
+reason, a phase of flight that is judged at another speed, skill that is not there, and an error of
+the simulation that is called the lidar's."""
 
 import math
 from types import SimpleNamespace
@@ -9,6 +10,7 @@ import pytest
 from lidar_mi.assessment.metrics.names import vortex_key
 from lidar_mi.assessment.metrics.requirements import judge, read_requirements
 from lidar_mi.assessment.report.answer import answer, verdict
+from lidar_mi.assessment.report.simulation import simulation_remark
 from lidar_mi.assessment.report.summary import summary
 
 TABLES = read_requirements()
@@ -172,3 +174,84 @@ def test_a_circulation_off_by_many_standard_errors_is_said(found, words):
         metrics |= {key: found if side == "port" else 440.0, f"{key}_stderr": 4.6}
     (line,) = answer(an_experiment(sensor=None), metrics)
     assert (words in line) if words else ("standard errors" not in line)
+
+
+NOISY = {
+    "backscatter.mc_relative_error": 0.01,
+    "backscatter.samples_per_beam": 64,
+    "backscatter_noisy.monte_carlo_fraction": 1.5,
+    "true_wind.rms_v": 2.9,
+    "true_wind.rms_w": 3.7,
+    **{
+        f"backscatter_noisy.{method}.{key}": value
+        for method in ("variational", "cc")
+        for key, value in (("valid_fraction", 1.0), ("rmse_v", 0.3), ("rmse_w", 0.4))
+    },
+}
+
+
+def rendered(samples="auto", detector=True, **parts):
+    experiment = an_experiment(**parts)
+    experiment.detector = detector or None
+    experiment.render = SimpleNamespace(samples_per_beam=samples, monte_carlo_fraction=0.1)
+    return experiment
+
+
+def noise(method, v, w):
+    key = f"backscatter_noisy.{method}.monte_carlo_"
+    return {f"{key}v": v, f"{key}w": w}
+
+
+def test_the_first_sentence_says_which_part_is_the_simulations():
+    """0.15 and 0.2 of 0.3 and 0.4 m/s are a quarter of the mean square error."""
+    metrics = NOISY | noise("variational", 0.15, 0.2) | noise("cc", 0.03, 0.04)
+    first, second = answer(rendered(64), metrics)
+    assert first == (
+        "Of the mean square error of v and w, noise of the simulation, not of the lidar, makes "
+        "25 % by variational retrieval (64 Monte Carlo samples per beam, with 1.5 times the "
+        "variance of the detector noise)."
+    )
+    assert second.startswith("Backscatter lidar, ")
+    text = simulation_remark(rendered(64), metrics)
+    assert text.startswith("render.samples_per_beam: of the mean square error")
+    assert text.endswith("; expected 960 or more, or auto")
+    text = simulation_remark(rendered("auto"), metrics)
+    assert text.startswith("render.max_samples: ") and text.endswith("expected 15 times as many")
+
+
+@pytest.mark.parametrize("part", [{}, noise("variational", 0.08, 0.12), noise("cc", 0.05, 0.09)])
+def test_a_small_part_has_no_sentence(part):
+    """0.09 of the error, a tenth of all else: as asked for. Without numbers it is smaller."""
+    experiment = rendered(64)
+    (only,) = answer(experiment, NOISY | part)
+    assert only.startswith("Backscatter lidar, ") and not simulation_remark(
+        experiment, NOISY | part
+    )
+
+
+def test_without_a_detector_all_noise_is_the_simulations():
+    metrics = {
+        key.replace("_noisy", ""): value for key, value in NOISY.items() if "fraction" not in key
+    }
+    metrics |= {"backscatter.variational.valid_fraction": 1.0}
+    part = {
+        "backscatter.variational.monte_carlo_v": 0.1,
+        "backscatter.variational.monte_carlo_w": 0.3,
+    }
+    experiment = rendered(64, detector=False)
+    first, _ = answer(experiment, metrics | part)
+    assert "makes 40 % by variational retrieval (64 Monte Carlo samples per beam)." in first
+    # 64 x 0.4 / 0.6 / 0.1
+    assert simulation_remark(experiment, metrics | part).endswith("; expected 430 or more")
+    lost = {"backscatter.variational.valid_fraction": 0.0}
+    first, _ = answer(experiment, metrics | lost)
+    assert first.startswith("No vector is valid, and noise of the images, 1 % of the signal")
+
+
+def test_of_volumes_the_noise_is_compared():
+    experiment = rendered(64)
+    experiment.volume = SimpleNamespace(methods=["correlation"])
+    (first, *_) = answer(experiment, NOISY)
+    assert "it has 1.5 times the variance of the detector noise" in first
+    enough = NOISY | {"backscatter_noisy.monte_carlo_fraction": 0.09}
+    assert answer(experiment, enough)[0].startswith("Backscatter lidar, ")

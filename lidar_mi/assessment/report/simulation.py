@@ -1,0 +1,135 @@
+"""What is said of the simulation's own noise: in the answer, in warnings, beside the number."""
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.labels import METHOD_NAMES
+from lidar_mi.assessment.metrics.campaign import metrics_of
+from lidar_mi.assessment.metrics.names import Source, wind_key
+from lidar_mi.assessment.metrics.simulation import largest_parts, simulation_parts
+from lidar_mi.assessment.report.digits import whole_percent
+
+_FRACTION = f"{Source.NOISY}.monte_carlo_fraction"
+_SAMPLES = f"{Source.BACKSCATTER}.samples_per_beam"
+# Of an error: what the rest of it is, and so the number of samples, follows from a small difference
+_NEARLY_ALL = 0.9
+# Of a mean square error that is the simulation's, 5 % of the rms error: worth a sentence.
+_LEAST_PART = 0.1
+
+
+def simulation_sentence(experiment, metrics: Mapping[str, float]) -> str:
+    """Which part of the wind's error is the simulation's; empty where it is as small as asked for.
+
+    Of volumes, whose winds are not retrieved once more, and where no vector is valid, which part of
+    the images' noise it is.
+
+    Parameters
+    ----------
+    experiment : lidar_mi.experiment.schema.Experiment
+    metrics : mapping of str to float
+        Of a run.
+    """
+    if _SAMPLES not in metrics:
+        return ""
+    allowed = experiment.render.monte_carlo_fraction
+    number = f"{metrics[_SAMPLES]:.0f} Monte Carlo samples per beam"
+    if experiment.volume or _without_vectors(experiment, metrics):
+        fraction = metrics.get(_FRACTION, 0.0)
+        if experiment.detector and fraction > allowed:
+            return (
+                "Noise of the images is in part that of the simulation, not of the lidar: with "
+                f"{number} it has {fraction:.2g} times the variance of the detector noise."
+            )
+        if experiment.detector or experiment.volume:
+            return ""
+        relative = whole_percent(metrics[f"{Source.BACKSCATTER}.mc_relative_error"])
+        return (
+            f"No vector is valid, and noise of the images, {relative} of the signal of a pixel, is "
+            f"that of the simulation, not of the lidar ({number})."
+        )
+    parts = simulation_parts(metrics, experiment.retrieval.methods)
+    large = [part for part in parts if part.exceeds(allowed)]
+    if not large:
+        return ""
+    named = " and ".join(
+        f"{whole_percent(part.fraction)} by {METHOD_NAMES[part.method]}" for part in large
+    )
+    beyond = " beyond two core radii" if large[0].place else ""
+    beside = ""
+    if _FRACTION in metrics:
+        beside = f", with {metrics[_FRACTION]:.2g} times the variance of the detector noise"
+    return (
+        f"Of the mean square error of v and w{beyond}, noise of the simulation, not of the lidar, "
+        f"makes {named} ({number}{beside})."
+    )
+
+
+def simulation_remark(experiment, metrics: Mapping[str, float]) -> str:
+    """The same as a warning, with what to set; empty where the answer has no such sentence."""
+    sentence = simulation_sentence(experiment, metrics)
+    if not sentence:
+        return ""
+    text = sentence[0].lower() + sentence[1:].removesuffix(".")
+    samples, needed = metrics[_SAMPLES], _needed(experiment, metrics)
+    if experiment.render.samples_per_beam == "auto" and experiment.detector:
+        times = f"; expected {float(f'{needed / samples:.2g}'):g} times as many" if needed else ""
+        return f"render.max_samples: {text}{times}"
+    # two digits of it are known
+    expected = f"{float(f'{needed:.2g}'):.0f} or more" if needed else "more"
+    automatic = ", or auto" if experiment.detector else ""
+    return f"render.samples_per_beam: {text}; expected {expected}{automatic}"
+
+
+def samples_of(experiment, metrics: Mapping[str, float]) -> str:
+    """The number of samples of a run's images, and whether it was chosen."""
+    asked = experiment.render.samples_per_beam
+    number = f"{metrics.get(_SAMPLES, asked):.4g}" if _SAMPLES in metrics else str(asked)
+    chosen = " chosen by the detector noise" if asked == "auto" and _SAMPLES in metrics else ""
+    return f"{number} samples per beam{chosen if experiment.detector else ''}"
+
+
+def points_sentence(dataset: xr.Dataset, place: Callable[[dict[str, int]], str]) -> str:
+    """At which points of a campaign the error is in part the simulation's; empty: nowhere.
+
+    Parameters
+    ----------
+    dataset : xr.Dataset
+        The campaign's. Points without numbers of the simulation have as small a part as asked for.
+    place : callable
+        A point's coordinates as text, from its indices.
+
+    Returns
+    -------
+    str
+        With a space at its end.
+    """
+    parts = largest_parts(metrics_of(dataset))
+    if parts is None or not (parts > _LEAST_PART).any():
+        return ""
+    index = np.unravel_index(np.nanargmax(parts.values), parts.shape)
+    where = place({str(dim): int(k) for dim, k in zip(parts.dims, index, strict=True)})
+    return (
+        f"At {int((parts > _LEAST_PART).sum())} of {parts.size} points, noise of the simulation, "
+        f"not of the lidar, makes more than {whole_percent(_LEAST_PART)} of the mean square error "
+        f"of v and w: up to {whole_percent(float(parts.max()))}{f' ({where})' if where else ''}; "
+        "render.samples_per_beam: auto or more, or a larger render.max_samples, lowers it. "
+    )
+
+
+def _without_vectors(experiment, metrics: Mapping[str, float]) -> bool:
+    """Whether no method has a valid vector from the most complete images."""
+    source = Source.NOISY if experiment.detector else Source.BACKSCATTER
+    methods = experiment.retrieval.methods
+    return not any(metrics.get(wind_key(source, m, "valid_fraction")) for m in methods)
+
+
+def _needed(experiment, metrics: Mapping[str, float]) -> float:
+    """Samples per beam that are enough; 0: not known, as hardly any error is of something else."""
+    samples, allowed = metrics[_SAMPLES], experiment.render.monte_carlo_fraction
+    if _FRACTION in metrics:
+        return samples * metrics[_FRACTION] / allowed
+    parts = () if experiment.volume else simulation_parts(metrics, experiment.retrieval.methods)
+    largest = max((part.fraction for part in parts), default=1.0)
+    return samples * largest / (1 - largest) / allowed if largest < _NEARLY_ALL else 0.0

@@ -1,0 +1,84 @@
+"""What the simulation's own noise adds to the cross-flow wind, which is no error of the lidar."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.stages.rendering import gridded_scans
+from lidar_mi.experiment.stages.winds import (
+    attenuated_backscatter_stderr,
+    known_blur,
+    pixel_times,
+    rendered_pairs,
+    window_settings,
+)
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+
+
+def simulation_noise(
+    experiment: Experiment,
+    detected: Sequence[xr.Dataset],
+    plans: Sequence[ScanPlan],
+    scans: Sequence[xr.Dataset],
+    wind: xr.Dataset,
+    *,
+    log: Log,
+) -> xr.Dataset | None:
+    """Changes of the wind by as much noise again as the simulation's, by every method.
+
+    Noise of the stated Monte Carlo standard errors is added to both images and the wind is
+    retrieved once more. To first order its changes have the variance that the simulation's noise
+    has in the wind, through whatever the method does with it.
+
+    Returns
+    -------
+    xr.Dataset, dims (algorithm, z, y), or None
+        v, w (m s^-1), of the most complete images; NaN where one of both vectors is not valid. None
+        where the noise has no more than ``render.monte_carlo_fraction`` of the detector's
+        variance: neither has it then of the wind's.
+    """
+    fraction = max(scan.attrs.get("monte_carlo_fraction", np.inf) for scan in detected)
+    if fraction <= experiment.render.monte_carlo_fraction:
+        return None
+    log.bar("retrieving winds with more noise of the simulation", None)
+    random = np.random.default_rng([experiment.seed, 2])
+    noisier = [_with_more_noise(scan, random) for scan in detected]
+    pairs = rendered_pairs(experiment, gridded_scans(experiment, noisier))
+    source, (pair, _) = pairs.popitem()
+    # methods that weight by noise are to do so as before
+    noise = rendered_pairs(experiment, scans)[source][1]
+    changes = []
+    for method in experiment.retrieval.methods:
+        found = retrieve_wind(
+            *pair,
+            dt=experiment.platform.dt,
+            method=method,
+            noise=noise,
+            times=pixel_times(experiment, scans),
+            blur=known_blur(experiment, plans[0]),
+            standard_errors=False,
+            **window_settings(experiment.retrieval),
+        )
+        first = wind.sel(source=source, algorithm=method)
+        valid = (found["flag"].values == 0) & (first["flag"].values == 0)
+        changes.append(
+            xr.Dataset(
+                {
+                    name: (("z", "y"), np.where(valid, found[name] - first[name].values, np.nan))
+                    for name in ("v", "w")
+                }
+            )
+        )
+    return xr.concat(changes, "algorithm").assign_coords(algorithm=list(wind["algorithm"].values))
+
+
+def _with_more_noise(scan: xr.Dataset, random: np.random.Generator) -> xr.Dataset:
+    """A scan with noise of its Monte Carlo standard error in addition, the same in both images."""
+    stderr = attenuated_backscatter_stderr(scan)
+    noise = stderr * random.standard_normal(stderr.shape)
+    names = [name for name in ("Y", "Y_noisy") if name in scan]
+    return scan.assign({name: scan[name] + noise for name in names})
