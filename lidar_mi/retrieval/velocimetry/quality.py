@@ -246,12 +246,30 @@ def non_finite(images: Sequence[torch.Tensor], windows: Windows) -> torch.Tensor
 
 
 def usable(images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Pixels (images, ...) that are three or more away from a non-finite one."""
+    """Pixels (images, ...) away from non-finite ones: three px, of lines and single pixels one.
+
+    The values that filters take there are guesses (`inpainting.inpainted`), across a pixel good
+    ones. Volumes: always three.
+    """
     bad = torch.stack([~torch.isfinite(image) for image in images])
     if not bool(bad.any()):
         return ~bad
-    pool = max_pool2d if bad.ndim == 3 else max_pool3d
-    return pool(bad.float()[:, None], 7, stride=1, padding=3)[:, 0] == 0
+    if bad.ndim > 3:
+        return max_pool3d(bad.float()[:, None], 7, stride=1, padding=3)[:, 0] == 0
+    near = max_pool2d(thick(bad).float(), 7, stride=1, padding=3)
+    return torch.maximum(near, max_pool2d(bad.float(), 3, stride=1, padding=1)) == 0
+
+
+def thick(pixels: torch.Tensor) -> torch.Tensor:
+    """Of pixels (..., z, y), those of areas wider than one: that squares of 2 x 2 px fit into."""
+    square = pixels[..., :-1, :] & pixels[..., 1:, :]
+    square = square[..., :-1] & square[..., 1:]
+    wide = torch.zeros_like(pixels)
+    rows, columns = square.shape[-2:]
+    for i in (0, 1):
+        for j in (0, 1):
+            wide[..., i : i + rows, j : j + columns] |= square
+    return wide
 
 
 def filled(image: torch.Tensor) -> torch.Tensor:

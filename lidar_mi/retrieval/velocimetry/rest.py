@@ -1,34 +1,29 @@
 """What does not move with the air: saturated areas and structure at rest in two images."""
 
 from collections.abc import Sequence
-from itertools import product
 from typing import NamedTuple
 
 import torch
 from torch.nn.functional import pad
 
+from lidar_mi.retrieval.velocimetry import impulses
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.fixed_pattern import FixedPattern, fixed_pattern
+from lidar_mi.retrieval.velocimetry.inpainting import inpainted
 from lidar_mi.retrieval.velocimetry.motion import motion_around, moved
-from lidar_mi.retrieval.velocimetry.quality import Flag, non_finite
+from lidar_mi.retrieval.velocimetry.quality import Flag, non_finite, thick
 from lidar_mi.retrieval.velocimetry.saturation import saturated, saturated_areas
 from lidar_mi.retrieval.velocimetry.windows import Windows, averaged, box_sum, working
 
 # Fraction of a template at the largest value that leaves too little to see.
 _SATURATED = 0.25
-# Px that a spot is moved by along each axis, either way, to see whether it fits better.
-_FARTHEST = 3
-# Px; slower air and structure at rest look alike.
-_SLOWEST = 1.0
+# The same of pixels that are no air.
+_HIDDEN = 0.25
 # Sizes of the spots that are looked for, px.
 _SIZES = (1, 3, 5, 9)
-# Standard deviations of the image, of spots of one size, that a spot must exceed.
-_OUTSTANDING = 5.0
-# Rolls by thirds of the sides: what lies at one place in both images then does so by chance.
-_THIRDS = tuple((i, j) for i in range(3) for j in range(3) if i or j)
-# Spots alike at rest must be so many times those that are by chance.
-_BEYOND_CHANCE = 3.0
+# Times that motion and structure at rest are estimated in turn.
+_TURNS = 3
 # Px; width of the Gaussians over which images without spots are averaged before the motion is
 # looked for.
 _SOFT = 1.5
@@ -45,6 +40,8 @@ class AtRest(NamedTuple):
         Areas of them of at least half a template, see `saturation.saturated_areas`.
     structure : torch.Tensor
         That of `at_rest`.
+    stray : torch.Tensor
+        Pixels of each image that no other has anything of, see `at_rest`.
     pattern : FixedPattern
         All over the images, without these pixels.
     """
@@ -52,12 +49,23 @@ class AtRest(NamedTuple):
     piled: torch.Tensor
     saturated: torch.Tensor
     structure: torch.Tensor
+    stray: torch.Tensor
     pattern: FixedPattern
 
+    @property
+    def hidden(self) -> torch.Tensor:
+        """Pixels (images, z, y) that are left out."""
+        return self.stray | self.saturated | self.structure
+
     def left_out(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """The images without the fixed pattern, NaN in place of what is at rest."""
-        pixels = self.saturated | self.structure
-        return [_left_out(image, pixels) for image in self.pattern.removed(images)]
+        """The images without the fixed pattern, NaN in place of what is no air."""
+        images = self.pattern.removed(images)
+        return [_left_out(image, pixels) for image, pixels in zip(images, self.hidden)]
+
+    def filled(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """The same, with smooth values in place of what is no air."""
+        found = zip(self.left_out(images), images, self.hidden)
+        return [filled_in(i, pixels) if bool(pixels.any()) else i for i, _, pixels in found]
 
     def flags(
         self, found: Displacement, images: Sequence[torch.Tensor], windows: Windows, left_out: bool
@@ -79,15 +87,20 @@ class AtRest(NamedTuple):
         bad = non_finite(images, windows)
         hidden = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
         flag = flag & ~(Flag.NON_FINITE_INPUT * hidden).to(flag.dtype)
-        nothing = not any(bool(part.any()) for part in (self.piled, self.saturated, self.structure))
-        if nothing and not self.pattern.spoils:
+        parts = self.piled, self.saturated, self.structure, self.stray
+        if not any(bool(part.any()) for part in parts) and not self.pattern.spoils:
             return flag
         wide = ~torch.isfinite(found.d).all(0) & ~bad
         piled = windows.of_templates(working(self.piled)).amax(0) > _SATURATED
         # an area of another brightness spoils a correlation from afar
+        spoiled = torch.full_like(bad, self.pattern.spoils)
+        hidden = self.hidden.any(0)
+        spoiled |= windows.of_templates(working(hidden)) > _HIDDEN
+        spoiled |= windows.of_centres(working(hidden)) > 0
+        structure = thick(hidden) if left_out else hidden
         for bit, pixels, here, reach in (
             (Flag.SATURATED, self.saturated, piled, wide if left_out else ~bad),
-            (Flag.AT_REST, self.structure, torch.full_like(bad, self.pattern.spoils), wide),
+            (Flag.AT_REST, structure, spoiled, wide),
         ):
             here = here | (windows.of_templates(working(pixels)) > 0)
             here |= reach & (windows.of_regions(working(pixels)) > 0)
@@ -120,14 +133,17 @@ def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
     pair = [_left_out(image, areas) for image in images[:2]]
     pattern = fixed_pattern(pair, windows)
     pair = pattern.removed(pair)
-    structure, d = at_rest(*pair, windows)
-    return AtRest(piled, areas, structure & ~areas, pattern.with_pixels(pair, d))
+    structure, stray, d = at_rest(*pair, windows)
+    more = torch.zeros_like(piled[2:])
+    found = AtRest(piled, areas, structure & ~areas, torch.cat([stray, more]), pattern)
+    return found._replace(pattern=pattern.with_pixels(found.filled(images)[:2], d))
 
 
 def nothing_at_rest(images: Sequence[torch.Tensor]) -> AtRest:
     """Images or volumes that are known to hold nothing of the kind."""
     none = torch.zeros_like(images[0], dtype=torch.bool)
-    return AtRest(torch.stack([none] * len(images)), none, none, FixedPattern(torch.ones(1)))
+    all_none = torch.stack([none] * len(images))
+    return AtRest(all_none, none, none, all_none, FixedPattern(torch.ones(1)))
 
 
 def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
@@ -137,23 +153,18 @@ def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     return torch.where(pixels, torch.nan, image)
 
 
+def filled_in(image: torch.Tensor, pixels: torch.Tensor | None = None) -> torch.Tensor:
+    """An image with smooth values in place of non-finite pixels, or of some of them."""
+    smooth = torch.as_tensor(inpainted(image.cpu().numpy())).to(image)
+    return smooth if pixels is None else torch.where(pixels, smooth, image)
+
+
 def at_rest(
     image1: torch.Tensor, image2: torch.Tensor, windows: Windows
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pixels with structure that stays where it is while the air around it moves.
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Pixels that do not move with the air around them.
 
-    Spots of 1, 3, 5 and 9 px count (mean over a square less that over one three times as large):
-    beyond 5 robust standard deviations in both images, and alike there to 0.3 of their height. The
-    motion d around them is the median of 5 x 5 coarse vectors of the images without these spots,
-    averaged over Gaussians of 1.5 px, which hide gains of pixels.
-    Spots are at rest where the images differ by 0.7 of the height along d, forward from image 1
-    and back from image 2, and differ least without a displacement: where a spot is all that there
-    is, no d is known. Gaussian texture has one pixel beyond 5 standard deviations in two
-    millions, in one image alone.
-
-    Not found: structure where the air moves by less than a pixel, where it fills most of 5 coarse
-    windows, edges, or a pattern so weak or so dense that no place stands out. Bright air that
-    stands still amid moving air looks at rest, and is.
+    TODO
 
     Parameters
     ----------
@@ -163,74 +174,56 @@ def at_rest(
     Returns
     -------
     structure : torch.Tensor of bool, shape (z, y)
+    stray : torch.Tensor of bool, shape (2, z, y)
     d : torch.Tensor, shape (2, z, y)
         Px.
     """
-    first, second = normalised([image1, image2]).nan_to_num(0.0)
-    means = {size: _means(first, second, size) for size in {*_SIZES, *(3 * n for n in _SIZES)}}
-    spots = [_spots(means[size] - means[3 * size]) for size in _SIZES]
-    candidates = torch.stack([_grown(s.alike, z) for s, z in zip(spots, _SIZES, strict=True)])
-    candidates = candidates.any(0)
-    soft = (_soft(image, ~candidates) for image in (image1, image2))
-    d, scatter = motion_around(*soft, windows)
-    if not bool(candidates.any()):
-        return candidates, d
-    found = torch.zeros_like(candidates)
-    # without texture around, vectors scatter over the search region
-    speed = d.norm(dim=0)
-    known = (speed >= _SLOWEST) & (scatter < speed)
-    for spot, size in zip(spots, _SIZES, strict=True):
-        apart = spot.alike & spot.apart(d)
-        if bool((_grown(apart, size) & known).any()):
-            found |= _grown(apart & spot.still(size), size)
-    return _grown(found & known, 3), d
+    pair = torch.stack([working(image) for image in (image1, image2)])
+    pair = torch.where(pair.isfinite(), pair, torch.nan)
+    outstanding = impulses.outstanding(pair)
+    pair = _normalised(pair, outstanding)
+    hidden = outstanding | impulses.in_both(pair)
+    found = torch.zeros_like(hidden[0])
+    for _ in range(_TURNS):
+        soft = (_soft(image, ~(pixels | found)) for image, pixels in zip(pair, hidden))
+        d, scatter = motion_around(*soft, windows)
+        stray = impulses.unmatched(pair, outstanding, found, d)
+        new = _still(torch.where(stray, torch.nan, pair), found, d)
+        if not bool((new & ~found).any()):
+            break
+        found = found | new
+    return found, stray & ~found, d
 
 
-class _Spots(NamedTuple):
-    """Two images of spots of one size, and where both have alike ones that stand out."""
-
-    one: torch.Tensor
-    two: torch.Tensor
-    alike: torch.Tensor
-
-    def apart(self, d: torch.Tensor) -> torch.Tensor:
-        """Where spots neither came along d nor go on."""
-        off = (self.two - moved(self.one, -d)).abs(), (self.one - moved(self.two, d)).abs()
-        return torch.minimum(*off) > 0.7 * torch.minimum(self.one.abs(), self.two.abs())
-
-    def still(self, size: int) -> torch.Tensor:
-        """Where squares twice as large differ less at rest than moved by up to 3 px."""
-        side = 2 * size + 1
-        steps = range(-_FARTHEST, _FARTHEST + 1)
-        rim = (size,) * 4
-        at_rest, best = None, torch.full_like(self.one, torch.inf)
-        for i, j in product(steps, steps):
-            off = pad((self.one - self.two.roll((i, j), (0, 1))).square(), rim)
-            off = box_sum(box_sum(off, side, -1), side, -2)
-            if i or j:
-                best = torch.minimum(best, off)
-            else:
-                at_rest = off
-        return at_rest < best
+def _normalised(pair: torch.Tensor, but: torch.Tensor) -> torch.Tensor:
+    """Images with mean 0 and standard deviation 1 of all but some pixels."""
+    known = pair.isfinite() & ~but
+    parts = []
+    for image, use in zip(pair, known, strict=True):
+        values = image[use]
+        contrast = values.std(correction=0) if values.numel() else image.new_ones(())
+        mean = values.mean() if values.numel() else 0.0
+        parts.append((image - mean) / torch.where(contrast > 0, contrast, 1.0))
+    return torch.stack(parts)
 
 
-def _spots(pair: torch.Tensor) -> _Spots:
-    one, two = pair
-    least = _OUTSTANDING * 1.4826 * torch.maximum(one.abs().median(), two.abs().median())
-    alike = _alike(one, two, least)
-    if not bool(alike.any()):
-        return _Spots(one, two, alike)
-    # among many bright particles some lie by chance where others were
-    rows, columns = two.shape
-    turned = [two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in _THIRDS]
-    chance = sum(float(_alike(one, other, least).sum()) for other in turned) / len(turned)
-    few = float(alike.sum()) < _BEYOND_CHANCE * chance
-    return _Spots(one, two, alike & (not few))
-
-
-def _alike(one: torch.Tensor, two: torch.Tensor, least: torch.Tensor) -> torch.Tensor:
-    lower = torch.minimum(one.abs(), two.abs())
-    return (lower > least) & ((two - one).abs() < 0.3 * lower)
+def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) at rest in air that moves by d, from small to large."""
+    for size in _SIZES:
+        known = torch.where(found, torch.nan, pair)
+        if size == 1:
+            one, two = (impulses.height(image).nan_to_num(0.0) for image in known)
+        else:
+            image = torch.stack([filled_in(i) for i in known])
+            one, two = _means(image, size) - _means(image, 3 * size)
+        off = torch.minimum((two - moved(one, -d)).abs(), (one - moved(two, d)).abs())
+        limit = impulses.threshold(off.numel())
+        lower = torch.minimum(one.abs(), two.abs())
+        spread = torch.maximum(*(impulses.median_scale(i) for i in (one, two)))
+        new = (off > limit * impulses.median_scale(off)) & (lower > limit * spread)
+        new &= ((two - one).abs() < 0.3 * off) & (lower > 0.5 * off)
+        found = found | _grown(new, size)
+    return found
 
 
 def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:
@@ -238,8 +231,8 @@ def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:
     return box_sum(box_sum(pixels, size, -1), size, -2) > 0
 
 
-def _means(first: torch.Tensor, second: torch.Tensor, size: int) -> torch.Tensor:
-    images = pad(torch.stack([first, second]), (size // 2,) * 4, "replicate")
+def _means(images: torch.Tensor, size: int) -> torch.Tensor:
+    images = pad(images, (size // 2,) * 4, "replicate")
     return box_sum(box_sum(images, size, -1), size, -2) / size**2
 
 

@@ -19,7 +19,7 @@ from lidar_mi.retrieval.velocimetry.band_limit import (
     radii,
     shell_means,
 )
-from lidar_mi.retrieval.velocimetry.common_grid import nearest_filled
+from lidar_mi.retrieval.velocimetry.inpainting import inpainted
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.velocimetry.windows import stored
@@ -294,11 +294,11 @@ def _finite(images: Sequence[torch.Tensor]) -> torch.Tensor:
 
 
 def _continued(image: torch.Tensor) -> torch.Tensor:
-    """The image with the value of the nearest finite pixel in place of non-finite ones."""
+    """The image with smooth values in place of non-finite ones."""
     finite = torch.isfinite(image)
     if bool(finite.all()) or not bool(finite.any()):
         return filled(image)
-    return torch.as_tensor(nearest_filled(image.cpu().numpy())).to(image)
+    return torch.as_tensor(inpainted(image.cpu().numpy())).to(image)
 
 
 def transform_sizes(shape: Sequence[int], settings: FilterSettings) -> list[int]:
