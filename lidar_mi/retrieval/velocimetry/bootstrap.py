@@ -16,9 +16,10 @@ from torch.nn.functional import grid_sample, pad
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
+from lidar_mi.retrieval.velocimetry.inpainting import filled_in
 from lidar_mi.retrieval.velocimetry.likelihood import usable_and_weight
 from lidar_mi.retrieval.velocimetry.outliers import median_outliers, validated
-from lidar_mi.retrieval.velocimetry.quality import filled
+from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.settings import (
     VOLUME_FILTER,
     FilterSettings,
@@ -179,7 +180,7 @@ def bootstrap_covariance(
 
     wind = at_mid_time(flow, coarse, centred)
     first, second = normalised(images)
-    carried, inside = _carried(filled(first), wind)
+    carried, inside = _carried(first, wind)
     # of air that came in nothing is known
     alike = second.isfinite() & inside
     rest = torch.where(alike, second - carried, 0.0)
@@ -196,12 +197,12 @@ def bootstrap_covariance(
     added = level
     if stated is not None:
         added = (square - about(stated)).clamp(min=_REMAINING * square).sqrt()
-    told = coarse.of_templates(known_noise) * _inverse_texture(filled(first), coarse)
+    told = coarse.of_templates(known_noise) * _inverse_texture(filled_in(first), coarse)
     same = [torch.ones_like(flow), told]
     if centred:
         shear = averaged(_squared_gradient(vectors), everywhere, _SHEAR * per_template)
         same.append(shear.square().expand_as(flow))
-        valid = known & ~replaced & (found.flag[some] == 0)
+        valid = known & ~replaced & _unflagged(found)[some]
         own = [_roughness(vectors, valid, _ROUGH * per_template)]
     else:
         same.append((flow - vectors).square())
@@ -214,7 +215,7 @@ def bootstrap_covariance(
         moved = torch.where(second.isfinite(), added * moved, torch.nan)
         again = retrieve(first, carried + moved, stride=coarse.stride)
         outlier = median_outliers(again.d, 3, max(1, round(per_template / 2)))
-        use = (again.flag == 0) & ~outlier & known
+        use = _unflagged(again) & ~outlier & known
         if not bool(use.any()):
             continue
         error = again.d - _read(wind, _places(again.d, coarse, centred))
@@ -249,6 +250,12 @@ def bootstrap_covariance(
     covariance[:, :, separable(number, weights) < _FEWEST] = torch.nan
     least = _LEAST**2 * torch.eye(windows.dims).to(d)
     return covariance + least.reshape(*least.shape, *[1] * windows.dims)
+
+
+def _unflagged(found: Displacement) -> torch.Tensor:
+    """Vectors that are valid, be it from what is finite in their windows."""
+    flag = found.flag & ~Flag.NON_FINITE_INPUT.value
+    return (flag == 0) & found.d.isfinite().all(0)
 
 
 def _in_a_mean(dims: int) -> float:

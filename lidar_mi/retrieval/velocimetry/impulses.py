@@ -15,6 +15,8 @@ _AROUND = 8.0
 _PEELS = 4
 # Px about a place, or about where the air carries it, in which an impulse is looked for.
 _NEAR = 2
+# Impulses without a match over those with one, below which they are texture as these are.
+_FEW = 0.1
 # Fraction of its height that counts as the same impulse.
 _ALIKE = 0.5
 
@@ -55,9 +57,9 @@ def scale(values: torch.Tensor) -> torch.Tensor:
         use = less & use
 
 
-def median_scale(values: torch.Tensor) -> torch.Tensor:
+def median_scale(values: torch.Tensor, size: int = 1) -> torch.Tensor:
     """The same of any distribution of which less than half stands out: 1.48 local medians."""
-    size = int(2 * _AROUND)
+    size = int(2 * _AROUND) + 6 * (size - 1)
     rows, columns = (-(-n // size) * size for n in values.shape)
     wide = values.new_full((rows, columns), torch.nan)
     wide[: values.shape[0], : values.shape[1]] = values.abs()
@@ -108,4 +110,9 @@ def unmatched(
         most = max_pool2d(heights[other].abs()[None], size, 1, _NEAR)[0]
         there = moved(most, along)
         gone.append(found[own] & (most < least) & (there < least))
-    return torch.stack(gone)
+    gone = torch.stack(gone)
+    others = found & ~gone & ~rest
+    if int(gone.sum()) < _FEW * int(others.sum()):
+        # where texture is impulses, some are not found again by chance
+        gone &= heights.abs() > heights[others].abs().max()
+    return gone

@@ -1,6 +1,7 @@
 """Values for pixels that are not known, for filters alone: the smoothest ones."""
 
 import numpy as np
+import torch
 from scipy import sparse
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse.linalg import spsolve
@@ -57,3 +58,15 @@ def inpainted(values: np.ndarray) -> np.ndarray:
     found = found.astype(float, copy=True)
     found[unknown] = spsolve((matrix.T @ matrix).tocsc(), matrix.T @ right)
     return found
+
+
+def filled_in(image: torch.Tensor, pixels: torch.Tensor | None = None) -> torch.Tensor:
+    """An image `inpainted`, all of it or only where some pixels are.
+
+    As it is if it is finite all over, or nowhere.
+    """
+    finite = torch.isfinite(image)
+    if bool(finite.all()) or not bool(finite.any()):
+        return image if bool(finite.all()) else torch.zeros_like(image)
+    smooth = torch.as_tensor(inpainted(image.cpu().numpy())).to(image)
+    return smooth if pixels is None else torch.where(pixels, smooth, image)

@@ -138,7 +138,7 @@ def multipass(
         + Flag.REPLACED * replaced[at]
     ).to(torch.int16)
     flag[bad] |= Flag.NON_FINITE_INPUT.value
-    d = torch.where(bad | ~matched, torch.nan, d)
+    d = torch.where(matched, d, torch.nan)
     return Displacement(d, fit.score, flag, fit.covariance + curved)
 
 

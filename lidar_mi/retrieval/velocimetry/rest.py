@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
+from scipy import ndimage
 from torch.nn.functional import pad
 
 from lidar_mi.retrieval.velocimetry import impulses
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.fixed_pattern import FixedPattern, fixed_pattern
-from lidar_mi.retrieval.velocimetry.inpainting import inpainted
+from lidar_mi.retrieval.velocimetry.inpainting import filled_in
 from lidar_mi.retrieval.velocimetry.motion import motion_around, moved
 from lidar_mi.retrieval.velocimetry.quality import Flag, non_finite, thick
 from lidar_mi.retrieval.velocimetry.saturation import saturated, saturated_areas
@@ -21,7 +22,15 @@ _SATURATED = 0.25
 # The same of pixels that are no air.
 _HIDDEN = 0.25
 # Sizes of the spots that are looked for, px.
-_SIZES = (1, 3, 5, 9)
+_SIZES = (3, 5, 9)
+# Of the images' mean squared difference, that of areas at rest.
+_STILL = 0.1
+# Fraction of their height by which spots at rest differ at most.
+_DIFFER = 0.3
+# Rolls by thirds of the sides: what lies at one place in both images then does so by chance.
+_THIRDS = tuple((i, j) for i in range(3) for j in range(3) if i or j)
+# Spots at rest must be so many times those that are by chance.
+_BEYOND_CHANCE = 3.0
 # Times that motion and structure at rest are estimated in turn.
 _TURNS = 3
 # Px; width of the Gaussians over which images without spots are averaged before the motion is
@@ -153,12 +162,6 @@ def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
     return torch.where(pixels, torch.nan, image)
 
 
-def filled_in(image: torch.Tensor, pixels: torch.Tensor | None = None) -> torch.Tensor:
-    """An image with smooth values in place of non-finite pixels, or of some of them."""
-    smooth = torch.as_tensor(inpainted(image.cpu().numpy())).to(image)
-    return smooth if pixels is None else torch.where(pixels, smooth, image)
-
-
 def at_rest(
     image1: torch.Tensor, image2: torch.Tensor, windows: Windows
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -208,22 +211,65 @@ def _normalised(pair: torch.Tensor, but: torch.Tensor) -> torch.Tensor:
 
 
 def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """Pixels (z, y) at rest in air that moves by d, from small to large."""
+    """Pixels (z, y) at rest in air that moves by d: single ones, edges, spots, areas."""
+    heights = torch.stack([impulses.height(i) for i in torch.where(found, torch.nan, pair)])
+    found = found | _stays(heights, d, 1)
+    for axis in (-2, -1):
+        steps = torch.where(found, torch.nan, pair).diff(dim=axis)
+        edge = _stays(pad(steps, (0, 0) * (-1 - axis) + (0, 1)), d, 1)
+        found = found | edge | edge.roll(1, axis)
     for size in _SIZES:
-        known = torch.where(found, torch.nan, pair)
-        if size == 1:
-            one, two = (impulses.height(image).nan_to_num(0.0) for image in known)
-        else:
-            image = torch.stack([filled_in(i) for i in known])
-            one, two = _means(image, size) - _means(image, 3 * size)
-        off = torch.minimum((two - moved(one, -d)).abs(), (one - moved(two, d)).abs())
-        limit = impulses.threshold(off.numel())
-        lower = torch.minimum(one.abs(), two.abs())
-        spread = torch.maximum(*(impulses.median_scale(i) for i in (one, two)))
-        new = (off > limit * impulses.median_scale(off)) & (lower > limit * spread)
-        new &= ((two - one).abs() < 0.3 * off) & (lower > 0.5 * off)
-        found = found | _grown(new, size)
-    return found
+        known = torch.stack([filled_in(i) for i in torch.where(found, torch.nan, pair)])
+        spots = _means(known, size) - _means(known, 3 * size)
+        found = found | _grown(_stays(spots, d, size), size)
+    return found | _enclosed(pair, found)
+
+
+def _stays(pair: torch.Tensor, d: torch.Tensor, size: int) -> torch.Tensor:
+    """Where what stands out of two fields (2, z, y) neither came along d nor goes on."""
+    one, two = pair.nan_to_num(0.0)
+    off = torch.minimum((two - moved(one, -d)).abs(), (one - moved(two, d)).abs())
+    limit = impulses.threshold(off.numel() // size**2)
+    least = limit * torch.maximum(*(impulses.median_scale(i, size) for i in (one, two)))
+    new = (off > limit * impulses.median_scale(off, size)) & _alike(one, two, least)
+    new &= ((two - one).abs() < _DIFFER * off) & (_lower(one, two) > off / 2)
+    if not bool(new.any()):
+        return new
+    # among many bright particles some lie by chance where others were
+    rows, columns = two.shape
+    turned = [two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in _THIRDS]
+    chance = sum(float(_alike(one, other, least).sum()) for other in turned) / len(turned)
+    return new & (float(new.sum()) >= _BEYOND_CHANCE * chance)
+
+
+def _enclosed(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
+    """Areas cut off by what is at rest that change by less than a tenth of what others do."""
+    if not bool(found.any()):
+        return found
+    square = (pair[1] - pair[0]).square()
+    known = square.isfinite() & ~found
+    area, number = ndimage.label((~found).cpu().numpy())
+    if number < 2:
+        return torch.zeros_like(found)
+    area = torch.as_tensor(area, device=found.device)
+    sums, count = (
+        torch.zeros(number + 1, dtype=square.dtype, device=square.device).index_add(
+            0, area[known], part[known]
+        )
+        for part in (square, torch.ones_like(square))
+    )
+    still = sums < _STILL * count * square[known].mean()
+    still[0] = False
+    return still[area]
+
+
+def _alike(one: torch.Tensor, two: torch.Tensor, least: torch.Tensor) -> torch.Tensor:
+    lower = _lower(one, two)
+    return (lower > least) & ((two - one).abs() < _DIFFER * lower)
+
+
+def _lower(one: torch.Tensor, two: torch.Tensor) -> torch.Tensor:
+    return torch.minimum(one.abs(), two.abs())
 
 
 def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:

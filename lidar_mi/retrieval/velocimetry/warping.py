@@ -19,8 +19,7 @@ from lidar_mi.retrieval.velocimetry.band_limit import (
     radii,
     shell_means,
 )
-from lidar_mi.retrieval.velocimetry.inpainting import inpainted
-from lidar_mi.retrieval.velocimetry.quality import filled
+from lidar_mi.retrieval.velocimetry.inpainting import filled_in
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.velocimetry.windows import stored
 
@@ -289,16 +288,8 @@ def spectrum_of(
 
 
 def _finite(images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Images (images, ...) as they are stored, `_continued`."""
-    return torch.stack([stored(_continued(image)) for image in images])
-
-
-def _continued(image: torch.Tensor) -> torch.Tensor:
-    """The image with smooth values in place of non-finite ones."""
-    finite = torch.isfinite(image)
-    if bool(finite.all()) or not bool(finite.any()):
-        return filled(image)
-    return torch.as_tensor(inpainted(image.cpu().numpy())).to(image)
+    """Images (images, ...) as they are stored, with smooth values where they are not finite."""
+    return torch.stack([stored(filled_in(image)) for image in images])
 
 
 def transform_sizes(shape: Sequence[int], settings: FilterSettings) -> list[int]:

@@ -208,6 +208,9 @@ def retrieve_wind(
         texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
         apart = max(1, round(template / 2 / stride))
         flag = resting.flags(found, whole, windows, chosen.centred)
+        if chosen.local:
+            bad = (flag & Flag.NON_FINITE_INPUT.value) > 0
+            found = found._replace(d=torch.where(bad, torch.nan, found.d))
         if chosen.repeats:
             if found.covariance is not None:
                 flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
