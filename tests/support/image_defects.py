@@ -231,7 +231,7 @@ def _interline(random, images, fraction):
 def _saturated(random, images, fraction):
     """Glints with halos, cut off at the limit."""
     inside = _discs(random, images[0].shape, fraction / 2, 2.0, 5.0)
-    more = 30.0 * np.exp(np.minimum(inside, 0.0))
+    more = 30.0 * np.exp(np.minimum(2 * inside, 0.0))
     return [np.minimum(image + more, 10.0) for image in images]
 
 

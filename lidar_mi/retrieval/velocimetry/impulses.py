@@ -1,24 +1,28 @@
 """Pixels that stand out of all around them, as no image of air does that a beam or a lens blurs."""
 
+import numpy as np
 import torch
 from scipy.stats import norm
 from torch.nn.functional import max_pool2d, pad
 
-from lidar_mi.retrieval.velocimetry.motion import moved
+from lidar_mi.retrieval.velocimetry.warping import nearest
 from lidar_mi.retrieval.velocimetry.windows import averaged
 
 FALSE_ALARM = 1e-4
 """Probability that an image of normal noise has a pixel that counts as an impulse."""
+THIRDS = tuple((i, j) for i in range(3) for j in range(3) if i or j)
+"""Rolls by thirds of the sides: what lies at one place in both images then does so by chance."""
 # Px; width of the Gaussian over which the scale of differences is estimated.
 _AROUND = 8.0
 # Times that pixels are peeled off: areas of four pixels across vanish.
 _PEELS = 4
 # Px about a place, or about where the air carries it, in which an impulse is looked for.
 _NEAR = 2
-# Impulses without a match over those with one, below which they are texture as these are.
-_FEW = 0.1
-# Fraction of its height that counts as the same impulse.
-_ALIKE = 0.5
+# Impulses at one place must be so many times those that are by chance.
+_BEYOND_CHANCE = 3.0
+# Least fraction of its height next to an impulse that a lens or a beam blurs; the neighbours.
+_RESOLVED = 0.15
+_BESIDE = (0, 1), (1, 0), (1, 2), (2, 1)
 
 
 def threshold(number: int) -> float:
@@ -89,30 +93,74 @@ def outstanding(pair: torch.Tensor) -> torch.Tensor:
     return torch.stack([_peeled(image, scale) for image in pair])
 
 
-def in_both(pair: torch.Tensor) -> torch.Tensor:
-    """Pixels (z, y) that stand out of most others in both images."""
-    return torch.stack([_peeled(image, median_scale) for image in pair]).all(0)
+def sharp(pair: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) that no image of air resolves and that two have alike, however fast it moves.
+
+    They stand out of most others in both images. Next to them nothing is left of their height: on
+    average over the known ones of the four neighbours less than 0.15. Of a particle of 2 px
+    (1/e^2), the smallest that can be followed, 0.23 is left. And there are three times as many as
+    in images that are rolled, which have them at one place by chance.
+    """
+    each = torch.stack([_peeled(image, median_scale) for image in pair])
+    found = each.all(0)
+    if not bool(found.any()):
+        return found
+    rows, columns = found.shape
+    turned = [each[1].roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in THIRDS]
+    # the median, as lines at rest fall on themselves
+    chance = float(np.median([int((each[0] & other).sum()) for other in turned]))
+    if float(found.sum()) < _BEYOND_CHANCE * chance:
+        return torch.zeros_like(found)
+    known = torch.where(found, torch.nan, pair)
+    wide = pad(known[None], (2,) * 4, mode="replicate")[0]
+    around = wide.unfold(1, 5, 1).unfold(2, 5, 1).flatten(3).nanmedian(-1).values
+    excess, peak = pad(known - around, (1,) * 4, value=torch.nan), (pair - around).nan_to_num(0.0)
+    beside = [excess[:, i : i + found.shape[0], j : j + found.shape[1]] for i, j in _BESIDE]
+    left = torch.stack(beside).nanmean(0).abs()
+    alike = (peak[1] - peak[0]).abs() < 0.3 * peak.abs().amin(0)
+    alone = (left < _RESOLVED * peak.abs()).all(0) & alike & found
+    return alone
 
 
-def unmatched(
+def stray(
     pair: torch.Tensor, found: torch.Tensor, rest: torch.Tensor, d: torch.Tensor
 ) -> torch.Tensor:
-    """Of `outstanding` pixels (images, z, y) those that the other image has nothing of.
+    """Of `outstanding` pixels (images, z, y) those that the air does not carry from one to another.
 
-    Neither about the same place, nor about where air in the motion d comes from or goes to.
+    A pixel has a match if the other image has one of at least half its height within 2 px of where
+    the motion d leads. If three times as many have one as in images that are rolled, the texture
+    itself is of such pixels (particles, wisps of smoke): then only those without a match count that
+    are higher than all with one. Else all do that are not at `rest`.
     """
+    found = found & ~rest
+    if not bool(found.any()):
+        return found
     heights = torch.stack([height(image) for image in torch.where(rest, torch.nan, pair)])
-    heights = heights.nan_to_num(0.0)
-    gone = []
-    for own, other, along in ((0, 1, d), (1, 0, -d)):
-        least = _ALIKE * heights[own].abs()
-        size = 2 * _NEAR + 1
-        most = max_pool2d(heights[other].abs()[None], size, 1, _NEAR)[0]
-        there = moved(most, along)
-        gone.append(found[own] & (most < least) & (there < least))
-    gone = torch.stack(gone)
-    others = found & ~gone & ~rest
-    if int(gone.sum()) < _FEW * int(others.sum()):
-        # where texture is impulses, some are not found again by chance
-        gone &= heights.abs() > heights[others].abs().max()
-    return gone
+    heights = heights.nan_to_num(0.0).abs() * found
+    carried = [_carried(heights, way, 0, 0, d) for way in (0, 1)]
+    matched = torch.stack([found[k] & carried[k] for k in (0, 1)])
+    rows, columns = d.shape[1:]
+    chance = torch.stack(
+        [
+            (found[0] & _carried(heights, 0, int(i * rows / 3), int(j * columns / 3), d)).sum()
+            for i, j in THIRDS
+        ]
+    )
+    if int(matched[0].sum()) <= _BEYOND_CHANCE * float(chance.double().median()):
+        return found
+    return found & ~matched & (heights > heights[matched].max())
+
+
+def _carried(
+    heights: torch.Tensor, own: int, row: int, column: int, d: torch.Tensor
+) -> torch.Tensor:
+    """Pixels of an image that the other, rolled, has a match of."""
+    side = 2 * _NEAR + 1
+    most = max_pool2d(heights[1 - own].roll((row, column), (0, 1))[None], side, 1, _NEAR)[0]
+    there = nearest(most[None], _places(d if own == 0 else -d))[0]
+    return there >= heights[own] / 2
+
+
+def _places(d: torch.Tensor) -> list[torch.Tensor]:
+    here = torch.meshgrid(*(torch.arange(n).to(d) for n in d.shape[1:]), indexing="ij")
+    return [(place + part)[None] for place, part in zip(here, d, strict=True)]

@@ -1,8 +1,9 @@
 """What does not move with the air: saturated areas and structure at rest in two images."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from scipy import ndimage
 from torch.nn.functional import pad
@@ -23,12 +24,12 @@ _SATURATED = 0.25
 _HIDDEN = 0.25
 # Sizes of the spots that are looked for, px.
 _SIZES = (3, 5, 9)
+# Length of lines, px.
+_LINE = 9
 # Of the images' mean squared difference, that of areas at rest.
 _STILL = 0.1
 # Fraction of their height by which spots at rest differ at most.
 _DIFFER = 0.3
-# Rolls by thirds of the sides: what lies at one place in both images then does so by chance.
-_THIRDS = tuple((i, j) for i in range(3) for j in range(3) if i or j)
 # Spots at rest must be so many times those that are by chance.
 _BEYOND_CHANCE = 3.0
 # Times that motion and structure at rest are estimated in turn.
@@ -69,12 +70,12 @@ class AtRest(NamedTuple):
     def left_out(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The images without the fixed pattern, NaN in place of what is no air."""
         images = self.pattern.removed(images)
-        return [_left_out(image, pixels) for image, pixels in zip(images, self.hidden)]
+        return [_left_out(image, pixels) for image, pixels in zip(images, self.hidden, strict=False)]
 
     def filled(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The same, with smooth values in place of what is no air."""
-        found = zip(self.left_out(images), images, self.hidden)
-        return [filled_in(i, pixels) if bool(pixels.any()) else i for i, _, pixels in found]
+        found = zip(self.left_out(images), self.hidden, strict=False)
+        return [filled_in(i, pixels) if bool(pixels.any()) else i for i, pixels in found]
 
     def flags(
         self, found: Displacement, images: Sequence[torch.Tensor], windows: Windows, left_out: bool
@@ -140,9 +141,11 @@ def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
     if windows.dims > 2:
         return nothing_at_rest(images)._replace(piled=piled, saturated=areas)
     pair = [_left_out(image, areas) for image in images[:2]]
-    pattern = fixed_pattern(pair, windows)
-    pair = pattern.removed(pair)
     structure, stray, d = at_rest(*pair, windows)
+    hidden = stray | structure
+    pattern = fixed_pattern([_left_out(i, p) for i, p in zip(pair, hidden, strict=True)], windows)
+    if pattern.columns or pattern.rows:
+        structure, stray, d = at_rest(*pattern.removed(pair), windows)
     more = torch.zeros_like(piled[2:])
     found = AtRest(piled, areas, structure & ~areas, torch.cat([stray, more]), pattern)
     return found._replace(pattern=pattern.with_pixels(found.filled(images)[:2], d))
@@ -185,12 +188,12 @@ def at_rest(
     pair = torch.where(pair.isfinite(), pair, torch.nan)
     outstanding = impulses.outstanding(pair)
     pair = _normalised(pair, outstanding)
-    hidden = outstanding | impulses.in_both(pair)
-    found = torch.zeros_like(hidden[0])
+    found = impulses.sharp(pair)
+    hidden = outstanding | _candidates(pair, found)
     for _ in range(_TURNS):
-        soft = (_soft(image, ~(pixels | found)) for image, pixels in zip(pair, hidden))
-        d, scatter = motion_around(*soft, windows)
-        stray = impulses.unmatched(pair, outstanding, found, d)
+        soft = (_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True))
+        d, _ = motion_around(*soft, windows)
+        stray = impulses.stray(pair, outstanding, found, d)
         new = _still(torch.where(stray, torch.nan, pair), found, d)
         if not bool((new & ~found).any()):
             break
@@ -210,36 +213,102 @@ def _normalised(pair: torch.Tensor, but: torch.Tensor) -> torch.Tensor:
     return torch.stack(parts)
 
 
-def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
-    """Pixels (z, y) at rest in air that moves by d: single ones, edges, spots, areas."""
-    heights = torch.stack([impulses.height(i) for i in torch.where(found, torch.nan, pair)])
-    found = found | _stays(heights, d, 1)
-    for axis in (-2, -1):
-        steps = torch.where(found, torch.nan, pair).diff(dim=axis)
-        edge = _stays(pad(steps, (0, 0) * (-1 - axis) + (0, 1)), d, 1)
-        found = found | edge | edge.roll(1, axis)
+class _Field(NamedTuple):
+    """What may stand out of two images (2, z, y), its size in px, and the pixels it marks."""
+
+    pair: torch.Tensor
+    size: int
+    marked: Callable[[torch.Tensor], torch.Tensor]
+
+
+def _fields(pair: torch.Tensor, found: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
+    """Single pixels, lines, edges, spots: each from the images without what was found before."""
+
+    def heights(found):
+        known = torch.where(found, torch.nan, pair)
+        return torch.stack([impulses.height(image) for image in known])
+
+    yield lambda found: _Field(heights(found), 1, lambda new: new)
+    for axis in (-1, -2):
+        yield lambda found, axis=axis: _Field(
+            _along(heights(found), axis), 3, lambda new: _along(new.double(), axis) > 0
+        )
+    for axis in (-1, -2):
+        yield lambda found, axis=axis: _Field(
+            pad(torch.where(found, torch.nan, pair).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1)),
+            1,
+            lambda new: new | new.roll(1, axis),
+        )
     for size in _SIZES:
-        known = torch.stack([filled_in(i) for i in torch.where(found, torch.nan, pair)])
-        spots = _means(known, size) - _means(known, 3 * size)
-        found = found | _grown(_stays(spots, d, size), size)
+        yield lambda found, size=size: _Field(
+            _spots(torch.where(found, torch.nan, pair), size), size, lambda new: _grown(new, size)
+        )
+
+
+def _spots(pair: torch.Tensor, size: int) -> torch.Tensor:
+    known = torch.stack([filled_in(image) for image in pair])
+    return _means(known, size) - _means(known, 3 * size)
+
+
+def _along(fields: torch.Tensor, axis: int) -> torch.Tensor:
+    """Means over lines of 9 px."""
+    rim = (0, 0) * (-1 - axis) + (_LINE // 2,) * 2
+    return box_sum(pad(fields.nan_to_num(0.0), rim), _LINE, axis) / _LINE
+
+
+def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) of all that stands out alike of both images, at rest or not."""
+    for of in _fields(pair, found):
+        field = of(found)
+        one, two = field.pair.nan_to_num(0.0)
+        least = _least(field)
+        alike = _beyond_chance(_alike(one, two, least), one, two, least)
+        found = found | field.marked(alike)
+    return found
+
+
+def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots, areas."""
+    for of in _fields(pair, found):
+        field = of(found)
+        found = found | field.marked(_stays(field, d))
     return found | _enclosed(pair, found)
 
 
-def _stays(pair: torch.Tensor, d: torch.Tensor, size: int) -> torch.Tensor:
+def _least(field: _Field) -> torch.Tensor:
+    """Height that no value of the field exceeds by chance."""
+    limit = impulses.threshold(field.pair[0].numel() // field.size**2)
+    return limit * torch.maximum(*(impulses.median_scale(i, field.size) for i in field.pair))
+
+
+def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     """Where what stands out of two fields (2, z, y) neither came along d nor goes on."""
-    one, two = pair.nan_to_num(0.0)
-    off = torch.minimum((two - moved(one, -d)).abs(), (one - moved(two, d)).abs())
-    limit = impulses.threshold(off.numel() // size**2)
-    least = limit * torch.maximum(*(impulses.median_scale(i, size) for i in (one, two)))
-    new = (off > limit * impulses.median_scale(off, size)) & _alike(one, two, least)
+    least = _least(field)
+    one, two = field.pair.nan_to_num(0.0)
+    off = [
+        torch.where(_inside(along), (here - moved(there, along)).abs(), torch.inf)
+        for here, there, along in ((one, two, d), (two, one, -d))
+    ]
+    off = torch.minimum(*off)
+    off = torch.where(off.isfinite(), off, 0.0)
+    limit = impulses.threshold(off.numel() // field.size**2)
+    new = (off > limit * impulses.median_scale(off, field.size)) & _alike(one, two, least)
     new &= ((two - one).abs() < _DIFFER * off) & (_lower(one, two) > off / 2)
     if not bool(new.any()):
         return new
-    # among many bright particles some lie by chance where others were
+    return _beyond_chance(new, one, two, least)
+
+
+def _beyond_chance(new, one, two, least) -> torch.Tensor:
+    """Those pixels, or none if unrelated images have a third as many alike in one place.
+
+    Among many bright particles some lie by chance where others were.
+    """
     rows, columns = two.shape
-    turned = [two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in _THIRDS]
-    chance = sum(float(_alike(one, other, least).sum()) for other in turned) / len(turned)
-    return new & (float(new.sum()) >= _BEYOND_CHANCE * chance)
+    turned = [two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in impulses.THIRDS]
+    # the median, as lines at rest fall on themselves
+    chance = float(np.median([int(_alike(one, other, least).sum()) for other in turned]))
+    return new & bool(int(new.sum()) >= _BEYOND_CHANCE * chance)
 
 
 def _enclosed(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
@@ -261,6 +330,15 @@ def _enclosed(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
     still = sums < _STILL * count * square[known].mean()
     still[0] = False
     return still[area]
+
+
+def _inside(d: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) from which d (2, z, y) leads to another one of the image."""
+    inside = torch.ones_like(d[0], dtype=torch.bool)
+    for axis, (part, n) in enumerate(zip(d, d.shape[1:], strict=True)):
+        place = torch.arange(n).to(d).reshape(-1, *[1] * (1 - axis)) + part
+        inside &= (place > -0.5) & (place < n - 0.5)
+    return inside
 
 
 def _alike(one: torch.Tensor, two: torch.Tensor, least: torch.Tensor) -> torch.Tensor:
