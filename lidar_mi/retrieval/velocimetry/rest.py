@@ -24,6 +24,8 @@ _SATURATED = 0.25
 _HIDDEN = 0.25
 # Sizes of the spots that are looked for, px.
 _SIZES = (3, 5, 9)
+# Half of the gaps in what stands out, px, that the motion is not looked for in.
+_GAP = 2
 # Length of lines, px.
 _LINE = 9
 # Of the images' mean squared difference, that of areas at rest.
@@ -264,7 +266,7 @@ def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
         least = _least(field)
         alike = _beyond_chance(_alike(one, two, least), one, two, least)
         found = found | field.marked(alike)
-    return found
+    return _closed(found, _GAP)
 
 
 def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
@@ -317,19 +319,28 @@ def _enclosed(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
         return found
     square = (pair[1] - pair[0]).square()
     known = square.isfinite() & ~found
-    area, number = ndimage.label((~found).cpu().numpy())
-    if number < 2:
+    if not bool(known.any()):
         return torch.zeros_like(found)
-    area = torch.as_tensor(area, device=found.device)
-    sums, count = (
-        torch.zeros(number + 1, dtype=square.dtype, device=square.device).index_add(
-            0, area[known], part[known]
+    limit = _STILL * float(square[known].mean())
+    closed = _closed(found, 1)
+    still = torch.zeros_like(found)
+    for part in (~closed, closed & ~found):
+        area, number = ndimage.label(part.cpu().numpy())
+        use = (known & part).cpu().numpy()
+        numbers, values = area[use], square.cpu().numpy()[use]
+        change = np.bincount(numbers, values, number + 1) - limit * np.bincount(
+            numbers, minlength=number + 1
         )
-        for part in (square, torch.ones_like(square))
-    )
-    still = sums < _STILL * count * square[known].mean()
-    still[0] = False
-    return still[area]
+        still |= torch.as_tensor((change < 0)[area], device=found.device) & part
+    return still
+
+
+def _closed(pixels: torch.Tensor, reach: int) -> torch.Tensor:
+    """Pixels and gaps between them of up to twice the reach."""
+    wide = _grown(pixels, 2 * reach + 1)
+    return ~_grown(pad(~wide, (reach,) * 4, value=False), 2 * reach + 1)[
+        reach : reach + pixels.shape[0], reach : reach + pixels.shape[1]
+    ] | pixels
 
 
 def _inside(d: torch.Tensor) -> torch.Tensor:
