@@ -24,6 +24,9 @@ _SATURATED = 0.25
 _HIDDEN = 0.25
 # Sizes of the spots that are looked for, px.
 _SIZES = (3, 5, 9)
+# Part of the thresholds that suffices next to what exceeds them (hysteresis: Canny 1986, IEEE
+# Trans. PAMI 8, 679-698).
+_WEAK = 0.5
 # Half of the gaps in what stands out, px, that the motion is not looked for in.
 _GAP = 2
 # Length of lines, px.
@@ -216,35 +219,55 @@ def _normalised(pair: torch.Tensor, but: torch.Tensor) -> torch.Tensor:
 
 
 class _Field(NamedTuple):
-    """What may stand out of two images (2, z, y), its size in px, and the pixels it marks."""
+    """What may stand out of two images.
+
+    Its values (2, z, y), by how much these or the pixels themselves differ (z, y), its size in px,
+    and the pixels that it marks.
+    """
 
     pair: torch.Tensor
+    change: torch.Tensor
     size: int
     marked: Callable[[torch.Tensor], torch.Tensor]
 
 
-def _fields(pair: torch.Tensor, found: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
+def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
     """Single pixels, lines, edges, spots: each from the images without what was found before."""
+    same = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
 
-    def heights(found):
-        known = torch.where(found, torch.nan, pair)
-        return torch.stack([impulses.height(image) for image in known])
+    def known(found):
+        return torch.where(found, torch.nan, pair)
 
-    yield lambda found: _Field(heights(found), 1, lambda new: new)
+    def of(values, size, marked, same=None):
+        change = (values[1] - values[0]).nan_to_num(0.0).abs()
+        return _Field(values, change if same is None else change.minimum(same), size, marked)
+
+    def pixels(found):
+        heights = torch.stack([impulses.height(image) for image in known(found)])
+        return of(heights, 1, lambda new: new, same)
+
+    yield pixels
     for axis in (-1, -2):
-        yield lambda found, axis=axis: _Field(
-            _along(heights(found), axis), 3, lambda new: _along(new.double(), axis) > 0
-        )
+
+        def lines(found, axis=axis):
+            means = _along(pixels(found).pair, axis)
+            return of(means, 3, lambda new: _along(new.double(), axis) > 0)
+
+        yield lines
     for axis in (-1, -2):
-        yield lambda found, axis=axis: _Field(
-            pad(torch.where(found, torch.nan, pair).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1)),
-            1,
-            lambda new: new | new.roll(1, axis),
-        )
+
+        def edges(found, axis=axis):
+            steps = pad(known(found).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
+            either = same.minimum(same.roll(-1, axis))
+            return of(steps, 1, lambda new: new | new.roll(1, axis), either)
+
+        yield edges
     for size in _SIZES:
-        yield lambda found, size=size: _Field(
-            _spots(torch.where(found, torch.nan, pair), size), size, lambda new: _grown(new, size)
-        )
+
+        def spots(found, size=size):
+            return of(_spots(known(found), size), size, lambda new: _grown(new, size))
+
+        yield spots
 
 
 def _spots(pair: torch.Tensor, size: int) -> torch.Tensor:
@@ -260,18 +283,16 @@ def _along(fields: torch.Tensor, axis: int) -> torch.Tensor:
 
 def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) of all that stands out alike of both images, at rest or not."""
-    for of in _fields(pair, found):
+    for of in _fields(pair):
         field = of(found)
-        one, two = field.pair.nan_to_num(0.0)
-        least = _least(field)
-        alike = _beyond_chance(_alike(one, two, least), one, two, least)
+        alike = _beyond_chance(_alike(field, _least(field)), field, _least(field))
         found = found | field.marked(alike)
     return _closed(found, _GAP)
 
 
 def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots, areas."""
-    for of in _fields(pair, found):
+    for of in _fields(pair):
         field = of(found)
         found = found | field.marked(_stays(field, d))
     return found | _enclosed(pair, found)
@@ -293,24 +314,37 @@ def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     ]
     off = torch.minimum(*off)
     off = torch.where(off.isfinite(), off, 0.0)
-    limit = impulses.threshold(off.numel() // field.size**2)
-    new = (off > limit * impulses.median_scale(off, field.size)) & _alike(one, two, least)
-    new &= ((two - one).abs() < _DIFFER * off) & (_lower(one, two) > off / 2)
+    limit = impulses.threshold(off.numel() // field.size**2) * impulses.median_scale(off, field.size)
+    new, weak = (
+        (off > part * limit)
+        & _alike(field, part * least)
+        & (field.change < _DIFFER * off)
+        & (_lower(field.pair) > off / 2)
+        for part in (1.0, _WEAK)
+    )
     if not bool(new.any()):
         return new
-    return _beyond_chance(new, one, two, least)
+    new = _beyond_chance(new, field, least)
+    if field.size > 1 or not bool(new.any()):
+        return new
+    new = ndimage.binary_propagation(new.cpu(), np.ones((3, 3)), weak.cpu())
+    return torch.as_tensor(new, device=weak.device)
 
 
-def _beyond_chance(new, one, two, least) -> torch.Tensor:
+def _beyond_chance(new: torch.Tensor, field: _Field, least: torch.Tensor) -> torch.Tensor:
     """Those pixels, or none if unrelated images have a third as many alike in one place.
 
     Among many bright particles some lie by chance where others were.
     """
+    one, two = field.pair.nan_to_num(0.0)
     rows, columns = two.shape
-    turned = [two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in impulses.THIRDS]
+    chance = []
+    for i, j in impulses.THIRDS:
+        other = two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1))
+        rolled = field._replace(pair=torch.stack([one, other]), change=(other - one).abs())
+        chance.append(int(_alike(rolled, least).sum()))
     # the median, as lines at rest fall on themselves
-    chance = float(np.median([int(_alike(one, other, least).sum()) for other in turned]))
-    return new & bool(int(new.sum()) >= _BEYOND_CHANCE * chance)
+    return new & (int(new.sum()) >= _BEYOND_CHANCE * float(np.median(chance)))
 
 
 def _enclosed(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
@@ -352,13 +386,13 @@ def _inside(d: torch.Tensor) -> torch.Tensor:
     return inside
 
 
-def _alike(one: torch.Tensor, two: torch.Tensor, least: torch.Tensor) -> torch.Tensor:
-    lower = _lower(one, two)
-    return (lower > least) & ((two - one).abs() < _DIFFER * lower)
+def _alike(field: _Field, least: torch.Tensor) -> torch.Tensor:
+    lower = _lower(field.pair)
+    return (lower > least) & (field.change < _DIFFER * lower)
 
 
-def _lower(one: torch.Tensor, two: torch.Tensor) -> torch.Tensor:
-    return torch.minimum(one.abs(), two.abs())
+def _lower(pair: torch.Tensor) -> torch.Tensor:
+    return pair.nan_to_num(0.0).abs().amin(0)
 
 
 def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:
