@@ -1,10 +1,14 @@
 """Values for pixels that are not known, for filters alone: the smoothest ones."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from scipy import sparse
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse.linalg import spsolve
+
+from lidar_mi.retrieval.velocimetry.common_grid import nearest_filled
 
 # Px from the known ones up to which values are smooth: what a filter reaches. Further on they are
 # those of the nearest pixel.
@@ -65,8 +69,19 @@ def filled_in(image: torch.Tensor, pixels: torch.Tensor | None = None) -> torch.
 
     As it is if it is finite all over, or nowhere.
     """
-    finite = torch.isfinite(image)
-    if bool(finite.all()) or not bool(finite.any()):
-        return image if bool(finite.all()) else torch.zeros_like(image)
-    smooth = torch.as_tensor(inpainted(image.cpu().numpy())).to(image)
+    smooth = _of_known(image, inpainted)
     return smooth if pixels is None else torch.where(pixels, smooth, image)
+
+
+def nearest_in(image: torch.Tensor) -> torch.Tensor:
+    """An image with the value of the nearest finite pixel where one is not."""
+    return _of_known(image, nearest_filled)
+
+
+def _of_known(image: torch.Tensor, fill: Callable[[np.ndarray], np.ndarray]) -> torch.Tensor:
+    finite = torch.isfinite(image)
+    if bool(finite.all()):
+        return image
+    if not bool(finite.any()):
+        return torch.zeros_like(image)
+    return torch.as_tensor(fill(image.cpu().numpy())).to(image)

@@ -47,6 +47,7 @@ def multipass(
     min_correlation: float = 0.5,
     noise: float | torch.Tensor | None = None,
     settings: MultipassSettings | None = None,
+    partly: bool = False,
 ) -> Displacement:
     """Displacement of every window by correlation of images deformed to fit, coarse to fine.
 
@@ -76,6 +77,9 @@ def multipass(
         errors are those of the mean in a window. Left out: from the images' spectra.
     settings : MultipassSettings, optional
         Left out: those of images or of volumes.
+    partly : bool
+        Whether windows that hold non-finite pixels have a displacement from the others, if these
+        are more than half of the weight. They are flagged all the same.
 
     Returns
     -------
@@ -138,7 +142,7 @@ def multipass(
         + Flag.REPLACED * replaced[at]
     ).to(torch.int16)
     flag[bad] |= Flag.NON_FINITE_INPUT.value
-    d = torch.where(matched, d, torch.nan)
+    d = torch.where(matched if partly else matched & ~bad, d, torch.nan)
     return Displacement(d, fit.score, flag, fit.covariance + curved)
 
 

@@ -19,7 +19,7 @@ from lidar_mi.retrieval.velocimetry.band_limit import (
     radii,
     shell_means,
 )
-from lidar_mi.retrieval.velocimetry.inpainting import filled_in
+from lidar_mi.retrieval.velocimetry.inpainting import filled_in, nearest_in
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.velocimetry.windows import stored
 
@@ -282,7 +282,8 @@ def spectrum_of(
 ) -> PowerSpectrum:
     """The power spectrum of images that `band_limited` filters."""
     known = torch.stack([torch.isfinite(image) for image in images])
-    images = _finite(images)
+    # smooth values would go on with the noise at the rim
+    images = torch.stack([stored(nearest_in(image)) for image in images])
     sizes = transform_sizes(images.shape[1:], settings)
     return power_spectrum(images, sizes, settings, weight, known)
 

@@ -191,6 +191,7 @@ def retrieve_wind(
         "times": tau,
         "blur": blurred,
         "settings": settings,
+        "partly": True,
     }
     with threads_for(image1.size):
         whole = [pixels1, pixels2, *rest]
