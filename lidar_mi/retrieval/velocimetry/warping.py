@@ -282,10 +282,14 @@ def spectrum_of(
 ) -> PowerSpectrum:
     """The power spectrum of images that `band_limited` filters."""
     known = torch.stack([torch.isfinite(image) for image in images])
-    # smooth values would go on with the noise at the rim
-    images = torch.stack([stored(nearest_in(image)) for image in images])
-    sizes = transform_sizes(images.shape[1:], settings)
-    return power_spectrum(images, sizes, settings, weight, known)
+    sizes = transform_sizes(images[0].shape, settings)
+    found = power_spectrum(_finite(images), sizes, settings, weight, known)
+    if bool(known.all()):
+        return found
+    # smooth values go on with the noise at the rim, the nearest ones make steps: both add power
+    nearest = torch.stack([stored(nearest_in(image)) for image in images])
+    other = power_spectrum(nearest, sizes, settings, weight, known)
+    return found._replace(density=torch.minimum(found.density, other.density))
 
 
 def _finite(images: Sequence[torch.Tensor]) -> torch.Tensor:
