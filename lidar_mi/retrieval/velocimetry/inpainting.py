@@ -31,8 +31,6 @@ def inpainted(values: np.ndarray) -> np.ndarray:
         Of any number of axes; somewhere finite.
     """
     missing = ~np.isfinite(values)
-    if not missing.any():
-        return values
     distance, nearest = distance_transform_edt(missing, return_indices=True)
     found = values[tuple(nearest)]
     unknown = missing & (distance <= _REACH)

@@ -19,7 +19,7 @@ from lidar_mi.retrieval.velocimetry.brightness import normalised, of_one_brightn
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
 from lidar_mi.retrieval.velocimetry.outliers import validated
-from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, non_finite, usable
+from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, informative, non_finite
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_MULTIPASS, MultipassSettings
 from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, nearest
 from lidar_mi.retrieval.velocimetry.windows import (
@@ -106,7 +106,7 @@ def multipass(
     grid = Grid.of(windows, spline.coefficients)
     pair = Pair(
         spline,
-        usable([image1, image2]),
+        informative([image1, image2]),
         2 * noise**2 * spline.excess,
         _relative_variance(grid_of_noise, grid),
         settings.gradient,

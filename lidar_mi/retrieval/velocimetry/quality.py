@@ -246,18 +246,25 @@ def non_finite(images: Sequence[torch.Tensor], windows: Windows) -> torch.Tensor
 
 
 def usable(images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Pixels (images, ...) away from non-finite ones: three px, of lines and single pixels one.
-
-    The values that filters take there are guesses (`inpainting.inpainted`), across a pixel good
-    ones. Volumes: always three.
-    """
+    """Pixels (images, ...) that are three or more away from a non-finite one."""
     bad = torch.stack([~torch.isfinite(image) for image in images])
     if not bool(bad.any()):
         return ~bad
-    if bad.ndim > 3:
-        return max_pool3d(bad.float()[:, None], 7, stride=1, padding=3)[:, 0] == 0
-    near = max_pool2d(thick(bad).float(), 7, stride=1, padding=3)
-    return torch.maximum(near, max_pool2d(bad.float(), 3, stride=1, padding=1)) == 0
+    pool = max_pool2d if bad.ndim == 3 else max_pool3d
+    return pool(bad.float()[:, None], 7, stride=1, padding=3)[:, 0] == 0
+
+
+def informative(images: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Pixels (images, ...) that filters hardly mix with non-finite ones.
+
+    They are three away from these, and one away from lines and single pixels of an image: across a
+    pixel smooth values (`inpainting.inpainted`) are good guesses.
+    """
+    bad = torch.stack([~torch.isfinite(image) for image in images])
+    if bad.ndim > 3 or not bool(bad.any()):
+        return usable(images)
+    wide = torch.where(thick(bad), torch.nan, 0.0)
+    return usable(list(wide)) & (max_pool2d(bad.float(), 3, stride=1, padding=1) == 0)
 
 
 def thick(pixels: torch.Tensor) -> torch.Tensor:

@@ -9,7 +9,6 @@ from scipy import ndimage
 from torch.nn.functional import pad
 
 from lidar_mi.retrieval.velocimetry import impulses
-from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.fixed_pattern import FixedPattern, fixed_pattern
 from lidar_mi.retrieval.velocimetry.inpainting import filled_in
@@ -67,6 +66,11 @@ class AtRest(NamedTuple):
     stray: torch.Tensor
     pattern: FixedPattern
 
+    def __str__(self) -> str:
+        parts = {"at rest": self.structure, "of one image alone": self.stray.any(0)}
+        said = [f"{p.double().mean():.2%} {name}" for name, p in parts.items() if bool(p.any())]
+        return f"pixels left out: {', '.join(said)}" if said else ""
+
     @property
     def hidden(self) -> torch.Tensor:
         """Pixels (images, z, y) that are left out."""
@@ -74,8 +78,8 @@ class AtRest(NamedTuple):
 
     def left_out(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The images without the fixed pattern, NaN in place of what is no air."""
-        images = self.pattern.removed(images)
-        return [_left_out(image, pixels) for image, pixels in zip(images, self.hidden, strict=False)]
+        pairs = zip(self.pattern.removed(images), self.hidden, strict=False)
+        return [_left_out(image, pixels) for image, pixels in pairs]
 
     def filled(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
         """The same, with smooth values in place of what is no air."""
@@ -197,8 +201,10 @@ def at_rest(
     hidden = outstanding | _candidates(pair, found)
     for _ in range(_TURNS):
         soft = (_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True))
-        d, _ = motion_around(*soft, windows)
+        d, _ = motion_around(*soft, windows, continued=True)
         stray = impulses.stray(pair, outstanding, found, d)
+        if not bool(d.any()):  # what stands out is all that there is
+            break
         new = _still(torch.where(stray, torch.nan, pair), found, d)
         if not bool((new & ~found).any()):
             break
@@ -314,7 +320,8 @@ def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     ]
     off = torch.minimum(*off)
     off = torch.where(off.isfinite(), off, 0.0)
-    limit = impulses.threshold(off.numel() // field.size**2) * impulses.median_scale(off, field.size)
+    limit = impulses.threshold(off.numel() // field.size**2)
+    limit = limit * impulses.median_scale(off, field.size)
     new, weak = (
         (off > part * limit)
         & _alike(field, part * least)

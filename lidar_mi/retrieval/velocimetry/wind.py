@@ -280,6 +280,8 @@ def retrieve_wind(
     if "min_correlation" in options:
         attributes["min_correlation"] = min_correlation
     patterns = [str(part) for part in (resting.pattern, still) if str(part)]
+    if str(resting):
+        attributes["defects"] = str(resting)
     if patterns:
         attributes["fixed_pattern"] = ", ".join(patterns)
     if still.fraction:
