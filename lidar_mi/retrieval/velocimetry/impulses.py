@@ -14,6 +14,8 @@ THIRDS = tuple((i, j) for i in range(3) for j in range(3) if i or j)
 """Rolls by thirds of the sides: what lies at one place in both images then does so by chance."""
 # Px; width of the Gaussian over which the scale of differences is estimated.
 _AROUND = 8.0
+# Fraction of the rms of all values below which there is no texture.
+_EMPTY = 1e-3
 # Times that pixels are peeled off: areas of four pixels across vanish.
 _PEELS = 4
 # Px about a place, or about where the air carries it, in which an impulse is looked for.
@@ -57,7 +59,7 @@ def scale(values: torch.Tensor) -> torch.Tensor:
         variance = averaged(square, use, _AROUND)
         less = known & (square <= limit * variance)
         if bool((less == use).all()) or not bool(less.any()):
-            return variance.sqrt()
+            return variance.sqrt().clamp(min=_faintest(values))
         use = less & use
 
 
@@ -73,7 +75,13 @@ def median_scale(values: torch.Tensor, size: int = 1) -> torch.Tensor:
     smooth = torch.nn.functional.interpolate(
         level[None, None], size=(rows, columns), mode="bilinear", align_corners=False
     )[0, 0]
-    return 1.4826 * smooth[: values.shape[0], : values.shape[1]]
+    smooth = 1.4826 * smooth[: values.shape[0], : values.shape[1]]
+    return smooth.clamp(min=_faintest(values))
+
+
+def _faintest(values: torch.Tensor) -> float:
+    """Scatter below which air is empty, in images without noise: nothing stands out of that."""
+    return _EMPTY * float(values[values.isfinite()].square().mean().sqrt())
 
 
 def _peeled(image: torch.Tensor, spread) -> torch.Tensor:

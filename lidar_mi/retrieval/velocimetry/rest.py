@@ -202,9 +202,9 @@ def at_rest(
     for _ in range(_TURNS):
         soft = (_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True))
         d, _ = motion_around(*soft, windows, continued=True)
-        stray = impulses.stray(pair, outstanding, found, d)
         if not bool(d.any()):  # what stands out is all that there is
-            break
+            return found, torch.zeros_like(outstanding), d
+        stray = impulses.stray(pair, outstanding, found, d)
         new = _still(torch.where(stray, torch.nan, pair), found, d)
         if not bool((new & ~found).any()):
             break
