@@ -222,7 +222,7 @@ def bootstrap_covariance(
         # the wind carried is as rough as the vectors: their mean stands for the true one
         rough = [_roughness(_continued(error, use) + smooth, use, _ROUGH * per_template)] * len(own)
         tried.append((error, use, torch.stack([*same, *rough])))
-        number += _in_a_mean(windows.dims) * averaged(use.to(number), everywhere, width)
+        number += _in_a_mean(windows) * averaged(use.to(number), everywhere, width)
         again_found += averaged(use.to(number), known, _AROUND * per_template) / repeats
     if not tried:
         return torch.full_like(torch.stack([found.d] * windows.dims), torch.nan)
@@ -247,7 +247,10 @@ def bootstrap_covariance(
         for axis in range(windows.dims)
     ]
     covariance = separable(covariance, weights)
-    covariance[:, :, separable(number, weights) < _FEWEST] = torch.nan
+    number = separable(number, weights)
+    # errors of the same windows with another residual are hardly further ones
+    covariance = covariance * _widened(number / repeats, windows.dims)
+    covariance[:, :, number < _FEWEST] = torch.nan
     least = _LEAST**2 * torch.eye(windows.dims).to(d)
     return covariance + least.reshape(*least.shape, *[1] * windows.dims)
 
@@ -258,14 +261,30 @@ def _unflagged(found: Displacement) -> torch.Tensor:
     return (flag == 0) & found.d.isfinite().all(0)
 
 
-def _in_a_mean(dims: int) -> float:
-    """Windows that do not overlap within the Gaussian mean of squared errors."""
+def _in_a_mean(windows: Windows) -> float:
+    """Windows that do not overlap within the Gaussian mean of squared errors, or in all."""
+    inside = math.prod(1 + (n - 1) * windows.stride / windows.template for n in windows.count)
+    return min(_of_a_mean(windows.dims), inside)
+
+
+def _of_a_mean(dims: int) -> float:
     return (2 * math.pi) ** (dims / 2) * _REGION**dims
+
+
+def _widened(number: torch.Tensor, dims: int) -> torch.Tensor:
+    """Variance of errors over the square of a standard error from so many windows.
+
+    With f errors in a mean, normalised errors have Student's distribution, of the variance f /
+    (f - 2). The factor is over that of a full mean (`_of_a_mean`), with which the predictors were
+    chosen.
+    """
+    degrees, full = dims * number.clamp(min=_FEWEST / 2), dims * _of_a_mean(dims)
+    return (degrees / (degrees - 2) * (full - 2) / full).clamp(min=1.0)
 
 
 def enough_windows(windows: Windows) -> bool:
     """Whether images hold as many windows that do not overlap as one mean of squared errors."""
-    return math.prod(n / windows.template for n in windows.shape) >= _in_a_mean(windows.dims)
+    return math.prod(n / windows.template for n in windows.shape) >= _of_a_mean(windows.dims)
 
 
 def _most_likely(predictors: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:

@@ -379,9 +379,12 @@ def _enclosed(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
 def _closed(pixels: torch.Tensor, reach: int) -> torch.Tensor:
     """Pixels and gaps between them of up to twice the reach."""
     wide = _grown(pixels, 2 * reach + 1)
-    return ~_grown(pad(~wide, (reach,) * 4, value=False), 2 * reach + 1)[
-        reach : reach + pixels.shape[0], reach : reach + pixels.shape[1]
-    ] | pixels
+    return (
+        ~_grown(pad(~wide, (reach,) * 4, value=False), 2 * reach + 1)[
+            reach : reach + pixels.shape[0], reach : reach + pixels.shape[1]
+        ]
+        | pixels
+    )
 
 
 def _inside(d: torch.Tensor) -> torch.Tensor:
