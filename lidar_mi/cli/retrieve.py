@@ -225,6 +225,8 @@ def _print_wind(wind: "xr.Dataset") -> None:
     """What was retrieved from two images or from a burst."""
     if "fit" in wind.attrs:
         _print_vortices(wind)
+    if "defects" in wind.attrs:
+        output.print(f"warning: {wind.attrs['defects']}")
     if "fixed_pattern" in wind.attrs:
         output.print(f"warning: {wind.attrs['fixed_pattern']} in all images")
     if "illumination" in wind.attrs:

@@ -132,7 +132,8 @@ def retrieve_wind(
         each with `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or
         NaN if there is none); nothing is replaced. Gains of a detector's columns and rows are
         removed beforehand, see `fixed_pattern`, and so is a change of illumination from edge to
-        edge, see `illumination`; attributes of these names say so.
+        edge, see `illumination`; attributes of these names say so. Pixels that do not move with the
+        air are left out, see `rest.at_rest`, and the attribute `defects` says how many.
 
     Raises
     ------
