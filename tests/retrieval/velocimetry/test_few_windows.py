@@ -43,7 +43,7 @@ def test_one_window_states_no_error(method):
 )
 def test_errors_from_few_windows(method, side):
     """Variance of normalised errors 0.6 to 1.25, within the scatter of the pairs (two sigma)."""
-    found = normalised_errors(method, side, 12)
+    found = normalised_errors(method, side, 8)
     if found.size:
         scatter = found.std() / np.sqrt(found.size)
         assert 0.6 - 2 * scatter < found.mean() < 1.25 + 2 * scatter
