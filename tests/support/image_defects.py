@@ -305,7 +305,9 @@ def changes(clean: Pair, spoiled: Pair, method: str) -> tuple[np.ndarray, np.nda
     """Of valid vectors (or parameters) in stated errors of both; and which vectors are valid.
 
     Two retrievals differ by the errors of both: without noise those of clean images, which the rim
-    of an image decides, are up to three times those of images with something left out. Valid: without a flag in the clean images, and in the spoiled ones, (2, ...).
+    of an image decides, are up to three times those of images with something left out.
+
+    Valid: without a flag in the clean images, and in the spoiled ones, (2, ...).
     """
     y, z = axes(*SIZE)
     images = [[data_array(i, y, z) for i in images] for images in (clean, spoiled)]
