@@ -315,6 +315,8 @@ def _print_wind(wind: "xr.Dataset") -> None:
         _print_vortices(wind)
     if "identical_images" in wind.attrs:
         output.print(f"warning: {wind.attrs['identical_images']}: no motion can be told from them")
+    if "defects" in wind.attrs:
+        output.print(f"warning: {wind.attrs['defects']}")
     if "fixed_pattern" in wind.attrs:
         output.print(f"warning: {wind.attrs['fixed_pattern']} in all images")
     if "illumination" in wind.attrs:

@@ -8,11 +8,11 @@ from tests.support.flows import axes, origin, plane_waves, texture
 DT = 0.1
 
 
-def crosswind_pair(seed, length=3.5, noise=0.03, *, size, mean, circulation=200.0):
+def crosswind_pair(seed, length=3.5, noise=0.03, *, size, mean, circulation=200.0, separation=40.0):
     """Images (arrays) of `size` (columns, rows) with `mean` (v, w), m/s, and v at the pixels."""
     y, z = axes(*size)
     grid = np.meshgrid(y, z)
-    vortices = vortex_pair(circulation, 40.0, 3.0)
+    vortices = vortex_pair(circulation, separation, 3.0)
 
     def wind(y, z):
         return [part + more for part, more in zip(velocity(vortices, y, z), mean, strict=True)]

@@ -82,6 +82,8 @@ def cross_flow_winds(
                 # the extinction itself has passed no instrument
                 blur=0.0 if source in EXACT else blur,
             )
+            if "defects" in wind.attrs and not methods:
+                log.remark(f"{source}: {wind.attrs['defects']}")
             if "fixed_pattern" in wind.attrs and not methods:
                 log.remark(f"{source}: {wind.attrs['fixed_pattern']} in all images")
             # once of the air itself and once of the lidar's images, not of every source

@@ -16,9 +16,10 @@ from torch.nn.functional import grid_sample, pad
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
+from lidar_mi.retrieval.velocimetry.inpainting import filled_in
 from lidar_mi.retrieval.velocimetry.likelihood import usable_and_weight
 from lidar_mi.retrieval.velocimetry.outliers import median_outliers, validated
-from lidar_mi.retrieval.velocimetry.quality import filled
+from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.settings import (
     VOLUME_FILTER,
     FilterSettings,
@@ -179,7 +180,7 @@ def bootstrap_covariance(
 
     wind = at_mid_time(flow, coarse, centred)
     first, second = normalised(images)
-    carried, inside = _carried(filled(first), wind)
+    carried, inside = _carried(first, wind)
     # of air that came in nothing is known
     alike = second.isfinite() & inside
     rest = torch.where(alike, second - carried, 0.0)
@@ -196,12 +197,12 @@ def bootstrap_covariance(
     added = level
     if stated is not None:
         added = (square - about(stated)).clamp(min=_REMAINING * square).sqrt()
-    told = coarse.of_templates(known_noise) * _inverse_texture(filled(first), coarse)
+    told = coarse.of_templates(known_noise) * _inverse_texture(filled_in(first), coarse)
     same = [torch.ones_like(flow), told]
     if centred:
         shear = averaged(_squared_gradient(vectors), everywhere, _SHEAR * per_template)
         same.append(shear.square().expand_as(flow))
-        valid = known & ~replaced & (found.flag[some] == 0)
+        valid = known & ~replaced & _unflagged(found)[some]
         own = [_roughness(vectors, valid, _ROUGH * per_template)]
     else:
         same.append((flow - vectors).square())
@@ -214,14 +215,14 @@ def bootstrap_covariance(
         moved = torch.where(second.isfinite(), added * moved, torch.nan)
         again = retrieve(first, carried + moved, stride=coarse.stride)
         outlier = median_outliers(again.d, 3, max(1, round(per_template / 2)))
-        use = (again.flag == 0) & ~outlier & known
+        use = _unflagged(again) & ~outlier & known
         if not bool(use.any()):
             continue
         error = again.d - _read(wind, _places(again.d, coarse, centred))
         # the wind carried is as rough as the vectors: their mean stands for the true one
         rough = [_roughness(_continued(error, use) + smooth, use, _ROUGH * per_template)] * len(own)
         tried.append((error, use, torch.stack([*same, *rough])))
-        number += _in_a_mean(windows.dims) * averaged(use.to(number), everywhere, width)
+        number += _in_a_mean(windows) * averaged(use.to(number), everywhere, width)
         again_found += averaged(use.to(number), known, _AROUND * per_template) / repeats
     if not tried:
         return torch.full_like(torch.stack([found.d] * windows.dims), torch.nan)
@@ -246,19 +247,44 @@ def bootstrap_covariance(
         for axis in range(windows.dims)
     ]
     covariance = separable(covariance, weights)
-    covariance[:, :, separable(number, weights) < _FEWEST] = torch.nan
+    number = separable(number, weights)
+    # errors of the same windows with another residual are hardly further ones
+    covariance = covariance * _widened(number / repeats, windows.dims)
+    covariance[:, :, number < _FEWEST] = torch.nan
     least = _LEAST**2 * torch.eye(windows.dims).to(d)
     return covariance + least.reshape(*least.shape, *[1] * windows.dims)
 
 
-def _in_a_mean(dims: int) -> float:
-    """Windows that do not overlap within the Gaussian mean of squared errors."""
+def _unflagged(found: Displacement) -> torch.Tensor:
+    """Vectors that are valid, be it from what is finite in their windows."""
+    flag = found.flag & ~Flag.NON_FINITE_INPUT.value
+    return (flag == 0) & found.d.isfinite().all(0)
+
+
+def _in_a_mean(windows: Windows) -> float:
+    """Windows that do not overlap within the Gaussian mean of squared errors, or in all."""
+    inside = math.prod(1 + (n - 1) * windows.stride / windows.template for n in windows.count)
+    return min(_of_a_mean(windows.dims), inside)
+
+
+def _of_a_mean(dims: int) -> float:
     return (2 * math.pi) ** (dims / 2) * _REGION**dims
+
+
+def _widened(number: torch.Tensor, dims: int) -> torch.Tensor:
+    """Variance of errors over the square of a standard error from so many windows.
+
+    With f errors in a mean, normalised errors have Student's distribution, of the variance f /
+    (f - 2). The factor is over that of a full mean (`_of_a_mean`), with which the predictors were
+    chosen.
+    """
+    degrees, full = dims * number.clamp(min=_FEWEST / 2), dims * _of_a_mean(dims)
+    return (degrees / (degrees - 2) * (full - 2) / full).clamp(min=1.0)
 
 
 def enough_windows(windows: Windows) -> bool:
     """Whether images hold as many windows that do not overlap as one mean of squared errors."""
-    return math.prod(n / windows.template for n in windows.shape) >= _in_a_mean(windows.dims)
+    return math.prod(n / windows.template for n in windows.shape) >= _of_a_mean(windows.dims)
 
 
 def _most_likely(predictors: torch.Tensor, squares: torch.Tensor) -> torch.Tensor:

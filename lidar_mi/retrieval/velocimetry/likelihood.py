@@ -8,7 +8,7 @@ import torch
 
 from lidar_mi.retrieval.velocimetry.brightness import normalised, of_one_brightness, rms
 from lidar_mi.retrieval.velocimetry.flow_spline import Mesh
-from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
+from lidar_mi.retrieval.velocimetry.quality import informative, misfit_variance
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, filter_of, nearest
 from lidar_mi.retrieval.velocimetry.windows import averaged, stored
@@ -149,11 +149,11 @@ def usable_and_weight(
     stack: Sequence[torch.Tensor], noise: float | torch.Tensor | None, settings: VariationalSettings
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Pixels of known value and noise, and their weights by a map of the noise."""
-    known_at = usable(stack)
+    known_at = informative(stack)
     weight = torch.ones_like(stored(stack[0]))
     if isinstance(noise, torch.Tensor) and noise.ndim:
         known = torch.isfinite(noise)
-        known_at = known_at & usable([noise])
+        known_at = known_at & informative([noise])
         # a level that few photons determine is lowest where an image is too dark by chance
         square = averaged(stored(noise).nan_to_num(0.0).square(), known, settings.noise_width)
         weight = torch.where(square > 0, rms(noise) ** 2 / square, weight)

@@ -63,7 +63,7 @@ METHODS: Mapping[str, Method] = {
     "multipass": Method(
         multipass,
         ("correlation", "normalised cross-correlation of the deformed windows"),
-        ("min_correlation", "noise", "settings"),
+        ("min_correlation", "noise", "settings", "partly"),
         centred=True,
         reach=2,
         repeats=1,

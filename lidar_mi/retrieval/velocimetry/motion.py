@@ -5,6 +5,7 @@ from torch.nn.functional import grid_sample, pad
 
 from lidar_mi.retrieval.velocimetry.correlation import cross_correlation
 from lidar_mi.retrieval.velocimetry.first_pass import coarse_windows
+from lidar_mi.retrieval.velocimetry.inpainting import nearest_in
 from lidar_mi.retrieval.velocimetry.quality import Flag
 from lidar_mi.retrieval.velocimetry.windows import Windows, linear_weights, separable
 
@@ -13,11 +14,12 @@ _AROUND = 5
 
 
 def motion_around(
-    image1: torch.Tensor, image2: torch.Tensor, windows: Windows
+    image1: torch.Tensor, image2: torch.Tensor, windows: Windows, continued: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Displacement (2, z, y) around every pixel, px, and how far (z, y) vectors there are from it.
 
-    The median of 5 x 5 coarse vectors, and that of their distances from it; 0 where there is none.
+    The median of 5 x 5 coarse vectors, and that of their distances from it; where there is none 0,
+    or the nearest ones (`continued`).
     """
     coarse = coarse_windows(windows)
     found = cross_correlation(image1, image2, coarse.template, coarse.search, coarse.stride)
@@ -26,6 +28,8 @@ def motion_around(
     near = d.unfold(1, _AROUND, 1).unfold(2, _AROUND, 1).flatten(3)
     d = near.nanmedian(-1).values
     scatter = (near - d[..., None]).norm(dim=0).nanmedian(-1).values
+    if continued:
+        d, scatter = (nearest_in(part) for part in (d, scatter))
     weights = [
         linear_weights(coarse.centres(axis).to(d), torch.arange(n).to(d))
         for axis, n in enumerate(windows.shape)

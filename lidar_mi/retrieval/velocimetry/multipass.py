@@ -19,7 +19,7 @@ from lidar_mi.retrieval.velocimetry.brightness import normalised, of_one_brightn
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.first_pass import Grid, first_pass
 from lidar_mi.retrieval.velocimetry.outliers import validated
-from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, non_finite, usable
+from lidar_mi.retrieval.velocimetry.quality import Flag, check_between, informative, non_finite
 from lidar_mi.retrieval.velocimetry.settings import VOLUME_MULTIPASS, MultipassSettings
 from lidar_mi.retrieval.velocimetry.warping import Spline, band_limited, nearest
 from lidar_mi.retrieval.velocimetry.windows import (
@@ -47,6 +47,7 @@ def multipass(
     min_correlation: float = 0.5,
     noise: float | torch.Tensor | None = None,
     settings: MultipassSettings | None = None,
+    partly: bool = False,
 ) -> Displacement:
     """Displacement of every window by correlation of images deformed to fit, coarse to fine.
 
@@ -76,6 +77,9 @@ def multipass(
         errors are those of the mean in a window. Left out: from the images' spectra.
     settings : MultipassSettings, optional
         Left out: those of images or of volumes.
+    partly : bool
+        Whether windows that hold non-finite pixels have a displacement from the others, if these
+        are more than half of the weight. They are flagged all the same.
 
     Returns
     -------
@@ -102,7 +106,7 @@ def multipass(
     grid = Grid.of(windows, spline.coefficients)
     pair = Pair(
         spline,
-        usable([image1, image2]),
+        informative([image1, image2]),
         2 * noise**2 * spline.excess,
         _relative_variance(grid_of_noise, grid),
         settings.gradient,
@@ -138,7 +142,7 @@ def multipass(
         + Flag.REPLACED * replaced[at]
     ).to(torch.int16)
     flag[bad] |= Flag.NON_FINITE_INPUT.value
-    d = torch.where(bad | ~matched, torch.nan, d)
+    d = torch.where(matched if partly else matched & ~bad, d, torch.nan)
     return Displacement(d, fit.score, flag, fit.covariance + curved)
 
 

@@ -31,7 +31,7 @@ from lidar_mi.retrieval.velocimetry.likelihood import (
     usable_and_weight,
 )
 from lidar_mi.retrieval.velocimetry.prior import Prior
-from lidar_mi.retrieval.velocimetry.quality import misfit_variance, usable
+from lidar_mi.retrieval.velocimetry.quality import informative, misfit_variance
 from lidar_mi.retrieval.velocimetry.settings import VariationalSettings
 from lidar_mi.retrieval.velocimetry.warping import filtered_spline
 from lidar_mi.retrieval.velocimetry.windows import Windows
@@ -323,9 +323,9 @@ def _completed(
     images: Images, start: Flow, stack: Sequence[torch.Tensor], noise: float | torch.Tensor | None
 ) -> Images:
     """Both images, after `_prepared`."""
-    known = usable(stack)
+    known = informative(stack)
     if isinstance(noise, torch.Tensor) and noise.ndim:
-        known = known & usable([noise])
+        known = known & informative([noise])
     pair = normalised(stack)
     second = pair[1:].nan_to_num(0.0).float()
     both = images.spline.beside(filtered_spline(second, _filter(start), start.settings.filter))

@@ -40,7 +40,7 @@ class Flag(enum.IntFlag):
     SATURATED = 512
     """The template holds a saturated area at rest, or is saturated by a quarter (`rest`)."""
     AT_REST = 1024
-    """The template holds structure at rest in moving air, or a pattern spoils all (`rest`)."""
+    """The template holds structure at rest or stray pixels, or a pattern spoils all (`rest`)."""
     NO_SKILL = 2048
     """The standard error approaches the wind's own spread, or noise assumed decides the wind."""
     RESAMPLED = 4096
@@ -252,6 +252,31 @@ def usable(images: Sequence[torch.Tensor]) -> torch.Tensor:
         return ~bad
     pool = max_pool2d if bad.ndim == 3 else max_pool3d
     return pool(bad.float()[:, None], 7, stride=1, padding=3)[:, 0] == 0
+
+
+def informative(images: Sequence[torch.Tensor]) -> torch.Tensor:
+    """Pixels (images, ...) that filters hardly mix with non-finite ones.
+
+    They are three away from these, and one away from lines and single pixels of an image: across a
+    pixel smooth values (`inpainting.inpainted`) are good guesses.
+    """
+    bad = torch.stack([~torch.isfinite(image) for image in images])
+    if bad.ndim > 3 or not bool(bad.any()):
+        return usable(images)
+    wide = torch.where(thick(bad), torch.nan, 0.0)
+    return usable(list(wide)) & (max_pool2d(bad.float(), 3, stride=1, padding=1) == 0)
+
+
+def thick(pixels: torch.Tensor) -> torch.Tensor:
+    """Of pixels (..., z, y), those of areas wider than one: that squares of 2 x 2 px fit into."""
+    square = pixels[..., :-1, :] & pixels[..., 1:, :]
+    square = square[..., :-1] & square[..., 1:]
+    wide = torch.zeros_like(pixels)
+    rows, columns = square.shape[-2:]
+    for i in (0, 1):
+        for j in (0, 1):
+            wide[..., i : i + rows, j : j + columns] |= square
+    return wide
 
 
 def filled(image: torch.Tensor) -> torch.Tensor:

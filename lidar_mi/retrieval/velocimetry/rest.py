@@ -1,34 +1,43 @@
 """What does not move with the air: saturated areas and structure at rest in two images."""
 
-from collections.abc import Sequence
-from itertools import product
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
+from scipy import ndimage
 from torch.nn.functional import pad
 
-from lidar_mi.retrieval.velocimetry.brightness import normalised
+from lidar_mi.retrieval.velocimetry import impulses
 from lidar_mi.retrieval.velocimetry.displacement import Displacement
 from lidar_mi.retrieval.velocimetry.fixed_pattern import FixedPattern, fixed_pattern
+from lidar_mi.retrieval.velocimetry.inpainting import filled_in
 from lidar_mi.retrieval.velocimetry.motion import motion_around, moved
-from lidar_mi.retrieval.velocimetry.quality import Flag, non_finite
+from lidar_mi.retrieval.velocimetry.quality import Flag, non_finite, thick
 from lidar_mi.retrieval.velocimetry.saturation import saturated, saturated_areas
 from lidar_mi.retrieval.velocimetry.windows import Windows, averaged, box_sum, working
 
 # Fraction of a template at the largest value that leaves too little to see.
 _SATURATED = 0.25
-# Px that a spot is moved by along each axis, either way, to see whether it fits better.
-_FARTHEST = 3
-# Px; slower air and structure at rest look alike.
-_SLOWEST = 1.0
+# The same of pixels that are no air.
+_HIDDEN = 0.25
 # Sizes of the spots that are looked for, px.
-_SIZES = (1, 3, 5, 9)
-# Standard deviations of the image, of spots of one size, that a spot must exceed.
-_OUTSTANDING = 5.0
-# Rolls by thirds of the sides: what lies at one place in both images then does so by chance.
-_THIRDS = tuple((i, j) for i in range(3) for j in range(3) if i or j)
-# Spots alike at rest must be so many times those that are by chance.
+_SIZES = (3, 5, 9)
+# Part of the thresholds that suffices next to what exceeds them (hysteresis: Canny 1986, IEEE
+# Trans. PAMI 8, 679-698).
+_WEAK = 0.5
+# Half of the gaps in what stands out, px, that the motion is not looked for in.
+_GAP = 2
+# Length of lines, px.
+_LINE = 9
+# Of the images' mean squared difference, that of areas at rest.
+_STILL = 0.1
+# Fraction of their height by which spots at rest differ at most.
+_DIFFER = 0.3
+# Spots at rest must be so many times those that are by chance.
 _BEYOND_CHANCE = 3.0
+# Times that motion and structure at rest are estimated in turn.
+_TURNS = 3
 # Px; width of the Gaussians over which images without spots are averaged before the motion is
 # looked for.
 _SOFT = 1.5
@@ -45,6 +54,8 @@ class AtRest(NamedTuple):
         Areas of them of at least half a template, see `saturation.saturated_areas`.
     structure : torch.Tensor
         That of `at_rest`.
+    stray : torch.Tensor
+        Pixels of each image that no other has anything of, see `at_rest`.
     pattern : FixedPattern
         All over the images, without these pixels.
     """
@@ -52,12 +63,28 @@ class AtRest(NamedTuple):
     piled: torch.Tensor
     saturated: torch.Tensor
     structure: torch.Tensor
+    stray: torch.Tensor
     pattern: FixedPattern
 
+    def __str__(self) -> str:
+        parts = {"at rest": self.structure, "of one image alone": self.stray.any(0)}
+        said = [f"{p.double().mean():.2%} {name}" for name, p in parts.items() if bool(p.any())]
+        return f"pixels left out: {', '.join(said)}" if said else ""
+
+    @property
+    def hidden(self) -> torch.Tensor:
+        """Pixels (images, z, y) that are left out."""
+        return self.stray | self.saturated | self.structure
+
     def left_out(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
-        """The images without the fixed pattern, NaN in place of what is at rest."""
-        pixels = self.saturated | self.structure
-        return [_left_out(image, pixels) for image in self.pattern.removed(images)]
+        """The images without the fixed pattern, NaN in place of what is no air."""
+        pairs = zip(self.pattern.removed(images), self.hidden, strict=False)
+        return [_left_out(image, pixels) for image, pixels in pairs]
+
+    def filled(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """The same, with smooth values in place of what is no air."""
+        found = zip(self.left_out(images), self.hidden, strict=False)
+        return [filled_in(i, pixels) if bool(pixels.any()) else i for i, pixels in found]
 
     def flags(
         self, found: Displacement, images: Sequence[torch.Tensor], windows: Windows, left_out: bool
@@ -79,15 +106,20 @@ class AtRest(NamedTuple):
         bad = non_finite(images, windows)
         hidden = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
         flag = flag & ~(Flag.NON_FINITE_INPUT * hidden).to(flag.dtype)
-        nothing = not any(bool(part.any()) for part in (self.piled, self.saturated, self.structure))
-        if nothing and not self.pattern.spoils:
+        parts = self.piled, self.saturated, self.structure, self.stray
+        if not any(bool(part.any()) for part in parts) and not self.pattern.spoils:
             return flag
         wide = ~torch.isfinite(found.d).all(0) & ~bad
         piled = windows.of_templates(working(self.piled)).amax(0) > _SATURATED
         # an area of another brightness spoils a correlation from afar
+        spoiled = torch.full_like(bad, self.pattern.spoils)
+        hidden = self.hidden.any(0)
+        spoiled |= windows.of_templates(working(hidden)) > _HIDDEN
+        spoiled |= windows.of_centres(working(hidden)) > 0
+        structure = thick(hidden) if left_out else hidden
         for bit, pixels, here, reach in (
             (Flag.SATURATED, self.saturated, piled, wide if left_out else ~bad),
-            (Flag.AT_REST, self.structure, torch.full_like(bad, self.pattern.spoils), wide),
+            (Flag.AT_REST, structure, spoiled, wide),
         ):
             here = here | (windows.of_templates(working(pixels)) > 0)
             here |= reach & (windows.of_regions(working(pixels)) > 0)
@@ -118,16 +150,21 @@ def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
     if windows.dims > 2:
         return nothing_at_rest(images)._replace(piled=piled, saturated=areas)
     pair = [_left_out(image, areas) for image in images[:2]]
-    pattern = fixed_pattern(pair, windows)
-    pair = pattern.removed(pair)
-    structure, d = at_rest(*pair, windows)
-    return AtRest(piled, areas, structure & ~areas, pattern.with_pixels(pair, d))
+    structure, stray, d = at_rest(*pair, windows)
+    hidden = stray | structure
+    pattern = fixed_pattern([_left_out(i, p) for i, p in zip(pair, hidden, strict=True)], windows)
+    if pattern.columns or pattern.rows:
+        structure, stray, d = at_rest(*pattern.removed(pair), windows)
+    more = torch.zeros_like(piled[2:])
+    found = AtRest(piled, areas, structure & ~areas, torch.cat([stray, more]), pattern)
+    return found._replace(pattern=pattern.with_pixels(found.filled(images)[:2], d))
 
 
 def nothing_at_rest(images: Sequence[torch.Tensor]) -> AtRest:
     """Images or volumes that are known to hold nothing of the kind."""
     none = torch.zeros_like(images[0], dtype=torch.bool)
-    return AtRest(torch.stack([none] * len(images)), none, none, FixedPattern(torch.ones(1)))
+    all_none = torch.stack([none] * len(images))
+    return AtRest(all_none, none, none, all_none, FixedPattern(torch.ones(1)))
 
 
 def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
@@ -139,21 +176,20 @@ def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
 
 def at_rest(
     image1: torch.Tensor, image2: torch.Tensor, windows: Windows
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Pixels with structure that stays where it is while the air around it moves.
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Pixels that do not move with the air around them.
 
-    Spots of 1, 3, 5 and 9 px count (mean over a square less that over one three times as large):
-    beyond 5 robust standard deviations in both images, and alike there to 0.3 of their height. The
-    motion d around them is the median of 5 x 5 coarse vectors of the images without these spots,
-    averaged over Gaussians of 1.5 px, which hide gains of pixels.
-    Spots are at rest where the images differ by 0.7 of the height along d, forward from image 1
-    and back from image 2, and differ least without a displacement: where a spot is all that there
-    is, no d is known. Gaussian texture has one pixel beyond 5 standard deviations in two
-    millions, in one image alone.
+    They are impulses that both images have at one place and no image of air resolves
+    (`impulses.sharp`); pixels, lines, steps and spots that stand out of both images and are more
+    alike at one place than along the motion d of what is around; and areas that these cut off. d is
+    the median of 5 x 5 coarse vectors of the images without what stands out of both, averaged over
+    Gaussians of 1.5 px, which hide gains of pixels. Motion and structure are estimated in turn.
+    What stands out is measured by local medians, with thresholds of one false alarm in 10 000
+    images of normal noise: the slower the air, the stronger a structure must be to be known from
+    it. Stray pixels stand out of one image alone (`impulses.stray`).
 
-    Not found: structure where the air moves by less than a pixel, where it fills most of 5 coarse
-    windows, edges, or a pattern so weak or so dense that no place stands out. Bright air that
-    stands still amid moving air looks at rest, and is.
+    Not found: soft structure as faint as the texture, and a pattern so weak or so dense that no
+    place stands out. Bright air that stands still amid moving air looks at rest, and is.
 
     Parameters
     ----------
@@ -163,74 +199,220 @@ def at_rest(
     Returns
     -------
     structure : torch.Tensor of bool, shape (z, y)
+    stray : torch.Tensor of bool, shape (2, z, y)
     d : torch.Tensor, shape (2, z, y)
         Px.
     """
-    first, second = normalised([image1, image2]).nan_to_num(0.0)
-    means = {size: _means(first, second, size) for size in {*_SIZES, *(3 * n for n in _SIZES)}}
-    spots = [_spots(means[size] - means[3 * size]) for size in _SIZES]
-    candidates = torch.stack([_grown(s.alike, z) for s, z in zip(spots, _SIZES, strict=True)])
-    candidates = candidates.any(0)
-    soft = (_soft(image, ~candidates) for image in (image1, image2))
-    d, scatter = motion_around(*soft, windows)
-    if not bool(candidates.any()):
-        return candidates, d
-    found = torch.zeros_like(candidates)
-    # without texture around, vectors scatter over the search region
-    speed = d.norm(dim=0)
-    known = (speed >= _SLOWEST) & (scatter < speed)
-    for spot, size in zip(spots, _SIZES, strict=True):
-        apart = spot.alike & spot.apart(d)
-        if bool((_grown(apart, size) & known).any()):
-            found |= _grown(apart & spot.still(size), size)
-    return _grown(found & known, 3), d
+    pair = torch.stack([working(image) for image in (image1, image2)])
+    pair = torch.where(pair.isfinite(), pair, torch.nan)
+    outstanding = impulses.outstanding(pair)
+    pair = _normalised(pair, outstanding)
+    found = impulses.sharp(pair)
+    hidden = outstanding | _candidates(pair, found)
+    for _ in range(_TURNS):
+        soft = (_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True))
+        d, _ = motion_around(*soft, windows, continued=True)
+        if not bool(d.any()):  # what stands out is all that there is
+            return found, torch.zeros_like(outstanding), d
+        stray = impulses.stray(pair, outstanding, found, d)
+        new = _still(torch.where(stray, torch.nan, pair), found, d)
+        if not bool((new & ~found).any()):
+            break
+        found = found | new
+    return found, stray & ~found, d
 
 
-class _Spots(NamedTuple):
-    """Two images of spots of one size, and where both have alike ones that stand out."""
-
-    one: torch.Tensor
-    two: torch.Tensor
-    alike: torch.Tensor
-
-    def apart(self, d: torch.Tensor) -> torch.Tensor:
-        """Where spots neither came along d nor go on."""
-        off = (self.two - moved(self.one, -d)).abs(), (self.one - moved(self.two, d)).abs()
-        return torch.minimum(*off) > 0.7 * torch.minimum(self.one.abs(), self.two.abs())
-
-    def still(self, size: int) -> torch.Tensor:
-        """Where squares twice as large differ less at rest than moved by up to 3 px."""
-        side = 2 * size + 1
-        steps = range(-_FARTHEST, _FARTHEST + 1)
-        rim = (size,) * 4
-        at_rest, best = None, torch.full_like(self.one, torch.inf)
-        for i, j in product(steps, steps):
-            off = pad((self.one - self.two.roll((i, j), (0, 1))).square(), rim)
-            off = box_sum(box_sum(off, side, -1), side, -2)
-            if i or j:
-                best = torch.minimum(best, off)
-            else:
-                at_rest = off
-        return at_rest < best
+def _normalised(pair: torch.Tensor, but: torch.Tensor) -> torch.Tensor:
+    """Images with mean 0 and standard deviation 1 of all but some pixels."""
+    known = pair.isfinite() & ~but
+    parts = []
+    for image, use in zip(pair, known, strict=True):
+        values = image[use]
+        contrast = values.std(correction=0) if values.numel() else image.new_ones(())
+        mean = values.mean() if values.numel() else 0.0
+        parts.append((image - mean) / torch.where(contrast > 0, contrast, 1.0))
+    return torch.stack(parts)
 
 
-def _spots(pair: torch.Tensor) -> _Spots:
-    one, two = pair
-    least = _OUTSTANDING * 1.4826 * torch.maximum(one.abs().median(), two.abs().median())
-    alike = _alike(one, two, least)
-    if not bool(alike.any()):
-        return _Spots(one, two, alike)
-    # among many bright particles some lie by chance where others were
+class _Field(NamedTuple):
+    """What may stand out of two images.
+
+    Its values (2, z, y), by how much these or the pixels themselves differ (z, y), its size in px,
+    and the pixels that it marks.
+    """
+
+    pair: torch.Tensor
+    change: torch.Tensor
+    size: int
+    marked: Callable[[torch.Tensor], torch.Tensor]
+
+
+def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
+    """Single pixels, lines, edges, spots: each from the images without what was found before."""
+    same = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
+
+    def known(found):
+        return torch.where(found, torch.nan, pair)
+
+    def of(values, size, marked, same=None):
+        change = (values[1] - values[0]).nan_to_num(0.0).abs()
+        return _Field(values, change if same is None else change.minimum(same), size, marked)
+
+    def pixels(found):
+        heights = torch.stack([impulses.height(image) for image in known(found)])
+        return of(heights, 1, lambda new: new, same)
+
+    yield pixels
+    for axis in (-1, -2):
+
+        def lines(found, axis=axis):
+            means = _along(pixels(found).pair, axis)
+            return of(means, 3, lambda new: _along(new.double(), axis) > 0)
+
+        yield lines
+    for axis in (-1, -2):
+
+        def edges(found, axis=axis):
+            steps = pad(known(found).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
+            either = same.minimum(same.roll(-1, axis))
+            return of(steps, 1, lambda new: new | new.roll(1, axis), either)
+
+        yield edges
+    for size in _SIZES:
+
+        def spots(found, size=size):
+            return of(_spots(known(found), size), size, lambda new: _grown(new, size))
+
+        yield spots
+
+
+def _spots(pair: torch.Tensor, size: int) -> torch.Tensor:
+    known = torch.stack([filled_in(image) for image in pair])
+    return _means(known, size) - _means(known, 3 * size)
+
+
+def _along(fields: torch.Tensor, axis: int) -> torch.Tensor:
+    """Means over lines of 9 px."""
+    rim = (0, 0) * (-1 - axis) + (_LINE // 2,) * 2
+    return box_sum(pad(fields.nan_to_num(0.0), rim), _LINE, axis) / _LINE
+
+
+def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) of all that stands out alike of both images, at rest or not."""
+    for of in _fields(pair):
+        field = of(found)
+        alike = _beyond_chance(_alike(field, _least(field)), field, _least(field))
+        found = found | field.marked(alike)
+    return _closed(found, _GAP)
+
+
+def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots, areas."""
+    for of in _fields(pair):
+        field = of(found)
+        found = found | field.marked(_stays(field, d))
+    return found | _enclosed(pair, found)
+
+
+def _least(field: _Field) -> torch.Tensor:
+    """Height that no value of the field exceeds by chance."""
+    limit = impulses.threshold(field.pair[0].numel() // field.size**2)
+    return limit * torch.maximum(*(impulses.median_scale(i, field.size) for i in field.pair))
+
+
+def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
+    """Where what stands out of two fields (2, z, y) neither came along d nor goes on."""
+    least = _least(field)
+    one, two = field.pair.nan_to_num(0.0)
+    off = [
+        torch.where(_inside(along), (here - moved(there, along)).abs(), torch.inf)
+        for here, there, along in ((one, two, d), (two, one, -d))
+    ]
+    off = torch.minimum(*off)
+    off = torch.where(off.isfinite(), off, 0.0)
+    limit = impulses.threshold(off.numel() // field.size**2)
+    limit = limit * impulses.median_scale(off, field.size)
+    new, weak = (
+        (off > part * limit)
+        & _alike(field, part * least)
+        & (field.change < _DIFFER * off)
+        & (_lower(field.pair) > off / 2)
+        for part in (1.0, _WEAK)
+    )
+    if not bool(new.any()):
+        return new
+    new = _beyond_chance(new, field, least)
+    if field.size > 1 or not bool(new.any()):
+        return new
+    new = ndimage.binary_propagation(new.cpu(), np.ones((3, 3)), weak.cpu())
+    return torch.as_tensor(new, device=weak.device)
+
+
+def _beyond_chance(new: torch.Tensor, field: _Field, least: torch.Tensor) -> torch.Tensor:
+    """Those pixels, or none if unrelated images have a third as many alike in one place.
+
+    Among many bright particles some lie by chance where others were.
+    """
+    one, two = field.pair.nan_to_num(0.0)
     rows, columns = two.shape
-    turned = [two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1)) for i, j in _THIRDS]
-    chance = sum(float(_alike(one, other, least).sum()) for other in turned) / len(turned)
-    few = float(alike.sum()) < _BEYOND_CHANCE * chance
-    return _Spots(one, two, alike & (not few))
+    chance = []
+    for i, j in impulses.THIRDS:
+        other = two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1))
+        rolled = field._replace(pair=torch.stack([one, other]), change=(other - one).abs())
+        chance.append(int(_alike(rolled, least).sum()))
+    # the median, as lines at rest fall on themselves
+    return new & (int(new.sum()) >= _BEYOND_CHANCE * float(np.median(chance)))
 
 
-def _alike(one: torch.Tensor, two: torch.Tensor, least: torch.Tensor) -> torch.Tensor:
-    lower = torch.minimum(one.abs(), two.abs())
-    return (lower > least) & ((two - one).abs() < 0.3 * lower)
+def _enclosed(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
+    """Areas cut off by what is at rest that change by less than a tenth of what others do."""
+    if not bool(found.any()):
+        return found
+    square = (pair[1] - pair[0]).square()
+    known = square.isfinite() & ~found
+    if not bool(known.any()):
+        return torch.zeros_like(found)
+    limit = _STILL * float(square[known].mean())
+    closed = _closed(found, 1)
+    still = torch.zeros_like(found)
+    for part in (~closed, closed & ~found):
+        area, number = ndimage.label(part.cpu().numpy())
+        use = (known & part).cpu().numpy()
+        numbers, values = area[use], square.cpu().numpy()[use]
+        change = np.bincount(numbers, values, number + 1) - limit * np.bincount(
+            numbers, minlength=number + 1
+        )
+        still |= torch.as_tensor((change < 0)[area], device=found.device) & part
+    return still
+
+
+def _closed(pixels: torch.Tensor, reach: int) -> torch.Tensor:
+    """Pixels and gaps between them of up to twice the reach."""
+    wide = _grown(pixels, 2 * reach + 1)
+    return (
+        ~_grown(pad(~wide, (reach,) * 4, value=False), 2 * reach + 1)[
+            reach : reach + pixels.shape[0], reach : reach + pixels.shape[1]
+        ]
+        | pixels
+    )
+
+
+def _inside(d: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) from which d (2, z, y) leads to another one of the image."""
+    inside = torch.ones_like(d[0], dtype=torch.bool)
+    for axis, (part, n) in enumerate(zip(d, d.shape[1:], strict=True)):
+        place = torch.arange(n).to(d).reshape(-1, *[1] * (1 - axis)) + part
+        inside &= (place > -0.5) & (place < n - 0.5)
+    return inside
+
+
+def _alike(field: _Field, least: torch.Tensor) -> torch.Tensor:
+    lower = _lower(field.pair)
+    return (lower > least) & (field.change < _DIFFER * lower)
+
+
+def _lower(pair: torch.Tensor) -> torch.Tensor:
+    return pair.nan_to_num(0.0).abs().amin(0)
 
 
 def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:
@@ -238,8 +420,8 @@ def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:
     return box_sum(box_sum(pixels, size, -1), size, -2) > 0
 
 
-def _means(first: torch.Tensor, second: torch.Tensor, size: int) -> torch.Tensor:
-    images = pad(torch.stack([first, second]), (size // 2,) * 4, "replicate")
+def _means(images: torch.Tensor, size: int) -> torch.Tensor:
+    images = pad(images, (size // 2,) * 4, "replicate")
     return box_sum(box_sum(images, size, -1), size, -2) / size**2
 
 

@@ -19,8 +19,7 @@ from lidar_mi.retrieval.velocimetry.band_limit import (
     radii,
     shell_means,
 )
-from lidar_mi.retrieval.velocimetry.common_grid import nearest_filled
-from lidar_mi.retrieval.velocimetry.quality import filled
+from lidar_mi.retrieval.velocimetry.inpainting import filled_in, nearest_in
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.velocimetry.windows import stored
 
@@ -283,22 +282,19 @@ def spectrum_of(
 ) -> PowerSpectrum:
     """The power spectrum of images that `band_limited` filters."""
     known = torch.stack([torch.isfinite(image) for image in images])
-    images = _finite(images)
-    sizes = transform_sizes(images.shape[1:], settings)
-    return power_spectrum(images, sizes, settings, weight, known)
+    sizes = transform_sizes(images[0].shape, settings)
+    found = power_spectrum(_finite(images), sizes, settings, weight, known)
+    if bool(known.all()):
+        return found
+    # smooth values go on with the noise at the rim, the nearest ones make steps: both add power
+    nearest = torch.stack([stored(nearest_in(image)) for image in images])
+    other = power_spectrum(nearest, sizes, settings, weight, known)
+    return found._replace(density=torch.minimum(found.density, other.density))
 
 
 def _finite(images: Sequence[torch.Tensor]) -> torch.Tensor:
-    """Images (images, ...) as they are stored, `_continued`."""
-    return torch.stack([stored(_continued(image)) for image in images])
-
-
-def _continued(image: torch.Tensor) -> torch.Tensor:
-    """The image with the value of the nearest finite pixel in place of non-finite ones."""
-    finite = torch.isfinite(image)
-    if bool(finite.all()) or not bool(finite.any()):
-        return filled(image)
-    return torch.as_tensor(nearest_filled(image.cpu().numpy())).to(image)
+    """Images (images, ...) as they are stored, with smooth values where they are not finite."""
+    return torch.stack([stored(filled_in(image)) for image in images])
 
 
 def transform_sizes(shape: Sequence[int], settings: FilterSettings) -> list[int]:

@@ -132,8 +132,10 @@ def retrieve_wind(
         each with `_stderr`, see `VortexPairFit.quantities`). Rejected vectors keep their value (or
         NaN if there is none); nothing is replaced. Gains of a detector's columns and rows are
         removed beforehand, see `fixed_pattern`, and so is a change of illumination from edge to
-        edge, see `illumination`; attributes of these names say so. `identical_images` names
-        images that are the same, bit for bit, from which no motion can be told.
+        edge, see `illumination`; attributes of these names say so. Pixels that do not move with the
+        air are left out, see `rest.at_rest`, and the attribute `defects` says how many.
+        `identical_images` names images that are the same, bit for bit, from which no motion can be
+        told.
 
     Raises
     ------
@@ -192,27 +194,32 @@ def retrieve_wind(
         "times": tau,
         "blur": blurred,
         "settings": settings,
+        "partly": True,
     }
     with threads_for(image1.size):
         whole = [pixels1, pixels2, *rest]
         resting = all_at_rest(whole, windows) if checks else nothing_at_rest(whole)
-        light = [illumination(pixels1, i) if checks else torch.ones(1, 1) for i in whole[1:]]
+        seen = resting.filled(whole)
+        light = [illumination(seen[0], i) if checks else torch.ones(1, 1) for i in seen[1:]]
         # a correlation of windows would lose all that see a pixel that is left out
-        remedy = resting.left_out if chosen.centred else resting.pattern.removed
+        remedy = resting.left_out if chosen.centred else resting.filled
         first, second, *offered["more"] = _of_one_light(remedy(whole), light)
         options = {name: offered[name] for name in chosen.options}
         find = partial(chosen.find, template=template, search=search, **options)
         found = find(first, second, stride=stride)
         level = 0.0 if noise is None else noise
-        pixels1, pixels2 = _of_one_light(resting.pattern.removed(whole[:2]), light)
+        pixels1, pixels2 = _of_one_light(resting.filled(whole[:2]), light)
         texture, low = low_texture(pixels1, windows, min_texture, min_isotropy, level)
         apart = max(1, round(template / 2 / stride))
         flag = resting.flags(found, whole, windows, chosen.centred)
+        if chosen.local:
+            bad = (flag & Flag.NON_FINITE_INPUT.value) > 0
+            found = found._replace(d=torch.where(bad, torch.nan, found.d))
         if chosen.repeats:
             if found.covariance is not None:
                 flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
             # errors of what is at rest or saturated say nothing of the vectors around
-            pair = _of_one_light(resting.left_out(whole[:2]), light)
+            pair = [first, second] if chosen.centred else [pixels1, pixels2]
             clear = clearly_textured(texture, min_texture, min_isotropy)
             covariance = None
             if standard_errors:
@@ -242,7 +249,7 @@ def retrieve_wind(
         by_itself = "times" in options
         shown = tau is None or not by_itself
         if checks and not chosen.local and shown and found.covariance is not None:
-            still = standing([pixels1, pixels2], found, windows)
+            still = standing([first, second], found, windows)
             # parameters beside the vectors would stay biased
             if still.spoils or (still.fraction and found.quantities):
                 flag = flag | Flag.AT_REST.value
@@ -276,6 +283,8 @@ def retrieve_wind(
     if "min_correlation" in options:
         attributes["min_correlation"] = min_correlation
     patterns = [str(part) for part in (resting.pattern, still) if str(part)]
+    if str(resting):
+        attributes["defects"] = str(resting)
     if patterns:
         attributes["fixed_pattern"] = ", ".join(patterns)
     if still.fraction:

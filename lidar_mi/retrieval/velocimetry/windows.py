@@ -157,6 +157,15 @@ class Windows:
             pixels = strided(box_sum(pixels, self.template, axis), self.stride, axis)
         return pixels / self.template**self.dims
 
+    def of_centres(self, pixels: torch.Tensor) -> torch.Tensor:
+        """Mean of an image over the middle pixel of every template, or the middle 2 x 2."""
+        side = 2 - self.template % 2
+        for axis, n in enumerate(self.count):
+            start, axis = self.starts(axis).start + (self.template - 1) // 2, axis - self.dims
+            pixels = pixels.narrow(axis, start, (n - 1) * self.stride + side)
+            pixels = strided(box_sum(pixels, side, axis), self.stride, axis)
+        return pixels / side**self.dims
+
     def of_regions(self, pixels: torch.Tensor) -> torch.Tensor:
         """Mean of an image over every search region, of a volume over every template."""
         if self.inner == self.template:

@@ -8,6 +8,7 @@ import torch
 
 from lidar_mi.retrieval.velocimetry.band_limit import best_filter
 from lidar_mi.retrieval.velocimetry.brightness import normalised
+from lidar_mi.retrieval.velocimetry.inpainting import filled_in
 from lidar_mi.retrieval.velocimetry.quality import filled
 from lidar_mi.retrieval.velocimetry.settings import FilterSettings
 from lidar_mi.retrieval.vortices.images import Builder, spectrum_of
@@ -31,7 +32,8 @@ def builder_of(
     if float(finite.double().mean()) < 0.5:
         return f"{float(finite.double().mean()):.0%} of the pixels are finite"
     # in units of image 1's own structure, so that no constant depends on the images' unit
-    images = normalised([image.double() for image in stack]).nan_to_num(0.0)
+    images = normalised([image.double() for image in stack])
+    images = torch.stack([filled_in(image) for image in images])
     contrast = images[0][finite].std()
     scale = filled(stack[0].double()).abs().max()
     if not bool(contrast > 1e-9 * scale) or not bool(images[-1][finite].std() > 0):

@@ -18,6 +18,9 @@ from lidar_mi.retrieval.checks import checked_stack, on_device, positive
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.retrieval.velocimetry.beam_times import checked_times
 from lidar_mi.retrieval.velocimetry.brightness import normalised
+from lidar_mi.retrieval.velocimetry.inpainting import filled_in
+from lidar_mi.retrieval.velocimetry.rest import all_at_rest
+from lidar_mi.retrieval.velocimetry.windows import Windows
 from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
     TOLERANCE,
@@ -80,7 +83,7 @@ def fit_vortices(
     ----------
     image1, image2 : DataArray, dims (z, y)
         On one grid, as `lidar_mi.retrieval.velocimetry.wind.retrieve_wind` takes them. NaN pixels
-        are left out.
+        are left out, and so are pixels that do not move with the air (`rest.all_at_rest`).
     dt : float
         s.
     noise : float or DataArray, optional
@@ -141,6 +144,8 @@ def fit_vortices(
     given = _checked_arguments(stack, dt, noise, profile, frozen, times, start, telescope, device)
     pixels = [on_device(image, device) for image in stack]
     with threads_for(image1.size):
+        if min(image1.shape) >= Windows.search:
+            pixels = all_at_rest(pixels, Windows(tuple(image1.shape))).left_out(pixels)
         return fit_pixels(*pixels, *given)
 
 
@@ -260,7 +265,7 @@ def _begun(make: Builder | str, start: VortexPairFit) -> Begun | None:
 def _completed(ready: Begun, image1: torch.Tensor, image2: torch.Tensor) -> VortexPairFit | None:
     """The fit near the expected pair; None if it is not accepted or does not agree with it."""
     finite, make = torch.isfinite(image2), ready.make
-    second = normalised([image1, image2])[1].nan_to_num(0.0) / make.contrast
+    second = filled_in(normalised([image1, image2])[1]) / make.contrast
     if float((finite & ~make.bad).double().mean()) < 0.5 or not bool(second.std() > 0):
         return None
     both = torch.cat([make.pair, second[None].to(make.pair)])
