@@ -90,7 +90,7 @@ def _pieces(sectors: Sectors) -> list[tuple[int, int]]:
 
 def _shifts(sectors: Sectors, pieces) -> tuple[np.ndarray, np.ndarray]:
     """Shift of every piece in every sector, px^2, NaN where it is not known; the pieces' r^2."""
-    value = np.stack([_filled(*one) for one in zip(sectors.value, sectors.count, strict=True)])
+    value = np.stack([_filled(*one) for one in zip(sectors.value, sectors.seen, strict=True)])
     shift = np.full((len(pieces), SECTORS), np.nan)
     for number, (first, last) in enumerate(pieces):
         size = last - first + 1

@@ -15,7 +15,7 @@ from scipy.stats import chi2
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.alignment import aligned, crests
-from lidar_mi.retrieval.rings.centre import gradient_centre
+from lidar_mi.retrieval.rings.centre import ring_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
 from lidar_mi.retrieval.rings.pattern import Pattern, Profile, find_pattern
 from lidar_mi.retrieval.rings.ring_fit import CurveFit, fit_all
@@ -209,7 +209,7 @@ def analyse_rings(
         raise InputError(f"image: {len(image)} images are not allowed; expected one")
     image = image[0].double().cpu().numpy()
     free = centre is None
-    centre = gradient_centre(image) if free else tuple(map(float, centre))
+    centre = ring_centre(image) if free else tuple(map(float, centre))
     inside(*centre, image.shape)
     geometry = aligned(image, RingCurves(centre), free)
     sectors = Sectors(image, geometry)
@@ -250,8 +250,9 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     places = crests(sectors)
     high = sectors.profile[places] - sectors.profile.min()
     places = sectors.r2[places[high > CREST * high.max()]]
-    profile = Profile(sectors.profile_r2, sectors.profile, sectors.profile_count, sectors.step)
-    noise = sectors.noise() / sectors.profile_count[sectors.profile_count > 0].mean()
+    weight = sectors.profile_count / sectors.profile_noise
+    profile = Profile(sectors.profile_r2, sectors.profile, weight, sectors.step)
+    noise = 1 / weight[weight > 0].mean()
     with threads_for(len(profile.r2)):
         found = find_pattern(profile, noise, spacing)
     radii = ", ".join(f"{math.sqrt(place):.0f}" for place in places)

@@ -122,12 +122,12 @@ def blur(r2: np.ndarray, step: float, spacing: float) -> np.ndarray:
 
 
 class Profile:
-    """A mean over circles that patterns are fitted to."""
+    """A mean over circles that patterns are fitted to, its annuli weighted."""
 
-    def __init__(self, r2: np.ndarray, value: np.ndarray, count: np.ndarray, step: float):
-        known = count > 0
+    def __init__(self, r2: np.ndarray, value: np.ndarray, weight: np.ndarray, step: float):
+        known = weight > 0
         self.r2, self.value, self.step = r2[known], value[known], step
-        self.root = np.sqrt(count[known] / count.mean())
+        self.root = np.sqrt(weight[known] / weight[known].mean())
         self.last = float(self.r2[-1])
         q = self.r2 / self.last
         self.background = np.column_stack([np.ones_like(q), np.sqrt(q), q])

@@ -160,9 +160,9 @@ class _System:
         smooth = np.stack([np.ones_like(q), np.sqrt(q1), q1, total, q1 * total], -1)
         smooth = np.repeat(smooth[None], SECTORS, 0)
         # about a single ring, a height that changes is hardly another than a shift
-        extent = np.where(sectors.count > 0, q, 0).max(1)
+        extent = np.where(sectors.seen > 0, q, 0).max(1)
         smooth[extent < TWO_RINGS * pattern.spacing, :, 4] = 0
-        root = np.sqrt(sectors.count)
+        root = np.sqrt(sectors.seen)
         keep = np.ones_like(root)
         for _ in range(2):
             weight = root * keep
@@ -191,7 +191,8 @@ class _System:
         size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
         self.inverse = np.linalg.pinv(whole / np.outer(size, size), 1e-10, hermitian=True)
         self.inverse /= np.outer(size, size)
-        cells = (keep * root > 0).sum() - 5 * SECTORS - len(size)
+        used = keep * root > 0
+        cells = used.sum() - 5 * used.any(1).sum() - len(size)
         self.variance = float((self.left**2).sum() / max(cells, 1))
         self.width = self._width()
 
@@ -289,7 +290,7 @@ class _System:
 def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
     """Order, line and number of sectors of the rings in enough of them, by their radius."""
     found = []
-    present = (sectors.count > 0).sum(0)
+    present = (sectors.seen > 0).sum(0)
     half = 0.5 * pattern.width * pattern.spacing
     for line, fraction in enumerate(pattern.fraction):
         for order in range(int(sectors.r2[-1] / pattern.spacing) + 1):

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar_mi.retrieval.rings.light import common_light
+
 STEPS = 1200  # annuli out to the farthest corner, at most
 PIXELS = 2  # least mean number of pixels of a sector of an annulus
 SECTORS = 48
@@ -98,13 +100,16 @@ class Sectors:
         some = np.maximum(self.count, 1)
         self.value = np.where(full, total[:, :last], 0) / some
         self.offset = np.where(self.count > 0, total_r2[:, :last] / some - self.r2, 0.0)
-        self.profile_count = self.count.sum(0)
-        known = np.flatnonzero(self.profile_count)
-        mean, mean_r2 = (
-            (self.count * part).sum(0)[known] / self.profile_count[known]
-            for part in (self.value, self.r2 + self.offset)
+        light = common_light(self.r2, self.value, self.count)
+        self.profile, self.profile_count, self.profile_noise = (
+            light.profile,
+            light.weight,
+            light.noise,
         )
-        self.profile = np.interp(self.r2, self.r2[known], mean)
+        self.seen = self.count * light.keep
+        total = self.seen.sum(0)
+        known = np.flatnonzero(total)
+        mean_r2 = (self.seen * (self.r2 + self.offset)).sum(0)[known] / total[known]
         self.profile_r2 = np.interp(self.r2, self.r2[known], mean_r2)
 
     def noise(self) -> float:
