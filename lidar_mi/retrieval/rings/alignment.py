@@ -59,9 +59,9 @@ def crests(sectors: Sectors) -> np.ndarray:
     mean = sectors.profile
     smooth = _smooth(mean)
     kept = np.sqrt((savgol_coeffs(_window(mean), 2) ** 2).sum())  # of white noise
-    off = np.abs(mean - smooth - np.median(mean - smooth)) * np.sqrt(sectors.profile_count)
-    few = np.sqrt(np.maximum(sectors.profile_count, 1))
-    noise = kept * 1.4826 * np.median(off) / few
+    known = sectors.profile_count > 0
+    noise = np.full(len(mean), np.inf)
+    noise[known] = kept * np.sqrt(sectors.profile_noise[known] / sectors.profile_count[known])
     if not np.ptp(smooth) > SIGNIFICANT * np.median(noise):
         raise InputError("rings: none detected; expected at least 2")
     places, found = find_peaks(smooth, prominence=PROMINENT * np.ptp(smooth))

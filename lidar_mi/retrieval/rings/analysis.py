@@ -18,7 +18,7 @@ from lidar_mi.retrieval.rings.alignment import aligned, crests
 from lidar_mi.retrieval.rings.centre import ring_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
 from lidar_mi.retrieval.rings.pattern import Pattern, Profile, find_pattern
-from lidar_mi.retrieval.rings.ring_fit import CurveFit, fit_all
+from lidar_mi.retrieval.rings.ring_fit import CurveFit, fit_all, hidden_rings
 from lidar_mi.retrieval.rings.sectors import RingCurves, Sectors
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.tables import Table, Tabular, with_error
@@ -213,8 +213,11 @@ def analyse_rings(
     inside(*centre, image.shape)
     geometry = aligned(image, RingCurves(centre), free)
     sectors = Sectors(image, geometry)
+    hidden = hidden_rings(sectors, _found(sectors, spacing)[0])
+    if hidden is not None:
+        sectors = Sectors(image, geometry, hidden)
     pattern, doubt = _pattern(sectors, spacing)
-    fit = fit_all(image, geometry, pattern, free)
+    fit = fit_all(image, geometry, pattern, free, hidden)
     law = _law(fit)
     return Rings(
         shape=image.shape,
@@ -250,19 +253,14 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     places = crests(sectors)
     high = sectors.profile[places] - sectors.profile.min()
     places = sectors.r2[places[high > CREST * high.max()]]
-    weight = sectors.profile_count / sectors.profile_noise
-    profile = Profile(sectors.profile_r2, sectors.profile, weight, sectors.step)
-    noise = 1 / weight[weight > 0].mean()
-    with threads_for(len(profile.r2)):
-        found = find_pattern(profile, noise, spacing)
+    pattern, doubt, noise = _found(sectors, spacing)
     radii = ", ".join(f"{math.sqrt(place):.0f}" for place in places)
     wrong = InputError(
         f"rings: radii of {radii} px are not allowed; expected squares that rise by equal "
         "steps from the centre on"
     )
-    if found is None:
+    if pattern is None:
         raise wrong
-    pattern, doubt = found
     left = pattern.unexplained - 2 * noise * pattern.freedom
     if left > UNEXPLAINED * pattern.power:
         raise wrong
@@ -270,6 +268,16 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     if (off > max(0.5 * pattern.width, 2 * LAW)).any():
         raise wrong
     return pattern, doubt
+
+
+def _found(sectors: Sectors, spacing: float | None) -> tuple[Pattern | None, str, float]:
+    """Pattern of the profile, what is doubtful about it, and the noise of its annuli."""
+    weight = sectors.profile_count / sectors.profile_noise
+    profile = Profile(sectors.profile_r2, sectors.profile, weight, sectors.step)
+    noise = 1 / weight[weight > 0].mean()
+    with threads_for(len(profile.r2)):
+        found = find_pattern(profile, noise, spacing)
+    return (None, "", noise) if found is None else (*found, noise)
 
 
 @dataclass(frozen=True)
@@ -300,8 +308,8 @@ def _law(fit: CurveFit) -> _Law:
     freedom = len(fit.square) - 1 - lines
     covariance = gain @ fit.square_covariance @ gain.T
     misfit = math.nan
+    usual = 1 / np.diag(fit.model_covariance)
     if freedom > 0:
-        usual = 1 / np.diag(fit.model_covariance)
         misfit = math.sqrt(usual @ off**2 / usual.sum() * len(off) / freedom) / spacing
         rest = np.eye(len(off)) - rows @ gain
         expected = np.trace(weight @ rest @ fit.square_covariance @ rest.T)

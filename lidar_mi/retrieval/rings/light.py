@@ -18,10 +18,13 @@ from itertools import pairwise
 
 import numpy as np
 
+from lidar_mi.errors import InputError
+
 OUTLIER = 6.0  # standard deviations of a cell
 TURNS = 12
 SEEN = 0.15  # of the usual height, the least of a sector that shows rings
 SIGNIFICANT = 4.0  # standard errors, likewise
+LEAST = 3  # sectors that an annulus must have
 SMOOTH = 25  # annuli over which the scatter is averaged
 
 
@@ -66,6 +69,7 @@ def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
     clipped = np.nan_to_num(np.clip(left, middle - reach, middle + reach))
     profile = (clipped * count).sum(0) / np.maximum(count.sum(0), 1)
     keep, taken = some, count / np.maximum(count.sum(0), 1)
+    seen = np.ones(len(value), bool)
     for turn in range(TURNS):
         # a height that changes with r only once there is a profile to compare with
         parts = [profile, q * profile] if turn > TURNS // 3 else [profile]
@@ -78,15 +82,22 @@ def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
         rest = 1 - taken
         noise = _noise(left / np.sqrt(np.maximum(rest, 0.5)), keep & (rest >= 0.5))
         # on a crest there is more, as of photons
-        scale = np.maximum(noise, (1.4826 * _median(np.where(keep, np.abs(left), np.nan))) ** 2)
+        usual = _median(np.where(some & seen[:, None], np.abs(left), np.nan))
+        scale = np.maximum(noise, (1.4826 * usual) ** 2)
         keep = some & (np.abs(left) <= OUTLIER * np.sqrt(scale) + 1e-12)
         height = linear[:, 3:] @ np.stack([np.ones_like(q), q])[: len(parts)]
         mean = (height * count * keep).sum(1) / np.maximum((count * keep).sum(1), 1)
-        usual = mean[mean > 0.5 * mean.max()].mean()
-        seen = mean > np.maximum(SEEN * usual, SIGNIFICANT * std[:, 3] * np.sqrt(noise.mean()))
+        # a sector of a few cells fits any profile, and its height is as large as its error
+        seen = mean > SIGNIFICANT * std[:, 3] * np.sqrt(noise.mean())
+        usual = np.median(mean[seen]) if seen.any() else np.inf
+        seen &= mean > SEEN * usual
         height = np.where(seen[:, None], height / usual, 0.0).clip(0)
         weight = (keep * count * height**2).sum(0)
+        # of fewer sectors none can be told to be an outlier
+        weight[(keep & seen[:, None]).sum(0) < LEAST] = 0
         known = weight > 0
+        if not known.any():
+            raise InputError("rings: none detected in three sectors; expected at least 2")
         taken = keep * count * height**2 / np.maximum(weight, 1e-300)
         rings = value - np.einsum("sqk,sk->sq", smooth, linear[:, :3])
         total = (keep * count * height * rings).sum(0)

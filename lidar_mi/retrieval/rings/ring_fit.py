@@ -19,11 +19,12 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.alignment import ALL_AROUND, LEAST, shape_columns
 from lidar_mi.retrieval.rings.frames import inside
 from lidar_mi.retrieval.rings.pattern import Pattern, airy, blur
-from lidar_mi.retrieval.rings.sectors import SECTORS, RingCurves, Sectors
+from lidar_mi.retrieval.rings.sectors import SECTORS, Hidden, RingCurves, Sectors
 
 BLOCKS = 6  # of neighbouring sectors, one of which is left out
 OUTLIER = 6.0  # standard deviations of an annulus's cells
 ROUNDS = 6
+HIDDEN = 0.3  # of the usual ring, the height below which a ring is hidden
 TWO_RINGS = 2.2  # orders, least extent of a sector whose height may change with r
 
 
@@ -63,7 +64,13 @@ class CurveFit:
     uneven: bool
 
 
-def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: bool) -> CurveFit:
+def fit_all(
+    image: np.ndarray,
+    geometry: RingCurves,
+    pattern: Pattern,
+    free: bool,
+    hidden: Hidden | None = None,
+) -> CurveFit:
     """Gauss-Newton from a geometry and a pattern that are nearly right.
 
     Ellipticity and tilt are fitted if two rings are in half of the sectors.
@@ -75,7 +82,7 @@ def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: boo
     """
     deviation: dict[tuple[int, int], float] = {}
     for number in range(ROUNDS):
-        sectors = Sectors(image, geometry)
+        sectors = Sectors(image, geometry, hidden)
         system = _System(sectors, pattern, deviation, free)
         step, std = system.solved()
         change, ring_change, heights, shape = system.parts(step)
@@ -117,6 +124,39 @@ def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: boo
         roundness=system.roundness(),
         uneven=system.width > 0,
     )
+
+
+def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
+    """Where the rings of a pattern are lower than `HIDDEN` of the usual ring, for certain.
+
+    The height of a ring in a sector is by least squares over an order about it, beside a level and
+    a slope.
+    """
+    if pattern is None:
+        return None
+    first = int(pattern.height.argmax())
+    fraction, q = float(pattern.fraction[first]), sectors.r2
+    waves = [airy(of_line, pattern.loss, pattern.spread + blur(q, sectors.step, pattern.spacing))[0] for of_line in pattern.phase(q)]
+    rings = pattern.height @ np.stack(waves)
+    number = np.floor(q / pattern.spacing - fraction + 1.5).astype(int)
+    height, std = np.full((2, SECTORS, number[-1] + 1), np.nan)
+    for k in range(number[-1] + 1):
+        inside = number == k
+        if inside.sum() < 4:
+            continue
+        part = np.stack([np.ones(inside.sum()), q[inside] / q[-1], rings[inside]], -1)
+        count, value = sectors.count[:, inside], sectors.value[:, inside]
+        matrix = np.einsum("sq,qk,ql->skl", count, part, part)
+        firm = np.linalg.cond(matrix) < 1e10
+        inverse = np.linalg.inv(matrix[firm])
+        height[firm, k] = np.einsum("sl,sq,ql,sq->s", inverse[:, 2], count[firm], part, value[firm])
+        std[firm, k] = np.sqrt(inverse[:, 2, 2] * sectors.profile_noise[inside].mean())
+    firm = height > 5 * std
+    if not firm.any():
+        return None
+    usual = np.quantile(height[firm], 0.8)
+    which = height + 3 * std < HIDDEN * usual
+    return Hidden(pattern.spacing, fraction, which) if which.any() else None
 
 
 class _System:

@@ -55,6 +55,27 @@ class RingCurves:
         return (2 * r / (linear + np.sqrt(np.maximum(linear**2 + 4 * along, 0)))) ** 2
 
 
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """Rings that something hides in some of the sectors.
+
+    Attributes
+    ----------
+    spacing, fraction : float
+        Of the intervals of r^2 from half an order before to half an order behind each ring.
+    which : array (SECTORS, intervals) of bool
+    """
+
+    spacing: float
+    fraction: float
+    which: np.ndarray
+
+    def cells(self, r2: np.ndarray) -> np.ndarray:
+        """Whether annuli are hidden, (SECTORS, annuli)."""
+        number = np.floor(r2 / self.spacing - self.fraction + 1.5).astype(int)
+        return self.which[:, number.clip(0, self.which.shape[1] - 1)]
+
+
 class Sectors:
     """Averages over sectors of annuli of equal steps in squared mean radius.
 
@@ -74,7 +95,7 @@ class Sectors:
         Mean over circles, of the value and of the squared radius; interpolated where no pixel is.
     """
 
-    def __init__(self, image: np.ndarray, geometry: RingCurves):
+    def __init__(self, image: np.ndarray, geometry: RingCurves, hidden: Hidden | None = None):
         height, width = image.shape
         centre = geometry.centre
         x, y = np.arange(width) - centre[0], np.arange(height)[:, None] - centre[1]
@@ -100,6 +121,8 @@ class Sectors:
         some = np.maximum(self.count, 1)
         self.value = np.where(full, total[:, :last], 0) / some
         self.offset = np.where(self.count > 0, total_r2[:, :last] / some - self.r2, 0.0)
+        if hidden is not None:
+            self.count = np.where(hidden.cells(self.r2), 0.0, self.count)
         light = common_light(self.r2, self.value, self.count)
         self.profile, self.profile_count, self.profile_noise = (
             light.profile,
