@@ -17,7 +17,14 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.alignment import aligned, crests
 from lidar_mi.retrieval.rings.centre import ring_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
-from lidar_mi.retrieval.rings.pattern import Pattern, Profile, find_pattern
+from lidar_mi.retrieval.rings.pattern import (
+    Pattern,
+    Profile,
+    find_pattern,
+    lines_at,
+    repeats,
+    strongest_period,
+)
 from lidar_mi.retrieval.rings.ring_fit import CurveFit, fit_all, hidden_rings
 from lidar_mi.retrieval.rings.sectors import RingCurves, Sectors
 from lidar_mi.retrieval.threads import threads_for
@@ -213,11 +220,15 @@ def analyse_rings(
     inside(*centre, image.shape)
     geometry = aligned(image, RingCurves(centre), free)
     sectors = Sectors(image, geometry)
-    hidden = hidden_rings(sectors, _found(sectors, spacing)[0])
+    hidden = hidden_rings(sectors, _rings_alone(sectors, spacing))
     if hidden is not None:
         sectors = Sectors(image, geometry, hidden)
     pattern, doubt = _pattern(sectors, spacing)
     fit = fit_all(image, geometry, pattern, free, hidden)
+    if spacing is None and repeats(fit.pattern):
+        # with a background and a height of every sector the lines are one, of a shorter spacing
+        pattern, doubt = _pattern(sectors, fit.pattern.spacing / len(fit.pattern.fraction))
+        fit = fit_all(image, geometry, pattern, free, hidden)
     law = _law(fit)
     return Rings(
         shape=image.shape,
@@ -270,11 +281,27 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     return pattern, doubt
 
 
-def _found(sectors: Sectors, spacing: float | None) -> tuple[Pattern | None, str, float]:
-    """Pattern of the profile, what is doubtful about it, and the noise of its annuli."""
+def _rings_alone(sectors: Sectors, spacing: float | None) -> Pattern | None:
+    """Lines of the strongest period where they explain the profile, of a longer one where not."""
+    profile, noise = _profile(sectors)
+    if spacing is None:
+        with threads_for(len(profile.r2)):
+            found = lines_at(profile, strongest_period(profile), noise, most=1)
+        if found is not None and found.unexplained < UNEXPLAINED * found.power:
+            return found
+    return _found(sectors, spacing)[0]
+
+
+def _profile(sectors: Sectors) -> tuple[Profile, float]:
+    """Mean over circles, weighted by its errors, and the variance that goes with the weights."""
     weight = sectors.profile_count / sectors.profile_noise
     profile = Profile(sectors.profile_r2, sectors.profile, weight, sectors.step)
-    noise = 1 / weight[weight > 0].mean()
+    return profile, float(1 / weight[weight > 0].mean())
+
+
+def _found(sectors: Sectors, spacing: float | None) -> tuple[Pattern | None, str, float]:
+    """Pattern of the profile, what is doubtful about it, and the noise of its annuli."""
+    profile, noise = _profile(sectors)
     with threads_for(len(profile.r2)):
         found = find_pattern(profile, noise, spacing)
     return (None, "", noise) if found is None else (*found, noise)

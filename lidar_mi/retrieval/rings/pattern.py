@@ -412,7 +412,7 @@ def find_pattern(
     def gain(short, long):
         """Of the pattern's power, what the longer spacing explains in addition; 0 for noise."""
         more = tried[short].unexplained - tried[long].unexplained
-        if more < 40 * noise or _repeats(tried[long]):
+        if more < 40 * noise or repeats(tried[long]):
             return 0.0
         return more / power
 
@@ -430,7 +430,7 @@ def find_pattern(
     return tried[chosen], said
 
 
-def _repeats(pattern: Pattern) -> bool:
+def repeats(pattern: Pattern) -> bool:
     """Whether two or three lines are at equal distances and of one height."""
     lines = len(pattern.fraction)
     if lines < 2:

@@ -156,6 +156,8 @@ def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
         return None
     usual = np.quantile(height[firm], 0.8)
     which = height + 3 * std < HIDDEN * usual
+    # the edge of what hides them runs through their neighbours
+    which |= np.roll(which, 1, 0) | np.roll(which, -1, 0)
     return Hidden(pattern.spacing, fraction, which) if which.any() else None
 
 
