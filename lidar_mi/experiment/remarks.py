@@ -104,6 +104,7 @@ def _of_the_pattern(experiment: Experiment) -> list[str]:
         return []
     return [
         f"scan.timing.pattern: beams of {timing.pattern} are resampled to the nodes of the image; "
-        "away from the rim, stated errors of unflagged vectors were 1.2 to 1.3 times too small "
-        "over three textures of a wake (1.4 in single runs); those of flagged vectors do not hold"
+        "stated errors of flagged vectors do not hold, and whether those of the others do was not "
+        "measured for every curve (docs/experiments/scan_patterns.md); rows, raster or serpentine, "
+        "are not resampled"
     ]
