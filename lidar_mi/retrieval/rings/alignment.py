@@ -10,7 +10,7 @@ from scipy.signal import find_peaks, peak_widths, savgol_coeffs, savgol_filter
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.frames import inside
-from lidar_mi.retrieval.rings.sectors import SECTORS, RingCurves, Sectors
+from lidar_mi.retrieval.rings.sectors import SECTORS, Hidden, RingCurves, Sectors
 
 SIGNIFICANT = 8.0  # standard deviations of the smoothed average, the least height of a ring
 PROMINENT = 0.1  # of the tallest ring's height, likewise
@@ -19,7 +19,9 @@ ALL_AROUND = 0.5  # of the sectors, in which a ring must be detected to determin
 ALIKE = 0.5  # least correlation of a sector with the mean
 
 
-def aligned(image: np.ndarray, start: RingCurves, free: bool) -> RingCurves:
+def aligned(
+    image: np.ndarray, start: RingCurves, free: bool, hidden: Hidden | None = None
+) -> RingCurves:
     """The rings' geometry, to a fraction of their width.
 
     Parameters
@@ -29,6 +31,8 @@ def aligned(image: np.ndarray, start: RingCurves, free: bool) -> RingCurves:
         With a centre within about a third of a ring's width.
     free : bool
         Whether the centre is fitted.
+    hidden : Hidden, optional
+        Rings that do not count.
 
     Raises
     ------
@@ -37,7 +41,7 @@ def aligned(image: np.ndarray, start: RingCurves, free: bool) -> RingCurves:
     """
     geometry = start
     for number in range(8):
-        sectors = Sectors(image, geometry)
+        sectors = Sectors(image, geometry, hidden)
         pieces = _pieces(sectors)
         shift, middle = _shifts(sectors, pieces)
         change = _change(shift, middle, sectors.angle, free)

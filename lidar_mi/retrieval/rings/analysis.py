@@ -123,6 +123,11 @@ class Rings(Tabular):
         """Points (x, y) of a ring of that mean radius, at angles from x toward y."""
         return RingCurves(self.centre, self.ellipticity, self.tilt).curve(radius, angle)
 
+    def _shape(self) -> str:
+        if not any((*self.ellipticity, *self.tilt)):
+            return "not determined by the part of the rings that is seen: taken for circles"
+        return f"{math.hypot(*self.ellipticity):.2g}, {math.hypot(*self.tilt):.2g} / px"
+
     def tables(self) -> list[Table]:
         """Pattern and rings, with standard errors."""
         (x, y), (x_std, y_std) = self.centre, self.centre_std
@@ -149,10 +154,7 @@ class Rings(Tabular):
             ("rms deviation from equal steps", steps),
             ("rms deviation of crests from the rings", f"{self.roundness:.2g} px"),
             *([("uneven", _UNEVEN)] if self.uneven else []),
-            (
-                "ellipticity, tilt",
-                (f"{math.hypot(*self.ellipticity):.2g}, {math.hypot(*self.tilt):.2g} / px"),
-            ),
+            ("ellipticity, tilt", self._shape()),
         ]
         single = [
             (str(order), str(line), with_error(radius, std, "px"))
@@ -222,6 +224,7 @@ def analyse_rings(
     sectors = Sectors(image, geometry)
     hidden = hidden_rings(sectors, _rings_alone(sectors, spacing))
     if hidden is not None:
+        geometry = aligned(image, RingCurves(geometry.centre), free, hidden)
         sectors = Sectors(image, geometry, hidden)
     pattern, doubt = _pattern(sectors, spacing)
     fit = fit_all(image, geometry, pattern, free, hidden)

@@ -84,6 +84,11 @@ def fit_all(
     for number in range(ROUNDS):
         sectors = Sectors(image, geometry, hidden)
         system = _System(sectors, pattern, deviation, free)
+        if not system.fitted[2:].any() and any((*geometry.ellipticity, *geometry.tilt)):
+            # what is not fitted is no shape that was found on the way
+            geometry = RingCurves(geometry.centre)
+            sectors = Sectors(image, geometry, hidden)
+            system = _System(sectors, pattern, deviation, free)
         step, std = system.solved()
         change, ring_change, heights, shape = system.parts(step)
         change_std = system.parts(std)[0]
