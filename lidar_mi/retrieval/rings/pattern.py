@@ -20,6 +20,7 @@ MULTIPLES = 6  # the strongest period may be this harmonic of the order
 FAINT = 0.02  # of the strongest line, the least height of a line
 SIGNIFICANT = 5.0  # standard errors, likewise
 FLANK = 0.2  # likewise, of a line within 1.2 widths of another
+CREST = 0.5  # of a line's height, its least crest: a line twice as broad has as much
 DISTINCT = 0.8  # full widths, the least distance of lines
 MATERIAL = 2e-3  # of the pattern's power, the least that a longer spacing must explain in addition
 DOUBTFUL = 4.0  # factor from MATERIAL within which the choice of the spacing is doubtful
@@ -238,14 +239,22 @@ class Profile:
         return float(np.abs(linear @ 0.3 ** np.arange(linear.shape[1])).max())
 
     def crest(self, pattern: Pattern) -> np.ndarray:
-        """Value at each line less that one width beside it, mean over the orders."""
+        """Value at each line less that one width beside it, without the other lines.
+
+        Mean over the orders.
+        """
+        _, columns, linear = self.residual(pattern)
+        lines = len(pattern.fraction)
+        waves = columns[:, 3:].reshape(len(self.r2), lines, -1) / self.root[:, None, None]
+        parts = (waves * linear[3:].reshape(lines, -1)).sum(2)
         found = []
-        for fraction in pattern.fraction:
+        for line, fraction in enumerate(pattern.fraction):
+            alone = self.value - parts.sum(1) + parts[:, line]
             orders = np.arange(1, self.last / pattern.spacing - 1)
             place = (orders + fraction) * pattern.spacing
             beside = pattern.width * pattern.spacing
             middle, low, high = (
-                np.interp(place + by, self.r2, self.value) for by in (0.0, -beside, beside)
+                np.interp(place + by, self.r2, alone) for by in (0.0, -beside, beside)
             )
             found.append((middle - (low + high) / 2).mean() if len(place) else np.inf)
         return np.array(found)
@@ -368,7 +377,7 @@ def _plausible(pattern: Pattern, profile: Profile, noise: float) -> bool:
     # a line away from the others has a crest of its own, which their wings have not; one in a
     # flank must be high, or it mends a shape that is not Airy's
     nearest = np.minimum(distance, np.roll(distance, 1))[np.argsort(np.argsort(fractions))]
-    crest = profile.crest(pattern) / top > 0.2 * pattern.height
+    crest = profile.crest(pattern) / top > CREST * pattern.height
     apart = nearest > 1.2 * pattern.width
     return bool(np.where(apart, crest, pattern.height > FLANK).all())
 
