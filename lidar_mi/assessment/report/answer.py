@@ -51,9 +51,7 @@ def answer(experiment, metrics: Mapping[str, float], judged: Judged = ()) -> lis
     speed = experiment.platform.speed if experiment.wake else 0.0
     unskilled = without_skill(metrics)
     lines += [
-        verdict(table, findings, unskilled)
-        for table, findings in judged
-        if table.applies_at(speed)
+        verdict(table, findings, unskilled) for table, findings in judged if table.applies_at(speed)
     ]
     others = [table for table, _ in judged if not table.applies_at(speed)]
     phases = dict.fromkeys(f"{table.phase} ({_speeds(table)})" for table in others)

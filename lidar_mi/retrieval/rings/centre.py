@@ -96,7 +96,9 @@ def ring_centre(image) -> tuple[float, float]:
     starts = [tuple((value - (block - 1) / 2) / block for value in starts[0])]
     starts += [(columns * a, rows * b) for a in (0.25, 0.5, 0.75) for b in (0.25, 0.5, 0.75)]
     found = [
-        _robust_centre(gaussian_filter(part, 2.0), start) for part in (coarse, fine) for start in starts
+        _robust_centre(gaussian_filter(part, 2.0), start)
+        for part in (coarse, fine)
+        for start in starts
     ]
 
     def contrast(place):

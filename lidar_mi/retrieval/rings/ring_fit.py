@@ -141,7 +141,10 @@ def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
         return None
     first = int(pattern.height.argmax())
     fraction, q = float(pattern.fraction[first]), sectors.r2
-    waves = [airy(of_line, pattern.loss, pattern.spread + blur(q, sectors.step, pattern.spacing))[0] for of_line in pattern.phase(q)]
+    waves = [
+        airy(of_line, pattern.loss, pattern.spread + blur(q, sectors.step, pattern.spacing))[0]
+        for of_line in pattern.phase(q)
+    ]
     rings = pattern.height @ np.stack(waves)
     number = np.floor(q / pattern.spacing - fraction + 1.5).astype(int)
     height, std = np.full((2, SECTORS, number[-1] + 1), np.nan)

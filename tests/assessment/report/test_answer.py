@@ -99,19 +99,16 @@ def test_a_verdict_gives_its_reasons():
 def test_a_component_as_uncertain_as_it_varies_fulfils_nothing(error, skill):
     """190 vectors: an rms is known to 5 %. u varies by 0.24 m/s, v and w by more than errors."""
     table = RequirementTable(
-        "wake",
-        "a table",
-        "landing",
-        tuple(Requirement(f"error_{n}", maximum=1.0) for n in "uvw"),
+        "wake", "a table", "landing", tuple(Requirement(f"error_{n}", maximum=1.0) for n in "uvw")
     )
     metrics = SENSOR | {
         "sensor.outside_cores.rmse_u": error,
         "sensor.outside_cores.rmse_w": 0.5,
-        **{f"sensor.outside_cores.std_{n}": v for n, v in zip("uvw", (0.24, 2.8, 3.7), strict=True)},
+        **{
+            f"sensor.outside_cores.std_{n}": v for n, v in zip("uvw", (0.24, 2.8, 3.7), strict=True)
+        },
     }
-    found = judge(
-        table, {f"error_{n}": metrics[f"sensor.outside_cores.rmse_{n}"] for n in "uvw"}
-    )
+    found = judge(table, {f"error_{n}": metrics[f"sensor.outside_cores.rmse_{n}"] for n in "uvw"})
     *_, line = answer(an_experiment(), metrics, [(table, found)])
     assert ("all 3 rows fulfilled." in line) == skill
     words = "2 of 3 rows fulfilled; u has no skill: its error is as large as the true wind varies."
