@@ -1,7 +1,8 @@
 """An aircraft of JSBSim: force over mass, moment over inertia, the derivatives of its file.
 
 Detects 1 % in the wake's force and moment, a wrong sense of any axis or control, a trim that is
-none, an upset that ends in an exception, an aircraft that does not load and does not say so in a line.
+none, an upset that ends in an exception, an aircraft that does not load and does not say so in one
+line.
 """
 
 import math

@@ -81,7 +81,7 @@ class Rings(Tabular):
     doubt : str
         How the spacing could be another; empty where the image excludes it.
     r2, profile : arrays
-        Mean over circles, for the image.
+        What all sectors share, mean over circles, for the image; without their backgrounds.
     """
 
     shape: tuple[int, int]
@@ -177,7 +177,7 @@ def analyse_rings(
     Parameters
     ----------
     image : array or tensor, shape (height, width)
-        Any scale; the background may have a slope.
+        Any scale; the background may slope or bend, and parts of the rings may be hidden.
     centre : (float, float), optional
         (x, y) of the rings where it is known, px; fitted if not given.
     saturation : float, optional

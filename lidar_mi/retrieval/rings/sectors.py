@@ -91,8 +91,13 @@ class Sectors:
         The annuli's middles.
     count, value, offset : arrays (SECTORS, annuli)
         Number of pixels; their mean; mean of their squared radius less the annulus's middle.
-    profile, profile_count, profile_r2 : arrays (annuli,)
-        Mean over circles, of the value and of the squared radius; interpolated where no pixel is.
+    seen : array (SECTORS, annuli)
+        Number of pixels of cells that show rings and are no outliers.
+    profile, profile_r2 : arrays (annuli,)
+        What all sectors share (`light.common_light`), and the mean squared radius; interpolated
+        where no pixel is.
+    profile_count, profile_noise : arrays (annuli,)
+        Number of pixels that the profile is worth, and the variance of one.
     """
 
     def __init__(self, image: np.ndarray, geometry: RingCurves, hidden: Hidden | None = None):
@@ -134,11 +139,3 @@ class Sectors:
         known = np.flatnonzero(total)
         mean_r2 = (self.seen * (self.r2 + self.offset)).sum(0)[known] / total[known]
         self.profile_r2 = np.interp(self.r2, self.r2[known], mean_r2)
-
-    def noise(self) -> float:
-        """Variance of a pixel: neighbouring sectors of an annulus differ by little else."""
-        ahead, number = np.roll(self.value, -1, 0), np.roll(self.count, -1, 0)
-        both = (self.count > 0) & (number > 0)
-        share = 1 / self.count[both] + 1 / number[both]
-        # the median of squares of Gaussian numbers is 0.4549 of their mean
-        return float(np.median((self.value - ahead)[both] ** 2 / share)) / 0.4549
