@@ -98,7 +98,7 @@ def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
         known = weight > 0
         if not known.any():
             raise InputError("rings: none detected in three sectors; expected at least 2")
-        taken = keep * count * height**2 / np.maximum(weight, 1e-300)
+        taken = np.where(known, keep * count * height**2, 0) / np.where(known, weight, 1)
         rings = value - np.einsum("sqk,sk->sq", smooth, linear[:, :3])
         total = (keep * count * height * rings).sum(0)
         profile = np.interp(r2, r2[known], total[known] / weight[known])
