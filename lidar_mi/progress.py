@@ -117,5 +117,15 @@ def _in_notebook() -> Iterator[Notice]:
         bar.update(HTML(""))
 
 
+def without_warnings(notice: Notice) -> Notice:
+    """A notice for steps whose warnings are shown with their results."""
+
+    def shown(text: str, fraction: float | None) -> None:
+        if not _is_warning(text):
+            notice(text, fraction)
+
+    return shown
+
+
 def _is_warning(text: str) -> bool:
     return text.startswith("warning: ")

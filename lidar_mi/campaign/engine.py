@@ -4,7 +4,7 @@ import os
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,12 @@ from lidar_mi.campaign.collect import collect
 from lidar_mi.campaign.description import checked_campaign, read_campaign
 from lidar_mi.campaign.folder import CampaignFolder, create, read_base, signatures
 from lidar_mi.campaign.points import Points
+from lidar_mi.campaign.spawning import (
+    check_spawning,
+    quiet_loggers,
+    refuse_while_importing,
+    workers_started,
+)
 from lidar_mi.campaign.status import Status, count
 from lidar_mi.campaign.worker import Prepare, carry_out, render_shared
 from lidar_mi.errors import InputError, one_line
@@ -125,7 +131,7 @@ def run_campaign(
     ------
     InputError
         A description that is none, too many points, the folder of another campaign, a scheduler
-        without workers or with workers of another version.
+        without workers or with workers of another version, workers that do not start.
 
     Examples
     --------
@@ -133,6 +139,7 @@ def run_campaign(
     >>> table = lm.run_campaign("design_map", quick=True)         # doctest: +SKIP
     >>> table["sensor.rmse_u"].sel(sky="day").mean("member")     # doctest: +SKIP
     """
+    refuse_while_importing()
     notice, watch = notice or silent, watch or (lambda state: None)
     ready = prepare_campaign(campaign, folder, quick=quick, confirmed=confirmed, notice=notice)
     with ready.claimed(), connected(client, workers, threads, notice) as connection:
@@ -197,6 +204,7 @@ def connected(
     if count < 1:
         raise InputError(f"workers: {workers} is not allowed; expected 1 or more")
     notice(f"starting {count} workers", None)
+    check_spawning(count)
     # a point is given up by its own count of killed workers, not by that of the scheduler
     settings: dict[str, Any] = {
         "distributed.scheduler.allowed-failures": 10**6,
@@ -212,17 +220,20 @@ def connected(
         "distributed.worker.memory.monitor-interval": "1s",
         "distributed.admin.tick.interval": "1s",
     }
-    with dask.config.set(settings):
-        cluster = LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            processes=True,
-            dashboard_address=":0",
-            silence_logs=50,
-        )
-        with cluster, Client(cluster, set_as_default=False) as found:
-            _make_ready(found, threads, own_cache=False)
-            yield found
+    with dask.config.set(settings), quiet_loggers(), ExitStack() as open_until_the_end:
+        with workers_started():
+            cluster = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=":0",
+                silence_logs=50,
+            )
+            open_until_the_end.enter_context(cluster)
+            found = open_until_the_end.enter_context(Client(cluster, set_as_default=False))
+            found.wait_for_workers(1, timeout=60)
+        _make_ready(found, threads, own_cache=False)
+        yield found
 
 
 def execute(

@@ -35,6 +35,6 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
         ]
     for title, rows in found:
         print_rows(title, rows)
-    warned = sum(len(rows) for title, rows in found if title.endswith(": warnings"))
+    warned = sum(len(rows) for title, rows in found if ": warnings" in title)
     warnings = f", {warned} warning{'s' * (warned > 1)} above" if warned else ""
     output.print(f"all checks passed{warnings}", highlight=False)

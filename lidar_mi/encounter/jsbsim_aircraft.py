@@ -9,7 +9,7 @@ import math
 import tempfile
 from dataclasses import replace
 from difflib import get_close_matches
-from functools import partial
+from functools import cache, partial
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -18,7 +18,7 @@ from scipy.constants import foot, inch, lbf, slug
 
 from lidar_mi.encounter.aircraft import LARGEST_ROLL, AircraftState, Commands, Limits, deflected
 from lidar_mi.encounter.strips import Loads, Strips, fin_strips, in_downwash, joined, wing_strips
-from lidar_mi.errors import InputError
+from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment.schema_encounter import Aircraft, Path
 from lidar_mi.instrument.motion import attitude
 from lidar_mi.io.jsbsim_files import AXES, shipped_aircraft, write_aircraft_in_wake
@@ -39,7 +39,7 @@ _CONTROLS = ("aileron", "elevator", "rudder")
 _POSITIONS = ("fcs/left-aileron-pos-rad", "fcs/elevator-pos-rad", "fcs/rudder-pos-rad")
 _TRIMS = ("fcs/roll-trim-cmd-norm", "fcs/pitch-trim-cmd-norm", "fcs/yaw-trim-cmd-norm")
 _NOMINAL = math.radians(20)  # full deflection of a control that states no angle
-_LARGE = ("737", "787-8", "B747", "C130")  # named where no name is like the wanted one
+_LARGE = ("737", "787-8", "B747", "MD11")  # named in place of one that does not work
 _SETTLED = 30  # steps in which a control reaches a small command
 
 
@@ -60,10 +60,21 @@ class JSBSimAircraft:
     Raises
     ------
     InputError
-        There is no JSBSim, or it has no such aircraft, or it does not trim on this path.
+        There is no JSBSim, or it has no such aircraft, or cannot load or start it, or it does not
+        trim on this path.
     """
 
     def __init__(self, aircraft: Aircraft, path: Path):
+        try:
+            self._begin(aircraft, path)
+        except (RuntimeError, ArithmeticError) as error:  # as all of JSBSim's own
+            reason = one_line(error, 100).rstrip(".") or type(error).__name__
+            raise InputError(
+                f"encounter.aircraft.model: JSBSim does not fly {aircraft.model!r} ({reason}); "
+                f"expected another aircraft, {_such_as(aircraft.model)}"
+            ) from None
+
+    def _begin(self, aircraft, path):
         self._climb = path.climb_angle
         self._fdm = _trimmed(aircraft.model, path, FLAPS)
         self.density = self._fdm["atmosphere/rho-slugs_ft3"] * slug / foot**3
@@ -107,7 +118,11 @@ class JSBSimAircraft:
         for _ in range(count):
             self.deflection, _ = deflected(self.deflection, commands, dt / count, self.limits)
             _set_commands(self._fdm, self._at_trim + self._normalised(self.deflection))
-            self._fdm.run()
+            try:
+                self._fdm.run()
+            except RuntimeError:  # JSBSim's own, of a state that it cannot compute
+                self.state = replace(self.state, time=time, departed=True)
+                return self.state
         self.state = self._read(time)
         return self.state
 
@@ -162,7 +177,7 @@ def _loaded(name) -> Any:
             f"encounter.aircraft.model: {name!r} is not known; expected roll or one of the "
             f"{len(names)} aircraft of JSBSim, such as {', '.join(alike or _LARGE)}"
         )
-    jsbsim.set_logger(jsbsim.DefaultLogger(jsbsim.LogLevel.FATAL))
+    jsbsim.set_logger(_silent_logger(jsbsim))
     fdm = jsbsim.FGFDMExec(str(root))
     fdm.set_debug_level(0)
     with tempfile.TemporaryDirectory() as folder:
@@ -171,9 +186,36 @@ def _loaded(name) -> Any:
         fdm.set_engine_path(str(root / "engine"))
         fdm.set_systems_path(str(root / "systems"))
         if not fdm.load_model(name):
-            raise InputError(f"encounter.aircraft.model: JSBSim does not load {name!r}")
+            raise RuntimeError("it does not load")
     fdm.set_dt(STEP)
     return fdm
+
+
+@cache
+def _silent_logger(jsbsim):
+    """In place of JSBSim's own, which writes to the terminal beside what it raises."""
+
+    class Silent(jsbsim.FGLogger):
+        def set_level(self, level):
+            pass
+
+        def file_location(self, filename, line):
+            pass
+
+        def message(self, message):
+            pass
+
+        def format(self, format):
+            pass
+
+        def flush(self):
+            pass
+
+    return Silent()
+
+
+def _such_as(name) -> str:
+    return f"such as {next(one for one in _LARGE if one != name)}"
 
 
 def _trimmed(name, path, flap_settings) -> Any:
@@ -192,7 +234,9 @@ def _trimmed(name, path, flap_settings) -> Any:
             continue
         try:
             fdm["simulation/do_simple_trim"] = 1
-        except RuntimeError:  # jsbsim's TrimFailureError
+        except RuntimeError as error:
+            if type(error).__name__ != "TrimFailureError":
+                raise
             continue
         best = fdm
         if fdm["aero/alpha-rad"] <= LARGEST_INCIDENCE:
@@ -201,7 +245,7 @@ def _trimmed(name, path, flap_settings) -> Any:
         raise InputError(
             f"encounter.path: {name} does not trim at {path.speed:g} m/s and "
             f"{math.degrees(path.climb_angle):g} deg at {path.altitude:g} m; expected a speed and "
-            "climb angle at which it flies"
+            f"climb angle at which it flies, or another aircraft, {_such_as(name)}"
         )
     return best
 

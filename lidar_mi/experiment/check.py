@@ -26,6 +26,7 @@ from lidar_mi.instrument.doppler import DopplerLidar, photons
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.instrument.scan_timing import Schedule
+from lidar_mi.progress import without_warnings
 from lidar_mi.rendering.memory import ceiling
 from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.rendering.samples import Samples
@@ -65,7 +66,7 @@ def sections(
         Anything that a run would refuse before it starts.
     """
     start = time.process_time()
-    prepared = experiment.prepare(asked, beside, notice)
+    prepared = experiment.prepare(asked, beside, without_warnings(notice))
     preparation, ahead = time.process_time() - start, prepared.results
     chosen: Samples | None = None
     if asked.wake:

@@ -46,7 +46,9 @@ class Log:
         self.notice(text, None)
 
     def remark(self, text: str) -> None:
-        """Warn of something that matters for the results."""
+        """Warn of something that matters for the results, once."""
+        if text in self.warnings:
+            return
         self.warnings.append(text)
         self(f"warning: {text}")
 

@@ -1,6 +1,7 @@
 """Warnings before images are rendered: of what is allowed and likely wrong."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -27,7 +28,7 @@ def image_remarks(
     flows: Flows | None = None,
 ) -> list[str]:
     """Warnings of an experiment with a wake, a line each; what else images need has none."""
-    flow = _of_the_flow(truth.wind) if experiment.wake.file else []
+    flow = _of_the_flow(experiment, truth.wind) if experiment.wake.file else []
     said = flows[0].attrs.get("interpolated") if flows else None
     grid = [f"wake.file: {said}"] if said else []
     return [
@@ -39,18 +40,31 @@ def image_remarks(
     ]
 
 
-def _of_the_flow(wind: xr.Dataset) -> list[str]:
+def written(experiment: Experiment, *keys: str) -> str:
+    """The first of some keys that an experiment sets itself; the last, if it sets none."""
+    return next((key for key in keys if _is_set(experiment, key)), keys[-1])
+
+
+def _is_set(section: Any, key: str) -> bool:
+    first, _, rest = key.partition(".")
+    if section is None or first not in section.model_fields_set:
+        return False
+    return not rest or _is_set(getattr(section, first), rest)
+
+
+def _of_the_flow(experiment: Experiment, wind: xr.Dataset) -> list[str]:
     """Components or axes of the wrong sign in a user's file; analytic flows have none."""
+    key = written(experiment, "wake.names", "wake.file")
     divergence = relative_divergence(wind)
     if divergence > MOST_DIVERGENCE:
         return [
-            f"wake.names: the divergence of v, w has {divergence:.2g} of the vorticity's rms, as "
+            f"{key}: the divergence of v, w has {divergence:.2g} of the vorticity's rms, as "
             "if a component or an axis had the wrong sign; expected y to port, z up, v along y, w "
             "along z (a minus sign changes one: names: {v: -V})"
         ]
     if rises(find_cores(wind)):
         return [
-            "wake.names: both vortices turn against the lift of an aircraft, and the pair rises; "
+            f"{key}: both vortices turn against the lift of an aircraft, and the pair rises; "
             "expected the port vortex (y > 0) to turn from +y towards +z (where z points "
             "down: names: {z: -Z, w: -W})"
         ]
@@ -73,8 +87,9 @@ def _of_the_speed(experiment: Experiment, wind: xr.Dataset, plan: ScanPlan) -> l
     methods = [method for method in (ImageMethod.CC, ImageMethod.WS) if method in taken]
     if not methods or fastest <= reach:
         return []
+    key = written(experiment, "retrieval.search", "retrieval.template", "platform.dt", "wake")
     return [
-        f"retrieval.search: windows of {' and '.join(methods)} follow {reach:.3g} m/s, the wind "
+        f"{key}: windows of {' and '.join(methods)} follow {reach:.3g} m/s, the wind "
         f"reaches {fastest:.3g} m/s; expected a larger retrieval.search or a smaller platform.dt"
     ]
 
@@ -91,8 +106,10 @@ def _of_the_light(experiment: Experiment, plan: ScanPlan) -> list[str]:
     seen = overlap(experiment.lidar, float(np.median(plan.ranges()[0])))
     if seen >= LEAST_OVERLAP:
         return []
+    key = written(experiment, "lidar.fov_half", "scan.range")
+    half = "" if key == "lidar.fov_half" else "a field of view (half angle) of "
     return [
-        f"lidar.fov_half: {shown(experiment.lidar.fov_half, 'mrad')} sees {seen:.0%} of "
+        f"{key}: {half}{shown(experiment.lidar.fov_half, 'mrad')} sees {seen:.0%} of "
         f"the light from {plan.centre:.0f} m (overlap of beam, telescope and field of view)"
     ]
 
@@ -104,6 +121,7 @@ def _of_the_pattern(experiment: Experiment) -> list[str]:
         return []
     return [
         f"scan.timing.pattern: beams of {timing.pattern} are resampled to the nodes of the image; "
-        "away from the rim, stated errors of unflagged vectors were 1.2 to 1.3 times too small "
-        "over three textures of a wake (1.4 in single runs); those of flagged vectors do not hold"
+        "stated errors of flagged vectors do not hold, and whether those of the others do was not "
+        "measured for every curve (docs/experiments/scan_patterns.md); rows, raster or serpentine, "
+        "are not resampled"
     ]

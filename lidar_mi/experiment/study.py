@@ -136,7 +136,12 @@ def answers(folder: str | Path) -> list[tuple[str, list[str]]]:
 
 
 def _of(variant: str, notice: Notice) -> Notice:
-    return lambda text, fraction: notice(f"{variant}: {text}", fraction)
+    def named(text: str, fraction: float | None) -> None:
+        # what is a warning stays one
+        kind, text = ("warning: ", text[9:]) if text.startswith("warning: ") else ("", text)
+        notice(f"{kind}{variant}: {text}", fraction)
+
+    return named
 
 
 def _shown(run: Run) -> tuple[xr.DataArray, xr.Dataset, list[tuple[float, float]]]:

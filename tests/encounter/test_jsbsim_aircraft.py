@@ -1,11 +1,14 @@
 """An aircraft of JSBSim: force over mass, moment over inertia, the derivatives of its file.
 
 Detects 1 % in the wake's force and moment, a wrong sense of any axis or control, a trim that is
-none, an upset that ends in an exception.
+none, an upset that ends in an exception, an aircraft that does not load and does not say so in one
+line.
 """
 
 import math
+import re
 import sys
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
@@ -18,6 +21,7 @@ from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.schema_encounter import Aircraft, Path
+from lidar_mi.io.jsbsim_files import shipped_aircraft
 
 pytest.importorskip("jsbsim")
 
@@ -152,6 +156,44 @@ def test_unknown_aircraft_names_those_that_there_are():
 def test_a_speed_at_which_it_does_not_fly():
     with pytest.raises(InputError, match="737 does not trim at 20 m/s"):
         boeing(speed=20.0)
+
+
+BROKEN = "fokker100", "fokker50", "f104", "dr1", "L17", "Pterosaur", "blank"
+
+
+def flies(name, **path):
+    """Whether an aircraft is ready to fly; refused in one line if not."""
+    try:
+        JSBSimAircraft(Aircraft(model=name), Path(**path))
+    except InputError as error:
+        assert re.search(r"such as (737|787-8)$", str(error)), error
+        assert f"{name}" in str(error)
+        return False
+    return True
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_aircraft_that_need_flightgear(name, capfd):
+    """Properties of FlightGear that JSBSim alone does not have, a file without an aircraft."""
+    assert not flies(name)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_jsbsim_writes_nothing_itself(capfd):
+    """Camel's file has a product of one factor, which JSBSim remarks on."""
+    flies("Camel", speed=40.0, climb_angle=0.0)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.slow
+def test_every_shipped_aircraft_flies_or_is_refused_in_one_line(capfd):
+    import jsbsim
+
+    names = shipped_aircraft(FilePath(jsbsim.__file__).parent)
+    ready = {name for name in names if flies(name)}
+    assert capfd.readouterr() == ("", "")
+    assert {"737", "787-8", "B747", "MD11"} <= ready and not ready & set(BROKEN)
+    assert 10 < len(ready) < len(names) and len(names) >= 60
 
 
 def test_without_jsbsim(monkeypatch):

@@ -79,7 +79,25 @@ def vector_metrics(found: xr.Dataset | None, cores: Sequence[Core]) -> dict[str,
             metrics[f"sensor.outside_cores.rmse_{name}"] = rmse
             strength = float(np.sqrt((true[beyond] ** 2).mean()))
             metrics[f"sensor.outside_cores.rms_{name}"] = strength
+            metrics[f"sensor.outside_cores.std_{name}"] = float(true[beyond].std())
     return metrics
+
+
+def without_skill(metrics: Mapping[str, float]) -> list[str]:
+    """Components whose rms error is as large as the true wind varies, beyond two core radii.
+
+    Their mean would do as well. As large: less than it by no more than the standard error of an rms
+    of so many values, 1 / sqrt(2 n) of it (Gaussian).
+    """
+    number = metrics.get("sensor.vectors", 0)
+    found = []
+    for name in COMPONENTS:
+        keys = [f"sensor.outside_cores.{key}_{name}" for key in ("rmse", "std")]
+        if number and all(key in metrics for key in keys):
+            error, spread = (metrics[key] for key in keys)
+            if error >= spread * (1 - 1 / math.sqrt(2 * number)):
+                found.append(name)
+    return found
 
 
 def line_metrics(lines: xr.Dataset) -> dict[str, float]:

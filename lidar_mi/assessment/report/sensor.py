@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.requirements import as_rows, fulfilled, look_ahead
+from lidar_mi.assessment.metrics.sensor import without_skill
 from lidar_mi.assessment.report.digits import in_row, percent, three
 from lidar_mi.assessment.report.page import Chapter, Tables
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
@@ -41,9 +42,11 @@ def sensor_chapter(
         warning = "The platform is at rest: there is no look-ahead time"
         warning += "." if judged else ", and requirements for flight control do not apply."
     verdicts = {True: "fulfilled", False: "not fulfilled", None: "undetermined"}
+    unskilled = without_skill(metrics)
     tables = [
         (
-            f"{table.title}, {table.phase}: {verdicts[fulfilled(findings)]}",
+            f"{table.title}, {table.phase}: {verdicts[fulfilled(findings)]}"
+            + _but(findings, unskilled),
             ["verdict", "measured", "required", "margin"],
             [
                 (name, "", (verdict, measured, required, margin))
@@ -98,6 +101,12 @@ _CAUSES = {
     "crossflow": "errors of v and w",
     "pointing": "errors of attitude and pointing",
 }
+
+
+def _but(findings, unskilled) -> str:
+    """Components of a table whose error is as large as they vary."""
+    found = [name for name in unskilled if any(f.quantity == f"error_{name}" for f in findings)]
+    return f", but {', '.join(found)} without skill" if found else ""
 
 
 def _limit_of_u(metrics) -> list[str]:

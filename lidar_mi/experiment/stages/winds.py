@@ -251,7 +251,7 @@ def vector_remarks(found: xr.Dataset) -> list[str]:
             elif fraction < _FEW_VALID and method in _OF_TEMPLATES:
                 few.append(
                     f"{source}, {method}: {fraction:.0%} of the vectors are valid; where most are "
-                    "flagged, stated errors of the others were up to 2 times too small"
+                    "flagged, stated errors of the others may be too small"
                 )
     none = [
         f"{' and '.join(sources)}, {method}: no vector is valid; {why}"

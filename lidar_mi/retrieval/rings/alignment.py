@@ -10,7 +10,7 @@ from scipy.signal import find_peaks, peak_widths, savgol_coeffs, savgol_filter
 
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.frames import inside
-from lidar_mi.retrieval.rings.sectors import SECTORS, RingCurves, Sectors
+from lidar_mi.retrieval.rings.sectors import SECTORS, Hidden, RingCurves, Sectors
 
 SIGNIFICANT = 8.0  # standard deviations of the smoothed average, the least height of a ring
 PROMINENT = 0.1  # of the tallest ring's height, likewise
@@ -19,7 +19,9 @@ ALL_AROUND = 0.5  # of the sectors, in which a ring must be detected to determin
 ALIKE = 0.5  # least correlation of a sector with the mean
 
 
-def aligned(image: np.ndarray, start: RingCurves, free: bool) -> RingCurves:
+def aligned(
+    image: np.ndarray, start: RingCurves, free: bool, hidden: Hidden | None = None
+) -> RingCurves:
     """The rings' geometry, to a fraction of their width.
 
     Parameters
@@ -29,6 +31,8 @@ def aligned(image: np.ndarray, start: RingCurves, free: bool) -> RingCurves:
         With a centre within about a third of a ring's width.
     free : bool
         Whether the centre is fitted.
+    hidden : Hidden, optional
+        Rings that do not count.
 
     Raises
     ------
@@ -37,7 +41,7 @@ def aligned(image: np.ndarray, start: RingCurves, free: bool) -> RingCurves:
     """
     geometry = start
     for number in range(8):
-        sectors = Sectors(image, geometry)
+        sectors = Sectors(image, geometry, hidden)
         pieces = _pieces(sectors)
         shift, middle = _shifts(sectors, pieces)
         change = _change(shift, middle, sectors.angle, free)
@@ -59,9 +63,9 @@ def crests(sectors: Sectors) -> np.ndarray:
     mean = sectors.profile
     smooth = _smooth(mean)
     kept = np.sqrt((savgol_coeffs(_window(mean), 2) ** 2).sum())  # of white noise
-    off = np.abs(mean - smooth - np.median(mean - smooth)) * np.sqrt(sectors.profile_count)
-    few = np.sqrt(np.maximum(sectors.profile_count, 1))
-    noise = kept * 1.4826 * np.median(off) / few
+    known = sectors.profile_count > 0
+    noise = np.full(len(mean), np.inf)
+    noise[known] = kept * np.sqrt(sectors.profile_noise[known] / sectors.profile_count[known])
     if not np.ptp(smooth) > SIGNIFICANT * np.median(noise):
         raise InputError("rings: none detected; expected at least 2")
     places, found = find_peaks(smooth, prominence=PROMINENT * np.ptp(smooth))
@@ -90,7 +94,7 @@ def _pieces(sectors: Sectors) -> list[tuple[int, int]]:
 
 def _shifts(sectors: Sectors, pieces) -> tuple[np.ndarray, np.ndarray]:
     """Shift of every piece in every sector, px^2, NaN where it is not known; the pieces' r^2."""
-    value = np.stack([_filled(*one) for one in zip(sectors.value, sectors.count, strict=True)])
+    value = np.stack([_filled(*one) for one in zip(sectors.value, sectors.seen, strict=True)])
     shift = np.full((len(pieces), SECTORS), np.nan)
     for number, (first, last) in enumerate(pieces):
         size = last - first + 1

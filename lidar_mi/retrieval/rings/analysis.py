@@ -15,10 +15,17 @@ from scipy.stats import chi2
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.alignment import aligned, crests
-from lidar_mi.retrieval.rings.centre import gradient_centre
+from lidar_mi.retrieval.rings.centre import ring_centre
 from lidar_mi.retrieval.rings.frames import checked, inside
-from lidar_mi.retrieval.rings.pattern import Pattern, Profile, find_pattern
-from lidar_mi.retrieval.rings.ring_fit import CurveFit, fit_all
+from lidar_mi.retrieval.rings.pattern import (
+    Pattern,
+    Profile,
+    find_pattern,
+    lines_at,
+    repeats,
+    strongest_period,
+)
+from lidar_mi.retrieval.rings.ring_fit import CurveFit, fit_all, hidden_rings
 from lidar_mi.retrieval.rings.sectors import RingCurves, Sectors
 from lidar_mi.retrieval.threads import threads_for
 from lidar_mi.tables import Table, Tabular, with_error
@@ -74,7 +81,7 @@ class Rings(Tabular):
     doubt : str
         How the spacing could be another; empty where the image excludes it.
     r2, profile : arrays
-        Mean over circles, for the image.
+        What all sectors share, mean over circles, for the image; without their backgrounds.
     """
 
     shape: tuple[int, int]
@@ -116,6 +123,11 @@ class Rings(Tabular):
         """Points (x, y) of a ring of that mean radius, at angles from x toward y."""
         return RingCurves(self.centre, self.ellipticity, self.tilt).curve(radius, angle)
 
+    def _shape(self) -> str:
+        if not any((*self.ellipticity, *self.tilt)):
+            return "not determined by the part of the rings that is seen: taken for circles"
+        return f"{math.hypot(*self.ellipticity):.2g}, {math.hypot(*self.tilt):.2g} / px"
+
     def tables(self) -> list[Table]:
         """Pattern and rings, with standard errors."""
         (x, y), (x_std, y_std) = self.centre, self.centre_std
@@ -142,10 +154,7 @@ class Rings(Tabular):
             ("rms deviation from equal steps", steps),
             ("rms deviation of crests from the rings", f"{self.roundness:.2g} px"),
             *([("uneven", _UNEVEN)] if self.uneven else []),
-            (
-                "ellipticity, tilt",
-                (f"{math.hypot(*self.ellipticity):.2g}, {math.hypot(*self.tilt):.2g} / px"),
-            ),
+            ("ellipticity, tilt", self._shape()),
         ]
         single = [
             (str(order), str(line), with_error(radius, std, "px"))
@@ -168,7 +177,7 @@ def analyse_rings(
     Parameters
     ----------
     image : array or tensor, shape (height, width)
-        Any scale; the background may have a slope.
+        Any scale; the background may slope or bend, and parts of the rings may be hidden.
     centre : (float, float), optional
         (x, y) of the rings where it is known, px; fitted if not given.
     saturation : float, optional
@@ -209,12 +218,20 @@ def analyse_rings(
         raise InputError(f"image: {len(image)} images are not allowed; expected one")
     image = image[0].double().cpu().numpy()
     free = centre is None
-    centre = gradient_centre(image) if free else tuple(map(float, centre))
+    centre = ring_centre(image) if free else tuple(map(float, centre))
     inside(*centre, image.shape)
     geometry = aligned(image, RingCurves(centre), free)
     sectors = Sectors(image, geometry)
+    hidden = hidden_rings(sectors, _rings_alone(sectors, spacing))
+    if hidden is not None:
+        geometry = aligned(image, RingCurves(geometry.centre), free, hidden)
+        sectors = Sectors(image, geometry, hidden)
     pattern, doubt = _pattern(sectors, spacing)
-    fit = fit_all(image, geometry, pattern, free)
+    fit = fit_all(image, geometry, pattern, free, hidden)
+    if spacing is None and repeats(fit.pattern):
+        # with a background and a height of every sector the lines are one, of a shorter spacing
+        pattern, doubt = _pattern(sectors, fit.pattern.spacing / len(fit.pattern.fraction))
+        fit = fit_all(image, geometry, pattern, free, hidden)
     law = _law(fit)
     return Rings(
         shape=image.shape,
@@ -250,18 +267,14 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     places = crests(sectors)
     high = sectors.profile[places] - sectors.profile.min()
     places = sectors.r2[places[high > CREST * high.max()]]
-    profile = Profile(sectors.profile_r2, sectors.profile, sectors.profile_count, sectors.step)
-    noise = sectors.noise() / sectors.profile_count[sectors.profile_count > 0].mean()
-    with threads_for(len(profile.r2)):
-        found = find_pattern(profile, noise, spacing)
+    pattern, doubt, noise = _found(sectors, spacing)
     radii = ", ".join(f"{math.sqrt(place):.0f}" for place in places)
     wrong = InputError(
         f"rings: radii of {radii} px are not allowed; expected squares that rise by equal "
         "steps from the centre on"
     )
-    if found is None:
+    if pattern is None:
         raise wrong
-    pattern, doubt = found
     left = pattern.unexplained - 2 * noise * pattern.freedom
     if left > UNEXPLAINED * pattern.power:
         raise wrong
@@ -269,6 +282,32 @@ def _pattern(sectors: Sectors, spacing: float | None) -> tuple[Pattern, str]:
     if (off > max(0.5 * pattern.width, 2 * LAW)).any():
         raise wrong
     return pattern, doubt
+
+
+def _rings_alone(sectors: Sectors, spacing: float | None) -> Pattern | None:
+    """Lines of the strongest period where they explain the profile, of a longer one where not."""
+    profile, noise = _profile(sectors)
+    if spacing is None:
+        with threads_for(len(profile.r2)):
+            found = lines_at(profile, strongest_period(profile), noise, most=1)
+        if found is not None and found.unexplained < UNEXPLAINED * found.power:
+            return found
+    return _found(sectors, spacing)[0]
+
+
+def _profile(sectors: Sectors) -> tuple[Profile, float]:
+    """Mean over circles, weighted by its errors, and the variance that goes with the weights."""
+    weight = sectors.profile_count / sectors.profile_noise
+    profile = Profile(sectors.profile_r2, sectors.profile, weight, sectors.step)
+    return profile, float(1 / weight[weight > 0].mean())
+
+
+def _found(sectors: Sectors, spacing: float | None) -> tuple[Pattern | None, str, float]:
+    """Pattern of the profile, what is doubtful about it, and the noise of its annuli."""
+    profile, noise = _profile(sectors)
+    with threads_for(len(profile.r2)):
+        found = find_pattern(profile, noise, spacing)
+    return (None, "", noise) if found is None else (*found, noise)
 
 
 @dataclass(frozen=True)
@@ -299,8 +338,8 @@ def _law(fit: CurveFit) -> _Law:
     freedom = len(fit.square) - 1 - lines
     covariance = gain @ fit.square_covariance @ gain.T
     misfit = math.nan
+    usual = 1 / np.diag(fit.model_covariance)
     if freedom > 0:
-        usual = 1 / np.diag(fit.model_covariance)
         misfit = math.sqrt(usual @ off**2 / usual.sum() * len(off) / freedom) / spacing
         rest = np.eye(len(off)) - rows @ gain
         expected = np.trace(weight @ rest @ fit.square_covariance @ rest.T)

@@ -20,6 +20,7 @@ MULTIPLES = 6  # the strongest period may be this harmonic of the order
 FAINT = 0.02  # of the strongest line, the least height of a line
 SIGNIFICANT = 5.0  # standard errors, likewise
 FLANK = 0.2  # likewise, of a line within 1.2 widths of another
+CREST = 0.5  # of a line's height, its least crest: a line twice as broad has as much
 DISTINCT = 0.8  # full widths, the least distance of lines
 MATERIAL = 2e-3  # of the pattern's power, the least that a longer spacing must explain in addition
 DOUBTFUL = 4.0  # factor from MATERIAL within which the choice of the spacing is doubtful
@@ -122,12 +123,12 @@ def blur(r2: np.ndarray, step: float, spacing: float) -> np.ndarray:
 
 
 class Profile:
-    """A mean over circles that patterns are fitted to."""
+    """A mean over circles that patterns are fitted to, its annuli weighted."""
 
-    def __init__(self, r2: np.ndarray, value: np.ndarray, count: np.ndarray, step: float):
-        known = count > 0
+    def __init__(self, r2: np.ndarray, value: np.ndarray, weight: np.ndarray, step: float):
+        known = weight > 0
         self.r2, self.value, self.step = r2[known], value[known], step
-        self.root = np.sqrt(count[known] / count.mean())
+        self.root = np.sqrt(weight[known] / weight[known].mean())
         self.last = float(self.r2[-1])
         q = self.r2 / self.last
         self.background = np.column_stack([np.ones_like(q), np.sqrt(q), q])
@@ -238,14 +239,22 @@ class Profile:
         return float(np.abs(linear @ 0.3 ** np.arange(linear.shape[1])).max())
 
     def crest(self, pattern: Pattern) -> np.ndarray:
-        """Value at each line less that one width beside it, mean over the orders."""
+        """Value at each line less that one width beside it, without the other lines.
+
+        Mean over the orders.
+        """
+        _, columns, linear = self.residual(pattern)
+        lines = len(pattern.fraction)
+        waves = columns[:, 3:].reshape(len(self.r2), lines, -1) / self.root[:, None, None]
+        parts = (waves * linear[3:].reshape(lines, -1)).sum(2)
         found = []
-        for fraction in pattern.fraction:
+        for line, fraction in enumerate(pattern.fraction):
+            alone = self.value - parts.sum(1) + parts[:, line]
             orders = np.arange(1, self.last / pattern.spacing - 1)
             place = (orders + fraction) * pattern.spacing
             beside = pattern.width * pattern.spacing
             middle, low, high = (
-                np.interp(place + by, self.r2, self.value) for by in (0.0, -beside, beside)
+                np.interp(place + by, self.r2, alone) for by in (0.0, -beside, beside)
             )
             found.append((middle - (low + high) / 2).mean() if len(place) else np.inf)
         return np.array(found)
@@ -368,7 +377,7 @@ def _plausible(pattern: Pattern, profile: Profile, noise: float) -> bool:
     # a line away from the others has a crest of its own, which their wings have not; one in a
     # flank must be high, or it mends a shape that is not Airy's
     nearest = np.minimum(distance, np.roll(distance, 1))[np.argsort(np.argsort(fractions))]
-    crest = profile.crest(pattern) / top > 0.2 * pattern.height
+    crest = profile.crest(pattern) / top > CREST * pattern.height
     apart = nearest > 1.2 * pattern.width
     return bool(np.where(apart, crest, pattern.height > FLANK).all())
 
@@ -412,7 +421,7 @@ def find_pattern(
     def gain(short, long):
         """Of the pattern's power, what the longer spacing explains in addition; 0 for noise."""
         more = tried[short].unexplained - tried[long].unexplained
-        if more < 40 * noise or _repeats(tried[long]):
+        if more < 40 * noise or repeats(tried[long]):
             return 0.0
         return more / power
 
@@ -430,7 +439,7 @@ def find_pattern(
     return tried[chosen], said
 
 
-def _repeats(pattern: Pattern) -> bool:
+def repeats(pattern: Pattern) -> bool:
     """Whether two or three lines are at equal distances and of one height."""
     lines = len(pattern.fraction)
     if lines < 2:

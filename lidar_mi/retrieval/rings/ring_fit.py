@@ -19,11 +19,12 @@ from lidar_mi.errors import InputError
 from lidar_mi.retrieval.rings.alignment import ALL_AROUND, LEAST, shape_columns
 from lidar_mi.retrieval.rings.frames import inside
 from lidar_mi.retrieval.rings.pattern import Pattern, airy, blur
-from lidar_mi.retrieval.rings.sectors import SECTORS, RingCurves, Sectors
+from lidar_mi.retrieval.rings.sectors import SECTORS, Hidden, RingCurves, Sectors
 
 BLOCKS = 6  # of neighbouring sectors, one of which is left out
 OUTLIER = 6.0  # standard deviations of an annulus's cells
 ROUNDS = 6
+HIDDEN = 0.3  # of the usual ring, the height below which a ring is hidden
 TWO_RINGS = 2.2  # orders, least extent of a sector whose height may change with r
 
 
@@ -63,7 +64,13 @@ class CurveFit:
     uneven: bool
 
 
-def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: bool) -> CurveFit:
+def fit_all(
+    image: np.ndarray,
+    geometry: RingCurves,
+    pattern: Pattern,
+    free: bool,
+    hidden: Hidden | None = None,
+) -> CurveFit:
     """Gauss-Newton from a geometry and a pattern that are nearly right.
 
     Ellipticity and tilt are fitted if two rings are in half of the sectors.
@@ -75,8 +82,13 @@ def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: boo
     """
     deviation: dict[tuple[int, int], float] = {}
     for number in range(ROUNDS):
-        sectors = Sectors(image, geometry)
+        sectors = Sectors(image, geometry, hidden)
         system = _System(sectors, pattern, deviation, free)
+        if not system.fitted[2:].any() and any((*geometry.ellipticity, *geometry.tilt)):
+            # what is not fitted is no shape that was found on the way
+            geometry = RingCurves(geometry.centre)
+            sectors = Sectors(image, geometry, hidden)
+            system = _System(sectors, pattern, deviation, free)
         step, std = system.solved()
         change, ring_change, heights, shape = system.parts(step)
         change_std = system.parts(std)[0]
@@ -117,6 +129,44 @@ def fit_all(image: np.ndarray, geometry: RingCurves, pattern: Pattern, free: boo
         roundness=system.roundness(),
         uneven=system.width > 0,
     )
+
+
+def hidden_rings(sectors: Sectors, pattern: Pattern | None) -> Hidden | None:
+    """Where the rings of a pattern are lower than `HIDDEN` of the usual ring, for certain.
+
+    The height of a ring in a sector is by least squares over an order about it, beside a level and
+    a slope.
+    """
+    if pattern is None:
+        return None
+    first = int(pattern.height.argmax())
+    fraction, q = float(pattern.fraction[first]), sectors.r2
+    waves = [
+        airy(of_line, pattern.loss, pattern.spread + blur(q, sectors.step, pattern.spacing))[0]
+        for of_line in pattern.phase(q)
+    ]
+    rings = pattern.height @ np.stack(waves)
+    number = np.floor(q / pattern.spacing - fraction + 1.5).astype(int)
+    height, std = np.full((2, SECTORS, number[-1] + 1), np.nan)
+    for k in range(number[-1] + 1):
+        inside = number == k
+        if inside.sum() < 4:
+            continue
+        part = np.stack([np.ones(inside.sum()), q[inside] / q[-1], rings[inside]], -1)
+        count, value = sectors.count[:, inside], sectors.value[:, inside]
+        matrix = np.einsum("sq,qk,ql->skl", count, part, part)
+        firm = np.linalg.cond(matrix) < 1e10
+        inverse = np.linalg.inv(matrix[firm])
+        height[firm, k] = np.einsum("sl,sq,ql,sq->s", inverse[:, 2], count[firm], part, value[firm])
+        std[firm, k] = np.sqrt(inverse[:, 2, 2] * sectors.profile_noise[inside].mean())
+    firm = height > 5 * std
+    if not firm.any():
+        return None
+    usual = np.quantile(height[firm], 0.8)
+    which = height + 3 * std < HIDDEN * usual
+    # the edge of what hides them runs through their neighbours
+    which |= np.roll(which, 1, 0) | np.roll(which, -1, 0)
+    return Hidden(pattern.spacing, fraction, which) if which.any() else None
 
 
 class _System:
@@ -160,9 +210,9 @@ class _System:
         smooth = np.stack([np.ones_like(q), np.sqrt(q1), q1, total, q1 * total], -1)
         smooth = np.repeat(smooth[None], SECTORS, 0)
         # about a single ring, a height that changes is hardly another than a shift
-        extent = np.where(sectors.count > 0, q, 0).max(1)
+        extent = np.where(sectors.seen > 0, q, 0).max(1)
         smooth[extent < TWO_RINGS * pattern.spacing, :, 4] = 0
-        root = np.sqrt(sectors.count)
+        root = np.sqrt(sectors.seen)
         keep = np.ones_like(root)
         for _ in range(2):
             weight = root * keep
@@ -191,7 +241,8 @@ class _System:
         size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
         self.inverse = np.linalg.pinv(whole / np.outer(size, size), 1e-10, hermitian=True)
         self.inverse /= np.outer(size, size)
-        cells = (keep * root > 0).sum() - 5 * SECTORS - len(size)
+        used = keep * root > 0
+        cells = used.sum() - 5 * used.any(1).sum() - len(size)
         self.variance = float((self.left**2).sum() / max(cells, 1))
         self.width = self._width()
 
@@ -289,7 +340,7 @@ class _System:
 def _visible(sectors: Sectors, pattern: Pattern) -> np.ndarray:
     """Order, line and number of sectors of the rings in enough of them, by their radius."""
     found = []
-    present = (sectors.count > 0).sum(0)
+    present = (sectors.seen > 0).sum(0)
     half = 0.5 * pattern.width * pattern.spacing
     for line, fraction in enumerate(pattern.fraction):
         for order in range(int(sectors.r2[-1] / pattern.spacing) + 1):

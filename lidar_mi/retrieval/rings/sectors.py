@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar_mi.retrieval.rings.light import common_light
+
 STEPS = 1200  # annuli out to the farthest corner, at most
 PIXELS = 2  # least mean number of pixels of a sector of an annulus
 SECTORS = 48
@@ -53,6 +55,27 @@ class RingCurves:
         return (2 * r / (linear + np.sqrt(np.maximum(linear**2 + 4 * along, 0)))) ** 2
 
 
+@dataclass(frozen=True, eq=False)
+class Hidden:
+    """Rings that something hides in some of the sectors.
+
+    Attributes
+    ----------
+    spacing, fraction : float
+        Of the intervals of r^2 from half an order before to half an order behind each ring.
+    which : array (SECTORS, intervals) of bool
+    """
+
+    spacing: float
+    fraction: float
+    which: np.ndarray
+
+    def cells(self, r2: np.ndarray) -> np.ndarray:
+        """Whether annuli are hidden, (SECTORS, annuli)."""
+        number = np.floor(r2 / self.spacing - self.fraction + 1.5).astype(int)
+        return self.which[:, number.clip(0, self.which.shape[1] - 1)]
+
+
 class Sectors:
     """Averages over sectors of annuli of equal steps in squared mean radius.
 
@@ -68,11 +91,16 @@ class Sectors:
         The annuli's middles.
     count, value, offset : arrays (SECTORS, annuli)
         Number of pixels; their mean; mean of their squared radius less the annulus's middle.
-    profile, profile_count, profile_r2 : arrays (annuli,)
-        Mean over circles, of the value and of the squared radius; interpolated where no pixel is.
+    seen : array (SECTORS, annuli)
+        Number of pixels of cells that show rings and are no outliers.
+    profile, profile_r2 : arrays (annuli,)
+        What all sectors share (`light.common_light`), and the mean squared radius; interpolated
+        where no pixel is.
+    profile_count, profile_noise : arrays (annuli,)
+        Number of pixels that the profile is worth, and the variance of one.
     """
 
-    def __init__(self, image: np.ndarray, geometry: RingCurves):
+    def __init__(self, image: np.ndarray, geometry: RingCurves, hidden: Hidden | None = None):
         height, width = image.shape
         centre = geometry.centre
         x, y = np.arange(width) - centre[0], np.arange(height)[:, None] - centre[1]
@@ -98,19 +126,16 @@ class Sectors:
         some = np.maximum(self.count, 1)
         self.value = np.where(full, total[:, :last], 0) / some
         self.offset = np.where(self.count > 0, total_r2[:, :last] / some - self.r2, 0.0)
-        self.profile_count = self.count.sum(0)
-        known = np.flatnonzero(self.profile_count)
-        mean, mean_r2 = (
-            (self.count * part).sum(0)[known] / self.profile_count[known]
-            for part in (self.value, self.r2 + self.offset)
+        if hidden is not None:
+            self.count = np.where(hidden.cells(self.r2), 0.0, self.count)
+        light = common_light(self.r2, self.value, self.count)
+        self.profile, self.profile_count, self.profile_noise = (
+            light.profile,
+            light.weight,
+            light.noise,
         )
-        self.profile = np.interp(self.r2, self.r2[known], mean)
+        self.seen = self.count * light.keep
+        total = self.seen.sum(0)
+        known = np.flatnonzero(total)
+        mean_r2 = (self.seen * (self.r2 + self.offset)).sum(0)[known] / total[known]
         self.profile_r2 = np.interp(self.r2, self.r2[known], mean_r2)
-
-    def noise(self) -> float:
-        """Variance of a pixel: neighbouring sectors of an annulus differ by little else."""
-        ahead, number = np.roll(self.value, -1, 0), np.roll(self.count, -1, 0)
-        both = (self.count > 0) & (number > 0)
-        share = 1 / self.count[both] + 1 / number[both]
-        # the median of squares of Gaussian numbers is 0.4549 of their mean
-        return float(np.median((self.value - ahead)[both] ** 2 / share)) / 0.4549

@@ -8,7 +8,12 @@ from types import SimpleNamespace
 import pytest
 
 from lidar_mi.assessment.metrics.names import vortex_key
-from lidar_mi.assessment.metrics.requirements import judge, read_requirements
+from lidar_mi.assessment.metrics.requirements import (
+    Requirement,
+    RequirementTable,
+    judge,
+    read_requirements,
+)
 from lidar_mi.assessment.report.answer import answer, verdict
 from lidar_mi.assessment.report.simulation import simulation_remark
 from lidar_mi.assessment.report.summary import summary
@@ -90,6 +95,26 @@ def test_a_verdict_gives_its_reasons():
     assert verdict(table, unknown).endswith(
         "4 of 5 rows fulfilled; undetermined: error of line-of-sight velocity."
     )
+
+
+@pytest.mark.parametrize(("error", "skill"), [(0.24, False), (0.231, False), (0.15, True)])
+def test_a_component_as_uncertain_as_it_varies_fulfils_nothing(error, skill):
+    """190 vectors: an rms is known to 5 %. u varies by 0.24 m/s, v and w by more than errors."""
+    table = RequirementTable(
+        "wake", "a table", "landing", tuple(Requirement(f"error_{n}", maximum=1.0) for n in "uvw")
+    )
+    metrics = SENSOR | {
+        "sensor.outside_cores.rmse_u": error,
+        "sensor.outside_cores.rmse_w": 0.5,
+        **{
+            f"sensor.outside_cores.std_{n}": v for n, v in zip("uvw", (0.24, 2.8, 3.7), strict=True)
+        },
+    }
+    found = judge(table, {f"error_{n}": metrics[f"sensor.outside_cores.rmse_{n}"] for n in "uvw"})
+    *_, line = answer(an_experiment(), metrics, [(table, found)])
+    assert ("all 3 rows fulfilled." in line) == skill
+    words = "2 of 3 rows fulfilled; u has no skill: its error is as large as the true wind varies."
+    assert (words in line) != skill
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,134 @@
+"""Worker processes of this machine: whether they can start, and why not.
+
+A worker is a new interpreter that imports the main module of the program (``spawn``). What stops
+it shows in that process alone, and dask notices after a minute. So one process that does nothing
+is started first, and what it says is kept from the terminal.
+"""
+
+import errno
+import logging
+import multiprocessing
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import process, spawn
+
+from lidar_mi.errors import InputError, causes, one_line
+
+PATIENCE = 300.0
+"""Seconds for a process to start, on a machine that is busy."""
+
+_FILES, _FILES_EACH = 16, 11
+"""Files that dask opens in this process, and for each worker: 25, 35 and 56 for 1, 2 and 4."""
+
+_GUARD = "the script needs if __name__ == '__main__': before what it starts"
+_TOO_FEW = "too few open files are allowed (ulimit -n); expected 64 and 16 for every worker"
+# multiprocessing's own words where a main module starts processes as it is imported
+_IMPORTING = "bootstrapping phase"
+
+
+def refuse_while_importing() -> None:
+    """Raise InputError in a worker that imports a script which starts workers itself."""
+    if getattr(process.current_process(), "_inheriting", False):
+        raise InputError(_GUARD)
+
+
+def check_spawning(count: int) -> None:
+    """Start a process as ``count`` workers will be started, and wait for its end.
+
+    Raises
+    ------
+    InputError
+        It does not start, or fails as it imports the main module; too few files may be open.
+    """
+    if not _may_open(_FILES + _FILES_EACH * count):
+        raise _refused(_TOO_FEW)
+    with tempfile.TemporaryFile() as said:
+        try:
+            with _output_to(said.fileno()):
+                one = multiprocessing.get_context("spawn").Process(target=os.getpid)
+                one.start()
+            one.join(PATIENCE)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise _not_started(error) from None
+        if one.exitcode == 0:
+            return
+        if one.exitcode is None:
+            one.kill()
+            one.join()
+            raise _refused(f"the first had not started after {PATIENCE:g} s")
+        said.seek(0)
+        text = said.read().decode(errors="replace").strip()
+    if _GUARD in text or _IMPORTING in text:
+        raise _refused(_GUARD)
+    interpreter = os.fsdecode(spawn.get_executable())
+    if not os.access(interpreter, os.X_OK):
+        raise _refused(f"{interpreter} may not be executed")
+    raise _refused(text.splitlines()[-1] if text else f"exit code {one.exitcode}")
+
+
+@contextmanager
+def workers_started() -> Iterator[None]:
+    """Turn whatever stops workers from starting into one line."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        raise _not_started(error) from None
+
+
+@contextmanager
+def quiet_loggers() -> Iterator[None]:
+    """Without the tracebacks that dask and what it builds on log of what they then raise."""
+    loggers = [logging.getLogger(name) for name in ("asyncio", "tornado", "distributed")]
+    levels = [one.level for one in loggers]
+    try:
+        for one in loggers:
+            one.setLevel(logging.CRITICAL)
+        yield
+    finally:
+        for one, level in zip(loggers, levels, strict=True):
+            one.setLevel(level)
+
+
+def _may_open(number: int) -> bool:
+    opened: list[int] = []
+    try:
+        while len(opened) < number:
+            opened.extend(os.pipe())
+    except OSError:
+        return False
+    finally:
+        for one in opened:
+            os.close(one)
+    return True
+
+
+def _not_started(error: BaseException) -> InputError:
+    numbers = [getattr(cause, "errno", None) for cause in causes(error)]
+    if errno.EMFILE in numbers or errno.ENFILE in numbers or not _may_open(_FILES_EACH):
+        return _refused(_TOO_FEW)
+    # dask puts exceptions of its own over the cause
+    first = list(causes(error))[-1]
+    return _refused(one_line(first, 150) or type(first).__name__)
+
+
+def _refused(reason: str) -> InputError:
+    return InputError(f"workers: the worker processes did not start: {reason}")
+
+
+@contextmanager
+def _output_to(target: int) -> Iterator[None]:
+    """Standard output and error of processes that start meanwhile, to a file descriptor."""
+    kept = {}
+    try:
+        for number in (1, 2):
+            kept[number] = os.dup(number)
+            os.dup2(target, number)
+        yield
+    finally:
+        for number, before in kept.items():
+            os.dup2(before, number)
+            os.close(before)

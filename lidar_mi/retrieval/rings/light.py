@@ -1,0 +1,140 @@
+"""Light of sectors: what each of them has of one profile that all share, and what it has not.
+
+The cells of a sector s are
+
+    value = b_s + h_s p(r^2),
+
+with a smooth background b_s of its own (1, r and r^2), a height h_s + k_s r^2, and the profile p
+of the rings, which is common to all. A background that slopes, vignetting, or a part of the image
+that something hides then do not enter the profile: the mean over circles would take them for rings
+where sectors leave the image one after the other. b, h and p are found in turns (alternating least
+squares: Young 1941, Psychometrika 6, 49). Cells far from it, as of hot pixels and of the edge of
+what hides a sector, do not count; nor do sectors without rings.
+"""
+
+import warnings
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from lidar_mi.errors import InputError
+
+OUTLIER = 6.0  # standard deviations of a cell
+TURNS = 12
+SEEN = 0.15  # of the usual height, the least of a sector that shows rings
+SIGNIFICANT = 4.0  # standard errors, likewise
+LEAST = 3  # sectors that an annulus must have
+SMOOTH = 25  # annuli over which the scatter is averaged
+
+
+@dataclass(frozen=True, eq=False)
+class Light:
+    """The profile that sectors share.
+
+    Attributes
+    ----------
+    profile : array (annuli,)
+        In units of the usual sector's light; NaN where no sector tells.
+    weight : array (annuli,)
+        Number of pixels it is worth, those of the usual sector counting 1.
+    noise : array (annuli,)
+        Variance of a pixel, from the scatter among sectors.
+    keep : array (sectors, annuli) of bool
+        Cells that show rings, and are no outliers.
+    """
+
+    profile: np.ndarray
+    weight: np.ndarray
+    noise: np.ndarray
+    keep: np.ndarray
+
+
+def common_light(r2: np.ndarray, value: np.ndarray, count: np.ndarray) -> Light:
+    """Profile and cells of sectors.
+
+    Parameters
+    ----------
+    r2 : array (annuli,)
+    value, count : arrays (sectors, annuli)
+        Mean and number of pixels of each cell.
+    """
+    q = r2 / r2[-1]
+    some = count > 0
+    smooth = np.broadcast_to(np.column_stack([np.ones_like(q), np.sqrt(q), q]), (*value.shape, 3))
+    # a start: each sector less its own background, without what stands out of an annulus
+    left = np.where(some, value - _fitted(value, smooth, count)[0], np.nan)
+    middle = _median(left)
+    reach = 3 * 1.4826 * np.nanmedian(np.abs(left - middle))
+    clipped = np.nan_to_num(np.clip(left, middle - reach, middle + reach))
+    profile = (clipped * count).sum(0) / np.maximum(count.sum(0), 1)
+    keep, taken = some, count / np.maximum(count.sum(0), 1)
+    seen = np.ones(len(value), bool)
+    for turn in range(TURNS):
+        # a height that changes with r only once there is a profile to compare with
+        parts = [profile, q * profile] if turn > TURNS // 3 else [profile]
+        columns = np.concatenate(
+            [smooth, np.broadcast_to(np.column_stack(parts), (*value.shape, len(parts)))], -1
+        )
+        model, linear, std = _fitted(value, columns, count * keep)
+        left = np.where(some, value - model, 0.0) * np.sqrt(count)
+        # the profile follows a sector that is alone in an annulus
+        rest = 1 - taken
+        noise = _noise(left / np.sqrt(np.maximum(rest, 0.5)), keep & (rest >= 0.5))
+        # on a crest there is more, as of photons
+        usual = _median(np.where(some & seen[:, None], np.abs(left), np.nan))
+        scale = np.maximum(noise, (1.4826 * usual) ** 2)
+        keep = some & (np.abs(left) <= OUTLIER * np.sqrt(scale) + 1e-12)
+        height = linear[:, 3:] @ np.stack([np.ones_like(q), q])[: len(parts)]
+        mean = (height * count * keep).sum(1) / np.maximum((count * keep).sum(1), 1)
+        # a sector of a few cells fits any profile, and its height is as large as its error
+        seen = mean > SIGNIFICANT * std[:, 3] * np.sqrt(noise.mean())
+        usual = np.median(mean[seen]) if seen.any() else np.inf
+        seen &= mean > SEEN * usual
+        height = np.where(seen[:, None], height / usual, 0.0).clip(0)
+        weight = (keep * count * height**2).sum(0)
+        # of fewer sectors none can be told to be an outlier
+        weight[(keep & seen[:, None]).sum(0) < LEAST] = 0
+        known = weight > 0
+        if not known.any():
+            raise InputError("rings: none detected in three sectors; expected at least 2")
+        taken = np.where(known, keep * count * height**2, 0) / np.where(known, weight, 1)
+        rings = value - np.einsum("sqk,sk->sq", smooth, linear[:, :3])
+        total = (keep * count * height * rings).sum(0)
+        profile = np.interp(r2, r2[known], total[known] / weight[known])
+    return Light(profile, weight, noise, keep & seen[:, None])
+
+
+def _fitted(value, columns, weight):
+    """Weighted least squares sector by sector: model, parameters, their errors for variance 1."""
+    weighted = columns * weight[..., None]
+    matrix = np.einsum("sqk,sql->skl", weighted, columns)
+    size = np.sqrt(np.maximum(np.diagonal(matrix, axis1=1, axis2=2), 1e-300))
+    outer = size[:, :, None] * size[:, None, :]
+    inverse = np.linalg.pinv(matrix / outer, 1e-8, hermitian=True) / outer
+    linear = np.einsum("skl,sql,sq->sk", inverse, weighted, value, optimize=True)
+    std = np.sqrt(np.maximum(np.diagonal(inverse, axis1=1, axis2=2), 0.0))
+    return np.einsum("sqk,sk->sq", columns, linear), linear, std
+
+
+def _noise(left, keep):
+    """Variance of a pixel at every annulus, from what the sectors of its neighbours deviate."""
+    size = left.shape[1]
+    edges = np.linspace(0, size, max(size // SMOOTH, 1) + 1).round().astype(int)
+    found = []
+    for first, last in pairwise(edges):
+        cells = np.abs(left[:, first:last][keep[:, first:last]])
+        found.append((1.4826 * np.median(cells)) ** 2 if len(cells) else np.nan)
+    found = np.array(found)
+    known = found > 0
+    if not known.any():
+        return np.full(size, np.finfo(float).tiny)
+    middle = (edges[:-1] + edges[1:]) / 2
+    return np.interp(np.arange(size), middle[known], found[known])
+
+
+def _median(value):
+    """Over sectors; 0 where there is none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # an annulus without cells
+        return np.nan_to_num(np.nanmedian(value, 0))
