@@ -22,8 +22,11 @@ _PEELS = 4
 _NEAR = 2
 # Impulses at one place must be so many times those that are by chance.
 _BEYOND_CHANCE = 3.0
-# Least fraction of its height next to an impulse that a lens or a beam blurs; the neighbours.
+# Least fraction of its height next to an impulse that a lens or a beam blurs.
 _RESOLVED = 0.15
+# Fraction of their height by which impulses in both images differ at most.
+_ALIKE = 0.3
+# The neighbours.
 _BESIDE = (0, 1), (1, 0), (1, 2), (2, 1)
 
 
@@ -125,7 +128,7 @@ def sharp(pair: torch.Tensor) -> torch.Tensor:
     excess, peak = pad(known - around, (1,) * 4, value=torch.nan), (pair - around).nan_to_num(0.0)
     beside = [excess[:, i : i + found.shape[0], j : j + found.shape[1]] for i, j in _BESIDE]
     left = torch.stack(beside).nanmean(0).abs()
-    alike = (peak[1] - peak[0]).abs() < 0.3 * peak.abs().amin(0)
+    alike = (peak[1] - peak[0]).abs() < _ALIKE * peak.abs().amin(0)
     alone = (left < _RESOLVED * peak.abs()).all(0) & alike & found
     return alone
 
