@@ -75,6 +75,8 @@ def median_scale(values: torch.Tensor, size: int = 1) -> torch.Tensor:
     blocks = wide.unfold(0, size, size).unfold(1, size, size).flatten(2)
     level = blocks.nanmedian(-1).values
     level = torch.where(level.isnan(), level.nanmedian(), level)
+    # next to smoke, a block of empty air takes the scatter of the smoke
+    level = max_pool2d(level[None], 3, 1, 1)[0]
     smooth = torch.nn.functional.interpolate(
         level[None, None], size=(rows, columns), mode="bilinear", align_corners=False
     )[0, 0]
