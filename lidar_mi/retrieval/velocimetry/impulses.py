@@ -24,6 +24,9 @@ _NEAR = 2
 _BEYOND_CHANCE = 3.0
 # Least fraction of its height next to an impulse that a lens or a beam blurs.
 _RESOLVED = 0.15
+# Least fraction of the impulses in both images that are sharp: thin smoke in images without noise
+# stands out of empty air, and a twentieth of its pixels would count.
+_SHARP = 0.25
 # Fraction of their height by which impulses in both images differ at most.
 _ALIKE = 0.3
 # The neighbours.
@@ -75,8 +78,9 @@ def median_scale(values: torch.Tensor, size: int = 1) -> torch.Tensor:
     blocks = wide.unfold(0, size, size).unfold(1, size, size).flatten(2)
     level = blocks.nanmedian(-1).values
     level = torch.where(level.isnan(), level.nanmedian(), level)
-    # next to smoke, a block of empty air takes the scatter of the smoke
-    level = max_pool2d(level[None], 3, 1, 1)[0]
+    # next to smoke, a block of calmer air takes half of the scatter of the smoke; blocks of one
+    # texture differ by less
+    level = torch.maximum(level, max_pool2d(level[None], 3, 1, 1)[0] / 2)
     smooth = torch.nn.functional.interpolate(
         level[None, None], size=(rows, columns), mode="bilinear", align_corners=False
     )[0, 0]
@@ -112,7 +116,8 @@ def sharp(pair: torch.Tensor) -> torch.Tensor:
     They stand out of most others in both images. Next to them nothing is left of their height: on
     average over the known ones of the four neighbours less than 0.15. Of a particle of 2 px
     (1/e^2), the smallest that can be followed, 0.23 is left. And there are three times as many as
-    in images that are rolled, which have them at one place by chance.
+    in images that are rolled, which have them at one place by chance, and not many more that are
+    resolved.
     """
     each = torch.stack([_peeled(image, median_scale) for image in pair])
     found = each.all(0)
@@ -132,6 +137,8 @@ def sharp(pair: torch.Tensor) -> torch.Tensor:
     left = torch.stack(beside).nanmean(0).abs()
     alike = (peak[1] - peak[0]).abs() < _ALIKE * peak.abs().amin(0)
     alone = (left < _RESOLVED * peak.abs()).all(0) & alike & found
+    if int(alone.sum()) < _SHARP * int(found.sum()):
+        return torch.zeros_like(found)
     return alone
 
 

@@ -308,10 +308,23 @@ def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
 
 def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots, areas."""
+    before, sharp = found, found
     for of in _fields(pair):
         field = of(found)
-        found = found | field.marked(_stays(field, d))
-    return found | _enclosed(pair, found)
+        new = field.marked(_stays(field, d))
+        sharp = sharp | (new if field.size == 1 else torch.zeros_like(new))
+        found = found | new
+    return before | _with_sharp(found | _enclosed(pair, found), sharp)
+
+
+def _with_sharp(found: torch.Tensor, sharp: torch.Tensor) -> torch.Tensor:
+    """Areas that hold something sharp: lines and spots without any may be smoke in calm air."""
+    if not bool(sharp.any()):
+        return sharp
+    held = ndimage.binary_propagation(
+        (sharp & found).cpu().numpy(), np.ones((3, 3)), _grown(found, 3).cpu().numpy()
+    )
+    return torch.as_tensor(held, device=found.device) & found
 
 
 def _least(field: _Field) -> torch.Tensor:
