@@ -259,8 +259,12 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         return _Field(values, change if same is None else change.minimum(same), size, marked)
 
     def pixels(found):
-        heights = torch.stack([impulses.height(image) for image in known(found)])
-        return of(heights, 1, lambda new: new, same)
+        images = known(found)
+        heights = torch.stack([impulses.height(image) for image in images])
+        soft = [~impulses.unresolved(i, h) for i, h in zip(images, heights, strict=True)]
+        field = of(heights, 1, lambda new: new, same)
+        change = field.change.masked_fill(torch.stack(soft).any(0), torch.inf)
+        return field._replace(change=change)
 
     yield pixels
     for axis in (-1, -2):
@@ -275,7 +279,12 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         def edges(found, axis=axis):
             steps = pad(known(found).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
             either = same.minimum(same.roll(-1, axis))
-            return of(steps, 1, lambda new: new | new.roll(1, axis), either)
+            # steps beside it are as large where smoke rises over several pixels
+            beside = steps.nan_to_num(0.0).abs()
+            beside = torch.maximum(beside.roll(2, axis), beside.roll(-2, axis))
+            soft = (steps.abs() < 2 * beside).any(0)
+            field = of(steps, 1, lambda new: new | new.roll(1, axis), either)
+            return field._replace(change=field.change.masked_fill(soft, torch.inf))
 
         yield edges
     for size in _SIZES:
