@@ -24,9 +24,9 @@ _NEAR = 2
 _BEYOND_CHANCE = 3.0
 # Least fraction of its height next to an impulse that a lens or a beam blurs.
 _RESOLVED = 0.15
-# Least fraction of the impulses in both images that are sharp: thin smoke in images without noise
+# Most of the impulses in both images are sharp: thin smoke in images without noise
 # stands out of empty air, and a twentieth of its pixels would count.
-_SHARP = 0.25
+_SHARP = 0.5
 # Fraction of their height by which impulses in both images differ at most.
 _ALIKE = 0.3
 # The neighbours.
