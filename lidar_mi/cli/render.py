@@ -51,6 +51,7 @@ def render(
     are is said.
     """
     from lidar_mi.experiment.shipped import scene_file
+    from lidar_mi.instrument.products import untrusted_pixels
     from lidar_mi.io.images import read_pixels
     from lidar_mi.io.png import write_preview
     from lidar_mi.io.target import check_target
@@ -66,7 +67,7 @@ def render(
     # made from the image: it is replaced together with it
     check_target(preview, read, overwrite=overwrite or path.exists())
     with progress() as notice:
-        render_file(
+        image = render_file(
             source,
             path,
             variant or "llvm_ad_mono_polarized",
@@ -75,6 +76,8 @@ def render(
             definitions,
             lambda fraction: notice(f"rendering {source.name}", fraction),
         )
+    if said := untrusted_pixels(image):
+        output.print(f"warning: {said}", soft_wrap=True)
     black, white = write_preview(preview, read_pixels(path))
     output.print(f"image    {path}")
     output.print(f"preview  {preview}: black is {black:.4g}, white {white:.4g}", soft_wrap=True)

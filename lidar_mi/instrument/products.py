@@ -246,3 +246,17 @@ def _samples(scan: xr.Dataset) -> int:
             raise InputError(f"scan: attribute {name} is missing; expected a scan rendered here")
     samples, gates = scan.attrs["samples_per_beam"], scan.attrs["gate_count"]
     return max(2, -(-samples // gates)) if scan.attrs["estimator"] == "gated" else samples
+
+
+def untrusted_pixels(scan: xr.Dataset) -> str | None:
+    """What a rendered scan says of pixels whose standard error rests on one Monte Carlo sample.
+
+    None where there are at most 1 % of those that receive light; see ``S0_largest_share``.
+    """
+    lit, untrusted = (scan.attrs.get(f"{name}_pixels", 0) for name in ("lit", "untrusted"))
+    if untrusted <= 0.01 * lit:
+        return None
+    return (
+        f"in {untrusted} of {lit} pixels that receive light one Monte Carlo sample carries half of "
+        "the variance or more; their standard errors cannot be trusted; expected more samples"
+    )

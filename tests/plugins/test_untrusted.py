@@ -10,6 +10,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+import lidar_mi as lm
+from lidar_mi.instrument.products import untrusted_pixels
+from lidar_mi.io.exr import read_scan
+from lidar_mi.rendering.scene import render_file
+
 pytestmark = pytest.mark.usefixtures("variant")
 
 BEAMS = (20, 15)
@@ -96,3 +101,15 @@ def test_a_warning_where_shares_are_not_asked_for(world):
         warnings.simplefilter("error")
         mi.render(loaded(world), spp=2)
         mi.render(loaded(world, shares=False), spp=64)
+
+
+def test_a_rendered_file_says_so(tmp_path):
+    """The header's counts are those of the layer, and the sentence is theirs."""
+    scene, out = lm.scene_file("slab"), tmp_path / "slab.exr"
+    image = render_file(scene, out, samples=4)
+    share, lit = image["S0_largest_share"].values, image["S0"].values > 0
+    header = read_scan(out).attrs
+    assert header["untrusted_pixels"] == (share[lit] >= 0.4999).sum() > 0.01 * lit.sum()
+    assert header["lit_pixels"] == lit.sum()
+    assert untrusted_pixels(image).startswith(f"in {header['untrusted_pixels']} of {lit.sum()} ")
+    assert untrusted_pixels(render_file(scene, out, samples=64)) is None

@@ -18,7 +18,7 @@ from lidar_mi.experiment.truth import Flows, Truth, read_flows
 from lidar_mi.experiment.truth_in_time import air_in_time, values_of_states
 from lidar_mi.instrument.detector import gate_duration
 from lidar_mi.instrument.detector_noise import noise_budget, noisy_scan
-from lidar_mi.instrument.products import with_products
+from lidar_mi.instrument.products import untrusted_pixels, with_products
 from lidar_mi.instrument.scan import ScanPlan, plan_scans
 from lidar_mi.instrument.speckle import speckle_modes
 from lidar_mi.rendering.backscatter import extrude, render_scans
@@ -170,6 +170,8 @@ def render_images(
         if plans[index].beams is not None:
             scan.attrs["reference_time"] = index * experiment.platform.dt
             scan.attrs["frozen_air"] = int(experiment.scan.air == "frozen")
+        if said := untrusted_pixels(scan):
+            log.remark(f"{IMAGES[index]}: {said}")
         yield IMAGES[index], scan
 
 
