@@ -115,12 +115,13 @@ def bounds_of(scene):
     return bounds
 
 
-def depth(scene, origin, direction, distance):
+def walk(along, scene, origin, direction, distance):
+    """What `transmittance` or `collision` finds along lines from outside of all media."""
     points = (
         type_(*(np.ascontiguousarray(axis) for axis in a.T))
         for type_, a in ((mi.Point3f, origin), (mi.Vector3f, direction))
     )
-    value, _ = transmittance(
+    return along(
         Air(scene),
         bounds_of(scene),
         mi.MediumPtr(None),
@@ -130,8 +131,12 @@ def depth(scene, origin, direction, distance):
         mi.Color0f(),
         mi.Float(0),
         mi.PCG32(size=len(origin)),
-        True,
+        mi.Bool(True),
     )
+
+
+def depth(scene, origin, direction, distance):
+    value, _ = walk(transmittance, scene, origin, direction, distance)
     return -np.log(np.array(value, float))
 
 
@@ -157,23 +162,8 @@ def test_free_flights(name, kind, tmp_path):
     """As many collisions as optical depths say, and their mean distance, within 4 sigma."""
     boxes = ARRANGEMENTS[name]
     origin, direction, distance = (np.tile(a, (30, *[1] * (a.ndim - 1))) for a in lines())
-    points = (
-        type_(*(np.ascontiguousarray(axis) for axis in a.T))
-        for type_, a in ((mi.Point3f, origin), (mi.Vector3f, direction))
-    )
     scene = build(boxes, kind, tmp_path)
-    flight, medium, found = collision(
-        Air(scene),
-        bounds_of(scene),
-        mi.MediumPtr(None),
-        *points,
-        mi.Float(distance),
-        0,
-        mi.Color0f(),
-        mi.Float(0),
-        mi.PCG32(size=len(origin)),
-        mi.Bool(True),
-    )
+    flight, medium, found = walk(collision, scene, origin, direction, distance)
     flight, found = np.array(flight, float), np.array(found)
     chance = -np.expm1(-expected(boxes, origin.astype(float), direction.astype(float), distance))
     sigma = np.sqrt((chance * (1 - chance)).sum())

@@ -317,13 +317,14 @@ def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
 
 def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
     """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots, areas."""
-    before, sharp = found, found
+    sharp = found
     for of in _fields(pair):
         field = of(found)
         new = field.marked(_stays(field, d))
-        sharp = sharp | (new if field.size == 1 else torch.zeros_like(new))
+        if field.size == 1:
+            sharp = sharp | new
         found = found | new
-    return before | _with_sharp(found | _enclosed(pair, found), sharp)
+    return _with_sharp(found | _enclosed(pair, found), sharp)
 
 
 def _with_sharp(found: torch.Tensor, sharp: torch.Tensor) -> torch.Tensor:
