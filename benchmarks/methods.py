@@ -11,8 +11,8 @@ from importlib.util import find_spec
 import numpy as np
 
 from lidar_mi.atmosphere.vortex import velocity
-from lidar_mi.retrieval.velocimetry.methods import METHODS
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.wind.methods import METHODS
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 from .cases import CORE_RADIUS, DT, SPACING, Pair, vortex_pair_images
 from .report import Comparison, row

@@ -21,7 +21,7 @@ from lidar_mi.instrument.detector_noise import noisy_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import scatterer
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.velocimetry.methods import METHODS
+from lidar_mi.retrieval.wind.methods import METHODS
 
 from .cases import CIRCULATION, CORE_RADIUS, DT, SEPARATION, SPACING, Pair, vortex_pair_images
 from .report import Comparison, row

@@ -7,14 +7,10 @@ from functools import partial
 import numpy as np
 
 from lidar_mi.atmosphere.vortex import velocity
-from lidar_mi.retrieval.velocimetry.settings import (
-    VOLUME_MULTIPASS,
-    VOLUME_VARIATIONAL,
-    MultipassSettings,
-    VariationalSettings,
-)
-from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.correlation.settings import VOLUME_MULTIPASS, MultipassSettings
+from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
+from lidar_mi.retrieval.wind.pair import retrieve_wind
+from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support import volumes
 
 from .cases import DT, vortex_pair_images

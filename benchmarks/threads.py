@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import torch
 
 from lidar_mi.retrieval import threads
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 from .cases import DT, Pair, vortex_pair_images
 from .measure import in_turns

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidar_mi.atmosphere.vortex import velocity
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 from .cases import (
     CIRCULATION,

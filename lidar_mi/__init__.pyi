@@ -19,17 +19,17 @@ from .io.images import read_image, read_noise
 from .io.vortex_file import read_vortices, write_vortices
 from .plugins import register_plugins
 from .rendering.variant import use_variant
+from .retrieval.images.common_grid import on_one_grid
+from .retrieval.images.quality import Flag
 from .retrieval.rings.analysis import Rings, analyse_rings
 from .retrieval.rings.calibration import Calibration
 from .retrieval.rings.gap import Gap, gap_from_fractions, gap_from_lines
-from .retrieval.velocimetry.common_grid import on_one_grid
-from .retrieval.velocimetry.quality import Flag
-from .retrieval.velocimetry.volume import retrieve_wind_volume
-from .retrieval.velocimetry.wind import retrieve_wind
-from .retrieval.velocimetry.wind_series import retrieve_winds
 from .retrieval.vortices.image_fit import fit_vortices
 from .retrieval.vortices.pair import VortexPairFit
 from .retrieval.vortices.vector_fit import fit_vortices_to_wind
+from .retrieval.wind.pair import retrieve_wind
+from .retrieval.wind.series import retrieve_winds
+from .retrieval.wind.volume import retrieve_wind_volume
 from .system.doctor import doctor
 
 __version__: str

@@ -59,6 +59,18 @@ ARROWS = {
 `instrument` and `retrieval` share descriptions alone: a vortex, a spectral line; `io` builds those
 that its files hold; only `experiment` and what lies above it see all."""
 
+FLOORS = {
+    "assessment": (("metrics",), ("figures",), ("report",)),
+    "retrieval": (
+        ("images", "rings"),
+        ("correlation", "channels", "lines"),
+        ("flow", "defects"),
+        ("vortices",),
+        ("wind",),
+    )
+}
+"""Folders of a room, the lowest floor first: each imports those of lower floors alone."""
+
 OPENS = {
     "assessment/report/campaign.py": "its own script, a resource of the package",
     "assessment/report/page.py": "its own script, a resource of the package",
@@ -150,15 +162,36 @@ def wrong_arrows() -> list[str]:
     return found
 
 
+def arrows_up_in_a_room() -> list[str]:
+    found = []
+    for name, (_, tree) in MODULES.items():
+        floors = FLOORS.get(room(name), ())
+        floor = {folder: level for level, folders in enumerate(floors) for folder in folders}
+        inside = name.split(".")[1] if name.count(".") > 1 else None
+        for imported in imports(name, tree):
+            parts = (ours(imported) or "").split(".")
+            if parts[0] != room(name) or len(parts) < 3 or parts[1] == inside:
+                continue
+            if parts[1] in floor and (inside not in floor or floor[parts[1]] >= floor[inside]):
+                found.append(f"{name} imports {imported}")
+    return found
+
+
 def circles() -> list[str]:
+    """Of modules, and of folders at every level: what is deeper counts as its folder."""
     modules = {
         name: {other for one in imports(name, tree) if (other := ours(one)) and other != name}
         for name, (_, tree) in MODULES.items()
     }
-    rooms: dict[str, set[str]] = {}
-    for name, others in modules.items():
-        rooms.setdefault(room(name), set()).update({room(o) for o in others} - {room(name)})
-    return [" -> ".join(found) for graph in (modules, rooms) if (found := circle(graph))]
+    found = [circle(modules)]
+    for depth in range(1, max(name.count(".") for name in modules) + 1):
+        folders: dict[str, set[str]] = {}
+        for name, others in modules.items():
+            own = ".".join(name.split(".")[:depth])
+            others = {".".join(other.split(".")[:depth]) for other in others}
+            folders.setdefault(own, set()).update(others - {own})
+        found.append(circle(folders))
+    return [" -> ".join(one) for one in found if one]
 
 
 def mitsuba_elsewhere() -> list[str]:
@@ -248,6 +281,7 @@ def imports_between_tests() -> list[str]:
 
 RULES = (
     wrong_arrows,
+    arrows_up_in_a_room,
     circles,
     mitsuba_elsewhere,
     plugins_that_know_the_package,
@@ -267,6 +301,12 @@ def test_every_room_has_its_rule():
     found = {room(name) for name in MODULES if "." in name}
     assert found == set(ARROWS)
     assert len(found) <= 11
+
+
+def test_every_folder_of_a_room_with_floors_has_one():
+    for name, floors in FLOORS.items():
+        folders = {m.split(".")[1] for m in MODULES if room(m) == name and m.count(".") > 1}
+        assert sorted(folder for floor in floors for folder in floor) == sorted(folders)
 
 
 def test_fixed_exceptions_leave_the_list():

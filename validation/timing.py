@@ -10,8 +10,8 @@ from lidar_mi.instrument.beams import steered_beams
 from lidar_mi.instrument.motion import Pose, attitude
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.instrument.scan_timing import ScanTiming
-from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.wind.pair import retrieve_wind
+from lidar_mi.retrieval.wind.synchronised import of_one_instant
 
 from .report import Check, Row
 

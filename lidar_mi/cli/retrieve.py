@@ -112,12 +112,12 @@ def retrieve(
     from lidar_mi.io.images import read_beams, read_images, read_noise
     from lidar_mi.io.target import check_target
     from lidar_mi.io.wind_file import SERIES, SUFFIXES, write_wind
-    from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
-    from lidar_mi.retrieval.velocimetry.gridding import on_nodes
-    from lidar_mi.retrieval.velocimetry.methods import METHODS
-    from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
-    from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
-    from lidar_mi.retrieval.velocimetry.wind_series import retrieve_winds
+    from lidar_mi.retrieval.images.common_grid import on_one_grid
+    from lidar_mi.retrieval.images.gridding import on_nodes
+    from lidar_mi.retrieval.wind.methods import METHODS
+    from lidar_mi.retrieval.wind.pair import retrieve_wind
+    from lidar_mi.retrieval.wind.series import retrieve_winds
+    from lidar_mi.retrieval.wind.synchronised import of_one_instant
 
     check_target(out, files, overwrite=overwrite, suffixes=SUFFIXES if pairs is None else SERIES)
     numbers = None if frame is None else _numbers(frame)

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 import xarray as xr
 
+from lidar_mi.retrieval.flow.next_flow import Awaited, Flow
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.velocimetry.next_flow import Awaited, Flow
-from lidar_mi.retrieval.velocimetry.slabs import awaited_wind, wind_of_slab
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.vortices.model import wind as model_wind
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
+from lidar_mi.retrieval.wind.pair import retrieve_wind
+from lidar_mi.retrieval.wind.slabs import awaited_wind, wind_of_slab
 
 Complete = Callable[[xr.Dataset], tuple[xr.Dataset, tuple[str, ...]]]
 """From the images' wind to the wind that is delivered, and flags."""

@@ -32,7 +32,7 @@ from lidar_mi.rendering.phase import molecules, scatterer
 from lidar_mi.rendering.samples import choose_samples, pilot_samples
 from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.velocimetry.common_grid import resample
+from lidar_mi.retrieval.images.common_grid import resample
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 
 NO_EARLIER_SCAN = "no earlier scan of this slab"

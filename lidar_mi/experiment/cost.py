@@ -18,7 +18,7 @@ from lidar_mi.experiment.pipeline import has_error_budget, has_vortices
 from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.rendering import IMAGES, chosen_samples, render_images, with_samples
 from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMethod
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 PROBE_SECONDS = 0.115
 """Processor time of `probe` beside which all costs below were measured."""

@@ -11,7 +11,7 @@ from lidar_mi.experiment.truth import Flows, Truth, blur_by_beam, slab_mean
 from lidar_mi.experiment.truth_in_time import air_in_time
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.retrieval.velocimetry.gridding import on_nodes
+from lidar_mi.retrieval.images.gridding import on_nodes
 
 
 def slab_images(
@@ -60,7 +60,7 @@ def ideal_scan(
     -------
     xr.Dataset, dims (z, y)
         ``Y``, unit of ``air``; with beams also their ``beam_time``, s. From
-        `lidar_mi.retrieval.velocimetry.gridding.on_nodes`; as this takes it if not ``gridded``.
+        `lidar_mi.retrieval.images.gridding.on_nodes`; as this takes it if not ``gridded``.
     """
     states = air if "time" in air.dims else air.expand_dims(time=[0.0])
     if lidar is not None:

@@ -32,7 +32,7 @@ def with_common_error(
     Parameters
     ----------
     wind : xr.Dataset
-        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`.
+        From `lidar_mi.retrieval.wind.pair.retrieve_wind`.
     stderr : float
         Of v and of w, m/s: the standard error of the pointing between the scans (rad) times the
         range over the time between the scans.

@@ -46,7 +46,8 @@ from benchmarks import (
 )
 from lidar_mi.atmosphere.vortex import velocity
 from lidar_mi.retrieval import threads as thread_choice
-from lidar_mi.retrieval.velocimetry.settings import VOLUME_MULTIPASS, VariationalSettings
+from lidar_mi.retrieval.correlation.settings import VOLUME_MULTIPASS
+from lidar_mi.retrieval.flow.settings import VariationalSettings
 
 
 def lines(comparison):

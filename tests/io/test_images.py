@@ -20,7 +20,7 @@ from lidar_mi.cli import app as cli
 from lidar_mi.errors import InputError
 from lidar_mi.io.images import as_webp, read_image, read_pixels
 from lidar_mi.retrieval.rings import analysis as rings
-from lidar_mi.retrieval.velocimetry import wind
+from lidar_mi.retrieval.wind import pair as wind
 
 
 @pytest.fixture

@@ -23,12 +23,12 @@ from lidar_mi.retrieval.common_error import (
     own_errors,
     with_common_error,
 )
+from lidar_mi.retrieval.images.gridding import on_nodes
 from lidar_mi.retrieval.lines.combine import combine
-from lidar_mi.retrieval.velocimetry.gridding import on_nodes
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.vortices.acceptance import no_fit
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.vector_fit import fit_vortices_to_wind
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, plane_waves, texture
 from tests.support.vortex_pairs import uneven, vector
 

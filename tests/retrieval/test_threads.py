@@ -9,7 +9,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import lidar_mi as lm
 from benchmarks.cases import vortex_pair_images
 from lidar_mi.retrieval.threads import SMALL, threads_for
-from lidar_mi.retrieval.velocimetry import methods
+from lidar_mi.retrieval.wind import methods
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.crosswind import DT, crosswind_pair
 from tests.support.flows import axes, data_array
 

@@ -25,7 +25,7 @@ PRELOADED = (
     "lidar_mi.experiment.check",
     "lidar_mi.experiment.study",
     "lidar_mi.io.images",
-    "lidar_mi.retrieval.velocimetry.wind",
+    "lidar_mi.retrieval.wind.pair",
     "lidar_mi.retrieval.rings.analysis",
     "lidar_mi.assessment.figures.rings",
     "h5netcdf",

@@ -170,7 +170,7 @@ def test_retrieve_uses_the_times_of_scans(there, lidar_mi):
         assert lidar_mi("retrieve", *files, *options)[0] == 0
         found[name] = xr.load_dataset(there / f"{name}.nc")
     assert float(found["moving"]["w"].mean()) == pytest.approx(12.0, abs=0.05)
-    # 1 / (1 - g . v), as in tests/retrieval/velocimetry/test_beam_times.py: 5 %
+    # 1 / (1 - g . v), as in tests/retrieval/images/test_beam_times.py: 5 %
     assert float(found["frozen"]["w"].mean()) == pytest.approx(12.61, abs=0.05)
     assert np.ptp(found["moving"]["time"].values) > 0.05
 

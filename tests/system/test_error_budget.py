@@ -18,7 +18,7 @@ from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import attenuated_backscatter_stderr
 from lidar_mi.experiment.truth import blur_by_beam, make_truth
 from lidar_mi.io import exr
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 pytestmark = pytest.mark.slow
 

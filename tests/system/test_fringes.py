@@ -17,7 +17,7 @@ import xarray as xr
 from scipy import stats
 from scipy.constants import speed_of_light
 
-from lidar_mi.assessment.report.digits import with_error
+from lidar_mi.assessment.digits import with_error
 from lidar_mi.cli.run import run as run_command
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading as config

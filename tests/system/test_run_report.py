@@ -15,7 +15,7 @@ from matplotlib.image import imread as plt_imread
 from PIL import Image
 from scipy import ndimage
 
-from lidar_mi.assessment.report.digits import percent
+from lidar_mi.assessment.digits import percent
 from lidar_mi.experiment.resumable_folder import IMAGES
 from lidar_mi.experiment.truth import make_truth
 from lidar_mi.io.exr import read_scan

@@ -15,9 +15,9 @@ import xarray as xr
 import yaml
 from matplotlib.image import imread
 
+from lidar_mi.assessment.digits import three
 from lidar_mi.assessment.report import comparison
 from lidar_mi.assessment.report.comparison import differences, flat
-from lidar_mi.assessment.report.digits import three
 from lidar_mi.encounter.check import geometry
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading as config

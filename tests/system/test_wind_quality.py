@@ -14,9 +14,9 @@ import xarray as xr
 from lidar_mi.experiment.resumable_folder import IMAGES
 from lidar_mi.experiment.stages.winds import rendered_pairs
 from lidar_mi.io.exr import read_scan
-from lidar_mi.retrieval.velocimetry.common_grid import on_one_grid
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.images.common_grid import on_one_grid
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 SCENES = Path(str(files("lidar_mi.scenes")))
 

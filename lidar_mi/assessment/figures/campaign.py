@@ -13,10 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from scipy.interpolate import RegularGridInterpolator
 
+from lidar_mi.assessment.digits import three
 from lidar_mi.assessment.figures.linked import Mark, as_svg, panel
 from lidar_mi.assessment.metrics.campaign import MEMBER, Interval, over_members
 from lidar_mi.assessment.metrics.sensitivity import SobolIndices
-from lidar_mi.assessment.report.digits import three
 
 FAILED, ABSENT, DOT = "#a4161a", "#e4e4e4", "#3b6ea5"
 COLOURS = ("#1f5fa8", "#c2571a", "#2c7a3f", "#8a3a8f", "#7a6200", "#4a4a4a", "#b0306a", "#0d7f86")

@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from lidar_mi.assessment.digits import whole_percent
 from lidar_mi.assessment.figures.plates import Drawn, save_all
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.error_budget import (
@@ -16,7 +17,6 @@ from lidar_mi.assessment.metrics.error_budget import (
     causes_of,
     component_rmse,
 )
-from lidar_mi.assessment.report.digits import whole_percent
 
 
 def draw_all(folder: Path, budgets: Budgets, log: Callable) -> list[Drawn]:

@@ -294,7 +294,7 @@ def error_budget(
     Parameters
     ----------
     found : xr.Dataset
-        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`; with the attributes
+        From `lidar_mi.retrieval.wind.pair.retrieve_wind`; with the attributes
         method, template and dt.
     without : mapping of xr.Dataset
         The same from `images_without`, by cause, and from `moved_rigidly` as `shear`.

@@ -15,7 +15,7 @@ def truth_at_vectors(wind: xr.Dataset, truth: xr.Dataset) -> xr.Dataset:
     Parameters
     ----------
     wind : xr.Dataset
-        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`: coordinates y_vector, z_vector.
+        From `lidar_mi.retrieval.wind.pair.retrieve_wind`: coordinates y_vector, z_vector.
     truth : xr.Dataset
         v, w (m s^-1) on (z, y); the flow is taken to be steady over dt. Cubic interpolation.
     """

@@ -8,7 +8,7 @@ import xarray as xr
 from lidar_mi.assessment.metrics.cores import Core, outside_cores
 from lidar_mi.assessment.metrics.errors import error_statistics, wind_metrics
 from lidar_mi.assessment.metrics.names import Source, sweep_key, wind_key
-from lidar_mi.retrieval.velocimetry.quality import Flag
+from lidar_mi.retrieval.images.quality import Flag
 
 
 def cross_flow_metrics(found: xr.Dataset, cores: Sequence[Core]) -> dict[str, float]:

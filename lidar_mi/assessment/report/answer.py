@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 
+from lidar_mi.assessment.digits import whole_percent
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import (
     Source,
@@ -16,7 +17,6 @@ from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, 
 from lidar_mi.assessment.metrics.sensor import without_skill
 from lidar_mi.assessment.metrics.velocities import READERS
 from lidar_mi.assessment.metrics.winds import has_no_skill
-from lidar_mi.assessment.report.digits import whole_percent
 from lidar_mi.assessment.report.simulation import simulation_sentence
 from lidar_mi.tables import with_error
 from lidar_mi.units import shown

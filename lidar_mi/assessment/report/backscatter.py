@@ -2,12 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 
+from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.names import Source, wind_key
 from lidar_mi.assessment.metrics.winds import has_no_skill
-from lidar_mi.assessment.report.digits import in_row, percent, three
 from lidar_mi.assessment.report.page import Chapter, Tables
 from lidar_mi.assessment.report.simulation import samples_of
 

@@ -8,13 +8,13 @@ import numpy as np
 import xarray as xr
 from markupsafe import Markup
 
+from lidar_mi.assessment.digits import three, with_error
 from lidar_mi.assessment.figures import campaign as figures
 from lidar_mi.assessment.figures.campaign import Axis, Points
 from lidar_mi.assessment.metrics import campaign as numbers
 from lidar_mi.assessment.metrics.campaign import MEMBER, SAMPLE, Interval
 from lidar_mi.assessment.metrics.requirements import QUANTITIES
 from lidar_mi.assessment.report.block import Block, label_of
-from lidar_mi.assessment.report.digits import three, with_error
 from lidar_mi.assessment.report.encounters import encounter_blocks
 from lidar_mi.assessment.report.page import template
 from lidar_mi.assessment.report.sample import margin_blocks, sample_blocks

@@ -4,11 +4,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 
 from lidar_mi import __version__
+from lidar_mi.assessment.digits import fixed, three
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import RENDERED, Source, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, READERS
-from lidar_mi.assessment.report.digits import fixed, three
 from lidar_mi.assessment.report.page import picture, script, template
 from lidar_mi.io.yaml import to_yaml
 from lidar_mi.retrieval.method_names import ImageMethod, RingCentre, RingMethod, VolumeMethod

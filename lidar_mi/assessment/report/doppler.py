@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 
+from lidar_mi.assessment.digits import fixed, three, with_error
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.names import REFERENCE_ERRORS, bound_key, reference_key, ring_key
 from lidar_mi.assessment.metrics.velocities import CENTRES, PEAK_READERS, READERS
-from lidar_mi.assessment.report.digits import fixed, three, with_error
 from lidar_mi.assessment.report.page import Chapter, Tables
 
 

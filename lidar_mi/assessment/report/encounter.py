@@ -3,12 +3,12 @@
 import math
 from collections.abc import Mapping, Sequence
 
+from lidar_mi.assessment.digits import fixed, percent, three
 from lidar_mi.assessment.figures.encounter import FLIGHTS
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.encounter import AFTER, flight_name
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK, ACCEPTED_RATIO
 from lidar_mi.assessment.metrics.requirements import Finding, RequirementTable, as_rows, fulfilled
-from lidar_mi.assessment.report.digits import fixed, percent, three
 from lidar_mi.assessment.report.page import Chapter, Film, Tables
 from lidar_mi.tables import Table
 

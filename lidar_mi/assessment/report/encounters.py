@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 import xarray as xr
 
+from lidar_mi.assessment.digits import with_error
 from lidar_mi.assessment.figures.campaign import draw_against, draw_distributions
 from lidar_mi.assessment.figures.encounter import FLIGHTS
 from lidar_mi.assessment.metrics.encounter_hazard import ACCEPTED_BANK
 from lidar_mi.assessment.report.block import Block
-from lidar_mi.assessment.report.digits import with_error
 
 
 def encounter_blocks(known: Mapping[str, xr.DataArray]) -> Iterator[Block]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from lidar_mi.assessment.digits import fixed, whole_percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.error_budget import (
@@ -11,7 +12,6 @@ from lidar_mi.assessment.metrics.error_budget import (
     causes_of,
     component_rmse,
 )
-from lidar_mi.assessment.report.digits import fixed, whole_percent
 from lidar_mi.assessment.report.page import Chapter, Tables
 
 # A cause with a smaller fraction of the mean square error is not named.

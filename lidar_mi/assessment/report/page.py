@@ -10,10 +10,10 @@ from typing import NamedTuple
 import jinja2
 from markupsafe import Markup
 
+from lidar_mi.assessment.digits import percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.units import unit_of
-from lidar_mi.assessment.report.digits import percent
 from lidar_mi.assessment.report.simulation import samples_of
 from lidar_mi.io.images import as_webp, panel_cuts
 from lidar_mi.units import shown

@@ -2,8 +2,8 @@
 
 from collections.abc import Mapping, Sequence
 
+from lidar_mi.assessment.digits import three
 from lidar_mi.assessment.figures.plates import Drawn
-from lidar_mi.assessment.report.digits import three
 from lidar_mi.assessment.report.page import Chapter, Tables
 
 

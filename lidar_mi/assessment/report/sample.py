@@ -6,6 +6,7 @@ import numpy as np
 import xarray as xr
 from scipy import stats
 
+from lidar_mi.assessment.digits import percent
 from lidar_mi.assessment.figures import campaign as figures
 from lidar_mi.assessment.figures.campaign import Axis, Points
 from lidar_mi.assessment.metrics import campaign as numbers
@@ -13,7 +14,6 @@ from lidar_mi.assessment.metrics.campaign import SAMPLE, Interval
 from lidar_mi.assessment.metrics.pareto import pareto_front
 from lidar_mi.assessment.metrics.sensitivity import SobolIndices, sobol_indices
 from lidar_mi.assessment.report.block import Block, label_of
-from lidar_mi.assessment.report.digits import percent
 
 # Objectives of a Pareto front beside the error: key, whether larger is better.
 _OBJECTIVES = (

@@ -2,10 +2,10 @@
 
 from collections.abc import Mapping, Sequence
 
+from lidar_mi.assessment.digits import in_row, percent, three
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.requirements import as_rows, fulfilled, look_ahead
 from lidar_mi.assessment.metrics.sensor import without_skill
-from lidar_mi.assessment.report.digits import in_row, percent, three
 from lidar_mi.assessment.report.page import Chapter, Tables
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
 

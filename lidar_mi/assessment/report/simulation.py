@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import xarray as xr
 
+from lidar_mi.assessment.digits import whole_percent
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.campaign import metrics_of
 from lidar_mi.assessment.metrics.names import Source, wind_key
 from lidar_mi.assessment.metrics.simulation import largest_parts, simulation_parts
-from lidar_mi.assessment.report.digits import whole_percent
 
 _FRACTION = f"{Source.NOISY}.monte_carlo_fraction"
 _SAMPLES = f"{Source.BACKSCATTER}.samples_per_beam"

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 
+from lidar_mi.assessment.digits import fixed, in_row, percent
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES, SOURCE_NAMES
 from lidar_mi.assessment.metrics.names import Source, wind_key
 from lidar_mi.assessment.metrics.volume import COMPONENTS
-from lidar_mi.assessment.report.digits import fixed, in_row, percent
 from lidar_mi.assessment.report.page import Chapter, Tables
 from lidar_mi.assessment.report.simulation import samples_of
 

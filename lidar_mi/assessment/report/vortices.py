@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from lidar_mi.assessment.digits import fixed, with_error
 from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.labels import METHOD_NAMES
 from lidar_mi.assessment.metrics.names import vortex_key
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES
-from lidar_mi.assessment.report.digits import fixed, with_error
 from lidar_mi.assessment.report.page import Chapter, Tables
 from lidar_mi.retrieval.vortices.pair import VortexPairFit
 

@@ -30,9 +30,9 @@ from lidar_mi.experiment.truth import Flows, Truth, blur_by_beam, read_flows
 from lidar_mi.instrument.motion import Motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
-from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.images.common_grid import resample_pair
+from lidar_mi.retrieval.wind.pair import retrieve_wind
+from lidar_mi.retrieval.wind.synchronised import of_one_instant
 
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")

@@ -26,7 +26,7 @@ from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
 from lidar_mi.rendering.samples import Samples, choose_samples, monte_carlo_fraction, pilot_samples
 from lidar_mi.rendering.variant import use_variant
-from lidar_mi.retrieval.velocimetry.one_instant import of_one_instant
+from lidar_mi.retrieval.wind.synchronised import of_one_instant
 
 IMAGES = ("image_t1", "image_t2")
 """Parts of the result of `render_images`."""

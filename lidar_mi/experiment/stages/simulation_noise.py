@@ -16,7 +16,7 @@ from lidar_mi.experiment.stages.winds import (
     window_settings,
 )
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 
 def simulation_noise(

@@ -9,7 +9,7 @@ from lidar_mi.experiment.schema import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.experiment.truth import Flows, advection_by, make_truth
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Relative rms of the texture."""

@@ -22,9 +22,9 @@ from lidar_mi.experiment.truth import Flows
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
-from lidar_mi.retrieval.velocimetry.common_grid import resample
-from lidar_mi.retrieval.velocimetry.volume import retrieve_wind_volume
-from lidar_mi.retrieval.velocimetry.windows import Windows
+from lidar_mi.retrieval.images.common_grid import resample
+from lidar_mi.retrieval.images.windows import Windows
+from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ from lidar_mi.experiment.schema import Experiment, Retrieval
 from lidar_mi.experiment.truth import Truth, blur_by_beam
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.common_error import with_common_error
+from lidar_mi.retrieval.images.common_grid import resample_pair
+from lidar_mi.retrieval.images.resampling_error import flag_resampled
+from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.method_names import ImageMethod
-from lidar_mi.retrieval.velocimetry.common_grid import resample_pair
-from lidar_mi.retrieval.velocimetry.methods import METHODS
-from lidar_mi.retrieval.velocimetry.resampling_error import flag_resampled
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind, wind_bound
-from lidar_mi.retrieval.velocimetry.windows import Windows
+from lidar_mi.retrieval.wind.methods import METHODS
+from lidar_mi.retrieval.wind.pair import retrieve_wind, wind_bound
 
 _FEW_VALID = 0.25
 _OF_TEMPLATES = (ImageMethod.CC, ImageMethod.MULTIPASS)

@@ -69,7 +69,7 @@ def combine(
     Parameters
     ----------
     crossflow : xr.Dataset, dims (z, y)
-        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`: `v`, `w`, `v_stderr`, `w_stderr`,
+        From `lidar_mi.retrieval.wind.pair.retrieve_wind`: `v`, `w`, `v_stderr`, `w_stderr`,
         `vw_correlation`, `flag`. Vectors are taken at the nodes. An error common to all of them
         (`lidar_mi.retrieval.common_error`) is an unknown of its own if it is ``free``; the lines
         determine it as far as they are oblique, and u differs from a plane that leans against it.

@@ -12,9 +12,9 @@ import xarray as xr
 from scipy.ndimage import map_coordinates
 
 from lidar_mi.errors import InputError
+from lidar_mi.retrieval.images.common_grid import nearest_filled
 from lidar_mi.retrieval.lines.crossflow import window_overlap, window_size
 from lidar_mi.retrieval.lines.vectors import line_origins, line_places
-from lidar_mi.retrieval.velocimetry.common_grid import nearest_filled
 
 # Nodes by which a place may lie outside of the grid by rounding.
 _ROUNDING = 1e-9

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from lidar_mi.retrieval.velocimetry.windows import averaged
+from lidar_mi.retrieval.images.windows import averaged
 from lidar_mi.retrieval.vortices.model_error import (
     ModelError,
     Response,

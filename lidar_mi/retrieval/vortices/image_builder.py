@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from lidar_mi.retrieval.velocimetry.band_limit import best_filter
-from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.inpainting import filled_in
-from lidar_mi.retrieval.velocimetry.quality import filled
-from lidar_mi.retrieval.velocimetry.settings import FilterSettings
+from lidar_mi.retrieval.images.band_limit import best_filter
+from lidar_mi.retrieval.images.inpainting import filled_in
+from lidar_mi.retrieval.images.intensity import normalised
+from lidar_mi.retrieval.images.quality import filled
+from lidar_mi.retrieval.images.settings import FilterSettings
 from lidar_mi.retrieval.vortices.images import Builder, spectrum_of
 from lidar_mi.retrieval.vortices.model import Profile
 from lidar_mi.retrieval.vortices.pixel_times import PixelTimes

@@ -15,12 +15,12 @@ import xarray as xr
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.defects.rest import all_at_rest
+from lidar_mi.retrieval.images.beam_times import checked_times
+from lidar_mi.retrieval.images.inpainting import filled_in
+from lidar_mi.retrieval.images.intensity import normalised
+from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.threads import threads_for
-from lidar_mi.retrieval.velocimetry.beam_times import checked_times
-from lidar_mi.retrieval.velocimetry.brightness import normalised
-from lidar_mi.retrieval.velocimetry.inpainting import filled_in
-from lidar_mi.retrieval.velocimetry.rest import all_at_rest
-from lidar_mi.retrieval.velocimetry.windows import Windows
 from lidar_mi.retrieval.vortices.acceptance import (
     STARTS,
     TOLERANCE,
@@ -82,7 +82,7 @@ def fit_vortices(
     Parameters
     ----------
     image1, image2 : DataArray, dims (z, y)
-        On one grid, as `lidar_mi.retrieval.velocimetry.wind.retrieve_wind` takes them. NaN pixels
+        On one grid, as `lidar_mi.retrieval.wind.pair.retrieve_wind` takes them. NaN pixels
         are left out, and so are pixels that do not move with the air (`rest.all_at_rest`).
     dt : float
         s.

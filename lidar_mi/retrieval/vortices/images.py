@@ -9,16 +9,16 @@ import numpy as np
 import torch
 from kornia.filters import gaussian_blur2d
 
-from lidar_mi.retrieval.velocimetry.band_limit import (
+from lidar_mi.retrieval.images.band_limit import (
     Filter,
     PowerSpectrum,
     best_filter,
     checked_noise,
     power_spectrum,
 )
-from lidar_mi.retrieval.velocimetry.quality import filled
-from lidar_mi.retrieval.velocimetry.settings import FilterSettings
-from lidar_mi.retrieval.velocimetry.warping import (
+from lidar_mi.retrieval.images.quality import filled
+from lidar_mi.retrieval.images.settings import FilterSettings
+from lidar_mi.retrieval.images.spline import (
     Spline,
     band_limited,
     filtered_splines,

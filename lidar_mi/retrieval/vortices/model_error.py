@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from scipy.optimize import nnls
 
-from lidar_mi.retrieval.velocimetry.band_limit import even_fast_len
-from lidar_mi.retrieval.velocimetry.windows import linear_weights, separable
+from lidar_mi.retrieval.images.band_limit import even_fast_len
+from lidar_mi.retrieval.images.windows import linear_weights, separable
 
 # Standard errors by which a departure must exceed what change and noise explain.
 _SIGNIFICANT = 3.0

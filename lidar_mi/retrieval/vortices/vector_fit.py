@@ -58,7 +58,7 @@ def fit_vortices_to_wind(vectors: xr.Dataset, profile: Profile = "lamb_oseen") -
     Parameters
     ----------
     vectors : Dataset, dims (z, y)
-        From `lidar_mi.retrieval.velocimetry.wind.retrieve_wind`: v, w, and if present v_stderr,
+        From `lidar_mi.retrieval.wind.pair.retrieve_wind`: v, w, and if present v_stderr,
         w_stderr, vw_correlation, flag, y_vector, z_vector. Vectors that are flagged or NaN are left
         out. Without standard errors all have the same weight, with the error estimated from their
         residuals.

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from lidar_mi.retrieval.velocimetry.displacement import Displacement
-from lidar_mi.retrieval.velocimetry.quality import Flag, non_finite
-from lidar_mi.retrieval.velocimetry.windows import Windows, image_pair
+from lidar_mi.retrieval.images.displacement import Displacement
+from lidar_mi.retrieval.images.quality import Flag, non_finite
+from lidar_mi.retrieval.images.windows import Windows, image_pair
 from lidar_mi.retrieval.vortices.image_fit import fit_pixels
 
 
@@ -37,7 +37,7 @@ def vortex_windows(
     noise : float or torch.Tensor, optional
         As `fit_vortices`.
     times : sequence of ndarray, optional
-        Of the pixels, from `lidar_mi.retrieval.velocimetry.beam_times.checked_times`.
+        Of the pixels, from `lidar_mi.retrieval.images.beam_times.checked_times`.
 
     Returns
     -------

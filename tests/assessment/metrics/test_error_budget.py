@@ -20,7 +20,7 @@ from lidar_mi.assessment.metrics.error_budget import (
 )
 from lidar_mi.assessment.report.error_budget import budget_chapter, limit_sentence
 from lidar_mi.atmosphere.vortex import Vortex, velocity
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.flows import axes, data_array, plane_waves, texture
 
 DT, H = 0.1, 0.5

@@ -18,9 +18,9 @@ from lidar_mi.errors import InputError
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, PlatformErrors, scan_wind
 from lidar_mi.retrieval.common_error import with_common_error
+from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.lines.combine import CombinedFlag, combine
 from lidar_mi.retrieval.lines.vectors import wind_from_triples
-from lidar_mi.retrieval.velocimetry.quality import Flag
 
 Y, Z = np.arange(-3, 3.1, 1.0), np.arange(-2, 2.1, 1.0)
 METRES = {"units": "m"}

@@ -19,7 +19,7 @@ from lidar_mi.atmosphere.wake_path import PairAlongPath
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.truth import make_truth
-from lidar_mi.retrieval.velocimetry.warping import band_limited
+from lidar_mi.retrieval.images.spline import band_limited
 from lidar_mi.retrieval.vortices import model
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.model import PROFILES, advected, path_sensitivity, wind

@@ -11,11 +11,11 @@ import pytest
 import torch
 
 from lidar_mi.atmosphere.vortex import velocity
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
 from lidar_mi.retrieval.vortices.images import SAME_BRIGHTNESS, Builder
 from lidar_mi.retrieval.vortices.model import PARAMETERS
 from lidar_mi.retrieval.vortices.pixel_times import PixelTimes
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.timed import DT, moving_vortices
 from tests.support.vortex_pairs import uneven, vector
 

@@ -6,9 +6,9 @@ import pytest
 import xarray as xr
 
 from benchmarks.cases import vortex_pair_images
-from lidar_mi.retrieval.velocimetry.quality import Flag
-from lidar_mi.retrieval.velocimetry.wind import retrieve_wind
+from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
+from lidar_mi.retrieval.wind.pair import retrieve_wind
 from tests.support.vortex_pairs import uneven
 
 DT = 0.1

@@ -1,0 +1,1 @@
+"""Displacements of windows by correlation, and their errors."""

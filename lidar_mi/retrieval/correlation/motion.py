@@ -1,0 +1,49 @@
+"""The motion around every pixel, from coarse vectors, and images read further on along it."""
+
+import torch
+from torch.nn.functional import grid_sample, pad
+
+from lidar_mi.retrieval.correlation.cross_correlation import cross_correlation
+from lidar_mi.retrieval.correlation.first_pass import coarse_windows
+from lidar_mi.retrieval.images.inpainting import nearest_in
+from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.images.windows import Windows, linear_weights, separable
+
+# Coarse vectors along each axis whose median is the motion around a place.
+_AROUND = 5
+
+
+def motion_around(
+    image1: torch.Tensor, image2: torch.Tensor, windows: Windows, continued: bool = False
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Displacement (2, z, y) around every pixel, px, and how far (z, y) vectors there are from it.
+
+    The median of 5 x 5 coarse vectors, and that of their distances from it; where there is none 0,
+    or the nearest ones (`continued`).
+    """
+    coarse = coarse_windows(windows)
+    found = cross_correlation(image1, image2, coarse.template, coarse.search, coarse.stride)
+    usable = (found.flag == 0) | (found.flag == Flag.NO_SUBPIXEL_FIT.value)
+    d = pad(torch.where(usable, found.d, torch.nan), (_AROUND // 2,) * 4, value=torch.nan)
+    near = d.unfold(1, _AROUND, 1).unfold(2, _AROUND, 1).flatten(3)
+    d = near.nanmedian(-1).values
+    scatter = (near - d[..., None]).norm(dim=0).nanmedian(-1).values
+    if continued:
+        d, scatter = (nearest_in(part) for part in (d, scatter))
+    weights = [
+        linear_weights(coarse.centres(axis).to(d), torch.arange(n).to(d))
+        for axis, n in enumerate(windows.shape)
+    ]
+    both = separable(torch.cat([d, scatter[None]]).nan_to_num(0.0), weights)
+    return both[:2], both[2]
+
+
+def moved(image: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+    """The image (z, y) read d (2, z, y) px further on, by cubics."""
+    place = [torch.arange(n).to(d) for n in image.shape]
+    at = [
+        2 * (p + part) / (n - 1) - 1
+        for p, part, n in zip(torch.meshgrid(*place, indexing="ij"), d, image.shape, strict=True)
+    ]
+    grid = torch.stack([at[1], at[0]], -1)[None]
+    return grid_sample(image[None, None], grid, "bicubic", "border", align_corners=True)[0, 0]

@@ -1,0 +1,1 @@
+"""What in an image is not air, or not moved by it."""

@@ -1,0 +1,160 @@
+"""A faint pattern at rest all over the images: the fraction of a displacement that it takes."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from scipy.stats import t as student
+
+from lidar_mi.retrieval.correlation.motion import moved
+from lidar_mi.retrieval.images.displacement import Displacement
+from lidar_mi.retrieval.images.windows import Windows, linear_weights, separable, working
+
+FALSE_ALARM = 1e-3
+"""Probability that images without a pattern count as having one."""
+# Side of the blocks, px, whose sums are nearly independent, their least number, the rim left out.
+_BLOCK, _FEW_BLOCKS, _RIM = 24, 8, 12
+# Px; slower air shows nothing.
+_SLOWEST = 0.25
+# Robust standard deviations that a pixel's difference counts at most.
+_CLIPPED = 4.0
+# Noise-free smoke that moves in its plane alone gives up to 0.009.
+_LEAST = 0.015
+# Above, the bias is no longer proportional to the fraction.
+_LARGEST = 0.08
+# Relative uncertainty of the bias along and across the wind: a pattern need not have the
+# texture's spectrum, and its gradients at one place are not isotropic.
+_UNLIKE = 0.4
+
+
+class Standing(NamedTuple):
+    """The fraction by which a pattern at rest makes displacements too small.
+
+    Attributes
+    ----------
+    fraction : float
+        0 where no pattern was detected.
+    stderr : float
+        From the scatter over the images.
+    """
+
+    fraction: float = 0.0
+    stderr: float = 0.0
+
+    @property
+    def spoils(self) -> bool:
+        """Whether the pattern is too strong for a correction."""
+        return self.fraction > _LARGEST
+
+    def corrected(self, found: Displacement) -> Displacement:
+        """Displacements without their bias, and with its uncertainty.
+
+        Parameters
+        ----------
+        found : Displacement
+            With a covariance.
+        """
+        if not self.fraction or self.spoils:
+            return found
+        left = 1 - self.fraction
+        d = found.d / left
+        variance = self.stderr**2 + (_UNLIKE * self.fraction) ** 2
+        unit = torch.eye(len(d)).to(d).reshape(len(d), len(d), *[1] * (d.ndim - 1))
+        more = variance * d.square().sum(0) * unit
+        return found._replace(d=d, covariance=found.covariance / left**2 + more)
+
+    def __str__(self) -> str:
+        return f"{self.fraction:.1%} of the squared slopes at rest" if self.fraction else ""
+
+
+def standing(
+    images: Sequence[torch.Tensor],
+    found: Displacement,
+    windows: Windows,
+    false_alarm: float = FALSE_ALARM,
+) -> Standing:
+    """The fraction of displacements that a pattern at rest takes, from what they do not explain.
+
+    A pattern p at rest in air that moves by d leaves r = p(x + d/2) - p(x - d/2) between images
+    warped to mid-time, of spectral density 4 sin^2(k.d / 2) P(k): more in waves along d than
+    across it. Noise, other air and motion through the plane leave as much in both. With the Riesz
+    transforms r_z, r_y (i k_z / |k|, i k_y / |k| in the spectrum), along and across d,
+
+        <r_along^2 - r_across^2> = d^2 / 4 <|grad p|^2>
+
+    for small d. The same of the images' mean m, q = m(x + d/2) - m(x - d/2), gives the gradients of
+    all structure. The ratio is the fraction of the squared gradients that is at rest, and as much
+    do displacements lack that are fitted to the gradients. Both are summed over blocks of 24 px,
+    weighted by what a pattern would give over the square of what the displacements leave. The
+    ratio counts if it exceeds its standard error, from the scatter of the blocks, by Student's t
+    at the rate of false alarms, and 0.015.
+
+    Parameters
+    ----------
+    images : sequence of torch.Tensor, shape (z, y)
+        The first two of them count.
+    found : Displacement
+        A field fitted to the images as a whole.
+    windows : Windows
+    false_alarm : float
+    """
+    first, second, known, d = _warped(images[:2], found, windows)
+    speed = d.norm(dim=0)
+    use = known & (speed > _SLOWEST)
+    use[:_RIM] = use[-_RIM:] = False
+    use[:, :_RIM] = use[:, -_RIM:] = False
+    if not bool(use.any()):
+        return Standing()
+    left = torch.where(known, second - first, 0.0)
+    limit = _CLIPPED * 1.4826 * left[use].abs().median()
+    mean = (first + second) / 2
+    shift = moved(mean, d / 2) - moved(mean, -d / 2)
+    excess, power = _along_and_across(left.clamp(-limit, limit), d / speed.clamp(min=1e-6))
+    whole, _ = _along_and_across(shift, d / speed.clamp(min=1e-6))
+    sums = torch.stack([excess, power, whole, torch.ones_like(power)]) * use
+    rows, columns = (n // _BLOCK for n in use.shape)
+    sums = sums[:, : rows * _BLOCK, : columns * _BLOCK]
+    sums = sums.reshape(4, rows, _BLOCK, columns, _BLOCK).sum((2, 4)).flatten(1)
+    sums = sums[:, (sums[3] > _BLOCK**2 / 4) & (sums[1] > 0)].cpu()
+    number = sums.shape[1]
+    if number < _FEW_BLOCKS:
+        return Standing()
+    excess, power, whole, pixels = sums
+    weight = (whole * pixels / power**2).clamp(min=0)
+    total = float((weight * whole).sum())
+    if not total > 0:
+        return Standing()
+    fraction = float((weight * excess).sum()) / total
+    scatter = (weight * (excess - fraction * whole)).square().sum() * number / (number - 1)
+    stderr = float(scatter.sqrt()) / total
+    if fraction <= max(_LEAST, student.isf(false_alarm, number - 1) * stderr):
+        return Standing()
+    return Standing(fraction, stderr)
+
+
+def _warped(
+    images: Sequence[torch.Tensor], found: Displacement, windows: Windows
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Two images over their means at mid-time, where both are known, and the displacement, px."""
+    weights = [
+        linear_weights(windows.centres(axis).to(found.d), torch.arange(n).to(found.d))
+        for axis, n in enumerate(windows.shape)
+    ]
+    one, two = (working(image) for image in images)
+    d = separable(found.d.nan_to_num(0.0), weights).to(one)
+    known = torch.isfinite(one) & torch.isfinite(two)
+    one, two = (torch.where(known, i / i[known].mean(), 1.0) for i in (one, two))
+    hole = (~known).to(one)
+    known = (moved(hole, -d / 2) < 0.1) & (moved(hole, d / 2) < 0.1)
+    return moved(one, -d / 2), moved(two, d / 2), known, d
+
+
+def _along_and_across(image: torch.Tensor, unit: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Squares of the Riesz transforms along and across unit vectors (2, z, y): difference, sum."""
+    kz, ky = torch.meshgrid(*(torch.fft.fftfreq(n).to(image) for n in image.shape), indexing="ij")
+    length = torch.hypot(kz, ky)
+    length[0, 0] = 1.0
+    spectrum = torch.fft.fft2(image - image.mean())
+    z, y = (torch.fft.ifft2(spectrum * 1j * k / length).real for k in (kz, ky))
+    along, across = z * unit[0] + y * unit[1], y * unit[0] - z * unit[1]
+    return along**2 - across**2, along**2 + across**2

@@ -1,0 +1,453 @@
+"""What does not move with the air: saturated areas and structure at rest in two images."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch.nn.functional import pad
+
+from lidar_mi.retrieval.correlation.motion import motion_around, moved
+from lidar_mi.retrieval.defects import impulses
+from lidar_mi.retrieval.defects.fixed_pattern import FixedPattern, fixed_pattern
+from lidar_mi.retrieval.defects.saturation import saturated, saturated_areas
+from lidar_mi.retrieval.images.displacement import Displacement
+from lidar_mi.retrieval.images.inpainting import filled_in
+from lidar_mi.retrieval.images.quality import Flag, non_finite, thick
+from lidar_mi.retrieval.images.windows import Windows, averaged, box_sum, working
+
+# Fraction of a template at the largest value that leaves too little to see.
+_SATURATED = 0.25
+# The same of pixels that are no air.
+_HIDDEN = 0.25
+# Sizes of the spots that are looked for, px.
+_SIZES = (3, 5, 9)
+# Part of the thresholds that suffices next to what exceeds them (hysteresis: Canny 1986, IEEE
+# Trans. PAMI 8, 679-698).
+_WEAK = 0.5
+# Half of the gaps in what stands out, px, that the motion is not looked for in.
+_GAP = 2
+# Length of lines, px.
+_LINE = 9
+# Of the images' mean squared difference, that of areas at rest.
+_STILL = 0.1
+# Fraction of their height by which spots at rest differ at most.
+_DIFFER = 0.3
+# Spots at rest must be so many times those that are by chance.
+_BEYOND_CHANCE = 3.0
+# Times that motion and structure at rest are estimated in turn.
+_TURNS = 3
+# Px; width of the Gaussians over which images without spots are averaged before the motion is
+# looked for.
+_SOFT = 1.5
+
+
+class AtRest(NamedTuple):
+    """What two or more images have in common that does not move, bool in the images' shape.
+
+    Attributes
+    ----------
+    piled : torch.Tensor
+        Saturated pixels, of each image.
+    saturated : torch.Tensor
+        Areas of them of at least half a template, see `saturation.saturated_areas`.
+    structure : torch.Tensor
+        That of `at_rest`.
+    stray : torch.Tensor
+        Pixels of each image that no other has anything of, see `at_rest`.
+    pattern : FixedPattern
+        All over the images, without these pixels.
+    """
+
+    piled: torch.Tensor
+    saturated: torch.Tensor
+    structure: torch.Tensor
+    stray: torch.Tensor
+    pattern: FixedPattern
+
+    def __str__(self) -> str:
+        parts = {"at rest": self.structure, "of one image alone": self.stray.any(0)}
+        said = [f"{p.double().mean():.2%} {name}" for name, p in parts.items() if bool(p.any())]
+        return f"pixels left out: {', '.join(said)}" if said else ""
+
+    @property
+    def hidden(self) -> torch.Tensor:
+        """Pixels (images, z, y) that are left out."""
+        return self.stray | self.saturated | self.structure
+
+    def left_out(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """The images without the fixed pattern, NaN in place of what is no air."""
+        pairs = zip(self.pattern.removed(images), self.hidden, strict=False)
+        return [_left_out(image, pixels) for image, pixels in pairs]
+
+    def filled(self, images: Sequence[torch.Tensor]) -> list[torch.Tensor]:
+        """The same, with smooth values in place of what is no air."""
+        found = zip(self.left_out(images), self.hidden, strict=False)
+        return [filled_in(i, pixels) if bool(pixels.any()) else i for i, pixels in found]
+
+    def flags(
+        self, found: Displacement, images: Sequence[torch.Tensor], windows: Windows, left_out: bool
+    ) -> torch.Tensor:
+        """The flags of vectors, with the reasons by their names.
+
+        Parameters
+        ----------
+        found : Displacement
+        images : sequence of torch.Tensor
+            As they are.
+        windows : Windows
+        left_out : bool
+            The vectors are from what was `left_out` of the images. Flags of non-finite input stay
+            where the images themselves hold it. Otherwise the place in image 2 counts as well, and
+            of saturated areas all of the search region.
+        """
+        flag = found.flag
+        bad = non_finite(images, windows)
+        hidden = ((flag & Flag.NON_FINITE_INPUT.value) > 0) & ~bad
+        flag = flag & ~(Flag.NON_FINITE_INPUT * hidden).to(flag.dtype)
+        parts = self.piled, self.saturated, self.structure, self.stray
+        if not any(bool(part.any()) for part in parts) and not self.pattern.spoils:
+            return flag
+        wide = ~torch.isfinite(found.d).all(0) & ~bad
+        piled = windows.of_templates(working(self.piled)).amax(0) > _SATURATED
+        # an area of another brightness spoils a correlation from afar
+        spoiled = torch.full_like(bad, self.pattern.spoils)
+        hidden = self.hidden.any(0)
+        spoiled |= windows.of_templates(working(hidden)) > _HIDDEN
+        spoiled |= windows.of_centres(working(hidden)) > 0
+        structure = thick(hidden) if left_out else hidden
+        for bit, pixels, here, reach in (
+            (Flag.SATURATED, self.saturated, piled, wide if left_out else ~bad),
+            (Flag.AT_REST, structure, spoiled, wide),
+        ):
+            here = here | (windows.of_templates(working(pixels)) > 0)
+            here |= reach & (windows.of_regions(working(pixels)) > 0)
+            if not left_out:
+                here |= _matched(pixels, windows, found.d)
+            flag = flag | (bit * here).to(flag.dtype)
+        return flag
+
+
+def _matched(pixels: torch.Tensor, windows: Windows, d: torch.Tensor) -> torch.Tensor:
+    """Whether there are such pixels where a template, moved by d px, lies in image 2."""
+    n = windows.template
+    boxes = box_sum(box_sum(working(pixels), n, -1), n, -2) > 0
+    starts = [torch.tensor(windows.starts(axis), device=d.device) for axis in (0, 1)]
+    row, column = (
+        (start + part.nan_to_num(0.0).round().long()).clamp(0, size - 1)
+        for start, part, size in zip(
+            torch.meshgrid(*starts, indexing="ij"), d, boxes.shape, strict=True
+        )
+    )
+    return boxes[row, column]
+
+
+def all_at_rest(images: Sequence[torch.Tensor], windows: Windows) -> AtRest:
+    """Saturated areas of images or volumes; structure and a fixed pattern at rest of images."""
+    piled = torch.stack([saturated(image) for image in images])
+    areas = saturated_areas(piled, windows)
+    if windows.dims > 2:
+        return nothing_at_rest(images)._replace(piled=piled, saturated=areas)
+    pair = [_left_out(image, areas) for image in images[:2]]
+    structure, stray, d = at_rest(*pair, windows)
+    hidden = stray | structure
+    pattern = fixed_pattern([_left_out(i, p) for i, p in zip(pair, hidden, strict=True)], windows)
+    if pattern.columns or pattern.rows:
+        structure, stray, d = at_rest(*pattern.removed(pair), windows)
+    more = torch.zeros_like(piled[2:])
+    found = AtRest(piled, areas, structure & ~areas, torch.cat([stray, more]), pattern)
+    return found._replace(pattern=pattern.with_pixels(found.filled(images)[:2], d))
+
+
+def nothing_at_rest(images: Sequence[torch.Tensor]) -> AtRest:
+    """Images or volumes that are known to hold nothing of the kind."""
+    none = torch.zeros_like(images[0], dtype=torch.bool)
+    all_none = torch.stack([none] * len(images))
+    return AtRest(all_none, none, none, all_none, FixedPattern(torch.ones(1)))
+
+
+def _left_out(image: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    if not bool(pixels.any()):
+        return image
+    image = image if image.is_floating_point() else working(image)
+    return torch.where(pixels, torch.nan, image)
+
+
+def at_rest(
+    image1: torch.Tensor, image2: torch.Tensor, windows: Windows
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Pixels that do not move with the air around them.
+
+    They are impulses that both images have at one place and no image of air resolves
+    (`impulses.sharp`); pixels, lines, steps and spots that stand out of both images and are more
+    alike at one place than along the motion d of what is around; and areas that these cut off. d is
+    the median of 5 x 5 coarse vectors of the images without what stands out of both, averaged over
+    Gaussians of 1.5 px, which hide gains of pixels. Motion and structure are estimated in turn.
+    What stands out is measured by local medians, with thresholds of one false alarm in 10 000
+    images of normal noise: the slower the air, the stronger a structure must be to be known from
+    it. Stray pixels stand out of one image alone (`impulses.stray`).
+
+    Not found: soft structure as faint as the texture, and a pattern so weak or so dense that no
+    place stands out. Bright air that stands still amid moving air looks at rest, and is.
+
+    Parameters
+    ----------
+    image1, image2 : torch.Tensor, shape (z, y)
+    windows : Windows
+
+    Returns
+    -------
+    structure : torch.Tensor of bool, shape (z, y)
+    stray : torch.Tensor of bool, shape (2, z, y)
+    d : torch.Tensor, shape (2, z, y)
+        Px.
+    """
+    pair = torch.stack([working(image) for image in (image1, image2)])
+    pair = torch.where(pair.isfinite(), pair, torch.nan)
+    outstanding = impulses.outstanding(pair)
+    pair = _normalised(pair, outstanding)
+    found = impulses.sharp(pair)
+    hidden = outstanding | _candidates(pair, found)
+    for _ in range(_TURNS):
+        soft = (_soft(image, ~(p | found)) for image, p in zip(pair, hidden, strict=True))
+        d, _ = motion_around(*soft, windows, continued=True)
+        if not bool(d.any()):  # what stands out is all that there is
+            return found, torch.zeros_like(outstanding), d
+        stray = impulses.stray(pair, outstanding, found, d)
+        new = _still(torch.where(stray, torch.nan, pair), found, d)
+        if not bool((new & ~found).any()):
+            break
+        found = found | new
+    return found, stray & ~found, d
+
+
+def _normalised(pair: torch.Tensor, but: torch.Tensor) -> torch.Tensor:
+    """Images with mean 0 and standard deviation 1 of all but some pixels."""
+    known = pair.isfinite() & ~but
+    parts = []
+    for image, use in zip(pair, known, strict=True):
+        values = image[use]
+        contrast = values.std(correction=0) if values.numel() else image.new_ones(())
+        mean = values.mean() if values.numel() else 0.0
+        parts.append((image - mean) / torch.where(contrast > 0, contrast, 1.0))
+    return torch.stack(parts)
+
+
+class _Field(NamedTuple):
+    """What may stand out of two images.
+
+    Its values (2, z, y), by how much these or the pixels themselves differ (z, y), its size in px,
+    and the pixels that it marks.
+    """
+
+    pair: torch.Tensor
+    change: torch.Tensor
+    size: int
+    marked: Callable[[torch.Tensor], torch.Tensor]
+
+
+def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
+    """Single pixels, lines, edges, spots: each from the images without what was found before."""
+    same = (pair[1] - pair[0]).abs().nan_to_num(torch.inf)
+
+    def known(found):
+        return torch.where(found, torch.nan, pair)
+
+    def of(values, size, marked, same=None):
+        change = (values[1] - values[0]).nan_to_num(0.0).abs()
+        return _Field(values, change if same is None else change.minimum(same), size, marked)
+
+    def pixels(found):
+        images = known(found)
+        heights = torch.stack([impulses.height(image) for image in images])
+        soft = [~impulses.unresolved(i, h) for i, h in zip(images, heights, strict=True)]
+        field = of(heights, 1, lambda new: new, same)
+        change = field.change.masked_fill(torch.stack(soft).any(0), torch.inf)
+        return field._replace(change=change)
+
+    yield pixels
+    for axis in (-1, -2):
+
+        def lines(found, axis=axis):
+            means = _along(pixels(found).pair, axis)
+            return of(means, 3, lambda new: _along(new.double(), axis) > 0)
+
+        yield lines
+    for axis in (-1, -2):
+
+        def edges(found, axis=axis):
+            steps = pad(known(found).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
+            either = same.minimum(same.roll(-1, axis))
+            # steps beside it are as large where smoke rises over several pixels
+            beside = steps.nan_to_num(0.0).abs()
+            beside = torch.maximum(beside.roll(2, axis), beside.roll(-2, axis))
+            soft = (steps.abs() < 2 * beside).any(0)
+            field = of(steps, 1, lambda new: new | new.roll(1, axis), either)
+            return field._replace(change=field.change.masked_fill(soft, torch.inf))
+
+        yield edges
+    for size in _SIZES:
+
+        def spots(found, size=size):
+            return of(_spots(known(found), size), size, lambda new: _grown(new, size))
+
+        yield spots
+
+
+def _spots(pair: torch.Tensor, size: int) -> torch.Tensor:
+    known = torch.stack([filled_in(image) for image in pair])
+    return _means(known, size) - _means(known, 3 * size)
+
+
+def _along(fields: torch.Tensor, axis: int) -> torch.Tensor:
+    """Means over lines of 9 px."""
+    rim = (0, 0) * (-1 - axis) + (_LINE // 2,) * 2
+    return box_sum(pad(fields.nan_to_num(0.0), rim), _LINE, axis) / _LINE
+
+
+def _candidates(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) of all that stands out alike of both images, at rest or not."""
+    for of in _fields(pair):
+        field = of(found)
+        alike = _beyond_chance(_alike(field, _least(field)), field, _least(field))
+        found = found | field.marked(alike)
+    return _closed(found, _GAP)
+
+
+def _still(pair: torch.Tensor, found: torch.Tensor, d: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) at rest in air that moves by d: single ones, lines, edges, spots, areas."""
+    sharp = found
+    for of in _fields(pair):
+        field = of(found)
+        new = field.marked(_stays(field, d))
+        if field.size == 1:
+            sharp = sharp | new
+        found = found | new
+    return _with_sharp(found | _enclosed(pair, found), sharp)
+
+
+def _with_sharp(found: torch.Tensor, sharp: torch.Tensor) -> torch.Tensor:
+    """Areas that hold something sharp: lines and spots without any may be smoke in calm air."""
+    if not bool(sharp.any()):
+        return sharp
+    held = ndimage.binary_propagation(
+        (sharp & found).cpu().numpy(), np.ones((3, 3)), _grown(found, 3).cpu().numpy()
+    )
+    return torch.as_tensor(held, device=found.device) & found
+
+
+def _least(field: _Field) -> torch.Tensor:
+    """Height that no value of the field exceeds by chance."""
+    limit = impulses.threshold(field.pair[0].numel() // field.size**2)
+    return limit * torch.maximum(*(impulses.median_scale(i, field.size) for i in field.pair))
+
+
+def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
+    """Where what stands out of two fields (2, z, y) neither came along d nor goes on."""
+    least = _least(field)
+    one, two = field.pair.nan_to_num(0.0)
+    off = [
+        torch.where(_inside(along), (here - moved(there, along)).abs(), torch.inf)
+        for here, there, along in ((one, two, d), (two, one, -d))
+    ]
+    off = torch.minimum(*off)
+    off = torch.where(off.isfinite(), off, 0.0)
+    limit = impulses.threshold(off.numel() // field.size**2)
+    limit = limit * impulses.median_scale(off, field.size)
+    new, weak = (
+        (off > part * limit)
+        & _alike(field, part * least)
+        & (field.change < _DIFFER * off)
+        & (_lower(field.pair) > off / 2)
+        for part in (1.0, _WEAK)
+    )
+    if not bool(new.any()):
+        return new
+    new = _beyond_chance(new, field, least)
+    if field.size > 1 or not bool(new.any()):
+        return new
+    new = ndimage.binary_propagation(new.cpu(), np.ones((3, 3)), weak.cpu())
+    return torch.as_tensor(new, device=weak.device)
+
+
+def _beyond_chance(new: torch.Tensor, field: _Field, least: torch.Tensor) -> torch.Tensor:
+    """Those pixels, or none if unrelated images have a third as many alike in one place.
+
+    Among many bright particles some lie by chance where others were.
+    """
+    one, two = field.pair.nan_to_num(0.0)
+    rows, columns = two.shape
+    chance = []
+    for i, j in impulses.THIRDS:
+        other = two.roll((int(i * rows / 3), int(j * columns / 3)), (0, 1))
+        rolled = field._replace(pair=torch.stack([one, other]), change=(other - one).abs())
+        chance.append(int(_alike(rolled, least).sum()))
+    # the median, as lines at rest fall on themselves
+    return new & (int(new.sum()) >= _BEYOND_CHANCE * float(np.median(chance)))
+
+
+def _enclosed(pair: torch.Tensor, found: torch.Tensor) -> torch.Tensor:
+    """Areas cut off by what is at rest that change by less than a tenth of what others do."""
+    if not bool(found.any()):
+        return found
+    square = (pair[1] - pair[0]).square()
+    known = square.isfinite() & ~found
+    if not bool(known.any()):
+        return torch.zeros_like(found)
+    limit = _STILL * float(square[known].mean())
+    closed = _closed(found, 1)
+    still = torch.zeros_like(found)
+    for part in (~closed, closed & ~found):
+        area, number = ndimage.label(part.cpu().numpy())
+        use = (known & part).cpu().numpy()
+        numbers, values = area[use], square.cpu().numpy()[use]
+        change = np.bincount(numbers, values, number + 1) - limit * np.bincount(
+            numbers, minlength=number + 1
+        )
+        still |= torch.as_tensor((change < 0)[area], device=found.device) & part
+    return still
+
+
+def _closed(pixels: torch.Tensor, reach: int) -> torch.Tensor:
+    """Pixels and gaps between them of up to twice the reach."""
+    wide = _grown(pixels, 2 * reach + 1)
+    return (
+        ~_grown(pad(~wide, (reach,) * 4, value=False), 2 * reach + 1)[
+            reach : reach + pixels.shape[0], reach : reach + pixels.shape[1]
+        ]
+        | pixels
+    )
+
+
+def _inside(d: torch.Tensor) -> torch.Tensor:
+    """Pixels (z, y) from which d (2, z, y) leads to another one of the image."""
+    inside = torch.ones_like(d[0], dtype=torch.bool)
+    for axis, (part, n) in enumerate(zip(d, d.shape[1:], strict=True)):
+        place = torch.arange(n).to(d).reshape(-1, *[1] * (1 - axis)) + part
+        inside &= (place > -0.5) & (place < n - 0.5)
+    return inside
+
+
+def _alike(field: _Field, least: torch.Tensor) -> torch.Tensor:
+    lower = _lower(field.pair)
+    return (lower > least) & (field.change < _DIFFER * lower)
+
+
+def _lower(pair: torch.Tensor) -> torch.Tensor:
+    return pair.nan_to_num(0.0).abs().amin(0)
+
+
+def _grown(pixels: torch.Tensor, size: int) -> torch.Tensor:
+    pixels = pad(pixels.double(), (size // 2,) * 4)
+    return box_sum(box_sum(pixels, size, -1), size, -2) > 0
+
+
+def _means(images: torch.Tensor, size: int) -> torch.Tensor:
+    images = pad(images, (size // 2,) * 4, "replicate")
+    return box_sum(box_sum(images, size, -1), size, -2) / size**2
+
+
+def _soft(image: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    image = working(image)
+    return averaged(image, torch.isfinite(image) & known, _SOFT)

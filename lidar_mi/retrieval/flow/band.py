@@ -1,0 +1,143 @@
+"""Quadratic forms of a plane flow's coefficients as band matrices, and their inverse.
+
+The coefficients (component, knot along z, knot along y) couple only where the knots are at most
+three apart. The matrix of a form is block banded, with one block for every knot along y.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch.nn.functional import pad
+
+from lidar_mi.retrieval.flow.block_banded import Factor, factor
+from lidar_mi.retrieval.flow.flow_spline import REACH, Mesh
+
+
+def form(
+    weight: torch.Tensor,
+    mesh: Mesh,
+    first: tuple[int, int] = (0, 0),
+    second: tuple[int, int] = (0, 0),
+    cells: slice | None = None,
+) -> torch.Tensor:
+    """Band (..., shift z, knot z, shift y, knot y) of sum(weight * D1 f * D2 f) over a mesh.
+
+    weight has shape (..., *mesh.shape); D1 and D2 are derivatives of these orders in z and y.
+    The sum may be limited to some cells along z; the band is then that of the knots of
+    `Mesh.within`.
+    """
+    cells = cells or slice(0, mesh.axes[0].cells)
+    along_z = mesh.products(0, first[0], second[0])
+    along_y = mesh.products(1, first[1], second[1])[REACH:]
+    rows = cells.stop - cells.start + REACH
+    middle = weight.new_zeros(*weight.shape[:-2], len(along_z), rows, weight.shape[-1])
+    for knots, nodes in mesh.groups(0, cells):
+        part = along_z[:, knots, nodes]
+        here = slice(knots.start - cells.start, knots.stop - cells.start)
+        product = part.flatten(0, 1) @ weight[..., nodes, :]
+        middle[..., here, :] += product.unflatten(-2, part.shape[:2])
+    found = weight.new_zeros(*middle.shape[:-1], len(along_y), along_y.shape[1])
+    for knots, nodes in mesh.groups(1):
+        part = along_y[:, knots, nodes]
+        product = middle[..., nodes] @ part.flatten(0, 1).T
+        found[..., knots] += product.unflatten(-1, part.shape[:2])
+    return found
+
+
+def spread(
+    band: torch.Tensor,
+    mesh: Mesh,
+    first: tuple[int, int] = (0, 0),
+    second: tuple[int, int] = (0, 0),
+    cells: slice | None = None,
+) -> torch.Tensor:
+    """Covariance (..., *mesh.shape) of two derivatives of components, from `Band.covariance`.
+
+    Of a band of the knots of some cells along z (see `form`) at the nodes in these cells.
+    """
+    cells = cells or slice(0, mesh.axes[0].cells)
+    rows, places = mesh.within(0, cells)
+    along_z = mesh.products(0, first[0], second[0])[:, rows, places].flatten(0, 1)
+    along_y = mesh.products(1, first[1], second[1])
+    middle = along_z.T @ band.flatten(-4, -3).flatten(-2, -1)
+    middle = middle.unflatten(-1, band.shape[-2:])
+    found = middle.new_zeros(*middle.shape[:-2], along_y.shape[-1])
+    for knots, nodes in mesh.groups(1):
+        part = along_y[:, knots, nodes].flatten(0, 1)
+        found[..., nodes] = middle[..., knots].flatten(-2) @ part
+    return found
+
+
+@dataclass(frozen=True)
+class Band:
+    """Quadratic forms of the coefficients (component, knot z, knot y) of a flow in a plane.
+
+    A form is held as its band: (component, component, shift z, knot z, shift y, knot y),
+    the coefficient at a knot against that at knot + shift, shifts from -3 to 3 in z and from 0 to
+    3 in y. Couplings with knots beyond the first or last row do not count.
+
+    Attributes
+    ----------
+    rows, columns : int
+        Knots along z and y.
+    """
+
+    rows: int
+    columns: int
+
+    def factor(self, form: torch.Tensor) -> Factor:
+        """Factor of the matrices of quadratic forms, bands of shape (..., 2, 2, 7, Z, 4, Y)."""
+        knots, batch = self.rows, form.shape[:-6]
+        # (knot y, ..., shift y, component, knot z there, component, knot z here)
+        columns = form.new_zeros(self.columns, *batch, REACH + 1, 2, knots, 2, knots)
+        # (knot y, ..., shift y, component there, component here, shift z, knot z)
+        form = form.movedim(-1, 0).movedim(-1, -5).transpose(-4, -3)
+        for shift in range(-REACH, REACH + 1):
+            rows = slice(max(0, -shift), knots - max(0, shift))
+            columns.diagonal(-shift, -3, -1).copy_(form[..., REACH + shift, rows])
+        # (.., shift y, component there, knot z there, component here, knot z here)
+        return factor(columns.flatten(-2).flatten(-4, -2))
+
+    def solve(self, root: Factor, right: torch.Tensor) -> torch.Tensor:
+        """Coefficients that solve the systems, from the right hand sides (..., 2, Z, Y)."""
+        found = root.solve(right.movedim(-1, 0).flatten(-2))
+        return found.unflatten(-1, (2, self.rows)).movedim(0, -1)
+
+    def covariance(self, root: Factor) -> torch.Tensor:
+        """The inverse within the band, all shifts: (..., 2, 2, 7, Z, 7, Y)."""
+        knots = self.rows
+        columns = root.inverse()
+        batch = columns.shape[1:-2]
+        columns = columns.unflatten(-1, (2, knots)).unflatten(-3, (REACH + 1, 2, knots))
+        shifts = 2 * REACH + 1
+        band = columns.new_zeros(*batch, 2, 2, shifts, knots, shifts, self.columns)
+        for shift in range(-REACH, REACH + 1):
+            rows = slice(max(0, -shift), knots - max(0, shift))
+            # (knot y, ..., shift y, component there, component here, knot z)
+            part = columns.diagonal(-shift, -3, -1).movedim(0, -1).movedim(-5, -2)
+            for ahead in range(REACH + 1):
+                here = part[..., ahead, : self.columns - ahead].transpose(-4, -3)
+                band[..., REACH + shift, rows, REACH + ahead, : self.columns - ahead] = here
+        for ahead in range(1, REACH + 1):
+            for shift in range(-REACH, REACH + 1):
+                rows = slice(max(0, -shift), knots - max(0, shift))
+                there = slice(max(0, shift), knots - max(0, -shift))
+                mirrored = band[..., REACH + shift, rows, REACH + ahead, : self.columns - ahead]
+                band[..., REACH - shift, there, REACH - ahead, ahead:] = mirrored.transpose(-4, -3)
+        return band
+
+    def apply(self, band: torch.Tensor, coefficients: torch.Tensor) -> torch.Tensor:
+        """The form's matrix times coefficients (2, Z, Y)."""
+        reach = REACH
+        padded = pad(coefficients, (reach,) * 4)
+        _, rows, columns = coefficients.shape
+        total = torch.zeros_like(padded)
+        here = slice(reach, reach + rows), slice(reach, reach + columns)
+        for i in range(2 * reach + 1):
+            for j in range(reach + 1):
+                there = slice(i, i + rows), slice(reach + j, reach + j + columns)
+                part = band[:, :, i, :, j]
+                total[:, *here] += (part * padded[None, :, *there]).sum(1)
+                if j:
+                    total[:, *there] += (part * coefficients[:, None]).sum(0)
+        return total[:, *here]

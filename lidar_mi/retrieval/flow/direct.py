@@ -1,0 +1,243 @@
+"""The flow in a plane, solved directly: exact posterior covariance and evidence."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from lidar_mi.retrieval.flow.band import Band, form, spread
+from lidar_mi.retrieval.flow.band_cholesky import BandCholesky, cholesky, solved_near
+from lidar_mi.retrieval.flow.block_banded import Factor
+from lidar_mi.retrieval.flow.flow_spline import REACH, Mesh
+from lidar_mi.retrieval.flow.likelihood import Linear
+from lidar_mi.retrieval.flow.prior import Prior
+from lidar_mi.retrieval.flow.settings import VariationalSettings
+
+# Relative rounding error of a factorisation: fifty times that of one entry.
+_ROUNDING = 1e-14
+
+# Residual over the right hand side that a step with a factor in single precision may leave.
+_SINGLE = 1e-3
+# Products with a form until conjugate gradients from a similar one are given up.
+_TURNS = 12
+
+
+# Least information over second derivative at which steps take the information: each then leaves
+# less than half of the distance.
+_ALIKE = 0.7
+
+
+class Posterior(NamedTuple):
+    """A flow after a Gauss-Newton step, and the factor of the posterior's precision there.
+
+    `stiff` is the prior's part of it, a band.
+    """
+
+    coefficients: torch.Tensor
+    band: Band
+    root: Factor
+    prior: Prior
+    stiff: torch.Tensor
+
+    def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """By kind of motion: the variance removed by the images, and its square in the flow."""
+        before = self.band.covariance(self.band.factor(self.stiff))
+        removed = before - self.band.covariance(self.root)
+        energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
+        return variances(removed, self.prior), energy
+
+    def response(self, gradient: torch.Tensor) -> torch.Tensor:
+        """Change of the coefficients by a gradient (components, knots) of the log-likelihood."""
+        return self.band.solve(self.root, gradient)
+
+    def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Of the flow (components, components, ...) at a mesh, after the images and before."""
+        mesh = Mesh(self.prior.mesh.axes, places)
+        after, before = (
+            spread(self.band.covariance(root), mesh)
+            for root in (self.root, self.band.factor(self.stiff))
+        )
+        return after, before
+
+
+def solved(
+    linear: Linear,
+    mesh: Mesh,
+    coefficients: torch.Tensor,
+    prior: Prior,
+    settings: VariationalSettings,
+    turn: int,
+) -> Posterior:
+    """One Gauss-Newton step; `turn` is for `iterative` only."""
+    band = _band(mesh)
+    stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
+    root = band.factor(data_form(linear, mesh) + stiff)
+    step = root if informative(linear) else band.factor(curvature(linear, mesh) + stiff)
+    return Posterior(coefficients + band.solve(step, gradient), band, root, prior, stiff)
+
+
+class Pull(NamedTuple):
+    """The prior of a flow: its quadratic form with the ridge, and its gradient there.
+
+    `whole` also has what keeps the form positive in spite of rounding.
+    """
+
+    stiff: torch.Tensor
+    whole: torch.Tensor
+    gradient: torch.Tensor
+
+    def at(self, prior: Prior, coefficients: torch.Tensor) -> "Pull":
+        """The same of another flow."""
+        return self._replace(gradient=-_band(prior.mesh).apply(self.stiff, coefficients))
+
+
+def pull_of(prior: Prior, coefficients: torch.Tensor, ridge: float) -> Pull:
+    """That of a prior at a flow."""
+    stiff = prior_form(prior)
+    with_diagonal(stiff, ridge)
+    whole = stiff.clone()
+    with_diagonal(whole, rounding(stiff))
+    return Pull(stiff, whole, stiff).at(prior, coefficients)
+
+
+def solved_in_single(
+    linear: Linear,
+    mesh: Mesh,
+    coefficients: torch.Tensor,
+    pull: Pull,
+    near: BandCholesky | None = None,
+) -> torch.Tensor:
+    """Coefficients after a step in single precision; its residual is looked at in double precision.
+
+    By conjugate gradients from the factor of a form that is `near` the step's own, or by the factor
+    of that. Where there is no such factor, or the residual is not small, all is in double
+    precision.
+    """
+    gradient = mesh.transposed(linear.gradient) + pull.gradient
+    whole = (data_form if informative(linear) else curvature)(linear, mesh) + pull.whole
+    if near is not None:
+        step = solved_near(near, whole, gradient, _SINGLE, _TURNS)
+        if step is not None:
+            return coefficients + step
+    root = cholesky(whole.float())
+    if root is not None:
+        step = root.solve(gradient)
+        left = gradient - _band(mesh).apply(whole, step)
+        if bool(left.norm() <= _SINGLE * gradient.norm()):
+            return coefficients + step
+    return coefficients + _in_double(whole).solve(gradient)
+
+
+def factor_in_single(form: torch.Tensor) -> BandCholesky:
+    """Factor of a form in single precision, or in double where there is none."""
+    return cholesky(form.float()) or _in_double(form)
+
+
+def _in_double(form: torch.Tensor) -> BandCholesky:
+    root = cholesky(form.double())
+    if root is None:
+        raise torch.linalg.LinAlgError("the quadratic form of a flow is not positive definite")
+    return root
+
+
+def _band(mesh: Mesh) -> Band:
+    return Band(*(axis.knots for axis in mesh.axes))
+
+
+def in_single(band: Band, form: torch.Tensor) -> Factor | None:
+    """A factor in single precision, if there is one."""
+    try:
+        return band.factor(form.float())
+    except torch.linalg.LinAlgError:
+        return None
+
+
+def informative(linear: Linear) -> bool:
+    """Whether information and second derivative are alike: steps by either converge."""
+    return bool((linear.information >= _ALIKE * linear.weight).all())
+
+
+def prior_and_gradient(
+    linear: Linear, mesh: Mesh, coefficients: torch.Tensor, prior: Prior, ridge: float
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The prior's quadratic form with its ridge, and the gradient of the log-posterior."""
+    stiff = prior_form(prior)
+    with_diagonal(stiff, ridge)
+    band = _band(mesh)
+    gradient = mesh.transposed(linear.gradient) - band.apply(stiff, coefficients)
+    with_diagonal(stiff, rounding(stiff))
+    return stiff, gradient
+
+
+def data_form(linear: Linear, mesh: Mesh, cells: slice | None = None) -> torch.Tensor:
+    """Quadratic form of what the images tell, of all cells along z or of some (`band.form`)."""
+    return form_of_slopes(linear.information, linear.damped, mesh, cells)
+
+
+def curvature(linear: Linear, mesh: Mesh) -> torch.Tensor:
+    """The log-likelihood's quadratic form: steps with less than it would overshoot."""
+    return form_of_slopes(linear.weight, linear.damped, mesh)
+
+
+def form_of_slopes(
+    weight: torch.Tensor, slope: torch.Tensor, mesh: Mesh, cells: slice | None = None
+) -> torch.Tensor:
+    """That of sum(weight * (slope . flow)^2), slopes (2, z, y): both mixed parts are alike."""
+    z, y = slope
+    first, mixed, last = form(weight * torch.stack([z * z, z * y, y * y]), mesh, cells=cells)
+    return torch.stack([first, mixed, mixed, last]).unflatten(0, (2, 2))
+
+
+def prior_form(prior: Prior, cells: slice | None = None) -> torch.Tensor:
+    """The prior's quadratic form without its ridge, of all cells along z or of some."""
+    mesh = prior.mesh
+    rows = mesh.axes[0].knots if cells is None else cells.stop - cells.start + REACH
+    total = prior.local.new_zeros(2, 2, 2 * REACH + 1, rows, REACH + 1, mesh.axes[1].knots)
+    pairs: dict = {}
+    for kind, terms in enumerate(_kinds(prior)):
+        for a, first, one in terms:
+            for b, second, other in terms:
+                pairs.setdefault((first, second), []).append((kind, a, b, one * other))
+    weight = prior.cell * prior.strength
+    for orders, members in pairs.items():
+        parts = form(weight, mesh, *orders, cells)
+        for kind, a, b, scale in members:
+            total[a, b].add_(parts[kind], alpha=scale)
+    return total
+
+
+def variances(covariance: torch.Tensor, prior: Prior, cells: slice | None = None) -> torch.Tensor:
+    """Variance of each kind of motion (kinds, ...) on the prior's mesh, from a band's."""
+    return torch.stack(
+        [
+            sum(
+                one * other * spread(covariance[a, b], prior.mesh, first, second, cells)
+                for a, first, one in terms
+                for b, second, other in terms
+            )
+            for terms in _kinds(prior)
+        ]
+    )
+
+
+def with_diagonal(form: torch.Tensor, value: float) -> None:
+    """Add a number to the diagonal, as the ridge that keeps the variance of rigid motion finite."""
+    for a in (0, 1):
+        form[a, a, REACH, :, 0] += value
+
+
+def rounding(form: torch.Tensor) -> float:
+    """What keeps a quadratic form positive in spite of rounding; this only shortens the steps.
+
+    Noise-free images of a flow without any vorticity make the prior stronger than the ridge by
+    more than the floating-point precision.
+    """
+    return _ROUNDING * float(form.amax())
+
+
+def _kinds(prior: Prior) -> list[list[tuple[int, tuple[int, int], float]]]:
+    """Each kind's terms as (component, orders of its derivative along z and y, factor)."""
+    return [
+        [(a, (int(b == 0), int(b == 1)), scale) for a, b, scale in motion]
+        for _, motion in prior.motions
+    ]

@@ -1,0 +1,210 @@
+"""The flow in a volume, solved by conjugate gradients; posterior covariance from random draws.
+
+The matrix is never stored. Solutions for random right-hand sides whose covariance is the
+second derivative are flows drawn from the posterior (Papandreou & Yuille 2010, NIPS 23).
+"""
+
+from collections.abc import Callable, Sequence
+from itertools import combinations_with_replacement
+from typing import NamedTuple
+
+import torch
+
+from lidar_mi.retrieval.flow.flow_spline import Mesh, interpolated
+from lidar_mi.retrieval.flow.likelihood import Linear
+from lidar_mi.retrieval.flow.prior import Prior
+from lidar_mi.retrieval.flow.settings import VariationalSettings
+from lidar_mi.retrieval.images.windows import linear_weights, separable
+
+
+class Posterior(NamedTuple):
+    """A flow after a Gauss-Newton step, with the terms of its posterior.
+
+    Attributes
+    ----------
+    coefficients : torch.Tensor
+    bend : torch.Tensor, shape (components, components, *prior.mesh.shape)
+        The information of the volumes, lumped to the prior's mesh.
+    prior : Prior
+    rough : Prior
+        The same in the precision of the voxels, which is enough for draws.
+    settings : VariationalSettings
+    turn : int
+        Seeds the draws.
+    """
+
+    coefficients: torch.Tensor
+    bend: torch.Tensor
+    prior: Prior
+    rough: Prior
+    settings: VariationalSettings
+    turn: int
+
+    def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """By kind of motion: the variance removed by the images, and its square in the flow."""
+        solver = self.settings.solver
+        before, after = (
+            self.rough.by_kind(self.rough.rates(flows).square()).mean(0)
+            for flows in self._drawn(solver.draws, before=True)
+        )
+        energy = self.prior.by_kind(self.prior.rates(self.coefficients).square())
+        # added to both, as the draws have sampling noise
+        more = solver.damping * before
+        return (before - after).clamp(min=0) + more, energy + more
+
+    def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Of the flow (components, components, ...) at a mesh, after the images and before.
+
+        A mean over flows drawn and over the width of the prior, accurate to some 10 %. Before the
+        images it is infinite: the prior leaves rigid motion free.
+        """
+        (flows,) = self._drawn(self.settings.solver.final_draws, before=False)
+        flows = self.rough.mesh.field(flows).to(self.prior.local)
+        mean = self.prior.smooth((flows[:, :, None] * flows[:, None]).mean(0))
+        after = interpolated(mean, self.prior.mesh.places, [p.to(mean) for p in places])
+        return after, torch.full_like(after, torch.inf)
+
+    def _drawn(self, number: int, before: bool) -> list[torch.Tensor]:
+        """Flows (number, components, knots) drawn from the prior, if wanted, and the posterior.
+
+        Both from the same random numbers: they are equal where the volumes inform nothing.
+        """
+        prior, ridge = self.rough, self.settings.ridge
+        like = self.coefficients.to(prior.local)
+        draw = torch.Generator(device=like.device)
+        draw.manual_seed(self.settings.solver.seed + self.turn)
+
+        def normal(*shape):
+            return torch.randn(number, *shape, generator=draw, dtype=like.dtype, device=like.device)
+
+        # right-hand sides whose covariance is the second derivative
+        weights = prior.weights
+        right = prior.rates_transposed(weights.sqrt() * normal(*weights.shape))
+        right = right + ridge**0.5 * normal(*like.shape)
+        bend = self.bend.to(like)
+        flows = [self._flows(torch.zeros_like(bend), right)] if before else []
+        root = _root(bend)
+        right = right + prior.mesh.transposed(_times(root, normal(len(root), *prior.mesh.shape)))
+        return [*flows, self._flows(bend, right)]
+
+    def _flows(self, bend: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
+        mesh, ridge = self.rough.mesh, self.settings.ridge
+
+        def applied(c):
+            found = mesh.transposed(_times(bend, mesh.field(c)))
+            return found + _stiff(c, self.rough, ridge)
+
+        ready = _preconditioner(bend, self.rough, ridge)
+        solver = self.settings.solver
+        return conjugate_gradients(applied, right, ready, solver.loose, solver.steps)
+
+
+def solved(
+    linear: Linear,
+    mesh: Mesh,
+    coefficients: torch.Tensor,
+    prior: Prior,
+    settings: VariationalSettings,
+    turn: int,
+) -> Posterior:
+    """One Gauss-Newton step; the number `turn` seeds the flows drawn from the posterior."""
+    ridge, solver = settings.ridge, settings.solver
+    lumps = [
+        linear_weights(m.to(p), p).T for m, p in zip(prior.mesh.places, mesh.places, strict=True)
+    ]
+    # knots have the precision of the prior, which may be strong; voxels have their own
+    coefficients, voxels = coefficients.to(prior.local), linear.slope.dtype
+    dims = mesh.dims
+    bend = coefficients.new_empty(dims, dims, *prior.mesh.shape)
+    for a, b in combinations_with_replacement(range(dims), 2):
+        squares = linear.information * linear.slope[a] * linear.slope[b]
+        bend[a, b] = bend[b, a] = separable(squares, lumps)
+    steep = linear.weight * linear.slope
+
+    def applied(c):
+        along = (linear.slope * mesh.field(c.to(voxels))).sum(1, keepdim=True)
+        return mesh.transposed(along * steep).to(c) + _stiff(c, prior, ridge)
+
+    right = mesh.transposed(linear.gradient).to(bend)[None]
+    right = right - _stiff(coefficients[None], prior, ridge)
+    ready = _preconditioner(bend, prior, ridge)
+    (change,) = conjugate_gradients(applied, right, ready, solver.tolerance, solver.steps)
+    rough = prior.to(linear.slope)
+    return Posterior(coefficients + change, bend, prior, rough, settings, turn)
+
+
+def _times(matrix: torch.Tensor, flows: torch.Tensor) -> torch.Tensor:
+    """Matrices (components, components, ...) times flows (n, components, ...)."""
+    total = matrix[:, 0] * flows[:, None, 0]
+    for b in range(1, len(matrix)):
+        total.addcmul_(matrix[:, b], flows[:, None, b])
+    return total
+
+
+def _stiff(coefficients: torch.Tensor, prior: Prior, ridge: float) -> torch.Tensor:
+    """The prior's second derivative times coefficients (n, components, knots)."""
+    rates = prior.weights * prior.rates(coefficients)
+    return prior.rates_transposed(rates) + ridge * coefficients
+
+
+def _root(bend: torch.Tensor) -> torch.Tensor:
+    """A square root of positive semidefinite matrices (components, components, ...)."""
+    matrix = bend.movedim((0, 1), (-2, -1))
+    unit = torch.eye(len(bend), dtype=matrix.dtype, device=matrix.device)
+    floor = 1e-5 * matrix.diagonal(dim1=-2, dim2=-1).mean(-1) + 1e-20
+    root = torch.linalg.cholesky(matrix + floor[..., None, None] * unit)
+    return root.movedim((-2, -1), (0, 1)).contiguous()
+
+
+def _preconditioner(
+    bend: torch.Tensor, prior: Prior, ridge: float
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The inverse of each knot's diagonal block (components, components)."""
+    mesh = prior.mesh
+    dims = mesh.dims
+    bases = [[mesh.basis(axis, order).square().T for axis in range(dims)] for order in (0, 1)]
+
+    def diagonal(values, axis=None):
+        return separable(values, [bases[a == axis][a] for a in range(dims)])
+
+    block = diagonal(bend)
+    for weight, (_, motion) in zip(prior.weights, prior.motions, strict=True):
+        for a, b, scale in motion:
+            block[a, a] += diagonal(weight, b) * scale**2
+    for a in range(dims):
+        block[a, a] += ridge
+    inverse = torch.linalg.inv(block.movedim((0, 1), (-2, -1)).double()).to(bend)
+    inverse = inverse.movedim((-2, -1), (0, 1)).contiguous()
+    return lambda c: _times(inverse, c)
+
+
+def conjugate_gradients(
+    applied: Callable[[torch.Tensor], torch.Tensor],
+    right: torch.Tensor,
+    preconditioned: Callable[[torch.Tensor], torch.Tensor],
+    tolerance: float,
+    steps: int,
+) -> torch.Tensor:
+    """Solutions (n, ...) of a symmetric positive system for right-hand sides (n, ...)."""
+
+    def inner(a, b):
+        return (a * b).flatten(1).sum(1).reshape(-1, *[1] * (a.ndim - 1))
+
+    solution = torch.zeros_like(right)
+    residual = right
+    ahead = preconditioned(residual)
+    direction = ahead
+    energy = inner(residual, ahead)
+    goal = tolerance**2 * energy
+    for _ in range(steps):
+        forward = applied(direction)
+        # a system that is solved already takes no more steps
+        length = energy / inner(direction, forward).clamp(min=1e-30)
+        solution = solution + length * direction
+        residual = residual - length * forward
+        ahead = preconditioned(residual)
+        before, energy = energy, inner(residual, ahead)
+        if bool((energy <= goal).all()):
+            break
+        direction = ahead + energy / before.clamp(min=1e-30) * direction
+    return solution

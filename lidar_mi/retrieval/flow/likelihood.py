@@ -1,0 +1,306 @@
+"""Likelihood of a flow, linearised: images or volumes warped to mid-time, equal in brightness."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+
+from lidar_mi.retrieval.flow.flow_spline import Mesh
+from lidar_mi.retrieval.flow.settings import VariationalSettings
+from lidar_mi.retrieval.images.intensity import normalised, of_one_brightness, rms
+from lidar_mi.retrieval.images.noise_map import known_and_weight
+from lidar_mi.retrieval.images.quality import misfit_variance
+from lidar_mi.retrieval.images.spline import Spline, band_limited, filter_of, nearest
+from lidar_mi.retrieval.images.windows import averaged
+
+# Interpolation error of the splines over an image's rms structure: the least noise assumed.
+_INTERPOLATION = 1e-5
+# A noise that is given and below this fraction of that of the spectra (of the variances) is only a
+# lower limit: what differs are the air and what splines cannot interpolate.
+_SAYS_LITTLE = 0.1
+# Width of the means that tell texture from noise, in cells between knots: at 0.8 too few pixels,
+# at 3 the rim of smoke counts as texture beside it.
+_SHARE_WIDTH = 1.5
+# Standard deviation, px, of the Gaussian mean of slopes that are structure and not texture.
+_STRUCTURE = 3.0
+# Of the mean that passes the long waves in which structure moves alike over an area; and the
+# variance of its motion in the other waves over that in these. Chosen on seeds 41 to 43 of the
+# true second states of ``validation/coverage.py``: 0.8 to 1.5 px and 0.1 to 0.3 are alike.
+_LONG, _SHORT = 1.0, 0.17
+
+
+class Images(NamedTuple):
+    """The images that the flow is fitted to, and their noise.
+
+    Attributes
+    ----------
+    spline : Spline
+        Of the images, band-limited.
+    usable : torch.Tensor of bool, shape (images, ...)
+        Away from non-finite pixels.
+    time : torch.Tensor, shape (images,)
+        From mid-time, in units of dt.
+    noise : float
+        Standard deviation of the images' white noise.
+    weight : torch.Tensor, shape of an image
+        Inverse-variance weight: mean variance of the noise over its own at each pixel.
+    stack : torch.Tensor, shape (images, ...)
+        The images, of one brightness.
+    blur : float
+        Standard deviation of the Gaussian that blurred the images, px.
+    white : float
+        The noise before it contained the local misfit.
+    noise_updated : bool
+        Whether noise and weight contain the local misfit already.
+    through : float
+        Mean square displacement through the plane that the misfit tells of, px^2.
+    given : bool
+        Whether the noise is as given; else it is that of the images' spectra.
+    told : float
+        The noise that was given, a lower limit; 0 if none was.
+    coherent : float
+        Variance of the displacement by which structure as a whole moves otherwise than the air in
+        the plane, times the area over which it does so alike, px^4.
+    """
+
+    spline: Spline
+    usable: torch.Tensor
+    time: torch.Tensor
+    noise: float
+    weight: torch.Tensor
+    stack: torch.Tensor
+    blur: float
+    white: float
+    told: float
+    noise_updated: bool = False
+    through: float = 0.0
+    given: bool = True
+    coherent: float = 0.0
+
+    def single(self) -> "Images":
+        """The same to be warped in single precision: places to 1e-5 px."""
+        spline = self.spline._replace(coefficients=self.spline.coefficients.float())
+        return self._replace(spline=spline, time=self.time.float(), weight=self.weight.float())
+
+
+class Linear(NamedTuple):
+    """The log-likelihood linearised about a flow.
+
+    Attributes
+    ----------
+    slope : torch.Tensor, shape (components, ...)
+        Of the mean of the warped images.
+    damped : torch.Tensor, shape (components, ...)
+        The same without what is `coarse`: slopes that tell of the flow.
+    coarse : torch.Tensor, shape (z, y), or None
+        Fraction of the long waves of differences and slopes that is left out at each pixel, as
+        structure moves otherwise than the air there: what is left is as white as the noise.
+    gradient : torch.Tensor, shape (components, ...)
+        Of the log-likelihood with respect to the flow at each pixel.
+    weight : torch.Tensor
+        Of the products of slopes in the second derivative.
+    information : torch.Tensor
+        Of the same in what the images tell of the flow: slopes of noise tell nothing.
+    variance : float
+        Of the noise.
+    warped : torch.Tensor, shape (images, ...)
+        The images at mid-time, equal in brightness.
+    valid : torch.Tensor of bool
+        Where all of them are.
+    """
+
+    slope: torch.Tensor
+    damped: torch.Tensor
+    coarse: torch.Tensor | None
+    gradient: torch.Tensor
+    weight: torch.Tensor
+    information: torch.Tensor
+    variance: float
+    warped: torch.Tensor
+    valid: torch.Tensor
+
+
+def prepared(
+    stack: Sequence[torch.Tensor],
+    noise: float | torch.Tensor | None,
+    blur: float,
+    settings: VariationalSettings,
+) -> Images:
+    """The images, normalised and band-limited, with the noise as given or estimated."""
+    known_at, weight = known_and_weight(stack, noise, settings.noise_width)
+    images = normalised(stack)
+    told = 0.0 if noise is None else rms(noise)
+    of_spectra = filter_of(images, None, None, weight.sqrt(), blur, settings.filter).level
+    given = told**2 > _SAYS_LITTLE * of_spectra**2
+    spline, level = band_limited(
+        images,
+        told if given else of_spectra,
+        weight=weight.sqrt(),
+        blur=blur,
+        settings=settings.filter,
+    )
+    level = max(level, _INTERPOLATION * rms(images))
+    time = torch.arange(len(stack), dtype=weight.dtype, device=weight.device)
+    time = time - time.mean()
+    return Images(spline, known_at, time, level, weight, images, blur, level, told, given=given)
+
+
+def linearised(
+    images: Images, mesh: Mesh, coefficients: torch.Tensor, settings: VariationalSettings
+) -> Linear:
+    """The log-likelihood about a flow; `mesh` is that of the pixels."""
+    places = path(mesh, coefficients, images.time, settings.path_order)
+    return linearised_there(images, mesh, places, images.spline.sample(*places), settings)
+
+
+def linearised_there(
+    images: Images,
+    mesh: Mesh,
+    places: torch.Tensor,
+    sampled: Sequence[torch.Tensor],
+    settings: VariationalSettings,
+) -> Linear:
+    """`linearised`, with the images' values and slopes at the places of `path`."""
+    value, *slopes = sampled
+    valid = (nearest(images.usable, places) & images.spline.holds(*places)).all(0)
+    value, gain = of_one_brightness(value, images.weight * valid)
+    slope = torch.stack([(gain * part).mean(0) for part in slopes])
+    residual = (value - value.mean(0)) * images.weight.sqrt()
+    passed = max(images.spline.passed, 1e-6)
+    misfit = residual.square().sum(0)
+    # what no flow explains counts as noise: images are never taken to be better than they fit
+    variance = max(images.noise**2, 1e-30)
+    if not images.noise_updated:
+        variance = max(variance, misfit_variance(misfit[valid], len(value)) / passed)
+    off = (misfit / ((len(value) - 1) * passed * variance)).sqrt()
+    weight = images.weight * (settings.robust / off.clamp(min=settings.robust)) * valid
+    time = images.time.reshape(-1, *[1] * mesh.dims)
+    difference = (time * (value - value.mean(0))).sum(0)
+    informed = images.spline.efficiency * weight / variance
+    coarse, damped = None, slope
+    if images.coherent:
+        # long waves scatter by variance + coherent s^2 a pixel where structure has the slope s
+        steep = steepness_of_structure(slope, valid)
+        change = images.coherent * steep * images.weight / variance
+        informed = informed / (1 + _SHORT * change)
+        coarse = 1 - ((1 + _SHORT * change) / (1 + change)).sqrt()
+        damped = torch.stack([without_coarse(part, coarse, valid) for part in slope])
+        difference = without_coarse(difference, coarse, valid)
+    downhill = -difference * damped
+    second = images.time.square().sum() * informed
+    information = second / images.spline.excess
+    if mesh.dims == 2:
+        noise = misfit / ((len(value) - 1) * passed * variance)
+        share = _share_of_texture(images, slope, noise, valid, mesh)
+        information = second * share.square() * images.spline.excess
+    gradient = informed * downhill
+    return Linear(slope, damped, coarse, gradient, second, information, variance, value, valid)
+
+
+def steepness_of_structure(slope: torch.Tensor, valid: torch.Tensor) -> torch.Tensor:
+    """Squared slope (z, y) of what images (2, z, y) show coarsely, in a Gaussian mean of 3 px."""
+    structure = torch.stack([averaged(part, valid, _STRUCTURE) for part in slope])
+    return structure.square().sum(0)
+
+
+def without_coarse(
+    field: torch.Tensor, coarse: torch.Tensor | None, valid: torch.Tensor
+) -> torch.Tensor:
+    """A field (z, y) without a fraction of its long waves at each pixel, see `Linear.coarse`."""
+    return field if coarse is None else field - coarse * averaged(field, valid, _LONG)
+
+
+def told_by_first(
+    images: Images, mesh: Mesh, places: torch.Tensor, sampled: Sequence[torch.Tensor], number: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """What images in a plane will tell of a flow, as far as the first of them shows.
+
+    Parameters
+    ----------
+    images : Images
+        The first one, with the noise that is known of all.
+    mesh : Mesh
+        Of the pixels.
+    places : torch.Tensor, shape (2, number, z, y)
+        Of `path`, to all of the images.
+    sampled : sequence of torch.Tensor, shape (1, z, y)
+        Value and slopes of the first one there.
+    number : int
+        Of images.
+
+    Returns
+    -------
+    slope : torch.Tensor, shape (2, z, y)
+    information : torch.Tensor, shape (z, y)
+        As in `Linear`, of texture that all images show alike. Outliers are not known.
+    """
+    _, *slopes = sampled
+    # as of the image warped to mid-time: the means of all images' own slopes need no turning
+    turned = torch.gradient(places[:, 0], dim=(1, 2))
+    slope = torch.stack([(torch.cat(slopes) * along).sum(0) for along in turned])
+    valid = nearest(images.usable, places[:, :1])[0] & images.spline.holds(*places).all(0)
+    # one image has more noise than the mean of them
+    share = _share_of_texture(images, slope, None, valid, mesh, number)
+    informed = images.spline.efficiency * images.weight * valid / max(images.noise**2, 1e-30)
+    second = images.time.square().sum() * informed
+    return slope, second * share.square() * images.spline.excess
+
+
+def information_near(slope: torch.Tensor, information: torch.Tensor, mesh: Mesh) -> torch.Tensor:
+    """Information on both components about each pixel: the mean that the flow's splines see."""
+    told = information * slope.square().sum(0)
+    return averaged(told, torch.ones_like(told, dtype=torch.bool), _width(mesh))
+
+
+def _width(mesh: Mesh) -> float:
+    axis = mesh.axes[0]
+    return _SHARE_WIDTH * (axis.size - 1) / axis.cells
+
+
+def _share_of_texture(
+    images: Images,
+    slope: torch.Tensor,
+    noise: torch.Tensor | None,
+    valid: torch.Tensor,
+    mesh: Mesh,
+    more: float = 1.0,
+) -> torch.Tensor:
+    """Share of texture in the mean square of the slopes at each pixel of a plane, 0 to 1.
+
+    Noise has slopes too, and beside bright smoke there are no others. With slopes J = T + N of
+    texture and noise the differences of two images tell of the flow by T J, and scatter by
+    s^2 J^2. Their information on it is (T J)^2 / (s^2 J^2), on average the square of this share
+    times J^2 / s^2. Both mean squares are Gaussian means over 1.5 cells of the flow's splines.
+    Where the noise was not told, `noise`, the square of the misfit over that assumed, is its
+    upper limit: texture down to single pixels looks like noise in the spectrum. Slopes may have
+    `more` noise than those of the mean of two images.
+    """
+    width = _width(mesh)
+    power = averaged(slope.square().sum(0) * images.weight, valid, width)
+    noisy = more * images.spline.noisy_slopes
+    if noise is not None and not images.given:
+        noisy = noisy * averaged(noise, valid, width).clamp(max=1.0)
+    return (1 - noisy / power.clamp(min=1e-30)).clamp(min=0.0)
+
+
+def path(mesh: Mesh, coefficients: torch.Tensor, time: torch.Tensor, terms: int) -> torch.Tensor:
+    """Position at other times of the air at the pixels at mid-time, (components, images, ...), px.
+
+    Lie series x + sum t^k / k! (u . grad)^(k - 1) u for a steady wind: with six terms, where air
+    rotates by an angle a in t, the position error is a^7 / 5040 of the radius.
+    """
+    flow = mesh.field(coefficients)
+    time = time.reshape(-1, *[1] * mesh.dims)
+    term = flow
+    change = time * term[:, None]
+    for k in range(2, terms + 1):
+        if k == 2:
+            along = mesh.slopes(coefficients)
+        else:
+            along = torch.gradient(term, dim=tuple(range(1, term.ndim)))
+        term = sum(u * part for u, part in zip(flow, along, strict=True))
+        change = change + time**k / math.factorial(k) * term[:, None]
+    for axis, place in enumerate(mesh.places):
+        change[axis] += place.reshape(-1, *[1] * (mesh.dims - 1 - axis))
+    return change

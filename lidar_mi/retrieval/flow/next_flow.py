@@ -1,0 +1,354 @@
+"""The flow of the next slab of air: one step from the last one, with what was learnt there."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import torch
+
+from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
+from lidar_mi.retrieval.flow.band_cholesky import BandCholesky, spread_half
+from lidar_mi.retrieval.flow.direct import (
+    Posterior,
+    Pull,
+    factor_in_single,
+    form_of_slopes,
+    pull_of,
+    solved_in_single,
+)
+from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
+from lidar_mi.retrieval.flow.likelihood import (
+    Images,
+    Linear,
+    information_near,
+    linearised,
+    linearised_there,
+    path,
+    told_by_first,
+)
+from lidar_mi.retrieval.flow.prior import Prior
+from lidar_mi.retrieval.flow.settings import VariationalSettings
+from lidar_mi.retrieval.images.band_limit import Filter
+from lidar_mi.retrieval.images.displacement import Displacement
+from lidar_mi.retrieval.images.intensity import normalised
+from lidar_mi.retrieval.images.noise_map import known_and_weight
+from lidar_mi.retrieval.images.quality import informative, misfit_variance
+from lidar_mi.retrieval.images.spline import filtered_spline
+from lidar_mi.retrieval.images.windows import Windows
+
+# Largest step (px, of 99 in 100 pixels) after which the images are not warped again, and how often
+# they are at most.
+_SMALL, _ROUNDS = 0.2, 2
+# Factors by which the misfit and the prior's energy of the next flow may differ: beyond, what was
+# learnt does not hold.
+_MISFIT, _ENERGY = 1.5, 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Flow:
+    """A retrieved flow, and what the retrieval of the next images of such air may start from.
+
+    Attributes
+    ----------
+    coefficients : torch.Tensor, shape (2, knots z, knots y)
+        Displacement in dt, px.
+    prior : Prior
+        Of largest evidence in a retrieval from scratch.
+    energy : float
+        Of the flow then, in the prior's units.
+    before : torch.Tensor, shape (2, 2, *windows.count)
+        Covariance of the flow a priori, px^2.
+    besides : torch.Tensor, shape (2, 2, *windows.count)
+        Covariance besides the posterior's, px^2: of motion that the splines do not resolve
+        (`unresolved`), and by the prior's strength (`Prior.evened`).
+    images : Images
+        Their filter and noise.
+    local : torch.Tensor, shape (z, y)
+        Weight of each pixel by its misfit, over that by its noise as given.
+    misfit : float
+        Mean square of the residuals then, over that of the noise.
+    windows : Windows
+    settings : VariationalSettings
+    offset : (float, float)
+        Along z and y, px: how far what was learnt of places (the prior's strength, `before`,
+        `besides`, `local`) has moved since.
+    """
+
+    coefficients: torch.Tensor
+    prior: Prior
+    energy: float
+    before: torch.Tensor
+    besides: torch.Tensor
+    images: Images
+    local: torch.Tensor
+    misfit: float
+    windows: Windows
+    settings: VariationalSettings
+    offset: Sequence[float] = (0.0, 0.0)
+
+    def moved(
+        self, shift: Sequence[float], change: torch.Tensor, offset: Sequence[float] | None = None
+    ) -> "Flow":
+        """The flow expected where its structure has moved and changed.
+
+        Parameters
+        ----------
+        shift : (float, float)
+            Along z and y, px; edges continue beyond.
+        change : torch.Tensor, shape (2, z, y)
+            Of the flow after this shift, px in dt, as by a model of both.
+        offset : (float, float), optional
+            See `Flow`. Left out: the last one and the shift.
+        """
+        axes, like = self.prior.mesh.axes, self.coefficients
+        pixels = _of_pixels(axes, self.windows, like)
+        flow = Mesh(axes, _back(pixels.places, shift)).field(self.coefficients) + change.to(like)
+        if offset is None:
+            offset = [sum(pair) for pair in zip(self.offset, shift, strict=True)]
+        return replace(self, coefficients=pixels.fitted(flow), offset=offset)
+
+    def placed(self) -> "Flow":
+        """What was learnt of places, where it is now: interpolated once, however often it moved."""
+        if not any(self.offset):
+            return self
+        pixels, centres = (of(self.windows, self.coefficients) for of in (_pixels, _centres))
+        places = self.prior.mesh.places
+        strength = interpolated(self.prior.local.log(), places, _back(places, self.offset))
+        return replace(
+            self,
+            prior=self.prior._replace(local=strength.exp()),
+            before=interpolated(self.before, centres, _back(centres, self.offset)),
+            besides=interpolated(self.besides, centres, _back(centres, self.offset)),
+            local=interpolated(self.local, pixels, _back(pixels, self.offset)),
+            offset=(0.0, 0.0),
+        )
+
+
+def flow_of(
+    posterior: Posterior,
+    linear: Linear,
+    images: Images,
+    given: torch.Tensor,
+    before: torch.Tensor,
+    besides: torch.Tensor,
+    windows: Windows,
+    settings: VariationalSettings,
+) -> Flow:
+    """What the next retrieval may start from, after one from scratch.
+
+    `given` is the weight (z, y) by the noise as given; the other arguments are those of its end.
+    """
+    return Flow(
+        posterior.coefficients,
+        posterior.prior,
+        _energy(posterior.prior, posterior.coefficients),
+        before,
+        besides,
+        images,
+        images.weight / given,
+        _misfit(linear, torch.zeros_like(linear.slope), images),
+        windows,
+        settings,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Awaited:
+    """The next flow before its second image is there; see `awaited`.
+
+    Attributes
+    ----------
+    start, placed : Flow
+        As expected, and with what was learnt where it is now.
+    mesh : Mesh
+        Of the pixels, in single precision.
+    images : Images
+        Of the first image alone.
+    places : torch.Tensor, shape (2, images, z, y)
+        Of the air at the pixels at mid-time in both images, px.
+    first : tuple of torch.Tensor, shape (1, z, y)
+        Value and slopes of the first image there.
+    pull : Pull
+    root : BandCholesky
+        Factor of the precision of the flow, by the information that the first image shows.
+    covariance : torch.Tensor, shape (2, 2, *windows.count)
+        Of the flow by it, px^2.
+    information : torch.Tensor, shape (z, y)
+        On both components, see `information_near`.
+    """
+
+    start: Flow
+    placed: Flow
+    mesh: Mesh
+    images: Images
+    places: torch.Tensor
+    first: tuple[torch.Tensor, ...]
+    pull: Pull
+    root: BandCholesky
+    covariance: torch.Tensor
+    information: torch.Tensor
+
+
+def awaited(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None) -> Awaited:
+    """All of `next_flow` that concerns the first image and the expected flow alone."""
+    placed = start.placed()
+    images = _prepared(placed, first, noise)
+    axes = placed.prior.mesh.axes
+    mesh = _of_pixels(axes, start.windows, images.spline.coefficients)
+    places = path(mesh, start.coefficients.float(), images.time, start.settings.path_order)
+    sampled = images.spline.sample(*places[:, :1])
+    slope, told = told_by_first(images, mesh, places, sampled, len(images.time))
+    pull = pull_of(placed.prior, start.coefficients, start.settings.ridge)
+    root = factor_in_single(form_of_slopes(told, slope, mesh) + pull.whole)
+    # the recursion for the inverse damps rounding: 1e-5 in single precision
+    inverse = root.covariance().float()
+    at_centres = _of_centres(axes, start.windows, inverse)
+    covariance = spread_half(inverse, at_centres).to(start.coefficients)
+    near = information_near(slope, told, mesh)
+    return Awaited(start, placed, mesh, images, places, sampled, pull, root, covariance, near)
+
+
+def next_flow(
+    start: Flow | Awaited,
+    stack: Sequence[torch.Tensor],
+    noise: float | torch.Tensor | None,
+    min_correlation: float,
+) -> tuple[Displacement, Flow] | None:
+    """`variational.variational` near a flow; None where what was learnt before does not hold.
+
+    Filter, noise, weights and prior are those learnt from scratch; the errors follow the misfit.
+    Images are read in single precision: places to 1e-5 px.
+
+    Parameters
+    ----------
+    start : Flow or Awaited
+        The expected one, or what was made of it and of the first image before.
+    stack : sequence of torch.Tensor, shape (z, y)
+        Two images of the windows' size.
+    noise : float or torch.Tensor, optional
+    min_correlation : float
+        As `variational` takes them.
+    """
+    ready = start if isinstance(start, Awaited) else awaited(start, stack[0], noise)
+    start, placed, mesh = ready.start, ready.placed, ready.mesh
+    windows, settings, prior = start.windows, start.settings, placed.prior
+    images = _completed(ready.images, placed, stack, noise)
+    second = images.spline.only(1).sample(*ready.places[:, 1:])
+    sampled = [torch.cat(pair) for pair in zip(ready.first, second, strict=True)]
+    linear = linearised_there(images, mesh, ready.places, sampled, settings)
+    coefficients, pull = start.coefficients, ready.pull
+    for turn in range(_ROUNDS):
+        if turn:
+            linear = linearised(images, mesh, coefficients.float(), settings)
+            pull = pull.at(prior, coefficients)
+        after = solved_in_single(linear, mesh, coefficients, pull, ready.root)
+        step = mesh.field((after - coefficients).float())
+        coefficients = after
+        far = float(step.abs().flatten().kthvalue(int(0.99 * step.numel())).values)
+        if far < _SMALL:
+            break
+    worse = _misfit(linear, step, images) / start.misfit
+    more = _energy(prior, coefficients) / start.energy
+    if not (far < _SMALL and 1 / _MISFIT < worse < _MISFIT and 1 / _ENERGY < more < _ENERGY):
+        return None
+    at_centres = _of_centres(prior.mesh.axes, windows, coefficients)
+    covariance = worse * _as_informed(ready, linear)
+    d, score = at_centres.field(coefficients), agreement(linear, windows)
+    found = flagged(d, covariance, placed.before, score, stack, windows, min_correlation)
+    found = found._replace(covariance=covariance + placed.besides)
+    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
+    return found, replace(start, coefficients=coefficients)
+
+
+def _as_informed(ready: Awaited, linear: Linear) -> torch.Tensor:
+    """The covariance (2, 2, *windows.count) by the information of all images.
+
+    That by the first one, changed as the information near each window differs. With a fraction f of
+    the variance before that the images removed, and r times the information, it changes by
+    1 / (1 + f (r - 1)).
+    """
+    found, before, windows = ready.covariance, ready.placed.before, ready.start.windows
+    known = information_near(linear.damped, linear.information, ready.mesh)
+    ratio = (known / ready.information.clamp(min=1e-30)).to(found)
+    pixels, centres = _pixels(windows, found), _centres(windows, found)
+    ratio = interpolated(ratio, pixels, centres)
+    removed = 1 - found.diagonal().sum(-1) / before.diagonal().sum(-1)
+    return found / (1 + removed.clamp(0, 1) * (ratio - 1))
+
+
+def _of_pixels(axes: Sequence[Axis], windows: Windows, like: torch.Tensor) -> Mesh:
+    return _mesh(axes, windows, _pixels, like.dtype, like.device)
+
+
+def _of_centres(axes: Sequence[Axis], windows: Windows, like: torch.Tensor) -> Mesh:
+    return _mesh(axes, windows, _centres, like.dtype, like.device)
+
+
+@lru_cache(maxsize=8)
+def _mesh(axes: Sequence[Axis], windows: Windows, places: Callable, dtype, device) -> Mesh:
+    """Kept for the next slab: to make its splines takes longer than to use them."""
+    return Mesh(axes, places(windows, torch.empty(0, dtype=dtype, device=device)))
+
+
+def _pixels(windows: Windows, like: torch.Tensor) -> list[torch.Tensor]:
+    return [torch.arange(n).to(like) for n in windows.shape]
+
+
+def _centres(windows: Windows, like: torch.Tensor) -> list[torch.Tensor]:
+    return [windows.centres(axis).to(like) for axis in range(windows.dims)]
+
+
+def _back(places: Sequence[torch.Tensor], shift: Sequence[float]) -> list[torch.Tensor]:
+    """Where what is at places (px) now was before a shift, or the edge."""
+    return [
+        (axis - by).clamp(float(axis[0]), float(axis[-1]))
+        for axis, by in zip(places, shift, strict=True)
+    ]
+
+
+def _prepared(start: Flow, first: torch.Tensor, noise: float | torch.Tensor | None) -> Images:
+    """The first of new images with the filter and the noise of those before."""
+    known, weight = known_and_weight([first], noise, start.settings.noise_width)
+    pair = normalised([first])
+    return start.images._replace(
+        spline=filtered_spline(pair.nan_to_num(0.0).float(), _filter(start), start.settings.filter),
+        usable=known,
+        time=start.images.time.float(),
+        weight=(weight * start.local).float(),
+        stack=pair,
+    )
+
+
+def _completed(
+    images: Images, start: Flow, stack: Sequence[torch.Tensor], noise: float | torch.Tensor | None
+) -> Images:
+    """Both images, after `_prepared`."""
+    known = informative(stack)
+    if isinstance(noise, torch.Tensor) and noise.ndim:
+        known = known & informative([noise])
+    pair = normalised(stack)
+    second = pair[1:].nan_to_num(0.0).float()
+    both = images.spline.beside(filtered_spline(second, _filter(start), start.settings.filter))
+    return images._replace(spline=both, usable=known, stack=pair)
+
+
+def _filter(start: Flow) -> Filter:
+    """The filter that was learnt, in single precision."""
+    used, noise = start.images.spline, start.images.noise
+    return Filter(
+        used.gain.float(), noise, used.passed, used.excess, used.efficiency, used.noisy_slopes
+    )
+
+
+def _energy(prior: Prior, coefficients: torch.Tensor) -> float:
+    """Mean over all motions and places of their squares times the prior's strength."""
+    return float((prior.weights * prior.rates(coefficients).square()).mean())
+
+
+def _misfit(linear: Linear, step: torch.Tensor, images: Images) -> float:
+    """Mean square of the residuals after a step (2, z, y) in px, over that of the noise."""
+    along = (linear.slope * step.to(linear.slope)).sum(0)
+    rest = linear.warped + images.time.reshape(-1, 1, 1) * along
+    rest = (rest - rest.mean(0)) * images.weight.sqrt()
+    square = misfit_variance(rest.square().sum(0)[linear.valid].double(), len(rest))
+    return square / (max(images.spline.passed, 1e-6) * linear.variance)

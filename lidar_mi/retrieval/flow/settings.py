@@ -1,0 +1,181 @@
+"""Settings of the variational retrieval, frozen: each field with its unit and its source or effect.
+
+How much the errors change where a field is halved or doubled is in ``docs/accuracy.md``, measured
+by ``python -m benchmarks settings``.
+"""
+
+from dataclasses import dataclass, field
+
+from lidar_mi.retrieval.images.noise_map import MAP_WIDTH
+from lidar_mi.retrieval.images.settings import VOLUME_FILTER, FilterSettings
+
+
+@dataclass(frozen=True)
+class IterativeSettings:
+    """Conjugate gradients and flows drawn from the posterior (`iterative`).
+
+    Attributes
+    ----------
+    tolerance, loose : float
+        Residual over the first one at which iteration ends: for the flow, for a drawn one.
+    steps : int
+        Largest number of steps. Where the prior is strong, draws that end too early state too small
+        errors.
+    draws, final_draws : int
+        Flows drawn per round, and for the standard errors.
+    damping : float
+        Fraction of the prior's expected energy added to both sides of the fixed point against the
+        sampling noise of the draws: 0 is MacKay's step.
+    seed : int
+        Of the draws.
+    """
+
+    tolerance: float = 1e-2
+    loose: float = 1e-1
+    steps: int = 120
+    draws: int = 4
+    final_draws: int = 16
+    damping: float = 0.05
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class StripSettings:
+    """Strips of large images (`strips`); lengths in cells between knots.
+
+    Attributes
+    ----------
+    largest : int
+        Knots along z up to which images are solved at once, which is faster up to about 60.
+    core, overlap : int
+        Width of a strip and its overlap with each neighbour, for the prior's strength. The
+        variance of vorticity and divergence that the images remove is 2 to 3 % too large with an
+        overlap of 5, which changes flow and errors by up to 0.5 and 20 % of a standard error where
+        noise hides the texture; with 10 by 0.05 and 2 %.
+    final_core, final_overlap : int
+        The same for the standard errors, of which 1 in 100 is off by more than 5 %; in still air
+        they are too large by up to 24 %.
+    solved_core, solved_overlap : int
+        The same for the preconditioner.
+    at_once, solved_at_once : int
+        Strips that one thread works on together, for the prior's strength and the preconditioner.
+    tolerance : float
+        Residual over the first one at which conjugate gradients end: each round solves again.
+    loose : float
+        The same for random differences that are sent through the fit.
+    steps : int
+        Largest number of them.
+    coarse_cells : int
+        Largest number along each axis for the covariance before the images.
+    """
+
+    largest: int = 64
+    core: int = 12
+    overlap: int = 10
+    at_once: int = 1
+    final_core: int = 15
+    final_overlap: int = 12
+    solved_core: int = 14
+    solved_overlap: int = 4
+    solved_at_once: int = 4
+    tolerance: float = 1e-3
+    loose: float = 2e-2
+    steps: int = 200
+    coarse_cells: int = 24
+
+
+@dataclass(frozen=True)
+class VariationalSettings:
+    """Variational retrieval (`variational.variational`).
+
+    Attributes
+    ----------
+    knots : tuple of float
+        Spacing of the knots over the template on each level.
+    rounds : tuple of int
+        Rounds of flow and evidence on each level. In volumes further ones make the prior too
+        strong: it takes vorticity for white, and that of a wake has more of its variance in long
+        waves.
+    noise_round : int
+        Round of the last level before which noise is estimated from the misfit.
+    rounds_changed : int
+        Further rounds of the last level if structure moves through the plane (`change`), after a
+        second estimate of the noise: the first flow absorbed part of the misfit.
+    rounds_finer : int
+        Further rounds of the last level if the misfit takes the place of a noise that was not
+        given: the prior is then that of images with more noise.
+    robust : float
+        Standard deviations beyond which residuals enter linearly (Huber 1964, Ann. Math. Stat.
+        35, 73-101).
+    path_order : int
+        Terms of the path's series in time.
+    coloured : bool
+        Whether the misfit is resolved by wavenumber as well as by place. In a thin volume few
+        shells hold the texture, and in none can its misfit be separated from edge effects.
+    misfit_width, misfit_width_trusted : float
+        Standard deviation over the template of the Gaussian that averages the misfit; the second
+        one in images whose noise is given. Without noise the misfit varies as steeply as cores do.
+    noise_width : float
+        The same for a known noise map, px.
+    ridge : float
+        Precision of each coefficient in addition to the prior's, px^-2: negligible for
+        displacements of some px.
+    ratio : float
+        Initial strength of the divergence over the vorticity's; 100 is a standard deviation of
+        10 % of the vorticity's.
+    least_vorticity : float
+        Lower limit of the initial standard deviation of the vorticity, px per px, of volumes at
+        each place: a coarse flow may be rigid.
+    largest_ratio : float
+        Upper limit of the ratio, images only; 1e5 is 0.3 % of the standard deviation. Images of
+        weak texture without measurable divergence do not prove that there is none.
+    prior_width, prior_width_trusted : float
+        Standard deviation over the template within which the prior's strength varies little; the
+        second one in images whose noise is given. Wider, errors are smaller in steady noise, and
+        stated too large.
+    largest_change, largest_change_trusted, largest_change_divergence : float
+        Factor by which a strength may change per round; the second one in images whose noise is
+        given.
+    filter : FilterSettings
+    solver : IterativeSettings
+        Of volumes.
+    strips : StripSettings
+        Of large images; smaller ones are solved directly.
+    """
+
+    knots: tuple[float, ...] = (1.25, 0.5)
+    rounds: tuple[int, ...] = (6, 4)
+    noise_round: int = 2
+    rounds_changed: int = 2
+    rounds_finer: int = 5
+    robust: float = 3.0
+    path_order: int = 6
+    coloured: bool = True
+    misfit_width: float = 0.3
+    misfit_width_trusted: float = 0.75
+    noise_width: float = MAP_WIDTH
+    ridge: float = 1e-4
+    ratio: float = 100.0
+    least_vorticity: float = 1e-3
+    largest_ratio: float = 1e5
+    prior_width: float = 0.65
+    prior_width_trusted: float = 0.85
+    largest_change: float = 4.0
+    largest_change_trusted: float = 16.0
+    largest_change_divergence: float = 16.0
+    filter: FilterSettings = field(default_factory=FilterSettings)
+    solver: IterativeSettings = field(default_factory=IterativeSettings)
+    strips: StripSettings = field(default_factory=StripSettings)
+
+
+VOLUME_VARIATIONAL = VariationalSettings(
+    knots=(0.625,),
+    rounds=(7,),
+    noise_round=3,
+    coloured=False,
+    misfit_width=0.75,
+    least_vorticity=0.03,
+    prior_width=0.5,
+    filter=VOLUME_FILTER,
+)
+"""Of volumes: the flow of the multi-pass correlation makes a coarse level unnecessary."""

@@ -1,0 +1,224 @@
+"""The flow in a large plane, solved in overlapping strips: work in proportion to the pixels.
+
+Images inform the flow within a few knots. What a strip of the image says about its middle then
+hardly depends on what lies beyond the strip. Strips extend along y over the whole image.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import torch
+
+from lidar_mi.retrieval.flow.band import Band, spread
+from lidar_mi.retrieval.flow.block_banded import Factor
+from lidar_mi.retrieval.flow.direct import (
+    curvature,
+    data_form,
+    in_single,
+    informative,
+    prior_and_gradient,
+    prior_form,
+    rounding,
+    variances,
+    with_diagonal,
+)
+from lidar_mi.retrieval.flow.flow_spline import REACH, Axis, Mesh, halves
+from lidar_mi.retrieval.flow.iterative import conjugate_gradients
+from lidar_mi.retrieval.flow.likelihood import Linear
+from lidar_mi.retrieval.flow.prior import Prior
+from lidar_mi.retrieval.flow.settings import VariationalSettings
+from lidar_mi.retrieval.images.windows import separable
+from lidar_mi.retrieval.threads import mapped
+
+
+class Strip(NamedTuple):
+    """Cells along z that are solved at once, and those of them whose result counts."""
+
+    cells: slice
+    core: slice
+
+    @property
+    def knots(self) -> slice:
+        """Those that reach into the strip's cells."""
+        return slice(self.cells.start, self.cells.stop + REACH)
+
+    def of_core(self, covariance: torch.Tensor) -> torch.Tensor:
+        """The covariance (..., knot z, shift y, knot y) of the knots that reach into the core."""
+        first = self.cells.start
+        return covariance[..., self.core.start - first : self.core.stop - first + REACH, :, :]
+
+
+class Posterior(NamedTuple):
+    """A flow after a Gauss-Newton step, with the posterior's precision there.
+
+    `stiff` is the prior's part of it, `both` all of it: bands. `images` is the
+    likelihood that they are of, and its mesh. `response` gives the change of the coefficients by a
+    gradient (components, knots) of the log-likelihood, to `StripSettings.loose`.
+    """
+
+    coefficients: torch.Tensor
+    stiff: torch.Tensor
+    both: torch.Tensor
+    prior: Prior
+    images: tuple[Linear, Mesh]
+    settings: VariationalSettings
+    response: Callable[[torch.Tensor], torch.Tensor]
+
+    def evidence(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """By kind of motion: the variance removed by the images, and its square in the flow.
+
+        The variance removed is that in each strip alone.
+        """
+        prior, solver = self.prior, self.settings.strips
+
+        def informed(part: list[Strip]) -> torch.Tensor:
+            found = _covariances(torch.stack([self._alone(strip) for strip in part]))
+            return torch.cat(
+                [
+                    variances(s.of_core(before - after), prior, s.core)
+                    for s, (before, after) in zip(part, found, strict=True)
+                ],
+                1,
+            )
+
+        energy = prior.by_kind(prior.rates(self.coefficients).square())
+        cut = strips(prior.mesh.axes[0].cells, solver.core, solver.overlap)
+        return torch.cat(mapped(informed, _grouped(cut, solver.at_once)), 1), energy
+
+    def covariance(self, places: Sequence[torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Of the flow (components, components, ...) at a mesh, after the images and before.
+
+        After the images it is that of strips alone: too large by what lies beyond them, see
+        `StripSettings.final_overlap`. Before them it is that of coarser splines.
+        """
+        prior, solver = self.prior, self.settings.strips
+        mesh = Mesh(prior.mesh.axes, places)
+
+        def after(strip: Strip) -> torch.Tensor:
+            covariance = _covariances(self._alone(strip)[1])
+            return spread(strip.of_core(covariance), mesh, cells=strip.core)
+
+        cut = strips(mesh.axes[0].cells, solver.final_core, solver.final_overlap)
+        return torch.cat(mapped(after, cut), 2), _before(mesh, prior, self.settings)
+
+    def _alone(self, strip: Strip) -> torch.Tensor:
+        """The bands (2, ...) of prior and posterior as if image and prior ended with a strip."""
+        cells, last = strip.cells, self.prior.mesh.axes[0].cells
+        own = torch.stack([band[:, :, :, strip.knots] for band in (self.stiff, self.both)])
+        # splines at the strip's ends reach into three cells beyond
+        if cells.start:
+            beyond = self._of(slice(max(0, cells.start - REACH), cells.start))
+            own[..., :REACH, :, :] -= beyond[..., -REACH:, :, :]
+        if cells.stop < last:
+            beyond = self._of(slice(cells.stop, min(cells.stop + REACH, last)))
+            own[..., -REACH:, :, :] -= beyond[..., :REACH, :, :]
+        return own
+
+    def _of(self, cells: slice) -> torch.Tensor:
+        """The bands (2, ...) of prior and posterior of some cells."""
+        form = prior_form(self.prior, cells)
+        return torch.stack([form, form + data_form(*self.images, cells)])
+
+
+def strips(cells: int, core: int, overlap: int) -> list[Strip]:
+    """Strips of one width with cores of about so many cells, and this overlap or more."""
+    number = max(1, round((cells - 2 * overlap) / core))
+    width = min(cells, -(-(cells - 2 * overlap) // number) + 2 * overlap)
+    starts = [round(i * (cells - width) / max(1, number - 1)) for i in range(number)]
+    edges = [0, *(start + overlap for start in starts[1:]), cells]
+    return [
+        Strip(slice(start, start + width), slice(*edges[i : i + 2]))
+        for i, start in enumerate(starts)
+    ]
+
+
+def _grouped(cut: list[Strip], at_once: int) -> list[list[Strip]]:
+    """Strips that one thread works on at once."""
+    return [cut[i : i + at_once] for i in range(0, len(cut), at_once)]
+
+
+def _covariances(forms: torch.Tensor) -> torch.Tensor:
+    """The inverses within the band of the matrices of forms (..., 2, 2, 7, Z, 4, Y)."""
+    band = Band(forms.shape[-3], forms.shape[-1])
+    return band.covariance(band.factor(forms))
+
+
+def solved(
+    linear: Linear,
+    mesh: Mesh,
+    coefficients: torch.Tensor,
+    prior: Prior,
+    settings: VariationalSettings,
+    turn: int,
+) -> Posterior:
+    """One Gauss-Newton step; `turn` is for `iterative` only.
+
+    By conjugate gradients. The preconditioner is the sum of the strips' inverses, each with the
+    flow beyond it held (additive Schwarz method; Toselli & Widlund 2005, Domain Decomposition
+    Methods, chapter 2).
+    """
+    solver = settings.strips
+    whole = Band(*(axis.knots for axis in mesh.axes))
+    stiff, gradient = prior_and_gradient(linear, mesh, coefficients, prior, settings.ridge)
+    both = data_form(linear, mesh) + stiff
+    steep = both if informative(linear) else curvature(linear, mesh) + stiff
+    cut = strips(mesh.axes[0].cells, solver.solved_core, solver.solved_overlap)
+    some = _grouped(cut, solver.solved_at_once)
+    roots = mapped(lambda part: _root(steep, part), some)
+
+    def inverse(part: tuple[list[Strip], Factor], right: torch.Tensor) -> torch.Tensor:
+        members, root = part
+        band = Band(root.root.shape[-1] // 2, whole.columns)
+        right = torch.stack([right[:, s.knots] for s in members]).to(root.root)
+        return band.solve(root, right).to(coefficients)
+
+    def preconditioned(right: torch.Tensor) -> torch.Tensor:
+        total = torch.zeros_like(right)
+        found = mapped(lambda part: inverse(part, right[0]), list(zip(some, roots, strict=True)))
+        for members, parts in zip(some, found, strict=True):
+            for strip, part in zip(members, parts, strict=True):
+                total[0, :, strip.knots] += part
+        return total
+
+    def response(right: torch.Tensor, tolerance: float) -> torch.Tensor:
+        (change,) = conjugate_gradients(
+            lambda c: whole.apply(steep, c[0])[None],
+            right[None],
+            preconditioned,
+            tolerance,
+            solver.steps,
+        )
+        return change
+
+    change, loose = response(gradient, solver.tolerance), partial(response, tolerance=solver.loose)
+    return Posterior(coefficients + change, stiff, both, prior, (linear, mesh), settings, loose)
+
+
+def _root(both: torch.Tensor, part: list[Strip]) -> Factor:
+    """Factor of the matrices of some strips, in single precision if there is one."""
+    forms = torch.stack([both[:, :, :, strip.knots] for strip in part])
+    band = Band(forms.shape[-3], forms.shape[-1])
+    return in_single(band, forms) or band.factor(forms)
+
+
+def _before(mesh: Mesh, prior: Prior, settings: VariationalSettings) -> torch.Tensor:
+    """Covariance of the flow a priori, from splines on at most so many cells along each axis.
+
+    Its scales are those of the image.
+    """
+    most = settings.strips.coarse_cells
+    axes = [Axis(axis.size, max(axis.spacing, (axis.size - 1) / most)) for axis in mesh.axes]
+    coarse = halves(axes, prior.local)
+    means = []
+    for axis, fine, own in zip(axes, prior.mesh.places, coarse.places, strict=True):
+        number = (fine / (axis.size - 1) * 2 * axis.cells).floor().long()
+        member = (number == torch.arange(len(own), device=fine.device)[:, None]).to(fine)
+        means.append(member / member.sum(1, keepdim=True))
+    local = 1 / separable(1 / prior.local, means)
+    form = prior_form(prior._replace(local=local, mesh=coarse))
+    knots, fine = ([axis.knots for axis in m] for m in (axes, mesh.axes))
+    with_diagonal(form, settings.ridge * fine[0] * fine[1] / (knots[0] * knots[1]))
+    with_diagonal(form, rounding(form))
+    band = Band(*knots)
+    return spread(band.covariance(band.factor(form)), Mesh(axes, mesh.places))

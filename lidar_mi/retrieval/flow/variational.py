@@ -1,0 +1,257 @@
+"""Variational retrieval: the smooth flow that warps the images into one another, with its errors.
+
+The flow is a field of cubic B-splines, of images or of volumes. Its coefficients are the most
+probable ones given the images and a prior of concentrated vorticity and small divergence. The
+prior's strength, which varies over the image, is itself estimated from the images (evidence).
+"""
+
+from collections.abc import Callable, Sequence
+
+import torch
+
+from lidar_mi.retrieval.correlation.first_pass import Grid, first_pass
+from lidar_mi.retrieval.flow import direct, iterative, strips
+from lidar_mi.retrieval.flow.agreement import agreement, flagged, unskilled
+from lidar_mi.retrieval.flow.change import mean_square_strain
+from lidar_mi.retrieval.flow.coherent_change import what_is_left
+from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh, interpolated
+from lidar_mi.retrieval.flow.likelihood import linearised, prepared
+from lidar_mi.retrieval.flow.misfit import with_local_noise
+from lidar_mi.retrieval.flow.next_flow import Flow, flow_of
+from lidar_mi.retrieval.flow.prior import first_prior, refined
+from lidar_mi.retrieval.flow.settings import VOLUME_VARIATIONAL, VariationalSettings
+from lidar_mi.retrieval.flow.unresolved import made_by_noise, unresolved_variance, with_unresolved
+from lidar_mi.retrieval.images.displacement import Displacement
+from lidar_mi.retrieval.images.quality import SMALL, Flag, check_between, no_skill
+from lidar_mi.retrieval.images.windows import Windows, image_pair, working
+
+# Structure is assumed to move this many times as far otherwise than the air as was found, and the
+# flow may then change by this fraction of its spread. Smoke without texture, of the true second
+# states of `validation/coverage.py`: 0.19 to 0.7; with texture of 2 % or more: 0.05 at most.
+_FARTHER, _ALIKE = 10.0, 0.1
+# Variance over a vector's own by which the flow changes by chance if the prior's strength is made
+# more even (in the cases of ``validation/coverage.py`` with noise and texture it is 0.1 to 0.3),
+# and times that what is beyond it counts. Chosen on seeds 41 to 46 of these cases: errors of smoke
+# without texture have a variance of 1.34 of their standard errors (once, beyond 0.5: 1.54), others
+# change by 0.04 at most.
+_CHANCE, _COUNTS = 0.2, 2.0
+
+
+def variational(
+    image1: torch.Tensor,
+    image2: torch.Tensor,
+    template: int = 8,
+    search: int = 16,
+    stride: int = 1,
+    *,
+    more: Sequence[torch.Tensor] = (),
+    min_correlation: float = 0.5,
+    noise: float | torch.Tensor | None = None,
+    blur: float = 0.0,
+    spacing: Sequence[float] | None = None,
+    settings: VariationalSettings | None = None,
+) -> Displacement:
+    """Displacement of every window's centre in the most probable flow between the images.
+
+    Minimised over the flow u (displacement in dt) as B-splines is
+
+        sum_k sum_x (I_k(x + path(u, t_k)) - mean_k)^2 / (2 s^2)
+            + 1/2 integral L(x) vorticity^2 + divergence^2 / (1 / D + 1 / (q L(x))),
+
+    with the images band-limited (`warping.band_limited`) and warped to mid-time along the curved
+    paths of the flow, so that no texture has to be known; residuals beyond 3 s count linearly.
+    The prior's strength L(x), which may vary over about a template, D and q are those of the
+    largest evidence: the energy of vorticity and of divergence is as large as the prior
+    expects, of what the images inform (MacKay 1992, Neural Comput. 4, 415-447). So the flow is
+    smoothed little in cores and strongly around them. In volumes vorticity along x, across x and
+    divergence each have a strength L(x) (`prior.KINDS`). Solved by Gauss-Newton steps from a coarse
+    correlation, level by level of `settings.knots`: images directly (`direct`; large
+    ones in strips, `strips`), volumes by
+    conjugate gradients (`iterative`).
+
+    Parameters
+    ----------
+    image1, image2 : torch.Tensor, shape (z, y), or (x, z, y) of volumes
+        On one device, where the result stays too. Brightness may differ by a factor and an offset,
+        which are fitted again for every flow, from the air that is valid in all images.
+    template, search, stride : int
+        Pixels, see `windows.Windows`: the positions of the vectors, and the range of the first
+        correlation (see `multipass`); the template also sets the scale of the knots.
+    more : sequence of torch.Tensor
+        Further images, each dt after the one before. Mid-time is then that of the whole burst.
+    min_correlation : float
+        Vectors are flagged where the images warped to mid-time correlate over a template by less
+        than half way from this to 1: a flow fitted to unrelated textures correlates them to 0.7.
+    noise : float or torch.Tensor, optional
+        Standard deviation of the images' white noise, of each pixel or of all; left out: from the
+        images' spectra. Where images warped by the flow differ by more, their misfit is used.
+    blur : float
+        Standard deviation, px, of a Gaussian that the instrument blurred the images by. They are
+        then sharpened before they are warped, as far as noise allows: shear in cores rotates the
+        blur with the texture, which is an error of 25 % there for a blur of 1 px.
+    spacing : sequence of float, optional
+        Of the pixels along each axis, in any unit: vorticity and divergence are those in space.
+        Left out: square pixels.
+    settings : VariationalSettings, optional
+        Left out: those of images or of volumes.
+
+    Returns
+    -------
+    Displacement
+        Wind times dt at the windows' centres at mid-time. `score` is the smallest correlation of an
+        image with the mean of the others, `covariance` that of the posterior, from noise, misfit
+        and prior, and of motion finer than the splines (`unresolved`), half of it in vortex cores.
+        In images whose noise is given it knows how little is known of the distribution of the
+        prior's strength (`prior.Prior.evened`).
+        On undersampled images displacements have an error that is correlated among
+        neighbours: up to 0.04 px on particles of 2 px (1/e^2), 0.01 px of 2.5 px, none on larger
+        ones.
+
+    Raises
+    ------
+    InputError
+        Sizes, threshold or noise out of range; images that differ in size.
+    """
+    return variational_and_flow(
+        [image1, image2, *more],
+        Windows(tuple(image1.shape), template, search, stride),
+        min_correlation,
+        noise,
+        blur,
+        spacing,
+        settings,
+    )[0]
+
+
+def variational_and_flow(
+    stack: Sequence[torch.Tensor],
+    windows: Windows,
+    min_correlation: float = 0.5,
+    noise: float | torch.Tensor | None = None,
+    blur: float = 0.0,
+    spacing: Sequence[float] | None = None,
+    settings: VariationalSettings | None = None,
+    *,
+    keep: bool = False,
+) -> tuple[Displacement, Flow | None]:
+    """`variational`, and if asked what the retrieval of the next images may start from.
+
+    There is none for volumes, for images of more than `settings.strips.largest` knots, and for
+    images that do not determine the flow.
+    """
+    check_between("min_correlation", min_correlation, -1, 1)
+    for other in stack[1:]:
+        image_pair(stack[0], other, (2, 3))
+    if settings is None:
+        settings = VariationalSettings() if windows.dims == 2 else VOLUME_VARIATIONAL
+    images = prepared(stack, noise, blur, settings)
+    given, trusted = images.weight, images.given and windows.dims == 2
+    like = images.spline.coefficients[:0]
+    pixels = [torch.arange(n).to(like) for n in windows.shape]
+    flow, _ = first_pass(stack, images.spline, windows, Grid(windows.shape, 0.0, like))
+    last, prior, displaced_only, posterior = len(settings.knots) - 1, None, flow, None
+    width = settings.misfit_width_trusted if trusted else settings.misfit_width
+    width *= windows.template
+    for level, (knots, rounds) in enumerate(zip(settings.knots, settings.rounds, strict=True)):
+        apart = max(2.0, knots * windows.template)
+        axes = [Axis(n, apart) for n in windows.shape]
+        mesh, single = Mesh(axes, pixels), Mesh(axes, [place.float() for place in pixels])
+        solve = _solver(axes, settings)
+        coefficients = mesh.fitted(flow)
+        if prior is None:
+            unit = (1.0,) * windows.dims
+            wide = settings.prior_width_trusted if trusted else settings.prior_width
+            wide *= windows.template
+            prior = first_prior(axes, working(coefficients), wide, spacing or unit, settings)
+        else:
+            prior = refined(prior, axes)
+        rough, turn = images.single(), 0
+        while turn < rounds + settings.rounds_changed * (images.through > 0):
+            if level == last and turn in (settings.noise_round, rounds):
+                linear = linearised(images, mesh, coefficients, settings)
+                displaced_only = displaced_only if turn == rounds else mesh.field(coefficients)
+                left, strain = None, 0.0
+                if windows.dims == 2 and posterior is not None:
+                    left = what_is_left(linear, mesh, posterior.response)
+                    strain = mean_square_strain(mesh.slopes(coefficients))
+                white = images.white
+                images = with_local_noise(
+                    images, linear, width, settings.coloured, apart, strain, left
+                )
+                # flow and prior so far are those of a noise that was far too large
+                if turn == settings.noise_round and images.white < white:
+                    rounds += settings.rounds_finer
+                rough = images.single()
+            linear = linearised(rough, single, coefficients.float(), settings)
+            posterior = solve(linear, single, coefficients, prior, settings, turn)
+            coefficients = posterior.coefficients.to(like)
+            # the first flow on coarse knots is too far off to estimate the prior from
+            if turn or level:
+                prior = prior.updated(*posterior.evidence(), settings, trusted)
+            turn += 1
+        flow = mesh.field(coefficients)
+    linear = linearised(images, mesh, coefficients, settings)
+    posterior = solve(linear, mesh, coefficients, prior, settings, settings.rounds[-1])
+    evened = posterior
+    if trusted:
+        evened = solve(linear, mesh, coefficients, prior.evened(), settings, settings.rounds[-1])
+    flow = mesh.field(posterior.coefficients.to(like))
+    # a flow that depends on how much is assumed to move otherwise is not in the images
+    undetermined = images.through > 0 and _differ(flow, displaced_only, 1.0)
+    if images.coherent and not undetermined:
+        farther = images._replace(coherent=_FARTHER**2 * images.coherent)
+        there = linearised(farther, mesh, posterior.coefficients.to(like), settings)
+        other = solve(there, mesh, posterior.coefficients, prior, settings, settings.rounds[-1])
+        undetermined = _differ(flow, mesh.field(other.coefficients.to(like)), _ALIKE)
+    centres = [windows.centres(axis).to(like) for axis in range(windows.dims)]
+    at_centres = Mesh(mesh.axes, centres)
+    d = at_centres.field(posterior.coefficients.to(like))
+    covariance, before = posterior.covariance(centres)
+    score = agreement(linear, windows)
+    found = flagged(d, covariance, before, score, stack, windows, min_correlation)
+    known = (found.flag == 0) & ~no_skill(d, covariance)
+    known = interpolated(known.to(like), centres, pixels) > 0.5
+    # where the noise is not given, little is known of what it makes; in strips and in volumes a
+    # draw takes as long as a step to the flow, and changes errors by 1 %
+    drawn = trusted and isinstance(posterior, direct.Posterior)
+    of_noise = made_by_noise(linear, mesh, posterior.response) if drawn else None
+    finer = unresolved_variance(flow, apart, known, of_noise)
+    finer = interpolated(finer, pixels, centres)
+    # neither what the splines do not resolve nor the prior's strength is in the posterior
+    off = at_centres.field((evened.coefficients - posterior.coefficients).to(like))
+    besides = with_unresolved(_beyond_chance(off.to(covariance), covariance), finer)
+    found = found._replace(covariance=covariance + besides)
+    if windows.dims > 2:
+        return found, None
+    found = found._replace(flag=found.flag | unskilled(found.d, found.covariance))
+    if undetermined:
+        found = found._replace(flag=found.flag | Flag.NO_SKILL.value)
+    if undetermined or not (keep and isinstance(posterior, direct.Posterior)):
+        return found, None
+    return found, flow_of(posterior, linear, images, given, before, besides, windows, settings)
+
+
+def _beyond_chance(off: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+    """Covariance of a flow's change (components, ...) where it is more than noise makes of it."""
+    square = off.square().sum(0)
+    chance = _CHANCE * covariance.diagonal().sum(-1)
+    share = _COUNTS * ((square - chance) / square.clamp(min=1e-30)).clamp(min=0.0)
+    return share * off[:, None] * off
+
+
+def _differ(flow: torch.Tensor, other: torch.Tensor, fraction: float) -> bool:
+    """Whether two flows (2, z, y) differ by more than a fraction of the first one's spread, rms.
+
+    And by more than what is small for any wind: uniform wind has no spread.
+    """
+    about = flow - flow.mean((1, 2), keepdim=True)
+    limit = max(fraction**2 * float(about.square().mean()), SMALL**2)
+    return float((other - flow).square().mean()) > limit
+
+
+def _solver(
+    axes: Sequence[Axis], settings: VariationalSettings
+) -> Callable[..., direct.Posterior | strips.Posterior | iterative.Posterior]:
+    if len(axes) > 2:
+        return iterative.solved
+    return direct.solved if axes[0].knots <= settings.strips.largest else strips.solved

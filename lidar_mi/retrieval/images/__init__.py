@@ -1,0 +1,1 @@
+"""Images and volumes before their motion is known."""

@@ -1,0 +1,85 @@
+"""Values for pixels that are not known, for filters alone: the smoothest ones."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy import sparse
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse.linalg import spsolve
+
+from lidar_mi.retrieval.images.common_grid import nearest_filled
+
+# Px from the known ones up to which values are smooth: what a filter reaches. Further on they are
+# those of the nearest pixel.
+_REACH = 8.0
+# Squared first over squared second differences: slopes fade over 3 px.
+_TENSION = 0.1
+
+
+def inpainted(values: np.ndarray) -> np.ndarray:
+    """Values with smooth ones in place of those that are not finite.
+
+    These minimise the sum of the squared second differences along the axes and, so that slopes do
+    not go on for long, of a tenth of the squared first ones: a thin plate under tension (Smith &
+    Wessel 1990, Geophysics 55, 293-305). Steps to any constant would be structure at rest. Beyond
+    8 px from the known ones they are constant.
+
+    Parameters
+    ----------
+    values : ndarray
+        Of any number of axes; somewhere finite.
+    """
+    missing = ~np.isfinite(values)
+    distance, nearest = distance_transform_edt(missing, return_indices=True)
+    found = values[tuple(nearest)]
+    unknown = missing & (distance <= _REACH)
+    number = np.full(values.shape, -1)
+    number[unknown] = np.arange(np.count_nonzero(unknown))
+    matrices, rights = [], []
+    for axis in range(values.ndim):
+        along, known = np.moveaxis(number, axis, 0), np.moveaxis(found, axis, 0)
+        for stencil in (np.array([1.0, -2.0, 1.0]), np.sqrt(_TENSION) * np.array([-1.0, 1.0])):
+            length = along.shape[0] - len(stencil) + 1
+            if length < 1:
+                continue
+            parts = [along[k : k + length] for k in range(len(stencil))]
+            use = np.any([part >= 0 for part in parts], 0)
+            rows = np.arange(np.count_nonzero(use))
+            right, entries = np.zeros(len(rows)), []
+            for k, (part, weight) in enumerate(zip(parts, stencil, strict=True)):
+                column = part[use]
+                inside = column >= 0
+                entries.append((np.full(inside.sum(), weight), rows[inside], column[inside]))
+                right -= weight * np.where(inside, 0.0, known[k : k + length][use])
+            data, row, column = (np.concatenate(parts) for parts in zip(*entries, strict=True))
+            shape = len(rows), np.count_nonzero(unknown)
+            matrices.append(sparse.csr_matrix((data, (row, column)), shape=shape))
+            rights.append(right)
+    matrix, right = sparse.vstack(matrices).tocsr(), np.concatenate(rights)
+    found = found.astype(float, copy=True)
+    found[unknown] = spsolve((matrix.T @ matrix).tocsc(), matrix.T @ right)
+    return found
+
+
+def filled_in(image: torch.Tensor, pixels: torch.Tensor | None = None) -> torch.Tensor:
+    """An image `inpainted`, all of it or only where some pixels are.
+
+    As it is if it is finite all over, or nowhere.
+    """
+    smooth = _of_known(image, inpainted)
+    return smooth if pixels is None else torch.where(pixels, smooth, image)
+
+
+def nearest_in(image: torch.Tensor) -> torch.Tensor:
+    """An image with the value of the nearest finite pixel where one is not."""
+    return _of_known(image, nearest_filled)
+
+
+def _of_known(image: torch.Tensor, fill: Callable[[np.ndarray], np.ndarray]) -> torch.Tensor:
+    finite = torch.isfinite(image)
+    if bool(finite.all()):
+        return image
+    if not bool(finite.any()):
+        return torch.zeros_like(image)
+    return torch.as_tensor(fill(image.cpu().numpy())).to(image)

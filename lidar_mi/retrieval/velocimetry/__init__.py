@@ -1,1 +1,0 @@
-"""Displacement and wind from images or volumes."""

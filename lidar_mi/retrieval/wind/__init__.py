@@ -1,0 +1,1 @@
+"""What users call: winds of pairs, series, slabs and volumes."""

@@ -1,0 +1,205 @@
+"""From many images to the wind in time: pair by pair, one CF data set out."""
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.arguments import checked_arguments
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.checks import positive
+from lidar_mi.retrieval.images.common_grid import all_on_one_grid
+from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.wind.pair import retrieve_wind
+
+_PER_PAIR = "identical_images", "fixed_pattern", "illumination"
+"""Attributes of a wind that are remarks on its images."""
+
+
+@checked_arguments
+def retrieve_winds(
+    images: Sequence[xr.DataArray],
+    dt: float | Sequence[float],
+    pairs: Sequence[tuple[int, int]] | None = None,
+    *,
+    noise: float | Sequence[float | xr.DataArray | None] | None = None,
+    beam_times: Sequence[xr.DataArray] | None = None,
+    notice: Callable | None = None,
+    **options: Any,
+) -> xr.Dataset:
+    """Wind in the image plane from each pair of a sequence of images.
+
+    Parameters
+    ----------
+    images : sequence of xr.DataArray, dims (z, y)
+        In the order of their times, of one size. Images on different grids are resampled onto one,
+        which covers what all of them cover (`on_one_grid`).
+    dt : float or sequence of float
+        Time from each image to the next, s: one for all, or one for each step.
+    pairs : sequence of (int, int), optional
+        Which images make a pair, from 0, the earlier first. Default: each with the next.
+    noise : float, or sequence of float, xr.DataArray or None, optional
+        Standard deviation of the noise, as of `retrieve_wind`: one for all images, or one an image.
+    beam_times : sequence of xr.DataArray, optional
+        When each pixel of each image was seen, as ``times`` of `retrieve_wind`.
+    notice : callable, optional
+        Called with a text and the fraction done (0 to 1) before each pair.
+    **options
+        Further arguments of `retrieve_wind`, the same for all pairs: ``method``, ``template``,
+        ``stride`` and so on.
+
+    Returns
+    -------
+    xr.Dataset, dims (time, z, y)
+        Variables of `retrieve_wind`, of which ``time`` is called ``vector_time``. ``time`` (s)
+        is the middle of a pair's two reference times. All times are from the first image's
+        reference time. ``first_image``, ``second_image``, ``dt`` (s) and ``remark`` belong to a
+        pair. A pair from which no wind can be retrieved has no values (NaN, flag "no_match");
+        its remark says why.
+
+    Raises
+    ------
+    InputError
+        Fewer than two images, a pair that is none, arguments that no pair can be retrieved with.
+
+    Examples
+    --------
+    Air that moves by two pixels of 0.5 m along y in 0.1 s, and by three in the next:
+
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from scipy.ndimage import gaussian_filter
+    >>> air = 1 + gaussian_filter(np.random.default_rng(1).normal(size=(32, 54)), 1.5)
+    >>> axes = {d: (d, 0.5 * np.arange(n), {"units": "m"}) for d, n in (("z", 32), ("y", 48))}
+    >>> images = [xr.DataArray(air[:, k : k + 48], axes, ("z", "y")) for k in (5, 3, 0)]
+    >>> winds = lm.retrieve_winds(images, dt=0.1)
+    >>> winds["time"].values.round(2).tolist()
+    [0.05, 0.15]
+    >>> [f"{speed:.0f}" for speed in winds["v"].median(("z", "y")).values]
+    ['10', '15']
+    """
+    chosen = _checked_pairs(pairs, len(images))
+    times = _reference_times(dt, len(images))
+    if "more" in options or "times" in options:
+        raise InputError("more, times: not allowed in a series of pairs; expected beam_times")
+    if beam_times is not None and len(beam_times) != len(images):
+        raise InputError(
+            f"beam_times: {len(beam_times)} are not allowed; expected {len(images)}, one an image"
+        )
+    levels = list(noise) if isinstance(noise, list | tuple) else [noise] * len(images)
+    if len(levels) != len(images):
+        raise InputError(
+            f"noise: {len(levels)} are not allowed; expected one, or {len(images)}, one an image"
+        )
+    shared = all_on_one_grid(images)
+    seen = None if beam_times is None else all_on_one_grid(beam_times)
+    if any(one is not other for one, other in zip(shared, images, strict=True)):
+        # noise cannot be interpolated: its median is used
+        levels = [float(n.median()) if isinstance(n, xr.DataArray) else n for n in levels]
+    found: list[xr.Dataset | InputError] = []
+    for number, (first, second) in enumerate(chosen):
+        if notice is not None:
+            notice(f"images {first}-{second}", number / len(chosen))
+        when = None if seen is None else [seen[first], seen[second]]
+        step = times[second] - times[first]
+        try:
+            wind = retrieve_wind(
+                shared[first], shared[second], step, times=when, noise=levels[first], **options
+            )
+            found.append(wind)
+        except InputError as error:
+            found.append(error)
+    winds = [wind for wind in found if isinstance(wind, xr.Dataset)]
+    if not winds:
+        raise InputError(f"images {chosen[0][0]}-{chosen[0][1]}: {found[0]}")
+    whole = xr.concat(
+        [_of_pair(wind, winds[0], times[a]) for (a, _), wind in zip(chosen, found, strict=True)],
+        "time",
+        combine_attrs="drop_conflicts",
+        # also where all pairs have theirs at the windows' centres
+        coords=["y_vector", "z_vector"],
+        compat="equals",
+    )
+    return whole.assign_attrs(
+        title="Wind in the image plane from pairs of a sequence"
+    ).assign_coords(
+        time=("time", [(times[a] + times[b]) / 2 for a, b in chosen], _about("middle of the pair")),
+        first_image=("time", [a for a, _ in chosen], {"long_name": "earlier image, from 0"}),
+        second_image=("time", [b for _, b in chosen], {"long_name": "later image, from 0"}),
+        dt=(
+            "time",
+            [times[b] - times[a] for a, b in chosen],
+            {"long_name": "time between the images", "units": "s"},
+        ),
+        remark=("time", [_remark(wind) for wind in found], {"long_name": "remark on the images"}),
+    )
+
+
+def _checked_pairs(pairs: Sequence[tuple[int, int]] | None, count: int) -> list[tuple[int, int]]:
+    """The pairs asked for, each of them within the sequence and in order."""
+    if count < 2:
+        raise InputError(f"images: {count} are not allowed; expected two or more")
+    chosen = list(pairwise(range(count))) if pairs is None else list(pairs)
+    if not chosen:
+        raise InputError("pairs: none given; expected one or more")
+    for first, second in chosen:
+        if not 0 <= first < second < count:
+            raise InputError(
+                f"pairs: {first}-{second} is not allowed; expected two of the images 0 to "
+                f"{count - 1}, the earlier first"
+            )
+    return [(int(first), int(second)) for first, second in chosen]
+
+
+def _reference_times(dt: float | Sequence[float], count: int) -> list[float]:
+    """Of each image from the first, s."""
+    steps = list(dt) if isinstance(dt, list | tuple) else [dt] * (count - 1)
+    if len(steps) != count - 1:
+        raise InputError(
+            f"dt: {len(steps)} steps are not allowed with {count} images; expected one, or "
+            f"{count - 1}"
+        )
+    whole = np.cumsum([0.0, *(positive("dt", step) for step in steps)])
+    # sums of steps such as 0.1 s carry no digits of rounding
+    return [float(f"{time:.12g}") for time in whole]
+
+
+def _about(what: str) -> dict[str, str]:
+    return {"long_name": f"{what}, from the first image's reference time", "units": "s"}
+
+
+def _of_pair(found: xr.Dataset | InputError, like: xr.Dataset, start: float) -> xr.Dataset:
+    """A pair's wind with times from the first image; without values where there is none."""
+    wind = found if isinstance(found, xr.Dataset) else _nothing(like)
+    wind = (
+        wind.rename(time="vector_time")
+        .drop_attrs(deep=False)
+        .assign_attrs(
+            {name: value for name, value in wind.attrs.items() if name not in (*_PER_PAIR, "dt")}
+        )
+    )
+    later = wind["vector_time"].astype(float) + start
+    return wind.assign(vector_time=later.assign_attrs(_about("mid-time of the vector")))
+
+
+def _nothing(like: xr.Dataset) -> xr.Dataset:
+    """A wind without a vector on the grid of another."""
+    empty = {
+        name: xr.full_like(values, Flag.NO_MATCH.value if name == "flag" else np.nan)
+        for name, values in like.data_vars.items()
+    }
+    at_rest = {f"{axis}_vector": like[axis].broadcast_like(like["v"]) for axis in ("y", "z")}
+    places = {
+        name: like[name].copy(data=values.transpose(*like[name].dims).astype(like[name].dtype))
+        for name, values in at_rest.items()
+    }
+    return like.assign(empty).assign_coords(places)
+
+
+def _remark(found: xr.Dataset | InputError) -> str:
+    if isinstance(found, InputError):
+        return str(found)
+    return ", ".join(str(found.attrs[name]) for name in _PER_PAIR if name in found.attrs)

@@ -1,0 +1,204 @@
+"""From two volumes to the wind in three dimensions: one call, CF data set out."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+
+import torch
+import xarray as xr
+
+from lidar_mi.arguments import checked_arguments
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance, enough_windows
+from lidar_mi.retrieval.correlation.multipass import multipass
+from lidar_mi.retrieval.correlation.outliers import median_outliers
+from lidar_mi.retrieval.correlation.settings import MultipassSettings
+from lidar_mi.retrieval.defects.rest import all_at_rest
+from lidar_mi.retrieval.defects.unrelated import unrelated
+from lidar_mi.retrieval.flow.settings import VariationalSettings
+from lidar_mi.retrieval.flow.variational import variational
+from lidar_mi.retrieval.images.dataset import centres, dataset, field, flags, spacing, winds
+from lidar_mi.retrieval.images.displacement import Displacement
+from lidar_mi.retrieval.images.quality import Flag, check_between, of_bootstrap, uncertain
+from lidar_mi.retrieval.images.windows import Windows, working
+
+AXES = ("x", "z", "y")
+
+METHODS: Mapping[str, Callable[..., Displacement]] = {
+    "correlation": multipass,
+    "variational": variational,
+}
+"""Methods by name."""
+
+
+@checked_arguments
+def retrieve_wind_volume(
+    volume1: xr.DataArray,
+    volume2: xr.DataArray,
+    dt: float,
+    method: str = "variational",
+    template: int = 8,
+    search: int = 16,
+    stride: int = 4,
+    device: str | torch.device = "cpu",
+    *,
+    more: Sequence[xr.DataArray] = (),
+    min_correlation: float = 0.5,
+    noise: float | xr.DataArray | None = None,
+    settings: MultipassSettings | VariationalSettings | None = None,
+) -> xr.Dataset:
+    """Wind in three dimensions from two volumes of the same air, dt apart.
+
+    Parameters
+    ----------
+    volume1, volume2 : xr.DataArray, dims (x, z, y)
+        On one grid: coordinates in metres (`units` attribute), ascending and uniform, spacings may
+        differ from axis to axis; positive in the mean. Brightness may differ by a factor and by a
+        decay along x. Non-finite voxels are left out.
+    dt : float
+        Time from volume to volume, s.
+    method : {"correlation", "variational"}
+        Correlation of deformed windows (`multipass.multipass`), or a smooth flow fitted to the
+        volumes as a whole (`variational.variational`).
+    template, search, stride : int
+        Voxels: windows of template^3 (>= 4), displacements up to (search - template) / 2 in each
+        direction, a vector every `stride`.
+    device : str or torch.device
+        Where to compute.
+    more : sequence of xr.DataArray
+        Further volumes, each dt after the one before ("variational" only).
+    min_correlation : float
+        Flag vectors whose volumes, warped to mid-time, correlate less over a window (variational:
+        by less than half way from this to 1).
+    noise : float or xr.DataArray, optional
+        Standard deviation of a voxel's noise in volume 1, in its unit. Left out: from the spectra.
+    settings : MultipassSettings or VariationalSettings, optional
+        Of "correlation" or "variational", see `settings`. Left out: the defaults of volumes.
+
+    Returns
+    -------
+    xr.Dataset, dims (x, z, y)
+        At the windows' centres at mid-time: `u`, `v`, `w` and `u_stderr`, `v_stderr`, `w_stderr`
+        (m s-1), `uv_correlation`, `uw_correlation`, `vw_correlation` of their errors,
+        `correlation`, `flag` (bits of `quality.Flag`, 0 = valid; low texture means a standard error
+        beyond half a voxel in some direction). Those of "correlation" are from `bootstrap` where
+        there are enough windows. Rejected vectors keep their value, or NaN where
+        there is none.
+
+    Raises
+    ------
+    InputError
+        Volumes on different or unsuitable grids, thinner than a template, not bright; a parameter
+        out of its range.
+
+    Examples
+    --------
+    Air that moves by a voxel of 0.5 m along y in 0.1 s:
+
+    >>> import lidar_mi as lm
+    >>> import numpy as np
+    >>> import xarray as xr
+    >>> from scipy.ndimage import gaussian_filter
+    >>> air = 2 + gaussian_filter(np.random.default_rng(1).normal(size=(18, 18, 19)), 1.5)
+    >>> axes = {d: (d, 0.5 * np.arange(18), {"units": "m"}) for d in "xzy"}
+    >>> volume1, volume2 = (xr.DataArray(air[..., k : k + 18], axes, tuple("xzy")) for k in (1, 0))
+    >>> wind = lm.retrieve_wind_volume(volume1, volume2, dt=0.1, method="correlation")
+    >>> abs(float(wind["v"].median()) - 5) < 0.3
+    True
+    """
+    if method not in METHODS:
+        raise InputError(f"method: {method!r} is not one of {', '.join(METHODS)}")
+    if more and method != "variational":
+        raise InputError(f"more: {len(more)} volumes are not allowed with {method}; expected none")
+    dt = positive("dt", dt)
+    check_between("min_correlation", min_correlation, -1, 1)
+    stack, noise = checked_stack([volume1, volume2, *more], noise, AXES, "volume")
+    windows = Windows(tuple(stack[0].shape), template, search, stride)
+    volumes = [on_device(volume, device) for volume in stack]
+    if isinstance(noise, xr.DataArray):
+        noise = on_device(noise, device)
+    resting, whole = all_at_rest(volumes, windows), volumes
+    volumes, noise = without_attenuation(resting.left_out(volumes), noise)
+    steps = spacing(stack[0])
+    options = {"min_correlation": min_correlation, "noise": noise, "settings": settings}
+    if method == "variational":
+        options |= {"more": volumes[2:], "spacing": steps}
+    find = partial(METHODS[method], template=template, search=search, **options)
+    found = find(*volumes[:2], stride=stride)
+    flag = resting.flags(found, whole, windows, True)
+    flag = flag | (Flag.LOW_TEXTURE * uncertain(found.covariance)).to(torch.int16)
+    if method == "correlation":
+        if enough_windows(windows):
+            covariance = bootstrap_covariance(
+                volumes, found, windows, find, True, textured=flag & Flag.LOW_TEXTURE.value == 0
+            )
+            flag, found = flag | of_bootstrap(covariance), found._replace(covariance=covariance)
+        apart = max(1, round(template / 2 / stride))
+        outlier = median_outliers(found.d, spacing=apart, continued=True)
+        flag = flag | (Flag.MEDIAN_OUTLIER * outlier).to(torch.int16)
+    # shear lowers the correlation of windows as large as a volume is thick: all windows together
+    if bool(unrelated(volumes, windows, False, noise).all()):
+        flag = flag | Flag.UNRELATED.value
+    found = found._replace(flag=flag)
+    variables = winds(found, AXES, steps, dt)
+    long_name = "correlation of the volumes warped to mid-time"
+    variables["correlation"] = field(AXES, found.score, long_name, "1")
+    variables["flag"] = flags(found, AXES)
+    attributes = {
+        "method": method,
+        "template": template,
+        "search": search,
+        "stride": stride,
+        "dt": dt,
+        "min_correlation": min_correlation,
+    }
+    coords = centres(stack[0], windows, "window")
+    return dataset(variables, coords, "Wind from two volumes", attributes, found)
+
+
+def without_attenuation(
+    volumes: Sequence[torch.Tensor], noise: float | torch.Tensor | None = None
+) -> tuple[list[torch.Tensor], torch.Tensor | None]:
+    """Volumes over their own brightness c exp(a x) less 1, and the noise of the first likewise.
+
+    The brightness is fitted to the means of the gates, so that attenuation through the volume
+    causes no displacement. Non-finite voxels stay so.
+
+    Parameters
+    ----------
+    volumes : sequence of torch.Tensor, shape (x, z, y)
+    noise : float or torch.Tensor, optional
+        Of a voxel of the first volume, in its unit.
+
+    Raises
+    ------
+    InputError
+        A volume that is not bright in some gate; noise below 0.
+    """
+    brightness = [_brightness(volume, n) for n, volume in enumerate(volumes, 1)]
+    if noise is not None:
+        noise = torch.as_tensor(noise, dtype=volumes[0].dtype, device=volumes[0].device)
+        if not bool((noise[noise.isfinite()] >= 0).all()):
+            raise InputError("noise: below 0 is not allowed; expected standard deviations >= 0")
+        noise = (noise / brightness[0]).expand_as(volumes[0])
+    return [volume / level - 1 for volume, level in zip(volumes, brightness, strict=True)], noise
+
+
+def _brightness(volume: torch.Tensor, number: int) -> torch.Tensor:
+    """c exp(a x), shape (x, 1, 1)."""
+    values = working(volume)
+    known = torch.isfinite(values)
+    values = torch.where(known, values, 0.0)
+    count = known.sum((1, 2))
+    gates = values.sum((1, 2)) / count.clamp(min=1)
+    if not bool((gates[count > 0] > 0).all()) or not bool(count.any()):
+        raise InputError(
+            f"volume{number}: gates that are 0, negative or not finite on the whole are not "
+            "allowed; expected a brightness above 0 in every gate"
+        )
+    x = torch.arange(len(gates)).to(gates)
+    x = x - (x * count).sum() / count.sum()
+    logarithm = torch.where(count > 0, gates.clamp(min=1e-300).log(), 0.0)
+    decay = (count * x * logarithm).sum() / (count * x * x).sum().clamp(min=1e-30)
+    level = (decay * x).exp()[:, None, None]
+    return level * (values / level).sum() / count.sum()

@@ -1,0 +1,93 @@
+"""Quadratic forms of a flow's coefficients and their inverse, against dense matrices.
+
+Detects a wrong block, shift or derivative.
+"""
+
+import torch
+
+from lidar_mi.retrieval.flow.band import Band, form, spread
+from lidar_mi.retrieval.flow.band_cholesky import cholesky, solved_near, spread_half
+from lidar_mi.retrieval.flow.block_banded import factor
+from lidar_mi.retrieval.flow.flow_spline import Axis, Mesh
+
+AXES = Axis(23, 4.0), Axis(38, 5.0)
+
+
+def pixels():
+    return [torch.arange(axis.size, dtype=torch.float64) for axis in AXES]
+
+
+def test_block_banded_is_its_dense_matrix():
+    random = torch.Generator().manual_seed(1)
+    blocks, matrices, n = 6, 2, 5
+    dense = torch.zeros(matrices, blocks, n, blocks, n, dtype=torch.float64)
+    columns = torch.zeros(blocks, matrices, 3, n, n, dtype=torch.float64)
+    for k in range(blocks):
+        for j in range(min(3, blocks - k)):
+            part = torch.randn(matrices, n, n, generator=random, dtype=torch.float64)
+            part = part + part.mT + 30 * torch.eye(n) if j == 0 else part
+            columns[k, :, j] = part
+            dense[:, k + j, :, k] = part
+            dense[:, k, :, k + j] = part.mT
+    dense = dense.reshape(matrices, blocks * n, blocks * n)
+    root = factor(columns.flatten(2, 3))
+    right = torch.randn(blocks, matrices, n, generator=random, dtype=torch.float64)
+    flat = right.movedim(0, 1).flatten(1)
+    found = root.solve(right).movedim(0, 1).flatten(1)
+    torch.testing.assert_close(found, torch.linalg.solve(dense, flat))
+    inverse = torch.linalg.inv(dense).unflatten(1, (blocks, n)).unflatten(3, (blocks, n))
+    found = root.inverse().unflatten(2, (3, n))
+    for k in range(blocks):
+        for j in range(min(3, blocks - k)):
+            torch.testing.assert_close(found[k, :, j], inverse[:, k + j, :, k])
+
+
+def test_forms_solutions_and_covariances_are_those_of_the_dense_matrix():
+    knots = Band(*(axis.knots for axis in AXES))
+    mesh = Mesh(AXES, pixels())
+    random = torch.Generator().manual_seed(2)
+    slope = torch.randn(2, 23, 38, generator=random, dtype=torch.float64)
+    weight = torch.rand(23, 38, generator=random, dtype=torch.float64)
+    band = form(slope[:, None] * slope, mesh)
+    bend = form(weight, mesh, (1, 1), (1, 1))
+    for a in (0, 1):
+        band[a, a] += bend
+    plain, twist = (torch.kron(mesh.basis(0, k), mesh.basis(1, k)) for k in (0, 1))
+    rows = torch.cat([part.flatten()[:, None] * plain for part in slope], 1)
+    side = twist.T @ (weight.flatten()[:, None] * twist)
+    dense = rows.T @ rows + torch.block_diag(side, side)
+    some = torch.randn((2, AXES[0].knots, AXES[1].knots), generator=random, dtype=torch.float64)
+    torch.testing.assert_close(knots.apply(band, some).flatten(), dense @ some.flatten())
+    dense += 0.1 * torch.eye(len(dense), dtype=torch.float64)
+    for a in (0, 1):
+        band[a, a, 3, :, 0] += 0.1
+    root = knots.factor(band)
+    torch.testing.assert_close(
+        knots.solve(root, some).flatten(), torch.linalg.solve(dense, some.flatten())
+    )
+    inverse = torch.linalg.inv(dense).unflatten(0, (2, -1)).unflatten(2, (2, -1))
+    places = torch.tensor([0.0, 3.3, 21.5]), torch.tensor([2.0, 17.7, 36.9, 37.0])
+    few = Mesh(AXES, [place.double() for place in places])
+    at = torch.kron(few.basis(0), few.basis(1))
+    of_blocks, alone = spread(knots.covariance(root), few), cholesky(band)
+    torch.testing.assert_close(
+        alone.solve(some).flatten(), torch.linalg.solve(dense, some.flatten())
+    )
+    of_band = spread_half(alone.covariance(), few)
+    for a in (0, 1):
+        for b in (0, 1):
+            expected = (at @ inverse[a, :, b] @ at.T).diagonal().reshape(3, 4)
+            torch.testing.assert_close(of_blocks[a, b], expected)
+            torch.testing.assert_close(of_band[a, b], expected)
+    # from the factor of another form, which is no longer asked for more than it is worth
+    similar = cholesky(1.3 * band)
+    near = solved_near(similar, band + 0.2 * band * (band > 0), some, 1e-9, 100)
+    changed = knots.factor(band + 0.2 * band * (band > 0))
+    torch.testing.assert_close(near, knots.solve(changed, some), rtol=1e-6, atol=1e-9)
+    assert solved_near(similar, band + 0.2 * band * (band > 0), some, 1e-9, 1) is None
+
+
+def test_a_form_that_is_not_positive_has_no_factor():
+    mesh = Mesh(AXES, pixels())
+    band = form(-torch.ones(2, 2, 23, 38, dtype=torch.float64), mesh)
+    assert cholesky(band) is None

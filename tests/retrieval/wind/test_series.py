@@ -1,0 +1,95 @@
+"""Winds of a sequence of images, pair by pair, in a wind that changes from step to step.
+
+Detects: pairs of wrong images, a wrong time or time step of a pair, vectors of one pair in the
+place of another, a sequence that ends where one pair is bad. Unit tier.
+"""
+
+import numpy as np
+import pytest
+
+from lidar_mi.errors import InputError
+from lidar_mi.retrieval.images.quality import Flag
+from lidar_mi.retrieval.wind.pair import retrieve_wind
+from lidar_mi.retrieval.wind.series import retrieve_winds
+from tests.support.flows import axes, data_array, plane_waves, texture
+
+WAYS = 0.0, 1.0, 0.5, 1.5
+"""Of the air along y up to each image, m: 10, -10 and 5 m/s."""
+
+STEPS = 0.1, 0.05, 0.2
+
+
+@pytest.fixture(scope="module")
+def images():
+    waves = plane_waves(1, 3.0, 0.5)
+    y, z = axes(48, 40)
+    return [data_array(texture(waves, y - way, z[:, None]), y, z) for way in WAYS]
+
+
+def mean(winds, name="v"):
+    return winds[name].where(winds["flag"] == 0).mean(("z", "y")).values
+
+
+def test_each_pair_has_its_wind_and_time(images):
+    said = []
+    winds = retrieve_winds(images, STEPS, stride=4, notice=lambda *call: said.append(call))
+    np.testing.assert_allclose(mean(winds), (10, -10, 5), atol=0.1)  # 0.01 px in 0.05 s
+    np.testing.assert_allclose(winds["time"], [0.05, 0.125, 0.25])
+    np.testing.assert_allclose(winds["dt"], STEPS)
+    # float32: a photograph's vectors belong to the middle of its pair
+    np.testing.assert_allclose(winds["vector_time"].mean(("z", "y")), winds["time"], rtol=1e-6)
+    assert [text for text, _ in said] == ["images 0-1", "images 1-2", "images 2-3"]
+    assert [fraction for _, fraction in said] == [0, 1 / 3, 2 / 3]
+    alone = retrieve_wind(images[1], images[2], STEPS[1], stride=4)
+    for name in ("v", "w_stderr", "flag", "y_vector"):
+        np.testing.assert_array_equal(winds[name][1], alone[name])
+
+
+def test_pairs_as_asked_for(images):
+    winds = retrieve_winds(images, 0.1, [(0, 2), (1, 3)], stride=4)
+    np.testing.assert_allclose(mean(winds), (2.5, 2.5), atol=0.05)
+    np.testing.assert_allclose(winds["time"], [0.1, 0.2])
+    np.testing.assert_array_equal(winds["second_image"], [2, 3])
+
+
+def test_a_bad_image_costs_its_pairs_alone(images):
+    dark = images[1] * np.nan
+    winds = retrieve_winds([images[0], images[1], dark], 0.1, stride=4)
+    assert mean(winds)[0] == pytest.approx(10, abs=0.05)
+    assert winds["remark"].values.tolist() == [
+        "",
+        "image2: no pixel is finite; expected light somewhere",
+    ]
+    assert np.isnan(winds["v"][1]).all() and (winds["flag"][1] == Flag.NO_MATCH).all()
+    np.testing.assert_array_equal(winds["y_vector"][1][0], winds["y"])
+
+
+def test_noise_is_that_of_the_earlier_image(images):
+    levels = [0.01, 0.5, None, None]
+    winds = retrieve_winds(images, 0.1, noise=levels, stride=4, min_texture=0)
+    pair = retrieve_wind(images[1], images[2], 0.1, noise=0.5, stride=4, min_texture=0)
+    np.testing.assert_array_equal(winds["flag"][1], pair["flag"])
+    assert (winds["flag"][0] == 0).sum() > (winds["flag"][1] == 0).sum()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"dt": (0.1, 0.1)}, "dt: 2 steps are not allowed with 4 images"),
+        ({"dt": 0.0}, "dt: 0.0 s is not a number > 0"),
+        ({"pairs": ((2, 1),)}, "pairs: 2-1 is not allowed"),
+        ({"pairs": ()}, "pairs: none given"),
+        ({"method": "none"}, "images 0-1: method: 'none'"),
+        ({"noise": (0.1,)}, "noise: 1 are not allowed"),
+        ({"beam_times": ()}, "beam_times: 0 are not allowed"),
+        ({"more": ()}, "expected beam_times"),
+    ],
+)
+def test_bad_arguments(images, change, words):
+    with pytest.raises(InputError, match=words.replace("(", r"\(")):
+        retrieve_winds(**({"images": images, "dt": 0.1} | change))
+
+
+def test_one_image_is_too_few(images):
+    with pytest.raises(InputError, match="images: 1 are not allowed"):
+        retrieve_winds(images[:1], 0.1)
