@@ -13,10 +13,10 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.error_budget import CAUSES
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.error_budget import budgets
 from lidar_mi.experiment.stages.rendering import scan_plans
-from lidar_mi.experiment.truth import Truth
+from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.instrument.detector_noise import noisy_scan
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.phase import scatterer

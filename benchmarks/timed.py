@@ -11,8 +11,9 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
-from lidar_mi.experiment.truth import make_truth, read_flows
-from lidar_mi.experiment.truth_in_time import air_in_time
+from lidar_mi.experiment.truth.extinction import make_truth
+from lidar_mi.experiment.truth.flows import read_flows
+from lidar_mi.experiment.truth.in_time import air_in_time
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.backscatter import extrude

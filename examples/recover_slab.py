@@ -17,8 +17,8 @@ import numpy as np
 import xarray as xr
 from matplotlib.figure import Figure
 
-from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.truth import make_truth
+from lidar_mi.experiment.schema import reading as config
+from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.rendering.backscatter import extrude, scene_dict

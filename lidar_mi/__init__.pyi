@@ -8,12 +8,12 @@ from .encounter.virtual_lidar import VirtualLidar
 from .errors import InputError
 from .experiment.export import export
 from .experiment.own_frames import calibrate_etalon, retrieve_v_los
-from .experiment.reading import load_experiment
 from .experiment.results import Run
 from .experiment.run import run
-from .experiment.schema import Experiment
+from .experiment.schema.experiment import Experiment
+from .experiment.schema.reading import load_experiment
 from .experiment.shipped import campaigns, experiments, scene_file
-from .experiment.truth import make_truth
+from .experiment.truth.extinction import make_truth
 from .io.exr import read_scan
 from .io.images import read_image, read_noise
 from .io.vortex_file import read_vortices, write_vortices

@@ -61,13 +61,14 @@ that its files hold; only `experiment` and what lies above it see all."""
 
 FLOORS = {
     "assessment": (("metrics",), ("figures",), ("report",)),
+    "experiment": (("schema",), ("truth",), ("stages",), ("folder",), ("preflight",)),
     "retrieval": (
         ("images", "rings"),
         ("correlation", "channels", "lines"),
         ("flow", "defects"),
         ("vortices",),
         ("wind",),
-    )
+    ),
 }
 """Folders of a room, the lowest floor first: each imports those of lower floors alone."""
 
@@ -75,7 +76,7 @@ OPENS = {
     "assessment/report/campaign.py": "its own script, a resource of the package",
     "assessment/report/page.py": "its own script, a resource of the package",
     "experiment/log.py": "the log, line by line",
-    "experiment/resumable_folder.py": "checksums of what a run depends on",
+    "experiment/folder/run_folder.py": "checksums of what a run depends on",
     "system/doctor.py": "a file of its own in a program that it tries",
     "system/llvm.py": "/proc",
     "system/memory.py": "/proc, /sys/fs/cgroup",
@@ -172,7 +173,7 @@ def arrows_up_in_a_room() -> list[str]:
             parts = (ours(imported) or "").split(".")
             if parts[0] != room(name) or len(parts) < 3 or parts[1] == inside:
                 continue
-            if parts[1] in floor and (inside not in floor or floor[parts[1]] >= floor[inside]):
+            if {parts[1], inside} <= {*floor} and floor[parts[1]] >= floor[inside]:
                 found.append(f"{name} imports {imported}")
     return found
 

@@ -12,7 +12,8 @@ import xarray as xr
 import lidar_mi as lm
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
-from lidar_mi.experiment.truth import blur_by_beam, mean_flow, read_flows
+from lidar_mi.experiment.truth.blur import blur_by_beam
+from lidar_mi.experiment.truth.flows import mean_flow, read_flows
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support.flows import axes, data_array, origin, plane_waves, texture

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.ring_instrument import air_rings, laser_rings, pixel_noise
+from lidar_mi.experiment.stages.ring_instrument import air_rings, laser_rings, pixel_noise
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.etalon import Etalon

@@ -8,7 +8,7 @@ from scipy import constants
 from scipy.optimize import minimize, minimize_scalar
 
 from lidar_mi.experiment import receivers
-from lidar_mi.experiment.ring_instrument import air_rings
+from lidar_mi.experiment.stages.ring_instrument import air_rings
 from lidar_mi.instrument.doppler import DopplerLidar, photons
 from lidar_mi.instrument.double_edge import DoubleEdge
 from lidar_mi.instrument.etalon import Etalon

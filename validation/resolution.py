@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.ring_instrument import pixel_noise
+from lidar_mi.experiment.stages.ring_instrument import pixel_noise
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.retrieval.rings import peaks
 from lidar_mi.retrieval.rings.bound import cramer_rao

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import xarray as xr
 
-from lidar_mi.experiment.ideal_images import ideal_scan
+from lidar_mi.experiment.stages.ideal_images import ideal_scan
 from lidar_mi.instrument.beams import steered_beams
 from lidar_mi.instrument.motion import Pose, attitude
 from lidar_mi.instrument.scan import Scan, plan_scans

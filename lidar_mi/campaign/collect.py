@@ -12,8 +12,8 @@ from lidar_mi.assessment.metrics.names import title_of
 from lidar_mi.assessment.metrics.units import unit_of
 from lidar_mi.campaign.folder import DATA, CampaignFolder, open_folder
 from lidar_mi.campaign.points import MEMBER, tied
+from lidar_mi.experiment.folder.run_folder import METRICS
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.resumable_folder import METRICS
 from lidar_mi.io.json import read_json
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 from lidar_mi.progress import Notice

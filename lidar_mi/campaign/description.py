@@ -8,8 +8,8 @@ from pydantic import Field, ValidationError, field_validator, model_validator
 
 from lidar_mi.description import Description
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.faults import first_fault
-from lidar_mi.experiment.schema import NAME
+from lidar_mi.experiment.schema.experiment import NAME
+from lidar_mi.experiment.schema.faults import first_fault
 from lidar_mi.io.yaml import parse_yaml, read_yaml
 from lidar_mi.units import Within, split_quantity
 

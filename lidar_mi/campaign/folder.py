@@ -16,10 +16,10 @@ from lidar_mi import __version__
 from lidar_mi.campaign.description import Campaign, checked_campaign
 from lidar_mi.campaign.points import Points
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import reading
+from lidar_mi.experiment.folder.run_folder import METRICS, made_by, new_record, refuse_strangers
 from lidar_mi.experiment.pipeline import storing_stages
-from lidar_mi.experiment.resumable_folder import METRICS, made_by, new_record, refuse_strangers
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema import reading
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.shipped import experiment_file
 from lidar_mi.io.folder import locked, make_folder
 from lidar_mi.io.json import read_json, to_json

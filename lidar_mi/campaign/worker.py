@@ -31,14 +31,14 @@ from lidar_mi.campaign.folder import (
 )
 from lidar_mi.encounter.fly import fly
 from lidar_mi.errors import InputError, one_line
-from lidar_mi.experiment import resumable_folder
-from lidar_mi.experiment.image_store import ImageStore
+from lidar_mi.experiment.folder import run_folder as resumable_folder
+from lidar_mi.experiment.folder.image_store import ImageStore
+from lidar_mi.experiment.graph import result_of
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.run import complete, finish, prepare
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stage import result_of
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.json import to_json
 from lidar_mi.io.text import append_line, read_text, write_text

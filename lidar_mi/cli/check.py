@@ -19,7 +19,7 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
     """
     from lidar_mi.encounter.check import sections as flight_sections
     from lidar_mi.experiment import reading as config
-    from lidar_mi.experiment.check import sections
+    from lidar_mi.experiment.preflight.check import sections
 
     path, changes = experiment_file(experiment), list(set_ or [])
     asked = config.load_variants(path, changes) or {"": config.load(path, changes)}

@@ -47,7 +47,7 @@ def info(
     single-scattering albedo, lidar ratio, depolarisation ratio.
     """
     from lidar_mi.experiment.describe import sections
-    from lidar_mi.experiment.resumable_folder import failure, read_metrics, read_record
+    from lidar_mi.experiment.folder.run_folder import failure, read_metrics, read_record
     from lidar_mi.experiment.study import RECORD, answers
 
     if (Path(what) / CAMPAIGN).is_file():

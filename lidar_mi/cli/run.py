@@ -34,7 +34,7 @@ def run(
     """
     from lidar_mi.assessment.report.summary import summary
     from lidar_mi.experiment import reading, study
-    from lidar_mi.experiment.resumable_folder import RESULTS
+    from lidar_mi.experiment.folder.run_folder import RESULTS
     from lidar_mi.experiment.run import run as start
 
     path, changes = experiment_file(experiment), list(set_ or [])
@@ -64,7 +64,7 @@ def run(
 def _run_study(variants, out, path, overwrite, start) -> None:
     """Variants of one experiment, each in its own folder, and their comparison."""
     from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment.resumable_folder import read_answer
+    from lidar_mi.experiment.folder.run_folder import read_answer
 
     first, experiment = next(iter(variants.items()))
     name = experiment.name.removesuffix(f".{first}")

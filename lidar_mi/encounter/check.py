@@ -11,12 +11,12 @@ from lidar_mi.encounter.flight import aircraft_of, duration
 from lidar_mi.encounter.slabs import Gates, gates_of
 from lidar_mi.encounter.wake import encounter_of, vortices_in_plane, wake_along_path
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import check as of_a_run
-from lidar_mi.experiment.cost import flight_seconds
 from lidar_mi.experiment.describe import Section
 from lidar_mi.experiment.log import Notice, silent
+from lidar_mi.experiment.preflight import check as of_a_run
+from lidar_mi.experiment.preflight.cost import flight_seconds
 from lidar_mi.experiment.run import prepare
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.units import shown
 
 # A path misses the wake where no rolling moment reaches this fraction of the ailerons'.

@@ -13,7 +13,7 @@ from lidar_mi.encounter.combination import Completion
 from lidar_mi.encounter.doppler import LineFrames
 from lidar_mi.encounter.line_speeds import LineSpeeds
 from lidar_mi.encounter.slab_winds import FirstImage, InOwnProcess, SlabWinds
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.image_fit import begun_fit, fit_vortices

@@ -23,8 +23,8 @@ from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.seen import Seen
 from lidar_mi.encounter.series import Recorder, flights_dataset, track_dataset
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.schema_encounter import Encounter
+from lidar_mi.experiment.schema.encounter import Encounter
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.progress import Notice
 
 OFF, AUTOPILOT, FEEDFORWARD, PERFECT = "off", "autopilot", "feedforward", "perfect"

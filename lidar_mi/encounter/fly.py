@@ -18,10 +18,10 @@ from lidar_mi.encounter.folder import FlightFolder
 from lidar_mi.encounter.report import answer, write_report
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError, is_interrupt
+from lidar_mi.experiment.folder.run_folder import REPORT
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.reading import load_experiment
-from lidar_mi.experiment.resumable_folder import REPORT
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.progress import progress
 from lidar_mi.tables import Table, Tabular
 

@@ -12,8 +12,8 @@ from lidar_mi.encounter.scan_store import ScanStore
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.export_flight import FLIGHT_FILES as FILES
-from lidar_mi.experiment.image_store import MADE_BY
-from lidar_mi.experiment.resumable_folder import (
+from lidar_mi.experiment.folder.image_store import MADE_BY
+from lidar_mi.experiment.folder.run_folder import (
     FIGURES,
     LOG,
     METRICS,
@@ -27,7 +27,7 @@ from lidar_mi.experiment.resumable_folder import (
     read_record,
     write_verdict,
 )
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.io.atomic import write_atomically
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 from lidar_mi.io.text import encoded

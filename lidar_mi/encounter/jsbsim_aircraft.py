@@ -19,7 +19,7 @@ from scipy.constants import foot, inch, lbf, slug
 from lidar_mi.encounter.aircraft import LARGEST_ROLL, AircraftState, Commands, Limits, deflected
 from lidar_mi.encounter.strips import Loads, Strips, fin_strips, in_downwash, joined, wing_strips
 from lidar_mi.errors import InputError, one_line
-from lidar_mi.experiment.schema_encounter import Aircraft, Path
+from lidar_mi.experiment.schema.encounter import Aircraft, Path
 from lidar_mi.instrument.motion import attitude
 from lidar_mi.io.jsbsim_files import AXES, shipped_aircraft, write_aircraft_in_wake
 
@@ -52,9 +52,9 @@ class JSBSimAircraft:
 
     Parameters
     ----------
-    aircraft : lidar_mi.experiment.schema_encounter.Aircraft
+    aircraft : lidar_mi.experiment.schema.encounter.Aircraft
         Its model, the lift slope of the sections, the rate of the controls.
-    path : lidar_mi.experiment.schema_encounter.Path
+    path : lidar_mi.experiment.schema.encounter.Path
         Speed, climb angle and altitude.
 
     Raises

@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.instrument.motion import PLACES, Pose
 from lidar_mi.instrument.reported import Reported, reported_pose
 

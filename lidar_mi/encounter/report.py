@@ -17,8 +17,8 @@ from lidar_mi.encounter.folder import ANIMATION, FlightFolder
 from lidar_mi.encounter.slabs import gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.reading import dump
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.reading import dump
 from lidar_mi.io.film import frame_as_webp, write_gif
 
 

@@ -9,7 +9,7 @@ import xarray as xr
 
 from lidar_mi.encounter.pose import AircraftPose
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.image_store import MADE_BY
+from lidar_mi.experiment.folder.image_store import MADE_BY
 from lidar_mi.io.folder import make_folder
 from lidar_mi.io.netcdf import read_netcdf, write_netcdf
 

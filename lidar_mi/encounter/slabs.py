@@ -14,9 +14,9 @@ from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.encounter.pointing import check_reported
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.forecast import most_nodes
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.truth import analytic_axes
+from lidar_mi.experiment.memory import most_nodes
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.truth.flows import analytic_axes
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.rendering.backscatter import beam_reach
 

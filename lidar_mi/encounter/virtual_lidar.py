@@ -20,8 +20,8 @@ from lidar_mi.encounter.scan_store import Scan, ScanStore
 from lidar_mi.encounter.slabs import Air, Gates, air_of, gates_of
 from lidar_mi.encounter.wake import encounter_of
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.reading import load_experiment
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.experiment.stages.rendering import PILOT_SEED, environment_extinction
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.detector_noise import noisy_scan

@@ -11,10 +11,12 @@ from lidar_mi.atmosphere.vortex import Vortex
 from lidar_mi.atmosphere.wake_path import PairAlongPath, WakeAlongPath
 from lidar_mi.atmosphere.wake_volume import VolumeAlongPath, one_period
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.schema_air import Wake
-from lidar_mi.experiment.schema_encounter import Encounter
-from lidar_mi.experiment.truth import extinction_of, find_file, tracers_of
+from lidar_mi.experiment.input_files import find_file
+from lidar_mi.experiment.schema.encounter import Encounter
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.wake import Wake
+from lidar_mi.experiment.truth.extinction import extinction_of
+from lidar_mi.experiment.truth.flows import tracers_of
 from lidar_mi.io.wake_file import read_wake
 
 

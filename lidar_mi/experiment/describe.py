@@ -199,7 +199,7 @@ def _study(folder: Path) -> Iterator[Section]:
 
 def _run_folder(folder: Path) -> Iterator[Section]:
     from lidar_mi.assessment.report.comparison import setting
-    from lidar_mi.experiment.resumable_folder import read_record
+    from lidar_mi.experiment.folder.run_folder import read_record
 
     record = read_record(folder)
     experiment = record["experiment"]

@@ -11,7 +11,7 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.describe import value_at
 from lidar_mi.experiment.export_flight import FLIGHT_FILES, flight_results
-from lidar_mi.experiment.resumable_folder import RESULTS, read_record
+from lidar_mi.experiment.folder.run_folder import RESULTS, read_record
 from lidar_mi.experiment.stages.rendering import IMAGES
 from lidar_mi.experiment.study import RECORD
 from lidar_mi.io.exr import read_scan

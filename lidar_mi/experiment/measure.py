@@ -24,7 +24,7 @@ from lidar_mi.assessment.metrics.velocities import velocity_metrics
 from lidar_mi.assessment.metrics.volume import volume_metrics
 from lidar_mi.assessment.metrics.vortices import core_metrics, vortex_metrics
 from lidar_mi.assessment.metrics.winds import cross_flow_metrics, sweep_metrics, true_wind_metrics
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 
 Results = Mapping[str, Any]
 """Results of stages by name."""

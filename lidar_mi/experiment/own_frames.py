@@ -15,10 +15,11 @@ import xarray as xr
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.reading import load_experiment
-from lidar_mi.experiment.ring_instrument import laser_rings, pixel_noise
-from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.experiment.schema.doppler import Doppler
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.experiment.stages.ring_images import ring_models
+from lidar_mi.experiment.stages.ring_instrument import laser_rings, pixel_noise
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.etalon import mirrors
 from lidar_mi.io.images import read_frames, stated_units

@@ -3,11 +3,11 @@
 from collections.abc import Callable
 from typing import Any
 
-from lidar_mi.experiment.remarks import image_remarks
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stage import Stage, in_order
+from lidar_mi.experiment.graph import Stage, in_order
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.error_budget import error_budgets
 from lidar_mi.experiment.stages.eye_safety import scan_safety
+from lidar_mi.experiment.stages.image_remarks import image_remarks
 from lidar_mi.experiment.stages.lines import (
     check_lines,
     measure_lines,
@@ -42,11 +42,11 @@ from lidar_mi.experiment.stages.sensor import combined_wind, doppler_alone, limi
 from lidar_mi.experiment.stages.sensor_cost import lidar_costs, pulses_needed
 from lidar_mi.experiment.stages.simulation_noise import simulation_noise
 from lidar_mi.experiment.stages.texture import texture_sweep
+from lidar_mi.experiment.stages.timed_beams import line_beams
 from lidar_mi.experiment.stages.volume import check_volume, scan_volumes, volume_winds
 from lidar_mi.experiment.stages.vortices import combined_vectors, fit_pairs, image_vectors
 from lidar_mi.experiment.stages.winds import check_windows, cross_flow_winds
-from lidar_mi.experiment.timed_beams import line_beams
-from lidar_mi.experiment.truth import make_truth
+from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.retrieval.method_names import ImageMethod
 
 GIVEN = ("beside",)

@@ -17,7 +17,7 @@ from scipy.optimize import brentq
 from lidar_mi.atmosphere.line import backscatter_line, laser_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.ring_instrument import TEMPERATURE_NODES, pixel_noise
+from lidar_mi.experiment.stages.ring_instrument import TEMPERATURE_NODES, pixel_noise
 from lidar_mi.instrument import double_edge, michelson
 from lidar_mi.instrument import etalon as fabry_perot
 from lidar_mi.instrument.ccd import CCD

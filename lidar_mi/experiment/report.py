@@ -25,7 +25,7 @@ from lidar_mi.assessment.report.volume import volume_chapter
 from lidar_mi.assessment.report.vortices import vortex_chapter
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import Results, judged
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import rendered_pairs
 
 Metrics = Mapping[str, float]

@@ -13,12 +13,12 @@ from lidar_mi.assessment.figures.backscatter import overview
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.report.answer import answer
 from lidar_mi.assessment.report.summary import summary
+from lidar_mi.experiment.folder.run_folder import REPORT
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import judged
-from lidar_mi.experiment.resumable_folder import REPORT
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.vortices import VortexFits
-from lidar_mi.experiment.truth import Truth
+from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.io.png import png_bytes
 from lidar_mi.tables import Table, Tabular
 

@@ -16,15 +16,15 @@ from lidar_mi.assessment.metrics.names import timing_key
 from lidar_mi.assessment.report.page import page
 from lidar_mi.assessment.report.simulation import simulation_remark
 from lidar_mi.errors import InputError, is_interrupt
+from lidar_mi.experiment.folder.run_folder import RunFolder
+from lidar_mi.experiment.graph import Keeper, Stage, result_of
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.measure import measure
 from lidar_mi.experiment.pipeline import stages_of
-from lidar_mi.experiment.reading import dump
 from lidar_mi.experiment.report import chapters
 from lidar_mi.experiment.results import Run
-from lidar_mi.experiment.resumable_folder import RunFolder
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stage import Keeper, Stage, result_of
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.reading import dump
 from lidar_mi.progress import Notice, progress
 
 RESUMED = "start it again to resume the run"

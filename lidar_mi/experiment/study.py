@@ -14,10 +14,7 @@ from lidar_mi.assessment.figures.comparison import draw_comparison
 from lidar_mi.assessment.report.comparison import page
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment.log import Log, Notice, silent
-from lidar_mi.experiment.reading import settings as settings_of
-from lidar_mi.experiment.results import Run
-from lidar_mi.experiment.resumable_folder import (
+from lidar_mi.experiment.folder.run_folder import (
     FIGURES,
     LOG,
     METRICS,
@@ -27,8 +24,11 @@ from lidar_mi.experiment.resumable_folder import (
     read_record,
     refuse_strangers,
 )
-from lidar_mi.experiment.resumable_folder import RECORD as RUN
-from lidar_mi.experiment.schema import NAME, Experiment
+from lidar_mi.experiment.folder.run_folder import RECORD as RUN
+from lidar_mi.experiment.log import Log, Notice, silent
+from lidar_mi.experiment.results import Run
+from lidar_mi.experiment.schema.experiment import NAME, Experiment
+from lidar_mi.experiment.schema.reading import settings as settings_of
 from lidar_mi.io.folder import locked, make_folder
 from lidar_mi.io.json import write_json
 from lidar_mi.io.text import write_text
@@ -52,7 +52,7 @@ def run(
     name : str
         Of the study.
     variants : mapping
-        From `lidar_mi.experiment.reading.load_variants`.
+        From `lidar_mi.experiment.schema.reading.load_variants`.
     folder, beside, overwrite, notice
         As in `lidar_mi.experiment.run.run`.
 

@@ -59,7 +59,7 @@ def scatterer(
 
     Parameters
     ----------
-    scattering : lidar_mi.experiment.schema_air.Scattering
+    scattering : lidar_mi.experiment.schema.scattering.Scattering
         Its own albedo, if given, replaces that of the scatterers.
     beside : path
         Folder of the tables.

@@ -24,7 +24,9 @@ from pydantic import BaseModel
 from lidar_mi import units
 from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.cli import app as cli
-from lidar_mi.experiment import reading, schema, schema_air, truth
+from lidar_mi.experiment.schema import experiment as schema
+from lidar_mi.experiment.schema import reading, scattering, wake
+from lidar_mi.experiment.truth import extinction as truth
 from lidar_mi.instrument import motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan_timing import ScanTiming
@@ -45,9 +47,9 @@ PAGES = (
 BASE = {"name": "base", "wake": {"file": "wake_slab_40s.nc", "time": "40 s"}}
 # sections that an experiment need not have
 OPTIONAL = (
-    schema_air.VortexPair,
-    schema_air.Turbine,
-    schema_air.Part,
+    wake.VortexPair,
+    wake.Turbine,
+    scattering.Part,
     ScanTiming,
     motion.Motion,
     motion.Sinusoid,
@@ -56,7 +58,7 @@ OPTIONAL = (
 )
 # what they need
 REQUIRED = {
-    schema_air.Part: {"phase": "rayleigh", "fraction": 1.0},
+    scattering.Part: {"phase": "rayleigh", "fraction": 1.0},
     ScanTiming: {"duration": 0.1},
     motion.Sinusoid: {"axis": "y", "amplitude": 1.0, "frequency": 1.0},
     motion.Attitude: {"rms": 0, "bandwidth": 1.0},

@@ -14,7 +14,7 @@ from lidar_mi.encounter.aircraft import Commands, loads_in_wind
 from lidar_mi.encounter.control import cancelling, feedforward, no_loads, wings_level
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
-from lidar_mi.experiment.schema_encounter import Aircraft, Path
+from lidar_mi.experiment.schema.encounter import Aircraft, Path
 
 STEP = 1 / 30
 CROSSING = np.tan(np.radians(10))

@@ -8,7 +8,7 @@ import pytest
 from benchmarks.cases import drifting_pair_images, vortex_pair_images
 from benchmarks.realtime import UNFORESEEN
 from lidar_mi.encounter.estimator import Estimator, _with_delay
-from lidar_mi.experiment.reading import load_experiment
+from lidar_mi.experiment.schema.reading import load_experiment
 from tests.support.vortex_pairs import uneven, vector
 
 DT = 0.1

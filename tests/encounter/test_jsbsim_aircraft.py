@@ -20,7 +20,7 @@ from lidar_mi.encounter.jsbsim_aircraft import JSBSimAircraft
 from lidar_mi.encounter.roll_model import RollModel
 from lidar_mi.encounter.strips import Loads
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema_encounter import Aircraft, Path
+from lidar_mi.experiment.schema.encounter import Aircraft, Path
 from lidar_mi.io.jsbsim_files import shipped_aircraft
 
 pytest.importorskip("jsbsim")

@@ -12,17 +12,13 @@ import xarray as xr
 
 from lidar_mi import load_experiment
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.check import duration, sections
-from lidar_mi.experiment.forecast import (
-    check_brightness,
-    check_size,
-    check_states,
-    forecast,
-    overlap,
-)
-from lidar_mi.experiment.timed_beams import timed_plans
-from lidar_mi.experiment.truth import make_truth, read_flows
-from lidar_mi.experiment.truth_in_time import air_in_time, values_of_states
+from lidar_mi.experiment.memory import check_size, check_states, forecast
+from lidar_mi.experiment.preflight.check import duration, sections
+from lidar_mi.experiment.stages.brightness import check_brightness, overlap
+from lidar_mi.experiment.stages.timed_beams import timed_plans
+from lidar_mi.experiment.truth.extinction import make_truth
+from lidar_mi.experiment.truth.flows import read_flows
+from lidar_mi.experiment.truth.in_time import air_in_time, values_of_states
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import plan_scans
 from lidar_mi.rendering.memory import PER_SAMPLE, samples_at_once
@@ -180,7 +176,7 @@ def test_check_refuses_from_the_forecast_before_the_truth(changes, says, tmp_pat
     def computed(*_):
         pytest.fail("the truth was computed")
 
-    monkeypatch.setattr("lidar_mi.experiment.truth.extinction_of", computed)
+    monkeypatch.setattr("lidar_mi.experiment.truth.extinction.extinction_of", computed)
     data = small(**changes.get("wake", {})) | {k: v for k, v in changes.items() if k != "wake"}
     data["render"] = data["render"] | {"memory": "8 GB"}
     with pytest.raises(InputError, match=says):

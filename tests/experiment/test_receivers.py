@@ -15,7 +15,7 @@ from lidar_mi.atmosphere.line import backscatter_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import receivers
-from lidar_mi.experiment.ring_instrument import air_rings
+from lidar_mi.experiment.stages.ring_instrument import air_rings
 from lidar_mi.instrument.ccd import CCD
 from lidar_mi.instrument.doppler import DopplerLidar, photons
 from lidar_mi.instrument.double_edge import DoubleEdge, harmonics

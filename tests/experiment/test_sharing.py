@@ -9,7 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from lidar_mi.experiment import reading
+from lidar_mi.experiment.folder.run_folder import made_by, new_record
+from lidar_mi.experiment.graph import result_of
 from lidar_mi.experiment.pipeline import (
     BEHIND_IMAGES,
     BEHIND_RING_IMAGES,
@@ -17,10 +18,9 @@ from lidar_mi.experiment.pipeline import (
     stages_of,
     storing_stages,
 )
-from lidar_mi.experiment.reading import load_experiment
-from lidar_mi.experiment.resumable_folder import made_by, new_record
 from lidar_mi.experiment.run import prepare
-from lidar_mi.experiment.stage import result_of
+from lidar_mi.experiment.schema import reading
+from lidar_mi.experiment.schema.reading import load_experiment
 from tests.support.experiments import small
 
 DOPPLER = {

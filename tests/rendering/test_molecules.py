@@ -10,9 +10,9 @@ import xarray as xr
 
 from lidar_mi.atmosphere.molecules import molecular_table
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.reading import check
-from lidar_mi.experiment.schema_air import Scattering
-from lidar_mi.experiment.truth import make_truth
+from lidar_mi.experiment.schema.reading import check
+from lidar_mi.experiment.schema.scattering import Scattering
+from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.io.scattering_table import aerosol_table

@@ -9,7 +9,7 @@ import pytest
 
 from lidar_mi.atmosphere.molecules import molecular_scattering
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema_air import Scattering
+from lidar_mi.experiment.schema.scattering import Scattering
 from lidar_mi.io.scattering_table import aerosol_table, write_table
 from lidar_mi.rendering.phase import backscatter_phase_function, scatterer, table_files
 

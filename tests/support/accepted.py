@@ -5,8 +5,9 @@ from pathlib import Path
 from hypothesis import strategies as st
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import check, reading
-from lidar_mi.experiment.forecast import most_samples
+from lidar_mi.experiment.memory import most_samples
+from lidar_mi.experiment.preflight import check
+from lidar_mi.experiment.schema import reading
 from tests.support.cases import Case
 from tests.support.hostile_experiments import as_yaml, settings
 

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from lidar_mi import __version__
 from lidar_mi.experiment import pipeline
-from lidar_mi.experiment import reading as config
+from lidar_mi.experiment.schema import reading as config
 from lidar_mi.io import png
 
 _PNG = png._png

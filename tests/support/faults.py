@@ -24,9 +24,10 @@ from matplotlib.figure import Figure
 
 from lidar_mi.assessment.figures.plates import save_all
 from lidar_mi.cli.exit_codes import exit_by
-from lidar_mi.experiment import pipeline, reading
+from lidar_mi.experiment import pipeline
 from lidar_mi.experiment import run as experiment
-from lidar_mi.experiment.stage import Stage
+from lidar_mi.experiment.graph import Stage
+from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.stages.rendering import IMAGES, batches_of
 from lidar_mi.io.exr import QUANTITIES, label_scan
 from lidar_mi.io.png import png_bytes

@@ -22,7 +22,7 @@ from typing import Any
 # imported by the server, so that no fork has to
 PRELOADED = (
     "lidar_mi.cli.app",
-    "lidar_mi.experiment.check",
+    "lidar_mi.experiment.preflight.check",
     "lidar_mi.experiment.study",
     "lidar_mi.io.images",
     "lidar_mi.retrieval.wind.pair",

@@ -10,7 +10,7 @@ import pytest
 import xarray as xr
 from scipy import ndimage
 
-from lidar_mi.experiment.resumable_folder import IMAGES
+from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.run import run
 from lidar_mi.retrieval.images.quality import Flag
 from tests.support.experiments import as_seen, blob, check, small, without_figures, write_wake

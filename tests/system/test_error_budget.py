@@ -10,13 +10,14 @@ import pytest
 import xarray as xr
 
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
-from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.resumable_folder import IMAGES
+from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.run import run
+from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.stages.error_budget import budgets
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import attenuated_backscatter_stderr
-from lidar_mi.experiment.truth import blur_by_beam, make_truth
+from lidar_mi.experiment.truth.blur import blur_by_beam
+from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.io import exr
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 

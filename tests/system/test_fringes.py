@@ -20,10 +20,10 @@ from scipy.constants import speed_of_light
 from lidar_mi.assessment.digits import with_error
 from lidar_mi.cli.run import run as run_command
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema import reading as config
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.ring_images import summed
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.io.exr import read_fringes

@@ -13,10 +13,11 @@ import xarray as xr
 from scipy.interpolate import RegularGridInterpolator
 from scipy.stats import norm, qmc
 
-from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.resumable_folder import IMAGES
+from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.truth import blur_by_beam, make_truth
+from lidar_mi.experiment.schema import reading as config
+from lidar_mi.experiment.truth.blur import blur_by_beam
+from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans
 from lidar_mi.io.exr import read_scan

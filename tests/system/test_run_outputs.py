@@ -17,8 +17,8 @@ import yaml
 from PIL import Image
 
 import lidar_mi as lm
-from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.resumable_folder import IMAGES
+from lidar_mi.experiment.folder.run_folder import IMAGES
+from lidar_mi.experiment.schema import reading as config
 from lidar_mi.io.exr import read_scan
 from tests.support.experiments import FIGURES, SOURCES
 

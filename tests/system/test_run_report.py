@@ -16,8 +16,8 @@ from PIL import Image
 from scipy import ndimage
 
 from lidar_mi.assessment.digits import percent
-from lidar_mi.experiment.resumable_folder import IMAGES
-from lidar_mi.experiment.truth import make_truth
+from lidar_mi.experiment.folder.run_folder import IMAGES
+from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.io.exr import read_scan
 from tests.support.experiments import FIGURES
 

@@ -18,11 +18,11 @@ from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.assessment.metrics.sensor import limit_metrics, vector_metrics
 from lidar_mi.assessment.report import sensor as sensor_report
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import check
-from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import measured
+from lidar_mi.experiment.preflight import check
 from lidar_mi.experiment.run import prepare, run
+from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.stages.sensor import doppler_alone, mean_squares_without, with_truth
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices

@@ -20,10 +20,10 @@ from lidar_mi.assessment.report import comparison
 from lidar_mi.assessment.report.comparison import differences, flat
 from lidar_mi.encounter.check import geometry
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import reading as config
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment import study
 from lidar_mi.experiment.describe import sections
+from lidar_mi.experiment.schema import reading as config
 from tests.support.experiments import leave_out_figures
 
 SCENES = Path(str(files("lidar_mi.scenes"))).resolve()

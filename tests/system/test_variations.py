@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.resumable_folder import IMAGES
+from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.run import run
-from lidar_mi.experiment.truth import blur_by_beam, make_truth
+from lidar_mi.experiment.schema import reading as config
+from lidar_mi.experiment.truth.blur import blur_by_beam
+from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.io.exr import read_scan
 from tests.support.experiments import FIGURES, SOURCES, as_seen, check, small, without_figures

@@ -14,8 +14,8 @@ import pytest
 import xarray as xr
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import reading as config
 from lidar_mi.experiment.run import prepare, run
+from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.stages import volume as volume_chain
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import Scan, plan_scans

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from lidar_mi.experiment.resumable_folder import IMAGES
+from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.stages.winds import rendered_pairs
 from lidar_mi.io.exr import read_scan
 from lidar_mi.retrieval.images.common_grid import on_one_grid

@@ -8,7 +8,7 @@ import math
 
 import pytest
 
-from lidar_mi.experiment.ring_instrument import pixel_noise
+from lidar_mi.experiment.stages.ring_instrument import pixel_noise
 from lidar_mi.retrieval.rings.bound import cramer_rao
 from validation import resolution
 from validation.resolution import Errors

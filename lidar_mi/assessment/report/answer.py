@@ -36,7 +36,7 @@ def answer(experiment, metrics: Mapping[str, float], judged: Judged = ()) -> lis
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.Experiment
+    experiment : lidar_mi.experiment.schema.experiment.Experiment
     metrics : mapping of str to float
         Of a run.
     judged : sequence of (RequirementTable, list of Finding)

@@ -40,7 +40,7 @@ def backscatter_chapter(
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.Experiment
+    experiment : lidar_mi.experiment.schema.experiment.Experiment
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     vectors : dict, optional

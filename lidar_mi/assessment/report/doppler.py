@@ -14,7 +14,7 @@ def doppler_chapter(doppler, metrics: Mapping[str, float], drawn: Sequence[Drawn
 
     Parameters
     ----------
-    doppler : lidar_mi.experiment.schema.Doppler
+    doppler : lidar_mi.experiment.schema.doppler.Doppler
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     """

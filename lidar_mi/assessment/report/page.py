@@ -95,7 +95,7 @@ def page(
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.Experiment
+    experiment : lidar_mi.experiment.schema.experiment.Experiment
     resolved : str
         The experiment with all defaults, as YAML.
     versions : mapping

@@ -21,7 +21,7 @@ def sensor_chapter(
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.Experiment
+    experiment : lidar_mi.experiment.schema.experiment.Experiment
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     judged : sequence of (RequirementTable, list of Finding)

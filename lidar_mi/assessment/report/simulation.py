@@ -27,7 +27,7 @@ def simulation_sentence(experiment, metrics: Mapping[str, float]) -> str:
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.Experiment
+    experiment : lidar_mi.experiment.schema.experiment.Experiment
     metrics : mapping of str to float
         Of a run.
     """

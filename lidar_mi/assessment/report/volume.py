@@ -16,7 +16,7 @@ def volume_chapter(experiment, metrics: Mapping[str, float], drawn: Sequence[Dra
 
     Parameters
     ----------
-    experiment : lidar_mi.experiment.schema.Experiment
+    experiment : lidar_mi.experiment.schema.experiment.Experiment
     metrics : mapping
         From `lidar_mi.experiment.measure.measure`.
     """

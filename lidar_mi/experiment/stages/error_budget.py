@@ -16,9 +16,10 @@ from lidar_mi.assessment.metrics.error_budget import (
 )
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.atmosphere.advection import advect, advect_to
-from lidar_mi.experiment.ideal_images import ideal_scan, slab_images
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema import Experiment, Platform
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.stages.ideal_images import ideal_scan, slab_images
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import (
     known_blur,
@@ -26,7 +27,9 @@ from lidar_mi.experiment.stages.winds import (
     rendered_pairs,
     window_settings,
 )
-from lidar_mi.experiment.truth import Flows, Truth, blur_by_beam, read_flows
+from lidar_mi.experiment.truth.blur import blur_by_beam
+from lidar_mi.experiment.truth.extinction import Truth
+from lidar_mi.experiment.truth.flows import Flows, read_flows
 from lidar_mi.instrument.motion import Motion
 from lidar_mi.instrument.reported import Reported
 from lidar_mi.instrument.scan import ScanPlan

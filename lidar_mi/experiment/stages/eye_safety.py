@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from lidar_mi.assessment.metrics.safety import ScanSafety
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.timed_beams import pulse_train
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.timed_beams import pulse_train
 from lidar_mi.instrument.eye_safety import assess_pulses, scan_hazard_distance
 from lidar_mi.instrument.scan import ScanPlan
 

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 
 from lidar_mi.atmosphere.line import laser_line
-from lidar_mi.experiment.ring_reference import reference_frames
-from lidar_mi.experiment.schema import Doppler
+from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.stages.ring_images import Rings, exposed_frames, reference_photons
+from lidar_mi.experiment.stages.ring_reference import reference_frames
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.fringe_camera import fringe_image
 

@@ -7,20 +7,22 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable, read_requirements
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.ring_instrument import pixel_noise
-from lidar_mi.experiment.ring_reference import (
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.line_frames import PULSES, line_frames, line_images
+from lidar_mi.experiment.stages.ring_images import Rings
+from lidar_mi.experiment.stages.ring_instrument import pixel_noise
+from lidar_mi.experiment.stages.ring_reference import (
     drifts,
     plate_error,
     plate_uncertainty,
     reference_frames,
     shared_covariance,
 )
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stages.line_frames import PULSES, line_frames, line_images
-from lidar_mi.experiment.stages.ring_images import Rings
 from lidar_mi.experiment.stages.ring_velocities import FRAMES, speeds_to_laser
-from lidar_mi.experiment.truth import Flows, Truth, find_file, slab_mean
+from lidar_mi.experiment.truth.extinction import Truth, slab_mean
+from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_of_lines
 from lidar_mi.retrieval.lines.vectors import COMPONENTS

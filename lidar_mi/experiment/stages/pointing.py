@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from lidar_mi.assessment.metrics.pointing import ScanPointing, scan_pointing
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.instrument.scan import ScanPlan
 
 

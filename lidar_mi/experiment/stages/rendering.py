@@ -9,13 +9,15 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.forecast import check_brightness, check_size, check_states, least_samples
+from lidar_mi.experiment.graph import Keeper
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.stage import Keeper
-from lidar_mi.experiment.timed_beams import timed_plans
-from lidar_mi.experiment.truth import Flows, Truth, read_flows
-from lidar_mi.experiment.truth_in_time import air_in_time, values_of_states
+from lidar_mi.experiment.memory import check_size, check_states
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.brightness import check_brightness, least_samples
+from lidar_mi.experiment.stages.timed_beams import timed_plans
+from lidar_mi.experiment.truth.extinction import Truth
+from lidar_mi.experiment.truth.flows import Flows, read_flows
+from lidar_mi.experiment.truth.in_time import air_in_time, values_of_states
 from lidar_mi.instrument.detector import gate_duration
 from lidar_mi.instrument.detector_noise import noise_budget, noisy_scan
 from lidar_mi.instrument.products import untrusted_pixels, with_products

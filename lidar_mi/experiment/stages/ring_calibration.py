@@ -6,17 +6,17 @@ import torch
 
 from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.ring_instrument import pixel_noise
-from lidar_mi.experiment.ring_reference import calibration_drift
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.ring_images import (
     Rings,
     exposed_frames,
     reference_photons,
     ring_models,
 )
-from lidar_mi.experiment.truth import find_file
+from lidar_mi.experiment.stages.ring_instrument import pixel_noise
+from lidar_mi.experiment.stages.ring_reference import calibration_drift
 from lidar_mi.instrument.fringe_camera import fringe_image
 from lidar_mi.io.netcdf import read_netcdf
 from lidar_mi.retrieval.rings.calibration import Calibration, calibrated, calibration_of

@@ -13,13 +13,14 @@ import xarray as xr
 from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.graph import Keeper
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.ring_instrument import air_rings, laser_rings, pixel_noise
-from lidar_mi.experiment.ring_reference import reference_frames
-from lidar_mi.experiment.schema import Doppler, Experiment
-from lidar_mi.experiment.schema_rings import Assumed
-from lidar_mi.experiment.stage import Keeper
+from lidar_mi.experiment.schema.doppler import Doppler
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.rings import Assumed
 from lidar_mi.experiment.stages.rendering import batches_of
+from lidar_mi.experiment.stages.ring_instrument import air_rings, laser_rings, pixel_noise
+from lidar_mi.experiment.stages.ring_reference import reference_frames
 from lidar_mi.instrument.ccd import CCD, expose
 from lidar_mi.instrument.doppler import photons, solar_background, speckle_modes
 from lidar_mi.instrument.fringe_camera import fringe_image, ring_radii

@@ -12,22 +12,23 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.rings import RingBudget
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.ring_instrument import pixel_noise
-from lidar_mi.experiment.ring_reference import (
-    drifts,
-    plate_error,
-    plate_uncertainty,
-    reference_frames,
-    reference_uncertainty,
-    scrambling_needed,
-)
-from lidar_mi.experiment.schema import Doppler, Experiment
+from lidar_mi.experiment.schema.doppler import Doppler
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.ring_images import (
     RingImages,
     Rings,
     expected_image,
     exposed_frames,
     reference_photons,
+)
+from lidar_mi.experiment.stages.ring_instrument import pixel_noise
+from lidar_mi.experiment.stages.ring_reference import (
+    drifts,
+    plate_error,
+    plate_uncertainty,
+    reference_frames,
+    reference_uncertainty,
+    scrambling_needed,
 )
 from lidar_mi.instrument.etalon import finesse
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod

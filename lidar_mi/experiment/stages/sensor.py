@@ -16,8 +16,8 @@ from lidar_mi.assessment.metrics.errors import commonest_flag
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.truth import moves_along
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
 from lidar_mi.retrieval.common_error import NAMES as COMMON_ERRORS

@@ -8,8 +8,8 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable
 from lidar_mi.assessment.metrics.sensor import LidarCost
-from lidar_mi.experiment.schema import Experiment
-from lidar_mi.experiment.timed_beams import lines_schedule, pulse_train
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.timed_beams import lines_schedule, pulse_train
 from lidar_mi.instrument.doppler import photons
 from lidar_mi.instrument.eye_safety import assess_pulses
 from lidar_mi.instrument.pulse_budget import pulse_budget, pulses_for_error

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.rendering import gridded_scans
 from lidar_mi.experiment.stages.winds import (
     attenuated_backscatter_stderr,

@@ -5,9 +5,10 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.errors import error_statistics, truth_at_vectors
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import window_settings
-from lidar_mi.experiment.truth import Flows, advection_by, make_truth
+from lidar_mi.experiment.truth.extinction import make_truth
+from lidar_mi.experiment.truth.flows import Flows, advection_by
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 

@@ -16,9 +16,9 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.rendering import environment_extinction
-from lidar_mi.experiment.truth import Flows
+from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan

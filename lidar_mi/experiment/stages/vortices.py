@@ -12,7 +12,7 @@ import xarray as xr
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema import Experiment
+from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import common_error, pixel_times, rendered_pairs
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.lines.combine import CombinedFlag

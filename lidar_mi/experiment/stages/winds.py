@@ -10,8 +10,10 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.errors import commonest_flag, truth_at_vectors
 from lidar_mi.assessment.metrics.names import EXACT, RENDERED, Source
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema import Experiment, Retrieval
-from lidar_mi.experiment.truth import Truth, blur_by_beam
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.retrieval import Retrieval
+from lidar_mi.experiment.truth.blur import blur_by_beam
+from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.instrument.scan import ScanPlan
 from lidar_mi.retrieval.common_error import with_common_error
 from lidar_mi.retrieval.images.common_grid import resample_pair

@@ -15,7 +15,7 @@ from lidar_mi.assessment.figures.plates import Drawn
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.report.page import Chapter, Tables, page
 from lidar_mi.assessment.report.vector_map import map_data
-from lidar_mi.experiment import reading as config
+from lidar_mi.experiment.schema import reading as config
 from lidar_mi.io.images import panel_cuts
 
 EVIL = "</script><script>alert(1)</script>&\"'"

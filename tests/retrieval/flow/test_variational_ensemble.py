@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidar_mi.experiment.reading import load
+from lidar_mi.experiment.schema.reading import load
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import window_settings
-from lidar_mi.experiment.truth import blur_by_beam, make_truth
+from lidar_mi.experiment.truth.blur import blur_by_beam
+from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 SCENES = Path(str(files("lidar_mi.scenes")))

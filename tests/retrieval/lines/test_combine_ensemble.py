@@ -22,7 +22,7 @@ from scipy.ndimage import gaussian_filter
 from lidar_mi.atmosphere.texture import gaussian_field
 from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
 from lidar_mi.atmosphere.vortex import Vortex, velocity
-from lidar_mi.experiment.truth import find_file
+from lidar_mi.experiment.input_files import find_file
 from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.doppler_scan import DopplerScan, scan_wind
 from lidar_mi.retrieval.lines.combine import combine

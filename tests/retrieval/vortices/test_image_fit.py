@@ -17,8 +17,8 @@ from benchmarks.cases import vortex_pair_images
 from lidar_mi.atmosphere.vortex import Vortex, velocity
 from lidar_mi.atmosphere.wake_path import PairAlongPath
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import reading as config
-from lidar_mi.experiment.truth import make_truth
+from lidar_mi.experiment.schema import reading as config
+from lidar_mi.experiment.truth.extinction import make_truth
 from lidar_mi.retrieval.images.spline import band_limited
 from lidar_mi.retrieval.vortices import model
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices

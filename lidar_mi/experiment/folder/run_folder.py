@@ -1,0 +1,447 @@
+"""The folder of a run: its experiment, the file of each result, its progress."""
+
+import functools
+import hashlib
+import json
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import xarray as xr
+
+from lidar_mi import __version__
+from lidar_mi.assessment.metrics.names import Source, current_name
+from lidar_mi.errors import InputError
+from lidar_mi.experiment import log
+from lidar_mi.experiment.folder.image_store import BATCHES, MADE_BY, ImageStore
+from lidar_mi.experiment.graph import Keeper
+from lidar_mi.experiment.input_files import find_file
+from lidar_mi.experiment.schema import reading
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages import rendering
+from lidar_mi.experiment.stages.timed_beams import timing_files
+from lidar_mi.io import exr
+from lidar_mi.io.atomic import write_atomically
+from lidar_mi.io.folder import is_free, locked, make_folder
+from lidar_mi.io.images import read_pixels
+from lidar_mi.io.json import read_json, to_json
+from lidar_mi.io.netcdf import write_netcdf
+from lidar_mi.io.png import write_preview
+from lidar_mi.io.text import encoded, read_text, write_text
+from lidar_mi.io.vortex_file import write_vortices
+from lidar_mi.io.yaml import read_yaml, to_yaml
+from lidar_mi.rendering.phase import table_files
+
+RECORD, LOG, METRICS, REPORT = "experiment.yaml", "log.txt", "metrics.json", "report.html"
+SUMMARY = "summary.txt"
+"""The answer of a run, a sentence a line."""
+FIGURES = "figures"
+IMAGES = tuple(f"{name}.exr" for name in rendering.IMAGES)
+RENDERED = (*IMAGES, "fringes_*.exr")
+PREVIEWS = tuple(pattern.replace(".exr", ".png") for pattern in RENDERED)
+"""Beside each rendered image one to look at."""
+"""Images of an earlier run of the same experiment that a resumed run reuses."""
+RESULTS = {
+    "wind": "wind.nc",
+    "wind_volume": "wind_volume.nc",
+    "v_los": "v_los.nc",
+    "lines": "lines_of_sight.nc",
+    "wind3d": "wind3d.nc",
+    "vortices": "vortex.json",
+}
+"""File of a result, by its stage."""
+
+# images may depend on the versions of these
+_RENDERED_BY = ("lidar-mi", "mitsuba", "drjit")
+_LIBRARIES = ("mitsuba", "drjit", "numpy", "scipy", "torch", "kornia", "OpenEXR", "xarray")
+
+
+class RunFolder:
+    """The files of a run, each result saved as soon as it is complete.
+
+    Rendered images are read back, so that a resumed run has the same float32 values as an
+    uninterrupted one.
+
+    Parameters
+    ----------
+    path : path
+    experiment : Experiment
+    beside : path
+        Folder in which files named by the experiment are looked for first.
+    shared : Keeper, optional
+        Images that are shared with other runs: used if they are there, else added.
+
+    Attributes
+    ----------
+    record : dict
+        The experiment, checksums of its files and of its metrics, versions.
+    made_by : str
+        SHA-256 of those parts of the record that determine the images. Every result has it as an
+        attribute; a result with another hash is not of this run.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        experiment: Experiment,
+        beside: str | Path,
+        shared: Keeper | None = None,
+    ):
+        self.path = Path(path)
+        self.figures = self.path / FIGURES
+        self.log = self.path / LOG
+        self._experiment, self._beside = experiment, Path(beside)
+        self._inputs = _inputs(experiment, beside)
+        self.record = new_record(experiment, beside)
+        self.made_by = made_by(self.record)
+        self._shared = shared
+        self._images = ImageStore(lambda part: self.path, lambda part: self.made_by)
+
+    @contextmanager
+    def claimed(self, overwrite: bool) -> Iterator[None]:
+        """Lock the folder for this run, keeping images of the same experiment.
+
+        Raises
+        ------
+        InputError
+            Another run is using the folder; it holds images of another experiment or version, and
+            ``overwrite`` is not set; or it is no run folder.
+        """
+        with held(self.path, "run folder"):
+            self._begin(overwrite)
+            yield
+
+    def _begin(self, overwrite: bool) -> None:
+        """Write the record; keep the files of an earlier run that are of this experiment."""
+        folder, marker = self.path, self.path / RECORD
+        images = self._those(RENDERED)
+        results = [folder / name for name in (METRICS, REPORT, SUMMARY, *RESULTS.values())]
+        results = [path for path in results if path.exists()] + [*folder.glob(f"*{BATCHES}")]
+        other = _difference(read_record(folder), self.record) if marker.is_file() else None
+        foreign = [path for path in images if self._is_foreign(path)]
+        if other:
+            what, old = f"a run of {other}", [*results, *images]
+        else:
+            what, old = f"{foreign[0].name} of another experiment" if foreign else "", foreign
+        self._refuse_inputs(changed=bool(other))
+        if old and not overwrite:
+            raise InputError(
+                f"{folder}: holds {what}; expected an empty folder (-o DIR), or --overwrite to "
+                "replace it"
+            )
+        # results of another experiment must not be mistaken for those of this one
+        drawn = [*self.figures.glob("*.png"), *self._those(PREVIEWS), self.log] if other else []
+
+        def remove_old() -> None:
+            for path in (*old, *drawn):
+                path.unlink(missing_ok=True)
+
+        # if the disk is full, the earlier run remains unchanged
+        write_atomically(marker, encoded(to_yaml(self.record)), first=remove_old)
+
+    def _refuse_inputs(self, *, changed: bool) -> None:
+        """Do not overwrite files that this run reads."""
+        here = self.path.resolve()
+        written = {METRICS, REPORT, SUMMARY, LOG, *RESULTS.values()}
+        for field, path in self._inputs.items():
+            rendered = any(path.match(pattern) for pattern in (*RENDERED, *PREVIEWS))
+            if path.resolve().parent == here and (path.name in written or rendered):
+                raise InputError(
+                    f"{field}: {path} lies where this run writes; expected another folder (-o DIR)"
+                )
+        # the record of a run is an experiment file, too
+        if changed and self._beside.resolve() == here:
+            raise InputError(
+                f"{self.path}: holds the experiment that this one was made from; expected another "
+                "folder (-o DIR)"
+            )
+
+    def kept(self, part: str) -> xr.Dataset | None:
+        """As of `ImageStore`; an image shared with other runs is copied here."""
+        image = self._images.kept(part)
+        if image is None and self._shared:
+            image = self._shared.kept(part)
+            if image is not None:
+                self._images.write(part, image)
+        return image
+
+    def unfinished(self, part: str) -> dict[str, Any] | None:
+        """As of `ImageStore`."""
+        return self._images.unfinished(part)
+
+    def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
+        """As of `ImageStore`."""
+        self._images.keep_unfinished(part, arrays)
+
+    def keep_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
+        """As of `ImageStore`; an image that may be shared with other runs is also written there."""
+        if self._shared:
+            self._shared.keep_part(part, value)
+        return self._images.keep_part(part, value)
+
+    def _is_foreign(self, image: Path) -> bool:
+        """Whether an image is of another experiment or version, or cannot be read."""
+        try:
+            return exr.read_header(image).get(MADE_BY) != self.made_by
+        except InputError:
+            return True
+
+    def keep(self, name: str, value: Any) -> None:
+        """Write a result into its file, if it has one; None: there is no such result."""
+        if name == "detected":
+            self._keep_noise(value)
+        write_result(self.path, name, value, self._experiment.name, self.made_by)
+
+    def _those(self, patterns: Sequence[str]) -> list[Path]:
+        return [path for pattern in patterns for path in self.path.glob(pattern)]
+
+    def write_previews(self) -> None:
+        """Write a PNG of its layer Y beside each rendered image, to look at."""
+        for image in self._those(RENDERED):
+            write_preview(image.with_suffix(".png"), read_pixels(image))
+
+    def data_files(self) -> list[str]:
+        """Names of the files beside the report, for links to them."""
+        there = self._those((*RENDERED, *PREVIEWS))
+        there += [self.path / name for name in RESULTS.values() if (self.path / name).exists()]
+        return [*sorted(path.name for path in there), METRICS, SUMMARY, RECORD, LOG]
+
+    def keep_verdict(
+        self, metrics: Mapping[str, float], page: str, answer: Sequence[str] = ()
+    ) -> None:
+        """Write report, answer and metrics: the run is complete.
+
+        The record has the metrics' checksum.
+        """
+        write_verdict(self.path, self.record, metrics, page, answer)
+
+    def _keep_noise(self, scans: list[xr.Dataset]) -> None:
+        """Add noisy images to the files of those without noise."""
+        for part, scan in zip(rendering.IMAGES, scans, strict=True):
+            if "Y_noisy" in scan and "Y_noisy" not in exr.read_scan(self._images.path(part)):
+                self._images.write(part, scan)
+
+
+def write_verdict(
+    folder: Path,
+    record: Mapping[str, Any],
+    metrics: Mapping[str, float],
+    page: str,
+    answer: Sequence[str] = (),
+) -> None:
+    """Write report, answer and metrics of a folder, last the metrics: then it is complete."""
+    text = to_json(metrics)
+    (folder / METRICS).unlink(missing_ok=True)
+    checked = {**record, "metrics": hashlib.sha256(text.encode()).hexdigest()}
+    samples = metrics.get(f"{Source.BACKSCATTER}.samples_per_beam")
+    if samples is not None:  # which the experiment may have left to be chosen
+        checked["samples_per_beam"] = int(samples)
+    write_text(folder / RECORD, to_yaml(checked))
+    write_text(folder / REPORT, page)
+    if answer:
+        write_text(folder / SUMMARY, "".join(f"{line}\n" for line in answer))
+    write_text(folder / METRICS, text)
+
+
+def write_result(folder: Path, name: str, value: Any, experiment: str, signature: str) -> None:
+    """Write the result of a stage into its file, if it has one.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        Of the stage.
+    value : Dataset or VortexFits or None
+        None: there is no such result.
+    experiment, signature : str
+        Name of the experiment and hash of its record, see `made_by`.
+    """
+    if name not in RESULTS:
+        return
+    path = folder / RESULTS[name]
+    if value is None:
+        path.unlink(missing_ok=True)
+    elif name == "vortices":
+        about = {"experiment": experiment, "source": f"lidar-mi {__version__}"}
+        if value.method:
+            about["vectors_method"] = str(value.method)
+        write_vortices(path, value.pairs, **about, **{MADE_BY: signature})
+    else:
+        write_netcdf(value.assign_attrs({MADE_BY: signature}), path)
+
+
+@contextmanager
+def held(folder: Path, kind: str) -> Iterator[None]:
+    """A folder with a record, made if missing and locked, that holds nothing of others.
+
+    Raises
+    ------
+    InputError
+        Another process uses the folder, or it holds files but no record.
+    """
+    refuse_strangers(folder, RECORD, kind)
+    make_folder(folder)
+    with locked(folder):
+        # the former holder of the lock may have changed its experiment
+        refuse_strangers(folder, RECORD, kind)
+        yield
+
+
+def refuse_strangers(folder: Path, marker: str, kind: str) -> None:
+    """Refuse a folder that is not empty and lacks a marker file.
+
+    Raises
+    ------
+    InputError
+        The folder is not empty, and the marker is not in it.
+    """
+    if not (folder / marker).is_file() and not is_free(folder):
+        raise InputError(f"{folder}: is no {kind}; expected an empty or a new one (-o DIR)")
+
+
+def new_record(experiment: Experiment, beside: str | Path) -> dict[str, Any]:
+    """Record of a run to be: ``experiment`` (resolved), ``files`` (checksums), ``versions``."""
+    return {
+        "experiment": reading.settings(experiment),
+        "files": {field: _checksum(path) for field, path in _inputs(experiment, beside).items()},
+        "versions": dict(_versions()),
+        "metrics": None,
+    }
+
+
+@functools.cache
+def _versions() -> dict[str, str]:
+    return {
+        "lidar-mi": __version__,
+        "python": platform.python_version(),
+        **{name: version(name) for name in _LIBRARIES},
+    }
+
+
+def made_by(record: dict, indifferent_to: Sequence[str] = ()) -> str:
+    """Hash of what a record says of settings, files and versions that rendered images depend on.
+
+    Parameters
+    ----------
+    record : dict
+        From `new_record`.
+    indifferent_to : sequence of str
+        Dotted keys of settings that have no influence; files that they name have none either.
+    """
+    decisive = {
+        "experiment": _without(reading.in_si(record["experiment"]), indifferent_to),
+        "files": _without(record["files"], indifferent_to),
+        "versions": {name: record["versions"][name] for name in _RENDERED_BY},
+    }
+    return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
+
+
+def _without(settings: dict, keys: Sequence[str], above: str = "") -> dict:
+    """Settings without some dotted keys and what is below them."""
+    found = {}
+    for key, value in settings.items():
+        name = f"{above}{key}"
+        if not any(name == one or name.startswith(f"{one}.") for one in keys):
+            nested = isinstance(value, dict)
+            found[key] = _without(value, keys, f"{name}.") if nested else value
+    return found
+
+
+def _difference(before: dict, now: dict) -> str | None:
+    """The first difference to an earlier run that affects its images; None: there is none."""
+    changed = reading.in_si(before["experiment"]) != reading.in_si(now["experiment"])
+    if changed or before.get("files") != now["files"]:
+        return "another experiment"
+    for name in _RENDERED_BY:
+        earlier = before["versions"].get(name)
+        if earlier != now["versions"][name]:
+            return f"{name} {earlier}, this is {now['versions'][name]}"
+    return None
+
+
+def _inputs(experiment: Experiment, beside: str | Path) -> dict[str, Path]:
+    """The files named by an experiment, by key: a changed file makes another experiment."""
+    if experiment.wake is None:
+        return {}
+    paths = table_files(experiment.scattering, beside)
+    if experiment.wake.file:
+        paths["wake.file"] = find_file(experiment.wake.file, beside, "wake.file")
+    return paths | timing_files(experiment, beside)
+
+
+def _checksum(path: Path) -> str:
+    found = path.stat()
+    return _checksum_of(path, found.st_size, found.st_mtime_ns)
+
+
+@functools.lru_cache(64)
+def _checksum_of(path: Path, size: int, changed: int) -> str:
+    """Of a file as it was then: many runs of one process read the same file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_record(folder: str | Path) -> dict:
+    """Record of a run folder: ``experiment`` (resolved), ``files`` (checksums), ``versions``.
+
+    Raises
+    ------
+    InputError
+        The folder's experiment.yaml is missing or was not written by a run.
+    """
+    marker = Path(folder) / RECORD
+    if not marker.is_file():
+        raise InputError(f"{folder}: no experiment.yaml in it; expected a run folder")
+    try:
+        record = read_yaml(marker, "a run's record")
+    except InputError:
+        record = None
+    if not isinstance(record, dict) or not all(
+        isinstance(record.get(key), dict) for key in ("experiment", "versions")
+    ):
+        raise InputError(f"{marker}: not written by a run; expected a run folder")
+    return record
+
+
+def read_metrics(folder: str | Path) -> dict[str, float] | None:
+    """Metrics of the run or the study in a folder, by today's names; None: not complete.
+
+    Raises
+    ------
+    InputError
+        The folder's metrics.json was not written by its run.
+    """
+    path, marker = Path(folder) / METRICS, Path(folder) / RECORD
+    if not path.is_file():
+        return None
+    metrics = read_json(path, "metrics of a run")
+    if not isinstance(metrics, dict) or not all(map(_is_number, metrics.values())):
+        raise InputError(f"{path}: not written by a run; expected names with numbers")
+    if marker.is_file():  # which a study has not
+        checksum = read_record(folder).get("metrics", "")
+        if checksum is None:  # of an earlier run; this one is not done
+            return None
+        # older versions wrote no checksum
+        if checksum and checksum != _checksum(path):
+            raise InputError(f"{path}: was changed or copied here; expected the metrics of its run")
+    return {current_name(key): value for key, value in metrics.items()}
+
+
+def read_answer(folder: str | Path) -> list[str]:
+    """The answer of the run in a folder, see `lidar_mi.assessment.report.answer`.
+
+    Empty: not complete, or of an earlier version.
+    """
+    path = Path(folder) / SUMMARY
+    return read_text(path, "the summary of a run").splitlines() if path.is_file() else []
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, float) or (isinstance(value, int) and abs(value) < 2**63)
+
+
+def failure(folder: str | Path) -> str | None:
+    """The error that ended the last run in a folder; None: none, or it was only stopped."""
+    return log.failure(Path(folder) / LOG)

@@ -1,0 +1,1 @@
+"""Before a run: what it will do, and how long it will take."""

@@ -1,0 +1,260 @@
+"""Summary of an experiment before its run, with the checks of a run, in numbers."""
+
+import math
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from lidar_mi.assessment.metrics.cores import find_cores
+from lidar_mi.assessment.metrics.flow_checks import relative_divergence, sense_of_rotation
+from lidar_mi.assessment.metrics.requirements import look_ahead
+from lidar_mi.experiment import run as experiment
+from lidar_mi.experiment.describe import Section
+from lidar_mi.experiment.log import Log, Notice, silent
+from lidar_mi.experiment.memory import forecast
+from lidar_mi.experiment.preflight.cost import cost
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.image_remarks import window_reach
+from lidar_mi.experiment.stages.light_budget import light_budget
+from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text, with_samples
+from lidar_mi.experiment.stages.timed_beams import lines_schedule, scan_schedule
+from lidar_mi.experiment.truth.extinction import Truth
+from lidar_mi.experiment.truth.in_time import values_of_states
+from lidar_mi.instrument.doppler import DopplerLidar, photons
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.scan_timing import Schedule
+from lidar_mi.progress import without_warnings
+from lidar_mi.rendering.memory import ceiling
+from lidar_mi.rendering.phase import Scatterer
+from lidar_mi.rendering.samples import Samples
+from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.units import shown
+
+LEAST_SHOWN = 0.5
+"""Seconds of a part of a run that is shown."""
+
+
+def sections(
+    asked: Experiment,
+    beside: str | Path = ".",
+    notice: Notice = silent,
+    *,
+    timed: bool = False,
+    sampled: bool = False,
+) -> Iterator[Section]:
+    """Titled tables of an experiment's instruments and the observed air; nothing is written.
+
+    Parameters
+    ----------
+    asked : Experiment
+    beside : path
+        Folder in which files named by the experiment are searched first.
+    notice : callable
+        Called with the name of the running step.
+    timed : bool
+        With the time of the run, which takes a probe of about a second.
+    sampled : bool
+        Say of Monte Carlo samples, where there is a detector, how many are chosen and what their
+        noise is beside its own, which takes an image of few samples.
+
+    Raises
+    ------
+    InputError
+        Anything that a run would refuse before it starts.
+    """
+    start = time.process_time()
+    prepared = experiment.prepare(asked, beside, without_warnings(notice))
+    preparation, ahead = time.process_time() - start, prepared.results
+    chosen: Samples | None = None
+    if asked.wake:
+        if sampled:
+            needed = [ahead[name] for name in ("truth", "plans", "air", "flows")]
+            chosen = chosen_samples(asked, *needed, log=Log(notice))
+        yield from _backscatter(asked, ahead["truth"], ahead["plans"][0], ahead["air"], chosen)
+        if asked.scan.timing:
+            schedule = scan_schedule(asked, ahead["plans"][0], beside)
+            yield "scan of the backscatter lidar", _timing(asked, schedule)
+    if asked.doppler:
+        yield _doppler(asked)
+    if asked.sensor:
+        yield _sensor(asked, ahead["requirements"])
+        if asked.sensor.timing:
+            yield "scan of the Doppler lidar", _timing(asked, lines_schedule(asked, beside))
+    if timed:
+        notice("timing a few samples and a retrieval", None)
+        whole = with_samples(asked, chosen.number) if chosen else asked
+        yield "cost of the run, to a factor of 2", _cost(whole, ahead, preparation)
+    if prepared.warnings:
+        yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
+
+
+def _backscatter(
+    asked: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer, chosen: Samples | None
+) -> Iterator[Section]:
+    wind, extinction = truth.wind, truth.extinction[0]
+    rows = [(axis, _span(wind[axis].values, "m")) for axis in ("y", "z")]
+    rows += [(name, _span(wind[name].values, "m/s")) for name in ("u", "v", "w") if name in wind]
+    if not asked.wake.turbine:
+        rows.append(("vortices", sense_of_rotation(wind, find_cores(wind))))
+    divergence = relative_divergence(wind)
+    if divergence == divergence:
+        rows.append(("divergence of v, w", f"{divergence:.2g} of the vorticity's rms"))
+    rows.append(("extinction", _span(1e3 * extinction.values, "1/km")))
+    rows.append(("texture, rms", f"{asked.wake.texture.rms:.0%}"))
+    title = asked.wake.file or ("vortex_pair" if asked.wake.vortex_pair else "turbine")
+    yield f"{asked.name}: extinction in the gates ({title}, about the scan's axis)", rows
+
+    scan, lidar, platform = asked.scan, asked.lidar, asked.platform
+    pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
+    rows = [
+        ("laser", _laser(lidar)),
+        ("beam's divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
+        ("field of view", f"{shown(lidar.fov_half, 'mrad')}, half angle"),
+        ("telescope's radius", f"{lidar.aperture_radius:g} m"),
+        ("beams", f"{plan.y.size} x {plan.z.size}, {pixel:.3g} m apart"),
+        ("beam's 1/e^2 radius there", f"{float(lidar.radius_at(plan.centre)):.3g} m"),
+        ("gates", f"{scan.gate_count}, from {plan.gate_start:g} to {plan.gate_stop:g} m"),
+        ("warning time", _warning(plan.gate_start, platform.speed)),
+        ("samples per beam", _samples(asked, chosen)),
+        ("time between the images", f"{platform.dt:g} s"),
+        *_light(asked, truth, plan, air),
+    ]
+    if not asked.volume:
+        rows += _displacements(asked, wind, plan)
+    yield "backscatter lidar", rows
+
+
+def _samples(asked: Experiment, chosen: Samples | None) -> str:
+    """Monte Carlo samples, and the variance of their noise over that of the detector's."""
+    number: object = asked.render.samples_per_beam
+    if chosen:
+        number = samples_text(asked, chosen)
+    elif asked.detector is None:
+        number = asked.render.without_detector(asked.scan.gate_count)
+    return f"{number}, orders 1 to {asked.render.max_order}"
+
+
+def _light(
+    asked: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer
+) -> list[tuple[str, str]]:
+    """What scatters, how much of it arrives, and with how much noise."""
+    light, kind = light_budget(asked, truth, plan, air), asked.scattering
+    named = kind.aerosol or kind.table
+    what = f"{kind.phase} {named}" if named else kind.phase.replace("_", "-")
+    rows = [
+        ("scattering", f"{what}, {light.lidar_ratio:.3g} sr of extinction over backscatter"),
+        ("overlap with the field of view", f"{light.overlap:.1%}"),
+        ("transmittance there and back", f"{light.transmittance:.1%}"),
+    ]
+    if light.photoelectrons is not None:
+        rows += [
+            ("photoelectrons of a pulse", f"{light.photoelectrons:.3g} in the median pixel"),
+            ("noise of a pixel", f"{light.noise:.2g} of its signal"),
+        ]
+    return rows
+
+
+def _cost(asked: Experiment, ahead: Mapping, preparation: float) -> list[tuple[str, str]]:
+    """Time of the parts of a run on one core of this machine, and its memory."""
+    found = cost(asked, ahead, preparation)
+    names = {
+        "preparation": "reading, advection of the air",
+        "rendering": "rendering (all cores share it)",
+        "images": "wind from the images",
+        "rings": "rings of the Doppler lidar",
+        "lines": "lines of sight",
+        "figures": "figures and report",
+    }
+    parts = found._asdict()
+    rows = [
+        (text, f"about {duration(parts[key])}")
+        for key, text in names.items()
+        if parts[key] >= LEAST_SHOWN
+    ]
+    rows.append(("all, on one core", f"about {duration(found.total)}"))
+    beams = in_states = 0
+    if asked.wake:
+        plan = ahead["plans"][0]
+        beams = plan.y.size * plan.z.size
+        in_states = values_of_states(asked, ahead["flows"], ahead["plans"])
+    expected = forecast(asked, beams, in_states) / 1e9
+    allowed = ceiling((asked.render if asked.wake else asked.doppler.render).memory) / 1e9
+    rows.append(("memory", f"about {expected:.2g} GB, at most {allowed:.3g} GB"))
+    return rows
+
+
+def duration(seconds: float) -> str:
+    """A time in a suitable unit: 40 s, 3 min, 5 h, 12 days."""
+    for unit, length in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{max(seconds, 1):.0f} s"
+
+
+def _displacements(asked: Experiment, wind, plan: ScanPlan) -> list[tuple[str, str]]:
+    """The fastest wind and the fastest that windows of this size can follow, per axis."""
+    settings, reach = asked.retrieval, window_reach(asked, plan)
+    fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
+    rows = [("methods", ", ".join(settings.methods))]
+    if {ImageMethod.CC, ImageMethod.WS} & set(settings.methods):
+        rows.append(("fastest wind windows follow", f"{reach:.3g} m/s, here {fastest:.3g}"))
+    return rows
+
+
+def _doppler(asked: Experiment) -> Section:
+    lidar = asked.doppler.lidar
+    return "Doppler lidar", [
+        ("laser", _laser(lidar)),
+        ("beam's divergence", f"{shown(lidar.divergence_full, 'mrad')}, full angle at 1/e^2"),
+        ("field of view", f"{shown(lidar.fov_half, 'mrad')}, half angle"),
+        ("range bin", f"{lidar.range_bin:g} m about {lidar.range:g} m"),
+        ("photons of a pulse", f"{photons(lidar):.3g}"),
+        ("methods", ", ".join(asked.doppler.retrieval.methods)),
+    ]
+
+
+def _laser(lidar: BackscatterLidar | DopplerLidar) -> str:
+    """Wavelength, energy and duration of a pulse."""
+    parts = [shown(lidar.wavelength, "nm"), f"{shown(lidar.pulse_energy, 'mJ')} a pulse"]
+    if lidar.pulse_duration:
+        parts.append(shown(lidar.pulse_duration, "ns"))
+    return ", ".join(parts)
+
+
+def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
+    """What a scan in time asks of the laser and of the scanner, and how far it is flown."""
+    flown = asked.platform.speed * schedule.duration
+    return [
+        ("duration", f"{schedule.duration:.4g} s"),
+        ("distance flown", f"{flown:.3g} m"),
+        ("beams per second between turns", f"{schedule.beam_rate:.4g}"),
+        ("angular rate", f"{math.degrees(schedule.load.rate):.4g} deg/s"),
+        ("angular acceleration", f"{math.degrees(schedule.load.acceleration):.4g} deg/s^2"),
+    ]
+
+
+def _sensor(asked: Experiment, tables: Mapping) -> Section:
+    sensor = asked.sensor
+    columns, rows = sensor.directions.columns, sensor.directions.rows
+    count = columns * rows
+    speed = asked.platform.speed
+    judged = [" ".join(key) for key, table in tables.items() if table.applies_at(speed)]
+    # further checks are made by a run
+    flat = "; all in one plane: no wind from both" if min(columns, rows) == 1 else ""
+    return "both as one sensor", [
+        ("lines of sight", f"{count}, {sensor.pulses} pulses each{flat}"),
+        ("pulses per second", f"{count * sensor.pulses * sensor.slabs_per_second:g}"),
+        ("v and w from", sensor.method),
+        ("compliance with", ", ".join(judged) or "no requirements"),
+    ]
+
+
+def _warning(distance: float, speed: float) -> str:
+    return f"{look_ahead(distance, speed):.3g} s at {shown(speed, 'm/s')}" if speed else "at rest"
+
+
+def _span(values: np.ndarray, unit: str) -> str:
+    return f"{values.min():.4g} to {values.max():.4g} {unit}"

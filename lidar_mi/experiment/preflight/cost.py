@@ -1,0 +1,234 @@
+"""Time of a run before it is started, calibrated on this machine by a probe of about a second.
+
+Rendering is timed with the experiment's own scene and few samples. All other steps have a cost per
+pixel that was measured beside a fixed piece of work, the probe; the time that the probe takes here
+and now over the time that it took then is the factor between the machines.
+"""
+
+import functools
+import time
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.pipeline import has_error_budget, has_vortices
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.rendering import IMAGES, chosen_samples, render_images, with_samples
+from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMethod
+from lidar_mi.retrieval.wind.pair import retrieve_wind
+
+PROBE_SECONDS = 0.115
+"""Processor time of `probe` beside which all costs below were measured."""
+START = 3.0
+"""Seconds: libraries, and kernels that are compiled."""
+IMAGE_METHODS = {
+    ImageMethod.CC: (0.07, 4.5e-6),
+    ImageMethod.WS: (0.06, 4e-6),
+    ImageMethod.MULTIPASS: (0.15, 1.5e-5),
+    ImageMethod.VARIATIONAL: (0.08, 4.2e-5),
+    ImageMethod.VORTEX_FIT: (1.0, 5e-5),
+}
+"""Seconds of a retrieval from one pair: fixed, and per pixel."""
+BOUND = (0.05, 5e-6)
+"""The bound of a pair, and its true wind."""
+LEVEL = (0.08, 5e-6)
+"""A level of the texture sweep beside its correlation."""
+CAUSES = 5
+"""Retrievals of an error budget, per method."""
+VOLUME_METHODS = {VolumeMethod.CORRELATION: (0.5, 1.1e-5), VolumeMethod.VARIATIONAL: (0.5, 3.4e-5)}
+"""Seconds of a retrieval from two volumes: fixed, and per voxel; strides do not matter."""
+RING_IMAGE = 1.3e-6
+"""Seconds of a pixel of an image of rings, without noise, of 16 samples."""
+RING_CALIBRATION = 3e-6
+"""Seconds of a pixel of a frame from which the instrument is calibrated."""
+RING_PAIR = 4.0e-7
+"""Seconds of a pixel of a noisy frame and its laser's, drawn and fitted."""
+RING_PIXELS_FIT = 4e-6
+"""Seconds of a pixel of a frame, fitted pixel by pixel."""
+RING_PEAK = 8e-8
+"""Seconds of a pixel of a frame whose peaks are found, by one method."""
+RING_BOUND = 6e-6
+"""Seconds of a pixel, for the bound."""
+VORTICES = 2.5
+FIGURES = {"images": 8.0, "rings": 2.5, "sensor": 2.5}
+"""Seconds of the figures of a chapter, and its part of the report."""
+FLIGHT_SLAB = 0.3
+"""Seconds of the wind and the vortices of a slab in flight."""
+FLIGHT_LINES = 0.3
+"""Of the time of fits, for frames that are read by the score function in flight."""
+FLIGHT_FIGURES = 13.0
+"""Seconds of the figures, the animation and the report of a flight."""
+_PROBES = 4
+_SAMPLES = 1.5e6
+"""Samples of the render probe, times orders: half a second."""
+
+
+class Cost(NamedTuple):
+    """Processor time of the parts of a run, s."""
+
+    preparation: float
+    rendering: float
+    images: float
+    rings: float
+    lines: float
+    figures: float
+
+    @property
+    def total(self) -> float:
+        """Of all parts."""
+        return START + sum(self)
+
+
+def cost(experiment: Experiment, ahead: Mapping[str, Any], preparation: float = 0.0) -> Cost:
+    """Processor time of a run on this machine, to a factor of two.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    ahead : mapping
+        Results of the stages that `lidar_mi.experiment.run.prepare` has computed.
+    preparation : float
+        Processor time that it took, s.
+    """
+    here = slowness()
+    rendering = 2 * render_seconds(experiment, ahead) if experiment.wake else 0.0
+    return Cost(
+        preparation,
+        rendering,
+        here * _images(experiment, ahead),
+        here * _rings(experiment),
+        here * _lines(experiment),
+        here * _figures(experiment),
+    )
+
+
+def flight_seconds(first: Experiment, ahead: Mapping[str, Any], scans: float) -> float:
+    """Processor time of a flight on this machine, to a factor of two.
+
+    Parameters
+    ----------
+    first : Experiment
+        The images of one slab.
+    ahead : mapping
+        Results of the stages that `lidar_mi.experiment.run.prepare` has computed of it.
+    scans : float
+        Of the lidar; each is of two slabs. Flights without it take hardly any time.
+    """
+    here = slowness()
+    each = here * (FLIGHT_SLAB + FLIGHT_LINES * _lines(first))
+    lidar = scans * (2 * render_seconds(first, ahead) + each) if scans else 0.0
+    return START + lidar + here * FLIGHT_FIGURES
+
+
+@functools.cache
+def slowness() -> float:
+    """Time of `probe` here over that beside which the costs were measured; once per process."""
+    probe()  # loads libraries
+    start = time.process_time()
+    for _ in range(_PROBES):
+        probe()
+    return (time.process_time() - start) / (_PROBES * PROBE_SECONDS)
+
+
+def probe() -> None:
+    """A fixed piece of work like that of a run: a correlation of images, and counted photons."""
+    rng = np.random.default_rng(1)
+    axes = {axis: (axis, np.arange(96.0), {"units": "m"}) for axis in ("z", "y")}
+    image = xr.DataArray(1 + 0.1 * rng.standard_normal((96, 96)), axes, ("z", "y"))
+    second = image.copy(data=np.roll(image.values, 1, 1))
+    retrieve_wind(image, second, dt=0.1, method=ImageMethod.CC)
+    rng.poisson(np.full((500, 800), 30.0))
+
+
+def render_seconds(experiment: Experiment, ahead: Mapping[str, Any]) -> float:
+    """Time of one image, from the first one with few samples and with four times as many.
+
+    Their difference has no part of what is done once, such as compiling. Where the number of
+    samples is to be chosen, with the time of doing so.
+    """
+    plan, render = ahead["plans"][0], experiment.render
+    needed = [ahead[name] for name in ("truth", "plans", "air", "flows")]
+    if render.samples_per_beam == "auto":
+        begin = time.process_time()
+        chosen = chosen_samples(experiment, *needed, log=Log())
+        number = chosen.number if chosen else render.without_detector(plan.gate_count)
+        choosing = time.process_time() - begin
+        return choosing / 2 + render_seconds(with_samples(experiment, number), ahead)
+    beams, least = plan.y.size * plan.z.size, 2 * experiment.scan.gate_count
+    few = max(2, least, round(_SAMPLES / 4 / (beams * render.max_order)))
+    whole = max(render.samples_per_beam, least)
+
+    def timed(samples: int) -> float:
+        asked = with_samples(experiment, samples)
+        start = time.process_time()
+        for _ in render_images(asked, *needed, log=Log(), missing=IMAGES[:1]):
+            pass
+        return time.process_time() - start
+
+    if whole <= 4 * few:
+        timed(whole)
+        return timed(whole)
+    timed(few)
+    short, long = timed(few), timed(4 * few)
+    return short + max(long - short, 0.0) * (whole - few) / (3 * few)
+
+
+def _images(experiment: Experiment, ahead: Mapping[str, Any]) -> float:
+    """Winds from images or volumes."""
+    if not experiment.wake:
+        return 0.0
+    plan = ahead["plans"][0]
+    pixels = plan.y.size * plan.z.size
+    if experiment.volume:
+        voxels = pixels * experiment.scan.gate_count
+        return sum(_at(VOLUME_METHODS[method], voxels) for method in experiment.volume.methods)
+    settings = experiment.retrieval
+    each = sum(_at(IMAGE_METHODS[method], pixels) for method in settings.methods)
+    everything = settings.sources == "all"
+    sources = (4 if everything else 1) + bool(experiment.detector and everything)
+    seconds = 1.0 + sources * (each + _at(BOUND, pixels))
+    seconds += 6 * (_at(IMAGE_METHODS[ImageMethod.CC], pixels) + _at(LEVEL, pixels))
+    if has_error_budget(experiment):
+        seconds += CAUSES * each
+    return seconds + VORTICES * has_vortices(experiment)
+
+
+def _rings(experiment: Experiment) -> float:
+    """Images of rings, and velocities from them."""
+    doppler = experiment.doppler
+    if not doppler:
+        return 0.0
+    settings, pixels = doppler.retrieval, doppler.camera.width * doppler.camera.height
+    cases = len(settings.averaged) * len(doppler.v_los)
+    slow = cases * settings.slow_images * len(settings.centre)
+    asked = doppler.calibration
+    calibrated = 0 if asked is None or asked.file else asked.frames
+    peaks = [m for m in settings.methods if m not in (RingMethod.ANNULAR, RingMethod.PIXELS)]
+    return pixels * (
+        RING_IMAGE * (len(doppler.v_los) + 1) * doppler.render.samples_per_pixel / 16
+        + RING_CALIBRATION * calibrated
+        + RING_PAIR * cases * settings.images
+        + RING_PIXELS_FIT * slow * (RingMethod.PIXELS in settings.methods)
+        + RING_PEAK * slow * len(peaks)
+        + RING_BOUND
+    )
+
+
+def _lines(experiment: Experiment) -> float:
+    """All lines of sight; the pulses of a line are summed, however many they are."""
+    if not experiment.sensor:
+        return 0.0
+    directions, camera = experiment.sensor.directions, experiment.doppler.camera
+    return RING_PAIR * directions.columns * directions.rows * camera.width * camera.height
+
+
+def _figures(experiment: Experiment) -> float:
+    parts = {"images": experiment.wake, "rings": experiment.doppler, "sensor": experiment.sensor}
+    return sum(FIGURES[name] for name, there in parts.items() if there)
+
+
+def _at(line: tuple[float, float], pixels: float) -> float:
+    return line[0] + line[1] * pixels

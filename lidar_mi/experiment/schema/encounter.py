@@ -1,0 +1,148 @@
+"""The keys of an encounter: a flight into the wake, the aircraft, its control."""
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from lidar_mi.experiment.schema.section import Section
+from lidar_mi.units import (
+    Angle,
+    AngularRate,
+    Area,
+    Frequency,
+    Inertia,
+    Length,
+    Number,
+    Speed,
+    Time,
+    Within,
+    quantity,
+)
+
+_Slope = Annotated[Angle, Within(-0.35, 0.35, "20 degrees")]
+
+
+class Miss(Section):
+    """Where the middle between the vortices is, from the path, when the aircraft arrives."""
+
+    y: Annotated[Length, Within(-1000, 1000, "an encounter")] = Field(
+        0.0, description="to the left of the path"
+    )
+    z: Annotated[Length, Within(-1000, 1000, "an encounter")] = Field(
+        0.0, description="above the path"
+    )
+
+
+class Path(Section):
+    """The straight nominal flight path, and where it meets the wake."""
+
+    speed: Annotated[Speed, Within(10, 350, "from a glider to the speed of sound")] = Field(
+        75.0, description="true airspeed"
+    )
+    crossing_angle: Annotated[Angle, Within(0, 1.5708, "0 to 90 degrees")] = Field(
+        quantity("10 deg"), description="of the path and the wake's axis, horizontal"
+    )
+    climb_angle: _Slope = Field(quantity("-3 deg"), description="of the path; the wake is level")
+    miss: Miss = Miss()
+    altitude: Annotated[Length, Within(1, 15000, "the lower atmosphere")] = Field(
+        300.0, description="height above the ground (sea level) at the start"
+    )
+    start: Annotated[Length, Within(1, 20000, "an encounter")] = Field(
+        600.0, description="distance from the wake's centre at the start"
+    )
+    beyond: Annotated[Length, Within(0, 20000, "an encounter")] = Field(
+        300.0, description="distance flown behind the wake's centre"
+    )
+
+    @model_validator(mode="after")
+    def _above_the_ground(self) -> "Path":
+        lowest = self.altitude + (self.start + self.beyond) * math.sin(min(self.climb_angle, 0.0))
+        if lowest <= 0:
+            raise ValueError(
+                f"altitude {self.altitude:g} m: the path ends {-lowest:.0f} m below the ground; "
+                f"expected above {self.altitude - lowest:.0f} m, or a flatter or shorter path"
+            )
+        return self
+
+
+class Crow(Section):
+    """Sinusoidal deformation of both vortices, in planes inclined by 45 degrees (Crow 1970)."""
+
+    amplitude: Annotated[Length, Within(0, 1000, "less than the separation")] = 0.0
+    wavelength: Annotated[Length, Within(1, 100000, "8.6 separations")] | None = Field(
+        None, description="default: 8.6 separations"
+    )
+
+
+class WakeInTime(Section):
+    """How the wake changes in time and along its axis, beside its drift."""
+
+    decay_time: Annotated[Time, Within(1, 1e9, "a wake's life")] | None = Field(
+        None, description="in which circulation falls to 1/e; default: it stays"
+    )
+    crow: Crow = Crow()
+
+
+class Aircraft(Section):
+    """The aircraft that flies into the wake.
+
+    Defaults are the Boeing 737 of JSBSim: its metrics, inertia with fuel, control power and, with
+    the finite-span slope of an elliptic wing, its lift slope of 4.35 per rad. The aileron's rate
+    is usual for transport aircraft. The numbers are those of the roll model; an aircraft of JSBSim
+    has its own, but for the lift slope of the sections and the rate of the controls.
+    """
+
+    model: str = Field(
+        "roll", description="roll: rigid, rolls only; else an aircraft of JSBSim, such as 737"
+    )
+    span: Annotated[Length, Within(1, 200, "aircraft")] = 28.9
+    wing_area: Annotated[Area, Within(0.1, 2000, "aircraft")] = 108.8
+    roll_inertia: Annotated[Inertia, Within(0.1, 1e9, "aircraft")] = 8.0e5
+    lift_slope: Annotated[Number, Within(1, 6.2832, "thin wings, per rad")] = Field(
+        5.3, description="of the wing's sections"
+    )
+    largest_aileron: Annotated[Angle, Within(0.001, 1, "aircraft")] = Field(quantity("20 deg"))
+    aileron_rate: Annotated[AngularRate, Within(0.001, 100, "actuators")] = quantity("50 deg/s")
+    aileron_power: Annotated[Number, Within(1e-3, 1, "aircraft")] = Field(
+        0.1, description="rolling moment coefficient per rad of deflection"
+    )
+
+    @field_validator("model", mode="before")
+    @classmethod
+    def _name(cls, value: object) -> object:
+        """YAML reads 737 as a number."""
+        return str(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+
+class Control(Section):
+    """What steers against the wake."""
+
+    mode: Literal["off", "feedforward", "perfect"] = Field(
+        "feedforward", description="off: the wings are levelled; perfect: knows the truth"
+    )
+    latency: Annotated[Time, Within(0, 10, "seconds")] = Field(
+        0.12, description="from the second scan of a slab to its estimate"
+    )
+    levelling_time: Annotated[Time, Within(0.1, 1000, "a pilot")] | None = Field(
+        3.0, description="in which the wings are levelled, in every mode; null: they are not"
+    )
+
+    @field_validator("mode", mode="before")
+    @classmethod
+    def _off_is_a_word(cls, value: object) -> object:
+        """YAML reads a bare off as false."""
+        return "off" if value is False else value
+
+
+class Encounter(Section):
+    """A flight through the wake of the experiment."""
+
+    aircraft: Aircraft = Aircraft()
+    path: Path = Path()
+    wake: WakeInTime = WakeInTime()
+    rate: Annotated[Frequency, Within(0.1, 1000, "slabs a second")] = 10.0
+    look_ahead: Annotated[Length, Within(5, 20000, "a lidar's range")] = Field(
+        150.0, description="range of the farther gate's start"
+    )
+    control: Control = Control()

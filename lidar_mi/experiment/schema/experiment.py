@@ -1,0 +1,181 @@
+"""The keys of an experiment file, each with its unit, its default and its limits.
+
+Each section has a file; those of the instruments are in `lidar_mi.instrument`.
+"""
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field, PrivateAttr, model_validator
+
+from lidar_mi.experiment.schema.doppler import Doppler
+from lidar_mi.experiment.schema.encounter import Encounter
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.retrieval import Retrieval
+from lidar_mi.experiment.schema.scattering import Scattering
+from lidar_mi.experiment.schema.section import Section
+from lidar_mi.experiment.schema.sensor import Sensor
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Wake
+from lidar_mi.instrument.detector import Detector
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import Scan
+from lidar_mi.rendering.settings import RenderSettings
+from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.tables import Table, Tabular
+from lidar_mi.units import AS_GIVEN, Within
+
+# keys of the backscatter lidar, which observes a wake
+BACKSCATTER = ("platform", "lidar", "detector", "scan", "scattering", "render", "retrieval")
+
+
+NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,99}"
+"""Allowed names of experiments and variants, which are names of folders."""
+
+
+class Experiment(Tabular, Section):
+    """One experiment: a wake for the backscatter lidar, a Doppler lidar, or both."""
+
+    name: str = Field(pattern=f"^{NAME}$")
+    seed: Annotated[int, Within(0, 2**31 - 1, "integers of an image header")] = 1
+    wake: Wake | None = Field(None, description="observed by the backscatter lidar")
+    doppler: Doppler | None = Field(None, description="the Doppler lidar; {} for the paper's")
+    platform: Platform = Platform()
+    lidar: BackscatterLidar = BackscatterLidar()
+    detector: Detector | None = Field(None, description="adds a noisy image and its winds")
+    scan: Scan = Scan()
+    scattering: Scattering = Scattering()
+    render: RenderSettings = RenderSettings()
+    retrieval: Retrieval = Retrieval()
+    sensor: Sensor | None = Field(None, description="both lidars combined; {} for all defaults")
+    volume: Volume | None = Field(
+        None, description="u, v, w from all gates, in place of retrieval; {} for all defaults"
+    )
+    encounter: Encounter | None = Field(
+        None, description="a flight through the wake, by fly; {} for all defaults"
+    )
+    _folder: Path = PrivateAttr(Path())
+
+    @property
+    def folder(self) -> Path:
+        """The folder of its file, in which files that it names are searched first."""
+        return self._folder
+
+    def tables(self) -> list[Table]:
+        """Keys that differ from their defaults, as they were given."""
+        given = self.model_dump(
+            mode="json", exclude_defaults=True, exclude={"name"}, context=AS_GIVEN
+        )
+        return [Table(f"experiment {self.name}; keys without their default", _rows(given))]
+
+    def read_from(self, folder: str | Path) -> "Experiment":
+        """The same experiment, with another folder for the files that it names."""
+        copy = self.model_copy()
+        copy._folder = Path(folder)
+        return copy
+
+    @model_validator(mode="after")
+    def _gates_that_make_a_volume(self):
+        if self.volume is None:
+            return self
+        wake, scan = self.wake, self.scan
+        if wake is None or (wake.depth != "volume" and wake.turbine is None):
+            raise ValueError(
+                "volume: not allowed without a wake in three dimensions; expected "
+                "wake.depth: volume"
+            )
+        if wake.second != "advect":
+            raise ValueError(
+                f"wake.second: {wake.second:g} s is not allowed with volume; expected advect"
+            )
+        if self.sensor or self.retrieval != Retrieval():
+            key = "sensor" if self.sensor else "retrieval"
+            raise ValueError(
+                f"{key}: not allowed with volume, which retrieves the wind in its stead"
+            )
+        for key, given in (
+            ("scan.timing", scan.timing),
+            ("platform.motion", self.platform.motion),
+            ("platform.reported", self.platform.reported),
+        ):
+            if given is not None:
+                raise ValueError(
+                    f"{key}: not allowed with volume, whose scans are instantaneous; expected none"
+                )
+        if scan.gates != "planar":
+            raise ValueError(
+                f"scan.gates: {scan.gates} is not allowed with volume; expected planar"
+            )
+        if scan.gate_count < self.volume.template:
+            raise ValueError(
+                f"scan.gate_count: {scan.gate_count} is not allowed with volume; expected at least "
+                f"volume.template = {self.volume.template}"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _both_lidars_for_the_sensor(self):
+        if self.sensor is None:
+            return self
+        if self.wake is None or self.doppler is None:
+            raise ValueError("sensor: not allowed without wake and doppler; expected both")
+        method = self.sensor.method
+        if method not in self.retrieval.methods:
+            raise ValueError(
+                f"sensor.method: {method!r} is not allowed; expected one of retrieval.methods, "
+                f"{', '.join(self.retrieval.methods)}"
+            )
+        if method == ImageMethod.WS and self.sensor.crossflow_std is None:
+            raise ValueError(
+                f"sensor.crossflow_std: missing; expected a speed, as method {method} knows the "
+                "standard errors of few vectors"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _molecules_beside_particles(self):
+        phase = self.scattering.phase
+        if (
+            self.wake
+            and self.wake.extinction.molecules
+            and phase in ("isotropic", "henyey_greenstein")
+        ):
+            raise ValueError(
+                f"wake.extinction.molecules: not allowed with scattering.phase {phase}, which "
+                "is unpolarised; expected 0"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _something_to_do(self):
+        if self.wake is None and self.doppler is None:
+            raise ValueError("expected wake, doppler or both")
+        for key in BACKSCATTER:
+            unused = getattr(self, key) != type(self).model_fields[key].default
+            if self.wake is None and unused:
+                raise ValueError(f"{key}: not allowed without wake; expected it under doppler")
+        return self
+
+    @model_validator(mode="after")
+    def _telescope_stays_before_the_slab(self):
+        flown = (self.platform.speed - self.scan.follow) * self.platform.dt
+        if flown >= self.scan.range:
+            raise ValueError(
+                f"scan.range: {self.scan.range:g} m is not allowed; expected more than the "
+                f"{flown:g} m flown in platform.dt"
+            )
+        return self
+
+
+def _rows(section: dict, above: str = "") -> list[tuple[str, str]]:
+    """Dotted keys of a section and their values, numbers to four digits."""
+    rows = []
+    for key, value in section.items():
+        if isinstance(value, dict) and value:
+            rows += _rows(value, f"{above}{key}.")
+        else:
+            text = ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+            shown = re.sub(r"\d+\.\d+(e-?\d+)?", lambda number: f"{float(number[0]):.4g}", text)
+            rows.append((f"{above}{key}", shown))
+    return rows

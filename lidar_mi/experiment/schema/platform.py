@@ -1,0 +1,23 @@
+"""The keys of the aircraft that carries the lidars."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+from lidar_mi.experiment.schema.section import Section
+from lidar_mi.instrument.motion import Motion
+from lidar_mi.instrument.reported import Reported
+from lidar_mi.units import Speed, Time, Within
+
+
+class Platform(Section):
+    """The aircraft that carries the lidar towards the wake."""
+
+    speed: Annotated[Speed, Within(0, 12000, "from rest to escape velocity")] = 150.0
+    dt: Annotated[
+        Time, Within(1e-6, 10000, "from a repetition rate of 1 MHz to the life of a wake")
+    ] = 0.1
+    motion: Motion | None = Field(None, description="departure from straight and level flight")
+    reported: Reported | None = Field(
+        None, description="errors of the pose that is told; default: the true one is known"
+    )

@@ -1,0 +1,79 @@
+"""The keys of the retrieval of cross-flow winds from two images."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, model_validator
+
+from lidar_mi.experiment.schema.section import Section, each_once
+from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.units import Angle, Length, Number, Within
+
+
+class Pointing(Section):
+    """What is known of the pointing from one scan to the next."""
+
+    offset: Literal["known", "free"] = Field(
+        "known", description="free: lines of sight may estimate the wind that it feigns"
+    )
+    stderr: Annotated[Angle, Within(0, 0.1, "displaced by more than the image")] = Field(
+        0.0, description="standard error of pitch and of yaw between the scans"
+    )
+    roll: Annotated[Angle, Within(0, 0.1, "displaced by more than the image")] = Field(
+        0.0, description="standard error of roll between the scans"
+    )
+
+    @model_validator(mode="after")
+    def _free_by_how_much(self):
+        if self.offset == "free" and not self.stderr:
+            raise ValueError(
+                "stderr: 0 rad is not allowed with offset free; expected above 0 rad, the standard "
+                "error of the pointing before"
+            )
+        return self
+
+
+class Retrieval(Section):
+    """How winds are retrieved from the image pair."""
+
+    methods: tuple[ImageMethod, ...] = Field(
+        (ImageMethod.VARIATIONAL, ImageMethod.CC), min_length=1
+    )
+    template: Annotated[int, Within(2, 4096, "wider than any image")] = 8
+    search: Annotated[int, Within(4, 8192, "wider than any image")] = 16
+    stride: Annotated[int, Within(1, 8192, "wider than any image")] = 1
+    min_correlation: Annotated[Number, Within(-1, 1, "definition of a correlation")] = 0.5
+    min_texture: Annotated[Number, Within(0, 1000, "noise without signal has about 1")] = 0.01
+    min_isotropy: Annotated[Number, Within(0, 1, "definition of a ratio")] = 0.2
+    blur: Literal["beam"] | Annotated[Length, Within(0, 1000, "the widest beam")] = Field(
+        0.0, description="standard deviation of the beam's blur, corrected by variational"
+    )
+    pointing: Pointing = Pointing()
+    error_budget: bool = Field(False, description="also retrieve winds without each cause of error")
+    sources: Literal["all", "measured"] = Field(
+        "all",
+        description="also from ideal images of the truth, for comparison, or from measured ones "
+        "alone",
+    )
+
+    @model_validator(mode="after")
+    def _budget_compares(self):
+        if self.error_budget and self.sources != "all":
+            raise ValueError(
+                "sources: 'measured' is not allowed with error_budget; expected all, or "
+                "retrieval.error_budget=false"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _each_once(self):
+        each_once("methods", self.methods)
+        return self
+
+    @model_validator(mode="after")
+    def _region_holds_template(self):
+        if self.search < self.template + 2:
+            raise ValueError(
+                f"search: {self.search} is not allowed; expected at least template + 2 = "
+                f"{self.template + 2}"
+            )
+        return self

@@ -1,0 +1,78 @@
+"""The keys of what scatters the light."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AliasChoices, Field, model_validator
+
+from lidar_mi.experiment.schema.section import Section
+from lidar_mi.units import Number, Within
+
+
+class _Scatterer(Section):
+    """The keys common to all kinds of scatterers."""
+
+    aerosol: str | None = Field(None, description="name of an aerosol, with phase: aerosol")
+    band: Literal["cabannes", "rayleigh"] = Field(
+        "cabannes", description="of molecules: the line transmitted by a narrow filter, or all"
+    )
+    depolarization: Annotated[
+        Number, Within(0, 0.5, "anisotropy of molecules allows no more", "[)")
+    ] = Field(0.0, description="of Rayleigh, natural light")
+    table: str | None = Field(None, description="scattering-matrix file, see the mueller plugin")
+
+    @model_validator(mode="after")
+    def _named_what_it_needs(self: Any) -> Any:  # kinds of scatterers have a phase
+        for name in ("table", "aerosol"):
+            value = getattr(self, name)
+            if (self.phase == name) != (value is not None):
+                raise ValueError(f"{name}: {value!r} is not allowed with phase {self.phase}")
+        if self.depolarization and self.phase != "rayleigh":
+            raise ValueError(
+                f"depolarization: {self.depolarization:g} is not allowed with phase {self.phase}; "
+                "expected phase: rayleigh"
+            )
+        return self
+
+
+class Part(_Scatterer):
+    """One kind of scatterer in a mixture."""
+
+    phase: Literal["rayleigh", "molecules", "aerosol", "table"]
+    fraction: Annotated[Number, Within(1e-9, 1e9, "only ratios count")] = Field(
+        description="of the extinction, relative to the other parts",
+        validation_alias=AliasChoices("fraction", "share"),  # its former name
+    )
+
+
+class Scattering(_Scatterer):
+    """Scattering by the air, in the slab and around it."""
+
+    phase: Literal[
+        "rayleigh", "molecules", "isotropic", "henyey_greenstein", "aerosol", "table", "mixture"
+    ] = "aerosol"
+    asymmetry: Annotated[
+        Number, Within(-0.999, 0.999, "at 0.999 the forward peak is 0.06 degrees wide")
+    ] = Field(0.0, description="of Henyey-Greenstein")
+    parts: tuple[Part, ...] | None = Field(None, min_length=1, description="of a mixture")
+    albedo: Annotated[Number, Within(0, 1, "definition of an albedo")] | None = Field(
+        None, description="scattered fraction of the extinction; default: the scatterers'"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _aerosol_unless_stated(cls, data: Any) -> Any:
+        if isinstance(data, dict) and data.get("phase", "aerosol") == "aerosol":
+            return data | {"aerosol": data.get("aerosol") or "spheroids"}
+        return data
+
+    @model_validator(mode="after")
+    def _parts_of_a_mixture(self):
+        if (self.phase == "mixture") != (self.parts is not None):
+            value = None if self.parts is None else f"{len(self.parts)} parts"
+            raise ValueError(f"parts: {value} is not allowed with phase {self.phase}")
+        if self.asymmetry and self.phase != "henyey_greenstein":
+            raise ValueError(
+                f"asymmetry: {self.asymmetry:g} is not allowed with phase {self.phase}; expected "
+                "phase: henyey_greenstein"
+            )
+        return self

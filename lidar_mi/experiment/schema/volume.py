@@ -1,0 +1,28 @@
+"""The keys of the retrieval of winds from two volumes."""
+
+from typing import Annotated
+
+from pydantic import Field, model_validator
+
+from lidar_mi.experiment.schema.section import Section, each_once
+from lidar_mi.retrieval.method_names import VolumeMethod
+from lidar_mi.units import Number, Within
+
+
+class Volume(Section):
+    """Wind in three dimensions, from all gates of both scans as two volumes."""
+
+    methods: tuple[VolumeMethod, ...] = Field(
+        (VolumeMethod.CORRELATION, VolumeMethod.VARIATIONAL), min_length=1
+    )
+    template: Annotated[int, Within(4, 1024, "wider than any volume")] = Field(
+        8, description="voxels along each side of a window"
+    )
+    search: Annotated[int, Within(6, 2048, "wider than any volume")] = 16
+    stride: Annotated[int, Within(1, 2048, "wider than any volume")] = 4
+    min_correlation: Annotated[Number, Within(-1, 1, "definition of a correlation")] = 0.5
+
+    @model_validator(mode="after")
+    def _each_once(self):
+        each_once("methods", self.methods)
+        return self

@@ -1,0 +1,160 @@
+"""The keys of the observed air: flow, extinction, texture."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from lidar_mi.experiment.schema.section import Section
+from lidar_mi.units import (
+    Circulation,
+    Extinction,
+    Length,
+    Number,
+    Speed,
+    Time,
+    Within,
+    quantity,
+    to_si,
+)
+
+_Extent = Annotated[
+    Length, Within(0.1, 100000, "from models in a tunnel to the boundary layer of a region")
+]
+_Place = Annotated[Length, Within(-1e6, 1e6, "models of a region")]
+_Moment = Annotated[Time, Within(-1e10, 1e10, "three centuries about any epoch")]
+
+
+class VortexPair(Section):
+    """An analytic vortex pair in place of a simulation."""
+
+    model: Literal["lamb_oseen", "burnham_hallock"] = "lamb_oseen"
+    circulation: Annotated[
+        Circulation, Within(1e-6, 10000, "the largest aircraft have 1000 m^2/s")
+    ] = 458.0
+    separation: Annotated[
+        Length, Within(0.01, 1000, "from models in a tunnel to ten times the widest wing")
+    ] = 47.1
+    core_radius: Annotated[
+        Length, Within(0.001, 100, "from models in a tunnel to wider than any wake's core")
+    ] = 3.0
+    width: _Extent = Field(109.0, description="extent of the domain in y")
+    height: _Extent = Field(69.0, description="extent of the domain in z")
+
+
+class Turbine(Section):
+    """The analytic wake of a wind turbine, viewed downstream from its nacelle."""
+
+    diameter: Annotated[
+        Length, Within(0.1, 1000, "from models in a tunnel to four times the largest rotor")
+    ] = Field(50.0, description="of the rotor")
+    thrust: Annotated[
+        Number, Within(0, 1, "in momentum theory 0 leaves no wake, 1 no wind", "()")
+    ] = Field(0.75, description="thrust coefficient")
+    tip_speed_ratio: Annotated[Number, Within(-100, 100, "fast rotors have 15")] = Field(
+        7.0, description="speed of the tips over that of the wind"
+    )
+    wind_speed: Annotated[Speed, Within(0.01, 200, "from a calm to a tornado")] = Field(
+        8.0, description="of the undisturbed wind, along x"
+    )
+    growth: Annotated[Number, Within(0.0001, 1, "wakes are measured to have 0.02 to 0.08")] = Field(
+        0.035, description="of the wake's width with the distance"
+    )
+    hub_core: Annotated[
+        Length, Within(0.001, 100, "from models in a tunnel to the largest rotor")
+    ] = Field(3.0, description="core radius of the swirl")
+    downstream: (
+        Annotated[
+            Length, Within(0.01, 100000, "from models in a tunnel to farms beyond the horizon")
+        ]
+        | None
+    ) = Field(None, description="distance from the rotor; default: the middle of the gates")
+    turbulence: Annotated[Number, Within(0, 0.5, "turbulence is frozen only below")] = Field(
+        0.06, description="intensity of the undisturbed wind"
+    )
+    outer_scale: Annotated[
+        Length, Within(0.01, 10000, "from a wind tunnel to the depth of the troposphere")
+    ] = Field(30.0, description="of the turbulence")
+    width: _Extent = Field(109.0, description="extent of the domain in y")
+    height: _Extent = Field(69.0, description="extent of the domain in z")
+
+
+class ExtinctionMapping(Section):
+    """From tracers (or from the wind's speed) to the extinction coefficient."""
+
+    source: Literal["tracer", "speed"] = "tracer"
+    tracer: str | None = Field("tracer", description="exhaust tracer, or null for none")
+    aerosol: str | None = Field("aerosol", description="background aerosol, or null for a flat one")
+    background: Annotated[Extinction, Within(0, 10, "visibility is 0.3 m in the densest smoke")] = (
+        Field(quantity("0.1 / km"), description="also of the environment")
+    )
+    maximum: Annotated[
+        Extinction, Within(1e-12, 10, "from the thermosphere to the densest smoke")
+    ] = quantity("1.8 / km")
+    molecules: Annotated[Extinction, Within(0, 0.1, "air at the ground has 0.03 / m at 100 nm")] = (
+        Field(
+            0.0, description="on top of it, in slab and environment: by air, which has no texture"
+        )
+    )
+    stretch: Annotated[Number, Within(1, 100, "1 is linear; 100 is a step")] = Field(
+        2.0, description="contrast of thin tracer; 1 = linear"
+    )
+
+
+class Texture(Section):
+    """Sub-grid aerosol texture, not resolved by a simulation's grid; rms 0: none."""
+
+    rms: Annotated[Number, Within(0, 2, "a log-normal field of 2 consists of few peaks")] = 0.1
+    outer_scale: Annotated[
+        Length, Within(0.001, 10000, "from the smallest eddies to the depth of the troposphere")
+    ] = 10.0
+
+
+class Wake(Section):
+    """The flow and the tracers in it."""
+
+    file: str | None = Field(None, description="NetCDF file; beside the experiment or shipped")
+    vortex_pair: VortexPair | None = None
+    turbine: Turbine | None = None
+    time: _Moment | None = Field(None, description="needed when the file holds several")
+    second: Literal["advect"] | _Moment = Field("advect", description="t2: advected, or a time")
+    x: _Place | None = Field(None, description="plane placed in the middle of the gates")
+    depth: Literal["plane", "volume"] = Field(
+        "plane", description="one plane extruded over the gates, or all planes of the file"
+    )
+    centre: tuple[_Place, _Place] | None = Field(
+        None, description="(y, z) of the wake placed on the beam axis; default: the domain's middle"
+    )
+    spacing: Annotated[
+        Length, Within(0.001, 1000, "from the smallest eddies to models of a region")
+    ] = 0.5
+    names: dict[str, str] = Field({}, description="our dimension or variable names: the file's")
+    extinction: ExtinctionMapping = ExtinctionMapping()
+    texture: Texture = Texture()
+
+    @field_validator("second", mode="before")
+    @classmethod
+    def _advect_or_time(cls, value: object) -> object:
+        if value == "advect":
+            return value
+        try:
+            return to_si(value, "s", "40.1 s")
+        except ValueError:
+            raise ValueError(
+                f"{value!r} is not allowed; expected advect or a time such as '40.1 s'"
+            ) from None
+
+    @model_validator(mode="after")
+    def _one_source(self):
+        sources = [name for name in ("file", "vortex_pair", "turbine") if getattr(self, name)]
+        if len(sources) != 1:
+            raise ValueError("expected one of file, vortex_pair and turbine")
+        if sources == ["file"]:
+            return self
+        if self.second != "advect":
+            raise ValueError(f"second: {self.second!r} is not allowed with {sources[0]}")
+        if self.depth == "volume":
+            raise ValueError(f"depth: 'volume' is not allowed with {sources[0]}")
+        for key in ("time", "x", "centre", "names"):
+            if getattr(self, key):
+                raise ValueError(f"{key}: {getattr(self, key)!r} is not allowed with {sources[0]}")
+        return self

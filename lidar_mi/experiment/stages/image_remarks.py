@@ -1,0 +1,128 @@
+"""Warnings before images are rendered: of what is allowed and likely wrong."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.assessment.metrics.cores import find_cores
+from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_divergence, rises
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.stages.brightness import overlap
+from lidar_mi.experiment.stages.light_budget import LEAST_OVERLAP
+from lidar_mi.experiment.truth.extinction import Truth
+from lidar_mi.experiment.truth.flows import Flows
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.retrieval.method_names import ImageMethod
+from lidar_mi.units import shown
+
+MOST_WIND = 150.0
+"""Winds across the path, m/s, beyond those of wakes: of a heavy aircraft's cores some 50 m/s."""
+
+
+def image_remarks(
+    experiment: Experiment,
+    truth: Truth,
+    plans: Sequence[ScanPlan],
+    air: object = None,
+    flows: Flows | None = None,
+) -> list[str]:
+    """Warnings of an experiment with a wake, a line each; what else images need has none."""
+    flow = _of_the_flow(experiment, truth.wind) if experiment.wake.file else []
+    said = flows[0].attrs.get("interpolated") if flows else None
+    grid = [f"wake.file: {said}"] if said else []
+    return [
+        *grid,
+        *flow,
+        *_of_the_speed(experiment, truth.wind, plans[0]),
+        *_of_the_light(experiment, plans[0]),
+        *_of_the_pattern(experiment),
+    ]
+
+
+def written(experiment: Experiment, *keys: str) -> str:
+    """The first of some keys that an experiment sets itself; the last, if it sets none."""
+    return next((key for key in keys if _is_set(experiment, key)), keys[-1])
+
+
+def _is_set(section: Any, key: str) -> bool:
+    first, _, rest = key.partition(".")
+    if section is None or first not in section.model_fields_set:
+        return False
+    return not rest or _is_set(getattr(section, first), rest)
+
+
+def _of_the_flow(experiment: Experiment, wind: xr.Dataset) -> list[str]:
+    """Components or axes of the wrong sign in a user's file; analytic flows have none."""
+    key = written(experiment, "wake.names", "wake.file")
+    divergence = relative_divergence(wind)
+    if divergence > MOST_DIVERGENCE:
+        return [
+            f"{key}: the divergence of v, w has {divergence:.2g} of the vorticity's rms, as "
+            "if a component or an axis had the wrong sign; expected y to port, z up, v along y, w "
+            "along z (a minus sign changes one: names: {v: -V})"
+        ]
+    if rises(find_cores(wind)):
+        return [
+            f"{key}: both vortices turn against the lift of an aircraft, and the pair rises; "
+            "expected the port vortex (y > 0) to turn from +y towards +z (where z points "
+            "down: names: {z: -Z, w: -W})"
+        ]
+    return []
+
+
+def _of_the_speed(experiment: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[str]:
+    """Winds that no wake has, or that windows of this size cannot follow."""
+    fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
+    if fastest > MOST_WIND:
+        doubt = "is the unit of v and w in the file right (attribute units)"
+        if not experiment.wake.file:
+            doubt = "are circulation and core radius right"
+        return [
+            f"wake: winds across the path reach {fastest:.3g} m/s; those of wakes of aircraft and "
+            f"turbines stay below {MOST_WIND:g} m/s: {doubt}?"
+        ]
+    reach = window_reach(experiment, plan)
+    taken = () if experiment.volume else experiment.retrieval.methods
+    methods = [method for method in (ImageMethod.CC, ImageMethod.WS) if method in taken]
+    if not methods or fastest <= reach:
+        return []
+    key = written(experiment, "retrieval.search", "retrieval.template", "platform.dt", "wake")
+    return [
+        f"{key}: windows of {' and '.join(methods)} follow {reach:.3g} m/s, the wind "
+        f"reaches {fastest:.3g} m/s; expected a larger retrieval.search or a smaller platform.dt"
+    ]
+
+
+def window_reach(experiment: Experiment, plan: ScanPlan) -> float:
+    """Fastest wind that a window's search region holds, m/s; NaN for a single column of beams."""
+    settings = experiment.retrieval
+    pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
+    return ((settings.search - settings.template) // 2 - 0.5) * pixel / experiment.platform.dt
+
+
+def _of_the_light(experiment: Experiment, plan: ScanPlan) -> list[str]:
+    """Light that the telescope does not see."""
+    seen = overlap(experiment.lidar, float(np.median(plan.ranges()[0])))
+    if seen >= LEAST_OVERLAP:
+        return []
+    key = written(experiment, "lidar.fov_half", "scan.range")
+    half = "" if key == "lidar.fov_half" else "a field of view (half angle) of "
+    return [
+        f"{key}: {half}{shown(experiment.lidar.fov_half, 'mrad')} sees {seen:.0%} of "
+        f"the light from {plan.centre:.0f} m (overlap of beam, telescope and field of view)"
+    ]
+
+
+def _of_the_pattern(experiment: Experiment) -> list[str]:
+    """Beams along a curve, whose images are resampled."""
+    timing = experiment.scan.timing
+    if timing is None or timing.pattern in ("raster", "serpentine"):
+        return []
+    return [
+        f"scan.timing.pattern: beams of {timing.pattern} are resampled to the nodes of the image; "
+        "stated errors of flagged vectors do not hold, and whether those of the others do was not "
+        "measured for every curve (docs/experiments/scan_patterns.md); rows, raster or serpentine, "
+        "are not resampled"
+    ]

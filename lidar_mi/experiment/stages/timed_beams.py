@@ -1,0 +1,231 @@
+"""Beams in time: the schedule of a scan, flown along the platform's true and reported motion."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.input_files import find_file
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.instrument.beams import Beams, steered_beams
+from lidar_mi.instrument.motion import ANGLES, PLACES, Motion, Pose, trajectory, true_pose
+from lidar_mi.instrument.reported import Reported, reported_pose
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.scan_timing import Directions, ScanTiming, Schedule
+from lidar_mi.io.timed_table import read_timed_table
+
+
+def is_steady(experiment: Experiment) -> bool:
+    """Whether the platform flies straight and its pose is known."""
+    platform = experiment.platform
+    return (platform.motion or Motion()) == Motion() and (
+        platform.reported or Reported()
+    ) == Reported()
+
+
+def timed_plans(
+    experiment: Experiment, plans: Sequence[ScanPlan], beside: str | Path
+) -> list[ScanPlan]:
+    """The plans of both scans with their beams; as they are where nothing takes time or moves.
+
+    Raises
+    ------
+    InputError
+        A table or trajectory that cannot be used, a scan longer than the time between the scans,
+        a scanner beyond its limits, a pose from which the slab is not reached.
+    """
+    scan, platform = experiment.scan, experiment.platform
+    if (scan.timing is None or scan.timing.is_instant) and is_steady(experiment):
+        return list(plans)
+    by_angle = scan.aim == "angles"
+    pose_at = _poses(experiment, beside)
+    found = []
+    for number, plan in enumerate(plans):
+        schedule = scan_schedule(experiment, plan, beside)
+        _fits("scan.timing", schedule, platform.dt, "platform.dt")
+        jitter = np.random.default_rng([experiment.seed, 3, 4, number + 1])
+        found.append(
+            replace(
+                plan,
+                beams=_beams(
+                    experiment,
+                    pose_at,
+                    number,
+                    schedule,
+                    plan.centre,
+                    plan.position,
+                    by_angle,
+                    jitter,
+                ),
+            )
+        )
+    return found
+
+
+def scan_schedule(experiment: Experiment, plan: ScanPlan, beside: str | Path) -> Schedule:
+    """Times and nominal places of the beams of a scan of the backscatter lidar."""
+    scan = experiment.scan
+    return _schedule(
+        scan.timing, "scan.timing", plan.y, plan.z, plan.centre, scan.aim == "angles", beside
+    )
+
+
+def pulse_train(experiment: Experiment, plan: ScanPlan, beside: str | Path) -> tuple[int, float]:
+    """Pulses of a beam and their rate while they are sent, Hz; a rate of 0 is not known."""
+    if experiment.scan.timing is None:
+        return 1, 0.0
+    pulses = experiment.scan.pulses_per_beam
+    rate = pulses * scan_schedule(experiment, plan, beside).beam_rate
+    return pulses, rate if np.isfinite(rate) else 0.0
+
+
+def lines_schedule(experiment: Experiment, beside: str | Path) -> Schedule:
+    """Times of the Doppler lidar's lines of sight, and their places in the plane of its range."""
+    sensor, distance = experiment.sensor, experiment.doppler.lidar.range
+    y, z = (distance * nodes for nodes in sensor.directions.nodes())
+    return _schedule(sensor.timing, "sensor.timing", y, z, distance, True, beside)
+
+
+def line_beams(experiment: Experiment, beside: str | Path) -> Beams | None:
+    """Beams of the Doppler lidar's lines of sight, about the first scan's reference time.
+
+    None where nothing takes time or moves.
+
+    Raises
+    ------
+    InputError
+        As `timed_plans`.
+    """
+    sensor = experiment.sensor
+    if (sensor.timing is None or sensor.timing.is_instant) and is_steady(experiment):
+        return None
+    schedule = lines_schedule(experiment, beside)
+    _fits("sensor.timing", schedule, 1 / sensor.slabs_per_second, "1 / sensor.slabs_per_second")
+    # of a scanner of its own
+    jitter = np.random.default_rng([experiment.seed, 3, 5, 1])
+    return _beams(
+        experiment,
+        _poses(experiment, beside),
+        0,
+        schedule,
+        experiment.doppler.lidar.range,
+        0.0,
+        True,
+        jitter,
+    )
+
+
+def timing_files(experiment: Experiment, beside: str | Path) -> dict[str, Path]:
+    """Files of directions and of the trajectory, by the keys that name them."""
+    motion, sensor = experiment.platform.motion, experiment.sensor
+    named = {
+        "scan.timing.table": experiment.scan.timing and experiment.scan.timing.table,
+        "sensor.timing.table": sensor and sensor.timing and sensor.timing.table,
+        "platform.motion.trajectory": motion and motion.trajectory,
+    }
+    return {key: find_file(name, beside, key) for key, name in named.items() if name}
+
+
+def _schedule(
+    timing: ScanTiming | None,
+    key: str,
+    y: np.ndarray,
+    z: np.ndarray,
+    distance: float,
+    by_angle: bool,
+    beside: str | Path,
+) -> Schedule:
+    if timing is None:
+        timing = ScanTiming(pattern="serpentine", duration=0.0)
+    table = _directions(timing.table, f"{key}.table", beside) if timing.table else None
+    try:
+        return timing.schedule(y, z, distance, by_angle=by_angle, table=table)
+    except InputError as error:
+        raise InputError(f"{key}.{error}") from None
+
+
+def _directions(name: str, key: str, beside: str | Path) -> Directions:
+    path = find_file(name, beside, key)
+    columns = read_timed_table(path, {"azimuth": "rad", "elevation": "rad"})
+    for missing in {"azimuth", "elevation"} - set(columns):
+        raise InputError(f"{path}: {missing} missing; expected columns t, azimuth, elevation")
+    return Directions(columns["t"], columns["azimuth"], columns["elevation"], path.name)
+
+
+def _fits(key: str, schedule: Schedule, interval: float, name: str) -> None:
+    if schedule.duration > interval * (1 + 1e-9):
+        raise InputError(
+            f"{key}: a scan of {schedule.duration:.4g} s is not allowed; expected at most "
+            f"{name} = {interval:g} s, when the next one begins"
+        )
+
+
+def _poses(experiment: Experiment, beside: str | Path) -> Callable[[np.ndarray], Pose]:
+    """The true pose at times since the first scan's reference time."""
+    platform = experiment.platform
+    motion = platform.motion or Motion()
+    flown = None
+    if motion.trajectory:
+        key = "platform.motion.trajectory"
+        path = find_file(motion.trajectory, beside, key)
+        columns = read_timed_table(path, dict.fromkeys(PLACES, "m") | dict.fromkeys(ANGLES, "rad"))
+        flown = trajectory(columns, platform.speed, path.name)
+        _flies(platform, columns, path.name)
+
+    def pose_at(time: np.ndarray) -> Pose:
+        try:
+            return true_pose(motion, time, platform.speed, experiment.seed, flown)
+        except InputError as error:
+            raise InputError(f"platform.motion.trajectory: {error}") from None
+
+    return pose_at
+
+
+def _flies(platform: Platform, columns: dict[str, np.ndarray], source: str) -> None:
+    """Refuse a trajectory along x at another speed than the platform's, by which the gates go."""
+    if "x" not in columns:
+        return
+    time, x = columns["t"], columns["x"]
+    mean = float((x[-1] - x[0]) / (time[-1] - time[0]))
+    if abs(mean - platform.speed) > 1 + 0.05 * platform.speed:
+        raise InputError(
+            f"platform.motion.trajectory: {source} flies at {mean:.4g} m/s along x; expected "
+            f"platform.speed = {platform.speed:g} m/s to 5 % and 1 m/s, or no column x"
+        )
+
+
+def _beams(
+    experiment: Experiment,
+    pose_at: Callable[[np.ndarray], Pose],
+    scan: int,
+    schedule: Schedule,
+    distance: float,
+    position: float,
+    body_fixed: bool,
+    random: np.random.Generator,
+) -> Beams:
+    platform = experiment.platform
+    clock = scan * platform.dt + schedule.time
+    true = told = pose_at(clock)
+    if platform.reported is not None and platform.reported != Reported():
+        told = reported_pose(
+            platform.reported, pose_at, clock, platform.speed, experiment.seed, scan
+        )
+    try:
+        return steered_beams(
+            schedule.time,
+            schedule.places,
+            distance,
+            position,
+            platform.speed - experiment.scan.follow,
+            true,
+            told,
+            body_fixed=body_fixed,
+            jitter=platform.motion.scanner_jitter if platform.motion else 0.0,
+            random=random,
+        )
+    except InputError as error:
+        raise InputError(f"platform.motion: {error}") from None

@@ -1,0 +1,1 @@
+"""The truth: flows, extinction, states in time."""

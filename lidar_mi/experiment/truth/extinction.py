@@ -1,0 +1,170 @@
+"""The truth of an experiment: extinction at both times and wind, in the frame of the lidar."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import xarray as xr
+from scipy import integrate
+
+from lidar_mi.arguments import checked_arguments
+from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
+from lidar_mi.atmosphere.texture import corrsin_obukhov
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.wake import ExtinctionMapping
+from lidar_mi.experiment.truth.flows import Advection, Flows, advection_by, mean_flow, read_flows
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The observed air, in the lidar's frame at t1 (metres, m^-1, m s^-1).
+
+    ``extinction`` and ``smooth`` (without sub-grid texture) hold the fields at t1 and t2, dims
+    (x, y, z); ``wind`` has v, w on (z, y), averaged over the depth of the first gate.
+    """
+
+    extinction: tuple[xr.DataArray, xr.DataArray]
+    smooth: tuple[xr.DataArray, xr.DataArray]
+    wind: xr.Dataset
+
+    def image(self, which: int, smooth: bool = False) -> xr.DataArray:
+        """Extinction averaged over depth as an image (z, y): that of an ideal lidar."""
+        field = (self.smooth if smooth else self.extinction)[which]
+        return slab_mean(field, self.wind.attrs["gates"])
+
+
+@checked_arguments
+def make_truth(
+    experiment: Experiment,
+    beside: str | Path | None = None,
+    flows: Flows | None = None,
+    advected: Advection | None = None,
+) -> Truth:
+    """The flow and the extinction at both times, on the scan's grid, in the lidar's frame.
+
+    Parameters
+    ----------
+    experiment : Experiment
+    beside : path, optional
+        Folder in which the wake's file is searched first. Default: the experiment's.
+    flows : optional
+        From `read_flows` of an experiment that differs in extinction and texture alone.
+    advected : callable, optional
+        From `advection_by` the same flows.
+
+    Returns
+    -------
+    Truth
+        ``wind`` (Dataset, m/s), ``extinction`` (at t1 and at t2, 1/m); ``image(k)`` is the
+        extinction over (z, y) as the lidar images it.
+
+    Raises
+    ------
+    InputError
+        A file that is missing or inconsistent with the experiment; an experiment without a wake.
+
+    Examples
+    --------
+    >>> import lidar_mi as lm
+    >>> experiment = lm.load_experiment("wake_backscatter")
+    >>> truth = lm.make_truth(experiment)
+    >>> truth.wind["v"].dims, len(truth.extinction)
+    (('z', 'y'), 2)
+    """
+    if experiment.wake is None:
+        raise InputError(f"wake: missing in {experiment.name}; expected the section of a wake")
+    beside = experiment.folder if beside is None else beside
+    first, second = flows or read_flows(experiment, beside)
+    mapping = experiment.wake.extinction
+    smooth1 = extinction_of(first, mapping, first, second)
+    flow = mean_flow((first, second))
+    advected = advected or advection_by(experiment, (first, second))
+    if second is None:
+        smooth2 = advected(smooth1)
+    else:
+        smooth2 = extinction_of(second, mapping, first, second)
+    texture = experiment.wake.texture
+    if texture.rms > 0:
+        x = first["x"].values if first.sizes["x"] > 1 else None
+        factor = corrsin_obukhov(
+            first["y"].values,
+            first["z"].values,
+            texture.rms,
+            texture.outer_scale,
+            experiment.seed,
+            x=x,
+        )
+        if x is None:
+            factor = factor.expand_dims(x=first["x"].values)
+        factor = factor.assign_coords(first.coords).transpose("x", "y", "z")
+        if second is None:
+            rough1 = smooth1 * factor
+            rough2 = advected(rough1)
+        else:
+            rough1 = smooth1 * factor
+            rough2 = smooth2 * advected(factor)
+    else:
+        rough1, rough2 = smooth1, smooth2
+    # winds are retrieved from the first gate
+    depth = experiment.scan.thickness / experiment.scan.gate_count
+    gates = (experiment.scan.range, experiment.scan.range + depth)
+    components = [name for name in ("u", "v", "w") if name in flow]
+    wind = xr.Dataset({name: slab_mean(flow[name], gates) for name in components})
+    wind.attrs["gates"] = gates
+    rough, smooth = (
+        tuple(field.copy(data=field.values + mapping.molecules) for field in pair)
+        for pair in ((rough1, rough2), (smooth1, smooth2))
+    )
+    return Truth(rough, smooth, wind)
+
+
+def extinction_of(
+    flow: xr.Dataset, mapping: ExtinctionMapping, first: xr.Dataset, second: xr.Dataset | None
+) -> xr.DataArray:
+    """Extinction (m^-1) of one state of a flow, scaled by the largest value of both."""
+    limits = {"background": mapping.background, "maximum": mapping.maximum}
+    states = [s for s in (first, second) if s is not None]
+    if mapping.source == "speed":
+        fastest = max(float(np.hypot(s["v"], s["w"]).max()) for s in states)
+        field = extinction_from_speed(flow, **limits, stretch=mapping.stretch, reference=fastest)
+    else:
+        # an analytic flow has neither: then there is only the background
+        tracer = "tracer" if mapping.tracer and "tracer" in flow else None
+        aerosol = "aerosol" if mapping.aerosol and "aerosol" in flow else None
+        if tracer is None and aerosol is None:
+            field = xr.full_like(flow["v"], mapping.background)
+            field.attrs = {"long_name": "extinction coefficient", "units": "m-1"}
+            return field.transpose("x", "y", "z")
+        densest = max(float(s[tracer].max()) for s in states) if tracer else None
+        field = extinction_from_tracer(
+            flow,
+            **limits,
+            stretch=mapping.stretch,
+            tracer=tracer,
+            aerosol=aerosol,
+            reference=densest,
+        )
+    return field.transpose("x", "y", "z")
+
+
+def slab_mean(field: xr.DataArray, gates: tuple[float, float]) -> xr.DataArray:
+    """Mean over the depth of planar gates, (..., z, y); linear between planes, as rendered."""
+    x = field["x"].values
+    weights = np.ones(1)
+    if len(x) > 1:
+        half = (x[1] - x[0]) / 2
+        first, last = x[0] - half, x[-1] + half
+        if gates[0] < first - 1e-6 or gates[1] > last + 1e-6:
+            raise InputError(
+                f"scan.thickness: gates from {gates[0]:g} to {gates[1]:g} m reach beyond the wake, "
+                f"whose planes fill {first:g} to {last:g} m; expected gates inside"
+            )
+        nodes = np.unique([*gates, *x[(x > gates[0]) & (x < gates[1])]])
+        linear = [np.interp(nodes, x, plane) for plane in np.eye(len(x))]
+        weights = integrate.trapezoid(linear, nodes) / (gates[1] - gates[0])
+    image = (field * xr.DataArray(weights, dims="x")).sum("x").transpose(..., "z", "y")
+    image.attrs = field.attrs
+    for axis in ("y", "z"):
+        image[axis].attrs["units"] = "m"
+    return image

@@ -1,0 +1,121 @@
+"""The truth while a scan lasts: the extinction that beams meet at times of their own."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import xarray as xr
+
+from lidar_mi.atmosphere.advection import advect_to
+from lidar_mi.errors import InputError
+from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.truth.extinction import Truth
+from lidar_mi.experiment.truth.flows import Flows, mean_flow, moves_along
+from lidar_mi.instrument.scan import ScanPlan
+
+LARGEST_STEP = 0.25
+"""Node spacings by which air moves from one state to the next, at most.
+
+Between states the renderer is linear in time. A wave of 4 nodes, the shortest that a grid carries,
+is then displaced by 0.63 * 0.25^3 / 4^2 = 0.0006 nodes at most, and its amplitude is 2 % smaller
+half way between two states.
+"""
+MOST_VALUES = 2.5e8  # of all states of a scan: 1 GB in the renderer
+
+
+def state_times(experiment: Experiment, flows: Flows, times: np.ndarray) -> np.ndarray:
+    """Equally spaced times, s, at which the air is computed for beams at ``times``.
+
+    The middle one is that of the middle of the scan.
+
+    Raises
+    ------
+    InputError
+        More states than the memory holds.
+    """
+    flow = mean_flow(flows)
+    first, last = float(np.min(times)), float(np.max(times))
+    if first == last:
+        return np.array([first])
+    moved = (last - first) * _speed_in_nodes(flow, experiment)
+    # an odd number
+    count = 2 * max(2, math.ceil(moved / LARGEST_STEP / 2)) + 1
+    values = count * flow["v"].size
+    if values > MOST_VALUES:
+        raise InputError(
+            f"scan.air: moving is not allowed here: air moves by {moved:.3g} nodes within a scan "
+            f"of {last - first:.3g} s, its {count} states would have {values:.2g} values, expected "
+            f"at most {MOST_VALUES:g} (frozen air, a shorter scan or a coarser wake.spacing)"
+        )
+    return np.linspace(first, last, count)
+
+
+def values_of_states(experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan]) -> int:
+    """Values of all states of the scan that has most; 0 where air is frozen or beams have one time.
+
+    Raises
+    ------
+    InputError
+        As of `state_times`.
+    """
+    if experiment.scan.air != "moving":
+        return 0
+    timed = [plan.beams.time for plan in plans if plan.beams is not None]
+    counts = [state_times(experiment, flows, times).size for times in timed]
+    return max(counts, default=0) * flows[0]["v"].size
+
+
+def air_in_time(
+    experiment: Experiment, truth: Truth, flows: Flows, which: int, times: np.ndarray
+) -> xr.DataArray:
+    """The extinction of scan ``which`` at the times of its beams, m^-1, dims (time, x, y, z).
+
+    The truth of the scan's reference time, carried by the same flow that carries the air from t1 to
+    t2. Of a wake with a second state, between both times, the mean of both carried to the time,
+    each weighted with its nearness.
+
+    Parameters
+    ----------
+    times : array
+        Of the beams, s, from the scan's reference time.
+
+    Returns
+    -------
+    xarray.DataArray
+        float32, at `state_times`, for linear interpolation. Without ``time`` where air is uniform.
+
+    Raises
+    ------
+    InputError
+        As of `state_times`.
+    """
+    if all(float(field.min()) == float(field.max()) for field in truth.extinction):
+        return truth.extinction[which]
+    flow, dt = mean_flow(flows), experiment.platform.dt
+    u = flow["u"] - experiment.scan.follow if moves_along(experiment) else None
+    molecules = experiment.wake.extinction.molecules
+    taus = state_times(experiment, flows, times)
+
+    def carried(state: int) -> xr.DataArray:
+        # molecules are everywhere, and no undershoot of a spline may remove them
+        field = truth.extinction[state] - molecules
+        passed = taus + (which - state) * dt
+        moved = advect_to(field, flow["v"], flow["w"], passed, u=u) + molecules
+        return moved.assign_coords(time=taus).astype(np.float32)
+
+    if flows[1] is None:
+        return carried(which)
+    nearness = xr.DataArray(np.clip((taus + which * dt) / dt, 0, 1), {"time": taus}, "time")
+    return ((1 - nearness) * carried(0) + nearness * carried(1)).astype(np.float32)
+
+
+def _speed_in_nodes(flow: xr.Dataset, experiment: Experiment) -> float:
+    """Largest speed of the air on its grid, node spacings a second."""
+    squared = 0.0
+    for component, axis in (("u", "x"), ("v", "y"), ("w", "z")):
+        if component == "u" and not moves_along(experiment):
+            continue
+        speed = flow[component] - (experiment.scan.follow if component == "u" else 0.0)
+        spacing = float(flow[axis][1] - flow[axis][0])
+        squared = squared + (speed / spacing) ** 2
+    return math.sqrt(float(squared.max()))

@@ -1,0 +1,211 @@
+"""Samples that are chosen, and what the simulation's noise adds to the wind.
+
+Detects: a stated variance that differs from that of other random numbers by a fifth, an image that
+holds samples of its pilot or depends on more than the number of its samples, an error of the wind
+that is the simulation's and called the lidar's, and one that is the lidar's and called the
+simulation's by half.
+"""
+
+import numpy as np
+import pytest
+
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.run import finish, prepare
+from lidar_mi.experiment.schema import reading
+from lidar_mi.experiment.stages import rendering
+from lidar_mi.experiment.stages.rendering import (
+    IMAGES,
+    batches_of,
+    chosen_samples,
+    detect_images,
+    render_images,
+    with_samples,
+)
+from lidar_mi.experiment.stages.simulation_noise import simulation_noise
+from lidar_mi.experiment.stages.winds import cross_flow_winds
+from lidar_mi.rendering.samples import noise_ratio
+
+pytestmark = pytest.mark.usefixtures("variant")
+
+
+def newcomer(**changes):
+    """An own wake, 200 m ahead, 5 mJ; samples as they come by default."""
+    pair = {"circulation": 60, "separation": 16, "core_radius": 5, "width": 40, "height": 26}
+    data = {
+        "name": "newcomer",
+        "wake": {"vortex_pair": pair, "spacing": "1 m", "texture": {"outer_scale": "5 m"}},
+        "platform": {"speed": "70 m/s"},
+        "lidar": {"pulse_energy": "5 mJ", "pulse_duration": "10 ns"},
+        "scan": {"range": "200 m"},
+        "detector": {},
+        "render": {"max_order": 1},
+        "retrieval": {"methods": ["variational"], "stride": 3, "sources": "measured"},
+    }
+    return reading.check(reading.merged(data, changes), "newcomer")
+
+
+@pytest.fixture(scope="module")
+def prepared():
+    return prepare(newcomer())
+
+
+def needed(prepared):
+    return [prepared.results[name] for name in ("truth", "plans", "air", "flows")]
+
+
+def rendered(experiment, prepared, **how):
+    return dict(render_images(experiment, *needed(prepared), log=Log(), **how))
+
+
+def reseeded(experiment, seed):
+    """The same air and detector with other random numbers of the light transport."""
+    return experiment.model_copy(update={"seed": seed})
+
+
+@pytest.fixture(scope="module")
+def number(prepared):
+    """The chosen number of samples."""
+    return chosen_samples(prepared.experiment, *needed(prepared), log=Log()).number
+
+
+def test_the_stated_fraction_is_that_of_other_random_numbers(prepared, number):
+    """Variance of 12 renderings of the same air, of every beam, over the detector's."""
+    asked = with_samples(prepared.experiment, number)
+    count, (plan, _) = 12, prepared.results["plans"]
+    images = [
+        rendered(reseeded(asked, seed), prepared, missing=IMAGES[:1])["image_t1"]
+        for seed in range(1, count + 1)
+    ]
+    s0 = np.stack([image["S0"].values[0].astype(float) for image in images])
+    one = {"image_t1": images[0], "image_t2": images[0]}
+    detected = detect_images(asked, one, [plan, plan])[0]
+    ratio = s0.var(0, ddof=1) / detected["S0_noise_std"].values[0].astype(float) ** 2
+    stated = detected.attrs["monte_carlo_fraction"]
+    assert stated == pytest.approx(float(noise_ratio(detected).mean()))
+    error = ratio.std() / np.sqrt(ratio.size)
+    assert abs(ratio.mean() - stated) < 4 * error < 0.2 * stated
+    asked_for = asked.render.monte_carlo_fraction
+    assert 0.75 * asked_for < stated < 1.05 * asked_for
+
+
+def test_an_image_of_chosen_samples_is_that_of_the_number_alone(prepared, number, monkeypatch):
+    """So its mean is that of independent samples whose number another, independent image chose."""
+    seeds = []
+    render = rendering.render_scans
+
+    def watched(*given, **how):
+        seeds.append((given[7], given[6].samples_per_beam))
+        return render(*given, **how)
+
+    monkeypatch.setattr(rendering, "render_scans", watched)
+    chosen = rendered(prepared.experiment, prepared, missing=IMAGES[1:])["image_t2"]
+    fixed = rendered(with_samples(prepared.experiment, number), prepared, missing=IMAGES[1:])
+    assert np.array_equal(chosen["S0"].values, fixed["image_t2"]["S0"].values)
+    assert chosen.attrs["samples_per_beam"] == number
+    (pilot, few), *others = seeds
+    assert few < number and all(abs(pilot - seed) >= 1 << 29 for seed, _ in others)
+
+
+def test_the_mean_of_chosen_images_is_unbiased(prepared):
+    """Twenty-four images, each with a number of its own, against one of as many samples in all."""
+    asked = newcomer(render={"monte_carlo_fraction": 2})
+    images = [
+        rendered(reseeded(asked, seed), prepared, missing=IMAGES[:1])["image_t1"]
+        for seed in range(100, 124)
+    ]
+    s0 = np.stack([image["S0"].values[0].astype(float) for image in images])
+    whole = sum(image.attrs["samples_per_beam"] for image in images)
+    true = rendered(with_samples(asked, whole), prepared, missing=IMAGES[:1])["image_t1"]
+    off = s0.mean(0) - true["S0"].values[0]
+    spread = np.hypot(s0.std(0, ddof=1) / np.sqrt(len(s0)), true["S0_stderr"].values[0])
+    z = off / spread
+    # over the beams, as one number and each
+    assert abs(off.sum()) < 4 * np.sqrt((spread**2).sum())
+    assert (z**2).mean() == pytest.approx(1, abs=0.2)
+
+
+def test_the_winds_of_a_newcomer_are_those_of_many_samples(prepared, number):
+    """Errors of w with a tenth of the variance, beside eight times as many and with eight samples:
+    noise of the detector is that of one seed."""
+    found = {}
+    for samples in (8, number, 8 * number):
+        images = rendered(with_samples(prepared.experiment, samples), prepared)
+        detected = detect_images(prepared.experiment, images, prepared.results["plans"])
+        wind = cross_flow_winds(
+            prepared.experiment,
+            prepared.results["truth"],
+            prepared.results["plans"],
+            detected,
+            log=Log(),
+        )
+        error = (wind["w"] - wind["w_true"]).values.ravel()
+        found[samples] = error[(wind["flag"].values.ravel() == 0) & np.isfinite(error)]
+    rms = {samples: np.sqrt((error**2).mean()) for samples, error in found.items()}
+    # a twentieth of the detector's part, and the scatter of an rms over so many vectors
+    scatter = 1 / np.sqrt(2 * len(found[number]))
+    assert rms[number] / rms[8 * number] < 1.05 + 3 * scatter
+    assert rms[8] > rms[number]
+
+
+def test_what_it_adds_to_the_wind_is_the_spread_of_other_random_numbers(prepared):
+    """Winds of eight renderings of the same air without a detector, about their mean."""
+    asked = newcomer(detector=None, render={"samples_per_beam": 32}, retrieval={"methods": ["cc"]})
+    plans, truth = prepared.results["plans"], prepared.results["truth"]
+    winds, stated = [], []
+    for seed in range(1, 9):
+        one = reseeded(asked, seed)
+        scans = detect_images(one, rendered(one, prepared), plans)
+        wind = cross_flow_winds(one, truth, plans, scans, log=Log())
+        winds.append(wind.isel(source=0, algorithm=0))
+        stated.append(simulation_noise(one, scans, plans, scans, wind, log=Log()))
+    valid = np.all([(wind["flag"] == 0).values for wind in winds], 0)
+    assert valid.sum() > 20
+    for name in ("v", "w"):
+        spread = np.var([wind[name].values[valid] for wind in winds], 0, ddof=1).mean()
+        changes = np.concatenate([one[name].values[0][valid] for one in stated])
+        changes = changes[np.isfinite(changes)]
+        # chi-square of 7 x vectors beside 8 x vectors, half of which overlap
+        sigma = np.sqrt(2 / (7 * valid.sum() / 2) + 2 / (len(changes) / 2))
+        assert np.log((changes**2).mean() / spread) == pytest.approx(0, abs=max(4 * sigma, 0.3))
+
+
+def test_the_first_sentence_names_it_where_samples_are_too_few_and_only_there(prepared):
+    for samples, expected in ((4, True), ("auto", False)):
+        asked = newcomer(render={"samples_per_beam": samples})
+        run = prepare(asked, known=prepared.results)
+        finish(run, illustrated=False)
+        said = "noise of the simulation, not of the lidar" in run.answer[0]
+        warned = [text for text in run.warnings if "noise of the simulation" in text]
+        assert said == expected and len(warned) == expected
+        fraction = run.metrics["backscatter_noisy.monte_carlo_fraction"]
+        key = "backscatter_noisy.variational.monte_carlo_w"
+        assert (key in run.metrics) == (fraction > 0.1) == expected
+        if expected:
+            assert warned[0].startswith("render.samples_per_beam: ") and "or auto" in warned[0]
+            assert run.metrics["backscatter.samples_per_beam"] == 4
+    limited = newcomer(render={"max_samples": 4e4})
+    run = prepare(limited, known=prepared.results)
+    finish(run, illustrated=False)
+    assert run.metrics["backscatter.samples_per_beam"] == 4e4 // (41 * 27)
+    said = [text for text in run.warnings if text.startswith("render.max_samples: ")]
+    assert bool(said) == ("noise of the simulation" in run.answer[0])
+
+
+def test_samples_of_another_number_are_not_resumed():
+    """A number that was chosen on another machine may be another one."""
+
+    class Keeper:
+        stored = None
+
+        def unfinished(self, part):
+            return self.stored and dict(self.stored)
+
+        def keep_unfinished(self, part, arrays):
+            self.stored = arrays
+
+    keeper = Keeper()
+    store = batches_of(IMAGES, keeper, Log(), 100)(0)
+    store._next = 0.0
+    store.keep(3, lambda: {"image": np.ones(2)})
+    assert batches_of(IMAGES, keeper, Log(), 100)(0).kept()[0] == 3
+    assert batches_of(IMAGES, keeper, Log(), 110)(0).kept() == (0, {})
