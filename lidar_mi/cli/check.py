@@ -18,8 +18,8 @@ def check(experiment: ExperimentName, set_: Changes = None) -> None:
     about a second tells how long the run will take on this machine.
     """
     from lidar_mi.encounter.check import sections as flight_sections
-    from lidar_mi.experiment import reading as config
     from lidar_mi.experiment.preflight.check import sections
+    from lidar_mi.experiment.schema import reading as config
 
     path, changes = experiment_file(experiment), list(set_ or [])
     asked = config.load_variants(path, changes) or {"": config.load(path, changes)}

@@ -59,7 +59,7 @@ def fly(
     Writes the flights and the track (NetCDF), metrics (JSON), figures, an animation and a report.
     """
     from lidar_mi.encounter.fly import fly as start
-    from lidar_mi.experiment import reading
+    from lidar_mi.experiment.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
     if mode:

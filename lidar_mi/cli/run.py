@@ -33,9 +33,10 @@ def run(
     A run that was stopped is resumed with the images it has.
     """
     from lidar_mi.assessment.report.summary import summary
-    from lidar_mi.experiment import reading, study
+    from lidar_mi.experiment import study
     from lidar_mi.experiment.folder.run_folder import RESULTS
     from lidar_mi.experiment.run import run as start
+    from lidar_mi.experiment.schema import reading
 
     path, changes = experiment_file(experiment), list(set_ or [])
     variants = reading.load_variants(path, changes)

@@ -9,10 +9,10 @@ import xarray as xr
 import yaml
 
 from lidar_mi.errors import InputError
-from lidar_mi.experiment import truth as truth_module
 from lidar_mi.experiment.folder import run_folder as resumable_folder
 from lidar_mi.experiment.folder.run_folder import IMAGES
 from lidar_mi.experiment.run import run
+from lidar_mi.experiment.truth import flows as truth_module
 from lidar_mi.io.exr import read_scan
 from lidar_mi.io.wake_file import read_wake
 from tests.support.experiments import blob, check, replace_stages, small, write_wake
