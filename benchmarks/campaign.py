@@ -163,5 +163,5 @@ def _cases(folder: Path, samples: int, count: int, turn: int) -> list[tuple]:
 
 def _point(experiment: Any, path: Path) -> None:
     run = prepare(experiment)
-    finish(run, illustrated=False)
+    finish(run, with_figures=False)
     write_text(path, to_json(run.metrics))

@@ -13,6 +13,7 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core
 from lidar_mi.assessment.metrics.error_budget import CAUSES
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.error_budget import budgets
 from lidar_mi.experiment.stages.rendering import scan_plans
@@ -152,7 +153,7 @@ def sensor(pair: Pair, samples: int, methods: Sequence[str]) -> Experiment:
 def images(experiment: Experiment, truth: Truth, seed: int) -> list[xr.Dataset]:
     """The two scans without a detector's noise."""
     use_variant(experiment.render.variant)
-    plans = scan_plans(experiment, truth)
+    plans = call(scan_plans, experiment, truth=truth)
     air = scatterer(experiment.scattering, ".", experiment.lidar.wavelength, lambda *_: None)
     solids = [
         extrude(field.isel(x=0).transpose("z", "y"), plans[0], experiment.lidar)

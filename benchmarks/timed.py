@@ -11,8 +11,9 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.truth.extinction import make_truth
-from lidar_mi.experiment.truth.flows import read_flows
+from lidar_mi.experiment.truth.flows import flows_of
 from lidar_mi.experiment.truth.in_time import air_in_time
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.scan import ScanPlan
@@ -75,10 +76,12 @@ def prepare(kind: str, columns: int, rows: int, samples: int, order: int) -> tup
     if kind != "at once":
         plan = in_flight(plan, experiment.platform.speed)
     if kind == "moving":
-        flows = read_flows(experiment, experiment.folder)
+        flows = flows_of(experiment, experiment.folder)
         truth = make_truth(experiment, flows=flows)
         start = time.perf_counter()
-        air = air_in_time(experiment, truth, flows, 0, plan.beams.time)
+        air = call(
+            air_in_time, experiment, truth=truth, flows=flows, which=0, times=plan.beams.time
+        )
         made, states = time.perf_counter() - start, air.sizes["time"]
         nodes = air.isel(x=0).sel(y=plan.y, z=plan.z).transpose(..., "z", "y")
         field = extrude(nodes, plan, experiment.lidar, [plan])

@@ -13,7 +13,7 @@ import lidar_mi as lm
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
 from lidar_mi.atmosphere.vortex import velocity, vortex_pair
 from lidar_mi.experiment.truth.blur import blur_by_beam
-from lidar_mi.experiment.truth.flows import mean_flow, read_flows
+from lidar_mi.experiment.truth.flows import flows_of, mean_flow
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
 from tests.support.flows import axes, data_array, origin, plane_waves, texture
@@ -171,7 +171,7 @@ def carried_volume(noise: float, seed: int) -> Pair:
     With white noise of a fraction of each voxel, whose map is given. There is no renderer.
     """
     experiment = lm.load_experiment("wake_3d", seed=seed)
-    flows = read_flows(experiment)
+    flows = flows_of(experiment)
     truth, wind = lm.make_truth(experiment, flows=flows), mean_flow(flows)
     scan = experiment.scan
     gates = slice(scan.range, scan.range + scan.thickness)

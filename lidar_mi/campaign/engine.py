@@ -28,7 +28,7 @@ from lidar_mi.campaign.status import Status, count
 from lidar_mi.campaign.worker import Prepare, carry_out, render_shared
 from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment.log import silent
-from lidar_mi.experiment.pipeline import storing_stages
+from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.shipped import campaign_file
 from lidar_mi.progress import Notice
 
@@ -322,7 +322,7 @@ class _Dispatch:
         signatures_ = self.folder.index[number].images
         if all(self.needed[one] < 2 for one in signatures_):
             return [], []
-        stages = storing_stages(self.folder.points.experiment(number))
+        stages = storing_stages(stages_of(self.folder.points.experiment(number)))
         first: list[int] = []
         tasks: list[Future] = []
         for signature, stage in zip(signatures_, stages, strict=True):

@@ -17,7 +17,7 @@ from lidar_mi.campaign.description import Campaign, checked_campaign
 from lidar_mi.campaign.points import Points
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.folder.run_folder import METRICS, made_by, new_record, refuse_strangers
-from lidar_mi.experiment.pipeline import storing_stages
+from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.shipped import experiment_file
@@ -280,8 +280,8 @@ def _checked(points: Points, notice: Notice) -> list[Row]:
 
 def _row(experiment: Experiment, beside: Path) -> Row:
     record = new_record(experiment, beside)
-    stages = storing_stages(experiment)
-    images = [made_by(record, stage.indifferent(experiment) or ()) for stage in stages]
+    graph = stages_of(experiment)
+    images = [made_by(record, graph.keys(stage)) for stage in storing_stages(graph)]
     return Row(made_by(record)[:_SHORT], tuple(images))
 
 

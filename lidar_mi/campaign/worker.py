@@ -33,7 +33,6 @@ from lidar_mi.encounter.fly import fly
 from lidar_mi.errors import InputError, one_line
 from lidar_mi.experiment.folder import run_folder as resumable_folder
 from lidar_mi.experiment.folder.image_store import ImageStore
-from lidar_mi.experiment.graph import result_of
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.results import Run
@@ -170,8 +169,8 @@ def render_shared(folder: str, number: int, name: str, session: str) -> int:
     campaign = _opened(folder, (Path(folder) / RECORD).stat().st_mtime_ns)
     experiment = campaign.points.experiment(number)
     keeper = PointKeeper(campaign, number, experiment)
-    stages = storing_stages(experiment)
-    signatures_ = campaign.index[number].images
+    graph = stages_of(experiment)
+    stages, signatures_ = storing_stages(graph), campaign.index[number].images
     stage, signature = next(
         (stage, one) for stage, one in zip(stages, signatures_, strict=True) if stage.name == name
     )
@@ -180,7 +179,7 @@ def render_shared(folder: str, number: int, name: str, session: str) -> int:
     try:
         _begin(images, session)
         run = _prepared(experiment, campaign.points.beside)
-        result_of(stage, experiment, run.results, run.log, keeper)
+        graph.compute(stage, dict(run.results), run.log, run.search_path, keeper)
     except Exception:
         return keeper.rendered
     (images / ATTEMPTS).unlink(missing_ok=True)
@@ -214,14 +213,15 @@ class PointKeeper:
     def __init__(self, campaign: CampaignFolder, number: int, experiment: Experiment):
         self._keep, self.place = campaign.campaign.keep, campaign.place(number)
         self._experiment, self.signature = experiment.name, campaign.index[number].point
-        pairs = zip(storing_stages(experiment), campaign.index[number].images, strict=True)
-        of = {part: one for stage, one in pairs if stage.parts for part in stage.parts(experiment)}
+        graph = stages_of(experiment)
+        pairs = zip(storing_stages(graph), campaign.index[number].images, strict=True)
+        of = {part: one for stage, one in pairs for part in graph.parts(stage)}
         self.images = ImageStore(lambda part: campaign.images(of[part]), of.__getitem__)
         self.rendered = self.reused = 0
 
-    def kept(self, part: str) -> xr.Dataset | None:
+    def stored(self, part: str) -> xr.Dataset | None:
         """An image of this content, from whichever point rendered it."""
-        found = self.images.kept(part)
+        found = self.images.stored(part)
         self.reused += found is not None
         return found
 
@@ -229,18 +229,18 @@ class PointKeeper:
         """As of `ImageStore`."""
         return self.images.unfinished(part)
 
-    def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
+    def store_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
         """As of `ImageStore`."""
         make_folder(self.images.folder_of(part))
-        self.images.keep_unfinished(part, arrays)
+        self.images.store_unfinished(part, arrays)
 
-    def keep_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
+    def store_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
         """As of `ImageStore`."""
         make_folder(self.images.folder_of(part))
         self.rendered += 1
-        return self.images.keep_part(part, value)
+        return self.images.store_part(part, value)
 
-    def keep(self, name: str, value: Any) -> None:
+    def store_result(self, name: str, value: Any) -> None:
         """Write an estimate, if estimates are kept."""
         if self._keep == "estimates":
             resumable_folder.write_result(self.place, name, value, self._experiment, self.signature)
@@ -253,7 +253,7 @@ def _compute(campaign: CampaignFolder, run: Run, keeper: PointKeeper) -> None:
         return
     record = resumable_folder.new_record(run.experiment, campaign.points.beside)
     write_text(keeper.place / resumable_folder.RECORD, to_yaml(record))
-    finish(run, keeper, illustrated=False)
+    finish(run, keeper, with_figures=False)
 
 
 _last: tuple[dict[str, str], dict[str, Any]] = ({}, {})
@@ -272,12 +272,12 @@ def _prepared(experiment: Experiment, beside: Path) -> Run:
 
 
 def _signatures(experiment: Experiment, beside: Path) -> dict[str, str]:
-    """Signatures of the stages computed ahead that runs can share."""
-    record = resumable_folder.new_record(experiment, beside)
+    """Signatures of the results of the preflight, which runs can share."""
+    record, graph = resumable_folder.new_record(experiment, beside), stages_of(experiment)
     return {
-        stage.name: resumable_folder.made_by(record, indifferent)
-        for stage in stages_of(experiment)
-        if stage.ahead and (indifferent := stage.indifferent(experiment)) is not None
+        stage.name: resumable_folder.made_by(record, graph.keys(stage))
+        for stage in graph
+        if stage.preflight
     }
 
 

@@ -6,6 +6,7 @@ import xarray as xr
 
 from lidar_mi.encounter.doppler import DopplerScans, LineFrames
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.stages.lines import line_noises, with_speeds
 from lidar_mi.experiment.stages.ring_calibration import assumed_rings, calibration_file
@@ -34,10 +35,12 @@ class LineSpeeds:
 
     def __init__(self, scans: DopplerScans):
         experiment, rings, log = scans.experiment, scans.rings, Log(silent)
-        given = calibration_file(experiment, rings, experiment.folder, log=log)
+        given = call(calibration_file, experiment, rings=rings)
         self._experiment = experiment
-        self._assumed = assumed_rings(experiment, rings, given, log=log)
-        self._noises = line_noises(experiment, rings)
+        self._assumed = call(
+            assumed_rings, experiment, rings=rings, calibration_file=given, log=log
+        )
+        self._noises = line_noises(experiment.doppler, experiment.sensor.pulses, rings)
         self._scores: list[MatchedScore] | None = None
 
     def read(self, frames: LineFrames) -> xr.Dataset:
@@ -95,4 +98,12 @@ class LineSpeeds:
         )
 
     def _with(self, frames: LineFrames, found: np.ndarray) -> xr.Dataset:
-        return with_speeds(frames.lines, *found, self._experiment, frames.scan)
+        experiment = self._experiment
+        return with_speeds(
+            frames.lines,
+            *found,
+            experiment.doppler,
+            experiment.sensor.pulses,
+            experiment.seed,
+            frames.scan,
+        )

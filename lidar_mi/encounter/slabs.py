@@ -14,7 +14,8 @@ from lidar_mi.atmosphere.wake_volume import VolumeAlongPath
 from lidar_mi.encounter.pointing import check_reported
 from lidar_mi.encounter.wake import encounter_of, wake_along_path
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.memory import most_nodes
+from lidar_mi.experiment.graph import call
+from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.truth.flows import analytic_axes
 from lidar_mi.instrument.scan import ScanPlan
@@ -125,15 +126,16 @@ def gates_of(experiment: Experiment) -> Gates:
 
 def _image_axes(experiment: Experiment, wake: WakeAlongPath) -> tuple[np.ndarray, np.ndarray]:
     """y and z of the nodes of the images, m: of an analytic pair its domain, else the volume's."""
+    most = call(Footprint, experiment).most_nodes()
     if not isinstance(wake, VolumeAlongPath):
-        y, z = analytic_axes(experiment.wake, "vortex_pair", most_nodes(experiment))
+        y, z = analytic_axes(experiment.wake, "vortex_pair", most)
         return y, z
     spacing, found = experiment.wake.spacing, {}
     for name in "yz":
         cells = math.floor(float(np.ptp(wake.flow[name].values)) / spacing + 1e-6)
         found[name] = spacing * (np.arange(cells + 1) - cells / 2)
     counts = {name: len(axis) for name, axis in found.items()}
-    check_nodes(spacing, counts, most_nodes(experiment))
+    check_nodes(spacing, counts, most)
     return found["y"], found["z"]
 
 

@@ -255,7 +255,7 @@ class VirtualLidar:
             air,
             plan,
             lidar,
-            environment_extinction(experiment),
+            environment_extinction(experiment.wake),
             *scatterer(scattering, experiment.folder, lidar.wavelength),
             settings,
             molecules(self.air.molecules, lidar.wavelength, scattering.band),

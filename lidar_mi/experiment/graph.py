@@ -1,11 +1,99 @@
-"""Stages: the steps of an experiment, ordered by their dependencies, each computed once."""
+"""The graph of an experiment's stages: what each needs, and what it depends on, by its signature.
 
-from collections.abc import Callable, Sequence
+A stage is a function. Each of its parameters is, by its name,
+
+- the result of another stage (``truth``);
+- a section or a value of the experiment, with ``_`` for the dots (``scan``, ``doppler_camera``);
+- what a run provides: ``log``, ``search_path`` (the folder in which files that an experiment names
+  are searched first) and, for a stage that gives its result in parts, ``missing`` and ``store``.
+
+The order of the stages and the keys of the experiment that a result depends on follow from this:
+two experiments that agree in these keys have the same result.
+"""
+
+import functools
+import inspect
+import types
+from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, Protocol, TypeVar, Union, get_args, get_origin
+from typing import get_type_hints as hints
+
+from pydantic import BaseModel
 
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.experiment import Experiment
+
+PROVIDED = ("log", "search_path", "missing", "store")
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Only:
+    """Of an annotated section: the result depends on these of its keys alone."""
+
+    keys: tuple[str, ...]
+
+    def __init__(self, *keys: str):
+        object.__setattr__(self, "keys", keys)
+
+
+@dataclass(frozen=True)
+class But:
+    """Of an annotated section: the result depends on all of its keys but these."""
+
+    keys: tuple[str, ...]
+
+    def __init__(self, *keys: str):
+        object.__setattr__(self, "keys", keys)
+
+
+class Guard:
+    """Of an annotated parameter: it may stop a stage, but its result does not depend on it."""
+
+
+class Parameter(NamedTuple):
+    """A parameter of a stage.
+
+    Attributes
+    ----------
+    name : str
+    path : str or None
+        The dotted key of the experiment that it would be, if it is no result.
+    optional : bool
+        Whether it may be None: the stage does without.
+    default : bool
+        Whether it may be left out.
+    marks : tuple
+        `Only`, `But`, `Guard`.
+    """
+
+    name: str
+    path: str | None
+    optional: bool
+    default: bool
+    marks: tuple[Any, ...]
+
+
+class Store(Protocol):
+    """Storage of results during a run."""
+
+    def stored(self, part: str) -> Any:
+        """A part from an earlier run; None: there is none."""
+
+    def unfinished(self, part: str) -> dict[str, Any] | None:
+        """Unfinished part of an earlier run; None: there is none."""
+
+    def store_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
+        """Save an unfinished part, until the part itself is saved."""
+
+    def store_part(self, part: str, value: Any) -> Any:
+        """Save a part; returns it as `stored` would."""
+
+    def store_result(self, name: str, value: Any) -> None:
+        """Save a result, if it is one of those that are saved."""
 
 
 def _always(experiment: Experiment) -> bool:
@@ -14,146 +102,339 @@ def _always(experiment: Experiment) -> bool:
 
 @dataclass(frozen=True)
 class Stage:
-    """One step of an experiment, from results to a result.
+    """One step of an experiment, from sections and results to a result.
 
-    It neither reads nor writes the files of a run, nor draws.
+    It neither reads nor writes the files of a run, nor draws. An experiment has it if it has all
+    sections and results that its function cannot do without.
 
     Attributes
     ----------
     name : str
         Of its result.
     compute : callable
-        ``compute(experiment, *results that it needs, log=log)``, returns the result.
-    needs : tuple of str
-        Names of the results it needs, in the order of its arguments.
-    wanted : callable
-        ``wanted(experiment)``: whether the experiment has this stage.
-    ahead : bool
+        Returns the result, see the module.
+    when : callable
+        ``when(experiment)``: a further condition for the experiment to have this stage.
+    preflight : bool
         Computed before anything is written: cheap, and needed to foresee later failures.
     check : callable, optional
-        ``check(experiment, *those of needs that are computed ahead)`` raises InputError for faults
-        that would otherwise appear after hours.
+        Parameters as of ``compute``, results of `preflight` stages alone. Raises InputError for
+        faults that would otherwise appear after hours.
     remarks : callable, optional
-        The same arguments; returns warnings, a line each, of what is allowed and likely wrong.
+        Parameters as of ``check``; returns warnings, a line each, of what is allowed and likely
+        wrong.
     parts : callable, optional
-        ``parts(experiment)``, names of the parts of a result that takes long. Then ``compute`` also
-        takes ``missing=``, the names of those to be computed, and ``keeper=``, the store of
-        unfinished ones, and yields (name, part) one by one: each is saved as soon as it is
+        Parameters are sections alone; names of the parts of a result that takes long. Then
+        ``compute`` also takes ``missing``, the names of those to be computed, and ``store``, the
+        store of unfinished ones, and yields (name, part) one by one: each is saved as soon as it is
         complete. The result is a dictionary of all parts.
     timing : str, optional
         Step to which its duration is added.
-    indifferent_to : tuple of str, optional
-        Dotted keys of the experiment, sections or values, that have no influence on the result.
-        Runs that differ in these alone share it. None: it is not shared.
-    needed_by : callable, optional
-        ``needed_by(experiment)``, those of ``indifferent_to`` that have an influence after all,
-        with the experiment's other settings; see `indifferent`.
-    illustrates : bool
+    on_demand : bool
+        Computed only where another stage lacks it.
+    figure_only : bool
         Only the report needs it.
     """
 
     name: str
     compute: Callable[..., Any]
-    needs: tuple[str, ...] = ()
-    wanted: Callable[[Experiment], bool] = _always
-    ahead: bool = False
+    when: Callable[[Experiment], bool] = _always
+    preflight: bool = False
     check: Callable[..., None] | None = None
     remarks: Callable[..., list[str]] | None = None
-    parts: Callable[[Experiment], Sequence[str]] | None = None
+    parts: Callable[..., Sequence[str]] | None = None
     timing: str | None = None
-    indifferent_to: tuple[str, ...] | None = None
-    needed_by: Callable[[Experiment], Sequence[str]] | None = None
-    illustrates: bool = False
-
-    def indifferent(self, experiment: Experiment) -> tuple[str, ...] | None:
-        """Keys of an experiment that have no influence on the result; None: it is not shared."""
-        if self.indifferent_to is None or self.needed_by is None:
-            return self.indifferent_to
-        needed = self.needed_by(experiment)
-        return tuple(key for key in self.indifferent_to if key not in needed)
+    on_demand: bool = False
+    figure_only: bool = False
 
 
-class Keeper(Protocol):
-    """Storage of results during a run."""
+@functools.cache
+def parameters(function: Callable[..., Any]) -> tuple[Parameter, ...]:
+    """The parameters of a stage's function that the graph provides."""
+    typed = hints(function, include_extras=True)
+    found = []
+    for name, given in inspect.signature(function).parameters.items():
+        if given.kind in (given.VAR_POSITIONAL, given.VAR_KEYWORD):
+            continue
+        kind, marks = typed.get(name), ()
+        if get_origin(kind) is Annotated:
+            kind, *rest = get_args(kind)
+            marks = tuple(rest)
+        optional = get_origin(kind) in (Union, types.UnionType) and type(None) in get_args(kind)
+        default = given.default is not given.empty
+        found.append(Parameter(name, section_path(name), optional, default, marks))
+    return tuple(found)
 
-    def kept(self, part: str) -> Any:
-        """A part from an earlier run; None: there is none."""
 
-    def unfinished(self, part: str) -> dict[str, Any] | None:
-        """Unfinished part of an earlier run; None: there is none."""
+@functools.cache
+def section_path(name: str, model: type[BaseModel] = Experiment) -> str | None:
+    """The dotted key that a parameter's name stands for; None: none."""
+    for key, field in model.model_fields.items():
+        if name == key:
+            return key
+        inner = next(
+            (k for k in (field.annotation, *get_args(field.annotation)) if _is_model(k)), None
+        )
+        if inner is not None and name.startswith(f"{key}_"):
+            rest = section_path(name[len(key) + 1 :], inner)
+            if rest is not None:
+                return f"{key}.{rest}"
+    return None
 
-    def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
-        """Save an unfinished part, until the part itself is saved."""
 
-    def keep_part(self, part: str, value: Any) -> Any:
-        """Save a part; returns it as `kept` would."""
-
-    def keep(self, name: str, value: Any) -> None:
-        """Save a result, if it is one of those that are saved."""
+def _is_model(kind: object) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 
-def in_order(stages: Sequence[Stage], given: Sequence[str] = ()) -> list[Stage]:
-    """Stages so that each follows those it needs, otherwise in the given order.
+def section(experiment: Experiment, path: str) -> Any:
+    """A section or a value of an experiment, by its dotted key; None below a missing section."""
+    found: Any = experiment
+    for key in path.split("."):
+        found = None if found is None else getattr(found, key)
+    return found
+
+
+def call(function: Callable[..., T], experiment: Experiment, **given: Any) -> T:
+    """A stage's function with its sections from an experiment.
+
+    Parameters
+    ----------
+    function : callable
+    experiment : Experiment
+    **given
+        Its other parameters: results, and what a run provides; by default a silent log, and the
+        experiment's folder.
+    """
+    provided = {"log": Log(), "search_path": experiment.folder} | given
+    arguments = {}
+    for parameter in parameters(function):
+        if parameter.name in provided:
+            arguments[parameter.name] = provided[parameter.name]
+        elif parameter.path is not None and parameter.name not in given:
+            arguments[parameter.name] = section(experiment, parameter.path)
+    return function(**arguments)
+
+
+class Graph:
+    """The stages that an experiment has, in their order.
 
     Parameters
     ----------
     stages : sequence of Stage
-    given : sequence of str
-        Names of results given from the start.
+        Those of all experiments.
+    experiment : Experiment
 
     Raises
     ------
     ValueError
-        Two stages of one name, a result that no stage gives, circular dependencies, a stage
-        computed ahead that needs one that is not.
+        Two stages of one name, a parameter that is nothing, stages that need each other, a stage
+        of the preflight that needs one that is not.
     """
-    names = [*given, *(stage.name for stage in stages)]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise ValueError(f"stages: {', '.join(twice)} given twice")
-    late = {stage.name for stage in stages if not stage.ahead}
-    for stage in stages:
-        unknown = [need for need in stage.needs if need not in names]
-        if unknown:
-            raise ValueError(f"stage {stage.name}: nothing gives {', '.join(unknown)}")
-        if stage.ahead and late.intersection(stage.needs):
-            raise ValueError(f"stage {stage.name}: is ahead of what it needs")
-    ordered: list[Stage] = []
-    there, waiting = set(given), list(stages)
-    while waiting:
-        ready = next((stage for stage in waiting if there.issuperset(stage.needs)), None)
-        if ready is None:
-            raise ValueError(f"stages: {', '.join(s.name for s in waiting)} need each other")
-        waiting.remove(ready)
-        ordered.append(ready)
-        there.add(ready.name)
-    return ordered
+
+    def __init__(self, stages: Sequence[Stage], experiment: Experiment):
+        self.experiment = experiment
+        self._names = {stage.name for stage in stages}
+        for stage in stages:
+            for parameter in parameters(stage.compute):
+                known = parameter.name in {*self._names, *PROVIDED} or parameter.path is not None
+                if not (known or parameter.default):
+                    raise ValueError(f"stage {stage.name}: nothing gives {parameter.name}")
+        there = self._existing(stages)
+        names = [stage.name for stage in there]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"stages: {', '.join(twice)} given twice")
+        self.stages = self._in_order(there)
+        self._by_name = {stage.name: stage for stage in self.stages}
+
+    def __getitem__(self, name: str) -> Stage:
+        return self._by_name[name]
+
+    def __iter__(self) -> Iterator[Stage]:
+        return iter(self.stages)
+
+    def needs(self, stage: Stage) -> list[str]:
+        """Names of the results that a stage takes."""
+        wanted = [p.name for p in parameters(stage.compute) if p.name in self._names]
+        return [name for name in wanted if name in self._by_name]
+
+    def _existing(self, stages: Sequence[Stage]) -> list[Stage]:
+        """Those that have all they cannot do without."""
+        left = [stage for stage in stages if stage.when(self.experiment)]
+        while True:
+            names = {stage.name for stage in left}
+            found = [stage for stage in left if self._is_possible(stage, names)]
+            if len(found) == len(left):
+                return found
+            left = found
+
+    def _is_possible(self, stage: Stage, names: set[str]) -> bool:
+        for parameter in parameters(stage.compute):
+            if parameter.optional or parameter.name in PROVIDED:
+                continue
+            if parameter.name in self._names:
+                if parameter.name not in names:
+                    return False
+            elif parameter.path and section(self.experiment, parameter.path) is None:
+                return False
+        return True
+
+    def _in_order(self, stages: Sequence[Stage]) -> list[Stage]:
+        """Each behind those that it needs, otherwise as given."""
+        all_names = {stage.name for stage in stages}
+        late = {stage.name for stage in stages if not (stage.preflight or stage.on_demand)}
+        ordered: list[Stage] = []
+        there: set[str] = set()
+        waiting = list(stages)
+        while waiting:
+            ready = next((s for s in waiting if there >= self._taken(s) & all_names), None)
+            if ready is None:
+                raise ValueError(f"stages: {', '.join(s.name for s in waiting)} need each other")
+            if ready.preflight and late & self._taken(ready):
+                raise ValueError(f"stage {ready.name}: of the preflight, but what it needs is not")
+            waiting.remove(ready)
+            ordered.append(ready)
+            there.add(ready.name)
+        return ordered
+
+    def _taken(self, stage: Stage) -> set[str]:
+        return {p.name for p in parameters(stage.compute)} & self._names
+
+    def arguments(
+        self,
+        function: Callable[..., Any],
+        results: Mapping[str, Any],
+        provided: Mapping[str, Any] = types.MappingProxyType({}),
+    ) -> dict[str, Any] | None:
+        """Arguments of a function from sections and results; None: a result is not there."""
+        found = {}
+        for parameter in parameters(function):
+            if parameter.name in provided:
+                found[parameter.name] = provided[parameter.name]
+            elif parameter.name in self._names:
+                if parameter.name in results:
+                    found[parameter.name] = results[parameter.name]
+                elif parameter.name in self._by_name:
+                    return None
+                else:
+                    found[parameter.name] = None
+            elif parameter.path is not None:
+                found[parameter.name] = section(self.experiment, parameter.path)
+        return found
+
+    def call(self, function: Callable[..., T], results: Mapping[str, Any]) -> T:
+        """A function that takes sections and results of the preflight."""
+        arguments = self.arguments(function, results)
+        if arguments is None:
+            raise ValueError(f"{function.__name__}: takes what the preflight does not compute")
+        return function(**arguments)
+
+    def compute(
+        self,
+        stage: Stage,
+        results: MutableMapping[str, Any],
+        log: Log,
+        search_path: str | Path,
+        store: Store | None = None,
+    ) -> Any:
+        """The result of a stage, saved if there is a store; those that it lacks are computed too.
+
+        Parts that the store has are not computed, nor what only they need.
+        """
+        provided: dict[str, Any] = {"log": log, "search_path": Path(search_path)}
+        if stage.parts is None:
+            result = stage.compute(**self._complete(stage, results, provided, store))
+            if store:
+                store.store_result(stage.name, result)
+            return result
+        names = self.parts(stage)
+        there = {name: store.stored(name) if store else None for name in names}
+        missing = [name for name in names if there[name] is None]
+        if len(missing) < len(names):
+            log(
+                f"using {len(names) - len(missing)} of {len(names)} "
+                f"{stage.name.replace('_', ' ')} from an earlier run"
+            )
+        if missing:
+            provided |= {"missing": missing, "store": store}
+            for name, part in stage.compute(**self._complete(stage, results, provided, store)):
+                there[name] = store.store_part(name, part) if store else part
+        return there
+
+    def _complete(
+        self,
+        stage: Stage,
+        results: MutableMapping[str, Any],
+        provided: dict[str, Any],
+        store: Store | None,
+    ) -> dict[str, Any]:
+        for name in self.needs(stage):
+            # others were computed before
+            if name not in results:
+                log, folder = provided["log"], provided["search_path"]
+                results[name] = self.compute(self[name], results, log, folder, store)
+        arguments = self.arguments(stage.compute, results, provided)
+        assert arguments is not None  # all that it needs was computed just now
+        return arguments
+
+    def parts(self, stage: Stage) -> list[str]:
+        """Names of the parts of a stage's result."""
+        if stage.parts is None:
+            return []
+        return list(stage.parts(**(self.arguments(stage.parts, {}) or {})))
+
+    def keys(self, stage: Stage) -> "Keys":
+        """The keys of the experiment that a result depends on, through all that it needs."""
+        found: set[tuple[str, Only | But | None]] = set()
+        seen: set[str] = set()
+        waiting = [stage]
+        while waiting:
+            one = waiting.pop()
+            seen.add(one.name)
+            functions = [one.compute] + ([one.parts] if one.parts else [])
+            for parameter in (p for f in functions for p in parameters(f)):
+                if Guard in parameter.marks:
+                    continue
+                if parameter.name in self._names:
+                    if parameter.name in self._by_name and parameter.name not in seen:
+                        waiting.append(self[parameter.name])
+                elif parameter.path is not None:
+                    marks = [m for m in parameter.marks if isinstance(m, Only | But)]
+                    found.add((parameter.path, marks[0] if marks else None))
+        return Keys(frozenset(found))
 
 
-def result_of(
-    stage: Stage,
-    experiment: Experiment,
-    results: dict[str, Any],
-    log: Log,
-    keeper: Keeper | None = None,
-) -> Any:
-    """The result of one stage from those it needs, saved if there is a keeper."""
-    needed = [results[need] for need in stage.needs]
-    if stage.parts is None:
-        result = stage.compute(experiment, *needed, log=log)
-        if keeper:
-            keeper.keep(stage.name, result)
-        return result
-    names = stage.parts(experiment)
-    there = {name: keeper.kept(name) if keeper else None for name in names}
-    missing = [name for name in names if there[name] is None]
-    if len(missing) < len(names):
-        log(
-            f"using {len(names) - len(missing)} of {len(names)} {stage.name.replace('_', ' ')} "
-            "from an earlier run"
-        )
-    if missing:
-        made = stage.compute(experiment, *needed, log=log, missing=missing, keeper=keeper)
-        for name, part in made:
-            there[name] = keeper.keep_part(name, part) if keeper else part
-    return there
+@dataclass(frozen=True)
+class Keys:
+    """Keys of an experiment: whole sections, or some of their keys."""
+
+    sections: frozenset[tuple[str, Only | But | None]]
+
+    def __contains__(self, key: str) -> bool:
+        return any(_holds(path, mark, key) for path, mark in self.sections)
+
+    def of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """Those of nested settings, by their dotted keys."""
+        return {key: value for key, value in _leaves(settings) if key in self}
+
+
+def _holds(path: str, mark: Only | But | None, key: str) -> bool:
+    if not _is_below(key, path):
+        return False
+    if mark is None:
+        return True
+    listed = any(_is_below(key, f"{path}.{one}") for one in mark.keys)
+    # a section that is left out as a whole is one value, None
+    return listed == isinstance(mark, Only) or key == path
+
+
+def _is_below(key: str, path: str) -> bool:
+    return key == path or key.startswith(f"{path}.")
+
+
+def _leaves(settings: Mapping[str, Any], above: str = "") -> Iterable[tuple[str, Any]]:
+    for key, value in settings.items():
+        if isinstance(value, dict) and value:
+            yield from _leaves(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key}", value

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping
-from typing import Any
 
 from lidar_mi.assessment.metrics.images import light_metrics, noise_metrics
 from lidar_mi.assessment.metrics.names import budget_key, timing_key
@@ -24,10 +23,8 @@ from lidar_mi.assessment.metrics.velocities import velocity_metrics
 from lidar_mi.assessment.metrics.volume import volume_metrics
 from lidar_mi.assessment.metrics.vortices import core_metrics, vortex_metrics
 from lidar_mi.assessment.metrics.winds import cross_flow_metrics, sweep_metrics, true_wind_metrics
+from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.schema.experiment import Experiment
-
-Results = Mapping[str, Any]
-"""Results of stages by name."""
 
 
 def measure(

@@ -1,9 +1,19 @@
-"""The stages of an experiment and their dependencies."""
+"""The stages of an experiment. What each needs, its function's signature says: see `graph`."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Mapping
+from typing import TypedDict
 
-from lidar_mi.experiment.graph import Stage, in_order
+import xarray as xr
+
+from lidar_mi.assessment.metrics.cores import Core
+from lidar_mi.assessment.metrics.pointing import ScanPointing
+from lidar_mi.assessment.metrics.requirements import RequirementTable
+from lidar_mi.assessment.metrics.rings import RingBudget
+from lidar_mi.assessment.metrics.safety import ScanSafety
+from lidar_mi.assessment.metrics.sensor import LidarCost
+from lidar_mi.atmosphere.line import Line
+from lidar_mi.experiment.graph import Graph, Stage
+from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.error_budget import error_budgets
 from lidar_mi.experiment.stages.eye_safety import scan_safety
@@ -17,24 +27,29 @@ from lidar_mi.experiment.stages.lines import (
 )
 from lidar_mi.experiment.stages.pointing import beam_pointing
 from lidar_mi.experiment.stages.rendering import (
-    IMAGES,
     check_light,
     detect_images,
     detector_noise,
+    given_samples,
     gridded_scans,
-    read_truth,
+    image_names,
     render_images,
+    samples_by_noise,
     scan_plans,
     scattering_air,
     true_cores,
 )
 from lidar_mi.experiment.stages.ring_calibration import assumed_rings, calibration_file
 from lidar_mi.experiment.stages.ring_images import (
+    Exposure,
+    RingImages,
+    Rings,
+    air_line,
     check_rings,
     exposure,
+    images_by_content,
     render_ring_images,
     ring_image_names,
-    ring_images,
     ring_instrument,
 )
 from lidar_mi.experiment.stages.ring_velocities import line_of_sight_winds, ring_budget
@@ -43,14 +58,21 @@ from lidar_mi.experiment.stages.sensor_cost import lidar_costs, pulses_needed
 from lidar_mi.experiment.stages.simulation_noise import simulation_noise
 from lidar_mi.experiment.stages.texture import texture_sweep
 from lidar_mi.experiment.stages.timed_beams import line_beams
-from lidar_mi.experiment.stages.volume import check_volume, scan_volumes, volume_winds
-from lidar_mi.experiment.stages.vortices import combined_vectors, fit_pairs, image_vectors
+from lidar_mi.experiment.stages.volume import Volumes, check_volume, scan_volumes, volume_winds
+from lidar_mi.experiment.stages.vortices import (
+    VortexFits,
+    combined_vectors,
+    fit_pairs,
+    image_vectors,
+)
 from lidar_mi.experiment.stages.winds import check_windows, cross_flow_winds
-from lidar_mi.experiment.truth.extinction import make_truth
+from lidar_mi.experiment.truth.extinction import Truth, true_air
+from lidar_mi.experiment.truth.flows import Flows, read_flows
+from lidar_mi.instrument.beams import Beams
+from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.rendering.phase import Scatterer
 from lidar_mi.retrieval.method_names import ImageMethod
-
-GIVEN = ("beside",)
-"""Given from the start: the folder in which files of an experiment are searched first."""
+from lidar_mi.retrieval.rings.calibration import Calibration
 
 RING_RETRIEVAL = "doppler_retrieve"
 
@@ -60,254 +82,154 @@ def has_wake(experiment: Experiment) -> bool:
     return experiment.wake is not None
 
 
-def has_images(experiment: Experiment) -> bool:
-    """Whether cross-flow winds are retrieved from the two images."""
-    return has_wake(experiment) and experiment.volume is None
-
-
-def has_volume(experiment: Experiment) -> bool:
-    """Whether winds are retrieved from two volumes."""
-    return experiment.volume is not None
-
-
-def has_detector(experiment: Experiment) -> bool:
-    """Whether the backscatter lidar has a detector whose noise is simulated."""
-    return has_images(experiment) and experiment.detector is not None
+def is_without_volume(experiment: Experiment) -> bool:
+    """Whether cross-flow winds are retrieved from two images, not winds from two volumes."""
+    return experiment.volume is None
 
 
 def has_error_budget(experiment: Experiment) -> bool:
     """Whether winds are also retrieved without each cause of error."""
-    return has_wake(experiment) and experiment.retrieval.error_budget
+    return experiment.wake is not None and experiment.retrieval.error_budget
 
 
-def has_rings(experiment: Experiment) -> bool:
-    """Whether there is a Doppler lidar."""
-    return experiment.doppler is not None
-
-
-def has_sensor(experiment: Experiment) -> bool:
-    """Whether both lidars work as one sensor."""
-    return experiment.sensor is not None
-
-
-def has_vortices_without_sensor(experiment: Experiment) -> bool:
+def has_image_vortices(experiment: Experiment) -> bool:
     """Whether vortex pairs are fitted to the backscatter lidar's measurements alone."""
-    fitted = has_images(experiment) and ImageMethod.VORTEX_FIT in experiment.retrieval.methods
-    return fitted and not has_sensor(experiment)
+    fitted = ImageMethod.VORTEX_FIT in experiment.retrieval.methods
+    alone = experiment.volume is None and experiment.sensor is None
+    return experiment.wake is not None and fitted and alone
 
 
 def has_vortices(experiment: Experiment) -> bool:
     """Whether vortex pairs are fitted."""
+    if experiment.wake is None or experiment.sensor is None:
+        return has_image_vortices(experiment)
     asked = ImageMethod.VORTEX_FIT in experiment.retrieval.methods
     # the wake of a turbine has no pair
-    pair = has_sensor(experiment) and (asked or not experiment.wake.turbine)
-    return pair or has_vortices_without_sensor(experiment)
+    return asked or experiment.wake.turbine is None
 
 
-def _quiet(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A stage's ``compute`` from a function without a log."""
-    return lambda *needed, log: function(*needed)
+def has_samples_by_noise(experiment: Experiment) -> bool:
+    """Whether the number of Monte Carlo samples is chosen by the noise of a detector."""
+    return experiment.render.samples_per_beam == "auto" and experiment.detector is not None
 
 
-BEHIND_IMAGES = ("name", "lidar.pulse_energy", "detector", "retrieval", "doppler", "sensor")
-"""What is used only after the backscatter lidar's images, which are per emitted energy."""
+def has_given_samples(experiment: Experiment) -> bool:
+    """Whether it is not."""
+    return not has_samples_by_noise(experiment)
 
-
-def needed_by_samples(experiment: Experiment) -> tuple[str, ...]:
-    """Keys that determine how many samples images have, where that is chosen by the noise."""
-    if experiment.render.samples_per_beam != "auto":
-        return ()
-    return ("detector", "lidar.pulse_energy") if experiment.detector else ("detector",)
-
-
-BEHIND_RING_IMAGES = (
-    "name",
-    "wake",
-    "platform",
-    "lidar",
-    "detector",
-    "scan",
-    "scattering",
-    "render",
-    "retrieval",
-    "sensor",
-    "volume",
-    "doppler.lidar.pulse_energy",
-    "doppler.lidar.pulse_duration",
-    "doppler.lidar.beam_radius",
-    "doppler.lidar.divergence_full",
-    "doppler.lidar.telescope_area",
-    "doppler.lidar.fov_half",
-    "doppler.lidar.instrument_constant",
-    "doppler.lidar.counted",
-    "doppler.lidar.range",
-    "doppler.lidar.range_bin",
-    "doppler.lidar.backscatter",
-    "doppler.lidar.extinction",
-    "doppler.lidar.sky_radiance",
-    "doppler.lidar.filter_bandwidth",
-    "doppler.ccd",
-    "doppler.speckle_modes",
-    "doppler.reference",
-    "doppler.assumed",
-    "doppler.calibration",
-    "doppler.retrieval",
-)
-"""What is used beside or after the Doppler lidar's images, which are in relative units."""
 
 STAGES = (
     # the truth, the scans, the air
-    Stage(
-        "flows",
-        read_truth,
-        ("beside",),
-        has_wake,
-        ahead=True,
-        timing="truth",
-        indifferent_to=BEHIND_IMAGES,
-    ),
-    Stage(
-        "truth",
-        _quiet(make_truth),
-        ("beside", "flows"),
-        has_wake,
-        ahead=True,
-        timing="truth",
-        indifferent_to=BEHIND_IMAGES,
-    ),
-    Stage(
-        "plans",
-        _quiet(scan_plans),
-        ("truth", "beside"),
-        has_wake,
-        ahead=True,
-        timing="truth",
-        indifferent_to=BEHIND_IMAGES,
-    ),
-    Stage("air", scattering_air, ("beside",), has_wake, ahead=True, indifferent_to=BEHIND_IMAGES),
-    Stage("cores", _quiet(true_cores), ("truth",), has_wake, timing="retrieve"),
+    Stage("footprint", Footprint, preflight=True),
+    Stage("flows", read_flows, preflight=True, timing="truth"),
+    Stage("truth", true_air, preflight=True, timing="truth"),
+    Stage("plans", scan_plans, preflight=True, timing="truth"),
+    Stage("air", scattering_air, has_wake, preflight=True),
+    Stage("cores", true_cores, timing="retrieve"),
     # the backscatter lidar
-    Stage(
-        "images",
-        render_images,
-        ("truth", "plans", "air", "flows"),
-        has_wake,
-        check=check_light,
-        remarks=image_remarks,
-        parts=lambda experiment: IMAGES,
-        indifferent_to=BEHIND_IMAGES,
-        needed_by=needed_by_samples,
-    ),
-    Stage("detected", _quiet(detect_images), ("images", "plans"), has_wake),
-    Stage("scans", _quiet(gridded_scans), ("detected",), has_wake),
-    Stage(
-        "wind",
-        cross_flow_winds,
-        ("truth", "plans", "scans"),
-        has_images,
-        check=check_windows,
-        timing="retrieve",
-    ),
-    Stage(
-        "simulation_noise",
-        simulation_noise,
-        ("detected", "plans", "scans", "wind"),
-        has_images,
-        timing="retrieve",
-    ),
-    Stage(
-        "texture_sweep", texture_sweep, ("flows",), has_images, timing="retrieve", illustrates=True
-    ),
-    Stage("detector_noise", _quiet(detector_noise), ("detected",), has_detector),
-    Stage("pointing", _quiet(beam_pointing), ("plans",), has_wake),
-    Stage("eye_safety", _quiet(scan_safety), ("plans", "beside"), has_images),
-    Stage(
-        "volumes",
-        _quiet(scan_volumes),
-        ("flows", "plans", "scans"),
-        has_volume,
-        check=check_volume,
-        timing="retrieve",
-    ),
-    Stage("wind_volume", volume_winds, ("flows", "volumes"), has_volume, timing="retrieve"),
-    Stage(
-        "error_budget",
-        error_budgets,
-        ("truth", "flows", "scans", "wind", "cores", "beside"),
-        has_error_budget,
-        timing="error_budget",
-    ),
+    Stage("samples", given_samples, has_given_samples, on_demand=True),
+    Stage("samples", samples_by_noise, has_samples_by_noise, on_demand=True),
+    Stage("images", render_images, check=check_light, remarks=image_remarks, parts=image_names),
+    Stage("detected", detect_images),
+    Stage("scans", gridded_scans),
+    Stage("wind", cross_flow_winds, is_without_volume, check=check_windows, timing="retrieve"),
+    Stage("simulation_noise", simulation_noise, timing="retrieve"),
+    Stage("texture_sweep", texture_sweep, is_without_volume, timing="retrieve", figure_only=True),
+    Stage("detector_noise", detector_noise, is_without_volume),
+    Stage("pointing", beam_pointing),
+    Stage("eye_safety", scan_safety, is_without_volume),
+    Stage("volumes", scan_volumes, check=check_volume, timing="retrieve"),
+    Stage("wind_volume", volume_winds, timing="retrieve"),
+    Stage("error_budget", error_budgets, has_error_budget, timing="error_budget"),
     # the Doppler lidar
-    Stage("rings", _quiet(lambda asked: ring_instrument(asked.doppler)), (), has_rings, ahead=True),
+    Stage("air_line", air_line, preflight=True),
+    Stage("rings", ring_instrument, preflight=True),
     Stage(
         "ring_images",
         render_ring_images,
-        ("rings",),
-        has_rings,
         check=check_rings,
         parts=ring_image_names,
         timing="doppler_render",
-        indifferent_to=BEHIND_RING_IMAGES,
     ),
-    Stage("lit_rings", _quiet(ring_images), ("ring_images",), has_rings),
-    Stage("calibration_file", calibration_file, ("rings", "beside"), has_rings, ahead=True),
-    Stage(
-        "assumed_rings",
-        assumed_rings,
-        ("rings", "calibration_file"),
-        has_rings,
-        timing=RING_RETRIEVAL,
-    ),
-    Stage(
-        "v_los",
-        line_of_sight_winds,
-        ("assumed_rings", "lit_rings"),
-        has_rings,
-        timing=RING_RETRIEVAL,
-    ),
-    Stage("ring_budget", ring_budget, ("rings", "lit_rings"), has_rings, timing=RING_RETRIEVAL),
-    Stage("exposure", _quiet(exposure), ("rings", "lit_rings"), has_rings, illustrates=True),
+    Stage("lit_rings", images_by_content),
+    Stage("calibration_file", calibration_file, preflight=True),
+    Stage("assumed_rings", assumed_rings, timing=RING_RETRIEVAL),
+    Stage("v_los", line_of_sight_winds, timing=RING_RETRIEVAL),
+    Stage("ring_budget", ring_budget, timing=RING_RETRIEVAL),
+    Stage("exposure", exposure, figure_only=True),
     # both as one sensor
-    Stage("requirements", _quiet(requirement_tables), ("beside",), has_sensor, ahead=True),
-    Stage("slab_wind", _quiet(slab_wind), ("truth",), has_sensor, ahead=True),
-    Stage("states", _quiet(states_of_wind), ("slab_wind", "flows"), has_sensor, ahead=True),
-    Stage("line_beams", _quiet(line_beams), ("beside",), has_sensor, ahead=True),
-    Stage(
-        "lines",
-        measure_lines,
-        ("states", "rings", "line_beams", "assumed_rings"),
-        has_sensor,
-        check=check_lines,
-        timing="sensor",
-    ),
-    Stage("wind3d", combined_wind, ("slab_wind", "lines", "wind"), has_sensor, timing="sensor"),
-    Stage(
-        "u_limits",
-        _quiet(limits_of_u),
-        ("slab_wind", "lines", "wind", "wind3d", "cores", "line_beams", "states"),
-        has_sensor,
-        timing="sensor",
-    ),
-    Stage("doppler_alone", doppler_alone, ("lines",), has_sensor, timing="sensor"),
-    Stage("costs", _quiet(lidar_costs), ("slab_wind", "beside"), has_sensor),
-    Stage("pulses_needed", _quiet(pulses_needed), ("requirements", "lines"), has_sensor),
+    Stage("requirements", requirement_tables, preflight=True),
+    Stage("slab_wind", slab_wind, preflight=True),
+    Stage("states", states_of_wind, preflight=True),
+    Stage("line_beams", line_beams, preflight=True),
+    Stage("lines", measure_lines, check=check_lines, timing="sensor"),
+    Stage("wind3d", combined_wind, timing="sensor"),
+    Stage("u_limits", limits_of_u, timing="sensor"),
+    Stage("doppler_alone", doppler_alone, timing="sensor"),
+    Stage("costs", lidar_costs),
+    Stage("pulses_needed", pulses_needed),
     # the vortices, fitted to the most accurate vectors available
-    Stage("vectors", _quiet(combined_vectors), ("wind3d",), has_sensor),
-    Stage("vectors", _quiet(image_vectors), ("wind",), has_vortices_without_sensor),
-    Stage("vortices", fit_pairs, ("plans", "scans", "vectors"), has_vortices, timing="vortex"),
+    Stage("vectors", combined_vectors),
+    Stage("vectors", image_vectors, has_image_vortices),
+    Stage("vortices", fit_pairs, has_vortices, timing="vortex"),
 )
 
 
-def stages_of(experiment: Experiment) -> list[Stage]:
+class Results(TypedDict, total=False):
+    """Results of the stages by name; of a stage that an experiment has not, there is none."""
+
+    footprint: Footprint
+    flows: Flows
+    truth: Truth
+    plans: list[ScanPlan]
+    air: Scatterer
+    cores: list[Core]
+    samples: int
+    images: dict[str, xr.Dataset]
+    detected: list[xr.Dataset]
+    scans: list[xr.Dataset]
+    wind: xr.Dataset
+    simulation_noise: xr.Dataset | None
+    texture_sweep: xr.Dataset
+    detector_noise: dict[str, float]
+    pointing: ScanPointing | None
+    eye_safety: ScanSafety | None
+    volumes: Volumes
+    wind_volume: xr.Dataset
+    error_budget: dict[str, dict[str, float]]
+    air_line: Line
+    rings: Rings
+    ring_images: dict[str, xr.Dataset]
+    lit_rings: RingImages
+    calibration_file: Calibration | None
+    assumed_rings: Rings
+    v_los: xr.Dataset
+    ring_budget: RingBudget
+    exposure: Exposure
+    requirements: Mapping[tuple[str, str], RequirementTable]
+    slab_wind: xr.Dataset
+    states: xr.Dataset
+    line_beams: Beams | None
+    lines: xr.Dataset
+    wind3d: xr.Dataset | None
+    u_limits: dict[str, float]
+    doppler_alone: dict[str, xr.Dataset]
+    costs: dict[str, LidarCost]
+    pulses_needed: int | None
+    vectors: xr.Dataset | None
+    vortices: VortexFits
+
+
+def stages_of(experiment: Experiment) -> Graph:
     """The stages of an experiment, each behind those it needs."""
-    return in_order([stage for stage in STAGES if stage.wanted(experiment)], GIVEN)
+    return Graph(STAGES, experiment)
 
 
-def storing_stages(experiment: Experiment) -> list[Stage]:
-    """The stages of an experiment whose results are stored in parts: images of both lidars.
+def storing_stages(graph: Graph) -> list[Stage]:
+    """The stages whose results are stored in parts: images of both lidars.
 
     An encounter has none: its images depend on the flight.
     """
-    if experiment.encounter is not None:
+    if graph.experiment.encounter is not None:
         return []
-    return [stage for stage in stages_of(experiment) if stage.parts]
+    return [stage for stage in graph if stage.parts]

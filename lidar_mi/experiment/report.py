@@ -23,8 +23,10 @@ from lidar_mi.assessment.report.sensor import sensor_chapter
 from lidar_mi.assessment.report.vector_map import map_data
 from lidar_mi.assessment.report.volume import volume_chapter
 from lidar_mi.assessment.report.vortices import vortex_chapter
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.measure import Results, judged
+from lidar_mi.experiment.measure import judged
+from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.winds import rendered_pairs
 
@@ -63,7 +65,9 @@ def chapters(
     return found, seconds
 
 
-def _backscatter(experiment, results, metrics, folder, log) -> Chapter:
+def _backscatter(
+    experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
+) -> Chapter:
     found, cores = results["wind"], results["cores"]
     drawn = backscatter_figures.draw_all(
         folder, results["truth"], results["scans"], found, cores, results["texture_sweep"], log
@@ -73,22 +77,30 @@ def _backscatter(experiment, results, metrics, folder, log) -> Chapter:
     return backscatter_chapter(experiment, metrics, cores, drawn, vectors)
 
 
-def _volume(experiment, results, metrics, folder, log) -> Chapter:
+def _volume(
+    experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
+) -> Chapter:
     pair = results["volumes"].pairs[Source.BACKSCATTER]
     drawn = volume_figures.draw_all(folder, results["wind_volume"], pair, results["cores"], log)
     return volume_chapter(experiment, metrics, drawn)
 
 
-def _pointing(experiment, results, metrics, folder, log) -> Chapter:
+def _pointing(
+    experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
+) -> Chapter:
     return pointing_chapter(metrics, pointing_figures.draw_all(folder, results["pointing"], log))
 
 
-def _error_budget(experiment, results, metrics, folder, log) -> Chapter:
+def _error_budget(
+    experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
+) -> Chapter:
     drawn = budget_figures.draw_all(folder, results["error_budget"], log)
     return budget_chapter(results["error_budget"], drawn)
 
 
-def _doppler(experiment, results, metrics, folder, log) -> Chapter:
+def _doppler(
+    experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
+) -> Chapter:
     doppler = experiment.doppler
     drawn = doppler_figures.draw_all(
         folder,
@@ -102,7 +114,9 @@ def _doppler(experiment, results, metrics, folder, log) -> Chapter:
     return doppler_chapter(doppler, metrics, drawn)
 
 
-def _sensor(experiment, results, metrics, folder, log) -> Chapter:
+def _sensor(
+    experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
+) -> Chapter:
     found, cores = results["wind3d"], results["cores"]
     shown = found if metrics["sensor.vectors"] else None
     drawn = sensor_figures.draw_all(folder, shown, results["lines"], cores, log)
@@ -115,9 +129,11 @@ def _sensor(experiment, results, metrics, folder, log) -> Chapter:
     return sensor_chapter(experiment, metrics, verdicts, drawn, vectors)
 
 
-def _vortices(experiment, results, metrics, folder, log) -> Chapter:
+def _vortices(
+    experiment: Experiment, results: Results, metrics: Metrics, folder: Path, log: Log
+) -> Chapter:
     fits, truth = results["vortices"], results["truth"].wind
-    (image, _), _ = list(rendered_pairs(experiment, results["scans"]).values())[-1]
+    (image, _), _ = list(call(rendered_pairs, experiment, scans=results["scans"]).values())[-1]
     drawn = vortex_figures.draw_all(
         folder, image, results["vectors"], truth, fits.pairs, results["cores"], log
     )

@@ -4,7 +4,6 @@ import webbrowser
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import xarray as xr
 from rich.console import Console
@@ -16,6 +15,7 @@ from lidar_mi.assessment.report.summary import summary
 from lidar_mi.experiment.folder.run_folder import REPORT
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import judged
+from lidar_mi.experiment.pipeline import Results
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.vortices import VortexFits
 from lidar_mi.experiment.truth.extinction import Truth
@@ -32,8 +32,8 @@ class Run(Tabular):
     Attributes
     ----------
     experiment : Experiment
-    results : dict
-        Of the completed stages, by name; see `lidar_mi.experiment.pipeline`.
+    results : Results
+        Of the completed stages, by name.
     metrics : dict of str to float
         Flat; empty until everything is done.
     folder : Path or None
@@ -42,14 +42,17 @@ class Run(Tabular):
         Lines of the log; ``log.warnings`` are those that matter for the results.
     seconds : dict of str to float
         Duration of the steps.
+    search_path : Path
+        Folder in which files that the experiment names are searched first.
     """
 
     experiment: Experiment
-    results: dict[str, Any]
+    results: Results
     log: Log
     metrics: dict[str, float] = field(default_factory=dict)
     folder: Path | None = None
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    search_path: Path = Path()
 
     @property
     def warnings(self) -> list[str]:

@@ -8,7 +8,7 @@ files are saved and reused, `rendering.batches` stores the samples of unfinished
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from lidar_mi import __version__
 from lidar_mi.arguments import checked_arguments
@@ -17,10 +17,10 @@ from lidar_mi.assessment.report.page import page
 from lidar_mi.assessment.report.simulation import simulation_remark
 from lidar_mi.errors import InputError, is_interrupt
 from lidar_mi.experiment.folder.run_folder import RunFolder
-from lidar_mi.experiment.graph import Keeper, Stage, result_of
+from lidar_mi.experiment.graph import Graph, Stage, Store
 from lidar_mi.experiment.log import Log, silent
 from lidar_mi.experiment.measure import measure
-from lidar_mi.experiment.pipeline import stages_of
+from lidar_mi.experiment.pipeline import Results, stages_of
 from lidar_mi.experiment.report import chapters
 from lidar_mi.experiment.results import Run
 from lidar_mi.experiment.schema.experiment import Experiment
@@ -99,13 +99,13 @@ def prepare(
     experiment, beside, notice
         As of `run`.
     known : mapping, optional
-        Results of stages, by name, of an experiment that differs only in what these are
-        indifferent to: they are not computed again.
+        Results of stages, by name, of an experiment that agrees in the keys that these depend on:
+        they are not computed again.
 
     Returns
     -------
     Run
-        With the truth and the other results computed ahead; `complete` runs the rest.
+        With the truth and the other results of the preflight; `complete` runs the rest.
 
     Raises
     ------
@@ -117,17 +117,16 @@ def prepare(
             f"encounter: {experiment.name} is a flight, not a run; expected lidar-mi fly (lm.fly)"
         )
     beside = experiment.folder if beside is None else beside
-    prepared = Run(experiment, {"beside": beside, **(known or {})}, Log(notice))
-    stages = stages_of(experiment)
-    for stage in stages:
-        if stage.ahead and stage.name not in prepared.results:
-            _carry_out(stage, prepared)
-    for stage in stages:
-        there = [prepared.results[n] for n in stage.needs if n in prepared.results]
+    graph, log = stages_of(experiment), Log(notice)
+    prepared = Run(experiment, cast(Results, dict(known or {})), log, search_path=Path(beside))
+    for stage in graph:
+        if stage.preflight and stage.name not in prepared.results:
+            _carry_out(graph, stage, prepared)
+    for stage in graph:
         if stage.check:
-            stage.check(experiment, *there)
-        for text in stage.remarks(experiment, *there) if stage.remarks else ():
-            prepared.log.remark(text)
+            graph.call(stage.check, prepared.results)
+        for text in graph.call(stage.remarks, prepared.results) if stage.remarks else ():
+            log.remark(text)
     return prepared
 
 
@@ -136,7 +135,7 @@ def complete(
     folder: str | Path | None = None,
     *,
     overwrite: bool = False,
-    shared: Keeper | None = None,
+    shared: Store | None = None,
 ) -> Run:
     """Run the rest of a prepared experiment.
 
@@ -146,7 +145,7 @@ def complete(
         From `prepare`.
     folder, overwrite
         As of `run`; errors, too.
-    shared : Keeper, optional
+    shared : Store, optional
         Images that are shared with other runs.
     """
     if folder is None:
@@ -154,17 +153,17 @@ def complete(
         prepared.log("done")
         return prepared
     prepared.folder = Path(folder)
-    kept = RunFolder(folder, prepared.experiment, prepared.results["beside"], shared)
-    with kept.claimed(overwrite):
+    store = RunFolder(folder, prepared.experiment, prepared.search_path, shared)
+    with store.claimed(overwrite):
         log = prepared.log
-        log.path = kept.log
+        log.path = store.log
         log(
             f"lidar-mi {__version__}, experiment {prepared.experiment.name}, "
             f"seed {prepared.experiment.seed}"
         )
         try:
-            finish(prepared, kept)
-            _report(prepared, kept)
+            finish(prepared, store)
+            _report(prepared, store)
             log("done")
             return prepared
         except BaseException as error:
@@ -177,21 +176,23 @@ def complete(
             raise
 
 
-def finish(prepared: Run, kept: Keeper | None = None, *, illustrated: bool = True) -> None:
+def finish(prepared: Run, store: Store | None = None, *, with_figures: bool = True) -> None:
     """Compute the stages that a prepared experiment lacks, and its metrics.
 
     Parameters
     ----------
     prepared : Run
         From `prepare`; complete afterwards.
-    kept : Keeper, optional
+    store : Store, optional
         Stores the results, and has those of an earlier run.
-    illustrated : bool
+    with_figures : bool
         With what only the report needs.
     """
-    for stage in stages_of(prepared.experiment):
-        if stage.name not in prepared.results and (illustrated or not stage.illustrates):
-            _carry_out(stage, prepared, kept)
+    graph = stages_of(prepared.experiment)
+    for stage in graph:
+        left_out = stage.on_demand or (stage.figure_only and not with_figures)
+        if stage.name not in prepared.results and not left_out:
+            _carry_out(graph, stage, prepared, store)
     if prepared.scans:
         # of images from an earlier run the time that they took then
         seconds = sum(scan.attrs["render_seconds"] for scan in prepared.scans)
@@ -202,20 +203,21 @@ def finish(prepared: Run, kept: Keeper | None = None, *, illustrated: bool = Tru
         prepared.log.remark(remark)
 
 
-def _carry_out(stage: Stage, run: Run, kept: Keeper | None = None) -> None:
+def _carry_out(graph: Graph, stage: Stage, run: Run, store: Store | None = None) -> None:
     start = time.perf_counter()
-    run.results[stage.name] = result_of(stage, run.experiment, run.results, run.log, kept)
+    results = cast(dict[str, Any], run.results)
+    results[stage.name] = graph.compute(stage, results, run.log, run.search_path, store)
     if stage.timing:
         run.seconds[stage.timing] += time.perf_counter() - start
 
 
-def _report(run: Run, kept: RunFolder) -> None:
+def _report(run: Run, store: RunFolder) -> None:
     """Draw the figures; write them, the metrics and the report."""
-    made, seconds = chapters(run.experiment, run.results, run.metrics, kept.figures, run.log)
+    made, seconds = chapters(run.experiment, run.results, run.metrics, store.figures, run.log)
     run.seconds |= seconds
     run.metrics |= {timing_key(step): round(value, 3) for step, value in seconds.items()}
-    kept.write_previews()
-    resolved, versions = dump(run.experiment), kept.record["versions"]
+    store.write_previews()
+    resolved, versions = dump(run.experiment), store.record["versions"]
     html = page(
         run.experiment,
         resolved,
@@ -224,6 +226,6 @@ def _report(run: Run, kept: RunFolder) -> None:
         made,
         run.warnings,
         run.answer,
-        kept.data_files(),
+        store.data_files(),
     )
-    kept.keep_verdict(run.metrics, html, run.answer)
+    store.store_verdict(run.metrics, html, run.answer)

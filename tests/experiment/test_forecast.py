@@ -12,12 +12,13 @@ import xarray as xr
 
 from lidar_mi import load_experiment
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.memory import check_size, check_states, forecast
+from lidar_mi.experiment.graph import call
+from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.preflight.check import duration, sections
 from lidar_mi.experiment.stages.brightness import check_brightness, overlap
 from lidar_mi.experiment.stages.timed_beams import timed_plans
 from lidar_mi.experiment.truth.extinction import make_truth
-from lidar_mi.experiment.truth.flows import read_flows
+from lidar_mi.experiment.truth.flows import flows_of
 from lidar_mi.experiment.truth.in_time import air_in_time, values_of_states
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import plan_scans
@@ -33,8 +34,14 @@ def planned(**changes):
     return experiment, plan_scans(experiment.scan, y, z, (0.0,))[0]
 
 
-def air(extinction):
-    return [xr.DataArray(np.full((1, 5, 5), extinction), dims=("x", "y", "z"))] * 2
+def brightness(experiment, extinction, plan):
+    air = [xr.DataArray(np.full((1, 5, 5), extinction), dims=("x", "y", "z"))] * 2
+    mapping = experiment.wake.extinction
+    call(check_brightness, experiment, mapping=mapping, extinction=air, plan=plan, albedo=1.0)
+
+
+def forecast(experiment, beams, in_states=0):
+    return call(Footprint, experiment).bytes(beams, in_states)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +77,7 @@ def test_overlap_by_throwing_darts(fov_half, distance, divergence):
 def test_images_that_would_be_dark_are_refused(changes, extinction, says):
     experiment, plan = planned(**changes)
     with pytest.raises(InputError, match=says) as error:
-        check_brightness(experiment, air(extinction), plan, 1.0)
+        brightness(experiment, extinction, plan)
     assert "; expected " in str(error.value) and len(str(error.value)) < 300
 
 
@@ -86,7 +93,7 @@ def test_images_that_would_be_dark_are_refused(changes, extinction, says):
 )
 def test_images_with_light_are_not(changes):
     experiment, plan = planned(**changes)
-    check_brightness(experiment, air(1e-3), plan, 1.0)
+    brightness(experiment, 1e-3, plan)
 
 
 def test_check_refuses_input_on_which_the_retrieval_would_fail(tmp_path):
@@ -120,10 +127,12 @@ def moving(duration="95 ms", **render):
     """Air that moves while 61 x 41 beams are sent, and what its states have in memory."""
     scan = {"air": "moving", "timing": {"duration": duration}}
     asked = check(small() | {"scan": scan, "render": small()["render"] | render})
-    flows = read_flows(asked, ".")
+    flows = flows_of(asked)
     y, z = flows[0]["y"].values, flows[0]["z"].values
-    plans = timed_plans(asked, plan_scans(asked.scan, y, z, (0.0, 0.0)), ".")
-    return asked, flows, plans, values_of_states(asked, flows, plans)
+    plans = call(
+        timed_plans, asked, plans=plan_scans(asked.scan, y, z, (0.0, 0.0)), search_path=asked.folder
+    )
+    return asked, flows, plans, call(values_of_states, asked, flows=flows, plans=plans)
 
 
 def test_states_of_moving_air_are_in_the_forecast():
@@ -132,7 +141,7 @@ def test_states_of_moving_air_are_in_the_forecast():
     assert values > 5 * flows[0]["v"].size and moving("0 s")[3] == 0
     truth = make_truth(asked, flows=flows)
     tracemalloc.start()
-    states = air_in_time(asked, truth, flows, 0, plans[0].beams.time)
+    states = call(air_in_time, asked, truth=truth, flows=flows, which=0, times=plans[0].beams.time)
     peak = tracemalloc.get_traced_memory()[1] + 2 * states.nbytes
     tracemalloc.stop()
     assert states.size == values
@@ -143,10 +152,11 @@ def test_states_of_moving_air_are_in_the_forecast():
 def test_states_beyond_the_memory_are_refused():
     """19 million values took 0.65 GB more than frozen air with molecules did, measured."""
     asked = moving(memory="1.3 GB")[0]
-    check_states(asked, 315, 10_000_000)
+    footprint = call(Footprint, asked)
+    footprint.check_states(315, 10_000_000)
     assert forecast(asked, 315, 19_039_079) - forecast(asked, 315) == pytest.approx(0.65e9, rel=0.1)
     with pytest.raises(InputError, match=r"scan.air: moving, of 4e\+07 values .*: frozen air"):
-        check_states(asked, 315, 40_000_000)
+        footprint.check_states(315, 40_000_000)
 
 
 @pytest.mark.parametrize(("gates", "fits"), [(1, True), (100, True), (2000, False)])
@@ -154,11 +164,11 @@ def test_a_run_beyond_the_memory_is_refused_with_its_requirement(gates, fits):
     render = {"memory": "8 GB", "max_order": 4}
     experiment = check(small() | {"scan": {"gate_count": gates}, "render": render})
     if fits:
-        return check_size(experiment, 219, 139)
+        return call(Footprint, experiment).check_size(219, 139)
     with pytest.raises(
         InputError, match=rf"219 x 139 beams x {gates} gates .* would take [\d.]+e?"
     ):
-        check_size(experiment, 219, 139)
+        call(Footprint, experiment).check_size(219, 139)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +197,7 @@ def test_a_spacing_that_memory_does_not_hold_is_refused_before_the_air_is_made()
     data = small(spacing="0.01 m")
     data["render"]["memory"] = "1 GB"
     with pytest.raises(InputError, match=r"wake\.spacing: 0\.01 m is not allowed, it makes"):
-        read_flows(check(data))
+        flows_of(check(data))
 
 
 def test_samples_of_a_pass_stay_below_the_ceiling():

@@ -1,29 +1,30 @@
-"""Order of stages, and runs in memory.
+"""Order of stages by their signatures, and runs in memory.
 
-Detects a stage that runs before what it needs or twice, a need that nothing gives, parts rendered
-again although they are there, a run in memory that writes files or finds other numbers than one in
-a folder.
+Detects a stage that runs before what it needs or twice, a parameter that nothing gives, a result of
+another type than is said, parts rendered again although they are there, a run in memory that writes
+files or finds other numbers than one in a folder.
 """
 
 import gc
+import inspect
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import wraps
+from typing import Annotated, get_origin, get_type_hints
 
 import numpy as np
 import pytest
 
 from lidar_mi.experiment import pipeline
-from lidar_mi.experiment.graph import Stage, in_order, result_of
+from lidar_mi.experiment.graph import But, Graph, Guard, Only, Stage, parameters, section_path
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.pipeline import STAGES, stages_of
+from lidar_mi.experiment.pipeline import STAGES, Results, stages_of
 from lidar_mi.experiment.run import complete, prepare, run
 from lidar_mi.experiment.schema import reading as config
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.shipped import experiment_file
+from lidar_mi.instrument.lidar import BackscatterLidar
 from tests.support.experiments import check, small
-
-
-def add(*numbers, log):
-    """A stage's computation: the first of what it gets is the experiment."""
-    return 1 + sum(numbers[1:])
 
 
 def load(name, changes=()):
@@ -34,11 +35,20 @@ def names(stages):
     return [stage.name for stage in stages]
 
 
-def test_stages_follow_those_they_need():
-    stages = [Stage("c", add, ("b", "a")), Stage("b", add, ("a",)), Stage("a", add, ("given",))]
-    assert names(in_order(stages, ("given",))) == ["a", "b", "c"]
+@pytest.fixture
+def experiment():
+    return check(small())
+
+
+def test_stages_follow_those_they_need(experiment):
+    stages = [
+        Stage("c", lambda b, a: a + b),
+        Stage("b", lambda a: 2 * a),
+        Stage("a", lambda seed: 10 * seed),
+    ]
+    assert names(Graph(stages, experiment)) == ["a", "b", "c"]
     # those that need nothing of each other stay as they are
-    assert names(in_order([Stage("y", add), Stage("x", add)])) == ["y", "x"]
+    assert names(Graph([Stage("y", lambda: 1), Stage("x", lambda: 2)], experiment)) == ["y", "x"]
 
 
 def test_no_pair_is_fitted_behind_a_turbine_unless_it_is_asked_for():
@@ -52,56 +62,120 @@ def test_no_pair_is_fitted_behind_a_turbine_unless_it_is_asked_for():
 @pytest.mark.parametrize(
     ("stages", "message"),
     [
-        ([Stage("a", add, ("b",))], "stage a: nothing gives b"),
-        ([Stage("a", add), Stage("a", add)], "stages: a given twice"),
-        ([Stage("a", add, ("b",)), Stage("b", add, ("a",))], "stages: a, b need each other"),
-        ([Stage("a", add, ("b",), ahead=True), Stage("b", add)], "stage a: is ahead of what it"),
+        ([Stage("a", lambda b: 1)], "stage a: nothing gives b"),
+        ([Stage("a", lambda: 1), Stage("a", lambda: 2)], "stages: a given twice"),
+        ([Stage("a", lambda b: 1), Stage("b", lambda a: 1)], "stages: a, b need each other"),
+        ([Stage("a", lambda b: 1, preflight=True), Stage("b", lambda: 1)], "stage a: of the prefl"),
     ],
 )
-def test_stages_that_do_not_go_together_are_named(stages, message):
+def test_stages_that_do_not_go_together_are_named(stages, message, experiment):
     with pytest.raises(ValueError, match=message):
-        in_order(stages)
+        Graph(stages, experiment)
 
 
-def test_a_result_is_computed_from_its_needs_in_order():
-    observed = []
-    stage = Stage("c", lambda experiment, *given, log: observed.append(given), ("b", "a"))
-    result_of(stage, None, {"a": 1, "b": 2, "other": 3}, Log())
-    assert observed == [(2, 1)]
+def test_a_stage_is_there_if_all_that_it_cannot_do_without_is():
+    def of_volume(volume: config.Experiment) -> int:
+        return 1
+
+    def after(first: int) -> int:
+        return 2
+
+    def without(first: int | None) -> int | None:
+        return first
+
+    stages = [Stage("first", of_volume), Stage("second", after), Stage("third", without)]
+    graph = Graph(stages, check(small()))
+    assert names(graph) == ["third"]
+    assert graph.compute(graph["third"], {}, Log(), ".") is None
+
+
+def test_a_result_depends_on_the_keys_of_its_signature_and_of_all_that_it_needs():
+    def light(
+        lidar: Annotated[BackscatterLidar, But("pulse_energy")], wake_texture_rms: float
+    ) -> int:
+        return 1
+
+    def image(light: int, scan: Annotated[object, Only("range")], limit: Annotated[int, Guard]):
+        return 2
+
+    def limit(retrieval: object) -> int:
+        return 3
+
+    graph = Graph(
+        [Stage("light", light), Stage("limit", limit), Stage("image", image)], check(small())
+    )
+    keys = graph.keys(graph["image"])
+    held = ("lidar.fov_half", "wake.texture.rms", "scan.range")
+    others = ("lidar.pulse_energy", "wake.texture", "scan.thickness", "retrieval.template", "seed")
+    assert all(key in keys for key in held) and not any(key in keys for key in others)
+    settings = {"lidar": {"fov_half": 1, "pulse_energy": 2}, "scan": {"range": 3}, "seed": 4}
+    assert keys.of(settings) == {"lidar.fov_half": 1, "scan.range": 3}
+    # a section that is left out is one value
+    assert keys.of({"lidar": None}) == {"lidar": None}
 
 
 class Drawer:
-    """Keeps things as a run folder does, with what an earlier run left."""
+    """Stores things as a run folder does, with what an earlier run left."""
 
     def __init__(self, **left):
         self.parts, self.results = left, {}
 
-    def kept(self, part):
+    def stored(self, part):
         return self.parts.get(part)
 
-    def keep_part(self, part, value):
+    def store_part(self, part, value):
         self.parts[part] = f"{value}, read"
         return self.parts[part]
 
-    def keep(self, name, value):
+    def store_result(self, name, value):
         self.results[name] = value
 
 
-def test_parts_that_are_there_are_not_made_again():
-    asked = []
+def test_parts_that_are_there_are_not_made_again(experiment):
+    asked, needed = [], []
 
-    def compute(experiment, *, log, missing, keeper):
+    def compute(number, missing):
         asked.append(list(missing))
         yield from ((name, f"new {name}") for name in missing)
 
-    stage = Stage("images", compute, parts=lambda experiment: ("one", "two"))
+    stages = [
+        Stage("number", lambda: needed.append(1), on_demand=True),
+        Stage("images", compute, parts=lambda: ("one", "two")),
+    ]
+    graph = Graph(stages, experiment)
+
+    def images(store=None):
+        return graph.compute(graph["images"], {}, Log(), ".", store)
+
     drawer = Drawer(two="old two")
     expected = {"one": "new one, read", "two": "old two"}
-    assert result_of(stage, None, {}, Log(), drawer) == expected
-    # all there: nothing is computed; no one to keep them: all are made
-    assert result_of(stage, None, {}, Log(), drawer) == expected
-    assert result_of(stage, None, {}, Log()) == {"one": "new one", "two": "new two"}
+    assert images(drawer) == expected and needed == [1]
+    # all there: nothing is computed, nor what only they need; no store: all are made
+    assert images(drawer) == expected and needed == [1]
+    assert images() == {"one": "new one", "two": "new two"}
     assert asked == [["one"], ["one", "two"]]
+
+
+def test_names_are_unambiguous_and_types_those_of_the_results():
+    """No stage has the name of a section; every parameter is typed; results are what is said."""
+    said = get_type_hints(Results)
+    assert {stage.name for stage in STAGES} == set(said)
+    for stage in STAGES:
+        assert section_path(stage.name) is None
+        functions = (stage.compute, stage.check, stage.remarks, stage.parts)
+        for function in (f for f in functions if f is not None):
+            typed = get_type_hints(function)
+            assert {p.name for p in parameters(function)} <= set(typed), function
+        if not inspect.isclass(stage.compute):
+            kind = get_type_hints(stage.compute)["return"]
+            assert get_origin(kind) is Iterator or kind == said[stage.name], stage.name
+
+
+def test_a_parameter_names_a_key():
+    assert section_path("doppler_camera") == "doppler.camera"
+    assert section_path("wake_texture_rms") == "wake.texture.rms"
+    assert section_path("wake") == "wake" and section_path("nothing") is None
+    assert get_type_hints(pipeline.true_cores)["wake"] is Wake
 
 
 @pytest.mark.parametrize(
@@ -136,6 +210,7 @@ def counted(monkeypatch):
     counts = {}
 
     def counting(stage):
+        @wraps(stage.compute)
         def compute(*needed, **options):
             counts[stage.name] = counts.get(stage.name, 0) + 1
             return stage.compute(*needed, **options)

@@ -1,4 +1,4 @@
-"""What results are indifferent to, and so may be shared by experiments that differ in it.
+"""What results do not depend on, and so may be shared by experiments that differ in it.
 
 Detects: a setting that changes an image and is said not to, with which a campaign would take the
 image of another experiment.
@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 
 from lidar_mi.experiment.folder.run_folder import made_by, new_record
-from lidar_mi.experiment.graph import result_of
-from lidar_mi.experiment.pipeline import (
-    BEHIND_IMAGES,
-    BEHIND_RING_IMAGES,
-    STAGES,
-    stages_of,
-    storing_stages,
-)
+from lidar_mi.experiment.pipeline import stages_of, storing_stages
 from lidar_mi.experiment.run import prepare
 from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.schema.reading import load_experiment
@@ -30,11 +23,13 @@ DOPPLER = {
     "path_samples": 0,
 }
 
-# other values of every key, or of one in every section, that images are said to be indifferent to
+# other values of every key, or of one in every section, that images do not depend on
 BEHIND = {
     "name": "another",
     "lidar.pulse_energy": "7.3 mJ",
     "detector": {"sky_radiance": "0.1 W/m^2/sr/nm", "quantum_efficiency": 0.3},
+    "render.max_samples": 2e6,
+    "render.monte_carlo_fraction": 0.4,
     "retrieval": {"methods": ["variational"], "stride": 4},
     "doppler": DOPPLER | {"lidar": {"pulse_energy": "1 mJ"}, "retrieval": {"images": 3}},
     "sensor": {"pulses": 3, "method": "cc"},
@@ -81,20 +76,19 @@ def changed(data, key, value):
 
 
 def images(experiment):
-    prepared = prepare(experiment)
+    prepared, graph = prepare(experiment), stages_of(experiment)
     found = {}
-    for stage in stages_of(experiment):
-        if stage.parts:
-            found |= result_of(stage, experiment, prepared.results, prepared.log)
+    for stage in storing_stages(graph):
+        found |= graph.compute(stage, prepared.results, prepared.log, experiment.folder)
     return found
 
 
 def signatures(experiment):
-    record = new_record(experiment, ".")
+    record, graph = new_record(experiment, "."), stages_of(experiment)
     return {
-        part: made_by(record, stage.indifferent(experiment))
-        for stage in storing_stages(experiment)
-        for part in stage.parts(experiment)
+        part: made_by(record, graph.keys(stage))
+        for stage in storing_stages(graph)
+        for part in graph.parts(stage)
     }
 
 
@@ -108,17 +102,30 @@ def equal(one, other):
     return all(np.array_equal(one[n].values, other[n].values, equal_nan=True) for n in one)
 
 
-def test_every_key_that_images_are_indifferent_to_is_tried():
-    assert set(BEHIND) == set(BEHIND_IMAGES) and set(BEHIND_RINGS) == set(BEHIND_RING_IMAGES)
-    shared = {stage.indifferent_to for stage in STAGES if stage.indifferent_to}
-    assert shared == {BEHIND_IMAGES, BEHIND_RING_IMAGES}
+def leaves(settings, above=""):
+    for name, value in settings.items():
+        if isinstance(value, dict) and value:
+            yield from leaves(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}"
+
+
+@pytest.mark.parametrize(("stage", "behind"), [("images", BEHIND), ("ring_images", BEHIND_RINGS)])
+def test_every_key_that_images_do_not_depend_on_is_tried(stage, behind):
+    sections = {"doppler": DOPPLER, "detector": {}, "sensor": {"method": "cc"}}
+    whole = reading.check(small() | sections, "whole")
+    graph = stages_of(whole)
+    keys = graph.keys(graph[stage])
+    for leaf in leaves(reading.settings(whole)):
+        tried = any(leaf == key or leaf.startswith(f"{key}.") for key in (*behind, "encounter"))
+        assert tried == (leaf not in keys), leaf
 
 
 def test_images_do_not_depend_on_what_follows_them(unchanged):
     base = small()
     before, signed = unchanged, signatures(reading.check(base, "base"))
     other = base
-    for key in BEHIND_IMAGES:
+    for key in BEHIND:
         if key == "sensor":  # which needs both lidars and their methods
             continue
         after = changed(other, key, BEHIND[key])
@@ -132,7 +139,7 @@ def test_ring_images_do_not_depend_on_what_is_beside_them():
     base = {"name": "rings", "doppler": DOPPLER}
     before, signed = images(reading.check(base, "base")), signatures(reading.check(base, "base"))
     other = base
-    for key in (k for k in BEHIND_RING_IMAGES if k not in ("volume", "sensor")):
+    for key in (k for k in BEHIND_RINGS if k not in ("volume", "sensor")):
         other = reading.settings(changed(other, key, BEHIND_RINGS[key]))
     after = reading.check(other, "after")
     found = images(after)

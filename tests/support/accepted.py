@@ -49,7 +49,9 @@ def _paths(experiment) -> float:
         beams = experiment.scan.columns * experiment.scan.rows
         if experiment.scan.aim == "grid" and pair:
             beams = pair.width * pair.height / wake.spacing**2
-        samples = most_samples(experiment, max(1, int(beams)))
+        samples = most_samples(
+            experiment.render, experiment.detector, max(1, int(beams)), experiment.scan.gate_count
+        )
         orders = experiment.render.max_order
         total += 2 * beams * samples * orders * experiment.scan.gate_count
     if rings:

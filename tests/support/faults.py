@@ -132,10 +132,10 @@ def make_fake(seed):
     axes = {"gate": [0], "z": np.arange(5.0), "y": np.arange(7.0)}
     wind = xr.Dataset({"v": (("z", "y"), random.random((5, 7)))})
 
-    def images(asked, *, log, missing, keeper):
+    def images(log, missing, store):
         for name in missing:
             light = np.random.default_rng([seed, IMAGES.index(name)]).random((1, 5, 7))
-            kept = batches_of(IMAGES, keeper, log)(IMAGES.index(name))
+            kept = batches_of(IMAGES, store, log)(IMAGES.index(name))
             passes, arrays = kept.kept()
             total = arrays.get("total", np.zeros_like(light))
             for number in range(passes, PASSES):
@@ -150,9 +150,9 @@ def make_fake(seed):
         return drawn, {}
 
     pipeline.STAGES = (
-        Stage("images", images, parts=lambda asked: IMAGES),
-        Stage("scans", lambda asked, images, log: list(images.values()), ("images",)),
-        Stage("wind", lambda asked, scans, log: wind, ("scans",)),
+        Stage("images", images, parts=lambda: IMAGES),
+        Stage("scans", lambda images: list(images.values())),
+        Stage("wind", lambda scans: wind),
     )
     experiment.measure = lambda *_: {"backscatter.cc.rmse_v": float(random.random())}
     experiment.chapters = figures

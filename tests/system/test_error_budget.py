@@ -11,6 +11,7 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.errors import truth_at_vectors
 from lidar_mi.experiment.folder.run_folder import IMAGES
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.run import run
 from lidar_mi.experiment.schema import reading as config
 from lidar_mi.experiment.stages.error_budget import budgets
@@ -84,7 +85,7 @@ def test_winds_of_the_run_are_used_as_they_would_be_retrieved_again(ran):
 def noise_free_scans(experiment, truth):
     """What would be rendered of the slab, with hardly any noise."""
     scans = []
-    for k, plan in enumerate(scan_plans(experiment, truth)):
+    for k, plan in enumerate(call(scan_plans, experiment, truth=truth)):
         image = 0.013 * blur_by_beam(truth.image(k), experiment.lidar, plan.centre, 2.5)
         s0 = image.expand_dims("gate") * 1e-3
         scans.append(xr.Dataset({"Y": image, "S0": s0, "S0_stderr": 1e-6 * s0}))

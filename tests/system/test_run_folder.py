@@ -140,11 +140,11 @@ def test_vortices_identify_their_run(tmp_path):
     folder = RunFolder(tmp_path, check(small()), tmp_path)
     parameters = np.array([300.0, 1.0, 15.0, 0.0, -300.0, 1.0, -15.0, 0.0, 0.0, 0.0])
     fit = VortexPairFit(parameters, np.eye(10), "lamb_oseen", 1.0, 1.0, 0.0, 0.0)
-    folder.keep("vortices", SimpleNamespace(pairs={"mine": fit}, method="variational"))
+    folder.store_result("vortices", SimpleNamespace(pairs={"mine": fit}, method="variational"))
     written = read_json(tmp_path / "vortex.json", "vortices")
     assert written[MADE_BY] == folder.made_by and written["vectors_method"] == "variational"
     assert read_vortices(tmp_path / "vortex.json")["mine"].port.circulation == 300
-    folder.keep("vortices", None)
+    folder.store_result("vortices", None)
     assert not list(tmp_path.iterdir())
 
 

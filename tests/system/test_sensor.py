@@ -18,12 +18,18 @@ from lidar_mi.assessment.metrics.requirements import read_requirements
 from lidar_mi.assessment.metrics.sensor import limit_metrics, vector_metrics
 from lidar_mi.assessment.report import sensor as sensor_report
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.measure import measured
 from lidar_mi.experiment.preflight import check
 from lidar_mi.experiment.run import prepare, run
 from lidar_mi.experiment.schema import reading as config
-from lidar_mi.experiment.stages.sensor import doppler_alone, mean_squares_without, with_truth
+from lidar_mi.experiment.stages.sensor import (
+    combine_settings,
+    doppler_alone,
+    mean_squares_without,
+    with_truth,
+)
 from lidar_mi.instrument.doppler_scan import scan_wind
 from lidar_mi.io.vortex_file import read_vortices
 from tests.support.experiments import (
@@ -54,6 +60,12 @@ SMALL = {
         "crossflow_std": "0.8 m/s",
     },
 }
+
+
+def combined(experiment, truth, lines, crossflow):
+    """The wind of both lidars as a run has it."""
+    settings = call(combine_settings, experiment, crossflow=crossflow)
+    return with_truth(experiment.name, experiment.scan, truth, lines, crossflow, settings)
 
 
 def changed(**sections):
@@ -326,8 +338,18 @@ def test_largest_cause_of_error_of_u_is_reported(amplitude, noise, errors, limit
     )
     crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), np.zeros(waves.shape, np.uint8)))
     crossflow.attrs = {"template": 4, "stride": 1}
-    found = with_truth(experiment, truth, lines, crossflow)
-    metrics = limit_metrics(mean_squares_without(experiment, truth, lines, crossflow, found, []))
+    found = combined(experiment, truth, lines, crossflow)
+    metrics = limit_metrics(
+        call(
+            mean_squares_without,
+            experiment,
+            truth=truth,
+            lines=lines,
+            crossflow=crossflow,
+            found=found,
+            cores=[],
+        )
+    )
     causes = ["line_noise", "range_bin", "crossflow", "sampling", *(["pointing"] if errors else [])]
     fractions = {c: metrics[f"sensor.error_budget.{c}.fraction_u"] for c in causes}
     other = "line_noise" if amplitude else "sampling"
@@ -355,16 +377,16 @@ def test_an_error_common_to_all_lines_is_stated_apart():
     )
     crossflow = truth[["v", "w"]].assign(flag=(("z", "y"), zero.astype(np.uint8)))
     crossflow.attrs = {"template": 4, "stride": 1}
-    silent = with_truth(experiment, truth, lines, crossflow)
+    silent = combined(experiment, truth, lines, crossflow)
     biased = lines.assign(v_los_systematic=("line", np.full(lines.sizes["line"], 0.5)))
-    found = with_truth(experiment, truth, biased, crossflow)
+    found = combined(experiment, truth, biased, crossflow)
     assert "u_systematic" not in silent
     xr.testing.assert_identical(found["u_stderr"], silent["u_stderr"])
     valid = found["flag"] == 0
     u = found["u_systematic"].where(valid)
     assert float(u.min()) > 0.4 and float(u.max()) < 0.6
     assert float(found["v_systematic"].where(valid).max()) < 0.1
-    alone = doppler_alone(experiment, biased, log=Log())["neighbours"]
+    alone = doppler_alone(biased, Log())["neighbours"]
     assert float(alone["u_systematic"].median()) == pytest.approx(0.5, rel=0.1)
 
 
@@ -389,9 +411,17 @@ def test_the_fraction_of_noise_is_between_those_of_draws_and_of_the_lines():
     winds, gained = [], []
     for seed in range(8):
         lines = scan_wind(truth, directions, experiment.doppler.lidar, noise, seed, 70.0)
-        found = with_truth(experiment, truth, lines, crossflow)
+        found = combined(experiment, truth, lines, crossflow)
         metrics = limit_metrics(
-            mean_squares_without(experiment, truth, lines, crossflow, found, [])
+            call(
+                mean_squares_without,
+                experiment,
+                truth=truth,
+                lines=lines,
+                crossflow=crossflow,
+                found=found,
+                cores=[],
+            )
         )
         valid = found["flag"].values == 0
         full = ((found["u"] - found["u_true"]).values[valid] ** 2).mean()

@@ -12,6 +12,7 @@ import pytest
 import xarray as xr
 
 from lidar_mi.experiment.folder.run_folder import IMAGES
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.stages.winds import rendered_pairs
 from lidar_mi.io.exr import read_scan
 from lidar_mi.retrieval.images.common_grid import on_one_grid
@@ -25,7 +26,7 @@ SCENES = Path(str(files("lidar_mi.scenes")))
 def test_the_images_alone_determine_the_vortices(demo):
     """The paper's case: circulation to 5 % of what the simulation's file says, places to 1 m."""
     scans = [read_scan(demo.folder / name) for name in IMAGES]
-    (pair, noise), *_ = rendered_pairs(demo.experiment, scans).values()
+    (pair, noise), *_ = call(rendered_pairs, demo.experiment, scans=scans).values()
     fit = fit_vortices(*pair, demo.experiment.platform.dt, noise)
     assert fit.success, fit.reasons
     for side, circulation in (("port", 439.99), ("starboard", -438.41)):

@@ -41,7 +41,7 @@ class ImageStore:
         """File of an image."""
         return self.folder_of(part) / f"{part}.exr"
 
-    def kept(self, part: str) -> xr.Dataset | None:
+    def stored(self, part: str) -> xr.Dataset | None:
         """A rendered image, without a detector's noise; None: it is not there.
 
         Raises
@@ -75,16 +75,16 @@ class ImageStore:
             return None
         return arrays if str(arrays.pop(MADE_BY, "")) == self.signature_of(part) else None
 
-    def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
+    def store_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
         """Save samples of an image until the image itself is saved."""
         write_arrays(self._batches(part), arrays | {MADE_BY: self.signature_of(part)})
 
-    def keep_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
+    def store_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
         """Write a rendered image; returns it as it is read."""
         self.write(part, value)
-        kept = self.kept(part)
-        assert kept is not None
-        return kept
+        found = self.stored(part)
+        assert found is not None
+        return found
 
     def write(self, part: str, value: xr.Dataset) -> None:
         """Write an image with its signature."""

@@ -17,7 +17,7 @@ from lidar_mi.assessment.metrics.names import Source, current_name
 from lidar_mi.errors import InputError
 from lidar_mi.experiment import log
 from lidar_mi.experiment.folder.image_store import BATCHES, MADE_BY, ImageStore
-from lidar_mi.experiment.graph import Keeper
+from lidar_mi.experiment.graph import Keys, Store
 from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.schema.experiment import Experiment
@@ -71,7 +71,7 @@ class RunFolder:
     experiment : Experiment
     beside : path
         Folder in which files named by the experiment are looked for first.
-    shared : Keeper, optional
+    shared : Store, optional
         Images that are shared with other runs: used if they are there, else added.
 
     Attributes
@@ -88,7 +88,7 @@ class RunFolder:
         path: str | Path,
         experiment: Experiment,
         beside: str | Path,
-        shared: Keeper | None = None,
+        shared: Store | None = None,
     ):
         self.path = Path(path)
         self.figures = self.path / FIGURES
@@ -159,11 +159,11 @@ class RunFolder:
                 "folder (-o DIR)"
             )
 
-    def kept(self, part: str) -> xr.Dataset | None:
+    def stored(self, part: str) -> xr.Dataset | None:
         """As of `ImageStore`; an image shared with other runs is copied here."""
-        image = self._images.kept(part)
+        image = self._images.stored(part)
         if image is None and self._shared:
-            image = self._shared.kept(part)
+            image = self._shared.stored(part)
             if image is not None:
                 self._images.write(part, image)
         return image
@@ -172,15 +172,15 @@ class RunFolder:
         """As of `ImageStore`."""
         return self._images.unfinished(part)
 
-    def keep_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
+    def store_unfinished(self, part: str, arrays: dict[str, Any]) -> None:
         """As of `ImageStore`."""
-        self._images.keep_unfinished(part, arrays)
+        self._images.store_unfinished(part, arrays)
 
-    def keep_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
+    def store_part(self, part: str, value: xr.Dataset) -> xr.Dataset:
         """As of `ImageStore`; an image that may be shared with other runs is also written there."""
         if self._shared:
-            self._shared.keep_part(part, value)
-        return self._images.keep_part(part, value)
+            self._shared.store_part(part, value)
+        return self._images.store_part(part, value)
 
     def _is_foreign(self, image: Path) -> bool:
         """Whether an image is of another experiment or version, or cannot be read."""
@@ -189,10 +189,10 @@ class RunFolder:
         except InputError:
             return True
 
-    def keep(self, name: str, value: Any) -> None:
+    def store_result(self, name: str, value: Any) -> None:
         """Write a result into its file, if it has one; None: there is no such result."""
         if name == "detected":
-            self._keep_noise(value)
+            self._store_noise(value)
         write_result(self.path, name, value, self._experiment.name, self.made_by)
 
     def _those(self, patterns: Sequence[str]) -> list[Path]:
@@ -209,7 +209,7 @@ class RunFolder:
         there += [self.path / name for name in RESULTS.values() if (self.path / name).exists()]
         return [*sorted(path.name for path in there), METRICS, SUMMARY, RECORD, LOG]
 
-    def keep_verdict(
+    def store_verdict(
         self, metrics: Mapping[str, float], page: str, answer: Sequence[str] = ()
     ) -> None:
         """Write report, answer and metrics: the run is complete.
@@ -218,7 +218,7 @@ class RunFolder:
         """
         write_verdict(self.path, self.record, metrics, page, answer)
 
-    def _keep_noise(self, scans: list[xr.Dataset]) -> None:
+    def _store_noise(self, scans: list[xr.Dataset]) -> None:
         """Add noisy images to the files of those without noise."""
         for part, scan in zip(rendering.IMAGES, scans, strict=True):
             if "Y_noisy" in scan and "Y_noisy" not in exr.read_scan(self._images.path(part)):
@@ -321,33 +321,23 @@ def _versions() -> dict[str, str]:
     }
 
 
-def made_by(record: dict, indifferent_to: Sequence[str] = ()) -> str:
+def made_by(record: Mapping[str, Any], keys: Keys | None = None) -> str:
     """Hash of what a record says of settings, files and versions that rendered images depend on.
 
     Parameters
     ----------
     record : dict
         From `new_record`.
-    indifferent_to : sequence of str
-        Dotted keys of settings that have no influence; files that they name have none either.
+    keys : Keys, optional
+        Those that matter, of settings and of files that they name; default: all.
     """
+    settings, files = reading.in_si(record["experiment"]), record["files"]
     decisive = {
-        "experiment": _without(reading.in_si(record["experiment"]), indifferent_to),
-        "files": _without(record["files"], indifferent_to),
+        "experiment": settings if keys is None else keys.of(settings),
+        "files": files if keys is None else keys.of(files),
         "versions": {name: record["versions"][name] for name in _RENDERED_BY},
     }
     return hashlib.sha256(json.dumps(decisive, sort_keys=True).encode()).hexdigest()
-
-
-def _without(settings: dict, keys: Sequence[str], above: str = "") -> dict:
-    """Settings without some dotted keys and what is below them."""
-    found = {}
-    for key, value in settings.items():
-        name = f"{above}{key}"
-        if not any(name == one or name.startswith(f"{one}.") for one in keys):
-            nested = isinstance(value, dict)
-            found[key] = _without(value, keys, f"{name}.") if nested else value
-    return found
 
 
 def _difference(before: dict, now: dict) -> str | None:

@@ -6,19 +6,22 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import relative_divergence, sense_of_rotation
-from lidar_mi.assessment.metrics.requirements import look_ahead
+from lidar_mi.assessment.metrics.requirements import RequirementTable, look_ahead
 from lidar_mi.experiment import run as experiment
 from lidar_mi.experiment.describe import Section
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log, Notice, silent
-from lidar_mi.experiment.memory import forecast
-from lidar_mi.experiment.preflight.cost import cost
+from lidar_mi.experiment.memory import Footprint
+from lidar_mi.experiment.pipeline import Results
+from lidar_mi.experiment.preflight.cost import cost, with_number
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.image_remarks import window_reach
 from lidar_mi.experiment.stages.light_budget import light_budget
-from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text, with_samples
+from lidar_mi.experiment.stages.rendering import chosen_samples, samples_text
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, scan_schedule
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.in_time import values_of_states
@@ -70,22 +73,25 @@ def sections(
     preparation, ahead = time.process_time() - start, prepared.results
     chosen: Samples | None = None
     if asked.wake:
-        if sampled:
-            needed = [ahead[name] for name in ("truth", "plans", "air", "flows")]
-            chosen = chosen_samples(asked, *needed, log=Log(notice))
+        if sampled and asked.detector:
+            needed = {name: ahead[name] for name in ("truth", "plans", "air", "flows")}
+            chosen = call(chosen_samples, asked, **needed, log=Log(notice))
         yield from _backscatter(asked, ahead["truth"], ahead["plans"][0], ahead["air"], chosen)
         if asked.scan.timing:
-            schedule = scan_schedule(asked, ahead["plans"][0], beside)
+            schedule = scan_schedule(asked.scan, ahead["plans"][0], prepared.search_path)
             yield "scan of the backscatter lidar", _timing(asked, schedule)
     if asked.doppler:
         yield _doppler(asked)
     if asked.sensor:
         yield _sensor(asked, ahead["requirements"])
         if asked.sensor.timing:
-            yield "scan of the Doppler lidar", _timing(asked, lines_schedule(asked, beside))
+            yield (
+                "scan of the Doppler lidar",
+                _timing(asked, call(lines_schedule, asked, search_path=prepared.search_path)),
+            )
     if timed:
         notice("timing a few samples and a retrieval", None)
-        whole = with_samples(asked, chosen.number) if chosen else asked
+        whole = with_number(asked, chosen.number) if chosen else asked
         yield "cost of the run, to a factor of 2", _cost(whole, ahead, preparation)
     if prepared.warnings:
         yield f"{asked.name}: warnings", [(text,) for text in prepared.warnings]
@@ -131,7 +137,7 @@ def _samples(asked: Experiment, chosen: Samples | None) -> str:
     """Monte Carlo samples, and the variance of their noise over that of the detector's."""
     number: object = asked.render.samples_per_beam
     if chosen:
-        number = samples_text(asked, chosen)
+        number = samples_text(asked.render, chosen)
     elif asked.detector is None:
         number = asked.render.without_detector(asked.scan.gate_count)
     return f"{number}, orders 1 to {asked.render.max_order}"
@@ -141,7 +147,8 @@ def _light(
     asked: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer
 ) -> list[tuple[str, str]]:
     """What scatters, how much of it arrives, and with how much noise."""
-    light, kind = light_budget(asked, truth, plan, air), asked.scattering
+    kind = asked.scattering
+    light = call(light_budget, asked, truth=truth, plan=plan, air=air)
     named = kind.aerosol or kind.table
     what = f"{kind.phase} {named}" if named else kind.phase.replace("_", "-")
     rows = [
@@ -157,7 +164,7 @@ def _light(
     return rows
 
 
-def _cost(asked: Experiment, ahead: Mapping, preparation: float) -> list[tuple[str, str]]:
+def _cost(asked: Experiment, ahead: Results, preparation: float) -> list[tuple[str, str]]:
     """Time of the parts of a run on one core of this machine, and its memory."""
     found = cost(asked, ahead, preparation)
     names = {
@@ -179,8 +186,8 @@ def _cost(asked: Experiment, ahead: Mapping, preparation: float) -> list[tuple[s
     if asked.wake:
         plan = ahead["plans"][0]
         beams = plan.y.size * plan.z.size
-        in_states = values_of_states(asked, ahead["flows"], ahead["plans"])
-    expected = forecast(asked, beams, in_states) / 1e9
+        in_states = call(values_of_states, asked, flows=ahead["flows"], plans=ahead["plans"])
+    expected = call(Footprint, asked).bytes(beams, in_states) / 1e9
     allowed = ceiling((asked.render if asked.wake else asked.doppler.render).memory) / 1e9
     rows.append(("memory", f"about {expected:.2g} GB, at most {allowed:.3g} GB"))
     return rows
@@ -194,9 +201,10 @@ def duration(seconds: float) -> str:
     return f"{max(seconds, 1):.0f} s"
 
 
-def _displacements(asked: Experiment, wind, plan: ScanPlan) -> list[tuple[str, str]]:
+def _displacements(asked: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[tuple[str, str]]:
     """The fastest wind and the fastest that windows of this size can follow, per axis."""
-    settings, reach = asked.retrieval, window_reach(asked, plan)
+    settings = asked.retrieval
+    reach = window_reach(settings, asked.platform, plan)
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
     rows = [("methods", ", ".join(settings.methods))]
     if {ImageMethod.CC, ImageMethod.WS} & set(settings.methods):
@@ -236,7 +244,7 @@ def _timing(asked: Experiment, schedule: Schedule) -> list[tuple[str, ...]]:
     ]
 
 
-def _sensor(asked: Experiment, tables: Mapping) -> Section:
+def _sensor(asked: Experiment, tables: Mapping[tuple[str, str], RequirementTable]) -> Section:
     sensor = asked.sensor
     columns, rows = sensor.directions.columns, sensor.directions.rows
     count = columns * rows

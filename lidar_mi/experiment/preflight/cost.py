@@ -7,16 +7,15 @@ and now over the time that it took then is the factor between the machines.
 
 import functools
 import time
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import xarray as xr
 
-from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.pipeline import has_error_budget, has_vortices
+from lidar_mi.experiment.graph import call
+from lidar_mi.experiment.pipeline import Results, has_error_budget, has_vortices
 from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.stages.rendering import IMAGES, chosen_samples, render_images, with_samples
+from lidar_mi.experiment.stages.rendering import IMAGES, chosen_samples, render_images
 from lidar_mi.retrieval.method_names import ImageMethod, RingMethod, VolumeMethod
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
@@ -82,7 +81,7 @@ class Cost(NamedTuple):
         return START + sum(self)
 
 
-def cost(experiment: Experiment, ahead: Mapping[str, Any], preparation: float = 0.0) -> Cost:
+def cost(experiment: Experiment, ahead: Results, preparation: float = 0.0) -> Cost:
     """Processor time of a run on this machine, to a factor of two.
 
     Parameters
@@ -105,7 +104,7 @@ def cost(experiment: Experiment, ahead: Mapping[str, Any], preparation: float = 
     )
 
 
-def flight_seconds(first: Experiment, ahead: Mapping[str, Any], scans: float) -> float:
+def flight_seconds(first: Experiment, ahead: Results, scans: float) -> float:
     """Processor time of a flight on this machine, to a factor of two.
 
     Parameters
@@ -143,28 +142,29 @@ def probe() -> None:
     rng.poisson(np.full((500, 800), 30.0))
 
 
-def render_seconds(experiment: Experiment, ahead: Mapping[str, Any]) -> float:
+def render_seconds(experiment: Experiment, ahead: Results) -> float:
     """Time of one image, from the first one with few samples and with four times as many.
 
     Their difference has no part of what is done once, such as compiling. Where the number of
     samples is to be chosen, with the time of doing so.
     """
     plan, render = ahead["plans"][0], experiment.render
-    needed = [ahead[name] for name in ("truth", "plans", "air", "flows")]
+    needed = {name: ahead[name] for name in ("truth", "plans", "air", "flows")}
     if render.samples_per_beam == "auto":
         begin = time.process_time()
-        chosen = chosen_samples(experiment, *needed, log=Log())
-        number = chosen.number if chosen else render.without_detector(plan.gate_count)
+        number = render.without_detector(plan.gate_count)
+        if experiment.detector:
+            number = call(chosen_samples, experiment, **needed).number
         choosing = time.process_time() - begin
-        return choosing / 2 + render_seconds(with_samples(experiment, number), ahead)
+        return choosing / 2 + render_seconds(with_number(experiment, number), ahead)
     beams, least = plan.y.size * plan.z.size, 2 * experiment.scan.gate_count
     few = max(2, least, round(_SAMPLES / 4 / (beams * render.max_order)))
     whole = max(render.samples_per_beam, least)
 
     def timed(samples: int) -> float:
-        asked = with_samples(experiment, samples)
         start = time.process_time()
-        for _ in render_images(asked, *needed, log=Log(), missing=IMAGES[:1]):
+        rendered = call(render_images, experiment, **needed, samples=samples, missing=IMAGES[:1])
+        for _ in rendered:
             pass
         return time.process_time() - start
 
@@ -176,7 +176,14 @@ def render_seconds(experiment: Experiment, ahead: Mapping[str, Any]) -> float:
     return short + max(long - short, 0.0) * (whole - few) / (3 * few)
 
 
-def _images(experiment: Experiment, ahead: Mapping[str, Any]) -> float:
+def with_number(experiment: Experiment, samples: int) -> Experiment:
+    """The experiment with a number of samples per beam."""
+    render = experiment.render.model_copy(update={"samples_per_beam": samples})
+    found = experiment.model_copy(update={"render": render})
+    return found.read_from(experiment.folder)
+
+
+def _images(experiment: Experiment, ahead: Results) -> float:
     """Winds from images or volumes."""
     if not experiment.wake:
         return 0.0

@@ -8,9 +8,11 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.memory import most_samples
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.wake import ExtinctionMapping
+from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.units import shown
 
 SINGLE = 1e-17
@@ -20,7 +22,13 @@ CONTRIBUTIONS = 5
 
 
 def check_brightness(
-    experiment: Experiment, extinction: Sequence[xr.DataArray], plan: ScanPlan, albedo: float
+    lidar: BackscatterLidar,
+    render: RenderSettings,
+    detector: Detector | None,
+    mapping: ExtinctionMapping,
+    extinction: Sequence[xr.DataArray],
+    plan: ScanPlan,
+    albedo: float,
 ) -> None:
     """Refuse images whose pixels would mostly be dark, by the lidar equation of the median pixel.
 
@@ -30,7 +38,6 @@ def check_brightness(
         Too few samples contribute: free flights that end elsewhere, or a field of view that
         contains hardly any of the beam; or light too weak for its error in single precision.
     """
-    lidar, render, mapping = experiment.lidar, experiment.render, experiment.wake.extinction
     inside = float(np.median([np.median(field.values) for field in extinction]))
     if not inside > 0:
         raise InputError(
@@ -48,13 +55,13 @@ def check_brightness(
             f"back, not {light * arriving**2:.1g}"
         )
     beams = len(plan.y) * len(plan.z)
-    samples = most_samples(experiment, beams)
-    least = least_samples(experiment, extinction, plan)
+    samples = most_samples(render, detector, beams, plan.gate_count)
+    least = least_samples(lidar, render, mapping, extinction, plan)
     if samples < least:
         key, value = "lidar.fov_half", shown(lidar.fov_half, "mrad")
         if render.estimator == "analog":
             key, value = "render.estimator", "analog"
-        chosen = render.samples_per_beam == "auto" and experiment.detector
+        chosen = render.samples_per_beam == "auto" and detector
         asked, needed = ("max_samples", least * beams) if chosen else ("samples_per_beam", least)
         raise InputError(
             f"{key}: {value} is not allowed with {samples} samples per beam, of "
@@ -64,16 +71,19 @@ def check_brightness(
 
 
 def least_samples(
-    experiment: Experiment, extinction: Sequence[xr.DataArray], plan: ScanPlan
+    lidar: BackscatterLidar,
+    render: RenderSettings,
+    mapping: ExtinctionMapping,
+    extinction: Sequence[xr.DataArray],
+    plan: ScanPlan,
 ) -> int:
     """Samples per beam of which `CONTRIBUTIONS` bring light to a pixel of the median extinction.
 
     2 where nearly all do.
     """
-    lidar, mapping = experiment.lidar, experiment.wake.extinction
     distance = float(np.median(plan.ranges()[0]))
     seen = overlap(lidar, distance)
-    if experiment.render.estimator == "analog":
+    if render.estimator == "analog":
         # samples contribute if they collide in the gate
         inside = float(np.median([np.median(field.values) for field in extinction]))
         around = mapping.background + mapping.molecules

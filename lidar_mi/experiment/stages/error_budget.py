@@ -1,7 +1,7 @@
 """The error budget of an experiment's cross-flow wind: retrieved without each cause of error."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,13 @@ from lidar_mi.assessment.metrics.error_budget import (
 )
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.atmosphere.advection import advect, advect_to
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.retrieval import Retrieval
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.ideal_images import ideal_scan, slab_images
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import (
@@ -29,10 +33,12 @@ from lidar_mi.experiment.stages.winds import (
 )
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.experiment.truth.flows import Flows, read_flows
+from lidar_mi.experiment.truth.flows import Flows, flows_of
+from lidar_mi.instrument.detector import Detector
+from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.motion import Motion
 from lidar_mi.instrument.reported import Reported
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.images.common_grid import resample_pair
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.synchronised import of_one_instant
@@ -40,6 +46,30 @@ from lidar_mi.retrieval.wind.synchronised import of_one_instant
 # Images of air without blur: a method that corrects for the beam's blur has none to correct there.
 _SHARP = ("perfect", "beam_blur")
 Times = list[xr.DataArray] | None
+
+
+@dataclass(frozen=True)
+class _Sensor:
+    """The air and the backscatter lidar: what images without a cause of error differ in."""
+
+    wake: Wake
+    platform: Platform
+    scan: Scan
+    lidar: BackscatterLidar
+    detector: Detector | None
+    volume: Volume | None
+    seed: int
+    search_path: Path
+
+    def plans(self, truth: Truth) -> list[ScanPlan]:
+        """The scans of both images."""
+        return scan_plans(self.scan, self.platform, self.seed, truth, self.search_path)
+
+    def slab_images(
+        self, truth: Truth, flows: Flows | None, plans: Sequence[ScanPlan]
+    ) -> list[xr.DataArray]:
+        """As of `ideal_images.slab_images`."""
+        return slab_images(self.wake, self.platform, self.scan, self.volume, truth, flows, plans)
 
 
 @dataclass(frozen=True)
@@ -52,61 +82,78 @@ class _Images:
 
 
 def error_budgets(
-    experiment: Experiment,
-    truth: Truth,
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector | None,
+    retrieval: Retrieval,
+    volume: Volume | None,
+    seed: int,
     flows: Flows,
+    truth: Truth,
     scans: Sequence[xr.Dataset],
     wind: xr.Dataset,
     cores: Sequence[Core],
-    beside: str | Path,
-    *,
+    search_path: Path,
     log: Log,
 ) -> dict[str, dict[str, float]]:
     """`budgets` from a run's winds, where these need not be retrieved again."""
     log("retrieving winds without each cause of error")
-    return budgets(experiment, truth, scans, log.bar, wind, cores, flows=flows, beside=beside)
+    sensor = _Sensor(wake, platform, scan, lidar, detector, volume, seed, search_path)
+    return _budgets(sensor, retrieval, truth, scans, flows, log.bar, wind, cores)
 
 
 def budgets(
     experiment: Experiment,
     truth: Truth,
-    scans,
-    progress: Callable[[str, float], None] = lambda text, fraction: None,
-    known: xr.Dataset | None = None,
+    scans: Sequence[xr.Dataset],
     cores: Sequence[Core] | None = None,
     flagged: bool = False,
-    *,
-    flows: Flows | None = None,
-    beside: str | Path | None = None,
 ) -> dict[str, dict[str, float]]:
     """`error_budget` of every method of an experiment, by method.
 
     Parameters
     ----------
     scans : the two rendered scans
+    cores, flagged : optional
+        See `error_budget`; cores left out: those of the true wind.
+    """
+    flows = None
+    if experiment.scan.air == "moving":
+        flows = flows_of(experiment)
+    sensor = call(_Sensor, experiment)
+    return _budgets(sensor, experiment.retrieval, truth, scans, flows, cores=cores, flagged=flagged)
+
+
+def _budgets(
+    sensor: _Sensor,
+    retrieval: Retrieval,
+    truth: Truth,
+    scans: Sequence[xr.Dataset],
+    flows: Flows | None,
+    progress: Callable[[str, float], None] = lambda text, fraction: None,
+    known: xr.Dataset | None = None,
+    cores: Sequence[Core] | None = None,
+    flagged: bool = False,
+) -> dict[str, dict[str, float]]:
+    """As `budgets`.
+
+    Parameters
+    ----------
     progress : callable, optional
         Called with the name of the step and the fraction done.
     known : xr.Dataset, optional
-        Winds that need not be retrieved again, from
-        `lidar_mi.experiment.stages.winds.cross_flow_winds`.
-    cores, flagged : optional
-        See `error_budget`; cores left out: those of the true wind.
-    flows : optional
-        From `lidar_mi.experiment.truth.read_flows`. Left out: read where the air moves.
-    beside : path, optional
-        Folder in which files are searched first. Default: the experiment's.
+        Winds that need not be retrieved again, from `cross_flow_winds`.
     """
-    beside = experiment.folder if beside is None else beside
-    plans = scan_plans(experiment, truth, beside)
-    if flows is None and experiment.scan.air == "moving":
-        flows = read_flows(experiment, beside)
-    images, blurred = _images(experiment, truth, flows, plans, scans, beside)
+    plans = sensor.plans(truth)
+    images, blurred = _images(sensor, truth, flows, plans, scans)
     cores = find_cores(truth.wind) if cores is None else cores
-    methods = experiment.retrieval.methods
-    settings = {"dt": experiment.platform.dt, **window_settings(experiment.retrieval)}
-    blur = known_blur(experiment, plans[0])
+    methods = retrieval.methods
+    settings = {"dt": sensor.platform.dt, **window_settings(retrieval)}
+    blur = known_blur(retrieval, sensor.lidar, plans[0])
     sources = {"measured": Source.BACKSCATTER, "perfect": Source.EXTINCTION}
-    if experiment.detector:
+    if sensor.detector:
         sources |= {"measured": Source.NOISY, "detector_noise": Source.BACKSCATTER}
     found = {}
     for index, method in enumerate(methods):
@@ -152,57 +199,64 @@ def budgets(
 
 
 def _images(
-    experiment, truth, flows, plans, scans, beside
+    sensor: _Sensor,
+    truth: Truth,
+    flows: Flows | None,
+    plans: Sequence[ScanPlan],
+    scans: Sequence[xr.Dataset],
 ) -> tuple[dict[str, _Images], list[xr.DataArray]]:
     """Images as measured, without each cause, and of the air itself, by cause.
 
     Also the air averaged over the beams.
     """
-    rendered = rendered_pairs(experiment, scans)
+    rendered = rendered_pairs(sensor.wake, sensor.scan, sensor.detector, scans)
     pair, noise = rendered[Source.BACKSCATTER]
     measured, level = rendered.get(Source.NOISY, (pair, noise))
-    gain = offset = None
-
-    def as_measured(air, of=plans, blurred=True):
-        """Extinction as the lidar would measure it without noise, on the images' grid."""
-        images, _ = _without_noise(experiment, air, of, pair, blurred)
-        return images if gain is None else [gain * image + offset for image in images]
-
-    air = slab_images(experiment, truth, flows, plans)
+    air = sensor.slab_images(truth, flows, plans)
     noises = [xr.zeros_like(image) + noise for image in pair]
-    gain, offset = image_scale(as_measured(air), pair, noises)
+    ideal, _ = _without_noise(sensor, air, plans, pair)
+    gain, offset = image_scale(ideal, pair, noises)
+
+    def as_measured(
+        air: Sequence[xr.DataArray], of: Sequence[ScanPlan] = plans, blurred: bool = True
+    ) -> list[xr.DataArray]:
+        """Extinction as the lidar would measure it without noise, on the images' grid."""
+        images, _ = _without_noise(sensor, air, of, pair, blurred)
+        return [gain * image + offset for image in images]
+
     advected = None
-    if truth.extinction[0].sizes["x"] > 1 or experiment.wake.second != "advect":
-        advected = as_measured(_advected_by_the_mean(experiment, truth, air))
+    if truth.extinction[0].sizes["x"] > 1 or sensor.wake.second != "advect":
+        advected = as_measured(_advected_by_the_mean(sensor.platform.dt, truth, air))
     photographs = [truth.image(k) for k in (0, 1)]
     blurred = as_measured(air)
     timed, times = {}, {}
     if any("time" in image.dims for image in air):
         timed["scan_time"], times["scan_time"] = as_measured(photographs), None
-    for cause, platform in platforms_without(experiment.platform).items():
-        other = experiment.model_copy(update={"platform": platform})
-        flown = scan_plans(other, truth, beside)
-        moving = slab_images(other, truth, flows, flown)
+    for cause, platform in platforms_without(sensor.platform).items():
+        other = replace(sensor, platform=platform)
+        flown = other.plans(truth)
+        moving = other.slab_images(truth, flows, flown)
         timed[cause] = as_measured(moving, flown)
         times[cause] = _without_noise(other, moving, flown, pair)[1]
     without = images_without(
         measured,
         blurred,
         as_measured(air, blurred=False),
-        pair if experiment.detector else None,
+        pair if sensor.detector else None,
         advected,
         timed,
     )
     # without the simulation's noise the detector's remains, if there is one
-    counts = np.sqrt(np.maximum(level**2 - noise**2, 0)) if experiment.detector else 0.0
+    counts = np.sqrt(np.maximum(level**2 - noise**2, 0)) if sensor.detector else 0.0
     levels = {"detector_noise": noise, "monte_carlo": counts}
-    told = pixel_times(experiment, scans)
-    sharp = [gain * image + offset for image in _on_grid(experiment, photographs, pair)]
+    known = pixel_times(sensor.wake, sensor.scan, scans)
+    on_grid = _on_grid(sensor.scan, photographs, pair)
+    sharp = [gain * image + offset for image in on_grid]
     return {
-        "measured": _Images(measured, level, told),
+        "measured": _Images(measured, level, known),
         "perfect": _Images(sharp, 0.0),
         **{
-            cause: _Images(images, levels.get(cause, level), times.get(cause, told))
+            cause: _Images(images, levels.get(cause, level), times.get(cause, known))
             for cause, images in without.items()
         },
     }, blurred
@@ -228,15 +282,16 @@ def platforms_without(platform: Platform) -> dict[str, Platform]:
 
 
 def _without_noise(
-    experiment: Experiment,
+    sensor: _Sensor,
     air: Sequence[xr.DataArray],
     plans: Sequence[ScanPlan],
     like: Sequence[xr.DataArray],
     blurred: bool = True,
 ) -> tuple[list[xr.DataArray], Times]:
     """The air as both scans see it, and the times of pixels where they are of their own air."""
-    depth = experiment.scan.thickness / experiment.scan.gate_count
-    lidar = experiment.lidar if blurred else None
+    scan = sensor.scan
+    depth = scan.thickness / scan.gate_count
+    lidar = sensor.lidar if blurred else None
     if all(plan.beams is None for plan in plans):
         images = list(air)
         if lidar is not None:
@@ -244,31 +299,34 @@ def _without_noise(
                 blur_by_beam(image, lidar, plan.centre, depth)
                 for image, plan in zip(images, plans, strict=True)
             ]
-        return _on_grid(experiment, images, like), None
+        return _on_grid(scan, images, like), None
     scans = [
         ideal_scan(image, plan, lidar, depth, gridded=False).assign_attrs(
-            frozen_air=int(experiment.scan.air == "frozen")
+            frozen_air=int(scan.air == "frozen")
         )
         for image, plan in zip(air, plans, strict=True)
     ]
-    scans = of_one_instant(scans, [experiment.platform.dt], "Y")
-    images = [scan["Y"] for scan in scans]
-    if experiment.scan.aim == "angles":
-        images = list(resample_pair(*images, experiment.wake.spacing))
-    return images, pixel_times(experiment, scans)
+    scans = of_one_instant(scans, [sensor.platform.dt], "Y")
+    images = [one["Y"] for one in scans]
+    if scan.aim == "angles":
+        images = list(resample_pair(*images, sensor.wake.spacing))
+    return images, pixel_times(sensor.wake, scan, scans)
 
 
-def _on_grid(experiment, images, like) -> list[xr.DataArray]:
+def _on_grid(
+    scan: Scan, images: Sequence[xr.DataArray], like: Sequence[xr.DataArray]
+) -> list[xr.DataArray]:
     """Images of the wake's grid on the grid of the measured ones."""
-    if experiment.scan.aim == "grid":
-        return images
+    if scan.aim == "grid":
+        return list(images)
     return [image.interp(y=like[0]["y"], z=like[0]["z"]) for image in images]
 
 
-def _advected_by_the_mean(experiment, truth, air) -> list[xr.DataArray]:
+def _advected_by_the_mean(
+    dt: float, truth: Truth, air: Sequence[xr.DataArray]
+) -> list[xr.DataArray]:
     """The first scan's air, at its reference time, moved with the slab's mean wind."""
     start, v, w = truth.image(0), truth.wind["v"], truth.wind["w"]
-    dt = experiment.platform.dt
     return [
         advect_to(start, v, w, image["time"].values + which * dt)
         if "time" in image.dims

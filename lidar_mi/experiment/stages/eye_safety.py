@@ -6,27 +6,34 @@ from pathlib import Path
 import numpy as np
 
 from lidar_mi.assessment.metrics.safety import ScanSafety
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.stages.timed_beams import pulse_train
 from lidar_mi.instrument.eye_safety import assess_pulses, scan_hazard_distance
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import Scan, ScanPlan
 
 EXPOSURE = 10.0
 """Time of exposure to the beams, s, unless given by the sensor."""
 
 
 def scan_safety(
-    experiment: Experiment, plans: Sequence[ScanPlan], beside: str | Path
+    lidar: BackscatterLidar,
+    scan: Scan,
+    platform: Platform,
+    sensor: Sensor | None,
+    plans: Sequence[ScanPlan],
+    search_path: Path,
 ) -> ScanSafety | None:
     """Distances from which eyes are safe; None: pulses have no duration, so that no limit applies.
 
     Every direction has its pulses each ``platform.dt``, at the rate of ``scan.timing``.
     """
-    lidar, plan, rate = experiment.lidar, plans[0], 1 / experiment.platform.dt
+    plan, rate = plans[0], 1 / platform.dt
     if lidar.pulse_duration == 0:
         return None
-    burst = pulse_train(experiment, plan, beside)
-    exposure = experiment.sensor.exposure if experiment.sensor else EXPOSURE
+    burst = pulse_train(scan, plan, search_path)
+    exposure = sensor.exposure if sensor else EXPOSURE
     pulse = (lidar.wavelength, lidar.pulse_energy, lidar.pulse_duration)
     beam = (float(lidar.radius_at(0)), lidar.divergence_full)
     one = assess_pulses(*pulse, *beam, rate * burst[0], exposure, burst=burst)

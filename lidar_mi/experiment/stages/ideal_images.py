@@ -6,18 +6,26 @@ import numpy as np
 import xarray as xr
 from scipy import ndimage
 
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth, slab_mean
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.experiment.truth.in_time import air_in_time
 from lidar_mi.instrument.lidar import BackscatterLidar
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.images.gridding import on_nodes
 
 
 def slab_images(
-    experiment: Experiment, truth: Truth, flows: Flows | None, plans: Sequence[ScanPlan]
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    truth: Truth,
+    flows: Flows | None,
+    plans: Sequence[ScanPlan],
 ) -> list[xr.DataArray]:
     """The extinction of both scans averaged over the first gate's depth, m^-1.
 
@@ -26,10 +34,10 @@ def slab_images(
     gates = truth.wind.attrs["gates"]
     images = []
     for which, plan in enumerate(plans):
-        if plan.beams is None or flows is None or experiment.scan.air == "frozen":
+        if plan.beams is None or flows is None or scan.air == "frozen":
             images.append(truth.image(which))
             continue
-        air = air_in_time(experiment, truth, flows, which, plan.beams.time)
+        air = air_in_time(wake, platform, scan, volume, truth, flows, which, plan.beams.time)
         images.append(slab_mean(air.astype(float), gates))
     return images
 

@@ -1,6 +1,6 @@
 """Warnings before images are rendered: of what is allowed and likely wrong."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -8,12 +8,17 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import find_cores
 from lidar_mi.assessment.metrics.flow_checks import MOST_DIVERGENCE, relative_divergence, rises
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.retrieval import Retrieval
+from lidar_mi.experiment.schema.section import Section
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.brightness import overlap
 from lidar_mi.experiment.stages.light_budget import LEAST_OVERLAP
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import Flows
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.units import shown
 
@@ -22,28 +27,36 @@ MOST_WIND = 150.0
 
 
 def image_remarks(
-    experiment: Experiment,
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    retrieval: Retrieval,
+    volume: Volume | None,
+    flows: Flows,
     truth: Truth,
     plans: Sequence[ScanPlan],
-    air: object = None,
-    flows: Flows | None = None,
 ) -> list[str]:
-    """Warnings of an experiment with a wake, a line each; what else images need has none."""
-    flow = _of_the_flow(experiment, truth.wind) if experiment.wake.file else []
-    said = flows[0].attrs.get("interpolated") if flows else None
-    grid = [f"wake.file: {said}"] if said else []
+    """Warnings of an experiment with a wake, a line each."""
+    flow = _of_the_flow(wake, truth.wind) if wake.file else []
+    interpolated = flows[0].attrs.get("interpolated")
+    grid = [f"wake.file: {interpolated}"] if interpolated else []
     return [
         *grid,
         *flow,
-        *_of_the_speed(experiment, truth.wind, plans[0]),
-        *_of_the_light(experiment, plans[0]),
-        *_of_the_pattern(experiment),
+        *_of_the_speed(wake, platform, retrieval, volume, truth.wind, plans[0]),
+        *_of_the_light(lidar, scan, plans[0]),
+        *_of_the_pattern(scan),
     ]
 
 
-def written(experiment: Experiment, *keys: str) -> str:
-    """The first of some keys that an experiment sets itself; the last, if it sets none."""
-    return next((key for key in keys if _is_set(experiment, key)), keys[-1])
+def first_set(sections: Mapping[str, Section], *keys: str) -> str:
+    """The first of some dotted keys that an experiment sets itself; the last, if it sets none."""
+    for key in keys:
+        name, _, rest = key.partition(".")
+        if rest and name in sections and _is_set(sections[name], rest):
+            return key
+    return keys[-1]
 
 
 def _is_set(section: Any, key: str) -> bool:
@@ -53,9 +66,9 @@ def _is_set(section: Any, key: str) -> bool:
     return not rest or _is_set(getattr(section, first), rest)
 
 
-def _of_the_flow(experiment: Experiment, wind: xr.Dataset) -> list[str]:
+def _of_the_flow(wake: Wake, wind: xr.Dataset) -> list[str]:
     """Components or axes of the wrong sign in a user's file; analytic flows have none."""
-    key = written(experiment, "wake.names", "wake.file")
+    key = first_set({"wake": wake}, "wake.names", "wake.file")
     divergence = relative_divergence(wind)
     if divergence > MOST_DIVERGENCE:
         return [
@@ -72,52 +85,59 @@ def _of_the_flow(experiment: Experiment, wind: xr.Dataset) -> list[str]:
     return []
 
 
-def _of_the_speed(experiment: Experiment, wind: xr.Dataset, plan: ScanPlan) -> list[str]:
+def _of_the_speed(
+    wake: Wake,
+    platform: Platform,
+    retrieval: Retrieval,
+    volume: Volume | None,
+    wind: xr.Dataset,
+    plan: ScanPlan,
+) -> list[str]:
     """Winds that no wake has, or that windows of this size cannot follow."""
     fastest = max(float(np.abs(wind[name]).max()) for name in ("v", "w"))
     if fastest > MOST_WIND:
         doubt = "is the unit of v and w in the file right (attribute units)"
-        if not experiment.wake.file:
+        if not wake.file:
             doubt = "are circulation and core radius right"
         return [
             f"wake: winds across the path reach {fastest:.3g} m/s; those of wakes of aircraft and "
             f"turbines stay below {MOST_WIND:g} m/s: {doubt}?"
         ]
-    reach = window_reach(experiment, plan)
-    taken = () if experiment.volume else experiment.retrieval.methods
+    reach = window_reach(retrieval, platform, plan)
+    taken = () if volume else retrieval.methods
     methods = [method for method in (ImageMethod.CC, ImageMethod.WS) if method in taken]
     if not methods or fastest <= reach:
         return []
-    key = written(experiment, "retrieval.search", "retrieval.template", "platform.dt", "wake")
+    sections = {"retrieval": retrieval, "platform": platform}
+    key = first_set(sections, "retrieval.search", "retrieval.template", "platform.dt", "wake")
     return [
         f"{key}: windows of {' and '.join(methods)} follow {reach:.3g} m/s, the wind "
         f"reaches {fastest:.3g} m/s; expected a larger retrieval.search or a smaller platform.dt"
     ]
 
 
-def window_reach(experiment: Experiment, plan: ScanPlan) -> float:
+def window_reach(retrieval: Retrieval, platform: Platform, plan: ScanPlan) -> float:
     """Fastest wind that a window's search region holds, m/s; NaN for a single column of beams."""
-    settings = experiment.retrieval
     pixel = float(plan.y[1] - plan.y[0]) if plan.y.size > 1 else float("nan")
-    return ((settings.search - settings.template) // 2 - 0.5) * pixel / experiment.platform.dt
+    return ((retrieval.search - retrieval.template) // 2 - 0.5) * pixel / platform.dt
 
 
-def _of_the_light(experiment: Experiment, plan: ScanPlan) -> list[str]:
+def _of_the_light(lidar: BackscatterLidar, scan: Scan, plan: ScanPlan) -> list[str]:
     """Light that the telescope does not see."""
-    seen = overlap(experiment.lidar, float(np.median(plan.ranges()[0])))
+    seen = overlap(lidar, float(np.median(plan.ranges()[0])))
     if seen >= LEAST_OVERLAP:
         return []
-    key = written(experiment, "lidar.fov_half", "scan.range")
+    key = first_set({"lidar": lidar, "scan": scan}, "lidar.fov_half", "scan.range")
     half = "" if key == "lidar.fov_half" else "a field of view (half angle) of "
     return [
-        f"{key}: {half}{shown(experiment.lidar.fov_half, 'mrad')} sees {seen:.0%} of "
+        f"{key}: {half}{shown(lidar.fov_half, 'mrad')} sees {seen:.0%} of "
         f"the light from {plan.centre:.0f} m (overlap of beam, telescope and field of view)"
     ]
 
 
-def _of_the_pattern(experiment: Experiment) -> list[str]:
+def _of_the_pattern(scan: Scan) -> list[str]:
     """Beams along a curve, whose images are resampled."""
-    timing = experiment.scan.timing
+    timing = scan.timing
     if timing is None or timing.pattern in ("raster", "serpentine"):
         return []
     return [

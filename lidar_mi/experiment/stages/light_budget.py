@@ -5,12 +5,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.brightness import overlap
 from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.instrument.detector import gate_duration
+from lidar_mi.instrument.detector import Detector, gate_duration
 from lidar_mi.instrument.detector_noise import expected_counts, noise_variance
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.rendering.phase import Scatterer, backscatter_phase_function
 
 LEAST_OVERLAP = 0.9
@@ -45,7 +46,13 @@ class LightBudget(NamedTuple):
 
 
 def light_budget(
-    experiment: Experiment, truth: Truth, plan: ScanPlan, air: Scatterer
+    wake: Wake,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector | None,
+    truth: Truth,
+    plan: ScanPlan,
+    air: Scatterer,
 ) -> LightBudget:
     """Light and noise of the median pixel.
 
@@ -53,7 +60,7 @@ def light_budget(
     slab and the molecular part's own phase function are left out. Accurate to some per cent where
     the air is optically thin; multiple scattering adds to it.
     """
-    lidar, detector, mapping = experiment.lidar, experiment.detector, experiment.wake.extinction
+    mapping = wake.extinction
     distance = float(np.median(plan.ranges()[0]))
     length = float(np.median(plan.gate_length()))
     extinction = float(np.median(truth.extinction[0].values))
@@ -63,7 +70,7 @@ def light_budget(
     s0 = seen * passing * lidar.aperture_area / distance**2 * backscatter * extinction * length
     counted = spread = None
     if detector:
-        duration, pulses = gate_duration(length), experiment.scan.pulses_per_beam
+        duration, pulses = gate_duration(length), scan.pulses_per_beam
         means = expected_counts(np.array(s0), lidar, detector, duration, distance, 1.0, pulses)
         variance, summed = noise_variance(*means, detector, pulses), float(means[0])
         counted = summed / pulses

@@ -1,6 +1,7 @@
 """Lines of sight of the Doppler lidar through the slab, each from images of rings."""
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 import xarray as xr
@@ -9,7 +10,9 @@ from lidar_mi.assessment.metrics.requirements import RequirementTable, read_requ
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.doppler import Doppler
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.stages.line_frames import PULSES, line_frames, line_images
 from lidar_mi.experiment.stages.ring_images import Rings
 from lidar_mi.experiment.stages.ring_instrument import pixel_noise
@@ -25,6 +28,7 @@ from lidar_mi.experiment.truth.extinction import Truth, slab_mean
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.doppler_scan import scan_wind, sight_volumes, wind_of_lines
+from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.lines.vectors import COMPONENTS
 from lidar_mi.retrieval.method_names import RingCentre, RingMethod
 from lidar_mi.retrieval.rings.model import PixelNoise
@@ -34,7 +38,7 @@ _DRIFTS = 1 << 24
 
 
 def requirement_tables(
-    experiment: Experiment, beside
+    sensor: Sensor, platform: Platform, search_path: Path
 ) -> Mapping[tuple[str, str], RequirementTable]:
     """The tables that the sensor is compared with, as `read_requirements` gives them.
 
@@ -43,37 +47,44 @@ def requirement_tables(
     InputError
         A requirement table that is missing or not one.
     """
-    path = experiment.sensor.requirements
+    path = sensor.requirements
     if path:
-        return read_requirements(find_file(path, beside, "sensor.requirements"))
+        return read_requirements(find_file(path, search_path, "sensor.requirements"))
     # the paper's are those of flight control: they do not apply to a platform at rest
-    return read_requirements() if experiment.platform.speed else {}
+    return read_requirements() if platform.speed else {}
 
 
-def slab_wind(experiment: Experiment, truth: Truth) -> xr.Dataset:
+def slab_wind(sensor: Sensor, truth: Truth) -> xr.Dataset:
     """True u, v, w (m s^-1) on (z, y), averaged over the slab; u is 0 in a wake without it."""
     wind = truth.wind
     return wind if "u" in wind else wind.assign(u=xr.zeros_like(wind["v"]))
 
 
-def states_of_wind(experiment: Experiment, wind: xr.Dataset, flows: Flows) -> xr.Dataset:
+def states_of_wind(platform: Platform, slab_wind: xr.Dataset, flows: Flows) -> xr.Dataset:
     """The wind that lines of sight meet: that of `slab_wind`, or its states at both images' times.
 
     Dims (time, z, y) with the times 0 and dt where a wake has a second state.
     """
     if flows[1] is None:
-        return wind
-    gates = wind.attrs["gates"]
+        return slab_wind
+    gates = slab_wind.attrs["gates"]
     states = [
         xr.Dataset({n: slab_mean(flow[n], gates) for n in COMPONENTS if n in flow})
         for flow in flows
+        if flow is not None
     ]
     states = [s if "u" in s else s.assign(u=xr.zeros_like(s["v"])) for s in states]
-    return xr.concat(states, xr.Variable("time", [0.0, experiment.platform.dt]))
+    return xr.concat(states, xr.Variable("time", [0.0, platform.dt]))
 
 
 def check_lines(
-    experiment: Experiment, wind: xr.Dataset, rings: Rings, beams: Beams | None
+    sensor: Sensor,
+    doppler: Doppler,
+    scan: Scan,
+    platform: Platform,
+    states: xr.Dataset,
+    rings: Rings,
+    line_beams: Beams | None,
 ) -> None:
     """Check that both lidars observe the same air, in the Doppler lidar's velocity range.
 
@@ -83,9 +94,9 @@ def check_lines(
         Lidars that do not observe the same slab, lines that leave the wake, speeds beyond the
         unambiguous range.
     """
-    reference_frames(experiment.sensor.pulses, experiment.doppler.reference.every, PULSES)
-    lidar = experiment.doppler.lidar
-    middle = experiment.scan.range + experiment.scan.thickness / 2
+    reference_frames(sensor.pulses, doppler.reference.every, PULSES)
+    lidar, beams = doppler.lidar, line_beams
+    middle = scan.range + scan.thickness / 2
     if abs(lidar.range - middle) > lidar.range_bin / 2:
         raise InputError(
             f"doppler.lidar.range: {lidar.range:g} m is not allowed with sensor; expected the slab "
@@ -93,36 +104,36 @@ def check_lines(
             f"{middle + lidar.range_bin / 2:g} m (set both, with scan.range)"
         )
     # lines that leave the wake, bins that reach the telescope
-    directions = experiment.sensor.directions
+    directions = sensor.directions
     try:
         going = directions.directions() if beams is None else beams.direction
         volumes = sight_volumes(going, directions.ranges(lidar, beams), lidar)[0]
-        wind_of_lines(wind, volumes if beams is None else volumes + beams.origin[:, None])
+        wind_of_lines(states, volumes if beams is None else volumes + beams.origin[:, None])
     except InputError as error:
         raise InputError(f"sensor.directions: {error}") from None
-    fastest = experiment.platform.speed + float(
-        np.sqrt(sum(wind[n] ** 2 for n in COMPONENTS)).max()
-    )
+    fastest = platform.speed + float(np.sqrt(sum(states[n] ** 2 for n in COMPONENTS)).max())
     limit = rings.model.velocity_range / 2
     if fastest > limit:
         raise InputError(
-            f"platform.speed: {experiment.platform.speed:g} m/s is not allowed with sensor; "
+            f"platform.speed: {platform.speed:g} m/s is not allowed with sensor; "
             f"expected less than {limit:.0f} m/s with the wind, half an order of doppler.etalon"
         )
 
 
 def measure_lines(
-    experiment: Experiment,
-    truth: xr.Dataset,
+    sensor: Sensor,
+    doppler: Doppler,
+    platform: Platform,
+    seed: int,
+    states: xr.Dataset,
     rings: Rings,
-    beams: Beams | None,
-    assumed: Rings,
-    *,
+    line_beams: Beams | None,
+    assumed_rings: Rings,
     log: Log,
 ) -> xr.Dataset:
     """Line-of-sight velocities retrieved from the Doppler lidar's rings.
 
-    ``assumed`` has the models of the instrument that the retrieval assumes.
+    ``assumed_rings`` has the models of the instrument that the retrieval assumes.
 
     The frames of each line (`line_frames`) are evaluated by the annular fit, which states its
     standard error.
@@ -133,21 +144,20 @@ def measure_lines(
         From `scan_wind`, with ``v_los``, its random ``v_los_std`` and ``v_los_systematic``, which
         all lines share (m s^-1), as retrieved; NaN where an image gives none.
     """
-    sensor, doppler = experiment.sensor, experiment.doppler
     lines = scan_wind(
-        truth,
+        states,
         sensor.directions,
         doppler.lidar,
         0.0,
-        experiment.seed,
-        experiment.platform.speed,
+        seed,
+        platform.speed,
         sensor.errors,
-        beams,
+        line_beams,
     )
     true, ranges = (lines[name].values for name in ("v_los_true", "range"))
     log(f"measuring {len(true)} lines of sight, {sensor.pulses} pulses each")
     images = line_images(doppler, rings, true.min(), true.max())
-    noises = line_noises(experiment, rings)
+    noises = line_noises(doppler, sensor.pulses, rings)
     retrieved = np.empty((4, len(true)))
     for start in range(0, len(true), FRAMES):
         log.bar(f"retrieving line of sight {start + 1} of {len(true)}", start / len(true))
@@ -160,17 +170,16 @@ def measure_lines(
             true[chunk],
             ranges[chunk],
             sensor.pulses,
-            experiment.seed,
+            seed,
         )
         retrieved[:, chunk] = speeds_to_laser(
-            air, laser[own], doppler, assumed, noises, RingMethod.ANNULAR, RingCentre.FREE
+            air, laser[own], doppler, assumed_rings, noises, RingMethod.ANNULAR, RingCentre.FREE
         )
-    return with_speeds(lines, *retrieved, experiment)
+    return with_speeds(lines, *retrieved, doppler, sensor.pulses, seed)
 
 
-def line_noises(experiment: Experiment, rings: Rings) -> list[PixelNoise]:
+def line_noises(doppler: Doppler, pulses: int, rings: Rings) -> list[PixelNoise]:
     """Noise of the pixels of a line's frame, and of the frame of the laser."""
-    doppler, pulses = experiment.doppler, experiment.sensor.pulses
     own, _ = reference_frames(pulses, doppler.reference.every, PULSES)
     return [pixel_noise(doppler.ccd, rings.modes, number) for number in (pulses, own)]
 
@@ -181,7 +190,9 @@ def with_speeds(
     std: np.ndarray,
     systematic: np.ndarray,
     laser_std: np.ndarray,
-    experiment: Experiment,
+    doppler: Doppler,
+    pulses: int,
+    seed: int,
     scan: int = 0,
 ) -> xr.Dataset:
     """Lines with the speeds that were read, the drifts behind the laser's frames and their errors.
@@ -192,8 +203,10 @@ def with_speeds(
         From `scan_wind`.
     v_los, std, systematic, laser_std : arrays, shape (lines,)
         From `speeds_to_laser`, m/s.
-    scan : int
-        Its number selects the drifts.
+    pulses : int
+        Of a line.
+    seed, scan : int
+        The seed and the number of the scan select the drifts.
 
     Returns
     -------
@@ -201,9 +214,8 @@ def with_speeds(
         With ``v_los_covariance`` (line, other_line), m^2 s^-2, where lines share a frame of the
         laser.
     """
-    doppler, pulses = experiment.doppler, experiment.sensor.pulses
-    seed = [experiment.seed, _DRIFTS + scan]
-    drift, drift_std = drifts(doppler, pulses, seed, range(len(v_los)), PULSES)
+    streams = [seed, _DRIFTS + scan]
+    drift, drift_std = drifts(doppler, pulses, streams, range(len(v_los)), PULSES)
     # all at once: each variable that a data set takes later copies and aligns it again
     found = {
         "v_los": ("line", v_los + drift + plate_error(doppler), lines.variables["v_los"].attrs),

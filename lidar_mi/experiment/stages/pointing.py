@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 
 from lidar_mi.assessment.metrics.pointing import ScanPointing, scan_pointing
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.instrument.scan import ScanPlan
 
 
-def beam_pointing(experiment: Experiment, plans: Sequence[ScanPlan]) -> ScanPointing | None:
+def beam_pointing(platform: Platform, plans: Sequence[ScanPlan]) -> ScanPointing | None:
     """Times, places and pointing errors of the beams; None: all at once, from known poses."""
     timed = [(plan, plan.beams) for plan in plans if plan.beams is not None]
     if not timed:
@@ -17,7 +17,7 @@ def beam_pointing(experiment: Experiment, plans: Sequence[ScanPlan]) -> ScanPoin
     return scan_pointing(
         plans[0].y,
         plans[0].z,
-        experiment.platform.dt,
+        platform.dt,
         [beams.time for _, beams in timed],
         [beams.true_places(x) for (_, beams), x in zip(timed, middles, strict=True)],
         [beams.reported_places(x) for (_, beams), x in zip(timed, middles, strict=True)],

@@ -2,83 +2,70 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
 
 from lidar_mi.assessment.metrics.cores import Core, find_cores
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.graph import Keeper
+from lidar_mi.experiment.graph import But, Only, Store
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.memory import check_size, check_states
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.memory import Footprint
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.scattering import Scattering
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.brightness import check_brightness, least_samples
 from lidar_mi.experiment.stages.timed_beams import timed_plans
 from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.experiment.truth.flows import Flows, read_flows
+from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.experiment.truth.in_time import air_in_time, values_of_states
-from lidar_mi.instrument.detector import gate_duration
+from lidar_mi.instrument.detector import Detector, gate_duration
 from lidar_mi.instrument.detector_noise import noise_budget, noisy_scan
+from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.products import untrusted_pixels, with_products
-from lidar_mi.instrument.scan import ScanPlan, plan_scans
+from lidar_mi.instrument.scan import Scan, ScanPlan, plan_scans
 from lidar_mi.instrument.speckle import speckle_modes
 from lidar_mi.rendering.backscatter import extrude, render_scans
 from lidar_mi.rendering.batches import Batches
 from lidar_mi.rendering.phase import Scatterer, molecules, scatterer
 from lidar_mi.rendering.samples import Samples, choose_samples, monte_carlo_fraction, pilot_samples
+from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.wind.synchronised import of_one_instant
 
 IMAGES = ("image_t1", "image_t2")
 """Parts of the result of `render_images`."""
 
+CHOOSING = ("samples_per_beam", "monte_carlo_fraction", "max_samples")
+"""Settings by which the number of samples is chosen, with which images are rendered."""
 PILOT_SEED = 1 << 30
 """Added to the seed for a pilot: far from those of all scans."""
 
 
 def scan_plans(
-    experiment: Experiment, truth: Truth, beside: str | Path | None = None
+    scan: Scan, platform: Platform, seed: int, truth: Truth, search_path: Path
 ) -> list[ScanPlan]:
-    """The scans of both images, with the beams in time where `timed_plans` has any.
-
-    Parameters
-    ----------
-    beside : path, optional
-        Folder in which files of directions and of the trajectory are searched first. Default: the
-        experiment's.
-    """
-    flown = (experiment.platform.speed - experiment.scan.follow) * experiment.platform.dt
+    """The scans of both images, with the beams in time where `timed_plans` has any."""
+    flown = (platform.speed - scan.follow) * platform.dt
     y, z = truth.wind["y"].values, truth.wind["z"].values
-    plans = plan_scans(experiment.scan, y, z, (0.0, flown))
-    return timed_plans(experiment, plans, experiment.folder if beside is None else beside)
+    plans = plan_scans(scan, y, z, (0.0, flown))
+    return timed_plans(scan, platform, seed, plans, search_path)
 
 
-def read_truth(experiment: Experiment, beside: str | Path, *, log: Log) -> Flows:
-    """The flow at both times; see `read_flows`.
-
-    Raises
-    ------
-    InputError
-        A wake that cannot be read, or images of it that a run cannot hold: before more is made of
-        it.
-    """
-    log.bar("reading the wake", None)
-    scan = experiment.scan
-    if scan.aim == "angles":
-        check_size(experiment, scan.columns, scan.rows)
-    flows = read_flows(experiment, beside)
-    if scan.aim == "grid":  # a beam for every node
-        check_size(experiment, flows[0].sizes["y"], flows[0].sizes["z"])
-    return flows
-
-
-def true_cores(experiment: Experiment, truth: Truth) -> list[Core]:
+def true_cores(wake: Wake, truth: Truth) -> list[Core]:
     """The vortices of the true wind; none are looked for in the gusts behind a turbine."""
-    return [] if experiment.wake.turbine else find_cores(truth.wind)
+    return [] if wake.turbine else find_cores(truth.wind)
 
 
-def scattering_air(experiment: Experiment, beside: str | Path, *, log: Log) -> Scatterer:
+def scattering_air(
+    render: Annotated[RenderSettings, Only("variant")],
+    lidar: Annotated[BackscatterLidar, Only("wavelength")],
+    scattering: Scattering,
+    search_path: Path,
+    log: Log,
+) -> Scatterer:
     """Phase function and albedo of the air; tables are read, or computed where they are missing.
 
     Raises
@@ -86,19 +73,28 @@ def scattering_air(experiment: Experiment, beside: str | Path, *, log: Log) -> S
     InputError
         A scattering table that is missing or not one.
     """
-    use_variant(experiment.render.variant)
+    use_variant(render.variant)
     log.bar("reading scattering matrices", None)
-    return scatterer(experiment.scattering, beside, experiment.lidar.wavelength, log.bar)
+    return scatterer(scattering, search_path, lidar.wavelength, log.bar)
 
 
-def environment_extinction(experiment: Experiment) -> float:
+def environment_extinction(wake: Wake) -> float:
     """Extinction coefficient around the slab and up to it, m^-1."""
-    mapping = experiment.wake.extinction
-    return mapping.background + mapping.molecules
+    return wake.extinction.background + wake.extinction.molecules
 
 
 def check_light(
-    experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan], air: Scatterer, flows: Flows
+    wake: Wake,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector | None,
+    render: RenderSettings,
+    volume: Volume | None,
+    footprint: Footprint,
+    flows: Flows,
+    truth: Truth,
+    plans: Sequence[ScanPlan],
+    air: Scatterer,
 ) -> None:
     """Check that the images will not be dark or their noise undetermined.
 
@@ -108,13 +104,13 @@ def check_light(
         Air that does not scatter, a detector inconsistent with the pulse, beams too wide for the
         largest medium, moving air in more states than the memory holds.
     """
-    _media(experiment, truth.extinction, plans)
-    in_states = values_of_states(experiment, flows, plans)
-    check_states(experiment, len(plans[0].y) * len(plans[0].z), in_states)
-    if experiment.detector:
+    _media(lidar, truth.extinction, plans)
+    in_states = values_of_states(wake, scan, volume, flows, plans)
+    footprint.check_states(len(plans[0].y) * len(plans[0].z), in_states)
+    if detector:
         for plan in plans:
             duration = gate_duration(plan.gate_length())
-            speckle_modes(experiment.detector, experiment.lidar, duration, plan.ranges())
+            speckle_modes(detector, lidar, duration, plan.ranges())
     if not max(float(field.max()) for field in truth.extinction) > 0:
         raise InputError(
             "wake.extinction: 0 everywhere is not allowed; expected air that scatters, by its "
@@ -123,19 +119,78 @@ def check_light(
     if not air.albedo > 0:
         raise InputError("scattering.albedo: 0 is not allowed here; expected above 0, up to 1")
     for plan in plans:
-        check_brightness(experiment, truth.extinction, plan, air.albedo)
+        check_brightness(
+            lidar, render, detector, wake.extinction, truth.extinction, plan, air.albedo
+        )
 
 
-def render_images(
-    experiment: Experiment,
+def image_names() -> tuple[str, ...]:
+    """Parts of the result of `render_images`."""
+    return IMAGES
+
+
+def given_samples(
+    render: Annotated[RenderSettings, Only("samples_per_beam")],
+    scan: Annotated[Scan, Only("gate_count")],
+) -> int:
+    """Monte Carlo samples per beam, as given or by the number of gates."""
+    return render.without_detector(scan.gate_count)
+
+
+def samples_by_noise(
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector,
+    scattering: Scattering,
+    render: RenderSettings,
+    volume: Volume | None,
+    seed: int,
+    flows: Flows,
     truth: Truth,
     plans: Sequence[ScanPlan],
     air: Scatterer,
+    log: Log,
+) -> int:
+    """Monte Carlo samples per beam, by the noise of the detector; see `chosen_samples`."""
+    chosen = chosen_samples(
+        wake,
+        platform,
+        scan,
+        lidar,
+        detector,
+        scattering,
+        render,
+        volume,
+        seed,
+        flows,
+        truth,
+        plans,
+        air,
+        log,
+    )
+    log(samples_text(render, chosen))
+    return chosen.number
+
+
+def render_images(
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    lidar: Annotated[BackscatterLidar, But("pulse_energy")],
+    scattering: Scattering,
+    render: Annotated[RenderSettings, But(*CHOOSING)],
+    volume: Volume | None,
+    seed: int,
     flows: Flows,
-    *,
+    truth: Truth,
+    plans: Sequence[ScanPlan],
+    air: Scatterer,
+    samples: int,
     log: Log,
     missing: Sequence[str] = IMAGES,
-    keeper: Keeper | None = None,
+    store: Store | None = None,
 ) -> Iterator[tuple[str, xr.Dataset]]:
     """Render the scans of both times without a detector's noise, one after the other.
 
@@ -146,113 +201,133 @@ def render_images(
     scan : xr.Dataset, dims (gate, z, y)
         From `render_scans`, with the depolarisation and what else it gives.
     """
-    use_variant(experiment.render.variant)
+    use_variant(render.variant)
     wanted = [IMAGES.index(name) for name in missing]
-    number: int | None = None
-    if experiment.render.samples_per_beam == "auto":
-        chosen = chosen_samples(experiment, truth, plans, air, flows, log=log)
-        number = experiment.render.without_detector(plans[0].gate_count)
-        if chosen:
-            number = chosen.number
-            log(samples_text(experiment, chosen))
-        experiment = with_samples(experiment, number)
     log(f"rendering {len(wanted)} scans of {len(plans[0].y)} x {len(plans[0].z)} beams")
 
-    def progress(scan: int, done: int, total: int) -> None:
-        log.bar(f"rendering scan {scan + 1} of {len(plans)}", done / total)
+    def progress(index: int, done: int, total: int) -> None:
+        log.bar(f"rendering scan {index + 1} of {len(plans)}", done / total)
 
-    batches = batches_of(IMAGES, keeper, log, number)
+    chosen = samples if render.samples_per_beam == "auto" else None
     rendered = _rendered(
-        experiment, truth, plans, air, flows, wanted, log, progress=progress, batches=batches
+        _fields(wake, platform, scan, volume, flows, truth, plans, wanted, log),
+        wake,
+        lidar,
+        scattering,
+        with_samples(render, samples),
+        seed,
+        plans,
+        air,
+        wanted,
+        progress=progress,
+        batches=batches_of(IMAGES, store, log, chosen),
     )
-    platform = {"platform_speed": experiment.platform.speed, "dt": experiment.platform.dt}
-    for index, scan in zip(wanted, rendered, strict=True):
-        scan = with_products(scan)
-        scan.attrs |= platform
+    flown = {"platform_speed": platform.speed, "dt": platform.dt}
+    for index, image in zip(wanted, rendered, strict=True):
+        image = with_products(image)
+        image.attrs |= flown
         if plans[index].beams is not None:
-            scan.attrs["reference_time"] = index * experiment.platform.dt
-            scan.attrs["frozen_air"] = int(experiment.scan.air == "frozen")
-        if said := untrusted_pixels(scan):
+            image.attrs["reference_time"] = index * platform.dt
+            image.attrs["frozen_air"] = int(scan.air == "frozen")
+        if said := untrusted_pixels(image):
             log.remark(f"{IMAGES[index]}: {said}")
-        yield IMAGES[index], scan
+        yield IMAGES[index], image
 
 
-def _rendered(
-    experiment: Experiment,
+def _fields(
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    flows: Flows,
     truth: Truth,
     plans: Sequence[ScanPlan],
-    air: Scatterer,
-    flows: Flows,
     wanted: Sequence[int],
     log: Log,
-    seed: int | None = None,
-    **how: Any,
-) -> Iterator[xr.Dataset]:
-    """Some of the scans, of the air at their times, from `render_scans`."""
+) -> list[xr.DataArray]:
+    """The extinction that the beams of each scan meet, at their times if the air moves."""
     fields = list(truth.extinction)
-    if experiment.scan.air == "moving":
+    if scan.air == "moving":
         for index, plan in enumerate(plans):
             if index in wanted and plan.beams is not None:
                 log.bar(f"moving the air of scan {index + 1} of {len(plans)}", None)
-                fields[index] = air_in_time(experiment, truth, flows, index, plan.beams.time)
-    mapping = experiment.wake.extinction
+                times = plan.beams.time
+                fields[index] = air_in_time(
+                    wake, platform, scan, volume, truth, flows, index, times
+                )
+    return fields
+
+
+def _rendered(
+    fields: Sequence[xr.DataArray],
+    wake: Wake,
+    lidar: BackscatterLidar,
+    scattering: Scattering,
+    render: RenderSettings,
+    seed: int,
+    plans: Sequence[ScanPlan],
+    air: Scatterer,
+    wanted: Sequence[int],
+    **how: Any,
+) -> Iterator[xr.Dataset]:
+    """Some of the scans, from `render_scans`."""
     return render_scans(
-        _media(experiment, fields, plans),
+        _media(lidar, fields, plans),
         plans,
-        experiment.lidar,
-        environment_extinction(experiment),
+        lidar,
+        environment_extinction(wake),
         *air,
-        experiment.render,
-        experiment.seed if seed is None else seed,
+        render,
+        seed,
         scans=wanted,
-        molecules=molecules(
-            mapping.molecules, experiment.lidar.wavelength, experiment.scattering.band
-        ),
+        molecules=molecules(wake.extinction.molecules, lidar.wavelength, scattering.band),
         **how,
     )
 
 
 def chosen_samples(
-    experiment: Experiment,
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector,
+    scattering: Scattering,
+    render: RenderSettings,
+    volume: Volume | None,
+    seed: int,
+    flows: Flows,
     truth: Truth,
     plans: Sequence[ScanPlan],
     air: Scatterer,
-    flows: Flows,
-    *,
     log: Log,
-) -> Samples | None:
-    """Samples per beam of both scans, from pilots of both; None without a detector.
+) -> Samples:
+    """Samples per beam of both scans, from pilots of both.
 
     The scan of more noise decides. Other pilots of the same experiment give the same number. Where
     the experiment has a number, it is that, with what its noise is.
     """
-    detector = experiment.detector
-    if detector is None:
-        return None
-    use_variant(experiment.render.variant)
+    use_variant(render.variant)
     log.bar("choosing the number of samples", None)
     beams, gates = len(plans[0].y) * len(plans[0].z), plans[0].gate_count
-    samples, seed = pilot_samples(experiment.render, beams, gates), experiment.seed + PILOT_SEED
+    number, seed = pilot_samples(render, beams, gates), seed + PILOT_SEED
     # noise is that of air at the scan's reference time, which need not be moved for it
-    frozen = experiment.scan.model_copy(update={"air": "frozen"})
-    asked = with_samples(experiment.model_copy(update={"scan": frozen}), samples)
-    pilots = _rendered(asked, truth, plans, air, flows, range(len(plans)), log, seed)
-    pulses, found = experiment.scan.pulses_per_beam, []
+    fields, wanted = truth.extinction, range(len(plans))
+    few = with_samples(render, number)
+    pilots = _rendered(fields, wake, lidar, scattering, few, seed, plans, air, wanted)
+    found = []
     for plan, pilot in zip(plans, pilots, strict=True):
-        seen = noisy_scan(pilot, experiment.lidar, detector, [seed, 0, 1], plan, pulses)
-        least = least_samples(experiment, truth.extinction, plan)
-        found.append(choose_samples(seen, samples, experiment.render, least))
+        seen = noisy_scan(pilot, lidar, detector, [seed, 0, 1], plan, scan.pulses_per_beam)
+        least = least_samples(lidar, render, wake.extinction, truth.extinction, plan)
+        found.append(choose_samples(seen, number, render, least))
     return max(found, key=lambda one: (one.number, one.fraction))
 
 
-def with_samples(experiment: Experiment, number: int) -> Experiment:
-    """The experiment with a number of samples per beam."""
-    render = experiment.render.model_copy(update={"samples_per_beam": number})
-    found = experiment.model_copy(update={"render": render})
-    return found.read_from(experiment.folder)
+def with_samples(render: RenderSettings, number: int) -> RenderSettings:
+    """Settings with a number of samples per beam."""
+    return render.model_copy(update={"samples_per_beam": number})
 
 
-def samples_text(experiment: Experiment, chosen: Samples) -> str:
+def samples_text(render: RenderSettings, chosen: Samples) -> str:
     """A number of samples, and what their noise is beside that of the detector."""
     text = (
         f"{chosen.number} Monte Carlo samples per beam, with {chosen.fraction:.2g} times the "
@@ -261,12 +336,12 @@ def samples_text(experiment: Experiment, chosen: Samples) -> str:
     )
     if chosen.reached:
         return text
-    asked = experiment.render.monte_carlo_fraction
+    asked = render.monte_carlo_fraction
     return f"{text}; {asked:g} needs {chosen.needed}"
 
 
 def batches_of(
-    names: Sequence[str], keeper: Keeper | None, log: Log, samples: int | None = None
+    names: Sequence[str], store: Store | None, log: Log, samples: int | None = None
 ) -> Callable[[int], Batches] | None:
     """Storage of an image's samples while it is rendered, by its index among the names.
 
@@ -275,22 +350,22 @@ def batches_of(
     samples : int, optional
         Per beam, where that was chosen: stored ones of an image with another number are not used.
     """
-    if keeper is None:
+    if store is None:
         return None
 
     def batches(index: int) -> Batches:
         name = names[index]
 
-        def load() -> dict | None:
-            found = keeper.unfinished(name)
+        def load() -> dict[str, Any] | None:
+            found = store.unfinished(name)
             if not found or found.pop("samples", samples) != samples:
                 return None
             log(f"resuming {name}: {found['passes']} passes are kept from an earlier run")
             return found
 
-        def save(arrays: dict) -> None:
+        def save(arrays: dict[str, Any]) -> None:
             number = {} if samples is None else {"samples": np.array(samples)}
-            keeper.keep_unfinished(name, arrays | number)
+            store.store_unfinished(name, arrays | number)
 
         return Batches(load, save)
 
@@ -298,27 +373,32 @@ def batches_of(
 
 
 def detect_images(
-    experiment: Experiment, images: Mapping[str, xr.Dataset], plans: Sequence[ScanPlan]
+    wake: Wake,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector | None,
+    seed: int,
+    images: Mapping[str, xr.Dataset],
+    plans: Sequence[ScanPlan],
 ) -> list[xr.Dataset]:
     """The images of all beams, with noisy ones in addition if there is a detector."""
     # images are per emitted energy: those of another pulse energy are the same
-    energy = experiment.lidar.pulse_energy
     scans = [
-        _on_nodes(images[name].assign_attrs(pulse_energy=energy), plan)
+        _on_nodes(images[name].assign_attrs(pulse_energy=lidar.pulse_energy), plan)
         for name, plan in zip(IMAGES, plans, strict=True)
     ]
-    if experiment.detector is None:
+    if detector is None:
         return scans
-    lidar, detector, seed = experiment.lidar, experiment.detector, experiment.seed
     # geometry and air are in single precision in a file: here they are known exactly
-    air = {"environment_extinction": environment_extinction(experiment)}
-    pulses = experiment.scan.pulses_per_beam
+    air = {"environment_extinction": environment_extinction(wake)}
     # random numbers different from those of the light transport
     found = [
-        noisy_scan(scan.assign_attrs(air), lidar, detector, [seed, index, 1], plan, pulses)
-        for index, (scan, plan) in enumerate(zip(scans, plans, strict=True))
+        noisy_scan(
+            one.assign_attrs(air), lidar, detector, [seed, index, 1], plan, scan.pulses_per_beam
+        )
+        for index, (one, plan) in enumerate(zip(scans, plans, strict=True))
     ]
-    return [scan.assign_attrs(monte_carlo_fraction=monte_carlo_fraction(scan)) for scan in found]
+    return [one.assign_attrs(monte_carlo_fraction=monte_carlo_fraction(one)) for one in found]
 
 
 def _on_nodes(scan: xr.Dataset, plan: ScanPlan) -> xr.Dataset:
@@ -327,32 +407,31 @@ def _on_nodes(scan: xr.Dataset, plan: ScanPlan) -> xr.Dataset:
     return scan.assign_coords(nodes)
 
 
-def gridded_scans(experiment: Experiment, detected: Sequence[xr.Dataset]) -> list[xr.Dataset]:
+def gridded_scans(platform: Platform, detected: Sequence[xr.Dataset]) -> list[xr.Dataset]:
     """The scans, on regular nodes where beams were reported beside them; see `of_one_instant`."""
     if any("y_reported" not in scan for scan in detected):
         return list(detected)
     # times in double precision, so that those of a node are not rounded twice
     scans = [scan.assign(beam_time=scan["beam_time"].astype(float)) for scan in detected]
     image = "Y_noisy" if "Y_noisy" in scans[0] else "Y"
-    found = of_one_instant(scans, [experiment.platform.dt], image)
+    found = of_one_instant(scans, [platform.dt], image)
     return [scan.assign_attrs(gridded=1) for scan in found]
 
 
-def detector_noise(experiment: Experiment, detected: Sequence[xr.Dataset]) -> dict[str, float]:
+def detector_noise(
+    lidar: BackscatterLidar, detector: Detector, scan: Scan, detected: Sequence[xr.Dataset]
+) -> dict[str, float]:
     """Contributions to the noise of the first scan, see `noise_budget`."""
-    return noise_budget(
-        detected[0], experiment.lidar, experiment.detector, experiment.scan.pulses_per_beam
-    )
+    return noise_budget(detected[0], lidar, detector, scan.pulses_per_beam)
 
 
 def _media(
-    experiment: Experiment, fields: Sequence[xr.DataArray], plans: Sequence[ScanPlan]
+    lidar: BackscatterLidar, fields: Sequence[xr.DataArray], plans: Sequence[ScanPlan]
 ) -> list[xr.DataArray]:
     """The extinction at both times, extended to the depth and width of the beams."""
     if fields[0].sizes["x"] > 1:
         return list(fields)
     reach = max(plans, key=lambda plan: plan.gate_stop)
     return [
-        extrude(field.isel(x=0).transpose(..., "z", "y"), reach, experiment.lidar, plans)
-        for field in fields
+        extrude(field.isel(x=0).transpose(..., "z", "y"), reach, lidar, plans) for field in fields
     ]

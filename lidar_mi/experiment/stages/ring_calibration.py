@@ -8,7 +8,7 @@ from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.doppler import Doppler
 from lidar_mi.experiment.stages.ring_images import (
     Rings,
     exposed_frames,
@@ -26,9 +26,7 @@ from lidar_mi.retrieval.rings.calibration_fit import calibrate_rings
 _STREAMS = 3 << 25
 
 
-def calibration_file(
-    experiment: Experiment, rings: Rings, beside: str | Path, *, log: Log
-) -> Calibration | None:
+def calibration_file(doppler: Doppler, rings: Rings, search_path: Path) -> Calibration | None:
     """The calibration that an experiment names, or none.
 
     Raises
@@ -36,11 +34,11 @@ def calibration_file(
     InputError
         A file that is missing, no calibration, or one of another camera, wavelength or gap.
     """
-    asked = experiment.doppler.calibration
+    asked = doppler.calibration
     if asked is None or asked.file is None:
         return None
     try:
-        found = calibration_of(read_netcdf(find_file(asked.file, beside, "file")))
+        found = calibration_of(read_netcdf(find_file(asked.file, search_path, "file")))
         calibrated(rings.model, found)
     except InputError as error:
         raise InputError(f"doppler.calibration.file: {error}") from None
@@ -48,7 +46,7 @@ def calibration_file(
 
 
 def assumed_rings(
-    experiment: Experiment, rings: Rings, given: Calibration | None, *, log: Log
+    doppler: Doppler, seed: int, rings: Rings, calibration_file: Calibration | None, log: Log
 ) -> Rings:
     """What the retrieval assumes of the instrument, calibrated where the experiment says so.
 
@@ -60,21 +58,20 @@ def assumed_rings(
     InputError
         Frames that do not fit the assumed instrument.
     """
-    doppler = experiment.doppler
     air, laser = ring_models(doppler)
-    asked, found = doppler.calibration, given
+    asked, found = doppler.calibration, calibration_file
     if asked is not None and found is None:
         log(f"calibrating the instrument from {asked.frames} frames of the laser")
         line = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
         light = reference_photons(doppler, rings)
         mean = fringe_image(doppler.camera, doppler.etalon, line, 0.0, light)
         numbers = range(_STREAMS, _STREAMS + asked.frames)
-        walk = calibration_drift(doppler, asked.frames, experiment.seed)
+        walk = calibration_drift(doppler, asked.frames, seed)
         if walk.any():
             mean = torch.stack(
                 [fringe_image(doppler.camera, doppler.etalon, line, v, light) for v in walk]
             )
-        frames = exposed_frames(doppler, rings, mean, 1, experiment.seed, numbers)
+        frames = exposed_frames(doppler, rings, mean, 1, seed, numbers)
         try:
             found = calibrate_rings(
                 frames,

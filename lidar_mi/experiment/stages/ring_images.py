@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -13,19 +13,20 @@ import xarray as xr
 from lidar_mi.atmosphere.line import Line, backscatter_line, laser_line
 from lidar_mi.atmosphere.molecules import standard_atmosphere
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.graph import Keeper
+from lidar_mi.experiment.graph import Only, Store
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.rings import Assumed
 from lidar_mi.experiment.stages.rendering import batches_of
 from lidar_mi.experiment.stages.ring_instrument import air_rings, laser_rings, pixel_noise
 from lidar_mi.experiment.stages.ring_reference import reference_frames
 from lidar_mi.instrument.ccd import CCD, expose
-from lidar_mi.instrument.doppler import photons, solar_background, speckle_modes
-from lidar_mi.instrument.fringe_camera import fringe_image, ring_radii
+from lidar_mi.instrument.doppler import DopplerLidar, photons, solar_background, speckle_modes
+from lidar_mi.instrument.etalon import Etalon
+from lidar_mi.instrument.fringe_camera import FringeCamera, fringe_image, ring_radii
 from lidar_mi.rendering.fringes import render_fringes, scene_dict
 from lidar_mi.rendering.memory import PER_PIXEL, PER_SAMPLE, PROGRAM, check_memory
+from lidar_mi.rendering.settings import FringeSettings
 from lidar_mi.rendering.variant import use_variant
 from lidar_mi.retrieval.rings.model import RingModel
 
@@ -69,6 +70,25 @@ class Exposure:
     noisy: np.ndarray
 
 
+def air_line(
+    doppler_lidar: Annotated[
+        DopplerLidar,
+        Only("wavelength", "altitude", "laser_width", "aerosol_fraction", "line_shape"),
+    ],
+) -> Line:
+    """The spectral line of the air's light."""
+    lidar = doppler_lidar
+    pressure, temperature = standard_atmosphere(lidar.altitude)
+    return backscatter_line(
+        lidar.wavelength,
+        temperature,
+        pressure,
+        lidar.laser_width,
+        lidar.aerosol_fraction,
+        lidar.line_shape,
+    )
+
+
 def ring_instrument(doppler: Doppler) -> Rings:
     """Instrument and air of the images, checked.
 
@@ -88,15 +108,7 @@ def ring_instrument(doppler: Doppler) -> Rings:
         "doppler.render.memory",
     )
     lidar, etalon, camera, ccd = doppler.lidar, doppler.etalon, doppler.camera, doppler.ccd
-    pressure, temperature = standard_atmosphere(lidar.altitude)
-    line = backscatter_line(
-        lidar.wavelength,
-        temperature,
-        pressure,
-        lidar.laser_width,
-        lidar.aerosol_fraction,
-        lidar.line_shape,
-    )
+    line = air_line(lidar)
     model, laser = ring_models(doppler.model_copy(update={"assumed": Assumed()}))
     for number in doppler.retrieval.averaged:
         reference_frames(number, doppler.reference.every, "doppler.retrieval.averaged")
@@ -133,16 +145,23 @@ def ring_instrument(doppler: Doppler) -> Rings:
 
 def ring_models(doppler: Doppler) -> tuple[RingModel, RingModel]:
     """What the ring fit assumes of images of air and of the laser."""
-    told, assumed = doppler.retrieval, doppler.assumed
-    instrument = doppler.lidar, assumed.of(doppler.etalon), assumed.of(doppler.camera)
-    smooth = {"light_degree": told.light_degree, "background_degree": told.background_degree}
+    known, assumed = doppler.retrieval, doppler.assumed
+    lidar, etalon, camera = doppler.lidar, assumed.of(doppler.etalon), assumed.of(doppler.camera)
+    light, background = known.light_degree, known.background_degree
     air = air_rings(
-        *instrument, aerosol_std=told.aerosol_std, temperature_std=told.temperature_std, **smooth
+        lidar,
+        etalon,
+        camera,
+        aerosol_std=known.aerosol_std,
+        temperature_std=known.temperature_std,
+        light_degree=light,
+        background_degree=background,
     )
-    return air, replace(laser_rings(*instrument), **smooth)
+    laser = laser_rings(lidar, etalon, camera)
+    return air, replace(laser, light_degree=light, background_degree=background)
 
 
-def check_rings(experiment: Experiment, rings: Rings) -> None:
+def check_rings(doppler: Doppler, rings: Rings) -> None:
     """Check that scenes of the rings can be built.
 
     Raises
@@ -150,24 +169,33 @@ def check_rings(experiment: Experiment, rings: Rings) -> None:
     InputError
         Inconsistent settings of etalon, camera and rendering.
     """
-    use_variant(experiment.doppler.render.variant)
-    for line, settings in ((rings.line, experiment.doppler.render), _path_by_path(experiment)):
-        scene_dict(experiment.doppler.etalon, experiment.doppler.camera, line, settings)
+    use_variant(doppler.render.variant)
+    laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
+    settings = [(rings.line, doppler.render), (laser, doppler.render)]
+    if doppler.path_samples:
+        settings[1] = laser, _path_by_path(doppler.render, doppler.path_samples)
+    for line, render in settings:
+        scene_dict(doppler.etalon, doppler.camera, line, render)
 
 
-def ring_image_names(experiment: Experiment) -> list[str]:
+def ring_image_names(doppler_v_los: tuple[float, ...], doppler_path_samples: int) -> list[str]:
     """Parts of the result of `render_ring_images`."""
-    single_paths = [PHOTONS] if experiment.doppler.path_samples else []
-    return [EMITTED, *single_paths, *_received(experiment)]
+    single_paths = [PHOTONS] if doppler_path_samples else []
+    return [EMITTED, *single_paths, *_received(doppler_v_los)]
 
 
 def render_ring_images(
-    experiment: Experiment,
-    rings: Rings,
-    *,
+    doppler_lidar: Annotated[DopplerLidar, Only("wavelength", "laser_width")],
+    doppler_etalon: Etalon,
+    doppler_camera: FringeCamera,
+    doppler_render: FringeSettings,
+    doppler_v_los: tuple[float, ...],
+    doppler_path_samples: int,
+    seed: int,
+    air_line: Line,
     log: Log,
     missing: Sequence[str],
-    keeper: Keeper | None = None,
+    store: Store | None = None,
 ) -> Iterator[tuple[str, xr.Dataset]]:
     """Render the laser's own light, single paths of it, and that of air at every speed.
 
@@ -178,70 +206,69 @@ def render_ring_images(
     image : xr.Dataset, dims (y, x)
         From `render_fringes`.
     """
-    doppler = experiment.doppler
-    use_variant(doppler.render.variant)
-    laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
+    use_variant(doppler_render.variant)
+    laser = laser_line(doppler_lidar.wavelength, doppler_lidar.laser_width)
     # what to render: line, settings, speeds, names
-    plan = [(laser, doppler.render, (0.0,), [EMITTED])]
-    if doppler.path_samples:
-        plan.append((*_path_by_path(experiment), (0.0,), [PHOTONS]))
-    plan.append((rings.line, doppler.render, doppler.v_los, _received(experiment)))
+    plan: list[tuple[Line, FringeSettings, tuple[float, ...], list[str]]]
+    plan = [(laser, doppler_render, (0.0,), [EMITTED])]
+    if doppler_path_samples:
+        single = _path_by_path(doppler_render, doppler_path_samples)
+        plan.append((laser, single, (0.0,), [PHOTONS]))
+    plan.append((air_line, doppler_render, doppler_v_los, _received(doppler_v_los)))
     total = sum(len(names) for *_, names in plan)
     before = 0
     for line, settings, speeds, names in plan:
         absent = [k for k, name in enumerate(names) if name in missing]
         if absent:
-            size = f"{doppler.camera.width} x {doppler.camera.height}"
+            size = f"{doppler_camera.width} x {doppler_camera.height}"
             log(f"rendering {names[absent[0]]} ... {names[absent[-1]]}, {size} pixels")
             # the seed depends on the number of an image: a resumed run renders the same ones
             rendered = render_fringes(
-                doppler.etalon,
-                doppler.camera,
+                doppler_etalon,
+                doppler_camera,
                 line,
                 speeds,
                 settings,
-                (experiment.seed + (before << 16)) % 2**31,
+                (seed + (before << 16)) % 2**31,
                 lambda k, done, paths, n=before: log.bar(
                     f"rendering rings {n + k + 1} of {total}", done / paths
                 ),
                 absent,
-                batches_of(names, keeper, log),
+                batches_of(names, store, log),
             )
             for k, image in zip(absent, rendered, strict=True):
                 yield names[k], image
         before += len(names)
 
 
-def ring_images(experiment: Experiment, parts: Mapping[str, xr.Dataset]) -> RingImages:
+def images_by_content(
+    doppler_v_los: tuple[float, ...], ring_images: Mapping[str, xr.Dataset]
+) -> RingImages:
     """The images by their content."""
-    received = [parts[name] for name in _received(experiment)]
-    return RingImages(parts[EMITTED], received, parts.get(PHOTONS))
+    received = [ring_images[name] for name in _received(doppler_v_los)]
+    return RingImages(ring_images[EMITTED], received, ring_images.get(PHOTONS))
 
 
-def exposure(experiment: Experiment, rings: Rings, images: RingImages) -> Exposure:
+def exposure(doppler: Doppler, seed: int, rings: Rings, lit_rings: RingImages) -> Exposure:
     """Images at the first speed as the CCD records one pulse, with and without noise."""
-    received = expected_image(images.received[0], rings.photons)
-    noisy = exposed_frames(experiment.doppler, rings, received, 1, experiment.seed, [0])[0]
-    emitted = expected_image(images.emitted, rings.photons)
+    received = expected_image(lit_rings.received[0], rings.photons)
+    noisy = exposed_frames(doppler, rings, received, 1, seed, [0])[0]
+    emitted = expected_image(lit_rings.emitted, rings.photons)
     return Exposure(emitted.numpy(), received.numpy(), noisy.numpy())
 
 
-def _received(experiment: Experiment) -> list[str]:
-    return [f"fringes_received_{k:02d}" for k in range(len(experiment.doppler.v_los))]
+def _received(v_los: Sequence[float]) -> list[str]:
+    return [f"fringes_received_{k:02d}" for k in range(len(v_los))]
 
 
-def _path_by_path(experiment: Experiment):
-    """The laser's line, and how single paths of its light are traced through a real lens."""
-    doppler = experiment.doppler
-    laser = laser_line(doppler.lidar.wavelength, doppler.lidar.laser_width)
-    if not doppler.path_samples:
-        return laser, doppler.render
-    return laser, doppler.render.model_copy(
+def _path_by_path(render: FringeSettings, samples: int) -> FringeSettings:
+    """How single paths of the laser's light are traced through a real lens."""
+    return render.model_copy(
         update={
             "estimator": "analog",
             "line_shape": "sampled",
             "lens": "singlet",
-            "samples_per_pixel": doppler.path_samples,
+            "samples_per_pixel": samples,
         }
     )
 
@@ -257,7 +284,14 @@ def expected_image(image: xr.Dataset, total: float) -> torch.Tensor:
     return light * (total / light.sum())
 
 
-def exposed_frames(doppler, rings, expected, averaged, seed, numbers) -> torch.Tensor:
+def exposed_frames(
+    doppler: Doppler,
+    rings: Rings,
+    expected: torch.Tensor,
+    averaged: int,
+    seed: int,
+    numbers: Sequence[int],
+) -> torch.Tensor:
     """Sums of so many noisy images each, photoelectrons; of one mean, or one each."""
     mean, ccd = averaged * expected, summed(doppler.ccd, averaged)
     modes, background = averaged * rings.modes, averaged * rings.background

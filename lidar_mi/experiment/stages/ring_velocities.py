@@ -13,7 +13,6 @@ from lidar_mi.assessment.metrics.rings import RingBudget
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.doppler import Doppler
-from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.stages.ring_images import (
     RingImages,
     Rings,
@@ -61,27 +60,26 @@ REFERENCES = 1 << 25
 
 
 def line_of_sight_winds(
-    experiment: Experiment, rings: Rings, images: RingImages, *, log: Log
+    name: str, doppler: Doppler, seed: int, assumed_rings: Rings, lit_rings: RingImages, log: Log
 ) -> xr.Dataset:
     """Winds by every method from noisy images, and from averages of several; see `velocities`.
 
-    ``rings`` has the models of the instrument that the retrieval assumes.
+    ``assumed_rings`` has the models of the instrument that the retrieval assumes.
     """
-    expected = [expected_image(image, rings.photons) for image in images.received]
-    found = velocities(experiment.doppler, rings, images, expected, experiment.seed, log)
+    rings = assumed_rings
+    expected = [expected_image(image, rings.photons) for image in lit_rings.received]
+    found = velocities(doppler, rings, lit_rings, expected, seed, log)
     found.attrs |= {
-        "title": f"Line-of-sight wind of the experiment {experiment.name}",
+        "title": f"Line-of-sight wind of the experiment {name}",
         "source": f"lidar-mi {__version__}",
     }
     return found
 
 
-def ring_budget(
-    experiment: Experiment, rings: Rings, images: RingImages, *, log: Log
-) -> RingBudget:
+def ring_budget(doppler: Doppler, rings: Rings, lit_rings: RingImages, log: Log) -> RingBudget:
     """Light, line and etalon of the lidar, and limits of what can be retrieved from its images."""
     log("computing the Cramer-Rao bound")
-    doppler = experiment.doppler
+    images = lit_rings
     expected = [expected_image(image, rings.photons) for image in images.received]
     # few samples leave more than the noise of photons: that shows as an error, not as no image
     v = fit_rings(torch.stack(expected), rings.model, max_chi_square=math.inf).v_los.numpy()

@@ -4,7 +4,7 @@ The Doppler lidar scans the slab observed by the backscatter lidar. All of its l
 the cross-flow wind together give (u, v, w).
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,16 @@ from lidar_mi.assessment.metrics.errors import commonest_flag
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.doppler import Doppler
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.sensor import Sensor
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.flows import moves_along
 from lidar_mi.instrument.beams import Beams
+from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.doppler_scan import PlatformErrors, scan_wind
+from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.common_error import NAMES as COMMON_ERRORS
 from lidar_mi.retrieval.lines.combine import combine
 from lidar_mi.retrieval.lines.common_time import estimated_drift
@@ -32,14 +38,24 @@ _SURE, _SHORT = 0.01, 0.1
 
 
 def combined_wind(
-    experiment: Experiment, truth: xr.Dataset, lines: xr.Dataset, wind: xr.Dataset, *, log: Log
+    name: str,
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    detector: Detector | None,
+    sensor: Sensor,
+    slab_wind: xr.Dataset,
+    lines: xr.Dataset,
+    wind: xr.Dataset,
+    log: Log,
 ) -> xr.Dataset | None:
     """The wind from the lines of sight and from the images' wind, with the truth.
 
     Parameters
     ----------
-    truth : xr.Dataset
-        u, v, w on (z, y).
+    slab_wind : xr.Dataset
+        True u, v, w on (z, y).
     wind : xr.Dataset
         From `winds.cross_flow_winds`.
 
@@ -51,7 +67,9 @@ def combined_wind(
     """
     log("combining both lidars")
     try:
-        found = with_truth(experiment, truth, lines, crossflow(experiment, wind))
+        seen = crossflow(sensor, detector, wind)
+        settings = combine_settings(wake, platform, scan, volume, sensor, seen)
+        found = with_truth(name, scan, slab_wind, lines, seen, settings)
     except InputError as error:
         log.remark(f"no wind from both lidars: {error}")
         return None
@@ -60,7 +78,7 @@ def combined_wind(
     return found
 
 
-def doppler_alone(experiment: Experiment, lines: xr.Dataset, *, log: Log) -> dict[str, xr.Dataset]:
+def doppler_alone(lines: xr.Dataset, log: Log) -> dict[str, xr.Dataset]:
     """Vectors of the Doppler lidar alone, from "triples" of lines and from "neighbours" of each.
 
     Empty where the valid lines do not give any, which is logged as a warning.
@@ -110,82 +128,126 @@ def with_systematic(found: xr.Dataset, shifted: xr.Dataset) -> xr.Dataset:
     return found
 
 
-def crossflow(experiment: Experiment, wind: xr.Dataset) -> xr.Dataset:
+def crossflow(sensor: Sensor, detector: Detector | None, wind: xr.Dataset) -> xr.Dataset:
     """The images' wind used by the sensor for v and w."""
-    source = Source.NOISY if experiment.detector else Source.BACKSCATTER
-    return wind.sel(source=source, algorithm=experiment.sensor.method)
+    source = Source.NOISY if detector else Source.BACKSCATTER
+    return wind.sel(source=source, algorithm=sensor.method)
 
 
-def _oblique_view(experiment: Experiment) -> dict[str, float]:
+def _oblique_view(
+    wake: Wake, platform: Platform, scan: Scan, volume: Volume | None
+) -> dict[str, float]:
     """Settings of `combine` for the apparent motion in the images by motion along x."""
-    if not moves_along(experiment):
+    if not moves_along(wake, volume):
         return {}
-    scan, platform = experiment.scan, experiment.platform
     # the telescope's distance at mid-time
     flown = (platform.speed - scan.follow) * platform.dt
     distance = scan.range + scan.thickness / 2 - flown / 2
     return {"distance": distance, "gate_speed": scan.follow}
 
 
-def _in_time(experiment: Experiment, crossflow: xr.Dataset) -> dict[str, Any]:
+def _in_time(platform: Platform, sensor: Sensor, crossflow: xr.Dataset) -> dict[str, Any]:
     """Settings of `combine` for the time of the wind, half way between both images."""
-    settings: dict[str, Any] = {"time": experiment.platform.dt / 2}
-    if experiment.sensor.drift == "estimated":
-        drift = estimated_drift(crossflow, experiment.sensor.crossflow_std)
+    settings: dict[str, Any] = {"time": platform.dt / 2}
+    if sensor.drift == "estimated":
+        drift = estimated_drift(crossflow, sensor.crossflow_std)
         settings |= {"drift": drift.velocity, "drift_std": drift.std}
     return settings
 
 
+def combine_settings(
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    sensor: Sensor,
+    crossflow: xr.Dataset,
+) -> dict[str, Any]:
+    """Settings of `combine` for the cross-flow wind of a sensor."""
+    oblique = _oblique_view(wake, platform, scan, volume)
+    settings = {"crossflow_std": sensor.crossflow_std, **oblique}
+    return settings | _in_time(platform, sensor, crossflow)
+
+
 def with_truth(
-    experiment: Experiment, truth: xr.Dataset, lines: xr.Dataset, crossflow: xr.Dataset
+    name: str,
+    scan: Scan,
+    truth: xr.Dataset,
+    lines: xr.Dataset,
+    crossflow: xr.Dataset,
+    settings: Mapping[str, Any],
 ) -> xr.Dataset:
     """The wind of `combine` from lines and cross-flow wind, with the truth at its nodes."""
-    settings = {"crossflow_std": experiment.sensor.crossflow_std, **_oblique_view(experiment)}
-    settings |= _in_time(experiment, crossflow)
     found, shifted = combine(crossflow, lines, **settings), _shifted(lines)
     if shifted is not None:
         found = with_systematic(found, combine(crossflow, shifted, **settings))
-    for name in COMPONENTS:
+    for component in COMPONENTS:
         at = {axis: found[axis] for axis in ("z", "y")}
-        found[f"{name}_true"] = (
-            truth[name]
+        found[f"{component}_true"] = (
+            truth[component]
             .interp(at)
-            .assign_attrs(units="m s-1", long_name=f"true {name}, mean over the slab")
+            .assign_attrs(units="m s-1", long_name=f"true {component}, mean over the slab")
         )
-    ahead = {
+    about = {
         "units": "m",
         "long_name": "distance ahead of the first image's telescope",
         "axis": "X",
     }
-    found["x"] = (), experiment.scan.range + experiment.scan.thickness / 2, ahead
+    found["x"] = (), scan.range + scan.thickness / 2, about
     found = found.set_coords("x")
     found.attrs |= {
-        "title": f"Wind from both lidars of the experiment {experiment.name}",
+        "title": f"Wind from both lidars of the experiment {name}",
         "source": f"lidar-mi {__version__}",
     }
     return found
 
 
 def limits_of_u(
-    experiment: Experiment,
-    truth: xr.Dataset,
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    detector: Detector | None,
+    doppler: Doppler,
+    sensor: Sensor,
+    seed: int,
+    slab_wind: xr.Dataset,
     lines: xr.Dataset,
     wind: xr.Dataset,
-    found: xr.Dataset | None,
+    wind3d: xr.Dataset | None,
     cores: Sequence[Core],
-    beams: Beams | None,
+    line_beams: Beams | None,
     states: xr.Dataset,
 ) -> dict[str, float]:
     """Error budget of u, see `mean_squares_without`. Empty without a wind from both lidars."""
-    if found is None:
+    if wind3d is None:
         return {}
     return mean_squares_without(
-        experiment, truth, lines, crossflow(experiment, wind), found, cores, beams, states
+        wake,
+        platform,
+        scan,
+        volume,
+        doppler,
+        sensor,
+        seed,
+        slab_wind,
+        lines,
+        crossflow(sensor, detector, wind),
+        wind3d,
+        cores,
+        line_beams,
+        states,
     )
 
 
 def mean_squares_without(
-    experiment: Experiment,
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    doppler: Doppler,
+    sensor: Sensor,
+    seed: int,
     truth: xr.Dataset,
     lines: xr.Dataset,
     crossflow: xr.Dataset,
@@ -221,19 +283,19 @@ def mean_squares_without(
     z, y = np.meshgrid(found["z"], found["y"], indexing="ij")
     chosen = (found["flag"].values == 0) & outside_cores(y, z, list(cores))
 
-    def square(causes) -> float:
-        lidar, missed = experiment.doppler.lidar, experiment.sensor.errors
+    def square(causes: Sequence[str]) -> float:
+        lidar, missed = doppler.lidar, sensor.errors
         if "range_bin" in causes:
             lidar = lidar.model_copy(update={"range_bin": _SHORT})
         if "pointing" in causes:
             missed = PlatformErrors()
         changed = scan_wind(
             truth if states is None else states,
-            experiment.sensor.directions,
+            sensor.directions,
             lidar,
             0.0,
-            experiment.seed,
-            experiment.platform.speed,
+            seed,
+            platform.speed,
             missed,
             beams,
         )
@@ -244,23 +306,23 @@ def mean_squares_without(
         changed = changed.assign(v_los=changed["v_los_true"] + noise, v_los_std=std)
         if "v_los_covariance" in lines and "line_noise" not in causes:
             changed["v_los_covariance"] = lines["v_los_covariance"]
-        flow, settings = crossflow, _oblique_view(experiment)
-        if "crossflow" in causes:
-            flow, settings = known, {}
-        else:
-            settings["crossflow_std"] = experiment.sensor.crossflow_std
+        flow, settings = known, {}
+        if "crossflow" not in causes:
+            flow = crossflow
+            oblique = _oblique_view(wake, platform, scan, volume)
+            settings = {"crossflow_std": sensor.crossflow_std, **oblique}
         settings |= timed
         u = combine(flow, changed, **settings)["u"].transpose("z", "y").values
         return float(((u - true["u"])[chosen] ** 2).mean())
 
     if not chosen.any():
         return {}
-    timed = _in_time(experiment, crossflow)
+    timed = _in_time(platform, sensor, crossflow)
     full = square(())
     if not full > 0:
         return {}
     causes = ["line_noise", "range_bin", "crossflow"]
-    if experiment.sensor.errors != PlatformErrors():
+    if sensor.errors != PlatformErrors():
         causes.append("pointing")
     left = {"": full} | {cause: square((cause,)) for cause in causes}
     return left | {"sampling": square(causes)}

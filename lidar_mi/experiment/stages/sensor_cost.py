@@ -8,23 +8,31 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.requirements import RequirementTable
 from lidar_mi.assessment.metrics.sensor import LidarCost
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.experiment.stages.timed_beams import lines_schedule, pulse_train
-from lidar_mi.instrument.doppler import photons
+from lidar_mi.instrument.doppler import DopplerLidar, photons
 from lidar_mi.instrument.eye_safety import assess_pulses
+from lidar_mi.instrument.lidar import BackscatterLidar
 from lidar_mi.instrument.pulse_budget import pulse_budget, pulses_for_error
-from lidar_mi.instrument.scan import plan_scans
+from lidar_mi.instrument.scan import Scan, plan_scans
 
 
 def lidar_costs(
-    experiment: Experiment, truth: xr.Dataset, beside: str | Path
+    sensor: Sensor,
+    doppler_lidar: DopplerLidar,
+    lidar: BackscatterLidar,
+    scan: Scan,
+    platform: Platform,
+    slab_wind: xr.Dataset,
+    search_path: Path,
 ) -> dict[str, LidarCost]:
     """Cost of the scans of "doppler" and "backscatter", at the pulse rates of their timing."""
-    sensor, doppler, lidar = experiment.sensor, experiment.doppler.lidar, experiment.lidar
+    doppler = doppler_lidar
     far = float(sensor.directions.ranges(doppler).max()) + doppler.range_bin / 2
     directions = sensor.directions.columns * sensor.directions.rows
     rate = sensor.slabs_per_second
-    line_rate = sensor.pulses * lines_schedule(experiment, beside).beam_rate
+    line_rate = sensor.pulses * lines_schedule(sensor, doppler, search_path).beam_rate
     lines = pulse_budget(
         directions,
         rate,
@@ -34,9 +42,9 @@ def lidar_costs(
         photons(doppler),
         directions * sensor.pulses / line_rate if math.isfinite(line_rate) else None,
     )
-    plan = plan_scans(experiment.scan, truth["y"].values, truth["z"].values, (0.0,))[0]
-    pulses, pulse_rate = pulse_train(experiment, plan, beside)
-    beams, slabs = len(plan.y) * len(plan.z), 1 / experiment.platform.dt
+    plan = plan_scans(scan, slab_wind["y"].values, slab_wind["z"].values, (0.0,))[0]
+    pulses, pulse_rate = pulse_train(scan, plan, search_path)
+    beams, slabs = len(plan.y) * len(plan.z), 1 / platform.dt
     images = pulse_budget(
         beams,
         slabs,
@@ -71,20 +79,24 @@ def lidar_costs(
 
 
 def pulses_needed(
-    experiment: Experiment, tables: Mapping[tuple[str, str], RequirementTable], lines: xr.Dataset
+    sensor: Sensor, requirements: Mapping[tuple[str, str], RequirementTable], lines: xr.Dataset
 ) -> int | None:
     """Pulses per direction for the smallest required error of v_LOS; None: none is required."""
-    rows = (row for table in tables.values() for row in table.rows)
+    rows = (row for table in requirements.values() for row in table.rows)
     limits = [r.maximum for r in rows if r.quantity == "error_v_los" and math.isfinite(r.maximum)]
     stated = lines["v_los_std"].where(lines["v_los"].notnull(), drop=True)
     if not limits or not stated.size:
         return None
-    one = math.sqrt(experiment.sensor.pulses * float((stated.values**2).mean()))
+    one = math.sqrt(sensor.pulses * float((stated.values**2).mean()))
     return pulses_for_error(one, min(limits))
 
 
 def _eye_safety(
-    beam, radius: float, rate: float, exposure: float, burst: tuple[float, float]
+    beam: BackscatterLidar | DopplerLidar,
+    radius: float,
+    rate: float,
+    exposure: float,
+    burst: tuple[float, float],
 ) -> dict[str, float]:
     """Limits of one beam, by the names of `LidarCost`; none for pulses without a duration."""
     if not beam.pulse_duration > 0:

@@ -6,7 +6,9 @@ import numpy as np
 import xarray as xr
 
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.retrieval import Retrieval
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.rendering import gridded_scans
 from lidar_mi.experiment.stages.winds import (
     attenuated_backscatter_stderr,
@@ -15,17 +17,26 @@ from lidar_mi.experiment.stages.winds import (
     rendered_pairs,
     window_settings,
 )
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.detector import Detector
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import Scan, ScanPlan
+from lidar_mi.rendering.settings import RenderSettings
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
 
 def simulation_noise(
-    experiment: Experiment,
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector | None,
+    render: RenderSettings,
+    retrieval: Retrieval,
+    seed: int,
     detected: Sequence[xr.Dataset],
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
     wind: xr.Dataset,
-    *,
     log: Log,
 ) -> xr.Dataset | None:
     """Changes of the wind by as much noise again as the simulation's, by every method.
@@ -41,27 +52,27 @@ def simulation_noise(
         where the noise has no more than ``render.monte_carlo_fraction`` of the detector's
         variance: neither has it then of the wind's.
     """
-    fraction = max(scan.attrs.get("monte_carlo_fraction", np.inf) for scan in detected)
-    if fraction <= experiment.render.monte_carlo_fraction:
+    fraction = max(one.attrs.get("monte_carlo_fraction", np.inf) for one in detected)
+    if fraction <= render.monte_carlo_fraction:
         return None
     log.bar("retrieving winds with more noise of the simulation", None)
-    random = np.random.default_rng([experiment.seed, 2])
-    noisier = [_with_more_noise(scan, random) for scan in detected]
-    pairs = rendered_pairs(experiment, gridded_scans(experiment, noisier))
+    random = np.random.default_rng([seed, 2])
+    noisier = [_with_more_noise(one, random) for one in detected]
+    pairs = rendered_pairs(wake, scan, detector, gridded_scans(platform, noisier))
     source, (pair, _) = pairs.popitem()
     # methods that weight by noise are to do so as before
-    noise = rendered_pairs(experiment, scans)[source][1]
+    noise = rendered_pairs(wake, scan, detector, scans)[source][1]
     changes = []
-    for method in experiment.retrieval.methods:
+    for method in retrieval.methods:
         found = retrieve_wind(
             *pair,
-            dt=experiment.platform.dt,
+            dt=platform.dt,
             method=method,
             noise=noise,
-            times=pixel_times(experiment, scans),
-            blur=known_blur(experiment, plans[0]),
+            times=pixel_times(wake, scan, scans),
+            blur=known_blur(retrieval, lidar, plans[0]),
             standard_errors=False,
-            **window_settings(experiment.retrieval),
+            **window_settings(retrieval),
         )
         first = wind.sel(source=source, algorithm=method)
         valid = (found["flag"].values == 0) & (first["flag"].values == 0)

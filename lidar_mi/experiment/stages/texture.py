@@ -5,10 +5,14 @@ import xarray as xr
 
 from lidar_mi.assessment.metrics.errors import error_statistics, truth_at_vectors
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.retrieval import Retrieval
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.winds import window_settings
-from lidar_mi.experiment.truth.extinction import make_truth
+from lidar_mi.experiment.truth.extinction import true_air
 from lidar_mi.experiment.truth.flows import Flows, advection_by
+from lidar_mi.instrument.scan import Scan
 from lidar_mi.retrieval.method_names import ImageMethod
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 
@@ -16,7 +20,16 @@ LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.4)
 """Relative rms of the texture."""
 
 
-def texture_sweep(experiment: Experiment, flows: Flows, *, log: Log) -> xr.Dataset:
+def texture_sweep(
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    retrieval: Retrieval,
+    seed: int,
+    flows: Flows,
+    log: Log,
+) -> xr.Dataset:
     """Errors of cross-correlation on extinction pairs of more and less sub-grid texture.
 
     Returns
@@ -25,20 +38,18 @@ def texture_sweep(experiment: Experiment, flows: Flows, *, log: Log) -> xr.Datas
         ``rmse_v``, ``rmse_w`` (m s^-1) over every vector with a displacement, NaN where there is
         none; ``valid_fraction``.
     """
-    points, advected = [], advection_by(experiment, flows)
+    points, advected = [], advection_by(wake, platform, scan, volume, flows)
     for index, rms in enumerate(LEVELS):
         log.bar(f"retrieving winds at {rms:.0%} texture", index / len(LEVELS))
-        texture = experiment.wake.texture.model_copy(update={"rms": rms})
-        wake = experiment.wake.model_copy(update={"texture": texture})
-        truth = make_truth(
-            experiment.model_copy(update={"wake": wake}), flows=flows, advected=advected
-        )
+        texture = wake.texture.model_copy(update={"rms": rms})
+        rough = wake.model_copy(update={"texture": texture})
+        truth = true_air(rough, platform, scan, volume, seed, flows, advected=advected)
         wind = retrieve_wind(
             truth.image(0),
             truth.image(1),
-            dt=experiment.platform.dt,
+            dt=platform.dt,
             method=ImageMethod.CC,
-            **window_settings(experiment.retrieval),
+            **window_settings(retrieval),
         )
         true = truth_at_vectors(wind, truth.wind)
         v, w = (wind[name].values - true[name].values for name in ("v", "w"))

@@ -10,24 +10,25 @@ from lidar_mi.errors import InputError
 from lidar_mi.experiment.input_files import find_file
 from lidar_mi.experiment.schema.experiment import Experiment
 from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.sensor import Sensor
 from lidar_mi.instrument.beams import Beams, steered_beams
+from lidar_mi.instrument.doppler import DopplerLidar
 from lidar_mi.instrument.motion import ANGLES, PLACES, Motion, Pose, trajectory, true_pose
 from lidar_mi.instrument.reported import Reported, reported_pose
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.instrument.scan_timing import Directions, ScanTiming, Schedule
 from lidar_mi.io.timed_table import read_timed_table
 
 
-def is_steady(experiment: Experiment) -> bool:
+def is_steady(platform: Platform) -> bool:
     """Whether the platform flies straight and its pose is known."""
-    platform = experiment.platform
     return (platform.motion or Motion()) == Motion() and (
         platform.reported or Reported()
     ) == Reported()
 
 
 def timed_plans(
-    experiment: Experiment, plans: Sequence[ScanPlan], beside: str | Path
+    scan: Scan, platform: Platform, seed: int, plans: Sequence[ScanPlan], search_path: Path
 ) -> list[ScanPlan]:
     """The plans of both scans with their beams; as they are where nothing takes time or moves.
 
@@ -37,21 +38,22 @@ def timed_plans(
         A table or trajectory that cannot be used, a scan longer than the time between the scans,
         a scanner beyond its limits, a pose from which the slab is not reached.
     """
-    scan, platform = experiment.scan, experiment.platform
-    if (scan.timing is None or scan.timing.is_instant) and is_steady(experiment):
+    if (scan.timing is None or scan.timing.is_instant) and is_steady(platform):
         return list(plans)
     by_angle = scan.aim == "angles"
-    pose_at = _poses(experiment, beside)
+    pose_at = _poses(platform, seed, search_path)
     found = []
     for number, plan in enumerate(plans):
-        schedule = scan_schedule(experiment, plan, beside)
+        schedule = scan_schedule(scan, plan, search_path)
         _fits("scan.timing", schedule, platform.dt, "platform.dt")
-        jitter = np.random.default_rng([experiment.seed, 3, 4, number + 1])
+        jitter = np.random.default_rng([seed, 3, 4, number + 1])
         found.append(
             replace(
                 plan,
                 beams=_beams(
-                    experiment,
+                    scan,
+                    platform,
+                    seed,
                     pose_at,
                     number,
                     schedule,
@@ -65,31 +67,37 @@ def timed_plans(
     return found
 
 
-def scan_schedule(experiment: Experiment, plan: ScanPlan, beside: str | Path) -> Schedule:
+def scan_schedule(scan: Scan, plan: ScanPlan, search_path: Path) -> Schedule:
     """Times and nominal places of the beams of a scan of the backscatter lidar."""
-    scan = experiment.scan
     return _schedule(
-        scan.timing, "scan.timing", plan.y, plan.z, plan.centre, scan.aim == "angles", beside
+        scan.timing, "scan.timing", plan.y, plan.z, plan.centre, scan.aim == "angles", search_path
     )
 
 
-def pulse_train(experiment: Experiment, plan: ScanPlan, beside: str | Path) -> tuple[int, float]:
+def pulse_train(scan: Scan, plan: ScanPlan, search_path: Path) -> tuple[int, float]:
     """Pulses of a beam and their rate while they are sent, Hz; a rate of 0 is not known."""
-    if experiment.scan.timing is None:
+    if scan.timing is None:
         return 1, 0.0
-    pulses = experiment.scan.pulses_per_beam
-    rate = pulses * scan_schedule(experiment, plan, beside).beam_rate
+    pulses = scan.pulses_per_beam
+    rate = pulses * scan_schedule(scan, plan, search_path).beam_rate
     return pulses, rate if np.isfinite(rate) else 0.0
 
 
-def lines_schedule(experiment: Experiment, beside: str | Path) -> Schedule:
+def lines_schedule(sensor: Sensor, doppler_lidar: DopplerLidar, search_path: Path) -> Schedule:
     """Times of the Doppler lidar's lines of sight, and their places in the plane of its range."""
-    sensor, distance = experiment.sensor, experiment.doppler.lidar.range
+    distance = doppler_lidar.range
     y, z = (distance * nodes for nodes in sensor.directions.nodes())
-    return _schedule(sensor.timing, "sensor.timing", y, z, distance, True, beside)
+    return _schedule(sensor.timing, "sensor.timing", y, z, distance, True, search_path)
 
 
-def line_beams(experiment: Experiment, beside: str | Path) -> Beams | None:
+def line_beams(
+    sensor: Sensor,
+    doppler_lidar: DopplerLidar,
+    scan: Scan,
+    platform: Platform,
+    seed: int,
+    search_path: Path,
+) -> Beams | None:
     """Beams of the Doppler lidar's lines of sight, about the first scan's reference time.
 
     None where nothing takes time or moves.
@@ -99,26 +107,27 @@ def line_beams(experiment: Experiment, beside: str | Path) -> Beams | None:
     InputError
         As `timed_plans`.
     """
-    sensor = experiment.sensor
-    if (sensor.timing is None or sensor.timing.is_instant) and is_steady(experiment):
+    if (sensor.timing is None or sensor.timing.is_instant) and is_steady(platform):
         return None
-    schedule = lines_schedule(experiment, beside)
+    schedule = lines_schedule(sensor, doppler_lidar, search_path)
     _fits("sensor.timing", schedule, 1 / sensor.slabs_per_second, "1 / sensor.slabs_per_second")
     # of a scanner of its own
-    jitter = np.random.default_rng([experiment.seed, 3, 5, 1])
+    jitter = np.random.default_rng([seed, 3, 5, 1])
     return _beams(
-        experiment,
-        _poses(experiment, beside),
+        scan,
+        platform,
+        seed,
+        _poses(platform, seed, search_path),
         0,
         schedule,
-        experiment.doppler.lidar.range,
+        doppler_lidar.range,
         0.0,
         True,
         jitter,
     )
 
 
-def timing_files(experiment: Experiment, beside: str | Path) -> dict[str, Path]:
+def timing_files(experiment: Experiment, search_path: str | Path) -> dict[str, Path]:
     """Files of directions and of the trajectory, by the keys that name them."""
     motion, sensor = experiment.platform.motion, experiment.sensor
     named = {
@@ -126,7 +135,7 @@ def timing_files(experiment: Experiment, beside: str | Path) -> dict[str, Path]:
         "sensor.timing.table": sensor and sensor.timing and sensor.timing.table,
         "platform.motion.trajectory": motion and motion.trajectory,
     }
-    return {key: find_file(name, beside, key) for key, name in named.items() if name}
+    return {key: find_file(name, search_path, key) for key, name in named.items() if name}
 
 
 def _schedule(
@@ -136,19 +145,19 @@ def _schedule(
     z: np.ndarray,
     distance: float,
     by_angle: bool,
-    beside: str | Path,
+    search_path: Path,
 ) -> Schedule:
     if timing is None:
         timing = ScanTiming(pattern="serpentine", duration=0.0)
-    table = _directions(timing.table, f"{key}.table", beside) if timing.table else None
+    table = _directions(timing.table, f"{key}.table", search_path) if timing.table else None
     try:
         return timing.schedule(y, z, distance, by_angle=by_angle, table=table)
     except InputError as error:
         raise InputError(f"{key}.{error}") from None
 
 
-def _directions(name: str, key: str, beside: str | Path) -> Directions:
-    path = find_file(name, beside, key)
+def _directions(name: str, key: str, search_path: Path) -> Directions:
+    path = find_file(name, search_path, key)
     columns = read_timed_table(path, {"azimuth": "rad", "elevation": "rad"})
     for missing in {"azimuth", "elevation"} - set(columns):
         raise InputError(f"{path}: {missing} missing; expected columns t, azimuth, elevation")
@@ -163,21 +172,20 @@ def _fits(key: str, schedule: Schedule, interval: float, name: str) -> None:
         )
 
 
-def _poses(experiment: Experiment, beside: str | Path) -> Callable[[np.ndarray], Pose]:
+def _poses(platform: Platform, seed: int, search_path: Path) -> Callable[[np.ndarray], Pose]:
     """The true pose at times since the first scan's reference time."""
-    platform = experiment.platform
     motion = platform.motion or Motion()
     flown = None
     if motion.trajectory:
         key = "platform.motion.trajectory"
-        path = find_file(motion.trajectory, beside, key)
+        path = find_file(motion.trajectory, search_path, key)
         columns = read_timed_table(path, dict.fromkeys(PLACES, "m") | dict.fromkeys(ANGLES, "rad"))
         flown = trajectory(columns, platform.speed, path.name)
         _flies(platform, columns, path.name)
 
     def pose_at(time: np.ndarray) -> Pose:
         try:
-            return true_pose(motion, time, platform.speed, experiment.seed, flown)
+            return true_pose(motion, time, platform.speed, seed, flown)
         except InputError as error:
             raise InputError(f"platform.motion.trajectory: {error}") from None
 
@@ -198,31 +206,30 @@ def _flies(platform: Platform, columns: dict[str, np.ndarray], source: str) -> N
 
 
 def _beams(
-    experiment: Experiment,
+    scan: Scan,
+    platform: Platform,
+    seed: int,
     pose_at: Callable[[np.ndarray], Pose],
-    scan: int,
+    number: int,
     schedule: Schedule,
     distance: float,
     position: float,
     body_fixed: bool,
     random: np.random.Generator,
 ) -> Beams:
-    platform = experiment.platform
-    clock = scan * platform.dt + schedule.time
-    true = told = pose_at(clock)
+    clock = number * platform.dt + schedule.time
+    true = reported = pose_at(clock)
     if platform.reported is not None and platform.reported != Reported():
-        told = reported_pose(
-            platform.reported, pose_at, clock, platform.speed, experiment.seed, scan
-        )
+        reported = reported_pose(platform.reported, pose_at, clock, platform.speed, seed, number)
     try:
         return steered_beams(
             schedule.time,
             schedule.places,
             distance,
             position,
-            platform.speed - experiment.scan.follow,
+            platform.speed - scan.follow,
             true,
-            told,
+            reported,
             body_fixed=body_fixed,
             jitter=platform.motion.scanner_jitter if platform.motion else 0.0,
             random=random,

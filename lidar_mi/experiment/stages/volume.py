@@ -16,12 +16,15 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.names import Source
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.rendering import environment_extinction
 from lidar_mi.experiment.truth.flows import Flows
 from lidar_mi.instrument.attenuated_backscatter import attenuated_backscatter
+from lidar_mi.instrument.detector import Detector
 from lidar_mi.instrument.lidar import BackscatterLidar
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.images.common_grid import resample
 from lidar_mi.retrieval.images.windows import Windows
 from lidar_mi.retrieval.wind.volume import retrieve_wind_volume
@@ -43,7 +46,9 @@ class Volumes:
     noise: dict[str, xr.DataArray]
 
 
-def check_volume(experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan]) -> None:
+def check_volume(
+    wake: Wake, scan: Scan, volume: Volume, flows: Flows, plans: Sequence[ScanPlan]
+) -> None:
     """Check that a wind in three dimensions can be retrieved.
 
     Raises
@@ -54,13 +59,13 @@ def check_volume(experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan]
     """
     if "u" not in flows[0]:
         raise InputError("wake.file: no wind along x (u) in it; expected u, v and w for volume")
-    _check_gates(experiment, flows[0])
-    settings, shape = experiment.volume, tuple(map(len, grid(experiment, plans)))
-    Windows(shape, settings.template, settings.search, settings.stride)
+    _check_gates(scan, flows[0])
+    shape = tuple(map(len, grid(wake, scan, plans)))
+    Windows(shape, volume.template, volume.search, volume.stride)
 
 
-def _check_gates(experiment: Experiment, flow: xr.Dataset) -> None:
-    scan, x = experiment.scan, flow["x"].values
+def _check_gates(scan: Scan, flow: xr.Dataset) -> None:
+    x = flow["x"].values
     half = (x[1] - x[0]) / 2
     if scan.range < x[0] - half or scan.range + scan.thickness > x[-1] + half:
         raise InputError(
@@ -70,12 +75,12 @@ def _check_gates(experiment: Experiment, flow: xr.Dataset) -> None:
         )
 
 
-def grid(experiment: Experiment, plans: Sequence[ScanPlan]) -> tuple[np.ndarray, ...]:
+def grid(wake: Wake, scan: Scan, plans: Sequence[ScanPlan]) -> tuple[np.ndarray, ...]:
     """Nodes x, z, y (m) of the volumes: middles of the gates at t1, and what all gates cover.
 
     Along z and y whole multiples of wake.spacing, inside the beams of the nearest gate.
     """
-    scan, spacing = experiment.scan, experiment.wake.spacing
+    spacing = wake.spacing
     edges = np.linspace(0, scan.thickness, scan.gate_count + 1)
     x = scan.range + (edges[1:] + edges[:-1]) / 2
     nodes = [x]
@@ -166,13 +171,18 @@ def noise_map(error: np.ndarray, plan: ScanPlan, nodes: tuple[np.ndarray, ...]) 
 
 
 def scan_volumes(
-    experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan], scans: Sequence[xr.Dataset]
+    wake: Wake,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector | None,
+    volume: Volume,
+    plans: Sequence[ScanPlan],
+    scans: Sequence[xr.Dataset],
 ) -> Volumes:
     """Both scans as volumes on one grid in the air, without and with a detector's noise."""
-    lidar, nodes = experiment.lidar, grid(experiment, plans)
-    way = environment_extinction(experiment)
+    nodes, way = grid(wake, scan, plans), environment_extinction(wake)
 
-    def volume(number: int, s0: xr.DataArray) -> xr.DataArray:
+    def of_scan(number: int, s0: xr.DataArray) -> xr.DataArray:
         return scan_volume(s0, plans[number], lidar, way, nodes)
 
     def level(error: xr.DataArray) -> xr.DataArray:
@@ -182,15 +192,23 @@ def scan_volumes(
         return noise_map(error, plans[0], nodes)
 
     first = scans[0]
-    pairs = {Source.BACKSCATTER: [volume(k, scan["S0"]) for k, scan in enumerate(scans)]}
+    pairs = {Source.BACKSCATTER: [of_scan(k, one["S0"]) for k, one in enumerate(scans)]}
     noise = {Source.BACKSCATTER: level(first["S0_stderr"])}
-    if experiment.detector:
-        pairs[Source.NOISY] = [volume(k, scan["S0_noisy"]) for k, scan in enumerate(scans)]
+    if detector:
+        pairs[Source.NOISY] = [of_scan(k, one["S0_noisy"]) for k, one in enumerate(scans)]
         noise[Source.NOISY] = level(np.hypot(first["S0_stderr"], first["S0_noise_std"]))
     return Volumes(pairs, noise)
 
 
-def volume_winds(experiment: Experiment, flows: Flows, volumes: Volumes, *, log: Log) -> xr.Dataset:
+def volume_winds(
+    name: str,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume,
+    flows: Flows,
+    volumes: Volumes,
+    log: Log,
+) -> xr.Dataset:
     """Winds by every method from every pair of volumes, with the truth at their places.
 
     Returns
@@ -198,35 +216,34 @@ def volume_winds(experiment: Experiment, flows: Flows, volumes: Volumes, *, log:
     xr.Dataset, dims (source, algorithm, x, z, y)
         The variables of `retrieve_wind_volume` and ``u_true``, ``v_true``, ``w_true`` (m s^-1).
     """
-    settings = experiment.volume
     sources = []
     for source, pair in volumes.pairs.items():
         methods = []
-        for number, method in enumerate(settings.methods):
+        for number, method in enumerate(volume.methods):
             log(f"retrieving winds from {source.replace('_', ' ')} by {method}")
-            log.bar(f"retrieving winds by {method}", number / len(settings.methods))
+            log.bar(f"retrieving winds by {method}", number / len(volume.methods))
             methods.append(
                 retrieve_wind_volume(
                     *pair,
-                    experiment.platform.dt,
+                    platform.dt,
                     method,
-                    settings.template,
-                    settings.search,
-                    settings.stride,
-                    min_correlation=settings.min_correlation,
+                    volume.template,
+                    volume.search,
+                    volume.stride,
+                    min_correlation=volume.min_correlation,
                     noise=volumes.noise[source],
                 )
             )
         sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
     found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
-    found = found.assign_coords(source=list(volumes.pairs), algorithm=list(settings.methods))
+    found = found.assign_coords(source=list(volumes.pairs), algorithm=list(volume.methods))
     # the gates move with the mean wind, which is 0 in their frame
     about = found["u"].attrs
-    found["u"] = (found["u"] + experiment.scan.follow).assign_attrs(about)
-    for name, values in true_wind(flows[0], found).items():
-        found[f"{name}_true"] = values
+    found["u"] = (found["u"] + scan.follow).assign_attrs(about)
+    for component, values in true_wind(flows[0], found).items():
+        found[f"{component}_true"] = values
     found.attrs |= {
-        "title": f"Wind in three dimensions of the experiment {experiment.name}",
+        "title": f"Wind in three dimensions of the experiment {name}",
         "source": f"lidar-mi {__version__}",
     }
     return found

@@ -12,9 +12,13 @@ import xarray as xr
 from lidar_mi.assessment.metrics.vortices import ORIGIN_NAMES, Origin
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.retrieval import Retrieval
+from lidar_mi.experiment.schema.sensor import Sensor
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.stages.winds import common_error, pixel_times, rendered_pairs
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.detector import Detector
+from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.lines.combine import CombinedFlag
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST
 from lidar_mi.retrieval.vortices.image_fit import fit_vortices
@@ -41,7 +45,7 @@ class VortexFits:
     method: str | None = None
 
 
-def combined_vectors(experiment: Experiment, wind3d: xr.Dataset | None) -> xr.Dataset | None:
+def combined_vectors(sensor: Sensor, wind3d: xr.Dataset | None) -> xr.Dataset | None:
     """Cross-flow wind of both lidars, with the flags of v and w; None: there is none."""
     if wind3d is None:
         return None
@@ -49,39 +53,44 @@ def combined_vectors(experiment: Experiment, wind3d: xr.Dataset | None) -> xr.Da
     return wind3d.assign(flag=wind3d["flag"] & CombinedFlag.NO_CROSSFLOW.value)
 
 
-def image_vectors(experiment: Experiment, wind: xr.Dataset) -> xr.Dataset | None:
+def image_vectors(retrieval: Retrieval, wind: xr.Dataset) -> xr.Dataset | None:
     """Cross-flow wind of the experiment's most accurate method, None where there is none."""
-    method = vectors_method(experiment)
+    method = vectors_method(None, retrieval)
     if method is None:
         return None
     found = wind.isel(source=-1).sel(algorithm=method)
     return found.set_coords(["y_vector", "z_vector"])
 
 
-def vectors_method(experiment: Experiment) -> str | None:
+def vectors_method(sensor: Sensor | None, retrieval: Retrieval) -> str | None:
     """Method whose vectors a vortex pair is fitted to; None where all methods fit vortices."""
-    if experiment.sensor:
-        return experiment.sensor.method
-    return next((m for m in MOST_ACCURATE_FIRST if m in experiment.retrieval.methods), None)
+    if sensor:
+        return sensor.method
+    return next((m for m in MOST_ACCURATE_FIRST if m in retrieval.methods), None)
 
 
 def fit_pairs(
-    experiment: Experiment,
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    detector: Detector | None,
+    retrieval: Retrieval,
+    sensor: Sensor | None,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
     vectors: xr.Dataset | None,
-    *,
     log: Log,
 ) -> VortexFits:
     """Vortex pairs from the images and from the vectors, where there are or should be some."""
-    with_vectors = bool(experiment.sensor) or vectors is not None
-    method = vectors_method(experiment) if with_vectors else None
+    with_vectors = sensor is not None or vectors is not None
+    method = vectors_method(sensor, retrieval) if with_vectors else None
     log(f"fitting vortex pairs to the images{f' and to the vectors by {method}' if method else ''}")
-    pair, noise = list(rendered_pairs(experiment, scans).values())[-1]
-    times, (common, rotation) = pixel_times(experiment, scans), common_error(experiment, plans)
+    pair, noise = list(rendered_pairs(wake, scan, detector, scans).values())[-1]
+    times = pixel_times(wake, scan, scans)
+    common, rotation = common_error(retrieval, platform, plans)
     ways = {
         Origin.IMAGES: lambda: fit_vortices(
-            *pair, experiment.platform.dt, noise, times=times
+            *pair, platform.dt, noise, times=times
         ).with_common_error(common, common, rotation)
     }
     if with_vectors:

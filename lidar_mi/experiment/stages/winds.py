@@ -10,11 +10,14 @@ from lidar_mi import __version__
 from lidar_mi.assessment.metrics.errors import commonest_flag, truth_at_vectors
 from lidar_mi.assessment.metrics.names import EXACT, RENDERED, Source
 from lidar_mi.experiment.log import Log
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
 from lidar_mi.experiment.schema.retrieval import Retrieval
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.blur import blur_by_beam
 from lidar_mi.experiment.truth.extinction import Truth
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.detector import Detector
+from lidar_mi.instrument.lidar import BackscatterLidar
+from lidar_mi.instrument.scan import Scan, ScanPlan
 from lidar_mi.retrieval.common_error import with_common_error
 from lidar_mi.retrieval.images.common_grid import resample_pair
 from lidar_mi.retrieval.images.resampling_error import flag_resampled
@@ -28,7 +31,7 @@ _OF_TEMPLATES = (ImageMethod.CC, ImageMethod.MULTIPASS)
 """Methods that find each vector by itself; below that fraction, chance correlations are many."""
 
 
-def check_windows(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan]) -> None:
+def check_windows(retrieval: Retrieval, plans: Sequence[ScanPlan]) -> None:
     """Check that windows fit into the images.
 
     Raises
@@ -36,16 +39,21 @@ def check_windows(experiment: Experiment, truth: Truth, plans: Sequence[ScanPlan
     InputError
         A search region larger than the images.
     """
-    settings, image = experiment.retrieval, (len(plans[0].z), len(plans[0].y))
-    Windows(image, settings.template, settings.search, settings.stride)
+    image = len(plans[0].z), len(plans[0].y)
+    Windows(image, retrieval.template, retrieval.search, retrieval.stride)
 
 
 def cross_flow_winds(
-    experiment: Experiment,
+    name: str,
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector | None,
+    retrieval: Retrieval,
     truth: Truth,
     plans: Sequence[ScanPlan],
     scans: Sequence[xr.Dataset],
-    *,
     log: Log,
 ) -> xr.Dataset:
     """Winds by every method from every image pair, with the truth at their places.
@@ -61,24 +69,24 @@ def cross_flow_winds(
         ``v_true``, ``w_true`` and, from `wind_bound`, ``v_bound``, ``w_bound`` (m s^-1).
     """
     log("retrieving winds")
-    _warn_of_wide_beams(experiment, truth, plans, log)
-    settings, blur = experiment.retrieval, known_blur(experiment, plans[0])
-    pairs, times = _image_pairs(experiment, truth, plans, scans), pixel_times(experiment, scans)
-    lost = resampled_noise(experiment, scans)
+    _warn_of_wide_beams(lidar, retrieval, truth, plans, log)
+    blur, times = known_blur(retrieval, lidar, plans[0]), pixel_times(wake, scan, scans)
+    pairs = _image_pairs(wake, scan, lidar, detector, retrieval, truth, plans, scans)
+    lost = resampled_noise(scans)
     sources, said = [], set()
     for index, (source, (pair, noise)) in enumerate(pairs.items()):
         log.bar(f"retrieving winds from {source.replace('_', ' ')}", index / len(pairs))
-        sizes = {name: getattr(settings, name) for name in ("template", "search", "stride")}
+        sizes = {key: getattr(retrieval, key) for key in ("template", "search", "stride")}
         # the truth's images are photographs
         seen = times if source in RENDERED else None
-        bound = wind_bound(*pair, experiment.platform.dt, noise, **sizes, times=seen)
+        bound = wind_bound(*pair, platform.dt, noise, **sizes, times=seen)
         methods = []
-        for method in settings.methods:
+        for method in retrieval.methods:
             wind = retrieve_wind(
                 *pair,
-                dt=experiment.platform.dt,
+                dt=platform.dt,
                 method=method,
-                **window_settings(settings),
+                **window_settings(retrieval),
                 noise=noise,
                 times=seen,
                 # the extinction itself has passed no instrument
@@ -95,11 +103,13 @@ def cross_flow_winds(
                 log.remark(f"{source}: {wind.attrs['illumination']} between the images")
             if source in lost:
                 wind = flag_resampled(wind, *lost[source])
-            if settings.pointing.stderr or settings.pointing.roll:
-                common = common_error(experiment, plans) if source in RENDERED else (0.0, 0.0)
-                wind = with_common_error(wind, common[0], settings.pointing.offset, common[1])
+            if retrieval.pointing.stderr or retrieval.pointing.roll:
+                common = (0.0, 0.0)
+                if source in RENDERED:
+                    common = common_error(retrieval, platform, plans)
+                wind = with_common_error(wind, common[0], retrieval.pointing.offset, common[1])
             wind = wind.assign(
-                {name: (field.dims, field.data, field.attrs) for name, field in bound.items()}
+                {key: (field.dims, field.data, field.attrs) for key, field in bound.items()}
             )
             true = truth_at_vectors(wind, truth.wind)
             wind = wind.assign(v_true=true["v"], w_true=true["w"])
@@ -107,30 +117,38 @@ def cross_flow_winds(
             methods.append(wind.reset_coords(["y_vector", "z_vector"]))
         sources.append(xr.concat(methods, "algorithm", combine_attrs="drop_conflicts"))
     found = xr.concat(sources, "source", combine_attrs="drop_conflicts")
-    found = found.assign_coords(source=list(pairs), algorithm=list(settings.methods))
+    found = found.assign_coords(source=list(pairs), algorithm=list(retrieval.methods))
     found["score"].attrs = {
-        "long_name": "; ".join(f"{name}: {METHODS[name].score[1]}" for name in settings.methods),
+        "long_name": "; ".join(f"{one}: {METHODS[one].score[1]}" for one in retrieval.methods),
         "units": "1",
     }
-    found.attrs["title"] = f"Cross-flow wind of the experiment {experiment.name}"
+    found.attrs["title"] = f"Cross-flow wind of the experiment {name}"
     found.attrs["source"] = f"lidar-mi {__version__}"
     for text in vector_remarks(found):
         log.remark(text)
     return found
 
 
-def _image_pairs(experiment, truth, plans, scans) -> dict[str, tuple[list[xr.DataArray], Any]]:
+def _image_pairs(
+    wake: Wake,
+    scan: Scan,
+    lidar: BackscatterLidar,
+    detector: Detector | None,
+    retrieval: Retrieval,
+    truth: Truth,
+    plans: Sequence[ScanPlan],
+    scans: Sequence[xr.Dataset],
+) -> dict[str, tuple[list[xr.DataArray], Any]]:
     """Both images and their noise by source: of the truth, then of the lidar."""
-    lidar = experiment.lidar
-    if experiment.retrieval.sources == "measured":
-        return dict([rendered_pairs(experiment, scans).popitem()])
+    rendered = rendered_pairs(wake, scan, detector, scans)
+    if retrieval.sources == "measured":
+        return dict([rendered.popitem()])
     exact = {
         Source.EXTINCTION: [truth.image(k) for k in (0, 1)],
         Source.WITHOUT_TEXTURE: [truth.image(k, smooth=True) for k in (0, 1)],
         Source.BLURRED: [blur_by_beam(truth.image(k), lidar, plans[k].centre) for k in (0, 1)],
     }
-    rendered = rendered_pairs(experiment, scans)
-    if experiment.scan.aim == "angles":
+    if scan.aim == "angles":
         grid = rendered[Source.BACKSCATTER][0][0]
         exact = {
             name: [image.interp(y=grid["y"], z=grid["z"]) for image in pair]
@@ -140,33 +158,29 @@ def _image_pairs(experiment, truth, plans, scans) -> dict[str, tuple[list[xr.Dat
 
 
 def rendered_pairs(
-    experiment: Experiment, scans: Sequence[xr.Dataset]
+    wake: Wake, scan: Scan, detector: Detector | None, scans: Sequence[xr.Dataset]
 ) -> dict[str, tuple[list[xr.DataArray], Any]]:
     """Images that winds are retrieved from, on one grid, and their noise (a map or its level).
 
     By source: the rendered backscatter, and with a detector the same with its noise.
     """
     noise = attenuated_backscatter_stderr(scans[0])
-    pairs = {
-        Source.BACKSCATTER: ([scan["Y"] for scan in scans], with_resampling(noise, scans, "Y"))
-    }
-    if experiment.detector:
+    pairs = {Source.BACKSCATTER: ([one["Y"] for one in scans], with_resampling(noise, scans, "Y"))}
+    if detector:
         noisy = np.hypot(noise, scans[0]["Y_noise_std"])
         noisy = with_resampling(noisy, scans, "Y_noisy")
-        pairs[Source.NOISY] = [scan["Y_noisy"] for scan in scans], noisy
-    if experiment.scan.aim == "angles":
+        pairs[Source.NOISY] = [one["Y_noisy"] for one in scans], noisy
+    if scan.aim == "angles":
         # noise cannot be interpolated: its rms level is used, as a few pixels have most of it
         # where photons are few
         pairs = {
-            name: (resample_pair(*pair, experiment.wake.spacing), float((level**2).mean() ** 0.5))
+            name: (resample_pair(*pair, wake.spacing), float((level**2).mean() ** 0.5))
             for name, (pair, level) in pairs.items()
         }
     return pairs
 
 
-def resampled_noise(
-    experiment: Experiment, scans: Sequence[xr.Dataset]
-) -> dict[str, tuple[xr.DataArray, xr.DataArray]]:
+def resampled_noise(scans: Sequence[xr.Dataset]) -> dict[str, tuple[xr.DataArray, xr.DataArray]]:
     """Noise of images of scattered beams without and with what resampling adds, by source."""
     noise, found = attenuated_backscatter_stderr(scans[0]), {}
     if "Y_resampling_std" in scans[0]:
@@ -187,16 +201,16 @@ def with_resampling(noise: xr.DataArray, scans: Sequence[xr.Dataset], name: str)
     return np.sqrt(noise**2 + added)
 
 
-def pixel_times(experiment: Experiment, scans: Sequence[xr.Dataset]) -> list[xr.DataArray] | None:
+def pixel_times(wake: Wake, scan: Scan, scans: Sequence[xr.Dataset]) -> list[xr.DataArray] | None:
     """Times of the pixels of `rendered_pairs`, as `retrieve_wind` takes them.
 
     None: all pixels of a scan show the air of its reference time.
     """
-    if any("beam_time" not in scan or scan.attrs.get("frozen_air") for scan in scans):
+    if any("beam_time" not in one or one.attrs.get("frozen_air") for one in scans):
         return None
-    times = [scan["beam_time"] for scan in scans]
-    if experiment.scan.aim == "angles":
-        times = list(resample_pair(times[0], times[1], experiment.wake.spacing))
+    times = [one["beam_time"] for one in scans]
+    if scan.aim == "angles":
+        times = list(resample_pair(times[0], times[1], wake.spacing))
     return times
 
 
@@ -207,18 +221,20 @@ def attenuated_backscatter_stderr(scan: xr.Dataset) -> xr.DataArray:
     return (scan["Y"] * first["S0_stderr"] / first["S0"].where(lit)).fillna(0.0)
 
 
-def known_blur(experiment: Experiment, plan: ScanPlan) -> float:
+def known_blur(retrieval: Retrieval, lidar: BackscatterLidar, plan: ScanPlan) -> float:
     """Standard deviation (m) of the blur that `retrieval.blur` states for the methods."""
-    blur = experiment.retrieval.blur
-    return float(experiment.lidar.radius_at(plan.centre)) / 2 if blur == "beam" else blur
+    blur = retrieval.blur
+    return float(lidar.radius_at(plan.centre)) / 2 if blur == "beam" else blur
 
 
-def common_error(experiment: Experiment, plans: Sequence[ScanPlan]) -> tuple[float, float]:
+def common_error(
+    retrieval: Retrieval, platform: Platform, plans: Sequence[ScanPlan]
+) -> tuple[float, float]:
     """Standard errors that all vectors share by the pointing between scans.
 
     Of v and of w (m/s), and of a rotation about the axis of roll (rad/s).
     """
-    pointing, dt = experiment.retrieval.pointing, experiment.platform.dt
+    pointing, dt = retrieval.pointing, platform.dt
     distance = sum(plan.centre for plan in plans) / len(plans)
     return pointing.stderr * distance / dt, pointing.roll / dt
 
@@ -228,10 +244,12 @@ def window_settings(settings: Retrieval) -> dict[str, Any]:
     return settings.model_dump(exclude={"methods", "error_budget", "blur", "sources", "pointing"})
 
 
-def _warn_of_wide_beams(experiment, truth, plans, log) -> None:
-    width = 2 * float(experiment.lidar.radius_at(plans[0].centre))
+def _warn_of_wide_beams(
+    lidar: BackscatterLidar, retrieval: Retrieval, truth: Truth, plans: Sequence[ScanPlan], log: Log
+) -> None:
+    width = 2 * float(lidar.radius_at(plans[0].centre))
     y = truth.wind["y"].values
-    template = experiment.retrieval.template * float(y[1] - y[0])
+    template = retrieval.template * float(y[1] - y[0])
     if width > template:
         log.remark(
             f"beams are {width:.3g} m wide at {plans[0].centre:g} m, wider than a template of "

@@ -4,8 +4,12 @@ import numpy as np
 import xarray as xr
 from scipy import constants, stats
 
+from lidar_mi.instrument.lidar import BackscatterLidar
 
-def blur_by_beam(image: xr.DataArray, lidar, distance: float, depth: float = 0.0) -> xr.DataArray:
+
+def blur_by_beam(
+    image: xr.DataArray, lidar: BackscatterLidar, distance: float, depth: float = 0.0
+) -> xr.DataArray:
     """An image averaged over beams of finite width, aimed at its nodes, at a distance.
 
     Between nodes the air varies linearly, as the renderer's grid does. A beam is a Gaussian with
@@ -17,7 +21,7 @@ def blur_by_beam(image: xr.DataArray, lidar, distance: float, depth: float = 0.0
     costs less than 0.1 % of a pixel on textured air: the aperture's truncation beyond its variance,
     and that smear where ``depth`` is 0 (500 m, gates of 2.5 m; at 150 m it is wider than the beam).
     """
-    metres = lidar.radius_at(distance) / 2
+    metres = float(lidar.radius_at(distance)) / 2
     steps, weights = _depths(lidar, depth)
     total = 0.0
     for step, weight in zip(steps, weights, strict=True):
@@ -29,7 +33,7 @@ def blur_by_beam(image: xr.DataArray, lidar, distance: float, depth: float = 0.0
     return image.copy(data=total)
 
 
-def _depths(lidar, depth: float) -> tuple[np.ndarray, np.ndarray]:
+def _depths(lidar: BackscatterLidar, depth: float) -> tuple[np.ndarray, np.ndarray]:
     """Positions along a gate from its middle, m, and their fractions of the light from it."""
     if not depth > 0:
         return np.zeros(1), np.ones(1)

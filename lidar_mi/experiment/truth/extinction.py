@@ -11,9 +11,13 @@ from lidar_mi.arguments import checked_arguments
 from lidar_mi.atmosphere.extinction import extinction_from_speed, extinction_from_tracer
 from lidar_mi.atmosphere.texture import corrsin_obukhov
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.wake import ExtinctionMapping
-from lidar_mi.experiment.truth.flows import Advection, Flows, advection_by, mean_flow, read_flows
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import ExtinctionMapping, Wake
+from lidar_mi.experiment.truth.flows import Advection, Flows, advection_by, flows_of, mean_flow
+from lidar_mi.instrument.scan import Scan
 
 
 @dataclass(frozen=True)
@@ -74,26 +78,44 @@ def make_truth(
     """
     if experiment.wake is None:
         raise InputError(f"wake: missing in {experiment.name}; expected the section of a wake")
-    beside = experiment.folder if beside is None else beside
-    first, second = flows or read_flows(experiment, beside)
-    mapping = experiment.wake.extinction
+    if flows is None:
+        flows = flows_of(experiment, None if beside is None else Path(beside))
+    return call(true_air, experiment, flows=flows, advected=advected)
+
+
+def true_air(
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    seed: int,
+    flows: Flows,
+    *,
+    advected: Advection | None = None,
+) -> Truth:
+    """As `make_truth`.
+
+    Parameters
+    ----------
+    flows
+        From `read_flows`.
+    advected : callable, optional
+        From `advection_by` the same flows.
+    """
+    first, second = flows
+    mapping = wake.extinction
     smooth1 = extinction_of(first, mapping, first, second)
     flow = mean_flow((first, second))
-    advected = advected or advection_by(experiment, (first, second))
+    advected = advected or advection_by(wake, platform, scan, volume, flows)
     if second is None:
         smooth2 = advected(smooth1)
     else:
         smooth2 = extinction_of(second, mapping, first, second)
-    texture = experiment.wake.texture
+    texture = wake.texture
     if texture.rms > 0:
         x = first["x"].values if first.sizes["x"] > 1 else None
         factor = corrsin_obukhov(
-            first["y"].values,
-            first["z"].values,
-            texture.rms,
-            texture.outer_scale,
-            experiment.seed,
-            x=x,
+            first["y"].values, first["z"].values, texture.rms, texture.outer_scale, seed, x=x
         )
         if x is None:
             factor = factor.expand_dims(x=first["x"].values)
@@ -107,15 +129,17 @@ def make_truth(
     else:
         rough1, rough2 = smooth1, smooth2
     # winds are retrieved from the first gate
-    depth = experiment.scan.thickness / experiment.scan.gate_count
-    gates = (experiment.scan.range, experiment.scan.range + depth)
+    depth = scan.thickness / scan.gate_count
+    gates = (scan.range, scan.range + depth)
     components = [name for name in ("u", "v", "w") if name in flow]
     wind = xr.Dataset({name: slab_mean(flow[name], gates) for name in components})
     wind.attrs["gates"] = gates
-    rough, smooth = (
-        tuple(field.copy(data=field.values + mapping.molecules) for field in pair)
-        for pair in ((rough1, rough2), (smooth1, smooth2))
-    )
+
+    def with_molecules(field: xr.DataArray) -> xr.DataArray:
+        return field.copy(data=field.values + mapping.molecules)
+
+    rough = with_molecules(rough1), with_molecules(rough2)
+    smooth = with_molecules(smooth1), with_molecules(smooth2)
     return Truth(rough, smooth, wind)
 
 

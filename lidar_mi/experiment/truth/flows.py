@@ -4,6 +4,7 @@ import functools
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import xarray as xr
@@ -13,10 +14,15 @@ from lidar_mi.atmosphere.turbine import TurbineWake, turbine_flow
 from lidar_mi.atmosphere.vortex import pair_wake, vortex_pair
 from lidar_mi.atmosphere.wake import centre, check_nodes, resample
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.graph import Guard, call
 from lidar_mi.experiment.input_files import find_file
-from lidar_mi.experiment.memory import most_nodes
+from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.memory import Footprint
 from lidar_mi.experiment.schema.experiment import Experiment
-from lidar_mi.experiment.schema.wake import Wake
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Turbine, Wake
+from lidar_mi.instrument.scan import Scan
 from lidar_mi.io.wake_file import read_wake
 
 Flows = tuple[xr.Dataset, xr.Dataset | None]
@@ -29,21 +35,23 @@ def mean_flow(flows: Flows) -> xr.Dataset:
     return first if second is None else (first + second) / 2
 
 
-def moves_along(experiment: Experiment) -> bool:
+def moves_along(wake: Wake, volume: Volume | None) -> bool:
     """Whether air moves along x between the images; a plane of air is uniform along it."""
-    return experiment.wake.turbine is not None or experiment.volume is not None
+    return wake.turbine is not None or volume is not None
 
 
-def advection_by(experiment: Experiment, flows: Flows) -> Advection:
+def advection_by(
+    wake: Wake, platform: Platform, scan: Scan, volume: Volume | None, flows: Flows
+) -> Advection:
     """From a field to the field after dt in the frame of the gates; trajectories are followed once.
 
     They are followed when they are first needed: a field of one value stays.
     """
-    flow, dt = mean_flow(flows), experiment.platform.dt
+    flow, dt = mean_flow(flows), platform.dt
 
     @functools.cache
     def carry() -> Advection:
-        along = flow["u"] - experiment.scan.follow if moves_along(experiment) else None
+        along = flow["u"] - scan.follow if moves_along(wake, volume) else None
         return carrier(flow["v"], flow["w"], dt, u=along)
 
     def advected(field: xr.DataArray) -> xr.DataArray:
@@ -52,32 +60,74 @@ def advection_by(experiment: Experiment, flows: Flows) -> Advection:
     return advected
 
 
-def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
-    """The flow at t1 and, if it is a state of its own, at t2, centred and refined."""
-    wake, most = experiment.wake, most_nodes(experiment)
-    gate_middle = experiment.scan.range + experiment.scan.thickness / 2
+def flows_of(experiment: Experiment, search_path: Path | None = None) -> Flows:
+    """The flows of an experiment, see `read_flows`; files are searched in its folder first."""
+    return call(
+        read_flows,
+        experiment,
+        footprint=call(Footprint, experiment),
+        search_path=search_path or experiment.folder,
+    )
+
+
+def read_flows(
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    seed: int,
+    footprint: Annotated[Footprint, Guard],
+    search_path: Path,
+    log: Log,
+) -> Flows:
+    """The flow at t1 and, if it is a state of its own, at t2, centred and refined.
+
+    Raises
+    ------
+    InputError
+        A wake that cannot be read, or images of it that a run cannot hold: before more is made of
+        it.
+    """
+    log.bar("reading the wake", None)
+    if scan.aim == "angles":
+        footprint.check_size(scan.columns, scan.rows)
+    flows = _flows(wake, platform, scan, volume, seed, footprint.most_nodes(), search_path)
+    if scan.aim == "grid":  # a beam for every node
+        footprint.check_size(flows[0].sizes["y"], flows[0].sizes["z"])
+    return flows
+
+
+def _flows(
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    seed: int,
+    most: int,
+    search_path: Path,
+) -> Flows:
+    gate_middle = scan.range + scan.thickness / 2
     if wake.vortex_pair:
         pair = wake.vortex_pair
-        axes = analytic_axes(wake, "vortex_pair", most)
+        y, z = analytic_axes(wake, "vortex_pair", most)
         vortices = vortex_pair(
             pair.circulation, pair.separation, pair.core_radius, model=pair.model
         )
-        return pair_wake(vortices, *axes, x=gate_middle), None
+        return pair_wake(vortices, y, z, x=gate_middle), None
     if wake.turbine:
-        return _turbine(experiment, gate_middle), None
+        return _turbine(wake, wake.turbine, platform, scan, seed, most, gate_middle), None
+    assert wake.file is not None  # of the three kinds of wake, the schema asks for one
     needed, names = tracers_of(wake)
-    path = find_file(wake.file, beside, "wake.file")
+    path = find_file(wake.file, search_path, "wake.file")
     if wake.second != "advect" and wake.time is not None:
         passed = wake.second - wake.time
-        if abs(passed - experiment.platform.dt) > 1e-3 * experiment.platform.dt:
+        if abs(passed - platform.dt) > 1e-3 * platform.dt:
             raise InputError(
                 f"wake.second: {wake.second:.15g} s is not allowed; expected platform.dt = "
-                f"{experiment.platform.dt:g} s after wake.time = {wake.time:.15g} s"
+                f"{platform.dt:g} s after wake.time = {wake.time:.15g} s"
             )
-    flows = []
-    for when in (wake.time, None if wake.second == "advect" else wake.second):
-        if flows and when is None:
-            return flows[0], None
+
+    def state(when: float | None) -> xr.Dataset:
         plane = wake.x if wake.depth == "plane" else None
         flow = read_wake(path, when, names, plane, require=needed)
         if wake.depth == "plane" and flow.sizes["x"] > 1:
@@ -87,12 +137,13 @@ def read_flows(experiment: Experiment, beside: str | Path = ".") -> Flows:
                 f"{places[0]:g} to {places[-1]:g} m (or wake.depth: volume)"
             )
         y, z = wake.centre or (None, None)
-        axes = "xyz" if experiment.volume else "yz"
-        fine = resample(flow, wake.spacing, axes, most)
+        fine = resample(flow, wake.spacing, "xyz" if volume else "yz", most)
         flow = centre(fine, y, z).drop_vars("time", errors="ignore")
         middle = wake.x if wake.x is not None else float(flow["x"].mean())
-        flows.append(flow.assign_coords(x=flow["x"] - middle + gate_middle))
-    return flows[0], flows[1]
+        return flow.assign_coords(x=flow["x"] - middle + gate_middle)
+
+    first = state(wake.time)
+    return first, None if wake.second == "advect" else state(wake.second)
 
 
 def tracers_of(wake: Wake) -> tuple[dict[str, str], dict[str, str]]:
@@ -106,9 +157,16 @@ def tracers_of(wake: Wake) -> tuple[dict[str, str], dict[str, str]]:
     return needed, wake.names | {n: t for n, t in needed.items() if t != n}
 
 
-def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
+def _turbine(
+    wake: Wake,
+    turbine: Turbine,
+    platform: Platform,
+    scan: Scan,
+    seed: int,
+    most: int,
+    gate_middle: float,
+) -> xr.Dataset:
     """Wind behind a turbine on planes that contain the gates and the air that passes them."""
-    wake, turbine, scan = experiment.wake, experiment.wake.turbine, experiment.scan
     mean = TurbineWake(
         **turbine.model_dump(
             include={"diameter", "thrust", "tip_speed_ratio", "wind_speed", "growth", "hub_core"}
@@ -117,20 +175,14 @@ def _turbine(experiment: Experiment, gate_middle: float) -> xr.Dataset:
     )
     # air from beyond the ends must not reach the gates: the wake's air moves at 0 to the full wind
     fastest = max(abs(scan.follow), abs(turbine.wind_speed - scan.follow))
-    margin = fastest * experiment.platform.dt + 2 * wake.spacing
+    margin = fastest * platform.dt + 2 * wake.spacing
     half = math.ceil((scan.thickness / 2 + margin) / wake.spacing)
+    y, z = analytic_axes(wake, "turbine", most)
     x = gate_middle + wake.spacing * np.arange(-half, half + 1)
-    return turbine_flow(
-        mean,
-        x,
-        *analytic_axes(wake, "turbine", most_nodes(experiment)),
-        turbine.turbulence,
-        turbine.outer_scale,
-        experiment.seed,
-    )
+    return turbine_flow(mean, x, y, z, turbine.turbulence, turbine.outer_scale, seed)
 
 
-def analytic_axes(wake, key: str, most: int) -> list[np.ndarray]:
+def analytic_axes(wake: Wake, key: str, most: int) -> list[np.ndarray]:
     """y and z of the nodes of an analytic wake, m, about the scan's axis.
 
     Parameters

@@ -8,10 +8,12 @@ import xarray as xr
 
 from lidar_mi.atmosphere.advection import advect_to
 from lidar_mi.errors import InputError
-from lidar_mi.experiment.schema.experiment import Experiment
+from lidar_mi.experiment.schema.platform import Platform
+from lidar_mi.experiment.schema.volume import Volume
+from lidar_mi.experiment.schema.wake import Wake
 from lidar_mi.experiment.truth.extinction import Truth
 from lidar_mi.experiment.truth.flows import Flows, mean_flow, moves_along
-from lidar_mi.instrument.scan import ScanPlan
+from lidar_mi.instrument.scan import Scan, ScanPlan
 
 LARGEST_STEP = 0.25
 """Node spacings by which air moves from one state to the next, at most.
@@ -23,7 +25,9 @@ half way between two states.
 MOST_VALUES = 2.5e8  # of all states of a scan: 1 GB in the renderer
 
 
-def state_times(experiment: Experiment, flows: Flows, times: np.ndarray) -> np.ndarray:
+def state_times(
+    wake: Wake, scan: Scan, volume: Volume | None, flows: Flows, times: np.ndarray
+) -> np.ndarray:
     """Equally spaced times, s, at which the air is computed for beams at ``times``.
 
     The middle one is that of the middle of the scan.
@@ -37,7 +41,7 @@ def state_times(experiment: Experiment, flows: Flows, times: np.ndarray) -> np.n
     first, last = float(np.min(times)), float(np.max(times))
     if first == last:
         return np.array([first])
-    moved = (last - first) * _speed_in_nodes(flow, experiment)
+    moved = (last - first) * _speed_in_nodes(flow, _along(wake, scan, volume, flow))
     # an odd number
     count = 2 * max(2, math.ceil(moved / LARGEST_STEP / 2)) + 1
     values = count * flow["v"].size
@@ -50,7 +54,9 @@ def state_times(experiment: Experiment, flows: Flows, times: np.ndarray) -> np.n
     return np.linspace(first, last, count)
 
 
-def values_of_states(experiment: Experiment, flows: Flows, plans: Sequence[ScanPlan]) -> int:
+def values_of_states(
+    wake: Wake, scan: Scan, volume: Volume | None, flows: Flows, plans: Sequence[ScanPlan]
+) -> int:
     """Values of all states of the scan that has most; 0 where air is frozen or beams have one time.
 
     Raises
@@ -58,15 +64,22 @@ def values_of_states(experiment: Experiment, flows: Flows, plans: Sequence[ScanP
     InputError
         As of `state_times`.
     """
-    if experiment.scan.air != "moving":
+    if scan.air != "moving":
         return 0
     timed = [plan.beams.time for plan in plans if plan.beams is not None]
-    counts = [state_times(experiment, flows, times).size for times in timed]
+    counts = [state_times(wake, scan, volume, flows, times).size for times in timed]
     return max(counts, default=0) * flows[0]["v"].size
 
 
 def air_in_time(
-    experiment: Experiment, truth: Truth, flows: Flows, which: int, times: np.ndarray
+    wake: Wake,
+    platform: Platform,
+    scan: Scan,
+    volume: Volume | None,
+    truth: Truth,
+    flows: Flows,
+    which: int,
+    times: np.ndarray,
 ) -> xr.DataArray:
     """The extinction of scan ``which`` at the times of its beams, m^-1, dims (time, x, y, z).
 
@@ -91,10 +104,10 @@ def air_in_time(
     """
     if all(float(field.min()) == float(field.max()) for field in truth.extinction):
         return truth.extinction[which]
-    flow, dt = mean_flow(flows), experiment.platform.dt
-    u = flow["u"] - experiment.scan.follow if moves_along(experiment) else None
-    molecules = experiment.wake.extinction.molecules
-    taus = state_times(experiment, flows, times)
+    flow, dt = mean_flow(flows), platform.dt
+    u = _along(wake, scan, volume, flow)
+    molecules = wake.extinction.molecules
+    taus = state_times(wake, scan, volume, flows, times)
 
     def carried(state: int) -> xr.DataArray:
         # molecules are everywhere, and no undershoot of a spline may remove them
@@ -109,13 +122,17 @@ def air_in_time(
     return ((1 - nearness) * carried(0) + nearness * carried(1)).astype(np.float32)
 
 
-def _speed_in_nodes(flow: xr.Dataset, experiment: Experiment) -> float:
+def _along(wake: Wake, scan: Scan, volume: Volume | None, flow: xr.Dataset) -> xr.DataArray | None:
+    """Speed of the air along x in the frame of the gates, m/s; None: it is uniform along x."""
+    return flow["u"] - scan.follow if moves_along(wake, volume) else None
+
+
+def _speed_in_nodes(flow: xr.Dataset, u: xr.DataArray | None) -> float:
     """Largest speed of the air on its grid, node spacings a second."""
-    squared = 0.0
-    for component, axis in (("u", "x"), ("v", "y"), ("w", "z")):
-        if component == "u" and not moves_along(experiment):
+    squared = xr.DataArray(0.0)
+    for speed, axis in ((u, "x"), (flow["v"], "y"), (flow["w"], "z")):
+        if speed is None:
             continue
-        speed = flow[component] - (experiment.scan.follow if component == "u" else 0.0)
         spacing = float(flow[axis][1] - flow[axis][0])
         squared = squared + (speed / spacing) ** 2
     return math.sqrt(float(squared.max()))

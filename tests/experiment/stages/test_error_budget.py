@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.stages.error_budget import budgets, platforms_without
 from lidar_mi.experiment.stages.ideal_images import ideal_scan, slab_images
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.truth.extinction import make_truth
-from lidar_mi.experiment.truth.flows import read_flows
+from lidar_mi.experiment.truth.flows import flows_of
 from lidar_mi.instrument.motion import Motion
 
 RATE = 2e-3  # rad/s
@@ -40,9 +41,11 @@ def experiment(**platform):
 
 def budget_of(asked):
     """From scans that are 0.013 of what the beams see, with hardly any noise."""
-    truth, flows = make_truth(asked), read_flows(asked)
-    plans, scans = scan_plans(asked, truth), []
-    for air, plan in zip(slab_images(asked, truth, flows, plans), plans, strict=True):
+    truth, flows = make_truth(asked), flows_of(asked)
+    plans, scans = call(scan_plans, asked, truth=truth), []
+    for air, plan in zip(
+        call(slab_images, asked, truth=truth, flows=flows, plans=plans), plans, strict=True
+    ):
         scan = ideal_scan(air, plan, asked.lidar, asked.scan.thickness)
         s0 = 1.3e-5 * scan["Y"].expand_dims("gate")
         scan = scan.assign(Y=0.013 * scan["Y"], S0=s0, S0_stderr=1e-6 * s0)
@@ -90,8 +93,8 @@ def test_frozen_air_is_seen_as_in_a_photograph_at_any_time():
         update={"scan": experiment().scan.model_copy(update={"air": "frozen"})}
     )
     truth = make_truth(frozen)
-    plans = scan_plans(frozen, truth)
-    images = slab_images(frozen, truth, read_flows(frozen), plans)
+    plans = call(scan_plans, frozen, truth=truth)
+    images = call(slab_images, frozen, truth=truth, flows=flows_of(frozen), plans=plans)
     assert all("time" not in image.dims for image in images)
     seen = ideal_scan(images[1], plans[1])
     xr.testing.assert_allclose(seen["Y"], images[1])

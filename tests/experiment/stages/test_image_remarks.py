@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.preflight.check import sections
 from lidar_mi.experiment.run import finish, prepare
@@ -122,8 +123,14 @@ def test_light_and_noise_are_those_of_the_rendered_image():
     """The first order's median, to the spread of air in the median pixels (3 %)."""
     run = prepared()
     results = run.results
-    light = light_budget(run.experiment, results["truth"], results["plans"][0], results["air"])
-    finish(run, illustrated=False)
+    light = call(
+        light_budget,
+        run.experiment,
+        truth=results["truth"],
+        plan=results["plans"][0],
+        air=results["air"],
+    )
+    finish(run, with_figures=False)
     scan = run.scans[0].isel(gate=0)
     s0 = scan["S0"].values
     assert light.s0 == pytest.approx(np.median(s0), rel=0.03)

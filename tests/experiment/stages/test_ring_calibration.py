@@ -11,6 +11,7 @@ import pytest
 
 from lidar_mi.atmosphere.line import laser_line
 from lidar_mi.errors import InputError
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
 from lidar_mi.experiment.schema.reading import check
 from lidar_mi.experiment.stages.ring_calibration import assumed_rings, calibration_file
@@ -48,7 +49,7 @@ def laser_image(asked, rings):
 def retrieved(asked):
     """Difference to the laser's frames of single pulses, (3, pulses), and the model."""
     doppler, rings = asked.doppler, ring_instrument(asked.doppler)
-    assumed = assumed_rings(asked, rings, None, log=QUIET)
+    assumed = call(assumed_rings, asked, rings=rings, calibration_file=None, log=QUIET)
     air = fringe_image(doppler.camera, doppler.etalon, rings.line, SPEED, rings.photons)
     frames = exposed_frames(doppler, rings, air, 1, asked.seed, range(PULSES))
     laser = exposed_frames(
@@ -117,7 +118,13 @@ def test_frames_of_the_calibration_drift():
     )
     found = []
     for asked in (quiet, drifting):
-        rings = assumed_rings(asked, ring_instrument(asked.doppler), None, log=QUIET)
+        rings = call(
+            assumed_rings,
+            asked,
+            rings=ring_instrument(asked.doppler),
+            calibration_file=None,
+            log=QUIET,
+        )
         found.append(math.sqrt(rings.laser.systematic[0, 0]))
     walk = calibration_drift(drifting.doppler, 8, drifting.seed)
     long = np.diff(calibration_drift(drifting.doppler, 1000, drifting.seed))
@@ -131,23 +138,29 @@ def test_calibration_of_a_file(tmp_path):
     asked = experiment(calibration={"file": "etalon.nc"})
     rings = ring_instrument(asked.doppler)
     with pytest.raises(InputError, match=r"calibration\.file: .*etalon.nc not found"):
-        calibration_file(asked, rings, tmp_path, log=QUIET)
+        call(calibration_file, asked, rings=rings, search_path=tmp_path, log=QUIET)
     frames = exposed_frames(asked.doppler, rings, laser_image(asked, rings), 1, 9, range(2))
     found = calibrate_rings(frames, rings.laser, pixel_noise(asked.doppler.ccd, rings.modes))
     write_netcdf(found.to_dataset(), tmp_path / "etalon.nc")
-    known = calibration_file(asked, rings, tmp_path, log=QUIET)
-    assumed = assumed_rings(asked, rings, known, log=QUIET)
+    known = call(calibration_file, asked, rings=rings, search_path=tmp_path, log=QUIET)
+    assumed = call(assumed_rings, asked, rings=rings, calibration_file=known, log=QUIET)
     assert assumed.model.focal_length == found.focal_length
     np.testing.assert_array_equal(assumed.laser.systematic, found.systematic)
     other = experiment(camera=CAMERA | {"width": 260}, calibration={"file": "etalon.nc"})
     with pytest.raises(InputError, match=r"calibration\.file: .*195 x 240 and 195 x 260"):
-        calibration_file(other, ring_instrument(other.doppler), tmp_path, log=QUIET)
+        call(
+            calibration_file,
+            other,
+            rings=ring_instrument(other.doppler),
+            search_path=tmp_path,
+            log=QUIET,
+        )
 
 
 def test_without_calibration_the_assumed_instrument_is_taken():
     asked = experiment(assumed=WRONG)
     rings = ring_instrument(asked.doppler)
-    assumed = assumed_rings(asked, rings, None, log=QUIET)
+    assumed = call(assumed_rings, asked, rings=rings, calibration_file=None, log=QUIET)
     found = rings.model.focal_length, assumed.model.focal_length
     assert found == pytest.approx((0.3, 0.3006), rel=1e-12)
     assert assumed.model.systematic is None

@@ -9,7 +9,10 @@ simulation's by half.
 import numpy as np
 import pytest
 
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.log import Log
+from lidar_mi.experiment.pipeline import stages_of
+from lidar_mi.experiment.preflight.cost import with_number
 from lidar_mi.experiment.run import finish, prepare
 from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.stages import rendering
@@ -19,7 +22,6 @@ from lidar_mi.experiment.stages.rendering import (
     chosen_samples,
     detect_images,
     render_images,
-    with_samples,
 )
 from lidar_mi.experiment.stages.simulation_noise import simulation_noise
 from lidar_mi.experiment.stages.winds import cross_flow_winds
@@ -50,11 +52,13 @@ def prepared():
 
 
 def needed(prepared):
-    return [prepared.results[name] for name in ("truth", "plans", "air", "flows")]
+    return {name: prepared.results[name] for name in ("truth", "plans", "air", "flows")}
 
 
 def rendered(experiment, prepared, **how):
-    return dict(render_images(experiment, *needed(prepared), log=Log(), **how))
+    graph, results = stages_of(experiment), needed(prepared)
+    samples = graph.compute(graph["samples"], results, Log(), experiment.folder)
+    return dict(call(render_images, experiment, **needed(prepared), samples=samples, **how))
 
 
 def reseeded(experiment, seed):
@@ -65,12 +69,12 @@ def reseeded(experiment, seed):
 @pytest.fixture(scope="module")
 def number(prepared):
     """The chosen number of samples."""
-    return chosen_samples(prepared.experiment, *needed(prepared), log=Log()).number
+    return call(chosen_samples, prepared.experiment, **needed(prepared)).number
 
 
 def test_the_stated_fraction_is_that_of_other_random_numbers(prepared, number):
     """Variance of 12 renderings of the same air, of every beam, over the detector's."""
-    asked = with_samples(prepared.experiment, number)
+    asked = with_number(prepared.experiment, number)
     count, (plan, _) = 12, prepared.results["plans"]
     images = [
         rendered(reseeded(asked, seed), prepared, missing=IMAGES[:1])["image_t1"]
@@ -78,7 +82,7 @@ def test_the_stated_fraction_is_that_of_other_random_numbers(prepared, number):
     ]
     s0 = np.stack([image["S0"].values[0].astype(float) for image in images])
     one = {"image_t1": images[0], "image_t2": images[0]}
-    detected = detect_images(asked, one, [plan, plan])[0]
+    detected = call(detect_images, asked, images=one, plans=[plan, plan])[0]
     ratio = s0.var(0, ddof=1) / detected["S0_noise_std"].values[0].astype(float) ** 2
     stated = detected.attrs["monte_carlo_fraction"]
     assert stated == pytest.approx(float(noise_ratio(detected).mean()))
@@ -99,7 +103,7 @@ def test_an_image_of_chosen_samples_is_that_of_the_number_alone(prepared, number
 
     monkeypatch.setattr(rendering, "render_scans", watched)
     chosen = rendered(prepared.experiment, prepared, missing=IMAGES[1:])["image_t2"]
-    fixed = rendered(with_samples(prepared.experiment, number), prepared, missing=IMAGES[1:])
+    fixed = rendered(with_number(prepared.experiment, number), prepared, missing=IMAGES[1:])
     assert np.array_equal(chosen["S0"].values, fixed["image_t2"]["S0"].values)
     assert chosen.attrs["samples_per_beam"] == number
     (pilot, few), *others = seeds
@@ -115,7 +119,7 @@ def test_the_mean_of_chosen_images_is_unbiased(prepared):
     ]
     s0 = np.stack([image["S0"].values[0].astype(float) for image in images])
     whole = sum(image.attrs["samples_per_beam"] for image in images)
-    true = rendered(with_samples(asked, whole), prepared, missing=IMAGES[:1])["image_t1"]
+    true = rendered(with_number(asked, whole), prepared, missing=IMAGES[:1])["image_t1"]
     off = s0.mean(0) - true["S0"].values[0]
     spread = np.hypot(s0.std(0, ddof=1) / np.sqrt(len(s0)), true["S0_stderr"].values[0])
     z = off / spread
@@ -129,13 +133,16 @@ def test_the_winds_of_a_newcomer_are_those_of_many_samples(prepared, number):
     noise of the detector is that of one seed."""
     found = {}
     for samples in (8, number, 8 * number):
-        images = rendered(with_samples(prepared.experiment, samples), prepared)
-        detected = detect_images(prepared.experiment, images, prepared.results["plans"])
-        wind = cross_flow_winds(
+        images = rendered(with_number(prepared.experiment, samples), prepared)
+        detected = call(
+            detect_images, prepared.experiment, images=images, plans=prepared.results["plans"]
+        )
+        wind = call(
+            cross_flow_winds,
             prepared.experiment,
-            prepared.results["truth"],
-            prepared.results["plans"],
-            detected,
+            truth=prepared.results["truth"],
+            plans=prepared.results["plans"],
+            scans=detected,
             log=Log(),
         )
         error = (wind["w"] - wind["w_true"]).values.ravel()
@@ -154,10 +161,20 @@ def test_what_it_adds_to_the_wind_is_the_spread_of_other_random_numbers(prepared
     winds, stated = [], []
     for seed in range(1, 9):
         one = reseeded(asked, seed)
-        scans = detect_images(one, rendered(one, prepared), plans)
-        wind = cross_flow_winds(one, truth, plans, scans, log=Log())
+        scans = call(detect_images, one, images=rendered(one, prepared), plans=plans)
+        wind = call(cross_flow_winds, one, truth=truth, plans=plans, scans=scans, log=Log())
         winds.append(wind.isel(source=0, algorithm=0))
-        stated.append(simulation_noise(one, scans, plans, scans, wind, log=Log()))
+        stated.append(
+            call(
+                simulation_noise,
+                one,
+                detected=scans,
+                plans=plans,
+                scans=scans,
+                wind=wind,
+                log=Log(),
+            )
+        )
     valid = np.all([(wind["flag"] == 0).values for wind in winds], 0)
     assert valid.sum() > 20
     for name in ("v", "w"):
@@ -173,7 +190,7 @@ def test_the_first_sentence_names_it_where_samples_are_too_few_and_only_there(pr
     for samples, expected in ((4, True), ("auto", False)):
         asked = newcomer(render={"samples_per_beam": samples})
         run = prepare(asked, known=prepared.results)
-        finish(run, illustrated=False)
+        finish(run, with_figures=False)
         said = "noise of the simulation, not of the lidar" in run.answer[0]
         warned = [text for text in run.warnings if "noise of the simulation" in text]
         assert said == expected and len(warned) == expected
@@ -185,7 +202,7 @@ def test_the_first_sentence_names_it_where_samples_are_too_few_and_only_there(pr
             assert run.metrics["backscatter.samples_per_beam"] == 4
     limited = newcomer(render={"max_samples": 4e4})
     run = prepare(limited, known=prepared.results)
-    finish(run, illustrated=False)
+    finish(run, with_figures=False)
     assert run.metrics["backscatter.samples_per_beam"] == 4e4 // (41 * 27)
     said = [text for text in run.warnings if text.startswith("render.max_samples: ")]
     assert bool(said) == ("noise of the simulation" in run.answer[0])
@@ -194,18 +211,18 @@ def test_the_first_sentence_names_it_where_samples_are_too_few_and_only_there(pr
 def test_samples_of_another_number_are_not_resumed():
     """A number that was chosen on another machine may be another one."""
 
-    class Keeper:
+    class Store:
         stored = None
 
         def unfinished(self, part):
             return self.stored and dict(self.stored)
 
-        def keep_unfinished(self, part, arrays):
+        def store_unfinished(self, part, arrays):
             self.stored = arrays
 
-    keeper = Keeper()
-    store = batches_of(IMAGES, keeper, Log(), 100)(0)
-    store._next = 0.0
-    store.keep(3, lambda: {"image": np.ones(2)})
-    assert batches_of(IMAGES, keeper, Log(), 100)(0).kept()[0] == 3
-    assert batches_of(IMAGES, keeper, Log(), 110)(0).kept() == (0, {})
+    store = Store()
+    batches = batches_of(IMAGES, store, Log(), 100)(0)
+    batches._next = 0.0
+    batches.keep(3, lambda: {"image": np.ones(2)})
+    assert batches_of(IMAGES, store, Log(), 100)(0).kept()[0] == 3
+    assert batches_of(IMAGES, store, Log(), 110)(0).kept() == (0, {})

@@ -12,13 +12,15 @@ import xarray as xr
 
 from lidar_mi.errors import InputError
 from lidar_mi.experiment.folder.run_folder import made_by, new_record
+from lidar_mi.experiment.graph import call
+from lidar_mi.experiment.pipeline import stages_of
 from lidar_mi.experiment.preflight.check import sections
 from lidar_mi.experiment.schema import reading
 from lidar_mi.experiment.stages.lines import slab_wind, states_of_wind
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.timed_beams import line_beams
 from lidar_mi.experiment.truth.extinction import make_truth
-from lidar_mi.experiment.truth.flows import read_flows
+from lidar_mi.experiment.truth.flows import flows_of
 from lidar_mi.instrument.doppler_scan import scan_wind
 from tests.support.experiments import small
 
@@ -48,7 +50,10 @@ def truth():
     ],
 )
 def test_nothing_that_takes_time_or_moves_has_no_beams(truth, keys):
-    assert [plan.beams for plan in scan_plans(experiment(**keys), truth)] == [None, None]
+    assert [plan.beams for plan in call(scan_plans, experiment(**keys), truth=truth)] == [
+        None,
+        None,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -61,13 +66,13 @@ def test_nothing_that_takes_time_or_moves_has_no_beams(truth, keys):
     ],
 )
 def test_anything_else_has_beams(truth, keys):
-    for plan in scan_plans(experiment(**keys), truth):
+    for plan in call(scan_plans, experiment(**keys), truth=truth):
         assert len(plan.beams.time) == len(plan.y) * len(plan.z)
 
 
 def test_without_motion_beams_go_from_straight_flight_to_the_nodes(truth):
     asked = experiment(timing={"duration": "80 ms"}, scan={"follow": "10 m/s"})
-    for number, plan in enumerate(scan_plans(asked, truth)):
+    for number, plan in enumerate(call(scan_plans, asked, truth=truth)):
         beams = plan.beams
         assert plan.position == pytest.approx(number * 14.0)
         assert beams.origin[:, 0] == pytest.approx(plan.position + 140 * beams.time)
@@ -82,7 +87,7 @@ def test_both_scans_fly_along_one_trajectory(tmp_path, truth):
     """Second scans see what the platform does dt later: a roll rate, a climb."""
     (tmp_path / "flight.csv").write_text("t,z (m),yaw (mrad)\n-1,-2,-5\n1,2,5\n")
     asked = experiment({"duration": "80 ms"}, {"trajectory": "flight.csv"}, scan={"aim": "angles"})
-    for number, plan in enumerate(scan_plans(asked, truth, tmp_path)):
+    for number, plan in enumerate(call(scan_plans, asked, truth=truth, search_path=tmp_path)):
         time = 0.1 * number + plan.beams.time
         assert plan.beams.origin[:, 2] == pytest.approx(2 * time)
         still = plan.directions()
@@ -96,7 +101,9 @@ def test_a_trajectory_is_found_beside_and_its_change_makes_another_experiment(tm
     signatures = []
     for climb in (1, 2):
         flight.write_text(f"t,z\n-1,0\n1,{climb}\n")
-        signatures.append(made_by(new_record(asked, tmp_path), ("detector",)))
+        graph = stages_of(asked)
+        keys = graph.keys(graph["images"])
+        signatures.append(made_by(new_record(asked, tmp_path), keys))
     assert signatures[0] != signatures[1]
 
 
@@ -154,7 +161,7 @@ def test_a_trajectory_is_found_beside_and_its_change_makes_another_experiment(tm
 def test_bad_input_is_one_line(tmp_path, truth, table, keys, message):
     (tmp_path / "a.csv").write_text(table)
     with pytest.raises(InputError) as error:
-        scan_plans(experiment(**keys), truth, tmp_path)
+        call(scan_plans, experiment(**keys), truth=truth, search_path=tmp_path)
     said = str(error.value)
     assert said.startswith(message.replace("<folder>", str(tmp_path))) and "\n" not in said
 
@@ -192,14 +199,14 @@ def both(timing=None, motion=None, reported=None, **sensor):
 
 
 def test_lines_of_sight_have_times_of_their_own():
-    assert line_beams(both(), ".") is None
-    beams = line_beams(both({"pattern": "raster", "duration": "90 ms"}), ".")
+    assert call(line_beams, both()) is None
+    beams = call(line_beams, both({"pattern": "raster", "duration": "90 ms"}))
     assert len(beams.time) == 63
     # row by row from the top left, each for 90 ms / 63
     assert beams.time == pytest.approx(((np.arange(63) + 0.5) / 63 - 0.5) * 0.09)
     # fixed to the body, they go where the directions are
     assert beams.direction == pytest.approx(both().sensor.directions.directions())
-    moved = line_beams(both(motion={"scanner_jitter": "1 mrad"}), ".")
+    moved = call(line_beams, both(motion={"scanner_jitter": "1 mrad"}))
     assert not moved.time.any() and np.ptp(moved.direction - moved.reported_direction) > 1e-3
 
 
@@ -207,14 +214,14 @@ def test_lines_meet_the_state_of_their_own_time(truth):
     """Of a wake with a second state, whose wind grows by (4, -6, 9) m/s in dt."""
     narrow = {"azimuth_half": "3 deg", "elevation_half": "2 deg"}
     asked = both({"pattern": "raster", "duration": "90 ms"}, directions=narrow)
-    growth, beams = np.array([4.0, -6.0, 9.0]), line_beams(asked, ".")
-    first, _ = read_flows(asked, ".")
+    growth, beams = np.array([4.0, -6.0, 9.0]), call(line_beams, asked)
+    first, _ = flows_of(asked)
     first = first if "u" in first else first.assign(u=0 * first["v"])
     later = xr.Dataset({n: first[n] + d for n, d in zip("uvw", growth, strict=True)})
-    wind = slab_wind(asked, truth)
+    wind = call(slab_wind, asked, truth=truth)
 
     def speeds(flows):
-        states = states_of_wind(asked, wind, flows)
+        states = call(states_of_wind, asked, slab_wind=wind, flows=flows)
         sensor = asked.sensor.directions, asked.doppler.lidar
         return scan_wind(states, *sensor, 0.0, 1, 150.0, None, beams)["v_los_true"].values
 
@@ -240,7 +247,7 @@ def test_lines_meet_the_state_of_their_own_time(truth):
 )
 def test_lines_that_take_too_long(timing, message):
     with pytest.raises(InputError, match=f"^{re.escape(message)}"):
-        line_beams(both(timing), ".")
+        call(line_beams, both(timing))
     with pytest.raises(InputError, match=r"timing.pulses_per_beam: 2 is not allowed with sensor"):
         both(timing | {"pulses_per_beam": 2})
 

@@ -6,6 +6,7 @@ import xarray as xr
 
 import lidar_mi as lm
 from lidar_mi.assessment.report.vortices import vortex_chapter
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.stages.vortices import image_vectors, vectors_method
 from lidar_mi.retrieval.method_names import MOST_ACCURATE_FIRST, ImageMethod
 
@@ -36,19 +37,19 @@ def test_every_method_with_vectors_has_a_rank():
 )
 def test_the_most_accurate_method_is_taken_in_any_order(methods, best):
     experiment = lm.load_experiment("wake_backscatter", retrieval={"methods": methods})
-    found = image_vectors(experiment, winds(methods))
-    assert str(found["algorithm"].values) == best == vectors_method(experiment)
+    found = call(image_vectors, experiment, wind=winds(methods))
+    assert str(found["algorithm"].values) == best == call(vectors_method, experiment)
     assert float(found["v"].item()) == len(methods) + methods.index(best)
     assert {"y_vector", "z_vector"} <= set(found.coords)
 
 
 def test_vortex_fit_alone_has_no_vectors():
     experiment = lm.load_experiment("wake_backscatter", retrieval={"methods": ["vortex_fit"]})
-    assert image_vectors(experiment, winds(["vortex_fit"])) is None
+    assert call(image_vectors, experiment, wind=winds(["vortex_fit"])) is None
 
 
 def test_a_sensor_s_own_method_is_used_and_reported():
     experiment = lm.load_experiment("wake_sensor")
-    assert vectors_method(experiment) == experiment.sensor.method
+    assert call(vectors_method, experiment) == experiment.sensor.method
     chapter = vortex_chapter({}, {}, {}, [], "multipass")
     assert "vectors of the multi-pass correlation" in chapter.lead[0]

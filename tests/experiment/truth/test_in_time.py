@@ -11,9 +11,10 @@ import pytest
 import xarray as xr
 
 import lidar_mi as lm
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.truth import in_time as truth_in_time
 from lidar_mi.experiment.truth.extinction import Truth, make_truth
-from lidar_mi.experiment.truth.flows import read_flows
+from lidar_mi.experiment.truth.flows import flows_of
 from lidar_mi.experiment.truth.in_time import air_in_time, state_times
 from lidar_mi.instrument.beams import Beams
 from lidar_mi.instrument.lidar import BackscatterLidar
@@ -64,8 +65,13 @@ def test_a_carried_sinusoid_at_any_time(experiment, carried, which, nodes):
     truth, flows = carried
     wave = nodes * SPACING
     extinction = (sinusoid(0, wave), sinusoid(DT, wave))
-    air = air_in_time(
-        experiment, replace(truth, extinction=extinction), flows, which, np.array([-0.06, 0.06])
+    air = call(
+        air_in_time,
+        experiment,
+        truth=replace(truth, extinction=extinction),
+        flows=flows,
+        which=which,
+        times=np.array([-0.06, 0.06]),
     )
     assert air["time"].values[[0, -1]] == pytest.approx([-0.06, 0.06]) and air.sizes["time"] % 2
     waves = 48 // nodes
@@ -81,12 +87,14 @@ def test_a_carried_sinusoid_at_any_time(experiment, carried, which, nodes):
 def test_states_from_the_largest_displacement(experiment, carried):
     """12.2 m/s in 0.12 s are 2.9 nodes, 12 intervals; an odd number of states."""
     _, flows = carried
-    taus = state_times(experiment, flows, np.array([0.06, -0.06, 0.0]))
+    taus = call(state_times, experiment, flows=flows, times=np.array([0.06, -0.06, 0.0]))
     assert len(taus) == 13 and taus[6] == pytest.approx(0, abs=1e-17)
     step = np.hypot(*U) * np.diff(taus) / SPACING
     assert step.max() <= truth_in_time.LARGEST_STEP
-    assert len(state_times(experiment, flows, np.array([0.0, 1e-6]))) == 5
-    assert state_times(experiment, flows, np.array([0.02, 0.02])).tolist() == [0.02]
+    assert len(call(state_times, experiment, flows=flows, times=np.array([0.0, 1e-6]))) == 5
+    assert call(state_times, experiment, flows=flows, times=np.array([0.02, 0.02])).tolist() == [
+        0.02
+    ]
 
 
 @pytest.mark.parametrize("name", ["wake_backscatter", "wake_changing"])
@@ -95,11 +103,19 @@ def test_the_air_of_the_reference_times_is_the_truth(name):
     # without texture: waves of two nodes do not survive half a node's displacement
     wake = {"spacing": "1 m", "texture": {"rms": 0}}
     experiment = lm.load_experiment(name, scan={"air": "moving"}, wake=wake)
-    flows = read_flows(experiment, experiment.folder)
+    flows = flows_of(experiment, experiment.folder)
     truth = make_truth(experiment, flows=flows)
     dt = experiment.platform.dt
     first, second = (
-        air_in_time(experiment, truth, flows, k, np.array([-dt / 2, dt / 2])) for k in (0, 1)
+        call(
+            air_in_time,
+            experiment,
+            truth=truth,
+            flows=flows,
+            which=k,
+            times=np.array([-dt / 2, dt / 2]),
+        )
+        for k in (0, 1)
     )
     middle = first.sizes["time"] // 2
     for air, expected in ((first, truth.extinction[0]), (second, truth.extinction[1])):
@@ -129,7 +145,7 @@ def test_air_along_x_in_the_frame_of_the_gates():
     still, flow = of(np.zeros(49)), of(np.full(49, 8.0))
     truth = Truth((waves, waves), (waves, waves), xr.Dataset())
     flows = (xr.Dataset({"u": flow, "v": still, "w": still}), None)
-    air = air_in_time(turbine, truth, flows, 0, np.array([-0.5, 0.5]))
+    air = call(air_in_time, turbine, truth=truth, flows=flows, which=0, times=np.array([-0.5, 0.5]))
     assert air.sizes["time"] == 17  # four nodes in the scan
     inner = slice(8, 40)
     for time in (-0.5, -0.21, 0.0, 0.33, 0.5):
@@ -148,11 +164,18 @@ def test_molecules_stay(experiment, carried):
         wake={"extinction": {"molecules": "1e-4 / m"}},
     )
     sharp = field(np.where(np.abs(Y) < 5, MEAN, 0)[None, :, None])
-    alone = air_in_time(
-        experiment, replace(truth, extinction=(sharp, sharp)), flows, 0, np.array([-0.05, 0.05])
+    alone = call(
+        air_in_time,
+        experiment,
+        truth=replace(truth, extinction=(sharp, sharp)),
+        flows=flows,
+        which=0,
+        times=np.array([-0.05, 0.05]),
     )
     added = replace(truth, extinction=(sharp + 1e-4, sharp + 1e-4))
-    both = air_in_time(mixed, added, flows, 0, np.array([-0.05, 0.05]))
+    both = call(
+        air_in_time, mixed, truth=added, flows=flows, which=0, times=np.array([-0.05, 0.05])
+    )
     assert np.abs(both.values - alone.values - 1e-4).max() < 1e-9
     assert both.min() >= 0.999999e-4
 
@@ -160,13 +183,18 @@ def test_molecules_stay(experiment, carried):
 def test_uniform_air_has_one_state(experiment, carried):
     truth, flows = carried
     same = replace(truth, extinction=(field(MEAN), field(MEAN)))
-    assert "time" not in air_in_time(experiment, same, flows, 1, np.array([-0.05, 0.05])).dims
+    assert (
+        "time"
+        not in call(
+            air_in_time, experiment, truth=same, flows=flows, which=1, times=np.array([-0.05, 0.05])
+        ).dims
+    )
 
 
 def test_too_many_states_are_refused(experiment, carried):
     _, flows = carried
     with pytest.raises(lm.InputError, match=r"scan\.air: moving is not allowed here: air moves by"):
-        state_times(experiment, flows, np.array([-1000.0, 1000.0]))
+        call(state_times, experiment, flows=flows, times=np.array([-1000.0, 1000.0]))
 
 
 def scan_of(air, times_of_rows, mixed=False, samples=1024):
@@ -203,7 +231,7 @@ def test_the_image_shows_every_row_at_its_time(experiment, carried, mixed):
     truth, flows = carried
     rows = 21
     times = 0.05 * np.linspace(1, -1, rows)  # the top row last
-    air = air_in_time(experiment, truth, flows, 0, times)
+    air = call(air_in_time, experiment, truth=truth, flows=flows, which=0, times=times)
     k = 2 * np.pi / WAVE
 
     def displaced(air):

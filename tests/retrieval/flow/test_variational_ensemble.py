@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lidar_mi.experiment.graph import call
 from lidar_mi.experiment.schema.reading import load
 from lidar_mi.experiment.stages.rendering import scan_plans
 from lidar_mi.experiment.stages.winds import window_settings
@@ -29,7 +30,7 @@ def reduced_errors(seed, amount, **changes):
     overrides = [f"{key}={value}" for key, value in changes.items()] + [f"seed={seed}"]
     experiment = load(SCENES / "wake_sensor.yaml", overrides)
     truth = make_truth(experiment, SCENES)
-    plans = scan_plans(experiment, truth)
+    plans = call(scan_plans, experiment, truth=truth)
     images = [blur_by_beam(truth.image(k), experiment.lidar, plans[k].centre) for k in (0, 1)]
     noise = images[0].copy(data=np.sqrt(amount * np.polyval(NOISE[::-1], images[0].values)))
     random = np.random.default_rng(seed)
