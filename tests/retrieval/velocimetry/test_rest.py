@@ -243,7 +243,7 @@ def test_saturated_voxels():
 @pytest.mark.parametrize("mean", [(-9.0, 5.0), (2.0, -3.0)])
 @pytest.mark.parametrize("thin", ["mast", "border"])
 def test_thin_structure_is_found_as_a_whole(thin, mean):
-    """Dark, two pixels wide, or one on the rim, with noise of its own: 12 to 43 % were found.
+    """Dark, two pixels wide, or one on the rim, with noise of its own: 14 to 43 % were found.
 
     Both sides of it, or opposite rims of the image, were taken for the slopes of smoke.
     """
