@@ -1,13 +1,15 @@
 """Images and their noise before a retrieval.
 
 Detects: noise that is unknown outside of the images' pixels and refused, or unknown within and
-taken for something; one image given twice of which nothing is said.
+taken for something; one image given twice of which nothing is said, or whose wind counts as valid.
 """
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from lidar_mi.retrieval.checks import checked_stack, identical
+from lidar_mi.retrieval.images.quality import Flag
 from lidar_mi.retrieval.wind.pair import retrieve_wind
 from lidar_mi.retrieval.wind.series import retrieve_winds
 from tests.support.flows import data_array
@@ -36,13 +38,28 @@ def test_images_that_are_the_same_are_named():
     assert identical([other, np.nextafter(other, 9)]) == ""
 
 
-@pytest.mark.parametrize("method", ["cc", "variational"])
-def test_a_wind_says_that_its_images_are_the_same(method):
+@pytest.mark.parametrize("checks", [True, False])
+@pytest.mark.parametrize("method", ["cc", "ws", "multipass", "variational", "vortex_fit"])
+def test_one_image_given_twice_has_no_valid_wind(method, checks):
+    """It was 0 m/s, and valid all over."""
     y, z = np.arange(40.0), np.arange(32.0)
-    air = 1 + 0.1 * np.random.default_rng(1).random((32, 41))
+    air = 1 + gaussian_filter(np.random.default_rng(1).standard_normal((32, 41)), 1.5)
     image, moved = (data_array(air[:, k : k + 40], y, z) for k in (0, 1))
+    wind = retrieve_wind(image, image.copy(), 1.0, method, checks=checks)
     words = "images 1 and 2 are the same, bit for bit"
-    assert retrieve_wind(image, image.copy(), 1.0, method).identical_images == words
-    assert "identical_images" not in retrieve_wind(image, moved, 1.0, method).attrs
-    winds = retrieve_winds([image, image, moved], 1.0, method=method)
+    assert wind.identical_images == words
+    assert bool((wind.flag & Flag.AT_REST.value).all())
+    if method == "vortex_fit":
+        return
+    winds = retrieve_winds([image, image, moved], 1.0, method=method, checks=checks)
     assert [words in str(remark) for remark in winds["remark"].values] == [True, False]
+    assert not bool((winds.flag[0] == 0).any())
+
+
+def test_nor_has_a_burst_with_one_image_twice():
+    y, z = np.arange(40.0), np.arange(32.0)
+    air = 1 + gaussian_filter(np.random.default_rng(1).standard_normal((32, 41)), 1.5)
+    image, moved = (data_array(air[:, k : k + 40], y, z) for k in (0, 1))
+    wind = retrieve_wind(image, moved, 1.0, more=[moved])
+    assert wind.identical_images == "images 2 and 3 are the same, bit for bit"
+    assert not bool((wind.flag == 0).any())

@@ -186,7 +186,8 @@ def at_rest(
     Gaussians of 1.5 px, which hide gains of pixels. Motion and structure are estimated in turn.
     What stands out is measured by local medians, with thresholds of one false alarm in 10 000
     images of normal noise: the slower the air, the stronger a structure must be to be known from
-    it. Stray pixels stand out of one image alone (`impulses.stray`).
+    it. What stands out of both next to it is part of it. Stray pixels stand out of one image alone
+    (`impulses.stray`).
 
     Not found: soft structure as faint as the texture, and a pattern so weak or so dense that no
     place stands out. Bright air that stands still amid moving air looks at rest, and is.
@@ -279,10 +280,12 @@ def _fields(pair: torch.Tensor) -> Iterator[Callable[[torch.Tensor], _Field]]:
         def edges(found, axis=axis):
             steps = pad(known(found).diff(dim=axis), (0, 0) * (-1 - axis) + (0, 1))
             either = same.minimum(same.roll(-1, axis))
-            # steps beside it are as large where smoke rises over several pixels
-            beside = steps.nan_to_num(0.0).abs()
-            beside = torch.maximum(beside.roll(2, axis), beside.roll(-2, axis))
-            soft = (steps.abs() < 2 * beside).any(0)
+            # smoke rises over several pixels: a step beside it is as large and of its sign, which
+            # that on the other side of a thin structure is not
+            wide = pad(steps.nan_to_num(0.0), (0, 0) * (-1 - axis) + (2, 2))
+            beside = (wide.narrow(axis, place, steps.shape[axis]) for place in (0, 4))
+            soft = torch.stack([steps.square() < 2 * steps * other for other in beside])
+            soft = soft.flatten(0, 1).any(0)
             field = of(steps, 1, lambda new: new | new.roll(1, axis), either)
             return field._replace(change=field.change.masked_fill(soft, torch.inf))
 
@@ -353,20 +356,23 @@ def _stays(field: _Field, d: torch.Tensor) -> torch.Tensor:
     ]
     off = torch.minimum(*off)
     off = torch.where(off.isfinite(), off, 0.0)
-    limit = impulses.threshold(off.numel() // field.size**2)
-    limit = limit * impulses.median_scale(off, field.size)
-    new, weak = (
-        (off > part * limit)
-        & _alike(field, part * least)
+    chance = impulses.median_scale(off, field.size)
+    limit = impulses.threshold(off.numel() // field.size**2) * chance
+    new = (
+        (off > limit)
+        & _alike(field, least)
         & (field.change < _DIFFER * off)
         & (_lower(field.pair) > off / 2)
-        for part in (1.0, _WEAK)
     )
     if not bool(new.any()):
         return new
     new = _beyond_chance(new, field, least)
     if field.size > 1 or not bool(new.any()):
         return new
+    # a structure is at rest as a whole: also where the air moves along it, which tells nothing,
+    # and where it changes with the air that it dims; not where its motion is the better match
+    stands_out = _alike(field, _WEAK * least) | (_lower(field.pair) > least)
+    weak = stands_out & (field.change < off.maximum(chance))
     new = ndimage.binary_propagation(new.cpu(), np.ones((3, 3)), weak.cpu())
     return torch.as_tensor(new, device=weak.device)
 

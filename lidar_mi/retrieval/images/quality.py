@@ -40,7 +40,9 @@ class Flag(enum.IntFlag):
     SATURATED = 512
     """The template holds a saturated area at rest, or is saturated by a quarter (`rest`)."""
     AT_REST = 1024
-    """The template holds structure at rest or stray pixels, or a pattern spoils all (`rest`)."""
+    """Structure at rest or stray pixels in the template, or a pattern spoils all (`rest`).
+
+    Or one of the images is the one before it, bit for bit."""
     NO_SKILL = 2048
     """The standard error approaches the wind's own spread, or noise assumed decides the wind."""
     RESAMPLED = 4096

@@ -136,7 +136,7 @@ def retrieve_wind(
         edge, see `illumination`; attributes of these names say so. Pixels that do not move with the
         air are left out, see `rest.at_rest`, and the attribute `defects` says how many.
         `identical_images` names images that are the same, bit for bit, from which no motion can be
-        told.
+        told: no vector is valid then.
 
     Raises
     ------
@@ -264,6 +264,9 @@ def retrieve_wind(
             # a field fitted as a whole is flagged only if the images are unrelated everywhere
             apart = apart if chosen.local else apart.all().expand_as(apart)
             flag = flag | (Flag.UNRELATED * apart).to(torch.int16)
+    same = identical(stack)
+    if same:
+        flag = flag | Flag.AT_REST.value
     attributes = {
         "method": method,
         "template": template,
@@ -290,7 +293,7 @@ def retrieve_wind(
         attributes["fixed_pattern"] = ", ".join(patterns)
     if still.fraction:
         attributes["standing_fraction"] = still.fraction
-    if same := identical(stack):
+    if same:
         attributes["identical_images"] = same
     if any(map(described, light)):
         attributes["illumination"] = described(light[-1])

@@ -8,7 +8,7 @@ import xarray as xr
 
 from lidar_mi.arguments import checked_arguments
 from lidar_mi.errors import InputError
-from lidar_mi.retrieval.checks import checked_stack, on_device, positive
+from lidar_mi.retrieval.checks import checked_stack, identical, on_device, positive
 from lidar_mi.retrieval.correlation.bootstrap import bootstrap_covariance, enough_windows
 from lidar_mi.retrieval.correlation.multipass import multipass
 from lidar_mi.retrieval.correlation.outliers import median_outliers
@@ -83,7 +83,7 @@ def retrieve_wind_volume(
         `correlation`, `flag` (bits of `quality.Flag`, 0 = valid; low texture means a standard error
         beyond half a voxel in some direction). Those of "correlation" are from `bootstrap` where
         there are enough windows. Rejected vectors keep their value, or NaN where
-        there is none.
+        there is none. `identical_images` as of `wind.retrieve_wind`.
 
     Raises
     ------
@@ -139,6 +139,9 @@ def retrieve_wind_volume(
     # shear lowers the correlation of windows as large as a volume is thick: all windows together
     if bool(unrelated(volumes, windows, False, noise).all()):
         flag = flag | Flag.UNRELATED.value
+    same = identical(stack, "volumes")
+    if same:
+        flag = flag | Flag.AT_REST.value
     found = found._replace(flag=flag)
     variables = winds(found, AXES, steps, dt)
     long_name = "correlation of the volumes warped to mid-time"
@@ -152,6 +155,8 @@ def retrieve_wind_volume(
         "dt": dt,
         "min_correlation": min_correlation,
     }
+    if same:
+        attributes["identical_images"] = same
     coords = centres(stack[0], windows, "window")
     return dataset(variables, coords, "Wind from two volumes", attributes, found)
 
