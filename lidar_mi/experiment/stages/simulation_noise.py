@@ -59,9 +59,12 @@ def simulation_noise(
     random = np.random.default_rng([seed, 2])
     noisier = [_with_more_noise(one, random) for one in detected]
     pairs = rendered_pairs(wake, scan, detector, gridded_scans(platform, noisier))
-    source, (pair, _) = pairs.popitem()
+    source, (changed, _) = pairs.popitem()
     # methods that weight by noise are to do so as before
-    noise = rendered_pairs(wake, scan, detector, scans)[source][1]
+    before, noise = rendered_pairs(wake, scan, detector, scans)[source]
+    # which pixels scattered beams reach depends on the wind between them, and so on the noise
+    pair = [one.where(first.notnull()) for one, first in zip(changed, before, strict=True)]
+    times = pixel_times(wake, scan, scans)
     changes = []
     for method in retrieval.methods:
         found = retrieve_wind(
@@ -69,7 +72,7 @@ def simulation_noise(
             dt=platform.dt,
             method=method,
             noise=noise,
-            times=pixel_times(wake, scan, scans),
+            times=times,
             blur=known_blur(retrieval, lidar, plans[0]),
             standard_errors=False,
             **window_settings(retrieval),

@@ -68,7 +68,11 @@ class AtRest(NamedTuple):
 
     def __str__(self) -> str:
         parts = {"at rest": self.structure, "of one image alone": self.stray.any(0)}
-        said = [f"{p.double().mean():.2%} {name}" for name, p in parts.items() if bool(p.any())]
+        said = [
+            f"{int(p.sum())} ({p.double().mean():.2g} of all) {name}"
+            for name, p in parts.items()
+            if bool(p.any())
+        ]
         return f"pixels left out: {', '.join(said)}" if said else ""
 
     @property

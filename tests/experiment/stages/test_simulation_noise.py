@@ -15,6 +15,7 @@ from lidar_mi.experiment.pipeline import stages_of
 from lidar_mi.experiment.preflight.cost import with_number
 from lidar_mi.experiment.run import finish, prepare
 from lidar_mi.experiment.schema import reading
+from lidar_mi.experiment.schema.reading import load_experiment
 from lidar_mi.experiment.stages import rendering
 from lidar_mi.experiment.stages.rendering import (
     IMAGES,
@@ -206,6 +207,24 @@ def test_the_first_sentence_names_it_where_samples_are_too_few_and_only_there(pr
     assert run.metrics["backscatter.samples_per_beam"] == 4e4 // (41 * 27)
     said = [text for text in run.warnings if text.startswith("render.max_samples: ")]
     assert bool(said) == ("noise of the simulation" in run.answer[0])
+
+
+def test_a_run_along_a_curve_has_it():
+    """Which pixels scattered beams reach at the reference time depends on the noise."""
+    timing = {"pattern": "lissajous", "cycles": [139, 110], "duration": "95 ms"}
+    asked = load_experiment(
+        "wake_backscatter",
+        wake={"spacing": "1 m"},
+        platform={"speed": "70 m/s"},
+        lidar={"pulse_energy": "1 mJ", "pulse_duration": "10 ns"},
+        scan={"range": "148.75 m", "air": "moving", "timing": timing},
+        detector={},
+        render={"samples_per_beam": 16, "max_order": 1},
+        retrieval={"methods": ["variational"], "sources": "measured", "stride": 4},
+    )
+    run = prepare(asked)
+    finish(run, with_figures=False)
+    assert run.results["simulation_noise"].sizes["algorithm"] == 1
 
 
 def test_samples_of_another_number_are_not_resumed():
