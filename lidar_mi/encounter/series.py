@@ -50,7 +50,7 @@ _DEFLECTION = ("rad", "aileron as deflected")
 _CONTROL = ("N m", "rolling moment of the controls")
 
 
-class Recorder:
+class FlightRecorder:
     """Collects a flight instant by instant."""
 
     def __init__(self) -> None:
