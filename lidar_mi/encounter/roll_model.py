@@ -24,7 +24,7 @@ class RollModel:
         Speed and altitude.
     """
 
-    def __init__(self, aircraft: Aircraft, path: Path):
+    def __init__(self, aircraft: Aircraft, path: Path) -> None:
         self.state = AircraftState(airspeed=path.speed)
         self.density = float(Atmosphere(path.altitude).density[0])
         self.strips = wing_strips(aircraft.span, aircraft.wing_area, aircraft.lift_slope)
@@ -71,8 +71,13 @@ class RollModel:
         )
         return self.state
 
-    def _rolled(self, roll, rate, dt, start, end):
-        """p' = -p / tau + m, where m goes from start to end in dt: the solution of the line."""
+    def _rolled(
+        self, roll: float, rate: float, dt: float, start: float, end: float
+    ) -> tuple[float, float]:
+        """Roll (rad) and roll rate (rad/s) after dt of p' = -p / tau + m.
+
+        m changes linearly from start to end (rad/s^2).
+        """
         tau = self.time_constant
         slope = (end - start) / dt
         # a particular solution is p = tau (m - slope tau)
