@@ -1,4 +1,4 @@
-"""A flight as data sets: its time series, the track slab by slab, what the lidar saw."""
+"""Flights as data sets: the time series, and the track slab by slab."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -51,7 +51,7 @@ _CONTROL = ("N m", "rolling moment of the controls")
 
 
 class FlightRecorder:
-    """Collects a flight instant by instant."""
+    """Records a flight, instant by instant."""
 
     def __init__(self) -> None:
         self._rows: list[dict[str, float]] = []
@@ -65,7 +65,7 @@ class FlightRecorder:
         deflection: np.ndarray,
         control_moments: np.ndarray,
     ) -> None:
-        """One instant."""
+        """Record one instant: deflections in rad, moments per deflection in N m per rad."""
         row = {field.name: float(getattr(state, field.name)) for field in fields(state)}
         row |= _named(loads, "")
         nothing = Loads(np.full(3, np.nan), np.full(3, np.nan))
@@ -208,7 +208,9 @@ def _line_error(lines: xr.Dataset | None) -> float:
     return float(np.sqrt(((lines["v_los"] - lines["v_los_true"]) ** 2).mean()))
 
 
-def _wind_errors(wind: xr.Dataset | None, wake, x: float, time: float) -> dict[str, float]:
+def _wind_errors(
+    wind: xr.Dataset | None, wake: WakeAlongPath, x: float, time: float
+) -> dict[str, float]:
     """Rms errors of the vectors that are valid; NaN where a component was not estimated."""
     found = {"error_u": np.nan, "error_v": np.nan, "error_w": np.nan, "vectors": 0.0}
     if wind is None:
