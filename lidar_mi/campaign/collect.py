@@ -20,6 +20,7 @@ from lidar_mi.progress import Notice
 
 STATUS = ("done", "failed", "missing")
 
+# Points between two notices.
 _EVERY = 200
 
 
@@ -55,8 +56,8 @@ def open_campaign(folder: str | Path) -> xr.Dataset:
 def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
     """Collect the metrics of all points, and write ``campaign.nc``.
 
-    The same points give the same file, whoever computed them and in whichever order. Durations are
-    left out: they are never the same.
+    The same points give the same file, by whichever workers and in whichever order they were
+    computed. Durations are omitted: they are never the same.
 
     Returns
     -------
@@ -88,7 +89,14 @@ def collect(folder: CampaignFolder, notice: Notice = silent) -> xr.Dataset:
     return data
 
 
-def _data_set(folder, values, status, messages, places) -> xr.Dataset:
+def _data_set(
+    folder: CampaignFolder,
+    values: dict[str, np.ndarray],
+    status: np.ndarray,
+    messages: np.ndarray,
+    places: np.ndarray,
+) -> xr.Dataset:
+    """The data set of arrays over all points, shape (points,)."""
     points, campaign = folder.points, folder.campaign
     dims = [one.name for one in points.dimensions]
     shape = points.shape
